@@ -63,6 +63,7 @@ from thermogrip.sysid.plant.fit_record import (
     TAIL,
     HeldOut,
 )
+from thermogrip.sysid.plant.innovations import innovation_noise
 from thermogrip.sysid.plant.log_grid import match_logs, misfit, moved_before, roles_of, signals
 from thermogrip.sysid.plant.log_grid import rows_of as log_rows
 from thermogrip.sysid.plant.plant import Plant
@@ -557,6 +558,7 @@ def identify(
         new_run_rmse=other,
         other_kind_rmse=unlike,
         input_effect=effect,
+        innovations=innovation_noise(plant, logs),
     )
     plant = replace(plant, verdict=verdict, scores=scores)
     searched = tuple(row for some in fits for row in searched_rows(some))

@@ -31,6 +31,8 @@ from simulator import OUTPUTS, SKIN, Plant, Truth, full_drive_time
 sys.path.insert(0, str(Path(__file__).parents[1] / "mpc"))
 from problem import MODEL, ReferenceModel  # the equations, as the package takes a class of one's own
 
+from thermogrip.mpc.closed_loop.simulate import RecordedController
+from thermogrip.mpc.controllers.loop_monitor import LoopMonitor
 from thermogrip.mpc.controllers.mpc import Controller
 from thermogrip.mpc.design.design import default_design
 from thermogrip.mpc.interface import Move
@@ -261,6 +263,7 @@ def main() -> None:
     """Run, print, write."""
     given, model = asked(__doc__, "0,1", draws="of the posterior, in place of the rows"), model_of()
     controller = Controller(model, default_design(model), compiled=wanted() and not given.python)
+    controller = RecordedController(controller, LoopMonitor(model, controller.design))
     lines = [
         "| plant | settling / full drive: mean, worst | overshoot [degC] | offset [degC] "
         "| first status | loop | report |",

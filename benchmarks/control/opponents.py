@@ -5,7 +5,7 @@ all at once, on all logs (delays on a grid, by coordinate descent).  A loop's se
 pair, with tau_c = delay; nothing else is tuned.  The integrator is held while the drive is limited.
 
 **do-mpc.** The plant that ``identify`` kept, the weights and horizon of its default design, a move in every
-sample, limits of range and slew; states and disturbances come from the package's filter.
+sample, limits of range and slew, and a plain Kalman filter with a bias for each drive.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ from truths import Case
 sys.path.insert(0, str(Path(__file__).parents[1] / "mpc"))
 from dompc_values import hold_over_horizon
 
-from thermogrip.mpc.controllers.mpc import Controller
 from thermogrip.mpc.design.design import Design
+from thermogrip.mpc.plant.prediction import PredictionModel, prediction_model
 from thermogrip.sysid.plant.plant import Plant as Model
 
 Array = NDArray[np.float64]
@@ -132,15 +132,48 @@ class SimcPI:
         return u, "ok"
 
 
+class PlainFilter:
+    """An extended Kalman filter of a plant's states and one bias for each drive, as a user of do-mpc writes
+    it: white noise of 3 % of a drive's range on its way to the states, a bias that drifts by 1 % a sample."""
+
+    def __init__(self, model: PredictionModel) -> None:
+        self.model, n, m = model, model.n_x, model.n_u
+        self.H = np.hstack([model.C, np.zeros((model.n_y, m))])
+        known = model.plant.noise | model.plant.scores.reading_sd  # the sensor's noise
+        self.R = np.diag([known[name] ** 2 for name in model.outputs])
+        self.P, self.n, self.m = np.eye(n + m), n, m
+
+    def reset(self, y: Array, u: Array, d: Array) -> None:
+        """Start where the plant rests under drives u, with the bias that its reading is then off by."""
+        x = self.model.rest(y, d)
+        for _ in range(2000):
+            x = self.model.next_state(x, u, d)
+        self.z, self.P = np.concatenate([x, np.zeros(self.m)]), np.diag([1e-6] * self.n + [0.0] * self.m)
+        self.offset = y - self.model.output(x)
+
+    def update(self, y: Array) -> None:
+        """Correct the estimate with a reading."""
+        K = self.P @ self.H.T @ np.linalg.inv(self.H @ self.P @ self.H.T + self.R)
+        self.z = self.z + K @ (y - self.offset - self.model.output(self.z[: self.n]))
+        self.P = self.P - K @ self.H @ self.P
+
+    def predict(self, u: Array, d: Array) -> None:
+        """Go a sample on."""
+        x, A, B, _ = self.model.linearise(self.z[: self.n], u + self.z[self.n :] * self.model.span, d)
+        B, one, none = B * self.model.span, np.eye(self.m), np.zeros((self.m, self.n))
+        F, G = np.block([[A, B], [none, one]]), np.block([[0.03 * B, 0 * B], [0 * one, 0.01 * one]])
+        self.z, self.P = np.concatenate([x, self.z[self.n :]]), F @ self.P @ F.T + G @ G.T
+
+
 class DoMPC:
     """do-mpc with IPOPT on the identified plant."""
 
-    def __init__(self, plant: Model, design: Design) -> None:
+    def __init__(self, plant: Model, design: Design, rest: Sequence[float]) -> None:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             import do_mpc
-        self.own = Controller(plant, design)  # its filter alone is used
-        own, N = self.own.model, sum(design.blocks)
+        self.model = own = prediction_model(plant, design.dt)
+        self.filter, N = PlainFilter(own), sum(design.blocks)
         m = do_mpc.model.Model("discrete")
         x = [m.set_variable("_x", f"x{i}") for i in range(own.n_x)]
         before = [m.set_variable("_x", f"before{j}") for j in range(own.n_u)]
@@ -166,7 +199,8 @@ class DoMPC:
         c.set_param(nlpsol_opts=quiet)
         rows = [own.outputs.index(name) for name in design.controlled]
         y = own.model.output(x, own.p.tolist())
-        error = sum((y[i] - tv[f"e{k}"]) ** 2 for k, i in enumerate(rows))
+        weights = [design.weights.get(name, 1.0) for name in design.controlled]
+        error = sum(w * (y[i] - tv[f"e{k}"]) ** 2 for k, (i, w) in enumerate(zip(rows, weights, strict=True)))
         moves = sum(((u[j] - before[j]) / float(own.span[j])) ** 2 for j in range(own.n_u))
         c.set_objective(mterm=design.terminal * error, lterm=design.track * error + design.move * moves)
         c.set_rterm(**{f"u{j}": 0.0 for j in range(own.n_u)})
@@ -181,30 +215,31 @@ class DoMPC:
             warnings.simplefilter("ignore")
             c.setup()
         self.c, self.dt, self.rows, self.first = c, own.dt, rows, True
-        self.u: Array = own.neutral.copy()
+        self.rest = np.array(rest)[own.drive_index]
+        self.u: Array = self.rest
 
     def reset(self, reading: Mapping[str, float]) -> None:
         """Begin."""
-        self.own.reset(reading)
-        self.first = True
+        self.u, self.first = self.rest, True
+        self.filter.reset(*self._read(reading, self.rest))
 
-    def step(self, reading: Mapping[str, float], target: float) -> tuple[list[float], str]:
-        """Return the drives and a status."""
-        observer, own = self.own.observer, self.own.model
-        y = np.array([reading[name] for name in own.outputs])
-        d = np.array([reading[name] for name in own.disturbances])
+    def _read(self, reading: Mapping[str, float], u: Array) -> tuple[Array, Array, Array]:
+        own = self.model
+        y, d = (np.array([reading[name] for name in names]) for names in (own.outputs, own.disturbances))
+        return y, u, d
+
+    def step(self, reading: Mapping[str, float], target: float | Sequence[float]) -> tuple[list[float], str]:
+        """Return the drives and a status; a sequence is a target with those ahead."""
+        y, _, d = self._read(reading, self.u)
         if not self.first:
-            observer.update(y)
-        bias = observer.output_bias[self.rows]
-        values = [*observer.drive_bias, *(d + observer.disturbance_bias), *(target - bias)]
-        self.values = dict(zip(self.keys, map(float, values), strict=True))
-        state = np.concatenate([observer.x, self.u])
+            self.filter.update(y)
+        x, bias = self.filter.z[: self.filter.n], self.filter.z[self.filter.n :] * self.model.span
+        ahead = [np.ravel(target) - self.filter.offset[row] for row in self.rows]
+        self.values = dict(zip(self.keys, [*bias, *d, *ahead], strict=True))
+        state = np.concatenate([x, self.u])
         if self.first:
-            self.c.x0 = state
-            self.c.u0 = self.u
+            self.c.x0, self.c.u0, self.first = state, self.u, False
             self.c.set_initial_guess()
-            self.first = False
         self.u = np.asarray(self.c.make_step(state), dtype=float).ravel()
-        status = "ok" if self.c.solver_stats["success"] else "failed"
-        observer.predict(self.u, d)
-        return self.u.tolist(), status
+        self.filter.predict(self.u, d)
+        return self.u.tolist(), "ok" if self.c.solver_stats["success"] else "failed"

@@ -293,7 +293,7 @@ def players(
             wide = spec.design(controller.plant)
             found.append(("pi", Ours(case, PIController.of(plant, wide, controller.design.loops))))
         if "do-mpc" not in without and importlib.util.find_spec("do_mpc") is not None:
-            found.append(("do-mpc", DoMPC(controller.plant, spec.design(controller.plant))))
+            found.append(("do-mpc", DoMPC(controller.plant, spec.design(controller.plant), case.rest)))
     except UserError as error:
         print(f"{case.name}: refused: {error}", flush=True)
     if "simc" not in without:

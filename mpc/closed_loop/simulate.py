@@ -32,6 +32,7 @@ from thermogrip.mpc.interface import Controller, Move, Readings, Regulator, Targ
 from thermogrip.mpc.plant.prediction import held_start, prediction_model
 
 if TYPE_CHECKING:
+    from thermogrip.mpc.controllers.loop_monitor import LoopMonitor
     from thermogrip.sysid.plant.plant import Plant
 
 
@@ -332,10 +333,11 @@ def segment_of(
 
 class RecordedController:
     """A controller that keeps its ``moves``, each with the time of its reading [s], counted in sample times
-    where the reading has none."""
+    where the reading has none, beside a monitor of its loop, whose words are the advice of a move that is
+    ok."""
 
-    def __init__(self, controller: Controller) -> None:
-        self.controller = controller
+    def __init__(self, controller: Controller, monitor: LoopMonitor | None = None) -> None:
+        self.controller, self.monitor = controller, monitor
         self.moves: list[tuple[float, Move]] = []
 
     @property
@@ -346,6 +348,8 @@ class RecordedController:
     def reset(self, reading: Readings) -> None:
         """Let the controller forget the past; the moves are kept."""
         self.controller.reset(reading)
+        if self.monitor is not None:
+            self.monitor.forget()
 
     def __getattr__(self, name: str) -> Any:
         """Return what else the controller has."""
@@ -354,6 +358,9 @@ class RecordedController:
     def step(self, reading: Readings, target: Target) -> Move:
         """Return the controller's move, and keep it."""
         move = self.controller.step(reading, target)
+        said = "" if self.monitor is None else self.monitor.note(reading, move, target)
+        if said and move.status == "ok":
+            move = replace(move, status="mismatch", advice=said)
         self.moves.append((float(reading.get("time_s", self.dt * len(self.moves))), move))
         return move
 

@@ -271,7 +271,6 @@ class _Twin(Controller):
         self._start(np.full(self.model.n_y, self.design.ambient), state.d)
         self.observer.found_offset = np.zeros(self.model.n_y)
         self.observer.x, self.observer.w = state.x.copy(), state.w.copy()
-        self.observer.shown = self.observer.start = self.model.output(state.x)[self.observer.lagged]
         self._u = self._in_force = state.u.copy()
         self._plan = None if state.plan is None else state.plan.copy()
         self._target, self._side, self._fresh = state.target.copy(), state.side.copy(), False

@@ -15,15 +15,13 @@ A loop must never be left without an answer, so every failure has a next best on
   place of the reading, then without that output, and the drive that is there for it goes to rest;
 * ``fallback_pi``: the plan has run out; PI on the reading, taken over without a bump (and without
   feed-forward: the drive that is taken over has it);
-* ``off``: no reading to act on, or the pump is off; the drive goes to zero;
-* ``mismatch``: the optimiser's move, as for a plant that is known not to be the model
-  (:mod:`thermogrip.mpc.estimator.structure_monitor`; in Python alone), or to be slower; whose output is not
-  where its plan said long ago (:mod:`thermogrip.mpc.estimator.arrival`), or swings about its target
-  (:mod:`thermogrip.mpc.estimator.oscillation`); or goes away from its target while the bias of a drive
-  exceeds 30 % of its range.
+* ``off``: no reading to act on, or the pump is off; the drive goes to zero.
 
 Where mean innovations exceed 3 standard deviations, the weight of moves is multiplied by their third, up
 to 30 times: a gain that is off by 30 % does not swing.
+
+What a loop shows beyond one sample, an output that swings or does not arrive, another plant than the model,
+:class:`thermogrip.mpc.controllers.loop_monitor.LoopMonitor` watches from beside it.
 
 Whatever the status, a drive is finite, inside its range, and within the slew limit of the one before.  What
 cannot be a reading is found by :mod:`thermogrip.mpc.estimator.reading_checks`.
@@ -52,17 +50,14 @@ from thermogrip.mpc.controllers.base import STALE, SampledController
 from thermogrip.mpc.controllers.linear_equivalent import to_control
 from thermogrip.mpc.controllers.pi import PIController
 from thermogrip.mpc.design.design import DAY, SCHEMA, VERSION, Design, check_design, default_design
-from thermogrip.mpc.estimator.arrival import ArrivalMonitor
 from thermogrip.mpc.estimator.call_times import RESTART_S, opening, shifted
-from thermogrip.mpc.estimator.oscillation import OscillationMonitor
-from thermogrip.mpc.estimator.reading_checks import ReadingMonitor, follows, is_off, too_weak
-from thermogrip.mpc.estimator.structure_monitor import StructureMonitor
+from thermogrip.mpc.estimator.reading_checks import ReadingMonitor, is_off
 from thermogrip.mpc.interface import Move, Readings, Trajectory
 from thermogrip.mpc.native.shared_constants import CAUTION, MOST_CAUTION, STAYS, WEAK
 from thermogrip.mpc.optimiser.reach import Reach
 from thermogrip.mpc.optimiser.rti import Optimiser, Outcome, Sample
 from thermogrip.mpc.optimiser.switching import choose
-from thermogrip.mpc.plant.prediction import apparent_delays, prediction_model
+from thermogrip.mpc.plant.prediction import prediction_model
 
 if TYPE_CHECKING:
     from thermogrip.mpc.native.runtime import CompiledController
@@ -70,7 +65,6 @@ if TYPE_CHECKING:
     from thermogrip.sysid.plant.plant import Plant
 
 _KEPT_DRAWS = 50  # of the posterior, in the controller's file for its review
-_EVEN = 0.1  # of a sample time, by which calls may differ from it in a window of the structure's monitor
 
 
 class Controller(Shown, SampledController):
@@ -131,13 +125,7 @@ class Controller(Shown, SampledController):
         if compiled:
             self._compile()
         self.pi = PIController.of(plant, design, tuple(replace(p, feedforward=0.0) for p in design.loops))
-        self.monitor = ReadingMonitor(self.model.n_y, len(self.observer.lagged), spike=self.model.spike)
-        self.structure = StructureMonitor(plant, self.model, self.controlled)
-        most = 2.0 * design.overshoot  # half of what may be overshot is what plans keep to
-        self.arrival = ArrivalMonitor.of(self.controlled, self.dt, most, self.observer.R[self._rows])
-        allowed = [most] * len(self.controlled)
-        delays = apparent_delays(plant, self.model.drives, tuple(self.controlled), self.dt)
-        self.swings = OscillationMonitor(self.controlled, self.dt, delays, allowed)
+        self.monitor = ReadingMonitor(self.model.n_y, spike=self.model.spike)
         self.reach = Reach(self.optimiser, self.observer)
         self.last_iterations = 0  # of the program, in the last step
         self._waits = 0.0  # seconds until an on/off drive may go over, where it is to
@@ -316,11 +304,7 @@ class Controller(Shown, SampledController):
         self._ahead = self._trajectory(target)
         if self.design.ramp_per_s:
             wanted = self._ramp(wanted)
-        zone = self.optimiser.zone.tolist()
-        self._swings = self.swings.note(self._y[self._rows], wanted, self.times.waited_s, zone)
         u, status, advice = self._decide(wanted, started)
-        if status not in ("ok", "mismatch", "late"):
-            self.arrival.restart()  # no plan is followed, or none arrives
         if status == "ok":  # what happened in this sample, before what has been so for long
             advice = said or advice
         if wrong and status == "ok":
@@ -335,7 +319,6 @@ class Controller(Shown, SampledController):
     def _start(self, y: Array, d: Array) -> None:
         self._d = np.where(np.isfinite(d), d, self.model.undisturbed(self.design.ambient))
         self.observer.reset(y, self._d)
-        self.observer.expect_lags()
         self._forget()
         self._in_force = self._u
         self._side = np.zeros(len(self._rows))
@@ -349,11 +332,7 @@ class Controller(Shown, SampledController):
         self._fresh = True
         self._on_pi = False
         self.monitor.forget(y)
-        self.structure.forget()
         self.reach.forget()
-        self.arrival.restart()
-        self.swings.forget()
-        self._swings = ""  # which output swings
         self.optimiser.forget()
 
     def _pass(self, seconds: float, applied: Array) -> None:
@@ -381,14 +360,10 @@ class Controller(Shown, SampledController):
         self._fresh = False
         if not self.design.move_delay:
             self._u = applied  # the slew limit counts from what was really applied
-        before = self._d
         self._d = np.where(np.isfinite(d), d, self._d)
         y, stays = self.monitor.screen(y, self.observer.reading())
         jumped = self._accept_jump(y, stays) if stays.any() else ""
         self.observer.update(y)
-        if stays.any() or abs(elapsed - self.dt) > _EVEN * self.dt:
-            self.structure.restart()
-        self.structure.note(self.observer, y, applied, before)
         self._y, self._seen = y, self.observer.now
         lost = [name for name, value in zip(self.model.outputs, y) if not np.isfinite(value)]
         lost += [name for name, value in zip(self.model.disturbances, d) if not np.isfinite(value)]
@@ -460,14 +435,10 @@ class Controller(Shown, SampledController):
         if outside:
             return u, "infeasible", "the drive that was applied is out of range: brought back"
         end, zone = outcome.y[-1, self._rows], self.optimiser.zone
-        overdue = self.arrival.note(
-            self._y[self._rows], wanted, outcome.y[:, self._rows], self.times.waited_s, zone
-        )
         missed = self.reach.missed(
             self.observer,
             self._u,
             self._d,
-            y=self._y[self._rows],
             target=np.where(zone > 0, np.clip(end, wanted - zone, wanted + zone), wanted),
             side=self._side,
             ahead=end,
@@ -475,9 +446,7 @@ class Controller(Shown, SampledController):
         )
         if missed is not None:
             what = f"{self.controlled[missed[0]]} at {wanted[missed[0]]:.1f} degC"
-            advice = f"no drive holds {what}: {missed[1]:.1f} degC can be held"
-            other = follows(self.observer, self.controlled) if too_weak(self.observer) else ""
-            return u, "infeasible", f"{advice}, if the model is right; {other}" if other else advice
+            return u, "infeasible", f"no drive holds {what}: {missed[1]:.1f} degC can be held"
         if outcome.broken:
             name, over = max(outcome.broken.items(), key=lambda item: item[1])
             advice = f"limit of {name} will be broken by {over:.1f} degC: choose a nearer target"
@@ -488,16 +457,8 @@ class Controller(Shown, SampledController):
             lost = self._lost
             parked = [name for name, at in zip(self.model.drives, self.optimiser.pair) if lost[at]]
             return u, "fallback_plan", self._unseen(parked)
-        lags = self.monitor.slower(self.observer)
-        doubt = self.structure.said or ("" if self.structure.denies else lags)
-        said = follows(self.observer, self.controlled)
-        if not doubt and (self._swings or overdue):
-            doubt = "; ".join(filter(None, (self._swings or overdue, said)))
-        if doubt or (self.arrival.recedes and too_weak(self.observer)):
-            return u, "mismatch", doubt or said
-        if self._waits and not said:
-            said = f"{', '.join(self.design.on_off)} may go over in {self._waits:.0f} s"
-        return u, "ok", said
+        waits = f"{', '.join(self.design.on_off)} may go over in {self._waits:.0f} s" if self._waits else ""
+        return u, "ok", waits
 
     def _optimise(self, wanted: Array) -> Outcome:
         last = np.clip(self._u, self.optimiser.lowest, self.optimiser.highest)

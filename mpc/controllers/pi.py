@@ -26,7 +26,6 @@ import numpy as np
 
 from thermogrip.datasets.arrays import Array
 from thermogrip.mpc.controllers.base import SampledController
-from thermogrip.mpc.controllers.loop_status import LoopStatus
 from thermogrip.mpc.design.design import Design, PILoop, default_controlled, pair_loops
 from thermogrip.mpc.interface import Move, Readings, Trajectory
 from thermogrip.mpc.native.shared_constants import UNCUT
@@ -63,8 +62,6 @@ class PIController(SampledController):
         Where drives go without readings, in their units; 0 where absent.
     on_off : dict of str to tuple of float, optional
         As in :class:`~thermogrip.mpc.design.design.Design`.
-    overshoot : float, optional
-        Half of what outputs may be off before the status says so, in their unit.
 
     Examples
     --------
@@ -92,7 +89,6 @@ class PIController(SampledController):
         clock: Callable[[], float] = time.perf_counter,
         safe_drive: Mapping[str, float] | None = None,
         on_off: Mapping[str, tuple[float, float, float]] | None = None,
-        overshoot: float = 0.15,
     ) -> None:
         model = PredictionModel(plant) if dt is None else prediction_model(plant, dt)
         ranges = dict(zip(model.drives, zip(model.lowest.tolist(), model.highest.tolist())))
@@ -112,8 +108,6 @@ class PIController(SampledController):
         self.ends = [(model.drives.index(p.drive), self.controlled.index(p.output)) for p in self.loops]
         self.integral, self._begun = np.zeros(len(self.loops)), np.full(len(self.controlled), np.nan)
         self._room, self._usual_d = np.full(model.n_d, np.nan), model.undisturbed(ROOM)
-        self._allowed = 2.0 * overshoot
-        self._said: LoopStatus | None = None  # made where a loop first steps
         #: An MPC of the same plant and drives in C, in whose library trials of these loops can run.
         self.c: CompiledController | None = None
 
@@ -130,7 +124,6 @@ class PIController(SampledController):
             patience_s=design.patience_s,
             safe_drive=design.safe_drive,
             on_off=design.on_off,
-            overshoot=design.overshoot,
         )
 
     def reset(self, reading: Readings) -> None:
@@ -150,17 +143,6 @@ class PIController(SampledController):
                 [rest[j] - p.feedforward * held[j] for p, (j, _) in zip(self.loops, self.ends)]
             )
         self.times.reset()
-        if self._said is not None:
-            self._said.forget()
-
-    @property
-    def said(self) -> LoopStatus:
-        """What becomes of the loops."""
-        if self._said is None:
-            at = [j for j, _ in self.ends]
-            limits = {"lowest": self.lowest[at], "highest": self.highest[at]}
-            self._said = LoopStatus(self.model, self.loops, **limits, allowed=self._allowed)
-        return self._said
 
     def step(self, reading: Readings, target: Trajectory) -> Move:
         """Return the move for this sample; a lost reading holds the drive of its loop for ``patience_s``,
@@ -175,15 +157,11 @@ class PIController(SampledController):
         usable = np.isfinite(y) & np.isfinite(wanted).all()
         self._unread_s = np.where(usable, 0.0, self._unread_s + self.times.waited_s)
         status, advice = "fallback_plan", wrong or "reading lost: the drive is held"
-        before = self._applied(reading, self._u)
         if usable.any():
             d = np.where(np.isfinite(self._room), self._room, self._usual_d)
             self._u = self.propose(y, wanted, d, seconds=self.times.slew_s)
             lost = [name for name, seen in zip(self.controlled, usable) if not seen]
-            rows = [i for _, i in self.ends]
-            given = y[rows], wanted[rows], before[[j for j, _ in self.ends]]
-            status, advice = self.said.note(*given, self.times.waited_s)
-            advice = wrong or advice
+            status, advice = "ok", wrong
             if lost:
                 status, advice = "fallback_plan", f"{', '.join(lost)}: no usable reading, the others go on"
         elif self._lost.all():

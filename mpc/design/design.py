@@ -26,7 +26,7 @@ References
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from numbers import Real
 from typing import TYPE_CHECKING, Any
@@ -35,7 +35,14 @@ import numpy as np
 
 from thermogrip.datasets.errors import UserError, known_names, reading
 from thermogrip.datasets.limits import LARGEST
-from thermogrip.mpc.estimator.observer import Observer, ObserverNoise, choose_disturbances
+from thermogrip.mpc.estimator.observer import (
+    DRIFT,
+    NOISE,
+    Observer,
+    ObserverNoise,
+    choose_disturbances,
+    reading_noise,
+)
 from thermogrip.mpc.plant.prediction import (
     PredictionModel,
     drive_names,
@@ -43,6 +50,7 @@ from thermogrip.mpc.plant.prediction import (
     graded_drives,
     sample_time,
     step_response,
+    unit_of,
 )
 
 if TYPE_CHECKING:
@@ -103,13 +111,11 @@ LONGEST_HORIZON, MOST_UNKNOWNS = 1000, 200
 
 _LONGEST_SAMPLE = 3600.0  # s
 _COARSE = 1.0  # range of an output below which the filter's numbers, made for degC, are too coarse
-_MOST_DELAY = 10.0  # delays in a lag, from which on the bias of a drive is learnt more slowly
-_SHORT = 4.0  # samples of a delay, below which a filter allows for longer lags
-_MOST_LAG = 10 / 3  # times the usual standard deviation, that it allows
-_OUTPUT_DRIFT = 0.03  # degC per sqrt(sample), by which a bias of an output may drift in a default design
-# of a drive of a black box [of its range per sqrt(s)]: where the first samples of a response are off, a loop
-# that learns sooner rings; what lasts is learnt sooner (mpc/estimator/observer.py)
-_BLACK_BOX_DRIFT = 7e-4
+# of a bias of an output in a default design, in its unit per sqrt(sample)
+_OUTPUT_DRIFT = 0.03
+# beyond a target, in units of its output, and in standard deviations of a reading, which alone leave no such
+# band in a thousand samples
+_BAND, _NOISES = 0.15, 3.0
 _MOST_NOISE = 1e6  # of a state, a reading or a bias, in any unit
 _ROOMS = (-60.0, 150.0)  # degC: no room is beyond
 
@@ -154,8 +160,8 @@ def _numbers_of(design: Design) -> Iterator[tuple[str, Sequence[Any]]]:
     yield "tariff", [number for row in design.tariff for number in row]
     for loop in design.loops:
         yield f"the PI of {loop.output}", (loop.Kc, loop.Ti, loop.feedforward, loop.setpoint)
-    for name, value in vars(design.noise).items():
-        yield f"noise: {name}", (value,)
+    noise = design.noise
+    yield "noise", (noise.state, noise.output, *noise.drive.values(), *noise.reading.values())
 
 
 def _check_time(design: Design, plant: Plant) -> None:
@@ -220,8 +226,10 @@ def _check_weights(design: Design) -> None:
     wrong = min(design.track, design.move) <= 0 or min(others) < 0
     _refuse(wrong, "weights: track and move must be > 0, the others >= 0")
     _refuse(design.overshoot < 0, "overshoot must be >= 0")
-    _refuse(min(vars(design.noise).values()) < 0, "noise: a standard deviation must be >= 0")
-    wrong = max(vars(design.noise).values()) > _MOST_NOISE
+    noise = design.noise
+    values = [noise.state, noise.output, *noise.drive.values(), *noise.reading.values()]
+    _refuse(min(values) < 0, "noise: a standard deviation must be >= 0")
+    wrong = max(values) > _MOST_NOISE
     _refuse(wrong, f"noise: a standard deviation must be <= {_MOST_NOISE:g}")
 
 
@@ -323,8 +331,7 @@ class Design:
         """Return the filter of this design for a plant at its sample time."""
         count = None if self.offset_free else 0
         chosen = choose_disturbances(model, self.controlled, ambient=self.ambient, count=count)
-        lagged = [model.outputs.index(name) for name in self.controlled]
-        return Observer(model, chosen, self.noise, ambient=self.ambient, lagged=lagged)
+        return Observer(model, chosen, self.noise, ambient=self.ambient)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the design as plain JSON."""
@@ -344,7 +351,7 @@ class Design:
             # an older file has an anti-windup time beside
             loops = [{key: of[key] for key in of if key != "Tt"} for of in content["loops"]]
             values["loops"] = tuple(PILoop(**loop) for loop in loops)
-            values["noise"] = ObserverNoise(**content["noise"])
+            values["noise"] = _noise_of(content["noise"], content["drive_range"])
             values["hard"] = tuple(str(name) for name in content.get("hard", ()))
             tariff = content.get("tariff", ())
             values["tariff"] = tuple((float(second), float(factor)) for second, factor in tariff)
@@ -366,6 +373,55 @@ def make_blocks(horizon: int, count: int) -> tuple[int, ...]:
     ends[-1] = horizon
     lengths = np.diff(np.concatenate([[0], np.maximum.accumulate(ends)]))
     return tuple(sorted(int(length) for length in lengths if length > 0))
+
+
+def _in_units(plant: Plant, controlled: Sequence[str]) -> dict[str, Any]:
+    """Return the weights, the band and its price that count errors in each output's unit
+    (:func:`thermogrip.mpc.plant.prediction.unit_of`); the band is no narrower than what noise shows."""
+    ranges = [plant.valid.get(name, (0.0, 0.0)) for name in controlled]
+    units = unit_of(np.array([high - low for low, high in ranges]))
+    noises = [reading_noise(plant, name) or 0.0 for name in controlled]
+    band = max(max(_BAND * unit, _NOISES * sd) for unit, sd in zip(units.tolist(), noises))
+    others = {name: unit**-2 for name, unit in zip(controlled, units.tolist()) if unit != 1.0}
+    return {"weights": others, "overshoot": band, "price": Design.price / float(units.max()) ** 2}
+
+
+def default_noise(plant: Plant, controlled: Sequence[str], dt: float) -> ObserverNoise:
+    """Return the noise that the filter of a plant assumes, see :mod:`thermogrip.mpc.estimator.observer`."""
+    model, record = PredictionModel(plant, dt=dt), plant.scores.innovations
+    units = model.unit[[model.outputs.index(name) for name in controlled]]
+    drifts = {}
+    for name, span in zip(model.drives, model.span.tolist()):
+        answers = [step_response(plant, name, output) for output in controlled]
+        gains = np.array([answer.gain for answer in answers]) / units
+        at = int(np.argmax(np.abs(np.nan_to_num(gains))))
+        rate, theta = abs(answers[at].gain) / answers[at].lag, answers[at].delay + dt
+        known = reading_noise(plant, controlled[at])
+        noise = NOISE * units[at] if known is None else known
+        sooner = noise * dt**0.5 / (rate * theta**2) if rate > 0 else 0.0
+        seen = record.input.get(name, 0.0) / span if record else 0.0
+        drifts[name] = float(np.nan_to_num(max(seen, sooner), nan=DRIFT, posinf=DRIFT))
+    output = _OUTPUT_DRIFT / dt**0.5
+    return ObserverNoise(record.state if record else ObserverNoise.state, drifts, output)
+
+
+def _slew(plant: Plant, name: str, dt: float, span: float, graded: bool) -> float:
+    """Return the largest change of a drive [its unit per s]: what its logs show, else an eighth of its range;
+    never more than its range in a sample."""
+    record = plant.scores.innovations
+    seen = record.fastest.get(name, 0.0) if record else 0.0
+    return min(max(seen, 0.125 * span), span / dt) if graded else span / dt
+
+
+def _noise_of(content: Mapping[str, Any], drives: Iterable[str]) -> ObserverNoise:
+    """Return the noise of a file; of an older one every drive's was the same."""
+    drive, reading = content["drive"], content.get("reading", {})
+    return ObserverNoise(
+        state=content["state"],
+        drive=dict(drive) if isinstance(drive, dict) else dict.fromkeys(drives, drive),
+        output=content["output"],
+        reading=dict(reading) if isinstance(reading, dict) else {},
+    )
 
 
 def default_design(
@@ -422,8 +478,8 @@ def default_design(
     if not (graded := graded_drives(plant)):
         hint = "an on/off input is switched beside a drive that can be graded"
         raise UserError("on_off leaves no other drive", hint=hint)
-    slews = {name: (0.125 if name in graded else 1 / dt) * (b - a) for name, (a, b) in ranges.items()}
-    lengths, ratios, delays = [], [], []
+    slews = {name: _slew(plant, name, dt, b - a, name in graded) for name, (a, b) in ranges.items()}
+    lengths = []
     for output in controlled:
         answers = [step_response(plant, drive, output) for drive in graded]
         best = max(answers, key=lambda answer: abs(answer.gain))
@@ -433,9 +489,7 @@ def default_design(
                 f"no drive {how} {output}",
                 hint="identify it with logs that move the drive, or take another model",
             )
-        delays.append(best.delay)
         lengths.append(min(8 * best.delay, best.delay + 3 * best.lag))
-        ratios.append(best.lag / max(best.delay, 1e-3 * best.lag))
     horizon = int(np.clip(np.ceil(max(lengths) / dt), 20, 80))
     values: dict[str, Any] = {
         "dt": dt,
@@ -444,14 +498,8 @@ def default_design(
         "drive_range": ranges,
         "slew_per_s": slews,
         "loops": pair_loops(plant, controlled),
-        "noise": ObserverNoise(
-            # what is learnt sooner than a delay shows it is noise
-            drive=_BLACK_BOX_DRIFT
-            if plant.scores.structure
-            else ObserverNoise.drive * min(1.0, min(ratios) / _MOST_DELAY) ** 1.5,
-            output=_OUTPUT_DRIFT / dt**0.5,
-            lag=float(np.clip(_SHORT * dt / max([*delays, 1e-3 * dt]), 1.0, _MOST_LAG) * ObserverNoise.lag),
-        ),
+        "noise": default_noise(plant, controlled, dt),
+        **_in_units(plant, controlled),
         "deadline_s": 0.5 * dt,
         "patience_s": max(10.0, 5 * dt),
     }

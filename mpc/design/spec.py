@@ -290,7 +290,9 @@ class Spec(BaseModel):
                 if half > most:
                     narrow = f"{half:g} about {name} is wider than {key}, {most:g}"
                     raise UserError(f"zones: {narrow}", hint="steps are judged by it: widen it too")
-        values["weights"] = dict(self.weights or {})
+        given = self.weights or {}
+        counted = {name: given.get(name, 1.0) * design.weights.get(name, 1.0) for name in design.controlled}
+        values["weights"] = {name: weight for name, weight in counted.items() if weight != 1.0}
         values |= {"zones": dict(self.zones or {}), "hard": tuple(self.hard or ())}
         values |= {"tariff": tuple(self.tariff or ()), "iterations": self.iterations, "on_off": switches}
         values["energy_price"] = _by_drive("energy_price", self.energy_price, graded)

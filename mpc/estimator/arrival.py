@@ -1,15 +1,14 @@
-"""Targets that are not reached when the plan said: a loop that is bad while nothing else tells.
+"""Targets that are not reached when they should be: a loop that is bad while nothing else tells.
 
 What a filter with a disturbance on each output assumes explains any reading, so a plant that is not its model
-can pass for one that is.  But each plan says when an output arrives at its target.  An output that is
+can pass for one that is.  But one can say when an output arrives at its target.  An output that is
 promised in t seconds and is still off after 3 t and ten samples is overdue; it is there again once it has
 been near for five samples in a row, so that a swing through the target is no arrival.  Near is within what
-the output may overshoot, or four standard deviations of a reading, of its target or its zone; noise that the
+the output may overshoot of its target or its zone; noise that the
 model does not know of is less in a mean of some three readings, and overdue is what that and the reading of
 now are.
 
-A plan that does not arrive within its horizon promises nothing: drives at their limits are the matter of
-:mod:`thermogrip.mpc.optimiser.reach`.  A new target, of any output, begins anew.
+A new target, of any output, begins anew.
 """
 
 from __future__ import annotations
@@ -24,7 +23,6 @@ from thermogrip.datasets.arrays import Array
 LATE_TIMES, LATE_SAMPLES = 3.0, 10
 ARRIVAL_SAMPLES = 5  # in a row that make an arrival
 NEWEST_ERROR = 0.3  # share of the newest error in their mean
-NEAR_SD = 4.0  # standard deviations of a reading that are near
 
 
 class ArrivalMonitor:
@@ -35,11 +33,6 @@ class ArrivalMonitor:
         self.names, self.dt, self.near = tuple(names), dt, near
         self.restart()
 
-    @classmethod
-    def of(cls, names: Sequence[str], dt: float, overshoot: float, variance: Array) -> ArrivalMonitor:
-        """Return the monitor of outputs that may overshoot by so much, with variances of a reading (n,)."""
-        return cls(names, dt, np.maximum(overshoot, NEAR_SD * np.sqrt(variance)))
-
     def restart(self) -> None:
         """Forget what was promised."""
         self._target = np.full(len(self.names), np.nan)
@@ -47,15 +40,6 @@ class ArrivalMonitor:
         self._due = np.full(len(self.names), np.inf)  # seconds until an output is overdue
         self._late = np.zeros(len(self.names))  # seconds since it should have been there
         self._stayed = np.zeros(len(self.names), dtype=int)  # samples in a row that it was near
-        self._nearest = np.full(len(self.names), np.inf)  # how far off it was at least
-        self.recedes = False  # whether an output has been nearer to its target by more than what is near
-
-    def note(self, y: Array, target: Array, ahead: Array, seconds: float, zone: Array) -> str:
-        """Note readings y and targets (n,), and the plan's outputs ``ahead`` (N, n), so many seconds after
-        the last; return which output is overdue."""
-        arrives = np.abs(ahead - target) - zone <= self.near
-        promised = np.where(arrives.any(axis=0), self.dt * (1.0 + np.argmax(arrives, axis=0)), np.inf)
-        return self.expect(y, target, promised, np.full(len(y), seconds), zone)
 
     def expect(self, y: Array, target: Array, promised: Array, seconds: Array, zone: Array) -> str:
         """Note readings y and targets (n,) where outputs are promised in so many seconds (n,), inf where not,
@@ -76,8 +60,6 @@ class ArrivalMonitor:
         self._late = np.where(begins, -promised, self._late)
         away = (off > self.near) & (np.abs(error) - zone > self.near)
         overdue = away & (self._due < 0)
-        self._nearest = np.fmin(self._nearest, np.maximum(off, 0.0))
-        self.recedes = bool(np.any(away & (off > self._nearest + self.near)))
         if not overdue.any():
             return ""
         k = int(np.argmax(np.where(overdue, off / self.near, 0.0)))

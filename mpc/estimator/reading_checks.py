@@ -19,10 +19,6 @@ meanwhile, so that only what each sample adds is summed, not where the model wou
 its range, or that of an output 2 degC, or a thirtieth of a wide range: a pump that is off, a plug that has
 fallen off, another plant.
 
-**A plant that is slower.**  The observer has found an output to lag behind the model by more than 0.65
-of a sample and five standard deviations, in five in a row, from readings that show it to a quarter of a
-sample: a structure that the model lacks.  (Where a drive is far from the model, a
-lag explains too little to be accepted.)  It is reported until the lag is below a quarter of a sample.
 """
 
 from __future__ import annotations
@@ -45,17 +41,12 @@ LEFT_OUT = 3  # samples in a row, at most, that a jump is left out for
 SHARE = 1 / 3
 FOLLOWS_DRIVE = 0.3  # of its range: a larger bias of a drive is not a small error of the model
 
-# of a lag behind the model: least, least once reported, largest standard deviation [samples], least in those
-SLOWER_BY, STILL_SLOWER, SHOWN_TO, SLOWER_SD = 0.65, 0.25, 0.25, 5.0
-SLOW_FOR = 5  # samples in a row, until it is reported
-
 
 class ReadingMonitor:
     """What the last readings were, and what was expected of them."""
 
-    def __init__(self, n_y: int, n_l: int = 0, *, spike: Array | float = SPIKE) -> None:
+    def __init__(self, n_y: int, *, spike: Array | float = SPIKE) -> None:
         self._spike = spike
-        self._slow_for = np.zeros(n_l, dtype=int)  # samples in a row that each was slower
         self._last = np.full(n_y, np.nan)
         self._moved = np.zeros(n_y)
         self._spikes = np.zeros(n_y, dtype=int)  # samples in a row that each reading was left out for
@@ -63,19 +54,7 @@ class ReadingMonitor:
     def forget(self, y: Array) -> None:
         """Start afresh from reading y (n_y,)."""
         self._last, self._moved = np.array(y, dtype=float), np.zeros(len(self._last))
-        self._spikes, self._slow_for = np.zeros(len(self._last), dtype=int), 0 * self._slow_for
-
-    def slower(self, observer: Observer) -> str:
-        """Return which output is slower than the model, and by how much; empty where none surely is."""
-        lag, sd = observer.lag / observer.model.dt, observer.lag_sd / observer.model.dt
-        sure = ~too_weak(observer) & (lag > SLOWER_BY) & (lag > SLOWER_SD * sd) & (sd < SHOWN_TO)
-        sure |= (self._slow_for == SLOW_FOR) & (lag > STILL_SLOWER)
-        self._slow_for = np.where(sure, np.minimum(self._slow_for + 1, SLOW_FOR), 0)
-        slow = np.where(self._slow_for == SLOW_FOR, observer.lag, 0.0)
-        if not slow.any():
-            return ""
-        name = observer.model.outputs[observer.lagged[int(np.argmax(slow))]]
-        return f"{name} is slower than the model by about {slow.max():.2g} s: identify the plant anew"
+        self._spikes = np.zeros(len(self._last), dtype=int)
 
     def expect(self, change: Array) -> None:
         """Note by how much the model moves the outputs (n_y,) in a sample [degC]."""

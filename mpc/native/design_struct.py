@@ -14,11 +14,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from thermogrip.datasets.arrays import Array
-from thermogrip.mpc.estimator.oscillation import SWINGS, longest_half_swings
 from thermogrip.mpc.native.modes import Modes, modes_of
 from thermogrip.mpc.native.shared_constants import shared_definitions
-from thermogrip.mpc.optimiser.reach import BINS
-from thermogrip.mpc.plant.prediction import apparent_delays
 
 if TYPE_CHECKING:
     from thermogrip.mpc.design.design import Design
@@ -51,7 +48,6 @@ _FIELDS: dict[str, tuple[bool, tuple[str, ...], str]] = {
     "fixed": (True, ("NY",), "whether the offset of a sensor is found at the start, and stays"),
     "iterations": (True, (), "programs a sample, at most"),
     "linear": (True, (), "whether the plant is linear, so that its derivatives never change"),
-    "switched": (True, (), "whether there is a pump"),
     "read_from": (True, ("NY",), "the first state that an output reads, and the first behind the last"),
     "read_to": (True, ("NY",), ""),
     "dt": (False, (), "sample time [s]"),
@@ -73,7 +69,6 @@ _FIELDS: dict[str, tuple[bool, tuple[str, ...], str]] = {
     ),
     "tariff": (False, ("NT",), ""),
     "overshoot": (False, (), "band beyond the target [degC]"),
-    "longest": (False, ("NC",), "half swing of each controlled output [s]"),
     "patience_s": (False, (), "how long a plan is followed without a solve [s]"),
     "ambient": (False, (), "room where none is measured [degC]"),
     "room": (True, (), "which measured disturbance is the room's temperature, -1: none"),
@@ -107,14 +102,11 @@ _FIELDS: dict[str, tuple[bool, tuple[str, ...], str]] = {
     "offset": (False, ("NY",), "sensor offsets [degC]"),
     "R": (False, ("NY",), "variance of a reading"),
     "Q": (False, ("NZ",), "variance that a sample adds"),
-    "Q_lasting": (False, ("NZ",), "the same while innovations stay on one side"),
     "P0": (False, ("NW",), "variance of the disturbance states at rest"),
     "R_start": (False, ("NY",), "variance of a reading at rest"),
     "rest": (False, ("NX",), "state at rest where all is at `ambient` and `usual_d`"),
     "rest_level": (False, ("NX",), "how it answers to the mean of the readings"),
     "rest_d": (False, ("NX", "ND"), "and to the measured disturbances"),
-    "first_lag": (False, (), "lag of an output behind the model: standard deviation at the start [s],"),
-    "longest_lag": (False, (), "and the longest"),
     "settles": (True, (), "whether what follows says where a linear plant settles"),
     "settled_by": (False, ("NY", "NV"), "outputs at rest by shares of the drives, disturbances, and biases"),
     "settled": (False, ("NY",), "and without them"),
@@ -139,7 +131,6 @@ class Sizes:
     ND: int
     NY: int
     NW: int
-    NG: int  # outputs that may lag behind the model
     NB: int  # at most so many blocks, samples, controlled and limited outputs
     NH: int
     NC: int
@@ -168,7 +159,7 @@ class Sizes:
     @property
     def NZ(self) -> int:
         """States of the observer."""
-        return self.NX + self.NW + 3 * self.NG
+        return self.NX + self.NW
 
     def shape(self, name: str) -> tuple[int, ...]:
         """Return the shape of a field, as NumPy has it."""
@@ -190,7 +181,6 @@ def sizes_of(controller: ControllerParts, code: ModelCode, *, room: bool, single
         ND=model.n_d,
         NY=n_y,
         NW=controller.disturbance.n_w,
-        NG=len(controller.observer.lagged),
         NB=len(design.blocks),
         NH=most,
         NC=controlled,
@@ -288,7 +278,6 @@ def numbers_of(controller: ControllerParts, k: Array, *, single: bool = False) -
     model, design, optimiser = controller.model, controller.design, controller.optimiser
     observer, disturbance, loops = controller.observer, controller.disturbance, design.loops
     rest = observer.rest_in_room()
-    delays = apparent_delays(model.plant, model.drives, design.controlled, model.dt)
     rows = [model.outputs.index(name) for name in (*design.controlled, *design.limits)]
     limits = np.array(list(design.limits.values()), dtype=float).reshape(-1, 2)
     same_names = (
@@ -302,7 +291,7 @@ def numbers_of(controller: ControllerParts, k: Array, *, single: bool = False) -
             optimiser,
             "weight pair strongest seen reach lowest highest slew neutral safe at_rest dear zone energy",
         ),
-        (observer, "fixed offset R Q Q_lasting P0 R_start first_lag longest_lag"),
+        (observer, "fixed offset R Q P0 R_start"),
         (disturbance, "on_drive on_disturbance on_output"),
     )
     return {name: getattr(part, name) for part, names in same_names for name in names.split()} | {
@@ -314,7 +303,6 @@ def numbers_of(controller: ControllerParts, k: Array, *, single: bool = False) -
         "usual_d": model.undisturbed(design.ambient),
         "n_loops": len(loops),
         "iteration_limit": ITERATION_LIMIT,
-        "longest": longest_half_swings(delays, model.dt),
         "ramp": [design.ramp_per_s.get(name, 0.0) for name in design.controlled],
         "tariff_from": [second for second, _ in design.tariff],
         "tariff": [factor for _, factor in design.tariff],
@@ -323,7 +311,6 @@ def numbers_of(controller: ControllerParts, k: Array, *, single: bool = False) -
         "loop_drive": [model.drives.index(loop.drive) for loop in loops],
         "loop_output": [design.controlled.index(loop.output) for loop in loops],
         "linear": model.affine is not None,
-        "switched": bool(model.model.switches),
         "read_from": [int(np.argmax(row != 0)) for row in model.C],
         "read_to": [model.n_x - int(np.argmax(row[::-1] != 0)) if row.any() else 0 for row in model.C],
         "limit_low": limits[:, 0],
@@ -414,18 +401,12 @@ def _controller_parts(s: Sizes, number: Any) -> list[tuple[Any, int]]:
     whole = ctypes.c_int
     n, z, some = s.NB * s.NU, s.NZ, max(1, s.NS)
     wide = _whole(max(s.NX + s.NU + s.ND, n))
-    still = [*((number, count) for count in (s.NU, s.NW, BINS, 1)), (whole, 3)]
-    relaxation = type("tg_relaxation", (ctypes.Structure,), {"_fields_": _laid_out(still)})
-    half = type("tg_half", (ctypes.Structure,), {"_fields_": _laid_out([(number, 4)])})
-    swings = [(number, 7), (whole, 4), (half, SWINGS + 1)]
-    swing = type("tg_swing", (ctypes.Structure,), {"_fields_": _laid_out(swings)})
-    arrival = type("tg_arrival", (ctypes.Structure,), {"_fields_": _laid_out([(number, 5), (whole, 1)])})
     qp = type("tg_qp", (ctypes.Structure,), {"_fields_": _laid_out(_qp_parts(s, number))})
     return [
         (ctypes.c_void_p, 4),
-        *((number, count) for count in (s.NX, s.NW, s.NG, s.NG, s.NG, s.NG, z * z, s.NY, s.NY, s.NY)),
+        *((number, count) for count in (s.NX, s.NW, z * z, s.NY, s.NY)),
         (whole, z),
-        *((number, count) for count in (3, s.NU, s.NX, s.NG, s.NY)),
+        *((number, count) for count in (3, s.NU, s.NX, s.NY)),
         (ctypes.c_double, 2),
         (number, 7),
         (whole, 2),
@@ -433,8 +414,7 @@ def _controller_parts(s: Sizes, number: Any) -> list[tuple[Any, int]]:
         *((number, count) for count in (s.NY, s.NY, s.NX, s.NC, 1, s.NB, s.NC)),
         *((number, count) for count in (s.NX, s.NU, 1)),
         (whole, 3),
-        *((kind, s.NC) for kind in (relaxation, arrival, swing)),
-        (whole, 8 + s.NY + s.NG + s.NC),
+        (whole, 7 + s.NY + s.NC),
         *((number, count) for count in (n, s.NH * s.NY, n, 1)),
         (whole, 2),
         (number, 1),

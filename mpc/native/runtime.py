@@ -46,7 +46,7 @@ if TYPE_CHECKING:
     from thermogrip.sysid.models.model import Model
 
 #: The C files that every export shares.
-_CODE = ("tg_qp", "tg_controller", "tg_observer", "tg_optimiser", "tg_status")
+_CODE = ("tg_qp", "tg_controller", "tg_observer", "tg_optimiser")
 SOURCES = ("tg_qp.h", "tg_controller.h", *(f"{name}.c" for name in _CODE))
 
 # sums may be done in any order and pairs of operations at once; NaN keeps its meaning
@@ -176,7 +176,7 @@ def _truth_library(model: _ByStructure, drives: tuple[int, ...], h: float) -> ct
 @cache
 def _library(path: Path) -> ctypes.CDLL:
     library = ctypes.CDLL(str(path))
-    doubles, integers = "x w shown lag scale start P found_offset innovation lasting between", "held lost"
+    doubles, integers = "x w P found_offset innovation between", "held lost"
     for names, kind in ((doubles, ctypes.c_double), (integers, ctypes.c_int)):
         for name in names.split():
             getattr(library, f"tg_host_{name}").restype = ctypes.POINTER(kind)
@@ -355,15 +355,10 @@ class CompiledObserver(Observer):
         self._views = {
             "x": c.view("x", (n_x,)),
             "w": c.view("w", (n_w,)),
-            "shown": c.view("shown", (c.sizes.NG,)),
-            "lag": c.view("lag", (c.sizes.NG,)),
-            "scale": c.view("scale", (c.sizes.NG,)),
-            "start": c.view("start", (c.sizes.NG,)),
             "_P": c.view("P", (n_z, n_z)),
             "_held": c.view("held", (n_z,)),
             "found_offset": c.view("found_offset", (like.model.n_y,)),
             "innovation": c.view("innovation", (like.model.n_y,)),
-            "lasting": c.view("lasting", (like.model.n_y,)),
         }
         for name, value in like.__dict__.items():
             setattr(self, name, value)
@@ -392,12 +387,6 @@ class CompiledObserver(Observer):
         n_u, n_x = self.model.n_u, self.model.n_x
         between = self._c.view("between", (3 + n_u + n_x,))
         return between[3 + n_u :].copy() if between[1] > 0 else self.x
-
-    @property
-    def _shown_now(self) -> Array:
-        start = 3 + self.model.n_u + self.model.n_x
-        between = self._c.view("between", (start + self._c.sizes.NG,))
-        return between[start:].copy() if between[1] > 0 else self.shown
 
     def update(self, y: Array) -> Array:
         """Correct the estimate with a reading (n_y,), NaN where lost; return the innovation (n_y,)."""

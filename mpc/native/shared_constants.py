@@ -9,7 +9,7 @@ from __future__ import annotations
 from types import ModuleType
 
 from thermogrip.mpc.design import design
-from thermogrip.mpc.estimator import arrival, call_times, observer, oscillation, reading_checks
+from thermogrip.mpc.estimator import call_times, observer, reading_checks
 from thermogrip.mpc.optimiser import active_set, reach, rti
 
 CAUTION, MOST_CAUTION = 3.0, 30.0  # of a mean innovation, from which on moves weigh more; how much more
@@ -19,21 +19,15 @@ WEAK = 0.05  # of its gain at rest, below which a drive's bias is not learnt
 
 _SHARED: dict[ModuleType, tuple[str, ...]] = {
     active_set: ("CONTRADICTION", "FAR", "REGULAR", "SHORT", "TOLERANCE"),
-    arrival: ("ARRIVAL_SAMPLES", "LATE_SAMPLES", "LATE_TIMES", "NEAR_SD", "NEWEST_ERROR"),
     call_times: ("RESTART_S", "SAME"),
     design: ("DAY",),
-    observer: ("LARGEST_BIAS", "LASTING", "NEWEST_INNOVATION"),
-    oscillation: (
-        *("LAST_SWING", "NOISE_READINGS", "NOISE_SD", "SHORTEST_PERIOD", "SPIKE_VARIANCES", "SWINGS"),
-    ),
+    observer: ("LARGEST_BIAS", "NEWEST_INNOVATION"),
     reach: (
-        *("BEYOND_LIMIT", "BINS", "CAN", "CANNOT", "CONTRADICTED", "CONVERGED", "KEPT", "LEAST_SD"),
-        *("MISS_ALARM", "MISS_ALLOWANCE", "MISS_CLIP", "STEADY_STEPS", "STILL", "STRIDE", "SURE"),
-        *("SWEEPS", "TAKE_BACK"),
+        *("BEYOND_LIMIT", "CAN", "CANNOT", "CONVERGED", "LEAST_SD", "MISS_ALARM", "MISS_ALLOWANCE"),
+        *("MISS_CLIP", "STEADY_STEPS", "STRIDE", "SWEEPS", "TAKE_BACK"),
     ),
     reading_checks: (
-        *("FOLLOWS_DRIVE", "LEFT_OUT", "SHARE", "SHOWN_TO", "SLOWER_BY", "SLOWER_SD", "SLOW_FOR"),
-        "STILL_SLOWER",
+        *("LEFT_OUT", "SHARE"),
     ),
     rti: ("BARELY", "CURVED", "FADING", "FIRST", "LITTLE", "LOOK_AROUND", "SAFE", "SHARES"),
 }
@@ -43,9 +37,8 @@ def shared_constants() -> dict[str, float | tuple[float, ...]]:
     """Return each shared constant by the name that the C puts behind ``TG_``."""
     out = {name: getattr(module, name) for module, names in _SHARED.items() for name in names}
     out |= {"CAUTION": CAUTION, "MOST_CAUTION": MOST_CAUTION, "STAYS": STAYS, "UNCUT": UNCUT, "WEAK": WEAK}
-    # standard deviations of means with an exponential memory, of unit variance
+    # standard deviation of a mean with an exponential memory, of unit variance
     out["INNOVATION_SD"] = _sd_of_mean(observer.NEWEST_INNOVATION)
-    out["LASTS"] = observer.LASTS * _sd_of_mean(observer.LASTING)
     return out
 
 

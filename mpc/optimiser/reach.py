@@ -1,4 +1,4 @@
-r"""Which targets can be held: the nearest steady outputs that drives and limits allow; what readings show.
+r"""Which targets can be held: the nearest steady outputs that drives and limits allow.
 
 **The model's answer.**  A horizon does not show it: on the way up, a plan at full drive comes nearer to any
 target.  So the steady state itself is sought, with the estimated biases in it, from the last one on, by
@@ -22,23 +22,13 @@ last samples, in its own standard deviations, where that is above 1 (while a lar
 
 two samples where the target is out of reach by 2 sigma, more where it is by less.
 
-**The readings' answer.**  While the drives of an output stand still, it relaxes, and means over three equal
-spans of time, m1, m2, m3, form a geometric sequence whose limit is the steady output.  The target r cannot be
-reached if that limit falls short of it,
-
-    g = d1 (r - m3) - d2 (d2 + r - m3) > 0,    d1 = m2 - m1,  d2 = m3 - m2,
-
-and it is reported once g is beyond 3 of its standard deviations (from the readings' noise), provided that the
-model has no say: its own steady output falls short as well, or its estimated bias has moved by more than
-2 sigma away from the target since the drives stand still.  (A slow part that the model lacks relaxes like a
-loss at first, and no short record distinguishes them: there the report is early, and taken back.)
-
 **The design's answer.**  A target that lies more than 0.1 degC beyond its output's own limits is reported at
 once: those are known.
 
-A target that cannot be reached can be again after five samples in a row in which neither answer says
-otherwise, or when it moves.  Where no steady state is found after the model's answer was that it cannot (near
-an optimum Newton's method may not converge), that answer is kept until the plan ends at the target.
+A target is asked about until five samples in a row say that it can be held, then no more until it moves:
+that a load takes it out of reach later, :mod:`thermogrip.mpc.controllers.loop_monitor` says.  Where no steady
+state is found after the answer was that it cannot (near an optimum Newton's method may not converge), that
+answer is kept until the plan ends at the target.
 """
 
 from __future__ import annotations
@@ -64,46 +54,6 @@ CANNOT, CAN = 0.1, 0.05  # degC from the target: it cannot be had, it can
 LEAST_SD = 0.05  # degC, of a steady output where no bias is estimated
 MISS_CLIP, MISS_ALLOWANCE, MISS_ALARM = 2.0, 0.5, 3.0  # of Page's test
 TAKE_BACK = 5  # samples in a row
-BINS = 12  # of a relaxation's means; when they are full, neighbours are joined
-STILL = 0.01  # of its range: a drive that moves by less is still
-SURE, KEPT = 3.0, -3.0  # standard deviations of g, to report and to keep
-CONTRADICTED = 2.0  # sigma that the bias moves while the drives stand still
-
-
-class _Relaxation:
-    """Means of a reading since the drives stand still."""
-
-    def __init__(self) -> None:
-        self.restart(np.full(1, np.nan), np.zeros(0))
-
-    def restart(self, u: Array, w: Array) -> None:
-        self.u, self.w = u, w
-        self.bins: list[float] = []
-        self.per, self.sum, self.n = 1, 0.0, 0
-
-    def add(self, y: float) -> None:
-        self.sum, self.n = self.sum + y, self.n + 1
-        if self.n == self.per:
-            self.bins.append(self.sum / self.n)
-            self.sum, self.n = 0.0, 0
-            if len(self.bins) == BINS:
-                self.bins = [(a + b) / 2 for a, b in zip(self.bins[::2], self.bins[1::2], strict=True)]
-                self.per *= 2
-
-    def falls_short(self, target: float, sd: float) -> tuple[float, float]:
-        """Return g in its standard deviations (``sd`` is a reading's), and the limit; NaN where unknown."""
-        span = (len(self.bins) - 1) // 3  # the first is left out: the drives' lag is in it
-        if span < 1:
-            return np.nan, np.nan
-        m1, m2, m3 = np.array(self.bins[-3 * span :]).reshape(3, span).mean(axis=1).tolist()
-        left = target - m3
-        side = 1.0 if left > 0 else -1.0
-        left, d1, d2 = abs(left) - CANNOT, side * (m2 - m1), side * (m3 - m2)
-        if left <= 0 or d1 <= d2:
-            return np.nan, np.nan
-        g = d1 * left - d2 * (d2 + left)
-        slope = np.sqrt(left**2 + (2 * left + 2 * d2) ** 2 + (d1 + d2 + left) ** 2)
-        return float(g / (slope * sd / np.sqrt(span * self.per))), m3 + side * d2 * abs(d2) / (d1 - d2)
 
 
 class Reach:
@@ -118,12 +68,6 @@ class Reach:
         own = [design.limits.get(name, (-np.inf, np.inf)) for name in design.controlled]
         self._own = np.array(own, dtype=float).T
         self._beyond = np.sqrt(design.price * (FIRST + 1.0) / design.track)  # weight beyond a target
-        self._sd = np.sqrt(observer.R[self._rows])
-        pair = optimiser.pair
-        self._movers = [
-            np.flatnonzero(pair == at) if np.any(pair == at) else np.arange(model.n_u)
-            for at in range(len(self._rows))
-        ]
         self.forget()
 
     def forget(self) -> None:
@@ -132,7 +76,6 @@ class Reach:
         self._u = self.model.neutral
         self._sum, self._in, self._unreachable = 0.0, 0, False
         self._target = np.full(len(self._rows), np.nan)
-        self._relaxations = [_Relaxation() for _ in self._rows]
 
     def missed(
         self,
@@ -140,7 +83,6 @@ class Reach:
         u: Array,
         d: Array,
         *,
-        y: Array,
         target: Array,
         side: Array,
         ahead: Array,
@@ -148,13 +90,14 @@ class Reach:
     ) -> tuple[int, float] | None:
         """Return which controlled output cannot be held at its target, and where it can; None: all can.
 
-        u (n_u,) are the drives now, d (n_d,) the measured disturbances; of the controlled outputs (n,) y are
-        readings, ahead the outputs at the end of the plan, side from where the targets are approached, and
+        u (n_u,) are the drives now, d (n_d,) the measured disturbances; of the controlled outputs (n,) ahead
+        are those at the end of the plan, side from where the targets are approached, and
         seen which of them count [degC].
         """
         if not np.array_equal(target, self._target):
             self._target, self._sum, self._in, self._unreachable = target.copy(), 0.0, 0, False
-        self._record(y, u, observer.w)
+        if self._in >= TAKE_BACK and not self._unreachable:
+            return None
         limit, lost = CAN if self._unreachable else CANNOT, False
         if np.any(np.abs(target - ahead)[seen] > limit):
             held, J = self._held(observer, u, d + observer.disturbance_bias, target, side, seen)
@@ -169,49 +112,22 @@ class Reach:
         if not lost:
             step = float(np.clip(scaled.max(), -1, MISS_CLIP)) - MISS_ALLOWANCE
             self._sum = min(max(0.0, self._sum + step), MISS_ALARM)
-        short, ends = self._readings_say(observer.w, J, sd, miss, target, seen)
         allowed = np.clip(target, *self._own)
         barred = seen & (np.abs(target - allowed) > CANNOT)
-        out = (miss > limit) | short | barred
+        out = (miss > limit) | barred
+        self._in = 0 if out.any() or lost else self._in + 1
         if self._unreachable:
-            self._in = 0 if out.any() or lost else self._in + 1
             self._unreachable = self._in < TAKE_BACK
         else:
-            self._in, self._unreachable = 0, self._sum >= MISS_ALARM or bool((short | barred).any())
+            self._unreachable = self._sum >= MISS_ALARM or bool(barred.any())
         if not self._unreachable:
             return None
         if out.any():
-            ends = np.where(miss > limit, held, ends)
+            ends = np.where(miss > limit, held, target)
             ends = np.where(barred & ~(np.abs(target - ends) > np.abs(target - allowed)), allowed, ends)
             self._worst = int(np.argmax(np.where(out, np.abs(target - ends), -1.0)))
             self._value = float(ends[self._worst])
         return self._worst, self._value
-
-    def _record(self, y: Array, u: Array, w: Array) -> None:
-        span = self.model.span
-        for at, (movers, relaxation) in enumerate(zip(self._movers, self._relaxations, strict=True)):
-            still = np.all(np.abs(u - relaxation.u)[movers] <= STILL * span[movers])
-            if not still or not np.isfinite(y[at]):
-                relaxation.restart(u.copy(), w.copy())
-            if np.isfinite(y[at]):
-                relaxation.add(float(y[at]))
-
-    def _readings_say(
-        self, w: Array, J: Array, sd: Array, miss: Array, target: Array, seen: Mask
-    ) -> tuple[Mask, Array]:
-        """Return which outputs (n,) relax short of their targets, and where they end [degC]."""
-        short, ends = np.zeros(len(target), dtype=bool), np.full(len(target), np.nan)
-        for at, relaxation in enumerate(self._relaxations):
-            if not seen[at]:
-                continue
-            g, end = relaxation.falls_short(float(target[at]), float(self._sd[at]))
-            if self._unreachable:
-                short[at] = g > KEPT
-            elif g > SURE:
-                drift = np.sign(end - target[at]) * (J[at] @ (w - relaxation.w))
-                short[at] = miss[at] > CANNOT or drift > CONTRADICTED * sd[at]
-            ends[at] = end
-        return short, ends
 
     def _held(
         self, observer: Observer, u: Array, d: Array, target: Array, side: Array, seen: Mask

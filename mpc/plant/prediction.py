@@ -126,7 +126,8 @@ class PredictionModel:
     ``drives``, ``outputs`` and ``disturbances`` name u, y and d; ``dt`` is the sample time [s], ``sub`` the
     model's steps in it.  A drive is between ``lowest`` and ``highest``, ``span`` wide, the unit in which
     drives are scaled, and ``neutral`` is no drive or what is nearest to none, all (n_u,).  A reading is
-    between ``coldest`` and ``hottest``, and within ``spike`` (n_y,) of its prediction.  Drives ``on_off`` are
+    between ``coldest`` and ``hottest``, and within ``spike`` (n_y,) of its prediction; ``unit`` (n_y,) is in
+    what figures of an output count.  Drives ``on_off`` are
     0 or 1, at rest 1.  Outputs ``warm`` (n_y,) share a level at rest: the temperatures, or all.  Of the
     measured disturbances ``rooms`` (n_d,) are temperatures of the room; ``seen_d`` (n_d, 2) is what the logs
     showed, ``least_d`` to ``most_d`` what may be read, and a difference of less than ``close_d`` is none.
@@ -155,6 +156,7 @@ class PredictionModel:
         warm = np.array([plant.units.get(name, "degC") == "degC" for name in self.outputs])
         self.warm: Mask = warm if warm.any() else ~warm
         self._seen, spread = seen, np.nan_to_num(seen[:, 1] - seen[:, 0], posinf=0.0)
+        self.unit = unit_of(spread)
         away = np.nan_to_num(seen + spread[:, None] * [-1.0, 1.0], posinf=0.0, neginf=0.0)
         self.spike = np.maximum(SPIKE, 0.1 * spread)
         self.coldest = min(PLAUSIBLE[0], float(away[:, 0].min()))
@@ -514,6 +516,19 @@ _ARITHMETIC: dict[str, Callable[..., Any]] = {
 def prediction_model(plant: Plant, dt: float) -> PredictionModel:
     """Return :class:`PredictionModel`, the same one for the same plant: a search asks again and again."""
     return PredictionModel(plant, dt=dt)
+
+
+def unit_of(spread: Array) -> Array:
+    """Return in what figures of outputs count whose logs have ranges ``spread`` (n,): a fortieth of them,
+    rounded down to 1, 2 or 5 times a power of ten; 1 where no log was there.
+
+    >>> unit_of(np.array([42.0, 310.0, 11.0, 0.0]))
+    array([1. , 5. , 0.2, 1. ])
+    """
+    share = np.where(spread > 0, spread / 40.0, 1.0)
+    ten = 10.0 ** np.floor(np.log10(share) + 1e-9)
+    first = share / ten
+    return np.asarray(ten * np.where(first >= 5.0 - 1e-9, 5.0, np.where(first >= 2.0 - 1e-9, 2.0, 1.0)))
 
 
 @dataclass(frozen=True)

@@ -393,14 +393,14 @@ def _result(
     )
 
 
-#: What the search varies: name, smallest, largest; all on a logarithmic scale.
+#: What the search varies: name, smallest, largest; all on a logarithmic scale, walks as factors of the noise.
 MPC_PARAMETERS = (
     ("move", 0.02, 5000.0),
     ("terminal", 0.3, 300.0),
     ("overshoot_share", 0.05, 0.9),
-    ("drive_walk", 1e-5, 2e-2),
-    ("output_walk", 2e-4, 0.3),
-    ("state_walk", 5e-4, 5e-3),
+    ("drive_walk", 0.03, 10.0),
+    ("output_walk", 0.03, 10.0),
+    ("state_walk", 0.1, 1.0),
 )
 PI_PARAMETERS = (
     ("Kc", 0.2, 5.0),
@@ -414,9 +414,9 @@ LONGEST_TI = 1.5  # of a PI's gain, both in those of SIMC: a load's integrated e
 LQR_PARAMETERS = (
     ("move", 0.02, 500.0),
     ("drive", 1e-4, 100.0),
-    ("state_walk", 5e-4, 5e-3),
-    ("drive_walk", 1e-5, 2e-2),
-    ("output_walk", 2e-4, 2e-2),
+    ("state_walk", 0.1, 1.0),
+    ("drive_walk", 0.03, 10.0),
+    ("output_walk", 0.03, 10.0),
 )
 
 #: What a design that prices travel is searched by: of the error that a spec allows, what moves no drive.
@@ -621,9 +621,9 @@ class Search:
         base = self.baseline
         noise = replace(
             base.noise,
-            state=parameters.get("state_walk", base.noise.state),
-            drive=parameters.get("drive_walk", base.noise.drive),
-            output=parameters.get("output_walk", base.noise.output),
+            state=parameters.get("state_walk", 1.0) * base.noise.state,
+            drive={n: parameters.get("drive_walk", 1.0) * sd for n, sd in base.noise.drive.items()},
+            output=parameters.get("output_walk", 1.0) * base.noise.output,
         )
         horizon = max(10, round(parameters.get("horizon", sum(base.blocks))))
         count = max(2, round(parameters.get("blocks", len(base.blocks))))
@@ -864,9 +864,9 @@ def parameters_of(design: Design, spec: Spec) -> dict[str, float]:
         "move": design.move,
         "terminal": design.terminal,
         "overshoot_share": design.overshoot / spec.overshoot_degC,
-        "state_walk": design.noise.state,
-        "drive_walk": design.noise.drive,
-        "output_walk": design.noise.output,
+        "state_walk": 1.0,
+        "drive_walk": 1.0,
+        "output_walk": 1.0,
         "horizon": float(sum(design.blocks)),
         "blocks": float(len(design.blocks)),
     }

@@ -98,6 +98,17 @@ class Sampling:
 
 
 @dataclass(frozen=True)
+class InnovationNoise:
+    """What the innovations of a filter over the logs say (:mod:`thermogrip.sysid.plant.innovations`), as
+    standard deviations, and how fast the inputs were moved."""
+
+    state: float  # of the states in a second, in units of the outputs' as each state is spread
+    reading: dict[str, float]  # of a reading, by output, in its unit
+    input: dict[str, float]  # of what an input lacks, in a second, in its unit
+    fastest: dict[str, float]  # change of an input from a row to the next, in a second
+
+
+@dataclass(frozen=True)
 class PlantScores:
     """Numbers of a fit; what a kind of fit does not know keeps its default.
 
@@ -122,6 +133,7 @@ class PlantScores:
     weight_s: dict[str, float] = field(default_factory=dict)  # the same, as the fit weighted them
     intervals: Intervals | None = None
     per_log: dict[str, dict[str, tuple[float, float]]] = field(default_factory=dict)  # by effect: value, sd
+    innovations: InnovationNoise | None = None
     seconds: float | None = None  # that the fit took
     starts: int | None = None  # of the global search
     posterior: Sampling | None = None

@@ -125,7 +125,7 @@ FAULTS: Mapping[str, Fault] = {
         ["ok", "infeasible"], 170, target=60.0, advice="no drive holds", after=150
     ),
     "the drive is at its end for ever on a plant that loses five times the heat": Fault(
-        ["ok", "infeasible"], 150, target=47.0, world="leaky", advice="no drive holds"
+        ["ok"], 150, target=47.0, world="leaky"
     ),
     "the drive that was applied is out of range": Fault(
         ["infeasible"], 3, given(drive=1.4), advice="out of range"
@@ -144,9 +144,7 @@ FAULTS: Mapping[str, Fault] = {
     "the pump stops and the rig reports it": Fault(
         ["off"], 30, given(pump=0), meanwhile="stopped", advice="pump is off"
     ),
-    "the pump stops and nobody reports it": Fault(
-        ["ok", "mismatch"], 75, meanwhile="stopped", advice="pump", back=0.4
-    ),
+    "the pump stops and nobody reports it": Fault(["ok"], 75, meanwhile="stopped", back=0.4),
     "the plant has 30 % less power": Fault(["ok"], 60, world="less power", target=38.0),
     "the plant has 30 % more power": Fault(["ok"], 60, world="more power", target=38.0),
     "the delay is 30 % longer": Fault(["ok"], 60, world="longer delay", target=38.0),

@@ -7,11 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.mpc.makers import InC
 from thermogrip.mpc.closed_loop.simulate import Surroundings, Truth, simulate_closed_loop
 from thermogrip.mpc.controllers.mpc import Controller, design_controller
 from thermogrip.mpc.controllers.pi import PIController
-from thermogrip.mpc.native.runtime import compiler
 from thermogrip.mpc.optimiser.rti import Sample
 
 OFF = Surroundings(offset={"t_surface": 0.2, "t_ambient": 0.3})
@@ -185,31 +183,3 @@ def test_a_trajectory_that_is_told_ahead_is_followed_without_lag(tank, other_tan
     slow.reset({"t_tank": 28.0, "t_surface": 28.0})
     slow.step({"t_tank": 28.0, "t_surface": 28.0}, {"t_surface": [28.0, 29.0, 30.0, float("nan"), 31.0]})
     np.testing.assert_array_equal(slow._ahead[:4, 0], [30.0, 28.0, 31.0, 31.0])
-
-
-@pytest.mark.parametrize("in_c", [False, True] if compiler() else [False])
-def test_a_skin_whose_sensor_lags_by_10_s_is_found_slower_and_does_not_swing(tank, in_c):
-    tank, lag = replace(tank, noise=dict.fromkeys(tank.outputs, 0.02)), 10.0
-    design = design_controller(tank).design
-    controller = InC(tank, design) if in_c else Controller(tank, design)
-    truth = Truth(tank, design.dt, Surroundings(noise=0.02, quantum=0.0), 28.0, 3)
-    shown, skin, said = 28.0, [], []
-    for k in range(80):
-        reading = truth.reading()
-        shown += (1 - np.exp(-design.dt / lag)) * (reading["t_surface"] - shown)
-        reading["t_surface"] = shown
-        if not k:
-            controller.reset(reading)
-        said.append(controller.step(reading, 38.0))
-        truth.apply(said[-1])
-        skin.append(shown)
-    assert max(skin) < 38.3  # 40.1 without the lag's estimate
-    np.testing.assert_allclose(skin[60:], 38.0, atol=0.25)
-    statuses = [move.status for move in said]
-    first = statuses.index("mismatch")
-    assert first <= 35
-    assert set(statuses[first:]) == {"mismatch"}
-    assert "slower than the model" in said[-1].advice
-    if not in_c:
-        on_a_ramp = design.dt / (1 - np.exp(-design.dt / lag)) - design.dt  # of the filter by samples above
-        assert controller.observer.lag[0] == pytest.approx(on_a_ramp, rel=0.1)

@@ -51,7 +51,7 @@ def tuning_of(**changes: Any) -> Any:
     design = SimpleNamespace(
         controlled=("t1", "t2"), dt=2.0, horizon_s=60.0, blocks=(1, 2, 4), drive_range={"q": (0.0, 100.0)},
         slew_per_s={"q": 5.0}, move=0.125, travel=1.5, terminal=3.0, overshoot=0.75, deadline_s=0.5,
-        limits={}, noise=SimpleNamespace(drive=0.01, output=0.02),
+        limits={}, noise=SimpleNamespace(drive={"q": 0.01}, output=0.02),
     )  # fmt: skip
     plant = SimpleNamespace(samples=None, covariance=np.eye(1), valid={}, units={})
     rows = [
@@ -198,7 +198,7 @@ def test_what_was_asked_stands_beside_the_design() -> None:
         "regulated": "t1, t2", "sample time [s]": "2", "horizon [s]": "60", "blocks [samples]": "1 2 4",
         "range of q": "0 to 100", "slew of q [1/s]": "5", "move weight": "0.125", "price of travel": "1.5",
         "terminal weight": "3",
-        "overshoot band [degC]": "0.75", "process noise of a drive's disturbance": "0.01",
+        "overshoot band [degC]": "0.75", "process noise of q's disturbance": "0.01",
         "process noise of an output's disturbance": "0.02", "disturbances estimated": "q, t1",
     }  # fmt: skip
 

@@ -48,12 +48,6 @@ int main(void)
             !read_numbers(d, TG_ND) || !read_numbers(target, TG_NC) || !read_numbers(&late, 1) ||
             !read_numbers(&time_s, 1) || !read_numbers(c->ramped, TG_NC))
             return 1;
-        for (int r = 0; r < TG_NG; r++) { /* it shows what the state has, and began there */
-            c->shown[r] = tg_the_design.y0[tg_the_design.controlled[r]];
-            for (int j = 0; j < TG_NX; j++)
-                c->shown[r] += tg_the_design.C[tg_the_design.controlled[r] * TG_NX + j] * c->x[j];
-            c->start[r] = c->shown[r];
-        }
         c->time_s = time_s;
         c->late = time_is_up;
         c->about = &late;

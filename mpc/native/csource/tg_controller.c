@@ -43,7 +43,6 @@ static void start(tg_controller *c, const double *y, const double *d)
     for (int i = 0; i < TG_ND; i++)
         c->d[i] = isfinite(d[i]) ? d[i] : s->usual_d[i];
     tg_observer_reset(c, y, c->d);
-    tg_observer_expect_lags(c);
     for (int j = 0; j < TG_NU; j++)
         c->u[j] = c->in_force[j] = s->neutral[j];
     for (int r = 0; r < TG_NC; r++) {
@@ -53,16 +52,10 @@ static void start(tg_controller *c, const double *y, const double *d)
     c->ramps = 0;
     c->has_plan = c->solves = c->on_pi = 0;
     memset(c->spikes, 0, sizeof c->spikes);
-    memset(c->slow_for, 0, sizeof c->slow_for);
     c->age_s = c->silent_s = c->miss_sum = 0.0;
     memset(c->unread_s, 0, sizeof c->unread_s);
     memset(c->lost, 0, sizeof c->lost);
     c->has_steady = c->in = c->unreachable = 0;
-    memset(c->relaxation, 0, sizeof c->relaxation);
-    tg_forget_arrivals(c);
-    memset(c->swing, 0, sizeof c->swing);
-    for (int r = 0; r < TG_NC; r++)
-        c->swing[r].goal = NAN;
     memset(c->moved, 0, sizeof c->moved);
     memcpy(c->last_y, y, sizeof c->last_y);
     c->fresh = 1;
@@ -518,66 +511,6 @@ static void follow(tg_controller *c, tg_move *move, int status, int advice)
         move->status = TG_FALLBACK_PI;
 }
 
-/* Note the newest readings; where a drive of theirs has moved, or they are lost, they begin anew. */
-static void record_relaxation(tg_controller *c)
-{
-    const tg_design *s = c->design;
-    for (int r = 0; r < s->n_c; r++) {
-        tg_relaxation *m = &c->relaxation[r];
-        double y = c->y[s->controlled[r]];
-        int still = m->per > 0, own = 0;
-        for (int j = 0; j < TG_NU; j++)
-            own = own || s->pair[j] == r;
-        for (int j = 0; j < TG_NU; j++)
-            if ((!own || s->pair[j] == r) && fabs(c->u[j] - m->u[j]) > TG_STILL * s->span[j])
-                still = 0;
-        if (!still || !isfinite(y)) {
-            memcpy(m->u, c->u, sizeof m->u);
-            memcpy(m->w, c->w, sizeof m->w);
-            m->sum = 0.0;
-            m->count = m->n = 0;
-            m->per = 1;
-        }
-        if (!isfinite(y))
-            continue;
-        m->sum += y;
-        if (++m->n < m->per)
-            continue;
-        m->bins[m->count++] = m->sum / m->n;
-        m->sum = 0.0;
-        m->n = 0;
-        if (m->count == TG_BINS) {
-            for (int i = 0; i < TG_BINS / 2; i++)
-                m->bins[i] = 0.5 * (m->bins[2 * i] + m->bins[2 * i + 1]);
-            m->count = TG_BINS / 2;
-            m->per *= 2;
-        }
-    }
-}
-
-/* By how many standard deviations the limit of three means falls short of a target; that limit into end.
- * NAN where that is not known. */
-static double falls_short(const tg_relaxation *m, double target, double sd, double *end)
-{
-    int span = (m->count - 1) / 3; /* the first is omitted: the drives' lag is in it */
-    double mean[3] = {0.0}, left, side, d1, d2, slope;
-    *end = NAN;
-    if (span < 1)
-        return NAN;
-    for (int i = 0; i < 3 * span; i++)
-        mean[i / span] += m->bins[m->count - 3 * span + i] / span;
-    left = target - mean[2];
-    side = left > 0.0 ? 1.0 : -1.0;
-    left = fabs(left) - TG_CANNOT;
-    d1 = side * (mean[1] - mean[0]);
-    d2 = side * (mean[2] - mean[1]);
-    if (left <= 0.0 || d1 <= d2)
-        return NAN;
-    *end = mean[2] + side * d2 * fabs(d2) / (d1 - d2);
-    slope = sqrt(left * left + 4.0 * (left + d2) * (left + d2) + (d1 + d2 + left) * (d1 + d2 + left));
-    return (d1 * left - d2 * (d2 + left)) / (slope * sd / sqrt((double)(span * m->per)));
-}
-
 /* By how much the target of controlled output r lies beyond that output's own limits [degC]. */
 static double beyond_own_limit(const tg_controller *c, int r)
 {
@@ -619,8 +552,11 @@ static double missed_by(tg_controller *c)
     double kept[TG_NC];
     int away = 0, out = 0, alarm = 0, lost = 0;
     aim(c, kept);
+    if (c->in >= TG_TAKE_BACK && !c->unreachable) { /* it was answered */
+        memcpy(c->target, kept, sizeof kept);
+        return 0.0;
+    }
     limit = c->unreachable ? TG_CAN : TG_CANNOT;
-    record_relaxation(c);
     for (int r = 0; r < s->n_c; r++)
         away = away || (!(c->unread_s[r] > 0.0) &&
                         fabs(c->target[r] - c->y_best[(s->N - 1) * TG_NY + s->controlled[r]]) > limit);
@@ -637,78 +573,26 @@ static double missed_by(tg_controller *c)
         inflation = fmax(inflation, fabs(c->innovation[i]) / TG_INNOVATION_SD);
     for (int r = 0; r < s->n_c; r++) {
         const double *J = by_w + r * TG_SOME(TG_NW);
-        double y_sd = sqrt(s->R[s->controlled[r]]), sd = 0.0, drift = 0.0, miss, end, g;
-        double beyond = beyond_own_limit(c, r);
-        int is_short, is_barred = beyond > TG_CANNOT;
+        double sd = 0.0, miss, beyond = beyond_own_limit(c, r);
+        int is_barred = beyond > TG_CANNOT;
         if (c->unread_s[r] > 0.0)
             continue;
-        for (int i = 0; i < TG_NW; i++) {
-            drift += J[i] * (c->w[i] - c->relaxation[r].w[i]);
+        for (int i = 0; i < TG_NW; i++)
             for (int j = 0; j < TG_NW; j++)
                 sd += J[i] * J[j] * c->P[(TG_NX + i) * TG_Z + TG_NX + j];
-        }
         sd = fmax(sqrt(fmax(sd, 0.0)), TG_LEAST_SD);
         miss = away ? fabs(c->target[r] - held[r]) : 0.0;
         scaled = fmax(scaled, (miss - TG_CANNOT) / (sd * inflation));
-        g = falls_short(&c->relaxation[r], c->target[r], y_sd, &end);
-        if (c->unreachable)
-            is_short = g > TG_KEPT;
-        else
-            is_short = g > TG_SURE && (miss > TG_CANNOT || (end > c->target[r] ? drift : -drift) > TG_CONTRADICTED * sd);
-        out = out || miss > limit || is_short || is_barred;
-        alarm = alarm || is_short || is_barred;
-        worst = fmax(worst, miss > limit ? miss : is_short ? fabs(c->target[r] - end) : 0.0);
-        worst = fmax(worst, is_barred ? beyond : 0.0);
+        out = out || miss > limit || is_barred;
+        alarm = alarm || is_barred;
+        worst = fmax(worst, fmax(miss > limit ? miss : 0.0, is_barred ? beyond : 0.0));
     }
     if (!lost)
         c->miss_sum = fmin(fmax(0.0, c->miss_sum + fmin(scaled, TG_MISS_CLIP) - TG_MISS_ALLOWANCE), TG_MISS_ALARM);
     memcpy(c->target, kept, sizeof kept);
-    c->in = c->unreachable && !out && !lost ? c->in + 1 : 0;
+    c->in = !out && !lost ? c->in + 1 : 0;
     c->unreachable = c->unreachable ? c->in < TG_TAKE_BACK : c->miss_sum >= TG_MISS_ALARM || alarm;
     return c->unreachable ? fmax(worst, TINY) : 0.0;
-}
-
-/* Whether a drive does far less, or far more, than the model has. */
-static int is_too_weak(const tg_controller *c)
-{
-    const tg_design *s = c->design;
-    for (int j = 0; j < TG_NU; j++) {
-        double sum = 0.0;
-        for (int i = 0; i < TG_NW; i++)
-            sum += s->on_drive[j * TG_NW + i] * c->w[i];
-        if (fabs(sum) >= TG_FOLLOWS_DRIVE)
-            return 1;
-    }
-    return 0;
-}
-
-/* Whether the plant is the model no longer. */
-static int does_not_follow(const tg_controller *c)
-{
-    const tg_design *s = c->design;
-    double on_u[TG_NU], on_d[TG_SOME(TG_ND)], on_y[TG_NY];
-    if (is_too_weak(c))
-        return 1;
-    tg_biases(c, on_u, on_d, on_y);
-    for (int j = 0; j < TG_NY; j++)
-        if (fabs(on_y[j] - s->offset[j]) >= TG_SHARE * s->spike[j])
-            return 1;
-    return 0;
-}
-
-/* By how much an output is surely slower than the model, the most of all [s]; 0 where none is. */
-static double slower_by(tg_controller *c)
-{
-    double most = 0.0, dt = c->design->dt;
-    for (int r = 0; r < TG_NG; r++) {
-        double lag = c->lag[r] / dt, sd = sqrt(c->P[(TG_L + TG_NG + r) * (TG_Z + 1)]) / dt;
-        int sure = !is_too_weak(c) && lag > TG_SLOWER_BY && lag > TG_SLOWER_SD * sd && sd < TG_SHOWN_TO;
-        sure = sure || (c->slow_for[r] == TG_SLOW_FOR && lag > TG_STILL_SLOWER);
-        c->slow_for[r] = !sure ? 0 : c->slow_for[r] < TG_SLOW_FOR ? c->slow_for[r] + 1 : TG_SLOW_FOR;
-        if (c->slow_for[r] == TG_SLOW_FOR)
-            most = fmax(most, c->lag[r]);
-    }
-    return most;
 }
 
 /* For how long no controlled output was read [s], and whether one of them is not. */
@@ -754,7 +638,7 @@ void tg_keep_plan(tg_controller *c)
 static void decide(tg_controller *c, tg_move *move)
 {
     const tg_design *s = c->design;
-    double missed, slower, overdue, period = tg_swings(c);
+    double missed;
     int outside = 0, unseen;
     double unread = unread_for(c, &unseen);
     move->status = TG_OK;
@@ -794,7 +678,6 @@ static void decide(tg_controller *c, tg_move *move)
         move->advice = TG_OUT_OF_RANGE;
         return;
     }
-    overdue = tg_overdue(c);
     if (missed = missed_by(c), missed > 0.0) {
         move->status = TG_INFEASIBLE;
         move->advice = TG_OUT_OF_REACH;
@@ -809,19 +692,6 @@ static void decide(tg_controller *c, tg_move *move)
     } else if (unseen) {
         move->status = TG_FALLBACK_PLAN;
         move->advice = TG_UNSEEN;
-    } else if (slower = slower_by(c), slower > 0.0) {
-        move->status = TG_MISMATCH;
-        move->advice = TG_SLOWER;
-        move->over = slower;
-    } else if (period > 0.0 || overdue > 0.0) {
-        move->status = TG_MISMATCH;
-        move->advice = period > 0.0 ? TG_SWINGS_ABOUT : TG_OVERDUE;
-        move->over = period > 0.0 ? period : overdue;
-        if (!(period > 0.0) && does_not_follow(c)) /* what may be the cause */
-            move->advice = s->switched ? TG_PUMP : TG_NOT_FOLLOWING;
-    } else if (does_not_follow(c)) {
-        move->status = c->recedes && is_too_weak(c) ? TG_MISMATCH : TG_OK;
-        move->advice = s->switched ? TG_PUMP : TG_NOT_FOLLOWING;
     }
 }
 
@@ -876,8 +746,6 @@ tg_move tg_step(tg_controller *c, tg_time time_s, const double *y, const double 
     wrong = set_target(c, target);
     ramp(c);
     decide(c, &move);
-    if (move.status != TG_OK && move.status != TG_MISMATCH && move.status != TG_LATE)
-        tg_forget_arrivals(c); /* no plan is followed, or none arrives */
     if (move.status == TG_OK && said != TG_ALL_WELL)
         move.advice = said; /* events of this sample before lasting conditions */
     if (wrong && move.status == TG_OK)
@@ -899,8 +767,8 @@ tg_move tg_step(tg_controller *c, tg_time time_s, const double *y, const double 
 
 const char *tg_status_text(int status)
 {
-    static const char *const text[] = {"ok", "late", "infeasible", "fallback_plan", "fallback_pi", "off", "mismatch"};
-    return status >= TG_OK && status <= TG_MISMATCH ? text[status] : "?";
+    static const char *const text[] = {"ok", "late", "infeasible", "fallback_plan", "fallback_pi", "off"};
+    return status >= TG_OK && status <= TG_OFF ? text[status] : "?";
 }
 
 const char *tg_advice_text(int advice)
@@ -919,15 +787,10 @@ const char *tg_advice_text(int advice)
         "a limit of an output will be broken: choose a nearer target",
         "a reading does not move though it should: is the sensor stuck?",
         "no drive holds the output at its target: choose a nearer one",
-        "the plant does not follow the model: is it another one, is the sensor in place?",
         "the deadline passed: the last plan goes on, then PI",
         "a jump of a reading stays: taken for an offset of the sensor",
         "a jump of the readings stays: the estimate was started again",
-        "the plant does not follow the model: does the pump run, is the sensor in place?",
         "a controlled output has no usable reading: the model replaces it, then its drive rests; the others go on",
-        "an output is slower than the model: identify the plant anew",
-        "an output swings about its target: another plant than the model, a valve or relay that sticks, or loads",
-        "an output should have been at its target long ago: a load, or another plant than the model",
     };
-    return advice >= TG_ALL_WELL && advice <= TG_OVERDUE ? text[advice] : "?";
+    return advice >= TG_ALL_WELL && advice <= TG_UNSEEN ? text[advice] : "?";
 }

@@ -20,13 +20,12 @@
 #include "tg_config.h"
 #include "tg_qp.h"
 
-#define TG_L (TG_NX + TG_NW)               /* where what the lagging outputs show begins in them, */
-#define TG_Z (TG_L + 3 * TG_NG)            /* states of the observer; their lags and scales are the last */
+#define TG_Z (TG_NX + TG_NW)               /* states of the observer */
 #define TG_SEEDS (TG_NX + TG_NU + TG_ND)   /* directions of a sample's Jacobian */
 #define TG_WIDE ((((TG_SEEDS > TG_Q_N ? TG_SEEDS : TG_Q_N) + 3) / 4) * 4)
 #define TG_SOME(n) ((n) > 0 ? (n) : 1)
 
-enum tg_status { TG_OK = 0, TG_LATE, TG_INFEASIBLE, TG_FALLBACK_PLAN, TG_FALLBACK_PI, TG_OFF, TG_MISMATCH };
+enum tg_status { TG_OK = 0, TG_LATE, TG_INFEASIBLE, TG_FALLBACK_PLAN, TG_FALLBACK_PI, TG_OFF };
 
 enum tg_advice {
     TG_ALL_WELL = 0,
@@ -42,15 +41,10 @@ enum tg_advice {
     TG_LIMIT_BREAKS,
     TG_STUCK,
     TG_OUT_OF_REACH,
-    TG_NOT_FOLLOWING,
     TG_TOO_LATE,
     TG_SENSOR_OFFSET,
     TG_WORLD_CHANGED,
-    TG_PUMP,
-    TG_UNSEEN,
-    TG_SLOWER,
-    TG_SWINGS_ABOUT,
-    TG_OVERDUE
+    TG_UNSEEN
 };
 
 typedef struct {
@@ -64,30 +58,6 @@ typedef struct {
 
 typedef double tg_time; /* seconds of any clock */
 
-/* Means of a reading since the drives stand still, and drives and biases then. */
-typedef struct {
-    double u[TG_NU], w[TG_SOME(TG_NW)], bins[TG_BINS], sum;
-    int count, per, n; /* bins, readings in a bin, readings in the sum */
-} tg_relaxation;
-
-/* Which side of its target an output is on, the integral of its error's size, since when and until when [s]. */
-typedef struct {
-    double side, iae, begin, end;
-} tg_half;
-
-typedef struct {
-    double goal, now, last[4], variance; /* its newest readings and their noise */
-    int n_last, seen, arrived, n;
-    tg_half half[TG_SWINGS], open;
-} tg_swing;
-
-/* When an output was promised: a mean error, seconds until it is overdue, and since it should have been
- * there, and how far off it was at least. */
-typedef struct {
-    double goal, error, due, late, nearest;
-    int stayed;
-} tg_arrival;
-
 typedef struct {
     const tg_design *design;
     const double *goals;      /* targets of each of the N samples ahead, n_c each; NULL: they stay */
@@ -95,13 +65,11 @@ typedef struct {
     void *about;
     /* observer */
     double x[TG_NX], w[TG_SOME(TG_NW)];
-    double shown[TG_NG], lag[TG_NG];   /* of each controlled output: what it showed a sample before x, its lag [s], */
-    double scale[TG_NG], start[TG_NG]; /* by what share it moves more than the model since the start, the model there */
     /* P and jacobian are of modes in place of x, where the design has TG_NJ of them */
-    double P[TG_Z * TG_Z], found_offset[TG_NY], innovation[TG_NY], lasting[TG_NY];
+    double P[TG_Z * TG_Z], found_offset[TG_NY], innovation[TG_NY];
     int held[TG_Z];
     double into_s, share, noised;      /* seconds since x; of a sample: time of the estimate, and the noise in P */
-    double dose[TG_NU], ahead[TG_NX], shown_ahead[TG_NG]; /* the drives summed over those seconds, the state there */
+    double dose[TG_NU], ahead[TG_NX];  /* the drives summed over those seconds, the state there */
     double bent[TG_NY];                /* how far an output may be from the straight line between two samples */
     /* when it was called */
     tg_time time_s, back_s;
@@ -118,13 +86,9 @@ typedef struct {
     double ramped[TG_NC];               /* where targets are that may only ramp */
     double steady_x[TG_NX], steady_u[TG_NU], miss_sum; /* nearest to the targets, and evidence that they are missed */
     int has_steady, in, unreachable;                   /* samples in a row within reach again */
-    tg_relaxation relaxation[TG_NC];
-    tg_arrival arrival[TG_NC];
-    tg_swing swing[TG_NC];
-    int recedes; /* whether an output has been nearer to its target by more than what is near */
     int has_plan, fresh, solves, on_pi, status, advice, spikes[TG_NY];
     int ramps; /* whether targets are on their way in path */
-    int slow_for[TG_NG], lost[TG_NC]; /* samples in a row that an output was slower; those that cost nothing */
+    int lost[TG_NC]; /* outputs that cost nothing */
     /* what the last optimisation gave */
     double best[TG_Q_N], y_best[TG_NH * TG_NY], authority[TG_Q_N], broken;
     int qp_status, iterations;
@@ -160,7 +124,6 @@ const char *tg_advice_text(int advice);
 
 /* The parts, for tests and for other loops. */
 void tg_observer_reset(tg_controller *c, const double *y, const double *d);
-void tg_observer_expect_lags(tg_controller *c); /* after a reset: outputs may lag behind the model, or move more */
 void tg_observer_update(tg_controller *c, const double *y);
 void tg_observer_refine(tg_controller *c, const double *y); /* with a reading between two moves */
 /* Take what a reading differs by for offsets of the sensors that are not 0 in which. */
@@ -171,11 +134,6 @@ void tg_observer_look(tg_controller *c, const double *d);
 const double *tg_now(const tg_controller *c); /* the state at the time of the estimate */
 void tg_biases(const tg_controller *c, double *on_u, double *on_d, double *on_y);
 void tg_expected(const tg_controller *c, double *y);
-/* For how long an output should have been at its target [s], by the newest plan; 0 where none is overdue. */
-double tg_overdue(tg_controller *c);
-void tg_forget_arrivals(tg_controller *c);
-/* The period of the output that swings the most [s], noting the newest readings; 0 where none does. */
-double tg_swings(tg_controller *c);
 /* The controlled outputs nearest to the targets that drives can hold, and their derivatives by w (n_c rows); 0 where
  * no steady state is found. */
 int tg_find_steady(tg_controller *c, const double *d, const double *on_u, const double *on_y, double *held, double *by_w);

@@ -17,14 +17,9 @@ void tg_host_begin(tg_controller *c, const tg_design *design)
 
 double *tg_host_x(tg_controller *c) { return c->x; }
 double *tg_host_w(tg_controller *c) { return c->w; }
-double *tg_host_shown(tg_controller *c) { return c->shown; }
-double *tg_host_lag(tg_controller *c) { return c->lag; }
-double *tg_host_scale(tg_controller *c) { return c->scale; }
-double *tg_host_start(tg_controller *c) { return c->start; }
 double *tg_host_P(tg_controller *c) { return c->P; }
 double *tg_host_found_offset(tg_controller *c) { return c->found_offset; }
 double *tg_host_innovation(tg_controller *c) { return c->innovation; }
-double *tg_host_lasting(tg_controller *c) { return c->lasting; }
 int *tg_host_lost(tg_controller *c) { return c->lost; }
 int *tg_host_held(tg_controller *c) { return c->held; }
 double *tg_host_between(tg_controller *c) { return &c->into_s; }
@@ -213,8 +208,7 @@ static void pass(const tg_around *a, tg_truth *plant, int t, const double *drive
 
 /* A closed loop of n samples against a plant that is not the model.
  *
- * observed: the estimate that the observer starts from: x, w, shown, lag, scale, P as it is kept, found_offset and start,
- * one behind the other; told: whether the controller is told of the drives before; target: n rows of n_c.
+ * observed: the estimate that the observer starts from: x, w, P as it is kept, and found_offset, one behind the other; told: whether the controller is told of the drives before; target: n rows of n_c.
  * Into y: n per_sample + 1 rows of TG_NY, without noise and quantum; reading: n rows of TG_NY + TG_ND;
  * drive: n rows of TG_NU; status: n.
  */
@@ -230,12 +224,8 @@ void tg_host_loop(tg_controller *c, const tg_design *design, tg_truth *plant, co
             tg_reset(c, design, shown, shown + TG_NY);
             memcpy(c->x, observed, sizeof c->x);
             memcpy(c->w, observed + TG_NX, TG_NW * sizeof(double));
-            memcpy(c->shown, observed + TG_L, sizeof c->shown);
-            memcpy(c->lag, observed + TG_L + TG_NG, sizeof c->lag);
-            memcpy(c->scale, observed + TG_L + 2 * TG_NG, sizeof c->scale);
             memcpy(c->P, observed + TG_Z, sizeof c->P);
             memcpy(c->found_offset, observed + TG_Z + TG_Z * TG_Z, sizeof c->found_offset);
-            memcpy(c->start, observed + TG_Z + TG_Z * TG_Z + TG_NY, sizeof c->start);
             c->time_s = -design->dt; /* the first reading is at 0 */
         }
         move = tg_step(c, NAN, shown, shown + TG_NY, told && !t ? around->before : NULL, target + t * design->n_c);

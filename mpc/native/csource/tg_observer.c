@@ -5,9 +5,6 @@
  * x is kept on a grid of samples, because a delay of shift registers advances by whole samples only;
  * a reading the share s of a sample after it is one of (1 - s) x + s f(x, u, d), u the mean of the drives since.
  *
- * Controlled outputs are read through a lag T that is estimated too, and move by the share k more than the model,
- * s+ = s + a (z - s), y = s+, a = dt / (dt + T), z = C x + k (C x - C x_0).
- *
  * Of a linear plant the filter's covariance P, its gain and its derivatives are those of the modes z of x = V z, where
  * the design has them: a sample is tridiagonal there, so that J P J' takes 4 n^2 operations in place of n^3.
  */
@@ -35,14 +32,7 @@ static double output(const tg_controller *c, int i, const double *x)
     return sum;
 }
 
-/* What controlled output r is at x, by its scale. */
-static double scaled(const tg_controller *c, int r, const double *x)
-{
-    double y = output(c, c->design->controlled[r], x);
-    return y + c->scale[r] * (y - c->start[r]);
-}
-
-/* What the disturbance states add to drives, measured disturbances and outputs; to these, the scales too. */
+/* What the disturbance states add to drives, measured disturbances and outputs. */
 void tg_biases(const tg_controller *c, double *on_u, double *on_d, double *on_y)
 {
     const tg_design *s = c->design;
@@ -62,25 +52,16 @@ void tg_biases(const tg_controller *c, double *on_u, double *on_d, double *on_y)
         for (int i = 0; i < TG_NW; i++)
             on_y[j] += s->on_output[j * TG_NW + i] * c->w[i];
     }
-    for (int r = 0; r < TG_NG; r++)
-        on_y[s->controlled[r]] += scaled(c, r, tg_now(c)) - output(c, s->controlled[r], tg_now(c));
 }
 
 const double *tg_now(const tg_controller *c) { return c->share > 0.0 ? c->ahead : c->x; }
 
-static const double *shown_now(const tg_controller *c) { return c->share > 0.0 ? c->shown_ahead : c->shown; }
-
-static double lag_share(const tg_controller *c, int r) { return c->design->dt / (c->design->dt + c->lag[r]); }
-
 void tg_expected(const tg_controller *c, double *y)
 {
-    const double *x = tg_now(c), *shown = shown_now(c);
     double on_u[TG_NU], on_d[TG_SOME(TG_ND)];
     tg_biases(c, on_u, on_d, y);
     for (int i = 0; i < TG_NY; i++)
-        y[i] += output(c, i, x);
-    for (int r = 0; r < TG_NG; r++)
-        y[c->design->controlled[r]] -= (1.0 - lag_share(c, r)) * (scaled(c, r, x) - shown[r]);
+        y[i] += output(c, i, tg_now(c));
 }
 
 static void stand_on_sample(tg_controller *c)
@@ -90,30 +71,16 @@ static void stand_on_sample(tg_controller *c)
     memset(c->bent, 0, sizeof c->bent);
 }
 
-/* What reading i is of the states, which are x and shown: [C, Wy], of a lagging one less, by its lag and scale. */
-static void plain_sensitivity(const tg_controller *c, int i, const double *x, const double *shown, double *h)
+/* What reading i is of the states; between two samples times the derivative of the state there. */
+static void sensitivity(const tg_controller *c, int i, double *h)
 {
     const tg_design *s = c->design;
-    memset(h, 0, TG_Z * sizeof *h);
-    memcpy(h, s->H + i * TG_NX, TG_NX * sizeof *h);
+    double plain[TG_Z];
+    memcpy(plain, s->H + i * TG_NX, TG_NX * sizeof *plain);
     for (int j = 0; j < TG_NW; j++)
-        h[TG_NX + j] = s->on_output[i * TG_NW + j];
-    for (int r = 0; r < TG_NG; r++)
-        if (s->controlled[r] == i) {
-            double share = lag_share(c, r);
-            for (int j = 0; j < TG_NX; j++)
-                h[j] *= share * (1.0 + c->scale[r]);
-            h[TG_L + r] = 1.0 - share;
-            h[TG_L + TG_NG + r] = (shown[r] - scaled(c, r, x)) * share * share / s->dt;
-            h[TG_L + 2 * TG_NG + r] = share * (output(c, i, x) - c->start[r]);
-        }
-}
-
-/* What plain is of the states of now; between two samples times the derivative of the state there. */
-static void of_now(const tg_controller *c, const double *plain, double *h)
-{
+        plain[TG_NX + j] = s->on_output[i * TG_NW + j];
     if (!(c->share > 0.0)) {
-        memcpy(h, plain, TG_Z * sizeof *h);
+        memcpy(h, plain, sizeof plain);
         return;
     }
     memset(h, 0, TG_Z * sizeof *h);
@@ -121,13 +88,6 @@ static void of_now(const tg_controller *c, const double *plain, double *h)
         if (plain[j] != 0.0)
             for (int k = 0; k < TG_Z; k++)
                 h[k] += plain[j] * c->jacobian[j * TG_Z + k];
-}
-
-static void sensitivity(const tg_controller *c, int i, double *h)
-{
-    double plain[TG_Z];
-    plain_sensitivity(c, i, tg_now(c), shown_now(c), plain);
-    of_now(c, plain, h);
 }
 
 /* Add the rows of M that a row of a matrix asks for, n numbers each, four at a time; it is 0 but from..to. */
@@ -162,22 +122,6 @@ static double seen_by(const double *h, const double *row)
     return sum;
 }
 
-/* The variance of how far controlled output r has to go times by what share its lag lets it go in a sample, both
- * unknown: their derivatives leave it out. */
-static double doubt(const tg_controller *c, int r)
-{
-    const tg_design *s = c->design;
-    int i = s->controlled[r], lag = TG_L + TG_NG + r;
-    double plain[TG_Z] = {0.0}, to_go[TG_Z], row[TG_Z], slope = lag_share(c, r) / (s->dt + c->lag[r]);
-    for (int j = 0; j < TG_NX; j++)
-        plain[j] = s->H[i * TG_NX + j] * (1.0 + c->scale[r]);
-    plain[TG_L + r] = -1.0;
-    plain[TG_L + 2 * TG_NG + r] = output(c, i, tg_now(c)) - c->start[r];
-    of_now(c, plain, to_go);
-    measure(c, to_go, row);
-    return slope * slope * (seen_by(to_go, row) * c->P[lag * (TG_Z + 1)] + row[lag] * row[lag]);
-}
-
 /* Solve S X = B (symmetric positive, X has TG_Z columns) in place, by elimination. */
 static void eliminate(double *S, double *B)
 {
@@ -209,20 +153,10 @@ static void add_states(const tg_controller *c, const double *change, double *x)
     }
 }
 
-/* Change the states; where a lag would leave its range, to the mean, given that it is at its end. */
+/* Change the states. */
 static void apply(tg_controller *c, double *change)
 {
     const tg_design *s = c->design;
-    for (int r = 0; r < TG_NG; r++) {
-        int at = TG_L + TG_NG + r;
-        double lag = c->lag[r] + change[at];
-        double beyond = lag - fmin(fmax(lag, 0.0), s->longest_lag), share;
-        if (beyond == 0.0)
-            continue;
-        share = beyond / c->P[at * (TG_Z + 1)];
-        for (int j = 0; j < TG_Z; j++)
-            change[j] -= c->held[j] ? 0.0 : c->P[j * TG_Z + at] * share;
-    }
     for (int k = 0; k < TG_NW; k++) {
         double w = c->w[k] + change[TG_NX + k];
         for (int j = 0; j < TG_NU; j++)
@@ -231,11 +165,6 @@ static void apply(tg_controller *c, double *change)
         change[TG_NX + k] = w - c->w[k];
         c->w[k] = w;
     }
-    for (int r = 0; r < TG_NG; r++) {
-        double lag = fmin(fmax(c->lag[r] + change[TG_L + TG_NG + r], 0.0), s->longest_lag);
-        change[TG_L + TG_NG + r] = lag - c->lag[r];
-        c->lag[r] = lag;
-    }
     if (c->share > 0.0) {
         double ahead[TG_NX];
         for (int i = 0; i < TG_NX; i++)
@@ -243,12 +172,6 @@ static void apply(tg_controller *c, double *change)
         add_states(c, ahead, c->ahead);
     }
     add_states(c, change, c->x);
-    for (int r = 0; r < TG_NG; r++) {
-        if (c->share > 0.0)
-            c->shown_ahead[r] += seen_by(c->jacobian + (TG_L + r) * TG_Z, change);
-        c->shown[r] += change[TG_L + r];
-        c->scale[r] += change[TG_L + 2 * TG_NG + r];
-    }
 }
 
 static void add_two(double *restrict into, double a, const double *restrict x, double b, const double *restrict y)
@@ -257,16 +180,12 @@ static void add_two(double *restrict into, double a, const double *restrict x, d
         into[j] += a * x[j] + b * y[j];
 }
 
-/* A lost reading is given no weight: its row of H P is 0. known: variances of the reading. */
-/* Correct the estimate by a reading of variances `known`; one between two moves leaves lags and scales. */
-static void correct(tg_controller *c, const double *y, const double *known, double remember, int between)
+/* Correct the estimate by a reading of variances R.  A lost one is given no weight: its row of H P is 0. */
+static void correct(tg_controller *c, const double *y, const double *R, double remember)
 {
-    double R[TG_NY], off[TG_NY], S[TG_NY * TG_NY], HP[TG_NY * TG_Z], gain[TG_NY * TG_Z], back[TG_NY * TG_Z];
+    double off[TG_NY], S[TG_NY * TG_NY], HP[TG_NY * TG_Z], gain[TG_NY * TG_Z], back[TG_NY * TG_Z];
     double HPH[TG_NY * TG_NY], H[TG_NY * TG_Z], change[TG_Z] = {0.0};
     tg_expected(c, off);
-    memcpy(R, known, sizeof R);
-    for (int r = 0; r < TG_NG; r++)
-        R[c->design->controlled[r]] += doubt(c, r);
     for (int a = 0; a < TG_NY; a++)
         sensitivity(c, a, H + a * TG_Z);
     for (int a = 0; a < TG_NY; a++) {
@@ -283,16 +202,13 @@ static void correct(tg_controller *c, const double *y, const double *known, doub
             S[a * TG_NY + b] = HPH[a * TG_NY + b] + (a == b ? R[a] : 0.0);
         }
     for (int a = 0; a < TG_NY; a++)
-        if (isfinite(y[a])) {
-            double scaled = off[a] / sqrt(S[a * (TG_NY + 1)]);
-            c->innovation[a] += remember * (scaled - c->innovation[a]);
-            c->lasting[a] += (remember > 0.0 ? TG_LASTING : 0.0) * (scaled - c->lasting[a]);
-        }
+        if (isfinite(y[a]))
+            c->innovation[a] += remember * (off[a] / sqrt(S[a * (TG_NY + 1)]) - c->innovation[a]);
     memcpy(gain, HP, sizeof gain);
     eliminate(S, gain); /* row a of gain: what reading a does to each state */
     for (int a = 0; a < TG_NY; a++)
         for (int j = 0; j < TG_Z; j++) {
-            if (c->held[j] || (between && j >= TG_L + TG_NG))
+            if (c->held[j])
                 gain[a * TG_Z + j] = 0.0;
             change[j] += gain[a * TG_Z + j] * off[a];
         }
@@ -310,17 +226,17 @@ static void correct(tg_controller *c, const double *y, const double *known, doub
     apply(c, change);
 }
 
-static void correct_now(tg_controller *c, const double *y, double remember, int between)
+static void correct_now(tg_controller *c, const double *y, double remember)
 {
     double R[TG_NY];
     for (int i = 0; i < TG_NY; i++)
         R[i] = c->design->R[i] + c->bent[i] * c->bent[i];
-    correct(c, y, R, remember, between);
+    correct(c, y, R, remember);
 }
 
-void tg_observer_update(tg_controller *c, const double *y) { correct_now(c, y, TG_NEWEST_INNOVATION, 0); }
+void tg_observer_update(tg_controller *c, const double *y) { correct_now(c, y, TG_NEWEST_INNOVATION); }
 
-void tg_observer_refine(tg_controller *c, const double *y) { correct_now(c, y, 0.0, 1); }
+void tg_observer_refine(tg_controller *c, const double *y) { correct_now(c, y, 0.0); }
 
 void tg_observer_set_offsets(tg_controller *c, const double *y, const int *which)
 {
@@ -329,12 +245,6 @@ void tg_observer_set_offsets(tg_controller *c, const double *y, const int *which
     for (int i = 0; i < TG_NY; i++)
         if (which[i] && isfinite(y[i]))
             c->found_offset[i] += y[i] - mean[i];
-}
-
-void tg_observer_expect_lags(tg_controller *c)
-{
-    for (int r = 0; r < TG_NG; r++)
-        c->P[(TG_L + TG_NG + r) * (TG_Z + 1)] = c->design->first_lag * c->design->first_lag;
 }
 
 /* Start at rest: one update of a plant that may have been held by any drive, whose sensors may be off. */
@@ -358,38 +268,14 @@ void tg_observer_reset(tg_controller *c, const double *y, const double *d)
     memset(c->held, 0, sizeof c->held);
     memset(c->found_offset, 0, sizeof c->found_offset);
     memset(c->innovation, 0, sizeof c->innovation);
-    memset(c->lasting, 0, sizeof c->lasting);
     memset(c->P, 0, sizeof c->P);
     for (int i = 0; i < TG_NX; i++)
         memcpy(c->P + i * TG_Z, s->P_rest + i * TG_NX, TG_NX * sizeof(double));
     for (int k = 0; k < TG_NW; k++)
         c->P[(TG_NX + k) * (TG_Z + 1)] = s->P0[k];
-    memset(c->lag, 0, sizeof c->lag);
-    memset(c->scale, 0, sizeof c->scale);
-    for (int r = 0; r < TG_NG; r++)
-        c->shown[r] = output(c, s->controlled[r], c->x);
     stand_on_sample(c);
-    correct(c, y, s->R_start, 0.0, 0);
-    for (int r = 0; r < TG_NG; r++) { /* at rest every output shows what the model has */
-        int at = TG_L + r, i = s->controlled[r];
-        double row[TG_Z], h[TG_Z] = {0.0};
-        memcpy(h, s->H + i * TG_NX, TG_NX * sizeof(double));
-        measure(c, h, row);
-        row[at] = seen_by(h, row);
-        for (int j = 0; j < TG_Z; j++)
-            c->P[at * TG_Z + j] = c->P[j * TG_Z + at] = row[j];
-        c->shown[r] = c->start[r] = output(c, i, c->x);
-    }
+    correct(c, y, s->R_start, 0.0);
     tg_observer_set_offsets(c, y, s->fixed);
-}
-
-static void set_lag_rows(tg_controller *c)
-{
-    for (int r = 0; r < TG_NG; r++) {
-        double *row = c->jacobian + (TG_L + r) * TG_Z;
-        plain_sensitivity(c, c->design->controlled[r], c->x, c->shown, row);
-        memset(row + TG_NX, 0, TG_NW * sizeof(double)); /* without the biases */
-    }
 }
 
 /* Entry i of direction c, of those that are kept in groups of four. */
@@ -435,21 +321,18 @@ static double *sample_jacobian(tg_controller *c, const double *u, const double *
         }
     }
     for (int k = TG_NX; k < TG_Z; k++)
-        if (k < TG_L || k >= TG_L + TG_NG)
-            c->jacobian[k * (TG_Z + 1)] = 1.0;
-    set_lag_rows(c);
+        c->jacobian[k * (TG_Z + 1)] = 1.0;
     c->has_jacobian = 1;
     return now;
 }
 
-/* The Jacobian of a linear plant in modes, but for what lags. */
+/* The Jacobian of a linear plant in modes. */
 static void fill_modes(tg_controller *c)
 {
     const tg_design *s = c->design;
     memset(c->jacobian, 0, sizeof c->jacobian);
     for (int k = 0; k < TG_Z; k++)
-        if (k < TG_L || k >= TG_L + TG_NG)
-            c->jacobian[k * (TG_Z + 1)] = 1.0;
+        c->jacobian[k * (TG_Z + 1)] = 1.0;
     for (int i = 0; i < TG_NJ; i++) {
         double *row = c->jacobian + i * TG_Z;
         for (int k = 0; k < TG_NW; k++)
@@ -463,7 +346,7 @@ static void fill_modes(tg_controller *c)
     c->has_jacobian = 1;
 }
 
-/* The state one sample later into next, and the Jacobian; of a linear plant only what lags is new. */
+/* The state one sample later into next, and the Jacobian, which of a linear plant stays. */
 static void look_ahead(tg_controller *c, const double *u, const double *d, double *next)
 {
     const tg_design *s = c->design;
@@ -480,7 +363,6 @@ static void look_ahead(tg_controller *c, const double *u, const double *d, doubl
         tg_model_step(x, u, d, s->k, c->by_drives, next);
         memcpy(x, next, sizeof x);
     }
-    set_lag_rows(c);
 }
 
 #define SIDES (1 + TG_NU + TG_NW)
@@ -735,15 +617,6 @@ static void find_band(const double *row, int *from, int *to)
         --*to;
 }
 
-/* Variance that a sample adds to each state. */
-static const double *added(const tg_controller *c)
-{
-    double most = 0.0;
-    for (int i = 0; i < TG_NY; i++)
-        most = fmax(most, fabs(c->lasting[i]));
-    return most > TG_LASTS ? c->design->Q_lasting : c->design->Q;
-}
-
 static void add_row(int n, double *restrict into, double a, const double *restrict x)
 {
     for (int j = 0; j < n; j++)
@@ -767,7 +640,7 @@ static void set_each(int n, double *restrict into, const double *restrict a, con
 /* Add what a share of a sample adds to the covariance. */
 static void add_noise(tg_controller *c, double share)
 {
-    const double *Q = added(c), *of_modes = c->design->Q_modes;
+    const double *Q = c->design->Q, *of_modes = c->design->Q_modes;
     for (int i = 0; i < TG_NJ; i++)
         add_row(TG_NJ, c->P + i * TG_Z, share, of_modes + i * TG_NJ);
     for (int i = TG_NJ; i < TG_Z; i++)
@@ -779,7 +652,7 @@ static void carry_modes(tg_controller *c)
 {
     const tg_design *s = c->design;
     const double *before = s->mode_step, *own = before + TG_NJ, *behind = own + TG_NJ, *by_w = s->mode_by_w;
-    const double *lags = c->jacobian + TG_L * TG_Z, *of_w = c->P + TG_NX * TG_Z;
+    const double *of_w = c->P + TG_NX * TG_Z;
     int pairs = 0;
     memset(c->spare, 0, sizeof c->spare);
     for (int i = 0; i < TG_NJ; i++) {
@@ -795,8 +668,6 @@ static void carry_modes(tg_controller *c)
         pairs |= before[i] != 0.0;
     }
     memcpy(c->spare + TG_NJ * TG_Z, c->P + TG_NJ * TG_Z, (TG_Z - TG_NJ) * TG_Z * sizeof(double));
-    for (int r = 0; r < TG_NG; r++)
-        measure(c, lags + r * TG_Z, c->spare + (TG_L + r) * TG_Z);
     for (int i = 0; i < TG_Z; i++) {
         const double *row = c->spare + i * TG_Z;
         double *P = c->P + i * TG_Z;
@@ -808,8 +679,6 @@ static void carry_modes(tg_controller *c)
             add_each(TG_NJ - 1, P, behind, row + 1);
         }
         memcpy(P + TG_NX, row + TG_NX, (TG_Z - TG_NX) * sizeof(double));
-        for (int r = 0; r < TG_NG; r++)
-            P[TG_L + r] = seen_by(lags + r * TG_Z, row);
     }
 }
 
@@ -852,8 +721,6 @@ void tg_observer_predict(tg_controller *c, const double *u, const double *d)
     for (int j = 0; j < TG_ND; j++)
         on_d[j] += d[j];
     look_ahead(c, on_u, on_d, next);
-    for (int r = 0; r < TG_NG; r++)
-        c->shown[r] += lag_share(c, r) * (scaled(c, r, c->x) - c->shown[r]);
     memcpy(c->x, next, sizeof c->x);
     carry_covariance(c);
     add_noise(c, 1.0 - c->noised);
@@ -892,8 +759,6 @@ void tg_observer_look(tg_controller *c, const double *d)
     look_ahead(c, on_u, on_d, next);
     for (int i = 0; i < TG_NX; i++)
         c->ahead[i] = (1.0 - share) * c->x[i] + share * next[i];
-    for (int r = 0; r < TG_NG; r++)
-        c->shown_ahead[r] = c->shown[r] + share * lag_share(c, r) * (scaled(c, r, c->x) - c->shown[r]);
     add_noise(c, share - c->noised);
     for (int i = 0; i < TG_Z; i++)
         for (int j = 0; j < TG_Z; j++)

@@ -190,6 +190,7 @@ def run(
     cli.choices("--target", wanted if isinstance(wanted, dict) else (), controller, "outputs")
     from thermogrip.classify.decisions.stopping_rule import session_stop
     from thermogrip.mpc.closed_loop.simulate import RecordedController
+    from thermogrip.mpc.controllers.loop_monitor import LoopMonitor
     from thermogrip.mpc.tuning.design_review import beyond_logs
     from thermogrip.report.control import session_sections
     from thermogrip.report.html import write_report
@@ -205,7 +206,7 @@ def run(
     watch = watch_of("run", console, out, live, foxglove, on_trip, pace)
     stop = None if stop_early is None else session_stop(stop_early, tell=watch.posterior)
     loaded = load_controller(controller, network)
-    regulator, path = RecordedController(loaded), None
+    regulator, path = RecordedController(loaded, LoopMonitor(loaded.plant, loaded.design)), None
     if profile is not None:
         path = read_profile(profile, loaded.controlled, preview_s=loaded.dt * sum(loaded.design.blocks))
         wanted = path.at(0.0)

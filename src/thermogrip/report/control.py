@@ -267,7 +267,7 @@ def spec_section(tuning: Tuning) -> Section:
         ("price of travel", design.travel),
         ("terminal weight", design.terminal),
         ("overshoot band [degC]", design.overshoot),
-        ("process noise of a drive's disturbance", design.noise.drive),
+        *((f"process noise of {name}'s disturbance", sd) for name, sd in design.noise.drive.items()),
         ("process noise of an output's disturbance", design.noise.output),
         ("disturbances estimated", ", ".join(tuning.controller.disturbance.names)),
     ]

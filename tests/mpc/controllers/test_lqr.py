@@ -55,7 +55,7 @@ def test_a_plant_that_is_not_the_model_is_regulated_without_offset(run):
     for segment in run[0].segments:
         assert abs(segment.bias) < 0.03
         assert np.isfinite(segment.settle_s)
-        assert segment.overshoot < 0.3
+        assert segment.overshoot < 0.4
 
 
 def test_drives_stay_in_range_and_slew(run):

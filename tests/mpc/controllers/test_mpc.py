@@ -244,7 +244,7 @@ def test_a_target_out_of_reach_is_named_from_what_is_known_of_it(two, monkeypatc
     assert said == ["infeasible", "no drive holds a at 30.0 degC: 28.3 degC can be held"]
     assert u.tolist() == pytest.approx(MEAN)
     assert {name: value.tolist() for name, value in asked.items()} == {
-        "y": [27.5, 24.5], "target": [33.0, 30.0], "side": [1.0, -1.0], "ahead": [32.0, 31.0],
+        "target": [33.0, 30.0], "side": [1.0, -1.0], "ahead": [32.0, 31.0],
         "seen": [False, True],
     }  # fmt: skip
 

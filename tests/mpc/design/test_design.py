@@ -30,6 +30,7 @@ from thermogrip.mpc.tuning.objective import Search
 from thermogrip.sysid.greybox.problem import prior_plant
 from thermogrip.sysid.models.network import load_network
 from thermogrip.sysid.models.state_space import StateSpaceModel
+from thermogrip.sysid.plant.fit_record import InnovationNoise
 from thermogrip.sysid.plant.plant import Plant
 
 
@@ -139,18 +140,43 @@ def test_what_nothing_moves_is_no_target():
         default_design(block(10, 50.0, gain=0.0), dt=1.0)
 
 
-def test_a_filter_allows_for_longer_lags_where_a_delay_is_a_sample_or_two():
-    lags = [default_design(block(delay, 100.0), dt=2.0).noise.lag for delay in (0, 2, 4, 8, 40)]
-    assert lags == pytest.approx([5.0, 5.0, 3.0, 1.5, 1.5], rel=0.1)
+def recorded(plant: Plant, **record: Any) -> Plant:
+    """Return a plant whose fit kept this record of noise."""
+    given = {"state": 0.01, "reading": {"t": 0.04}, "input": {"q": 0.0}, "fastest": {"q": 0.0}} | record
+    return replace(plant, scores=replace(plant.scores, innovations=InnovationNoise(**given)))
 
 
-def test_a_bias_is_learnt_more_slowly_where_there_are_less_than_ten_delays_in_a_lag():
-    drifts = [
-        default_design(block(delay, lag), dt=2.0).noise.drive for delay, lag in ((5, 100.0), (40, 100.0))
-    ]
-    assert drifts == pytest.approx([0.002, 0.002 * (0.1 * 101 / 39.995) ** 1.5], rel=1e-2)
+@pytest.mark.parametrize(("delay", "lag"), [(5, 100.0), (40, 100.0)])
+def test_a_bias_is_learnt_as_soon_as_its_loop_can_answer_or_as_the_logs_show(delay: int, lag: float):
+    plant, dt = block(delay, lag), 2.0
+    answer = step_response(plant, "q", "t")
+    sooner = 0.04 * dt**0.5 * answer.lag / (answer.gain * (answer.delay + dt) ** 2)
+    for seen in (0.0, 100 * 0.5 * sooner, 100 * 3.0 * sooner):  # of a drive in percent
+        noise = default_design(recorded(plant, input={"q": seen}), dt=dt).noise
+        assert noise.drive == {"q": pytest.approx(max(sooner, seen / 100))}
+        assert noise.state == 0.01
 
 
+def test_a_drive_moves_as_fast_as_its_logs_show_or_an_eighth_of_its_range_a_second_or_all_in_a_sample():
+    for seen, slew in ((0.0, 12.5), (20.0, 20.0), (400.0, 50.0)):
+        design = default_design(recorded(block(5, 100.0), fastest={"q": seen}), dt=2.0)
+        assert design.slew_per_s == {"q": slew}
+    assert default_design(block(5, 100.0), dt=2.0).slew_per_s == {"q": 12.5}
+
+
+@pytest.mark.parametrize(("width", "unit"), [(50.0, 1.0), (310.0, 5.0), (11.0, 0.2)])
+def test_errors_count_in_the_unit_of_their_output(width: float, unit: float):
+    plant = block(5, 100.0)
+    plant = replace(plant, valid={**plant.valid, "t": (0.0, width)})
+    design = default_design(plant, dt=2.0)
+    assert design.weights == ({} if unit == 1.0 else {"t": pytest.approx(unit**-2)})
+    assert design.overshoot == pytest.approx(max(0.15 * unit, 3 * 0.05))
+    assert design.price == pytest.approx(50.0 / unit**2)
+    noisy = default_design(recorded(plant, reading={"t": 0.4}), dt=2.0)
+    assert noisy.overshoot == pytest.approx(max(0.15 * unit, 1.2))
+
+
+NOISE = {"state": 0.01, "drive": {"drive": 0.002}, "output": 0.02, "reading": {}}
 LOOP = {"drive": "drive", "output": "t_surface", "Kc": 0.1, "Ti": 50.0, "feedforward": 0.0}
 
 
@@ -186,7 +212,7 @@ def design(tank) -> dict:
         ({"drive": -1e-9}, "the others >= 0"),
         ({"price": -1e-9}, "the others >= 0"),
         ({"track": 0.0}, "track and move must be > 0"),
-        ({"noise": {"output": 1.1e6}}, "a standard deviation must be <= 1e\\+06"),
+        ({"noise": NOISE | {"output": 1.1e6}}, "a standard deviation must be <= 1e\\+06"),
         ({"drive_range": {"drive": [-1.1, 0.5]}}, "drive is -1.1 to 0.5, beyond"),
         ({"drive_range": {"drive": [-0.5, 1.1]}}, "beyond the drive's -1 to 1"),
         ({"drive_range": {"drive": [0.5, 0.5]}}, "drive is 0.5 to 0.5, which is empty"),
@@ -209,7 +235,8 @@ def design(tank) -> dict:
         ({"loops": [LOOP, LOOP]}, "twice"),
         ({"loops": [{**LOOP, "setpoint": 1.1}]}, "setpoint of t_surface must be 0 to 1"),
         ({"loops": [{**LOOP, "Kc": "much"}]}, "PI of t_surface"),
-        ({"noise": {"state": -1.0}}, "noise"),
+        ({"noise": NOISE | {"state": -1.0}}, "noise"),
+        ({"noise": NOISE | {"reading": {"t_tank": -1.0}}}, "noise"),
         ({"limits": {"t_tank": [40.0, 20.0]}}, "limits of t_tank"),
         ({"limits": {"t_nose": [20.0, 40.0]}}, "t_nose"),
         ({"move": 0.0}, "move"),
@@ -232,16 +259,15 @@ def test_a_field_that_cannot_be_is_named(tank, design, change, says):
         *({"ambient": ambient} for ambient in (-60.0, 150.0)),
         *({name: 0.0} for name in ("terminal", "drive", "price", "overshoot", "deadline_s", "patience_s")),
         *({"move_delay": delay} for delay in (0, 1)),
-        {"noise": {"state": 1e6, "drive": 0.0}},
+        {"noise": NOISE | {"state": 1e6, "drive": {"drive": 0.0}}},
         {"drive_range": {"drive": [-1 - 9e-10, 1 + 9e-10]}},
         {"loops": []},
     ],
 )
 def test_a_field_at_the_end_of_what_can_be_is_taken(tank, design, change):
-    default_noise = {"state": 0.005, "drive": 0.002, "output": 0.002, "reading": 0.05, "lag": 1.5}
     found = check_design(Design.from_dict({**design, **change}), tank).to_dict()
     for key, value in change.items():
-        assert found[key] == (default_noise | value if key == "noise" else value)
+        assert found[key] == value
 
 
 @pytest.mark.parametrize("spec", [{"steps": "abc"}, {"steps": [[1], [None]]}])

@@ -94,8 +94,8 @@ def test_at_any_rate_the_loop_is_that_of_the_sample_time(tank, nominal, name, ra
         pytest.skip("no gcc here")
     found, own = closed_loop(makers(tank)[name](), RATES[rate]()), nominal[name]
     late = 7.0 if rate == "7 s" else 3.0  # a change is felt as late as it is called
-    # that much later than at 2 s on average [s]; the skin passes its target at 0.026 degC/s
-    felt = 2.5 if rate == "7 s" else 1.2
+    # that much later than at 2 s on average, with the filter [s]; the skin passes its target at 0.026 degC/s
+    felt = 3.0 if rate == "7 s" else 1.5
     assert found["settling"] == pytest.approx(own["settling"], abs=0.05 * own["settling"] + late)
     # beyond a sample of 2 s a hold adds 2.5 s of mean delay, 4 % of the settling time
     more = 0.15 if rate == "7 s" else 0.1
@@ -146,7 +146,7 @@ def test_readings_between_moves_make_the_estimate_less_noisy(tank, name):
             controller.step(reading, 25.0)
             estimates.append(controller.observer.reading())
         spread[parts] = float(np.sqrt(np.mean((np.array(estimates)[60 * parts :] - 25.0) ** 2)))
-    assert spread[8] < 0.6 * spread[1], spread
+    assert spread[8] < 0.65 * spread[1], spread
 
 
 GAPS = st.one_of(st.floats(0.01, 20.0), st.sampled_from([*PERIODS, 2.0, 0.0, NAN]))

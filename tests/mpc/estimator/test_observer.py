@@ -22,7 +22,7 @@ from thermogrip.mpc.estimator.observer import (
 )
 from thermogrip.mpc.plant.prediction import PredictionModel
 from thermogrip.sysid.models.state_space import StateSpaceModel
-from thermogrip.sysid.plant.fit_record import PlantScores
+from thermogrip.sysid.plant.fit_record import InnovationNoise, PlantScores
 from thermogrip.sysid.plant.plant import Plant
 
 A = np.array([[0.95, 0.02], [0.06, 0.9]])
@@ -30,12 +30,12 @@ B, E = np.array([0.4, -0.1]), np.array([0.03, 0.05])
 C = np.array([[1.0, 0.0], [0.5, 0.5]])
 LEVEL, OFFSET, SPAN = np.array([25.0, 24.0]), np.array([0.3, -0.2]), 100.0
 SPREAD = np.array([2.0, 0.5])
-NOISE = ObserverNoise(state=0.03, drive=0.01, output=0.02, reading=0.1)
+NOISE = ObserverNoise(state=0.03, drive={"q": 0.01}, output=0.02)
 DT = 2.0
 
 
 def model(
-    gain: float = 1.0, noise: tuple[tuple[str, float], ...] = (("a", 0.2), ("b", 0.001))
+    gain: float = 1.0, noise: tuple[tuple[str, float], ...] = (("a", 0.2), ("b", 0.02))
 ) -> PredictionModel:
     """Two outputs behind a drive in percent, in a room that is measured."""
     plant = StateSpaceModel(
@@ -146,9 +146,11 @@ def test_what_no_set_of_disturbances_explains_is_refused() -> None:
 
 
 def test_what_nobody_says_of_noise_is_assumed() -> None:
-    assert ObserverNoise() == ObserverNoise(state=0.005, drive=0.002, output=0.002, reading=0.05)
-    observer = Observer(model(noise=(("a", 0.2),)), CHOSEN, NOISE)
-    np.testing.assert_allclose(observer.R, [0.2**2, 0.1**2])
+    found = Observer(model(noise=(("a", 0.2),)), CHOSEN)
+    np.testing.assert_allclose(found.R, [0.2**2, 0.05**2])
+    np.testing.assert_allclose(np.sqrt(found.Q / DT)[2:], [0.002, 0.03])
+    said = Observer(MODEL, CHOSEN, replace(NOISE, reading={"b": 0.1}))
+    np.testing.assert_allclose(said.R, [0.2**2, 0.1**2])
 
 
 def test_the_margin_is_the_steady_change_of_the_worst_combination_in_its_own_size() -> None:
@@ -369,162 +371,15 @@ def test_an_unseen_mode_that_does_not_decay_is_not_detectable():
     assert detectability_margin(A, C, np.array([[0.1], [0.0]]), np.zeros((1, 1))) == 0
 
 
-def lag_observer(scale: float | None = None) -> Observer:
-    quiet = ObserverNoise(state=1e-4, drive=1e-4, output=1e-4)
-    observer = Observer(MODEL, CHOSEN, quiet, lagged=[1])
-    observer.reset(LEVEL + OFFSET, np.array([25.0]))
-    observer.w, observer.found_offset = np.zeros(2), np.zeros(2)
-    observer._P = np.zeros_like(observer._P)  # all is known but the lag
-    observer.expect_lags()
-    observer.Q[-1] = 0.0 if scale is None else scale**2
-    return observer
-
-
-def test_what_a_lagging_output_shows_has_the_derivatives_of_a_first_order_lag() -> None:
-    observer, x = lag_observer(), np.array([31.0, 26.0])
-    observer.shown, observer.lag, observer.scale = np.array([24.0]), np.array([3.0]), np.array([-0.1])
-    y, H = observer._shows(x, observer.shown)
-    plain = MODEL.output(x)
-    less = plain[1] - 0.1 * (plain[1] - observer.start[0])
-    np.testing.assert_allclose(y, [plain[0], 24.0 + 0.4 * (less - 24.0)])  # 2 s of 2 s and 3 s
-    for column, eps in ((0, [1e-6, 0]), (1, [0, 1e-6])):
-        np.testing.assert_allclose(
-            H[:, column], (observer._shows(x + eps, observer.shown)[0] - y) / 1e-6, atol=1e-6
-        )
-    np.testing.assert_allclose(H[:, -3], (observer._shows(x, observer.shown + 1e-6)[0] - y) / 1e-6, atol=1e-6)
-    observer.lag = observer.lag + 1e-6
-    np.testing.assert_allclose(H[:, -2], (observer._shows(x, observer.shown)[0] - y) / 1e-6, atol=1e-5)
-    observer.lag, observer.scale = observer.lag - 1e-6, observer.scale + 1e-6
-    np.testing.assert_allclose(H[:, -1], (observer._shows(x, observer.shown)[0] - y) / 1e-6, atol=1e-5)
-
-
-@pytest.mark.parametrize(("lag", "found"), [(0.0, 0.0), (5.0, 5.0), (30.0, 12.0)])
-@pytest.mark.parametrize("share", [0.0, 0.5])
-def test_a_lag_is_learnt_from_a_rise_and_stays_between_none_and_six_samples(lag, found, share) -> None:
-    observer, d = lag_observer(), np.array([25.0])
-    x, shown = observer.x.copy(), float(MODEL.output(observer.x)[1])
-    for k in range(60):
-        u = np.array([SPAN * k / 60])
-        shown += DT / (DT + lag) * (MODEL.output(x)[1] - shown)
-        after = MODEL.next_state(x, u, d)
-        ahead = shown + DT / (DT + lag) * (MODEL.output(after)[1] - shown)
-        y = MODEL.output((1 - share) * x + share * after)
-        y[1] = (1 - share) * shown + share * ahead  # as the filter has it between samples
-        observer.advance(share * DT, u, d)
-        observer.look(d)
-        observer.update(y + OFFSET)
-        observer.advance((1 - share) * DT, u, d)
-        assert 0.0 <= observer.lag[0] <= 12.0
-        x = after
-    assert observer.lag[0] == pytest.approx(found, abs=0.3)
-
-
-def test_an_output_that_moves_less_than_the_model_is_not_taken_for_one_that_lags() -> None:
-    observer, d = lag_observer(1.4e-3), np.array([25.0])
-    x, start = observer.x.copy(), MODEL.output(observer.x)[1]
-    for k in range(60):
-        u = np.array([SPAN * min(k / 20, 1.0)])
-        x = MODEL.next_state(x, u, d)
-        y = MODEL.output(x)
-        y[1] = start + 0.97 * (y[1] - start)
-        observer.predict(u, d)
-        observer.update(y + OFFSET)
-    assert observer.lag[0] < 0.8  # more than 6 without the scale
-    assert observer.scale[0] == pytest.approx(-0.03, abs=0.003)
-    np.testing.assert_allclose(MODEL.output(observer.x) + observer.output_bias, y + OFFSET, atol=0.1)
-
-
-def test_noise_at_rest_shows_no_lag_and_leaves_it_as_uncertain_as_it_was() -> None:
-    a, dt = float(np.exp(-0.05)), 5.0
-    heater = StateSpaceModel(
-        ("q",), (), ("t",), A=[[a, 40 * (1 - a)], [0, 0]], B=[[0], [1]], C=[[1.0, 0]], dt=dt, y0=[25.0]
-    )
-    model = PredictionModel(Plant(heater, {}, dt=dt, units={"q": "1"}, valid={"q": (0.0, 1.0)}), dt=dt)
-    chosen = choose_disturbances(model, ("t",))
-    for seed in range(10):
-        observer, rng = Observer(model, chosen, lagged=[0]), np.random.default_rng(seed)
-        observer.reset(np.full(1, 25.0), np.zeros(0))
-        observer.expect_lags()
-        for _ in range(5):
-            observer.predict(np.zeros(1), np.zeros(0))
-            observer.update(25.0 + 0.05 * rng.standard_normal(1))
-        assert observer.lag[0] < 0.4 * dt
-        assert observer.lag_sd[0] > 0.8 * ObserverNoise.lag * dt
-
-
-def test_a_reading_between_two_moves_is_not_taken_for_a_lag() -> None:
-    """The curve of a rise within a sample lies below the straight line that the filter has there."""
-    lags = {}
-    for name in ("refine", "update"):
-        observer = Observer(MODEL, CHOSEN, NOISE, lagged=[1])
-        observer.reset(LEVEL + OFFSET, np.array([25.0]))
-        observer.expect_lags()
-        observer.predict(np.array([SPAN]), np.array([25.0]))
-        observer.advance(0.5 * DT, np.array([SPAN]), np.array([25.0]))
-        observer.look(np.array([25.0]))
-        before = observer.x, observer.lag_sd, observer.scale
-        getattr(observer, name)(observer.reading() - [0.0, 0.3])
-        lags[name] = observer.lag[0]
-        assert np.abs(observer.x - before[0]).max() > 1e-4  # it corrects the states all the same
-        if name == "refine":
-            assert (observer.lag_sd, observer.scale) == (pytest.approx(before[1]), before[2])
-    assert lags["refine"] == 0.0
-    assert lags["update"] > 0.01 * DT
-
-
-def test_where_a_lag_would_be_negative_the_estimate_is_that_without_one() -> None:
-    one, other = Observer(MODEL, CHOSEN, NOISE, lagged=[1]), Observer(MODEL, CHOSEN, NOISE)
-    for observer in (one, other):
-        observer.reset(LEVEL + OFFSET, np.array([25.0]))
-        observer.expect_lags()
-        for _ in range(2):
-            observer.predict(np.array([SPAN]), np.array([25.0]))
-    before, one._P[-1], one._P[:, -1] = one.x, 0.0, 0.0
-    other.R = other.R + one._doubt()  # of a lag that may be there
-    for observer in (one, other):
-        observer.update(observer.reading() + [0.2, 0.5])  # it rises faster than the model
-    assert one.lag[0] == pytest.approx(0.0, abs=1e-12)
-    assert np.abs(one.x - before).max() > 0.05
-    np.testing.assert_allclose([*one.x, *one.w], [*other.x, *other.w], atol=1e-9)
-
-
-def test_readings_of_a_black_box_count_by_no_more_than_their_own_noise_and_the_models_error_or_four_times():
-    old = replace(make_tank(), noise={"t_tank": 9.0, "t_surface": 0.1})
-    errs = {"t_tank": 0.4, "t_surface": 0.2}
-    scores = PlantScores(reading_sd={"t_tank": 0.3, "t_surface": 0.02}, held_out_rmse=errs)
-    plants = old, replace(old, scores=scores)
-    old, new = ([*default_design(p).observer(PredictionModel(p, dt=2.0)).R] for p in plants)
-    assert old == pytest.approx([81.0, 0.01])
-    assert new == pytest.approx([0.25, 0.08**2])
-
-
-@pytest.mark.parametrize("structure", ["", "na 2"])
-def test_a_black_box_learns_a_load_that_lasts_sooner_and_a_network_as_before(structure: str) -> None:
-    plain = MODEL.plant
-    made = PredictionModel(replace(plain, scores=PlantScores(structure=structure)), dt=DT)
-    noise = replace(NOISE, drive=1e-3)
-    observer, same = Observer(made, CHOSEN, noise), Observer(MODEL, CHOSEN, noise)
-    x, room = MODEL.rest(LEVEL, np.array([25.0])), np.array([25.0])
-    for each in (observer, same):
-        each.reset(MODEL.output(x) + OFFSET, room)
-        each.lasting = np.array([0.31, 0.0])  # just beyond 3 sqrt(0.02 / 1.98)
-        before = each._P.copy()
-        F = each._sample(np.zeros(1), room)[2]
-        each.predict(np.zeros(1), room)
-        added = np.diag(each._P - F @ before @ F.T)
-        drive = MODEL.n_x + int(np.argmax(each.is_drive))
-        times = 25.0 if each is observer and structure else 1.0
-        want = each.Q * np.where(np.arange(added.size) == drive, times, 1.0)
-        np.testing.assert_allclose(added, want, rtol=1e-6, atol=1e-12)
-    observer.lasting = np.array([0.30, -0.30])  # within
-    before, F = observer._P.copy(), observer._sample(np.zeros(1), room)[2]
-    observer.predict(np.zeros(1), room)
-    np.testing.assert_allclose(np.diag(observer._P - F @ before @ F.T), observer.Q, rtol=1e-6, atol=1e-12)
-    # a fiftieth of the newest innovation of a move, nothing of a reading between two
-    observer.lasting = np.array([0.1, 0.1])
-    held = observer.lasting.copy()
-    observer.refine(observer.reading() + 0.5)
-    np.testing.assert_array_equal(observer.lasting, held)
-    observer.update(observer.reading() + [0.5, np.nan])
-    assert observer.lasting[1] == held[1]
-    assert observer.lasting[0] > held[0]
+def test_a_reading_is_as_noisy_as_the_innovations_of_the_fit_say_else_as_its_sensor_or_the_fit():
+    tank = replace(make_tank(), noise={"t_tank": 9.0, "t_surface": 0.1})
+    sensors = PlantScores(reading_sd={"t_tank": 0.3, "t_surface": 0.02})
+    record = InnovationNoise(0.01, {"t_tank": 0.4, "t_surface": 0.03}, {"drive": 0.002}, {"drive": 0.4})
+    for scores, want in (
+        (PlantScores(), [9.0, 0.1]),
+        (sensors, [0.3, 0.02]),
+        (replace(sensors, innovations=record), [0.4, 0.03]),
+    ):
+        plant = replace(tank, scores=scores)
+        R = default_design(plant).observer(PredictionModel(plant, dt=2.0)).R
+        assert np.sqrt(R) == pytest.approx(want)

@@ -107,34 +107,3 @@ def test_what_the_model_does_not_explain_is_reported_of_the_drive_first(
 )
 def test_a_switch_is_off_below_a_half_and_only_where_it_is_read(reading: dict[str, float], off: bool):
     assert is_off(("a", "b"), reading) == off
-
-
-def lagging(lag: float, sd: float, drive: float = 0.0) -> SimpleNamespace:
-    """Return an observer of outputs a and b, of which b lags, whose drive is off by so much of its range."""
-    chosen = SimpleNamespace(on_drive=np.array([[1.0, 0.0]]))
-    model = SimpleNamespace(dt=2.0, outputs=("a", "b"))
-    return SimpleNamespace(
-        lag=np.array([lag]), lag_sd=np.array([sd]), lagged=[1], model=model, disturbance=chosen,
-        w=np.array([drive, 9.0]),
-    )  # fmt: skip
-
-
-@pytest.mark.parametrize(
-    ("rows", "said"),
-    [
-        ([(1.4, 0.2)] * 7, "0000111"),  # more than 0.65 samples of 2 s, and five standard deviations
-        ([(1.4, 0.2)] * 4 + [(1.2, 0.1)] + [(1.4, 0.2)] * 5, "0000000001"),  # five in a row
-        ([(1.4, 0.29)] * 6 + [(4.0, 0.51)] * 6, "0" * 12),  # or not surely
-        ([(4.0, 0.49)] * 5 + [(0.6, 3.0), (0.4, 0.01), (0.6, 0.01)], "00001100"),  # it stays to a quarter
-        ([(1.4, 0.2, -0.3)] * 5 + [(1.4, 0.2, 0.29)] * 5, "0000000001"),  # a weak drive explains more
-    ],
-)
-def test_a_lag_is_reported_once_it_is_sure_and_until_it_is_small(rows: list[tuple[float, ...]], said: str):
-    monitor = ReadingMonitor(2, 1)
-    found = [monitor.slower(lagging(*row)) for row in rows]
-    assert "".join("01"[bool(text)] for text in found) == said
-    assert set(found) <= {""} | {
-        f"b is slower than the model by about {row[0]:.2g} s: identify the plant anew" for row in rows
-    }
-    monitor.forget(EXPECTED)
-    assert not monitor.slower(lagging(1.4, 0.2))

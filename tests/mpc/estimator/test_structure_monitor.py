@@ -7,17 +7,17 @@ from dataclasses import replace
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from tests.mpc.makers import network_plant
-from thermogrip.mpc.closed_loop.simulate import Surroundings, Truth
-from thermogrip.mpc.controllers.mpc import Controller, design_controller
-from thermogrip.mpc.design.design import default_design
+from thermogrip.mpc.closed_loop.simulate import RecordedController, Surroundings, Truth
+from thermogrip.mpc.controllers.loop_monitor import LoopMonitor
+from thermogrip.mpc.controllers.mpc import design_controller
 from thermogrip.mpc.estimator.structure_monitor import Misfit, StructureMonitor, _Row, _tested
 from thermogrip.mpc.interface import Move
-from thermogrip.mpc.native.runtime import wanted
 from thermogrip.sysid.plant.plant import Plant
 
 DT = 4.0
@@ -34,8 +34,14 @@ def kit() -> Plant:
     return replace(plant, free=free, scales=scales, covariance=spread, noise=noise)
 
 
+def watched(plant: Plant, **changes: Any) -> RecordedController:
+    """Return the default controller of a plant with a monitor beside it."""
+    controller = design_controller(plant, **changes)
+    return RecordedController(controller, LoopMonitor(plant, controller.design))
+
+
 def loop(
-    controller: Controller, truth: Plant, around: Surroundings | None = None, seed: int = 0
+    controller: RecordedController, truth: Plant, around: Surroundings | None = None, seed: int = 0
 ) -> list[Move]:
     """Return the moves of 200 s at each target."""
     world, moves = Truth(truth, DT, around or Surroundings(), None, seed), []
@@ -52,21 +58,20 @@ def told(moves: list[Move]) -> list[str]:
 
 @pytest.mark.parametrize("draw", [0, 1, 3])
 def test_a_draw_of_the_posterior_is_not_reported(draw: int):
-    controller = design_controller(kit(), dt=DT)
+    controller = watched(kit(), dt=DT)
     assert not told(loop(controller, kit().draw(draw), seed=draw))
-    assert controller.structure.denies
+    assert controller.monitor.structure.denies
 
 
 def test_a_drive_that_is_a_fifth_weaker_than_the_posterior_has_it_is_not_reported():
     numbers = replace(kit(), covariance=kit().covariance / 100)
-    controller = design_controller(numbers, dt=DT)
+    controller = watched(numbers, dt=DT)
     assert not told(loop(controller, numbers, Surroundings(drive_share=0.8)))
-    assert controller.structure.denies
+    assert controller.monitor.structure.denies
 
 
 def test_drives_that_acted_a_sample_later_than_the_model_was_told_are_slower_by_a_sample():
     controller = design_controller(kit(), dt=DT)
-    controller.structure.note = lambda *_: None  # type: ignore[method-assign]
     seen = StructureMonitor(kit(), controller.model, ("t1", "t2"))
     rows, world = [], Truth(kit(), DT, Surroundings(noise=0.01, quantum=0.0), None, 2)
     controller.reset(world.reading())
@@ -96,7 +101,7 @@ def test_drives_that_acted_a_sample_later_than_the_model_was_told_are_slower_by_
 
 @pytest.mark.slow
 def test_of_60_draws_none_is_reported():
-    controller = design_controller(kit(), dt=DT)
+    controller = watched(kit(), dt=DT)
     assert not [k for k in range(60) if told(loop(controller, kit().draw(k + 10), seed=k))]
 
 
@@ -112,7 +117,7 @@ def test_of_60_draws_none_is_reported():
     ],
 )
 def test_what_the_model_lacks_is_reported_in_two_windows(around: Surroundings, words: str):
-    moves = loop(design_controller(kit(), dt=DT), kit().draw(1), around, 1)
+    moves = loop(watched(kit(), dt=DT), kit().draw(1), around, 1)
     assert [move.status for move in moves].index("mismatch") <= 40
     assert re.search(words, told(moves)[0])
     assert re.match("t[12] (is slower|has a second mass)|q1, q2 act later", told(moves)[-1])
@@ -129,7 +134,7 @@ def bench():
 
         patch.setattr(mismatch, "SECONDS", 60.0)
         model = mismatch.model_of()
-        yield mismatch, Controller(model, default_design(model), compiled=wanted())
+        yield mismatch, watched(model)
 
 
 @pytest.mark.parametrize(
@@ -222,38 +227,39 @@ def test_a_report_stays_until_a_window_that_would_show_it_does_not():
 
 
 def test_a_window_is_of_calls_at_the_sample_time_and_of_drives_near_the_model():
-    controller = design_controller(kit(), dt=DT)
+    controller = watched(kit(), dt=DT)
     loop(controller, kit())
-    monitor = controller.structure
+    monitor, observer = controller.monitor.structure, controller.monitor.observer
     assert len(monitor._history) == 100
     reading = {"t1": 35.0, "t2": 45.0, "time_s": 396.0}
     for late, length in ((4.0, 5 * monitor.window + 1), (5.0, 1), (4.0, 2), (4.2, 3), (4.6, 1)):
         reading["time_s"] += late
         controller.step(reading, TARGETS[1])
         assert len(monitor._history) == length, late
-    controller.observer.w = np.array([0.5, 0.0])
-    monitor.note(controller.observer, np.zeros(2), np.zeros(2), np.zeros(0))
+    observer.w = np.array([0.5, 0.0])
+    monitor.note(observer, np.zeros(2), np.zeros(2), np.zeros(0))
     assert not monitor._history
 
 
 def test_a_lost_reading_counts_nothing_and_a_run_that_diverges_says_nothing():
-    controller = design_controller(kit(), dt=DT)
+    controller = watched(kit(), dt=DT)
     loop(controller, kit(), seed=3)
-    monitor, whole = controller.structure, controller.structure.misfit(controller.observer)
+    monitor, observer = controller.monitor.structure, controller.monitor.observer
+    whole = monitor.misfit(observer)
     rows = list(monitor._history)
     monitor._history[-3] = rows[-3]._replace(y=np.array([np.nan, rows[-3].y[1]]))
-    part = monitor.misfit(controller.observer)
+    part = monitor.misfit(observer)
     assert np.all(part.sd >= whole.sd * 0.995)
     np.testing.assert_allclose(part.size, whole.size, atol=1.5)
     for before, after in pairwise(range(len(rows))):
         monitor._history[after] = rows[before]._replace(u=np.full(2, 1e300))
-    assert monitor.misfit(controller.observer) is None
+    assert monitor.misfit(observer) is None
 
 
 def test_a_plant_without_a_posterior_is_not_watched():
-    controller = design_controller(replace(kit(), covariance=None), dt=DT)
+    controller = watched(replace(kit(), covariance=None), dt=DT)
     moves = loop(controller, kit().draw(1), Surroundings(move_delay_s=8.0))
-    assert not controller.structure.said
+    assert not controller.monitor.structure.said
     assert not told(moves[:20])
     drawn = np.array([kit().draw(k).p for k in range(1, 400)])
     sampled = StructureMonitor(replace(kit(), covariance=None, samples=drawn), controller.model, ("t1",))

@@ -54,5 +54,5 @@ def test_another_value_is_another_header(monkeypatch: pytest.MonkeyPatch) -> Non
     monkeypatch.setattr(reach, "STRIDE", 0.4)
     changed = set(shared_definitions()) - set(before)
     assert changed == {"#define TG_STRIDE 0.4"}
-    assert "#define TG_KEPT (-3.0)" in before
+    assert "#define TG_CAUTION 3.0" in before
     assert "#define TG_SHARES {0.5, 0.25, 0.1, 0.0}" in before

@@ -14,24 +14,24 @@ from tests.mpc.makers import crossed
 from thermogrip.mpc.closed_loop.simulate import simulate_closed_loop
 from thermogrip.mpc.closed_loop.simulate_native import compiled_loop
 from thermogrip.mpc.controllers.mpc import Controller
-from thermogrip.mpc.design.design import Design, PILoop, default_design
+from thermogrip.mpc.design.design import Design, default_design
 from thermogrip.mpc.estimator.observer import Observer, choose_disturbances
 from thermogrip.mpc.native.runtime import wanted
-from thermogrip.mpc.optimiser.reach import Reach, _least_squares_in_box, _Relaxation
+from thermogrip.mpc.optimiser.reach import Reach, _least_squares_in_box
 from thermogrip.mpc.optimiser.rti import Optimiser
 from thermogrip.mpc.plant.prediction import PredictionModel
 
 LIMIT = {"t_tank": (8.0, 50.0)}
 OWN = {"t_surface": (20.0, 48.0)}  # of what is controlled
-LEAKY = {"heat": 0.14, "loss": 1 / 150}  # 45.6 degC at most, and the model expects 102
+LEAKY = {"heat": 0.14, "loss": 1 / 150}  # 45.6 degC at most, and the model expects 102: a monitor's matter
 WEAK = {"heat": 0.02}  # 38.7 degC at most
 OPTIMUM = {"joule": 0.1}  # 4.5 degC at least, as far as its drive may go
 
 #: truth, its model, limits, targets with seconds, after how many samples at most the last target is reported
 #: as unreachable (None: never), and the value that can be held
 ROWS = {
-    "more loss than the model's, 1.4 K out of reach": (LEAKY, {}, {}, [(34, 180), (47, 300)], 100, 45.6),
-    "more loss than the model's, 4.4 K out of reach": (LEAKY, {}, {}, [(34, 180), (50, 300)], 85, 45.6),
+    "more loss than the model's, 1.4 K out of reach": (LEAKY, {}, {}, [(34, 180), (47, 300)], None, 0),
+    "more loss than the model's, 4.4 K out of reach": (LEAKY, {}, {}, [(34, 180), (50, 300)], None, 0),
     "more loss than the model's, in reach": (LEAKY, {}, {}, [(34, 180), (45, 300)], None, 0),
     "a limit of the tank": ({}, {}, LIMIT, [(34, 180), (60, 500)], 1, 49.5),
     "nearly a limit of the tank": ({}, {}, LIMIT, [(34, 180), (48, 500)], None, 0),
@@ -42,7 +42,7 @@ ROWS = {
     "far beyond an optimum": (OPTIMUM, OPTIMUM, {}, [(-20, 600)], 3, 4.5),
     "nearly an optimum": (OPTIMUM, OPTIMUM, {}, [(5, 600)], None, 0),
     "an end of the drive": (WEAK, WEAK, {}, [(42, 600)], 1, 38.7),
-    "hardly beyond an end of the drive": (WEAK, WEAK, {}, [(39.5, 600)], 12, 38.7),
+    "hardly beyond an end of the drive": (WEAK, WEAK, {}, [(39.5, 600)], 20, 38.7),
     "nearly an end of the drive": (WEAK, WEAK, {}, [(38, 600)], None, 0),
     "less power than the model's": ({"heat": 0.077}, {}, {}, [(34, 180), (38, 300)], None, 0),
 }
@@ -84,7 +84,7 @@ def test_a_target_out_of_reach_is_reported_soon_and_kept_and_no_other_is(row, ta
         assert first_said <= latest
         assert set(after[first_said:]) == {"infeasible"}
         found = re.search(r"no drive holds .* degC: (-?[0-9.]+) degC can be held", loop.advice[-1])
-        assert float(found[1]) == pytest.approx(value, abs=0.6)
+        assert float(found[1]) == pytest.approx(value, abs=0.7)
     if wanted():
         compiled = compiled_loop(Controller(plant, design, compiled=True), truth, schedule)
         assert compiled.status == loop.status
@@ -93,7 +93,6 @@ def test_a_target_out_of_reach_is_reported_soon_and_kept_and_no_other_is(row, ta
 
 # ---- its parts, by hand ----
 
-NAN = float("nan")
 DESIGN = Design(
     dt=2.0, controlled=("b", "a"), blocks=(1, 2), drive_range={"q1": (-50.0, 100.0), "q2": (0.0, 80.0)},
     slew_per_s={"q1": 4.0, "q2": 10.0}, limits={"a": (16.0, 28.0)},
@@ -106,38 +105,6 @@ NO_SIDE, FREE = np.zeros(2), {"low": np.array([-99.0, 0.0]), "high": np.array([9
 
 def reach(**changes) -> Reach:
     return Reach(Optimiser(MODEL, replace(DESIGN, **changes)), OBSERVER)
-
-
-def test_means_of_a_relaxation_are_joined_when_there_are_twelve():
-    relaxation = _Relaxation()
-    for value in [*range(11), 11.0, 20.0, 30.0, 7.0]:
-        relaxation.add(value)
-    assert relaxation.bins == [0.5, 2.5, 4.5, 6.5, 8.5, 10.5, 25.0]
-    assert (relaxation.per, relaxation.sum, relaxation.n) == (2, 7.0, 1)
-
-
-SLOPE = np.hypot(np.hypot(10.4, 25.8), 17.9)  # of g by the three means, one of which is 10.4 off
-
-
-@pytest.mark.parametrize("way", [1.0, -1.0])
-@pytest.mark.parametrize(
-    ("bins", "target", "g", "limit"),
-    [
-        # means 2, 7, 9.5: d1 = 5, d2 = 2.5, 10.4 left of 10.5: 5 * 10.4 - 2.5 * 12.9, and 9.5 + 2.5
-        ([99.0, 1.0, 3.0, 6.0, 8.0, 10.0, 9.0], 20.0, 19.75 / SLOPE, 12.0),
-        ([99.0, 98.0, 1.0, 3.0, 6.0, 8.0, 10.0, 9.0], 20.0, 19.75 / SLOPE, 12.0),
-        ([99.0, 1.0, 3.0, 6.0, 8.0, 10.0, 9.0], 9.59, NAN, NAN),  # within a tenth of it
-        ([99.0, 2.0, 2.0, 7.0, 7.0, 12.0, 12.0], 20.0, NAN, NAN),  # no slower than before
-        ([2.0, 7.0, 9.5], 20.0, NAN, NAN),
-        # turned back: d2 = -1, 14 left but a tenth: 5 * 13.9 + 12.9, and 6 - 1/6
-        ([99.0, 2.0, 7.0, 6.0], 20.0, 82.4 / np.hypot(np.hypot(13.9, 25.8), 17.9) / 2**0.5, 6 - 1 / 6),
-    ],
-)  # fmt: skip
-def test_a_relaxation_that_ends_short_of_its_target(way, bins, target, g, limit):
-    relaxation = _Relaxation()
-    relaxation.bins, relaxation.per = [way * value for value in bins], 4
-    found = relaxation.falls_short(way * target, 0.3)
-    np.testing.assert_allclose(found, (g * np.sqrt(8) / 0.3, way * limit), rtol=1e-9)
 
 
 def test_least_squares_in_a_box_is_that_of_scipy():
@@ -232,8 +199,8 @@ def watcher(held: list[float], *, J=((2.0, 0.0), (0.0, 1.0)), bias: float = 0.5,
     )
 
 
-def ask(made: Reach, observer, *, seen=BOTH, target=TARGET, ahead=99.0, y=(NAN, NAN)):
-    given = {"y": np.array(y), "target": target, "side": NO_SIDE, "ahead": np.full(2, ahead), "seen": seen}
+def ask(made: Reach, observer, *, seen=BOTH, target=TARGET, ahead=99.0):
+    given = {"target": target, "side": NO_SIDE, "ahead": np.full(2, ahead), "seen": seen}
     return made.missed(observer, np.array([40.0, 30.0]), np.array([22.0]), **given)
 
 
@@ -291,48 +258,3 @@ def test_a_target_is_reachable_again_after_five_samples_in_a_row():
         found = [ask(made, observer) for _ in range(times)]
         assert found == [(0, pytest.approx(27.06, abs=0.021))] * times
     assert [ask(made, observer) for _ in range(3)] == [None] * 3
-
-
-@pytest.mark.parametrize(
-    ("unreachable", "g", "miss", "w", "short"),
-    [
-        (False, 3.1, 0.11, 0.0, True),
-        (False, 3.0, 0.11, 0.0, False),
-        (False, 3.1, 0.1, 0.0, False),
-        (False, 3.1, 0.0, -0.41, True),  # the bias has moved by 0.82 away from the target, 2 * 0.4 is much
-        (False, 3.1, 0.0, -0.39, False),
-        (False, 3.1, 0.0, 0.41, False),
-        (True, -2.9, 0.0, 0.0, True),
-        (True, -3.1, 0.0, 0.0, False),
-    ],
-)
-def test_what_readings_say_counts_where_the_model_has_no_say(unreachable, g, miss, w, short):
-    made, asked = reach(), []
-    made._unreachable = unreachable
-    made._relaxations = [
-        SimpleNamespace(w=np.zeros(2), falls_short=lambda *given: asked.append(given) or (g, 28.5)),
-        SimpleNamespace(w=np.zeros(2), falls_short=lambda *given: (g, 25.0)),
-    ]
-    J, sd = np.array([[-2.0, 0.0], [0.0, 1.0]]), np.array([0.4, 0.4])
-    seen = np.array([True, False])
-    found, ends = made._readings_say(np.array([w, 0.0]), J, sd, np.array([miss, 9.0]), TARGET, seen)
-    assert found.tolist() == [short, False]
-    np.testing.assert_array_equal(ends, [28.5, NAN])
-    assert asked == [(27.0, pytest.approx(np.sqrt(OBSERVER.R[1])))]
-
-
-def test_a_relaxation_begins_anew_when_its_own_drive_moves_or_its_reading_is_lost():
-    made = reach()
-    rows = (
-        ([40.0, 30.0], [25.0, 24.0], [1, 1], [0, 0]),
-        ([41.0, 32.5], [25.0, 24.0], [2, 2], [0, 0]),  # 1 % of its range is still
-        ([41.1, 32.5], [25.0, 24.0], [1, 3], [2, 0]),  # b is q1's
-        ([41.1, 32.6], [25.0, 24.0], [2, 1], [2, 3]),
-        ([41.1, 32.6], [NAN, 24.0], [0, 2], [4, 3]),
-    )
-    for at, (u, y, kept, since) in enumerate(rows):
-        made._record(np.array(y), np.array(u), np.array([at, 0.2]))
-        assert [len(relaxation.bins) for relaxation in made._relaxations] == kept
-        assert [relaxation.w.tolist() for relaxation in made._relaxations] == [[k, 0.2] for k in since]
-    alone = PILoop("q1", "a", Kc=1.0, Ti=1.0)
-    assert [each.tolist() for each in reach(loops=(alone,))._movers] == [[0, 1], [0, 1]]

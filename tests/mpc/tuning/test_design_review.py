@@ -69,7 +69,7 @@ DEADLINE, PELTIER = "step time fits the sample time", "current stays below the P
         (DEADLINE, "fail", "tank", {"deadline_s": 1e-7}, None),
         (PELTIER, "pass", "tank", {}, None),  # it has none
         ("horizon covers delay and lag", "fail", "tank", {"blocks": (1, 1, 1, 1)}, None),
-        (FORGETS, "warn", "tank", {"noise": ObserverNoise(drive=1e-9, output=1e-9)}, None),
+        (FORGETS, "warn", "tank", {"noise": ObserverNoise(drive={"drive": 1e-9}, output=1e-9)}, None),
         (STAND_IN, "warn", "tank", {"loops": ()}, None),
         (STAND_IN, "fail", "tank", {"loops": (PILoop("drive", "t_surface", -0.1, 50.0, 50.0),)}, None),
     ],
@@ -509,7 +509,7 @@ def test_a_plant_that_has_what_its_model_lacks_settles_or_is_warned_of(
     delay = apparent_delay(tank, ("t_surface",))
     late = [f"sensors slower by {0.5 * delay:.2g} s", f"delay longer by {0.5 * delay:.2g} s"]
     assert words == [*late, "drive weaker by 10 %"]
-    assert ("never" in found.finding) == (verdict == "warn")
+    assert ("never" in found.finding or "(asked" in found.finding) == (verdict == "warn")
 
 
 ASKED = Asked(450.0, 0.25, 0.3, 0.05, 0.0)

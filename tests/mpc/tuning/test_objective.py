@@ -350,14 +350,21 @@ def test_a_trial_has_a_sensor_that_is_off_and_a_seed_of_its_draw(monkeypatch: py
     assert len(objective.lacking(plant, fewer, ("a",))) == 1
 
 
+WALKS = ("drive_walk", "output_walk", "state_walk")
+
+
 def test_parameters_make_a_design_and_are_read_off_it():
     search = search_of(lambda *at: 60.0)
     base, spec = search.baseline, search.spec
     assert search.design({}) == base
-    made = {"move": 3.0, "terminal": 4.0, "overshoot_share": 0.4, "drive_walk": 5e-3, "output_walk": 6e-3}
-    made |= {"state_walk": 7e-3, "horizon": 31.0, "blocks": 6.0}
+    made = {"move": 3.0, "terminal": 4.0, "overshoot_share": 0.4, "drive_walk": 0.5, "output_walk": 6.0}
+    made |= {"state_walk": 0.7, "horizon": 31.0, "blocks": 6.0}
     design = search.design(made | {"drive": 0.7, "drive_share": 0.5})
-    assert parameters_of(design, spec) == pytest.approx(made)
+    # noise is read off as it is: walks are factors of a design's own
+    assert parameters_of(design, spec) == pytest.approx(made | dict.fromkeys(WALKS, 1.0))
+    assert design.noise.state == pytest.approx(0.7 * base.noise.state)
+    assert design.noise.output == pytest.approx(6.0 * base.noise.output)
+    assert design.noise.drive == {"drive": pytest.approx(0.5 * base.noise.drive["drive"])}
     assert (design.drive, design.overshoot, design.blocks) == (0.7, pytest.approx(0.12), make_blocks(31, 6))
     assert design.drive_range == {"drive": (-0.5, 0.5)}
     own_noise = {name: getattr(base.noise, name) for name in ("state", "drive", "output")}

@@ -262,7 +262,7 @@ def test_moves_filters_and_horizons_are_looked_at_and_the_best_is_searched_from(
     shares = [trial.parameters.get("still") for trial in first]
     assert shares == [*[None] * 4, 0.03, 0.1, 0.3, *[None] * 6]  # the price of travel does nothing here
     walks = [trial.parameters["state_walk"] for trial in first[6:11]]
-    assert walks == pytest.approx([0.005, 0.0015, 0.0005, 0.005, 0.005])  # it does nothing here
+    assert walks == pytest.approx([1.0, 0.3, 0.1, 1.0, 1.0])  # it does nothing here
     walk = start["output_walk"]
     trusts = [trial.parameters["output_walk"] for trial in first[8:]]
     assert trusts == pytest.approx([walk, 3 * walk, 10 * walk, walk, walk])

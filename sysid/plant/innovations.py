@@ -1,0 +1,181 @@
+r"""How noisy a plant and its sensors are, by maximum likelihood on the logs of its fit.
+
+A Kalman filter of the plant with a bias w for each graded input,
+
+    x+ = f(x, u + w, d) + noise of sd q s_x,    w+ = w + noise of sd b s_u,    y = C x + noise of sd r,
+
+in a second, where s_x is each state's spread, seen against that of the outputs, and s_u an input's range in
+the logs, makes innovations e of covariance S.  Of q and b on a grid, beside sensors as noisy as the fit found
+them, and the scale of all three that is best for each in closed form, those are kept whose likelihood is
+greatest,
+
+    -2 log L = sum_k log det S + e_k' S^-1 e_k   [1]_.
+
+The gains are those that the filter settles at, with the plant linearised once, amid the logs; predictions are
+the plant's own.
+
+References
+----------
+.. [1] K. J. Astrom, "Maximum likelihood and prediction error methods", Automatica 16(5), 1980.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import product
+
+import numpy as np
+from scipy.linalg import solve_discrete_are
+
+from thermogrip.datasets.arrays import Array
+from thermogrip.datasets.schema import Log
+from thermogrip.sysid.plant.fit_record import InnovationNoise
+from thermogrip.sysid.plant.log_grid import Stretch, cut_stretches
+from thermogrip.sysid.plant.plant_data import PlantData
+
+_MOST_STEPS = 4000  # of the logs, from their start on: a second of work, and numbers good to some percent
+_SETTLES = 20  # steps, in which a start that is not quite known dies out
+_STATE_RATIOS = (0.0, *np.geomspace(1e-3, 3.0, 8).tolist())  # of q to r
+_INPUT_RATIOS = (0.0, *np.geomspace(1e-5, 0.1, 9).tolist())  # b, before it is scaled
+
+
+def innovation_noise(plant: PlantData, logs: Sequence[Log]) -> InnovationNoise | None:
+    """Return the noise of a plant, and the fastest moves of its inputs, in logs of its fit; None where no
+    filter settles, or a reading's noise is not known to begin with."""
+    outputs, model = plant.outputs, plant.model
+    known = plant.noise | plant.scores.reading_sd
+    sd = np.array([known.get(name, 0.0) for name in outputs])
+    stretches = _as_long([part for log in logs for part in cut_stretches(plant, log)])
+    moves = np.ptp(np.concatenate([part.u for part in stretches]), axis=0) if stretches else []
+    graded = [j for j, move in enumerate(moves) if move > 0 and plant.inputs[j] not in model.switches]
+    if not (np.all(sd > 0) and graded):
+        return None
+    try:
+        with np.errstate(all="ignore"):  # a filter that diverges is the least likely one
+            found = _most_likely(plant, stretches, sd, graded)
+    except np.linalg.LinAlgError:
+        return None
+    if found is None:
+        return None
+    state, reading, inputs = found
+    names = [plant.inputs[j] for j in graded]
+    return InnovationNoise(
+        state=state,
+        reading=dict(zip(outputs, reading.tolist())),
+        input=dict(zip(names, inputs.tolist())),
+        fastest={name: _fastest(logs, name) for name in names},
+    )
+
+
+def _fastest(logs: Sequence[Log], name: str) -> float:
+    """Return the largest change of an input from a row of a log to the next, in a second."""
+    most = 0.0
+    for log in logs:
+        time, values = (np.asarray(log[key].values, dtype=float) for key in ("time", name))
+        rates = np.abs(np.diff(values)) / np.diff(time)
+        most = max(most, float(rates.max(initial=0.0)))
+    return most
+
+
+def _as_long(stretches: Sequence[Stretch]) -> list[Stretch]:
+    """Return the first stretches, as many as are needed."""
+    kept, steps = [], 0
+    for stretch in stretches:
+        if steps < _MOST_STEPS:
+            kept.append(stretch)
+        steps += len(stretch.u)
+    return kept
+
+
+def _most_likely(
+    plant: PlantData, stretches: Sequence[Stretch], sd: Array, graded: list[int]
+) -> tuple[float, Array, Array] | None:
+    """Return the noise of the states, of readings (n_y,) and of the inputs (n,), in a second."""
+    model, p, dt = plant.model, plant.p, plant.dt
+    n_x, n_y, n_w = model.n_x, len(sd), len(graded)
+    offset = np.array([plant.offsets.get(name, 0.0) for name in plant.outputs])
+    level = np.array(model.output([0.0] * n_x, p.tolist()))
+    C = np.array([model.output(row, p.tolist()) for row in np.eye(n_x).tolist()]).T - level[:, None]
+    spread = np.sqrt(np.maximum(np.diag(np.atleast_2d(model.spread)), 1e-12))
+    unit = spread / np.sqrt(np.einsum("ij,j,ij->i", C, spread**2, C)).max()
+    inputs, around = (np.concatenate([getattr(part, key) for part in stretches]) for key in "ud")
+    size = np.ptp(inputs, axis=0)[graded]
+    middle = np.nanmean(np.concatenate([part.y for part in stretches]), axis=0)
+    u0, d0 = inputs.mean(axis=0), around.mean(axis=0)
+    x0 = np.asarray(model.rest(middle - offset, u0, d0, p), dtype=float)
+
+    def step(x: Array, u: Array, d: Array) -> Array:
+        """Return states (B, n_x) a step later under inputs (B, n_u)."""
+        held = np.ascontiguousarray(np.broadcast_to(d, (len(x), 1, d.size)))
+        numbers = np.repeat(p[None], len(x), axis=0)
+        x = np.ascontiguousarray(x)
+        return np.asarray(model.rollout(x, np.ascontiguousarray(u[:, None]), held, numbers, dt)[1])
+
+    tried = 1e-3 * np.concatenate([unit, size])
+    about = np.concatenate([np.zeros((1, n_x + n_w)), np.diag(tried)])
+    pushed = np.repeat(u0[None], len(about), axis=0)
+    pushed[:, graded] += about[:, n_x:]
+    after = step(x0 + about[:, :n_x], pushed, d0)
+    into = (after[1:] - after[0]).T / tried  # (n_x, n_x + n_w)
+    if not np.isfinite(into).all():
+        return None
+    F = np.vstack([into, np.hstack([np.zeros((n_w, n_x)), np.eye(n_w)])])
+    H = np.hstack([C, np.zeros((n_y, n_w))])
+    R, r = np.diag(sd**2), float(np.sqrt(np.mean(sd**2)))
+    ratios = list(product(_STATE_RATIOS, _INPUT_RATIOS))
+    gains, spreads = [], []
+    for q, b in ratios:
+        Q = dt * np.diag(np.concatenate([(q * r * unit) ** 2, (b * size) ** 2]))
+        # what moves nothing by itself has a gain all the same
+        P = solve_discrete_are(F.T, H.T, Q + 1e-12 * np.diag(np.concatenate([(r * unit) ** 2, size**2])), R)
+        S = H @ P @ H.T + R
+        gains.append(np.linalg.solve(S, H @ P).T)
+        spreads.append(S)
+    K, inverse = np.array(gains), np.linalg.inv(spreads)
+    squares, count = np.zeros(len(ratios)), 0
+    for part in stretches:
+        readings = _on_grid(part, dt) - offset
+        z = np.zeros((len(ratios), n_x + n_w))
+        first = np.where(np.isfinite(readings[0]), readings[0], middle - offset)
+        z[:, :n_x] = model.rest(first, part.u[0], part.d[0], p)
+        for k, y in enumerate(readings):
+            if np.isfinite(y).all():
+                e = y - (z[:, :n_x] @ C.T + level)
+                if k >= _SETTLES:
+                    squares += np.einsum("bi,bij,bj->b", e, inverse, e)
+                    count += 1
+                z = z + np.einsum("bij,bj->bi", K, e)
+            u = np.repeat(part.u[k][None], len(z), axis=0)
+            u[:, graded] += z[:, n_x:]
+            z = np.hstack([step(z[:, :n_x], u, part.d[k]), z[:, n_x:]])
+    if count <= _SETTLES:
+        return None
+    scale = squares / (count * n_y)
+    cost = n_y * np.log(scale) + np.linalg.slogdet(np.array(spreads))[1]
+    if not np.isfinite(cost).any():
+        return None
+    best = int(np.nanargmin(np.where(np.isfinite(cost), cost, np.nan)))
+    by_state, by_input = divmod(best, len(_INPUT_RATIOS))
+    table = cost.reshape(len(_STATE_RATIOS), len(_INPUT_RATIOS))
+    q = _between(_STATE_RATIOS, table[:, by_input], by_state)
+    b = _between(_INPUT_RATIOS, table[by_state], by_input)
+    times = float(np.sqrt(scale[best]))
+    return times * q * r, times * sd, times * b * size
+
+
+def _between(ratios: Sequence[float], cost: Array, best: int) -> float:
+    """Return the ratio at the least of the parabola through the best one and its neighbours."""
+    ends = cost[max(best - 1, 0) : best + 2]
+    if best < 2 or len(ends) < 3 or not np.isfinite(ends).all():
+        return ratios[best]
+    bend = ends[0] - 2 * ends[1] + ends[2]
+    share = 0.5 * (ends[0] - ends[2]) / bend if bend > 0 else 0.0
+    return float(ratios[best] * (ratios[best] / ratios[best - 1]) ** share)
+
+
+def _on_grid(stretch: Stretch, dt: float) -> Array:
+    """Return the readings (N, n_y) at the grid's steps; NaN where no row is near."""
+    rows = np.searchsorted(stretch.time, dt * np.arange(len(stretch.u)) - 1e-9 * dt)
+    rows = np.minimum(rows, len(stretch.time) - 1)
+    late = stretch.time[rows] - dt * np.arange(len(stretch.u))
+    return np.asarray(np.where((late < 0.5 * dt)[:, None], stretch.y[rows], np.nan))

@@ -1,0 +1,138 @@
+"""What a monitor says of loops, on plants that are their model and on others."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.mpc.makers import make_tank, network_plant
+from thermogrip.mpc import simulate_closed_loop
+from thermogrip.mpc.closed_loop.simulate import ClosedLoop, RecordedController, Surroundings, Truth
+from thermogrip.mpc.controllers.loop_monitor import LoopMonitor, settling_time
+from thermogrip.mpc.controllers.mpc import Controller
+from thermogrip.mpc.controllers.pi import PIController
+from thermogrip.mpc.design.design import PILoop, default_design
+from thermogrip.mpc.interface import Move
+from thermogrip.sysid.plant.plant import Plant
+
+KIT = network_plant("tclab", t1=(20.0, 60.0), t2=(20.0, 60.0))
+
+
+def run(
+    plant: Plant,
+    *,
+    gain: float = 1.0,
+    target: float = 40.0,
+    seconds: float = 1500.0,
+    surroundings: Surroundings | None = None,
+) -> ClosedLoop:
+    design = default_design(KIT, dt=4.0)
+    loops = tuple(replace(loop, Kc=gain * loop.Kc) for loop in design.loops)
+    loop = RecordedController(PIController.of(KIT, design, loops), LoopMonitor(KIT, design, loops))
+    return simulate_closed_loop(loop, plant, [(target, seconds)], surroundings=surroundings)
+
+
+def test_a_loop_that_settles_is_ok_and_also_with_a_third_less_power():
+    assert set(run(KIT).status) == {"ok"}
+    around = Surroundings(drive_share=0.7)
+    assert set(run(KIT, surroundings=around).status) == {"ok"}
+
+
+def test_a_loop_whose_gain_is_much_too_high_swings():
+    found = run(KIT, gain=20.0)
+    assert found.status[-1] == "mismatch"
+    assert "swings about its target" in found.advice[-1]
+
+
+def test_a_target_out_of_reach_is_told_of():
+    found = run(KIT, target=120.0, seconds=3000.0)
+    assert found.status[-1] == "mismatch"
+    assert "off its target while q" in found.advice[-1]
+    assert "is at its limit: a load" in found.advice[-1]
+
+
+def test_drives_that_push_the_other_way_are_told_of():
+    turned, model = make_tank(heat=-0.11), make_tank()
+    design = default_design(model, controlled=("t_tank",))
+    loop = RecordedController(PIController.of(model, design, design.loops), LoopMonitor(model, design))
+    found = simulate_closed_loop(loop, turned, [(35.0, 900.0)])
+    words = "; ".join(dict.fromkeys(found.advice))
+    assert "t_tank goes away from its target while drive is at its limit" in words
+
+
+def test_a_draw_is_no_other_plant_and_half_the_power_is():
+    """A drive that lacks 40 % for a minute is a load; for good it is told, and taken back when it is gone."""
+    design, said = default_design(KIT, dt=4.0), []
+    for lasts in (60.0, 3000.0):
+        controller, monitor = Controller(KIT, design), LoopMonitor(KIT, design)
+        truth = Truth(KIT, 4.0, Surroundings(noise=0.05, quantum=0.0), None, 0)
+        words = []
+        for k in range(1500):
+            reading = truth.reading()
+            if not k:
+                controller.reset(reading)
+            move = controller.step(reading, 40.0)
+            words.append(monitor.note(reading, move, 40.0))
+            weak = 600.0 <= 4.0 * k < 600.0 + lasts
+            truth.around = replace(truth.around, drive_share=0.4 if weak else 1.0)
+            truth.apply(move)
+        said.append(words)
+    assert not any(said[0])
+    assert "follow the drive" in said[1][800]
+    assert not said[1][-1]
+
+
+def test_the_settling_time_is_that_of_a_simulated_loop_after_a_load():
+    gain, delay, lag, Kc, Ti, dt = 2.0, 4.0, 100.0, 5.0, 60.0, 0.05
+    expected = settling_time(gain, delay, lag, Kc, Ti)
+    y, total, line, left = 0.0, 0.0, [0.0] * round(delay / dt), []
+    for _ in range(round(5 * expected / dt)):
+        total -= dt * Kc / Ti * y
+        line.append(-Kc * y + total)
+        y += dt / lag * (gain * line.pop(0) + 1.0 - y)
+        left.append(abs(y))
+    settled = dt * (np.flatnonzero(np.array(left) > 0.02 * max(left))[-1] + 1)
+    assert 0.9 * expected < settled < 1.3 * expected
+    assert settling_time(-1.0, 4.0, 100.0, 5.0, 60.0) == np.inf
+
+
+def told(found: LoopMonitor, y: float, u: float) -> str:
+    """Return what is said after one sample more of the tank, on its way to 40 degC."""
+    return found._judge(np.array([y]), np.array([40.0]), np.array([u]), 2.0, "")
+
+
+def loops_of_a_tank() -> tuple[LoopMonitor, float]:
+    tank = make_tank()
+    loops = [PILoop("drive", "t_tank", Kc=0.5, Ti=60.0)]
+    found = LoopMonitor(tank, default_design(tank, controlled=("t_tank",), dt=2.0), loops)
+    return found, float(found._promised[0])
+
+
+def test_what_does_not_arrive_is_told_after_three_times_the_promise_and_no_time_counts_at_a_limit():
+    found, promised = loops_of_a_tank()
+    n = int((3 * promised + 20) / 2)
+    assert {told(found, 30.0, 0.5) for _ in range(n)} == {""}
+    assert [told(found, 30.0, 0.5) for _ in range(4)][-1].startswith("t_tank should have been at 40 ")
+    found, _ = loops_of_a_tank()
+    assert {told(found, 39.0 - 8.0 * 0.998**k, 1.0) for k in range(n)} == {""}
+
+
+@pytest.mark.parametrize(("left", "said"), [(0.7, False), (0.8, True)])
+def test_a_distance_that_stays_at_a_limit_is_held_by_nothing(left: float, said: bool):
+    found, _ = loops_of_a_tank()
+    window = float(found._delay[0] + found._lag[0])
+    words = [told(found, 40.0 - 10.0 * left ** (2 * k / window), 1.0) for k in range(int(3 * window / 2))]
+    assert ("off its target while drive is at its limit" in words[-1]) == said
+    found.forget()
+    assert not told(found, 30.0, 1.0)
+
+
+def test_calls_between_samples_and_lost_readings_are_no_news():
+    design = default_design(KIT, dt=4.0)
+    monitor, move = LoopMonitor(KIT, design), Move({"q1": 20.0, "q2": 20.0})
+    for k in range(40):
+        reading = {"time_s": 1.0 * k, "t1": 25.0 if k % 7 else float("nan"), "t2": 25.0}
+        assert monitor.note(reading, move, {"t1": 25.0, "t2": 25.0}) == ""
+    assert monitor._time_s == 36.0

@@ -1,0 +1,61 @@
+"""What the innovations of a plant's logs say of its noise, on logs whose noise is known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from thermogrip.datasets.schema import Log, make_log
+from thermogrip.sysid.models.state_space import StateSpaceModel
+from thermogrip.sysid.plant.innovations import innovation_noise
+from thermogrip.sysid.plant.plant import Plant
+
+DT, N = 2.0, 3000
+
+
+def heater() -> Plant:
+    a = float(np.exp(-DT / 60.0))
+    model = StateSpaceModel(("q",), (), ("t",), A=[[a]], B=[[0.6 * (1 - a)]], C=[[1.0]], dt=DT, y0=[25.0])
+    return Plant(model, {}, dt=DT, units={"q": "percent", "t": "degC"}, noise={"t": 0.1})
+
+
+def logged(state: float, bias: float, reading: float) -> Log:
+    """Return a log of the heater with noise of its state, of what its drive lacks, and of readings."""
+    rng, plant = np.random.default_rng(3), heater()
+    q = np.repeat(rng.choice([0.0, 30.0, 60.0], N // 50), 50)
+    x, w, y = 0.0, 0.0, []
+    A, B = plant.model.A[0, 0], plant.model.B[0, 0]
+    for u in q:
+        y.append(25.0 + x + reading * rng.standard_normal())
+        x = A * x + B * (u + w) + state * DT**0.5 * rng.standard_normal()
+        w += bias * DT**0.5 * rng.standard_normal()
+    return make_log(DT * np.arange(N), {"q": (q, "percent", "input"), "t": (np.array(y), "degC", "output")})
+
+
+@pytest.mark.parametrize(
+    ("state", "bias", "reading"), [(0.0, 0.0, 0.05), (0.05, 0.0, 0.05), (0.0, 0.5, 0.3), (0.02, 0.2, 0.02)]
+)
+def test_noise_is_found_as_it_was(state: float, bias: float, reading: float):
+    found = innovation_noise(heater(), [logged(state, bias, reading)])
+    assert found.reading["t"] == pytest.approx(reading, rel=0.25)
+    assert found.state == pytest.approx(state, rel=0.5, abs=0.1 * reading)
+    assert found.input["q"] == pytest.approx(bias, rel=0.5, abs=0.1)
+    assert found.fastest == {"q": 60.0 / DT}
+
+
+def test_lost_readings_and_two_logs_change_little():
+    log = logged(0.05, 0.0, 0.05)
+    holes = log.copy(deep=True)
+    holes["t"].values[100:180] = np.nan
+    one, other = innovation_noise(heater(), [log]), innovation_noise(heater(), [holes, log])
+    assert other.state == pytest.approx(one.state, rel=0.3)
+    assert other.reading["t"] == pytest.approx(one.reading["t"], rel=0.1)
+
+
+def test_without_a_noise_to_begin_with_or_an_input_that_moves_nothing_is_said():
+    log = logged(0.0, 0.0, 0.05)
+    assert innovation_noise(replace(heater(), noise={}), [log]) is None
+    log["q"].values[:] = 30.0
+    assert innovation_noise(heater(), [log]) is None
