@@ -68,6 +68,7 @@ IS_SET_POINT = "its name is that of a set point"
 NO_CLUE = "neither its name nor its unit shows what it is"
 _NEVER_MOVES, _COUNTS_ROWS = "it never moves", "it counts rows or time"
 BY_UNIT = "its unit is degC"
+FOLLOWS = "its course follows"
 FOLLOWED = "comes to its levels and stays there, as to a set point"
 _HELD_SHARE, _HELD_SIZE = 0.5, 0.05  # of rows with a move; of the range that its median has, at least
 _FEW = 20  # rows: too few to distinguish chance from rule
@@ -218,7 +219,7 @@ def roles_of_data(
     for name in open_:
         help_ = gain[:, names.index(name)]
         if help_.max() > _STRONG:
-            out[name] = "output", f"its course follows {names[int(help_.argmax())]}"
+            out[name] = "output", f"{FOLLOWS} {names[int(help_.argmax())]}"
     roles |= {name: role for name, (role, _) in out.items()}
     held = next((n for n in names if roles.get(n) == "input" and _is_held(columns[n])), None)
     read = [n for n in names if roles.get(n) == "output"]
@@ -342,7 +343,7 @@ def _unnamed_causes(
     columns: Mapping[str, Floats], guesses: Mapping[str, tuple[str, str]], stated: Mapping[str, str]
 ) -> dict[str, tuple[str, str]]:
     """Return what acts on the outputs although no name says so: held columns that help to predict one are
-    inputs, temperatures that no drive moves are disturbances."""
+    inputs; what no drive moves, and no name calls a reading, is a disturbance."""
     roles = {name: role for name, (role, _) in guesses.items()} | dict(stated)
     drives, outputs = ([n for n in columns if roles[n] == role] for role in ("input", "output"))
     if not drives or not outputs:
@@ -353,7 +354,7 @@ def _unnamed_causes(
         if helped is not None:
             out[name] = "input", f"it is held between its moves and helps to predict {helped}"
     moved = {name: _is_moved(columns, name, drives) for name in outputs}
-    for name in [n for n in outputs if guesses.get(n, ("", ""))[1] == BY_UNIT]:
+    for name in [n for n in outputs if guesses.get(n, ("", ""))[1].startswith((BY_UNIT, FOLLOWS))]:
         if not moved[name] and any(moved[other] for other in outputs):
             out[name] = "disturbance", f"no drive moves it ({', '.join(drives)})"
     return out
