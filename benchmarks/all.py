@@ -60,7 +60,11 @@ ALL = [
     Benchmark("mpc/sizes.py", "--peer", "--quick --states 4"),
     Benchmark("mpc/twenty_plants.py", quick="--plants 2"),
     Benchmark("control/mismatch.py", quick="--seeds 4 --only delay"),
-    Benchmark("control/eight_plants.py", "--keep {out}/eight", "--plants sous_vide --who ours,simc --keep {out}/eight"),
+    Benchmark(
+        "control/eight_plants.py",
+        "--keep {out}/eight",
+        "--plants sous_vide --who ours,simc --keep {out}/eight",
+    ),
     Benchmark("control/false_alarms.py", "--keep {out}/eight", "--hours 0.2 --keep {out}/eight"),
     Benchmark(
         "control/ten_plants.py", "--keep {out}/ten", "--plants tclab --without do-mpc --keep {out}/ten"
