@@ -489,8 +489,7 @@ def calibrate_gripper(
     ------
     UserError
         If there is no grasp, a grasp has no label, no material is in the library, both ``start`` and
-        ``prior`` are given, all grasps are of one material and there is no ``prior``, or no grasp has a known
-        ``t_object``.
+        ``prior`` are given, or all grasps are of one material and there is no ``prior``.
 
     Examples
     --------
@@ -527,7 +526,7 @@ def _calibrated(
         theta = gripper_theta(earlier, problem.labels, theta)
         spread = {k: float(getattr(earlier.spreads, k)) for k in spread}
         noise = earlier.noise
-    w = np.zeros((data.y.shape[0], 7))
+    w = _begin(problem, theta, spread)
     rounds = _ROUNDS if earlier is None else 1
     for i in range(rounds):
 
@@ -660,6 +659,17 @@ def _problem(
     )  # fmt: skip
 
 
+def _begin(problem: Problem, theta: Array, spread: Spread) -> Array:
+    """Return the nuisances to start from, (n, 7): those expected, but for objects of unknown temperature,
+    which are as far beyond where the skin ended as it came; as warm as it they would show nothing."""
+    w, data = np.zeros((problem.which.size, N_NUISANCE)), problem.data
+    last = (data.count > 0).cumsum(axis=1).argmax(axis=1)
+    went = data.y[np.arange(last.size), last] - data.level
+    away = data.level + 2 * went - problem.centre(theta)[:, T_OBJECT]
+    w[~problem.known, T_OBJECT] = (away / problem.scales(spread)[:, T_OBJECT])[~problem.known]
+    return w
+
+
 def _labelled(grasps: Sequence[Grasps], materials: Mapping[str, Material], least: int) -> Touches:
     if not grasps:
         raise UserError("no training grasps", hint="give at least one record with materials")
@@ -686,12 +696,6 @@ def _labelled(grasps: Sequence[Grasps], materials: Mapping[str, Material], least
         problem = f"{first}, and the materials table has none of the labels"
         hint = "name one of them at least as 'thermogrip materials' does: it holds the scale"
         raise UserError(problem, file=log_name(grasps[0]), column="material", hint=hint)
-    if not np.isfinite(data.t_object).any():
-        raise UserError(
-            "no training grasp has a known object temperature, so nothing shows how much of it the skin sees",
-            file=log_name(grasps[0]),
-            hint="fill in t_object_nominal_degC, if only of some",
-        )
     return data
 
 

@@ -46,6 +46,7 @@ from thermogrip.sysid.effusivity.laplace_approximation import (
     SLIPS,
     T_OBJECT,
     H,
+    Mode,
     Prior,
     at_temperature,
     doubted,
@@ -266,24 +267,45 @@ def free_evidence(
 def _free_evidence(
     gripper: GripperModel, data: Touches, near: Array | None, noise: Whitened | None
 ) -> Array:
-    """Return :func:`free_evidence` under the grade that each of the touches has."""
+    """Return :func:`free_evidence` under the grade that each of the touches has, none where another grade of
+    its touch is far ahead."""
     out, noise = np.full(data.level.size, np.nan), whitened(gripper, data) if noise is None else noise
     by_one = gripper.second is None or data.second is None
     if near is not None and by_one and gripper.discrepancy is None and not gripper.uncertain:
-        at = np.flatnonzero(np.isfinite(data.t_object))
+        known = np.isfinite(data.t_object)
+        if known.any():
+            out[known] = _evidence_of_likely(gripper, data.take(known), near[known], taken(noise, known))
+    for rest, fitted in ((data.unlike == 0.0, _fitted), (data.unlike > 0.0, _roughly_fitted)):
+        at = np.flatnonzero(rest & np.isnan(out))
         if at.size:
-            some = data if at.size == out.size else data.take(at)
-            out[at] = _evidence_near(gripper, some, near[at], taken(noise, at))
-    rest = np.flatnonzero(np.isnan(out))
-    if rest.size:
-        some = data if rest.size == out.size else data.take(rest)
-        found = _fitted(gripper, some, taken(noise, rest))
-        out[rest] = log_total(found.x, found.value) - np.log(LN_E_RANGE[1] - LN_E_RANGE[0])
+            found = fitted(gripper, data.take(at), taken(noise, at))
+            out[at] = log_total(found.x, found.value) - np.log(LN_E_RANGE[1] - LN_E_RANGE[0])
     return out
+
+
+def _evidence_of_likely(gripper: GripperModel, data: Touches, near: Array, noise: Whitened) -> Array:
+    """Return :func:`_evidence_near` of touches under their grades, -inf for a grade that is far behind."""
+    mode, n_grade = _free_modes(gripper, data, near, noise), len(gripper.grades)
+    away = (mode.u[:, EFFUSIVITY] - near[:, EFFUSIVITY]) / _ANYWHERE
+    about = over_grades(gripper, (mode.log_evidence + 0.5 * away**2).reshape(-1, n_grade))
+    at = np.flatnonzero(about > about.max(axis=1, keepdims=True) - _GRADE_BEHIND)
+    out = np.full(data.level.size, -np.inf)
+    parts: Any = (part[at] for part in mode)
+    mode = Mode(*parts)
+    out[at] = _evidence_near(gripper, data.take(at), near[at], taken(noise, at), mode)
+    return out
+
+
+def _free_modes(gripper: GripperModel, data: Touches, near: Array, noise: Whitened) -> Mode:
+    """Return where a search with ln e free ends, a row a touch."""
+    free = free_hypotheses(gripper, np.clip(near[:, EFFUSIVITY], *LN_E_RANGE))
+    law = prior_of(gripper, data, free._replace(ln_e_sd=np.full(len(near), _ANYWHERE)))
+    return fit_pairs(gripper, data, np.arange(len(near)), free, start=near, noise=noise, prior=law)
 
 
 _AROUND, _SIDE = 9, 4.0  # points about the density's place, and how many of its sds to either side
 _INNER = [1, 3, 4, 5, 7]  # of these: the others start between them
+_GRADE_BEHIND = 15.0  # nats, by the mode alone, from which on a grade has no part in the sum
 _ANYWHERE = 1.0  # of ln e about a candidate's, where its density is looked for
 _ENDED, _STEEP = 7.0, 3.0  # nats below the best where a density may end; and that it may fall beside the best
 _FEWEST = 7  # points of a density that have not ended
@@ -295,7 +317,9 @@ _HALVED = 8  # cells that are halved where they differ by more
 _ROUGH_TO = 3.0  # nats behind the best up to which points are found the more roughly
 
 
-def _evidence_near(gripper: GripperModel, data: Touches, near: Array, noise: Whitened) -> Array:
+def _evidence_near(
+    gripper: GripperModel, data: Touches, near: Array, noise: Whitened, mode: Mode | None = None
+) -> Array:
     """Return the log evidence of a free effusivity for each touch of an object of stated temperature, (n,),
     NaN where that is not sure.
 
@@ -304,9 +328,7 @@ def _evidence_near(gripper: GripperModel, data: Touches, near: Array, noise: Whi
     steeply between points."""
     row = np.arange(data.level.size)
     lowest, highest = LN_E_RANGE
-    free = free_hypotheses(gripper, np.clip(near[:, EFFUSIVITY], lowest, highest))
-    law = prior_of(gripper, data, free._replace(ln_e_sd=np.full(row.size, _ANYWHERE)))
-    mode = fit_pairs(gripper, data, row, free, start=near, noise=noise, prior=law)
+    mode = _free_modes(gripper, data, near, noise) if mode is None else mode
     place, spread = mode.u[:, EFFUSIVITY], np.sqrt(mode.covariance[:, EFFUSIVITY, EFFUSIVITY])
     low = np.clip(place - _SIDE * spread, lowest, highest - _NARROWEST)
     high = np.clip(place + _SIDE * spread, low + _NARROWEST, highest)
@@ -395,10 +417,14 @@ def _sure_total(found: _Fitted) -> Array:
 def rough_evidence(gripper: GripperModel, data: Touches) -> Array:
     """Return :func:`free_evidence` by few points, of a gripper under which densities are wide: within 0.15
     of it."""
-    noise = whitened(gripper, data)
-    grid = np.tile(np.linspace(*LN_E_RANGE, _ROUGH), (data.level.size, 1))
-    found = _evaluate(gripper, data, noise, grid, None)
+    found = _roughly_fitted(gripper, data, whitened(gripper, data))
     return np.asarray(log_total(found.x, found.value) - np.log(LN_E_RANGE[1] - LN_E_RANGE[0]))
+
+
+def _roughly_fitted(gripper: GripperModel, data: Touches, noise: Whitened) -> _Fitted:
+    """Return the fits at few points of densities that are wide."""
+    grid = np.tile(np.linspace(*LN_E_RANGE, _ROUGH), (data.level.size, 1))
+    return _evaluate(gripper, data, noise, grid, None)
 
 
 def _fitted(gripper: GripperModel, data: Touches, noise: Whitened) -> _Fitted:
@@ -442,6 +468,7 @@ def _left_out(gripper: GripperModel, data: Touches, noise: Whitened, found: _Fit
     if gripper.uncertain or gripper.discrepancy is not None:
         return out
     near = settled & (value > value.max(axis=1, keepdims=True) - _REACH)
+    near[data.unlike > 0.0] = False  # nor for nuisances so wide that a few points of them are no integral
     knots: dict[int, NDArray[np.int64]] = {}
     for i in np.flatnonzero(near.sum(axis=1) >= _KNOTS).tolist():
         at = np.flatnonzero(near[i])

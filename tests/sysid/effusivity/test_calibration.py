@@ -175,12 +175,22 @@ def test_a_refit_from_an_earlier_one_ends_at_the_same_place(files):
     [
         (lambda g: [], "no training grasps"), (lambda g: [g.drop_vars("material")], "has no material"),
         (lambda g: [g.isel(grasp=[0, 1, 2])], "at least two materials, or a prior"),
-        (lambda g: [g.drop_vars("t_object")], "no training grasp has a known object temperature"),
     ],
 )  # fmt: skip
 def test_grasps_that_teach_nothing_are_refused(files, records, match):
     with pytest.raises(UserError, match=match):
         calibrate_gripper(records(files["exp2_dT20"]))
+
+
+def test_a_training_in_which_no_object_temperature_is_known_names_materials(files):
+    """Objects 15 K below the skin, as of a heated sensor that touches what lies in the room."""
+    record = files["exp2_dT15"].drop_vars(["t_object", "t_ambient"])
+    found = calibrate_gripper([split_of(record, "train")])
+    test, names = split_of(record, "test"), ["copper", "iron", "wood"]
+    p = material_posterior(found, test, names)
+    metal = np.isin(test["material"].values, names[:2])
+    assert (p[metal, :2].sum(axis=1) > 0.5).all()
+    assert (p[~metal, 2] > 0.5).all()
 
 
 def test_calibration_finds_the_loss_and_with_it_the_temperature(device):
