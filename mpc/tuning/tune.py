@@ -153,12 +153,19 @@ def verdict_of(
     if beyond:
         return "actuator-limited", _beyond(max(beyond, key=lambda row: row.bound_s), spec)
     ratio = float(np.mean([row.settle_mean_s / max(row.bound_s, 1.0) for row in rows]))
-    against = f"{_limits(rows, spec)} {_simpler(scores, spec)}".strip()
+    limits, simpler = _limits(rows, spec), _simpler(scores, spec)
+    best = min(scores, key=lambda name: scores[name])
+    first = ""
+    if best in ("PI", "LQR"):  # what is best of all is said before all
+        kept = " (its settings are in the file, `PIController.of` runs them)" if best == "PI" else ""
+        first = f"{simpler} The MPC is what is saved{kept}. "
+    against = limits if first else f"{limits} {simpler}".strip()
     if won > _WON:
-        return "improved", f"Score {100 * won:.0f} % below the default design {unseen}. {against}"
+        return "improved", f"{first}Score {100 * won:.0f} % below the default design {unseen}. {against}"
     if ratio <= _NEAR:
-        return "actuator-limited", f"Weights win {100 * won:.1f} %: the drive is the limit. {against}"
-    return "flat", f"Weights win {100 * won:.1f} %, less than the {100 * _WON:.0f} % that count. {against}"
+        return "actuator-limited", f"{first}Weights win {100 * won:.1f} %: the drive is the limit. {against}"
+    few = f"less than the {100 * _WON:.0f} % that count"
+    return "flat", f"{first}Weights win {100 * won:.1f} %, {few}. {against}"
 
 
 def _beyond(row: Row, spec: Spec) -> str:

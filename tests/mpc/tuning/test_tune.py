@@ -672,6 +672,15 @@ def test_the_verdict_and_its_sentence(
     assert words in finding
 
 
+@pytest.mark.parametrize(
+    ("scores", "first"), [({"PI": 54.0}, "PI, "), ({"LQR": 54.0}, "LQR, "), ({}, "Score ")]
+)
+def test_the_first_sentence_names_the_best_of_all_kinds(scores: dict[str, float], first: str) -> None:
+    _, finding = verdict_of(STEP, BETTER | {"PI": 60.5, "LQR": 60.5} | scores, rows(50.0, result()))
+    assert finding.startswith(first)
+    assert ("The MPC is what is saved" in finding) == bool(scores)
+
+
 def test_a_simpler_controller_that_is_plainly_worse_is_not_named() -> None:
     _, finding = verdict_of(STEP, BETTER | {"PI": 61.9, "LQR": 62.0}, rows(50.0, result()))
     assert finding.endswith("yours takes 80 s.")
