@@ -420,11 +420,11 @@ def _repair(
         raise UserError(f"{time.size} row(s) are not a log", file=table.file, hint="give at least two rows")
     time, found = since_first_row(time)
     repairs += found + repair.describe_steps(time)
-    inputs = [values for name, values in columns.items() if roles[name] == "input"]
+    inputs, stuck = [values for name, values in columns.items() if roles[name] == "input"], False
     for name, values in columns.items():
         if roles[name] == "output" and inputs:
             moving, found = repair.drop_stuck(name, values, inputs)
-            repairs += found
+            repairs, stuck = repairs + found, stuck or bool(found)
             if np.isfinite(moving).any():
                 values = moving
             else:  # nothing is left of it to be predicted
@@ -432,7 +432,14 @@ def _repair(
         columns[name], found = _repair_column(name, values, time, units[name], roles[name], table.file)
         repairs += found
     time, columns, found = _drop_unknown_start(time, columns, roles, table.file)
-    repairs += found + repair.describe_gaps(time, {n: v for n, v in columns.items() if roles[n] == "input"})
+    repairs += found
+    read = np.any([np.isfinite(v) for n, v in columns.items() if roles[n] == "output"] or [True], axis=0)
+    if stuck and not (read[0] and read[-1]):  # a held-out part without any reading has no error
+        first, last = int(read.argmax()), int(read.size - read[::-1].argmax())
+        count = read.size - (last - first)
+        repairs.append(f"{count} rows at the ends of the log, in which no output reads, left out")
+        time, columns = time[first:last], {name: v[first:last] for name, v in columns.items()}
+    repairs += repair.describe_gaps(time, {n: v for n, v in columns.items() if roles[n] == "input"})
     return time, columns, repairs
 
 

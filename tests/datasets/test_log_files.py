@@ -919,3 +919,14 @@ def test_an_output_without_a_long_part_of_the_readings_is_left_out_beside_a_whol
     assert "LOG@0:399" in log.attrs["role_doubts"]
     stated = read_log(tmp_path / "half.csv", outputs=["near", "far"])
     assert stated["near"].attrs["role"] == "output"
+
+
+def test_the_rows_after_the_only_sensor_stuck_are_left_out(tmp_path):
+    heater = np.repeat([0, 60] * 15, 20)
+    plate = np.round(20 + lfilter([0.1], [1, -0.9], np.r_[0, heater[:-1]]), 2)
+    plate[300:] = plate[300]
+    rows = [f"{k},{heater[k]},{plate[k]}\n" for k in range(600)]
+    (tmp_path / "stuck.csv").write_text("time_s,heater,plate_degC\n" + "".join(rows))
+    log = read_log(tmp_path / "stuck.csv")
+    assert log.sizes["time"] == 300
+    assert "300 rows at the ends of the log, in which no output reads, left out" in log.attrs["repairs"]
