@@ -433,7 +433,8 @@ def _repair(
         repairs += found
     time, columns, found = _drop_unknown_start(time, columns, roles, table.file)
     repairs += found
-    read = np.any([np.isfinite(v) for n, v in columns.items() if roles[n] == "output"] or [True], axis=0)
+    known = [np.isfinite(v) for n, v in columns.items() if roles[n] == "output"]
+    read = np.any(known or [np.ones(time.size, dtype=bool)], axis=0)
     if stuck and not (read[0] and read[-1]):  # a held-out part without any reading has no error
         first, last = int(read.argmax()), int(read.size - read[::-1].argmax())
         count = read.size - (last - first)
