@@ -2,12 +2,11 @@
 
     python benchmarks/abroad/score.py FOLDER [--sets luca,house] [--each [--swapped]]
 
-By set and output: the error stated (of two boards for another run, of the rest for the run itself), that on
-the other half, the share of its readings inside the 90 % band with the band's interval score, of two boards
-by how much the gain is off on the other day; by set: the chosen model, whether it is called good, CPU
-seconds.  ``--each``: every black box beside it, fitted to the whole training half.  ``--swapped``: only the
-black boxes, fitted to the other half and scored on the training half: what errors on unseen data of the same
-plant say of which kind is best.
+By set and output: the error stated for another run, that on the other half, the share of its readings inside
+the 90 % band with the band's interval score, of two boards by how much the gain is off on the other day; by
+set: the chosen model, whether it is called good, CPU seconds.  ``--each``: every black box beside it, fitted
+to the whole training half.  ``--swapped``: only the black boxes, fitted to the other half and scored on the
+training half: what errors on unseen data of the same plant say of which kind is best.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log, column
 from thermogrip.sysid import identify
 from thermogrip.sysid.blackbox.fit import BLACK_BOXES, fit_black_box
-from thermogrip.sysid.identification import USUAL_MODELS, stated_error
+from thermogrip.sysid.identification import USUAL_MODELS
 from thermogrip.sysid.plant.plant import Plant
 from thermogrip.sysid.validation.free_run import FreeRun, free_run
 from thermogrip.sysid.validation.prediction_bands import between_runs
@@ -72,9 +71,7 @@ def score_set(some: ForeignSet, each: bool) -> None:
     band = run.band(0.9)
     scored = np.asarray(run.log["scored"].values) > 0
     for name, score in run.scores.items():
-        rows = [row for row in found.rows if row.held_out and row.model == found.model and row.output == name]
-        same = stated_error(rows, name)
-        stated = same if some.same_run else found.plant.scores.new_run_rmse.get(name, same)
+        stated = found.expected[name].rmse
         miss = np.abs(column(some.test, name) - column(run.log, name))[scored]
         half = band.half[name][scored]
         interval = float(np.mean(2 * half + 20 * np.maximum(miss - half, 0.0)))

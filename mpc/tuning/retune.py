@@ -130,7 +130,8 @@ def _identified(
 
 def _errors(old: Plant, found: Identification, loop: Log) -> tuple[RunError, ...]:
     """Return the errors of both plants over the end of the loop, the new one fitted without it."""
-    [(_, held)] = cases_of([loop], leave_one_out=False)
+    [case] = cases_of([loop], leave_one_out=False)
+    [held] = case.held
     scores = run_held_out(old, held).scores
     own = [row for row in found.rows if row.held_out and (row.model, row.log) == (found.model, held.name)]
     return tuple(RunError(row.output, row.unit, scores[row.output].rmse, row.rmse) for row in own)

@@ -50,6 +50,7 @@ from thermogrip.sysid.blackbox.order_selection import (
     Choice,
     Family,
     Model,
+    Run,
     choose,
     excess_within_noise,
     free_run_errors,
@@ -84,7 +85,8 @@ _FIXED |= {(kind, "delay"): "delays" for kind, _ in _FIXED}
 _FIXED |= {(kind, "order"): "orders" for kind in ("subspace", "parsim")}
 _MOST_FIXED = 20  # more poles, or steps of delay, than any record determines
 _AVERAGED = ("sindy", "neural")  # fitted at the averaged rate alone
-_MAX_ROWS = 8000  # beyond it the logs' own rate is not tried beside the averaged one
+_MAX_ROWS = 8000  # beyond it one step alone is tried
+_FEWEST_ROWS = 160  # of means over five rows: eight blocks' worth of the shortest that is held out
 _BLOCKS, _BLOCK_ROWS = 16, 40  # blocks of the bootstrap in all, each of so many rows at least
 _FEWEST = 8  # blocks
 _TRIES, _HOPELESS = 3, 8  # fits per draw; fits of which none agrees
@@ -116,7 +118,8 @@ def fit_black_box(
 ) -> BlackBoxFit:
     """Fit one kind of :data:`BLACK_BOXES` to one or several logs.
 
-    Where absent, signals are known by role, both the chosen step ``average`` [s] and the logs' own are tried,
+    Where absent, signals are known by role, two steps ``average`` [s] are tried (the chosen one and the logs'
+    own, or means over five rows),
     ``order`` (poles of each output; states, of ``subspace`` and ``parsim``) and ``delay`` (steps from an
     input to its effect, of ``arx``, ``oe``, ``armax`` and ``bj``) are searched, and the readings of 5 s for
     whole logs (they begin at rest), 50 samples for stretches cut out of a log, set the state of what is held
@@ -136,15 +139,9 @@ def fit_black_box(
     if kind not in FAMILIES:
         raise UserError(f"no model of kind {kind!r}", hint=known_names(kind, BLACK_BOXES))
     family = _of_order(kind, order, delay)
-    first = make_grid(logs, inputs=inputs, outputs=outputs, disturbances=disturbances, average=average)
-    grids = [first]
-    own_rows = sum(len(s.time) for s in first.segments) * first.dt / first.native
-    if average is None and first.dt > 1.5 * first.native and own_rows <= _MAX_ROWS and kind not in _AVERAGED:
-        own = first.of(logs, average=first.native)
-        grids.append(replace(own, why=f"the logs' own: held-out free runs err less than at {first.dt:.3g} s"))
-    averages = kind in ("subspace", "parsim")  # structures of it differ in how they see the same states
-    best: tuple[Grid, Choice] | None = None
+    best: tuple[float, Grid, Choice] | None = None
     refused: UserError | None = None
+    grids = _grids(kind, logs, inputs, outputs, disturbances, average)
     for at, grid in enumerate(grids):
 
         def report(done: float, what: str, at: int = at) -> None:
@@ -152,17 +149,57 @@ def fit_black_box(
                 progress((at + done) / len(grids), f"{kind}, {what}")
 
         try:
-            rows = _warmup_rows(grid, warmup)
-            choice = choose(grid, family, warmup=rows, average=averages, progress=report)
+            choice = choose(grid, family, warmup=_warmup_rows(grid, warmup), progress=report)
         except UserError as error:
-            refused = error
+            refused = refused or error
             continue
-        if best is None or choice.error < best[1].error:
-            best = (grid, choice)
+        error_of_readings = float(np.hypot(choice.error, _within_steps(grid, grids)))
+        if best is None or error_of_readings < best[0]:
+            best = error_of_readings, grid, choice
     if best is None:
         raise refused if refused is not None else UserError(f"{kind} could not be fitted")
-    grid, choice = _with_convention(*best, logs, family, warmup, averages)
+    grid, choice = _with_convention(*best[1:], logs, family, warmup)
     return BlackBoxFit(kind, _plant(grid, choice, logs), choice, grid)
+
+
+def _grids(
+    kind: str,
+    logs: Sequence[Log],
+    inputs: Sequence[str] | None,
+    outputs: Sequence[str] | None,
+    disturbances: Sequence[str] | None,
+    average: float | None,
+) -> list[Grid]:
+    """Return the logs at the steps that are tried: the averaged one and the logs' own, or where that is the
+    logs' own, five times it too."""
+    first = make_grid(logs, inputs=inputs, outputs=outputs, disturbances=disturbances, average=average)
+    rows = sum(len(segment.time) for segment in first.segments) * first.dt / first.native
+    if average is not None or kind in _AVERAGED or rows > _MAX_ROWS:
+        return [first]
+    if first.dt > 1.5 * first.native:
+        other, usual = first.native, "the logs' own"
+    elif rows >= 5 * _FEWEST_ROWS:
+        other, usual = 5 * first.native, "five rows"
+    else:
+        return [first]
+    why = f"{usual}: free runs over held-out parts err less than at {first.dt:.3g} s"
+    return [first, replace(first.of(logs, average=other), why=why)]
+
+
+def _within_steps(grid: Grid, grids: Sequence[Grid]) -> float:
+    """Return how far the readings on the finest grid lie off the lines between those of this one, in the
+    outputs' spread: errors at different steps are compared as errors of the same readings."""
+    finest = min(grids, key=lambda each: each.dt)
+    if grid.dt == finest.dt:
+        return 0.0
+    squares = []
+    for fine in finest.segments:
+        for coarse in grid.segments:
+            inside = (fine.time >= coarse.time[0]) & (fine.time <= coarse.time[-1]) & (fine.log == coarse.log)
+            lines = [np.interp(fine.time[inside], coarse.time, each) for each in coarse.y.T]
+            squares.append((fine.y[inside] - np.transpose(lines)) ** 2)
+    missed = np.sqrt(np.nanmean(np.concatenate(squares), axis=0))
+    return float(np.mean(missed / np.maximum(finest.output_spread(), 1e-9)))
 
 
 def _of_order(kind: str, order: int | None, delay: int | None) -> Family:
@@ -180,7 +217,7 @@ def _of_order(kind: str, order: int | None, delay: int | None) -> Family:
 
 
 def _with_convention(
-    grid: Grid, choice: Choice, logs: Sequence[Log], family: Family, warmup: float | None, average: bool
+    grid: Grid, choice: Choice, logs: Sequence[Log], family: Family, warmup: float | None
 ) -> tuple[Grid, Choice]:
     """Return grid and choice with inputs that were applied up to their rows where that errs clearly less;
     within a step that was averaged over several rows one row makes no difference."""
@@ -189,7 +226,7 @@ def _with_convention(
     moved = replace(grid.of(logs, ends=True), why=grid.why)
     for tried in (partial(family, only=choice.structure), family):  # the same structure first: one fit a fold
         try:
-            other = choose(moved, tried, warmup=_warmup_rows(moved, warmup), average=average)
+            other = choose(moved, tried, warmup=_warmup_rows(moved, warmup))
         except UserError:  # no structure of it is stable
             return grid, choice
         excess = np.log(choice.errors[choice.structure]) - np.log(other.errors[other.structure])
@@ -263,7 +300,7 @@ def cut_into_blocks(segments: tuple[Segment, ...]) -> list[Segment]:
 
 def _error(fit: BlackBoxFit, model: Model) -> float:
     """Return the free-run error over all logs, the worst output's, in units of its spread."""
-    return float(np.max(free_run_errors(model, fit.grid.segments, **_run_settings(fit))))
+    return float(np.max(free_run_errors(model, [Run(s) for s in fit.grid.segments], **_run_settings(fit))))
 
 
 def _misses(fit: BlackBoxFit) -> list[Array]:
@@ -289,17 +326,19 @@ def _plant(grid: Grid, choice: Choice, logs: Sequence[Log]) -> Plant:
     # a simulation counts one independent reading in 10 s, the choice counted every row
     independent = min(1 + rows * grid.dt / READING_EVERY, rows + 1) / (rows + 1)
     noise, nuisance = prior.noise * scale * np.sqrt(independent), prior.nuisance * scale
-    rmse = np.sqrt(np.mean(choice.rmse**2, axis=0))
     own = [rows_of(log, (), grid.outputs, ()) for log in logs]
+    excess = reading_excess(own, grid.outputs, grid.dt)
+    by_part = np.hypot(choice.rmse, [excess[name] for name in grid.outputs])  # of readings, not of means
+    rmse = np.sqrt(np.mean(by_part**2, axis=0))
     scores = PlantScores(
         structure=choice.structure.label,
         average_s=grid.dt,
         average_why=grid.why,
-        reading_excess=reading_excess(own, grid.outputs, grid.dt),
+        reading_excess=excess,
         reading_sd=reading_excess(own, grid.outputs, np.inf),
-        folds=list(choice.folds),
+        folds=[fold.label for fold in choice.folds],
         held_out_rmse={name: float(v) for name, v in zip(grid.outputs, rmse)},
-        held_out_by_part={name: part.tolist() for name, part in zip(grid.outputs, choice.rmse.T)},
+        held_out_by_part={name: part.tolist() for name, part in zip(grid.outputs, by_part.T)},
     )
     plant = Plant(
         choice.model,

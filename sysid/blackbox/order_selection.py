@@ -1,39 +1,34 @@
-"""Order selection by free run on held-out stretches.
+"""Order selection by free run on held-out parts.
 
 One-step error cannot choose a model: on a slow plant the last reading alone predicts the next one well,
 input or not. Every structure is therefore fitted on part of the training data and *simulated* over the
-rest: the readings of a short warm-up set its state, and the remaining rows score it. With three or more
-logs each log is held out in turn; with fewer, each of four consecutive blocks. A log or block that alone
-moves an input (the only one that stops the pump, the one with the step) is not held out: a model fitted to
-the others cannot know that input.
+rest. With three or more logs each log is held out in turn: a run from its start.  Of one or two logs
 
-**The one-standard-error rule.** With e_sf the error of structure s on fold f and b the best structure, the
+* each of four consecutive blocks is: the readings of a short warm-up set the state, the others are scored,
+  and the second half is run once more from a warm-up of its own;
+* and the last 30 percent of each log, run from the start of the log.  A block is shorter than another run
+  would be: what grows slowly, the drift of an integrator or of a pole that is a little too slow, shows here.
+
+A part that alone moves an input (the only one that stops the pump, the one with the step) is not held out:
+a model fitted to the others cannot know that input.
+
+**The one-standard-error rule.** With e_sf the error of structure s on part f and b the best structure, the
 smallest structure is taken for which
 
     mean_f ln(e_sf / e_bf) <= min(se_f ln(e_sf / e_bf), ln 1.05),        ln 1.2 over whole logs,
 
-with the standard error of the paired differences. Logarithms, because a fold whose input lies outside of
+with the standard error of the paired differences. Logarithms, because a part whose input lies outside of
 what the rest has seen is bad for every structure alike and must not outweigh the others. Models that are
-unstable or diverge on any fold are refused, and structures whose fit to all data is, or errs on them far more
-than on any fold.
-
-**Averages.** Structures that err alike on the folds may differ by much on another day, where each errs in its
-own way.  The mean of their free runs errs at most as much as they do in the mean, and less as far as their
-errors differ.  So of one or two logs, which do not show what differs between days, the average of the ten,
-five or three best structures is taken instead of the one above if
-
-    mean_f ln(hypot(e_af, s) / hypot(e_1f, s)) <= ln 1.05
-
-with the error s that another run adds, 7 percent of the outputs' spread.
+unstable or diverge on any part are refused, and structures whose fit to all data is, or errs on them far more
+than on any part.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from itertools import pairwise, product
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,15 +37,17 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.sysid.models.lti import StartPrior, estimate_starts, evaluate_terms
 from thermogrip.sysid.models.model import Model as PlantModel
 from thermogrip.sysid.models.state_space import StateSpaceModel
-from thermogrip.sysid.plant.fit_record import RUN_GAIN_LARGE, SEVERAL
+from thermogrip.sysid.plant.fit_record import HELD_OUT_SHARE, SEVERAL, TAIL
 from thermogrip.sysid.plant.log_grid import MOVED, Grid, Segment
 
 Array = NDArray[np.float64]
+Item = TypeVar("Item")
 
 HARDLY_MORE = float(np.log(1.05))  # of log errors
 MORE_BY_LOGS = float(np.log(1.2))  # the same over whole logs, of which there are few
-_AVERAGED = (10, 5, 3)  # structures
-_MOST_ON_ALL = 2.0  # times the worst fold's error: a fit to all data that errs more on them is refused
+# Times the error on the worst part: a fit to all data, which it has seen, errs on them no more than that;
+# where none does (one structure was asked for, say) no more than twice that.
+_MOST_ON_ALL = (1.0, 2.0)
 _BLOCKS = 4  # of one or two logs
 FEWEST = 20  # rows of a block that is held out
 
@@ -73,7 +70,6 @@ class Structure(NamedTuple):
 
     label: str
     size: int
-    members: tuple[Structure, ...] = ()  # of what is the average of several
 
 
 class Family(Protocol):
@@ -91,7 +87,7 @@ class Choice:
     structure: Structure
     prior: StartPrior  # the start of the free runs that served this structure best
     errors: dict[Structure, Array]  # (n_fold,) mean over outputs of RMSE / sd of the output; inf: refused
-    folds: tuple[str, ...]  # what each fold held out
+    folds: tuple[Fold, ...]  # what was held out
     rmse: Array  # (n_fold, n_y), free-run RMSE of the chosen structure, in the outputs' units
     warmup: int  # rows at the start of each run that set its state and are not scored
     model: Model  # the structure fitted to all data
@@ -106,41 +102,71 @@ class Choice:
         return float(np.exp(np.mean(np.log(np.maximum(self.errors[structure], 1e-12)))))
 
 
-def folds(grid: Grid, *, blocks: int = _BLOCKS) -> Iterator[tuple[str, Grid, tuple[Segment, ...]]]:
-    """Yield (what is held out, the training grid, the held-out segments)."""
-    if len(grid.logs) >= 3:
-        parts = [
-            (name, [s for s in grid.segments if s.log == name], [s for s in grid.segments if s.log != name])
-            for name in grid.logs
-        ]
-        yield from _of_known_inputs(grid, parts)
-        return
+class Run(NamedTuple):
+    """A segment that is run freely, and the first of its rows that is scored (after the warm-up)."""
+
+    segment: Segment
+    scored_from: int = 0
+
+
+class Fold(NamedTuple):
+    """A part of the data that is held out."""
+
+    label: str
+    train: Grid
+    runs: tuple[Run, ...]
+
+
+def folds(grid: Grid, *, blocks: int = _BLOCKS) -> list[Fold]:
+    """Return the parts that are held out in turn: those whose rest moves each input that they move, or all
+    where these are fewer than two."""
+    if len(grid.logs) >= SEVERAL:
+        parts = [_whole_log(grid, name) for name in grid.logs]
+    else:
+        parts = [*_blocks(grid, blocks), _last_parts(grid)]
+    range_of = np.ptp(np.concatenate([segment.u for segment in grid.segments]), axis=0)
+    known = [part for part in parts if _moves_all(part[1], than=part[2], least=MOVED * range_of)]
+    kept = known if len(known) >= 2 else parts
+    return [Fold(label, grid.having(rest), tuple(runs)) for label, rest, runs in kept]
+
+
+_Part: TypeAlias = "tuple[str, list[Segment], list[Run]]"  # what is held out, the rest, what is run
+
+
+def _whole_log(grid: Grid, name: str) -> _Part:
+    rest = [segment for segment in grid.segments if segment.log != name]
+    return name, rest, [Run(segment) for segment in grid.segments if segment.log == name]
+
+
+def _blocks(grid: Grid, blocks: int) -> list[_Part]:
     total = sum(len(segment.time) for segment in grid.segments)
     if total < FEWEST * blocks:
         raise UserError(
-            f"{total} rows of {grid.dt:g} s are too short to hold a part out",
+            f"{total} rows of {grid.dt:g} s are too few: parts are held out in turn, which takes "
+            f"{FEWEST * blocks}",
             hint="give a longer log or average less",
         )
     edges = [round(total * block / blocks) for block in range(blocks + 1)]
-    labels = [f"block {block + 1} of {blocks}" for block in range(blocks)]
-    cut = [_split(grid.segments, *pair) for pair in pairwise(edges)]
-    yield from _of_known_inputs(grid, [(label, *both) for label, both in zip(labels, cut)])
+    parts: list[_Part] = []
+    for at, (first, last) in enumerate(pairwise(edges)):
+        held, rest = _split(grid.segments, first, last)
+        halves = [segment.part(len(segment.time) // 2, len(segment.time)) for segment in held]
+        parts.append((f"block {at + 1} of {blocks}", rest, [Run(segment) for segment in (*held, *halves)]))
+    return parts
 
 
-def _of_known_inputs(
-    grid: Grid, parts: Sequence[tuple[str, list[Segment], list[Segment]]]
-) -> Iterator[tuple[str, Grid, tuple[Segment, ...]]]:
-    """Yield the parts (what, held out, rest) as folds: those whose rest moves each input that they move, or
-    all where these are fewer than two."""
-    range_of = np.ptp(np.concatenate([segment.u for segment in grid.segments]), axis=0)
-    known = [part for part in parts if _moves_all(part[2], than=part[1], least=MOVED * range_of)]
-    for label, held, rest in known if len(known) >= 2 else parts:
-        yield label, grid.having(rest), tuple(held)
-
-
-def held_out_runs(grid: Grid, held: Sequence[Segment]) -> list[Segment]:
-    """Return what is run freely of a held-out part: all of it, and of a block its second half once more."""
-    return [*held, *(s.part(len(s.time) // 2, len(s.time)) for s in held if len(grid.logs) < 3)]
+def _last_parts(grid: Grid) -> _Part:
+    """Return the last part of each log, to be run from the log's start."""
+    rest: list[Segment] = []
+    runs: list[Run] = []
+    for log in grid.logs:
+        segments = [segment for segment in grid.segments if segment.log == log]
+        begin, end = segments[0].time[0], segments[-1].time[-1]
+        for segment in segments:
+            at = int(np.searchsorted(segment.time, begin + (1 - HELD_OUT_SHARE) * (end - begin)))
+            rest += [segment.part(0, at)] if at >= FEWEST else []
+            runs += [Run(segment, at)] if at < len(segment.time) else []
+    return f"{TAIL}{' and '.join(grid.logs)}", rest, runs
 
 
 def priors_of(grid: Grid) -> tuple[StartPrior, ...]:
@@ -155,7 +181,7 @@ def priors_of(grid: Grid) -> tuple[StartPrior, ...]:
 
 def free_run_errors(
     model: Model,
-    segments: Sequence[Segment],
+    runs: Sequence[Run],
     *,
     dt: float,
     scale: Array,
@@ -167,9 +193,10 @@ def free_run_errors(
     if not model.stable:
         return refused
     total, count = np.zeros((len(priors), len(scale))), np.zeros(len(scale))
-    for segment in segments:
-        known = np.isfinite(segment.y[warmup:])
-        miss = free_run_misses(model, segment, dt=dt, scale=scale, warmup=warmup, priors=priors)[:, warmup:]
+    for segment, scored_from in runs:
+        first = max(warmup, scored_from)
+        known = np.isfinite(segment.y[first:])
+        miss = free_run_misses(model, segment, dt=dt, scale=scale, warmup=warmup, priors=priors)[:, first:]
         if not np.isfinite(miss[:, known]).all():
             return refused
         total += np.sum(np.where(known, miss, 0.0) ** 2, axis=1)
@@ -198,30 +225,37 @@ def choose(
     family: Family,
     *,
     warmup: int,
-    average: bool = False,
     progress: Callable[[float, str], None] | None = None,
 ) -> Choice:
-    """Fit every structure of the family on every fold and choose by the one-standard-error rule; ``average``:
-    of one or two logs the average of the best ones is taken where it errs hardly more."""
-    cases = list(folds(grid))
+    """Fit every structure of the family on every fold and choose by the one-standard-error rule."""
+    cases = folds(grid)
     scored = _score(grid, family, cases, warmup, progress)
-    left = {structure: errors.mean for structure, errors in scored.items()}
-    fitted = None
-    while fitted is None:
-        structure = _one_standard_error(left, HARDLY_MORE if len(grid.logs) < SEVERAL else MORE_BY_LOGS)
-        fitted = _fit_to_all(grid, family, structure, scored[structure], warmup)
-        del left[structure]
-    best = scored[structure].mean
-    for each in _averages_of(scored) if average and len(grid.logs) < SEVERAL else ():
-        scored |= _score(grid, partial(family, only=each), cases, warmup)
-        if each in scored and _hardly_worse(scored[each].mean, best):
-            averaged = _fit_to_all(grid, family, each, scored[each], warmup)
-            if averaged is not None:
-                structure, fitted = each, averaged
-                break
-    errors, labels = scored[structure], tuple(label for label, _, _ in cases)
+    structure, fitted = _first_sound(grid, family, scored, warmup)
+    errors = scored[structure]
     table = {each: item.mean for each, item in scored.items()}
-    return Choice(structure, errors.prior, table, labels, errors.rmse, warmup, fitted)
+    return Choice(structure, errors.prior, table, tuple(cases), errors.rmse, warmup, fitted)
+
+
+def _first_sound(
+    grid: Grid, family: Family, scored: Mapping[Structure, _Errors], warmup: int
+) -> tuple[Structure, Model]:
+    """Return the best structure whose fit to all data errs on them no more than it may, and that fit."""
+    most = HARDLY_MORE if len(grid.logs) < SEVERAL else MORE_BY_LOGS
+    on_all: dict[Structure, tuple[Model, float] | None] = {}
+    for times in _MOST_ON_ALL:
+        remaining = {structure: errors.mean for structure, errors in scored.items()}
+        while any(np.isfinite(errors).all() for errors in remaining.values()):
+            structure = smallest_near_the_best(remaining, most, size=lambda s: s.size)
+            if structure not in on_all:
+                on_all[structure] = _fit_to_all(grid, family, structure, scored[structure], warmup)
+            fit = on_all[structure]
+            if fit is not None and fit[1] <= times * float(np.max(scored[structure].mean)):
+                return structure, fit[0]
+            del remaining[structure]
+    raise UserError(
+        "no structure gives a stable model on every held-out part",
+        hint="give a longer log, more excitation, or average more",
+    )
 
 
 class _Errors(NamedTuple):
@@ -235,7 +269,7 @@ class _Errors(NamedTuple):
 def _score(
     grid: Grid,
     fit: Callable[[Grid], Mapping[Structure, Model]],
-    cases: Sequence[tuple[str, Grid, tuple[Segment, ...]]],
+    cases: Sequence[Fold],
     warmup: int,
     progress: Callable[[float, str], None] | None = None,
 ) -> dict[Structure, _Errors]:
@@ -243,15 +277,12 @@ def _score(
     scale, priors = np.maximum(grid.output_spread(), 1e-9), priors_of(grid)
     refused = np.full((len(priors), len(scale)), np.inf)
     errors: dict[Structure, list[Array]] = {}
-    for at, (label, train, held) in enumerate(cases):
+    for at, (label, train, runs) in enumerate(cases):
         if progress is not None:
             progress(at / len(cases), f"without {label}")
-        starts = held_out_runs(grid, held)
         for structure, model in fit(train).items():
             column = errors.setdefault(structure, [refused] * at)
-            column.append(
-                free_run_errors(model, starts, dt=grid.dt, scale=scale, warmup=warmup, priors=priors)
-            )
+            column.append(free_run_errors(model, runs, dt=grid.dt, scale=scale, warmup=warmup, priors=priors))
         for column in errors.values():  # a structure that could not be fitted on this fold is refused
             column.extend([refused] * (at + 1 - len(column)))
     out = {}
@@ -264,38 +295,19 @@ def _score(
     return out
 
 
-def _averages_of(scored: Mapping[Structure, _Errors]) -> list[Structure]:
-    """Return the averages of the ten, five and three best structures, as far as there are so many."""
-    logs = {s: float(np.log(np.maximum(errors.mean, 1e-12)).mean()) for s, errors in scored.items()}
-    best = sorted((structure for structure in logs if np.isfinite(logs[structure])), key=logs.__getitem__)
-    return [
-        Structure(f"average of the best {n}", sum(s.size for s in best[:n]) // n, tuple(best[:n]))
-        for n in _AVERAGED
-        if n <= len(best)
-    ]
-
-
-def _hardly_worse(errors: Array, least: Array) -> bool:
-    """Return whether errors on the folds hardly exceed others on another run, where the gain differs too."""
-    excess = np.log(np.hypot(errors, RUN_GAIN_LARGE)) - np.log(np.hypot(least, RUN_GAIN_LARGE))
-    return bool(excess.mean() <= HARDLY_MORE)
-
-
 def _fit_to_all(
     grid: Grid, family: Family, structure: Structure, errors: _Errors, warmup: int
-) -> Model | None:
-    """Return the structure fitted to all data; None if it is unstable, or errs far more than on any fold."""
+) -> tuple[Model, float] | None:
+    """Return the structure fitted to all data and its error on them; None if it is unstable."""
     fitted = family(grid, only=structure).get(structure)
-    most = _MOST_ON_ALL * float(np.max(errors.mean))
-    if fitted is None or _error_on_all(fitted, grid, errors.prior, warmup) > most:
-        return None
-    return fitted
+    return None if fitted is None else (fitted, _error_on_all(fitted, grid, errors.prior, warmup))
 
 
 def _error_on_all(model: Model, grid: Grid, prior: StartPrior, warmup: int) -> float:
     """Return the error over the data of the fit, of runs that start as held-out ones do."""
     scale = np.maximum(grid.output_spread(), 1e-9)
-    runs = held_out_runs(grid, grid.segments)
+    halves = [s.part(len(s.time) // 2, len(s.time)) for s in grid.segments if len(grid.logs) < SEVERAL]
+    runs = [Run(segment) for segment in (*grid.segments, *halves)]
     errors = free_run_errors(model, runs, dt=grid.dt, scale=scale, warmup=warmup, priors=[prior])
     return float(np.mean(errors / scale))
 
@@ -372,25 +384,23 @@ def excess_within_noise(excess: Array, most: float = HARDLY_MORE) -> bool:
     return bool(excess.mean() <= min(excess.std(ddof=1) / np.sqrt(excess.size), most))
 
 
-def _one_standard_error(table: Mapping[Structure, Array], most: float = HARDLY_MORE) -> Structure:
-    usable = {structure: error for structure, error in table.items() if np.isfinite(error).all()}
-    if not usable:
-        raise UserError(
-            "no structure gives a stable model on every held-out part",
-            hint="give a longer log, more excitation, or average more",
-        )
-    logs = {structure: np.log(np.maximum(error, 1e-12)) for structure, error in usable.items()}
-    best = min(logs, key=lambda s: float(logs[s].mean()))
-    good = [best]
-    for structure, error in logs.items():
-        if excess_within_noise(error - logs[best], most):
-            good.append(structure)
-    return min(good, key=lambda s: (s.size, float(logs[s].mean())))
+def smallest_near_the_best(
+    table: Mapping[Item, Array], most: float, *, size: Callable[[Item], float]
+) -> Item:
+    """Return by the one-standard-error rule the smallest of items that were scored on the same parts."""
+    usable = {item: error for item, error in table.items() if np.isfinite(error).all()}
+    logs = {item: np.log(np.maximum(error, 1e-12)) for item, error in usable.items()}
+    best = min(logs, key=lambda item: float(logs[item].mean()))
+    near = [item for item in logs if item == best or excess_within_noise(logs[item] - logs[best], most)]
+    return min(near, key=lambda item: (size(item), float(logs[item].mean())))
 
 
-def _moves_all(rest: Sequence[Segment], *, than: Sequence[Segment], least: Array) -> bool:
-    """Return whether the rest moves every input that these segments move by more than ``least``."""
-    own, others = (np.concatenate([segment.u for segment in some]) for some in (than, rest))
+def _moves_all(rest: Sequence[Segment], *, than: Sequence[Run], least: Array) -> bool:
+    """Return whether the rest moves every input that these runs move by more than ``least``."""
+    if not rest or not than:
+        return False
+    own = np.concatenate([run.segment.u[run.scored_from :] for run in than])
+    others = np.concatenate([segment.u for segment in rest])
     return not np.any((np.ptp(own, axis=0) > least) & (np.ptp(others, axis=0) <= least))
 
 

@@ -28,8 +28,6 @@ independent of the noise, and are biased by feedback.  (The paper goes on with A
 to be longer than any memory; solved for Gamma, a short one does.)  A drive that acts on its own row's reading
 is one that ends at its row (``Grid.ends``), which the folds choose.
 
-The average of several such models is one of low order, by balanced truncation (:func:`average`).
-
 Several logs are side by side in the Hankel matrices; a window that touches a gap or a lost reading is left
 out.
 
@@ -49,7 +47,6 @@ from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import block_diag, solve_discrete_lyapunov
 
 from thermogrip.sysid.blackbox.missing_data import MANY, fill_readings
 from thermogrip.sysid.blackbox.order_selection import (
@@ -65,11 +62,7 @@ from thermogrip.sysid.plant.log_grid import Grid
 
 Array = NDArray[np.float64]
 
-Fitted = tuple[StateSpaceModel, Sequence[Array]]  # with the initial state of each segment
-
 DEPENDENT = 1e-8  # of the largest singular value: what is less is none
-_NEAR = 0.1  # of the error: how far an average's run may be from the mean of its members'
-_MOST_STATES = 14  # of an average, or those of its smallest member
 
 
 def subspace_family(
@@ -84,8 +77,7 @@ def subspace_family(
     """Return a model for each order, number of block rows f and weighting that the data allow; where absent,
     ``rows`` are 3, 5, 8, 15 and 30 as far as the data allow (2 where they allow none), and ``terms`` none and
     the magnitudes of signed inputs, or else the squares of others."""
-    found: dict[Structure, Fitted] = {}
-    asked = None if only is None else only.members or (only,)
+    found: dict[Structure, StateSpaceModel] = {}
     longest = max(len(segment.time) for segment in grid.segments)
     sets = default_terms(grid)[:2] if terms is None else terms
     n_drive, n_y = len(grid.inputs) + len(grid.disturbances), len(grid.outputs)
@@ -99,11 +91,9 @@ def subspace_family(
             for f, w, n in product(sizes, weightings, orders)
             if n < f or (f == 2 and n <= n_y)
         }
-        wanted = {of: name for of, name in names.items() if asked is None or name in asked}
-        found |= {wanted[of]: pair for of, pair in _realised(grid, wanted, some).items()}
-    if only is not None and only.members:
-        return {only: average(grid, [*found.values()])} if len(found) == len(only.members) else {}
-    return {structure: model for structure, (model, _) in found.items()}
+        wanted = {of: name for of, name in names.items() if only in (None, name)}
+        found |= {wanted[of]: model for of, model in _realised(grid, wanted, some).items()}
+    return found
 
 
 def _columns(f: int, n_drive: int, n_y: int) -> int:
@@ -117,9 +107,9 @@ def _structure(n: int, f: int, weighting: str, some: Sequence[str], n_drive: int
 
 def _realised(
     grid: Grid, wanted: Collection[tuple[int, str, int]], terms: tuple[str, ...]
-) -> dict[tuple[int, str, int], Fitted]:
+) -> dict[tuple[int, str, int], StateSpaceModel]:
     """Return the models of these block rows, weightings and orders."""
-    out: dict[tuple[int, str, int], Fitted] = {}
+    out: dict[tuple[int, str, int], StateSpaceModel] = {}
     readings = _readings(grid, terms) if wanted else []
     for f in dict.fromkeys(f for f, _, _ in wanted):
         triangle = _triangle(grid, readings, f, terms)
@@ -157,10 +147,9 @@ def extended_observability(L32: Array, L33: Array, *, n_y: int, weighting: str) 
     return back @ (left * np.sqrt(values)), values
 
 
-def fit_inputs(grid: Grid, A: Array, C: Array, terms: tuple[str, ...] = ()) -> Fitted:
-    """Return the model with the B, E, constant of the least free-run error, given A and C, and the starts;
-    the simulated output is linear in all of them; the columns of the regression are simulations of unit
-    entries."""
+def fit_inputs(grid: Grid, A: Array, C: Array, terms: tuple[str, ...] = ()) -> StateSpaceModel:
+    """Return the model with the B, E, constant of the least free-run error, given A and C; the simulated
+    output is linear in all of them; the columns of the regression are simulations of unit entries."""
     n = A.shape[0]
     y0 = np.nanmean(np.concatenate([segment.y for segment in grid.segments]), axis=0)
     scale = np.maximum(grid.output_spread(), 1e-9)
@@ -185,8 +174,7 @@ def fit_inputs(grid: Grid, A: Array, C: Array, terms: tuple[str, ...] = ()) -> F
     W = solved[:n_shared].reshape(len(centre) + 1, n).T
     c = W[:, -1] - W[:, :-1] @ centre
     model = as_state_space(grid, A, W[:, :-1], C, c, terms=terms, origin="subspace", y0=y0)
-    starts = list(solved[n_shared:].reshape(-1, n))
-    return with_spread(model, grid, starts), starts
+    return with_spread(model, grid, list(solved[n_shared:].reshape(-1, n)))
 
 
 def _unit_responses(drive: Array, A: Array, C: Array) -> Array:
@@ -199,73 +187,13 @@ def _unit_responses(drive: Array, A: Array, C: Array) -> Array:
     return np.concatenate([forced, free]) @ C.T
 
 
-def _realise(grid: Grid, gamma: Array, terms: tuple[str, ...]) -> Fitted:
+def _realise(grid: Grid, gamma: Array, terms: tuple[str, ...]) -> StateSpaceModel:
     """Return the model of these columns of Gamma."""
     n_y = len(grid.outputs)
     A = np.asarray(np.linalg.lstsq(gamma[:-n_y], gamma[n_y:], rcond=None)[0], dtype=float)
     A = stabilised(A, max(len(segment.time) for segment in grid.segments))
     C = gamma[:n_y] * np.maximum(grid.output_spread(), 1e-9)[:, None]
     return fit_inputs(grid, A, C, terms)
-
-
-def average(grid: Grid, members: Sequence[Fitted]) -> StateSpaceModel:
-    """Return a model of low order whose free run is the mean of those of the members.
-
-    The members side by side, about their rest at the mean drive, are truncated in balanced coordinates to the
-    fewest states whose run is near the mean of theirs over the data, 14 where none is; the gains at rest are
-    kept.
-    """
-    scale = np.maximum(grid.output_spread(), 1e-9)
-    models = [model for model, _ in members]
-    terms = max((model.terms for model in models), key=len)
-    w = np.concatenate(drives(grid, terms))
-    middle = w.mean(axis=0)
-    W = [np.hstack([model.B, model.E, model.F]) for model in models]
-    W = [np.pad(some, ((0, 0), (0, len(middle) - some.shape[1]))) for some in W]
-    rest = [np.linalg.solve(np.eye(m.n_x) - m.A, some @ middle + m.c) for m, some in zip(models, W)]
-    y0 = np.mean([model.C @ x + model.y0 for model, x in zip(models, rest)], axis=0)
-    A, B = block_diag(*(model.A for model in models)), np.concatenate(W)
-    C = np.hstack([model.C for model in models]) / len(models)
-    gain = C @ np.linalg.solve(np.eye(len(A)) - A, B)
-    starts = [np.concatenate(x0) - np.concatenate(rest) for x0 in zip(*(x for _, x in members))]
-    mean = [np.mean(runs, axis=0) for runs in zip(*(_runs(grid, *member) for member in members))]
-    miss = _rms([(segment.y - y) / scale for segment, y in zip(grid.segments, mean)])
-    reached = B * w.std(axis=0) if w.std(axis=0).any() else np.stack(starts, axis=1)
-    left, right = balanced(A, reached, C / scale[:, None])
-    least = min(model.n_x for model in models)
-    for n in range(least, max(least, min(_MOST_STATES, len(A))) + 1):
-        a, c = left[:n] @ A @ right[:, :n], C @ right[:, :n]
-        at_rest = c @ np.linalg.inv(np.eye(n) - a)
-        b = left[:n] @ B
-        b += np.linalg.pinv(at_rest) @ (gain - at_rest @ b)
-        model = as_state_space(grid, a, b, c, -b @ middle, terms=terms, origin="subspace", y0=y0)
-        begin = [left[:n] @ x0 for x0 in starts]
-        if _rms([(run - y) / scale for run, y in zip(_runs(grid, model, begin), mean)]) <= _NEAR * miss:
-            break
-    return with_spread(model, grid, begin)
-
-
-def balanced(A: Array, B: Array, C: Array) -> tuple[Array, Array]:
-    """Return the maps (n, n) to and from balanced states (Moore), the strongest first."""
-    roots = []
-    for some, push in ((A, B), (A.T, C.T)):
-        size, vectors = np.linalg.eigh(solve_discrete_lyapunov(some, push @ push.T))
-        roots.append(vectors * np.sqrt(np.maximum(size, 0.0)))
-    U, values, Vt = np.linalg.svd(roots[1].T @ roots[0])
-    size = np.sqrt(np.maximum(values, 1e-14 * values[0]))
-    return (roots[1] @ U / size).T, roots[0] @ Vt.T / size
-
-
-def _runs(grid: Grid, model: StateSpaceModel, starts: Sequence[Array]) -> list[Array]:
-    """Return the outputs (n, n_y) over each segment, from these initial states."""
-    return [
-        model.rollout(x0[None], segment.u[None], segment.d[None], (), model.dt)[0][0, :-1]
-        for x0, segment in zip(starts, grid.segments)
-    ]
-
-
-def _rms(parts: Sequence[Array]) -> float:
-    return float(np.sqrt(np.nanmean(np.concatenate(parts) ** 2)))
 
 
 def stabilised(A: Array, rows: int) -> Array:

@@ -24,7 +24,7 @@ s are not scored, and the figure with the last row held through the gap is given
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -45,7 +45,7 @@ from thermogrip.sysid.validation.residual_tests import (
     cross_correlation,
     residual_correlations,
 )
-from thermogrip.sysid.validation.verdict import EXCEEDS, NO_BETTER, Verdict, judge
+from thermogrip.sysid.validation.verdict import NO_BETTER, Cause, Verdict, judge
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -55,6 +55,7 @@ if TYPE_CHECKING:
     from thermogrip.sysid.plant.plant import Plant
     from thermogrip.sysid.validation.prediction_bands import Band
 
+EXCEEDS = 2.0  # times the error of the fit, from which that is reported
 START = 0.1  # share of the squared error due to the start, from which that is reported
 
 
@@ -196,14 +197,13 @@ def free_run(
         miss = rows.y - np.where(scored[:, None], run, np.nan)
         off, gain = _gain(plant, log, miss, units)
         band = free_run_band(plant, log, simulated, warmup=warmup)
-        readings = _beside(plant, rows, run, scored, None).outputs
+        readings = _beside(plant, rows, run, scored, None)
         tested = replace(fit_logs([log])[0], start_s=float(rows.time[np.argmax(scored)]))
         verdict = judge(
             band,
-            {name: score(*pair).rmse for name, pair in readings.items()},
-            residual.start,
-            {name: no_input[name].rmse for name in plant.outputs},
-            no_better=no_better,
+            {name: score(*pair).rmse for name, pair in readings.outputs.items()},
+            {n: score(y, no_input_baseline(readings.time, y)).rmse for n, (y, _) in readings.outputs.items()},
+            causes=_causes(miss, plant.outputs, residual.start),
             gain=off,
             seen=bool(said_of_fit(plant.fitted_to, tested)),
         )
@@ -225,6 +225,15 @@ def free_run(
         simulated, scores, one, naive, held, whiteness, left, residual, exceeds_fit, no_better, notes, warmup,
         plant, log, verdict, band,
     )  # fmt: skip
+
+
+def _causes(
+    miss: Array, outputs: Sequence[str], start: Mapping[str, float]
+) -> dict[str, dict[Cause, float]]:
+    """Return by output which share of the squared error is the start, and which a constant offset."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        offsets = np.nanmean(miss, axis=0) ** 2 / np.maximum(np.nanmean(miss**2, axis=0), 1e-300)
+    return {n: {"start": start.get(n, 0.0), "offset": float(share)} for n, share in zip(outputs, offsets)}
 
 
 def score(measured: Array, simulated: Array, unit: str = "degC") -> Score:
@@ -346,7 +355,7 @@ def _no_test(verdict: Verdict | None) -> bool:
 
 def _small(verdict: Verdict | None) -> bool:
     """Return whether a run is known to err by no more than was stated."""
-    return verdict is not None and verdict.standing != "changed"
+    return verdict is not None and verdict.standing not in ("worse", "another plant")
 
 
 def _correlation_note(

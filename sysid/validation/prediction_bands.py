@@ -1,66 +1,44 @@
-"""How far a free run may be off: prediction bands, and the disagreement of an ensemble.
+"""How far a free run may be off: the error of another run, bands, and the disagreement of an ensemble.
 
-**Bands.** With v_k the free run of the k-th draw of the parameters and s the error of the fit (model error
-and sensor together, ``Plant.noise``), a reading is expected within
+**The error of another run.** One number is stated for each output: the rms error of a free run over another
+run like those of the fit (:func:`expected_error`).  `identify` prints it, the plant's file keeps it, bands
+and `validate` are made of it.  It has two parts.
 
-    v +- z sqrt(var_k v_k + s^2 + r^2),        z = 1.645 for 90 %.
+*Parts held out.*  Each of n parts (blocks of a log and its last part, or whole logs) has an error e_f.  The
+error of one part more lies about them as they do about each other: ln e^2 is Student's t about their mean,
+with the scale s sqrt(1 + 1/n).  A few numbers hardly show a spread, so s^2 is taken with a prior of
+:data:`PRIOR_PARTS` parts that differ by :data:`PRIOR_SPREAD`.  The median is the geometric mean of the e_f:
+one part that is unlike all others (a tank that overflows once) makes a band of rms errors three times too
+wide everywhere else.
 
-A fit compares means over bins of n readings, so s is an error of means. A reading of white noise w lies off
-its mean by r besides, r^2 = w^2 (1 - 1/n); w follows from the second differences of the logs of the fit,
-whose variance is 6 w^2 (:func:`thermogrip.sysid.data.data_quality.reading_excess`).
+*What differs between runs* (supply voltage, air about the plant, a sensor that was glued anew) is in the
+errors of whole logs that were held out, so in those of a plant of three logs or more. One or two logs cannot
+show it, and parts of one log share it. Then the gain of the inputs varies from run to run by g ~ N(0,
+:data:`~thermogrip.sysid.plant.fit_record.RUN_GAIN_SD`^2), which adds
 
-A draw has its own start: state and sensor offsets are estimated anew from the warm-up. A plant without
-uncertainty of its parameters (a neural model) has the second part alone, and reports that.
+    (v(u) - v(u - g (u - u_0)))^2,        u_0 the value nearest to 0 in the logs of the fit:
 
-A black box chose its structure by free runs over parts that were held out, whose rms error h contains both
-the wrong structure and the uncertainty of its numbers. Its s is the part of it that the draws do not
-explain,
+an input that was 0 at times has its whole effect scaled, and one that never was only the effect of its
+changes, for what it does from 0 on is part of the operating point.
 
-    s^2 = max(h^2 - mean_k,t (v_k - v)^2, 0),
+The stated error has the median of both parts, so that it is as likely exceeded as not; its ends are the 5
+and 95 % quantiles of their sum.
 
-so that on average the band is as wide as its held-out errors, and wider where its draws disagree. (Its
-``Plant.noise`` is smaller: that is the weight of a reading in a warm-up.) h is the larger one of the folds'
-error and of that on the last parts of the logs; with n folds it is known as badly as a variance of n numbers,
-so s is multiplied by t_n / z, Student's quantile over the normal one (1.3 for four folds and 90 %).
+**Bands.** With v the free run, a reading is expected within
 
-The error to expect of one part more is neither the larger one nor that of those seen: of n folds and the last
-parts, which lie in them, with the mean square e^2 it is e sqrt(1 + 1 / n) (:func:`expected_error`), as the
-variance of one value more about the mean of n; over 33 outputs of public sets its median ratio to the true
-error is 1.00 (docs/records/identification.md).
+    v +- z sqrt(var_k v_k + s^2 + (median g)^2 effect^2 + unlike^2),        z = 1.645 for 90 %,
 
-**Where that is too narrow.** The average over parts does not apply to each: a tank that overflows in one
-stretch and not in the next errs there three times as much. With e_f the error on part f and h_f that on all
-the others, the expected coverage of part f by a band of the others is
+v_k the free runs of draws of the parameters, each with a start of its own, and s^2 what these do not explain
+of the error of parts held out, so that on average a band is as wide as stated, and wider where its draws
+disagree.  A plant that was not compared (a fit alone) has the error of its fit, and the white noise of one
+reading where that was of means (:func:`thermogrip.sysid.data.data_quality.reading_excess`).
 
-    2 Phi(z h_f / e_f) - 1.
-
-Where the least of these falls short the band reports it (:func:`expected_coverage`); no factor on h is
-right for both kinds of stretches. Parts that are alike give no information on logs that are not: a plant
-that drifts, or is driven where it never was, errs by more than any of its parts.
-
-**Another run.** What differs between runs (supply voltage, air about the plant, a sensor that was glued
-anew) is in the errors of whole logs that were held out, so in those of a plant of three logs or more. One or
-two logs cannot show it, and parts of one log share it. Then the gain of the inputs is taken to vary from run
-to run by g = :data:`~thermogrip.sysid.plant.fit_record.RUN_GAIN_SD`, and
-
-    (v(u) - v(u - g (u - u_0)))^2,        u_0 the value nearest to 0 in the logs of the fit,
-
-is added to the variance: an input that was 0 at times has its whole effect scaled, and one that never was
-only the effect of its changes, for what it does from 0 on is part of the operating point. Models of two
-heater boards, fitted on one day, have gains that are off by 4 to 8 percent on another, and few other errors;
-of a third board and of a motor by 0 and 3 percent (rms of the four 4 percent); boards of one kind differ by 5
-to 20 percent.
-
-**A run unlike the fit.** A black box knows nothing of where it has not been. Three things are added to its
-variance, all 0 on a run like those of the fit: the part of v that lies beyond the range of the readings of
-the fit (it may be wrong altogether: losses curve, supplies saturate); by how much the readings of the warm-up
-lie beyond it (another room, to which the model does not know the way); and a gain that is off by
-
-    k min(|ln r|, 1),        r = rms effect of the inputs on this run over that in the fit,
-
-for where losses grow with temperature the gain of a linear model is that of the excursions that it was
-fitted to. Of four heater boards, from one kind of run to another (pulses, long steps), gains are off by .11
-to .27 where |ln r| is .27 to .46 and by .02 to .14 where it is .5 to .6: k = :data:`GAIN_OF_SIZE`.
+**A run unlike the fit.** A black box knows nothing of where it has not been. Two things are added to its
+variance, both 0 on a run like those of the fit: the part of v that lies beyond the range of the readings of
+the fit (it may be wrong altogether: losses curve, supplies saturate), and by how much the readings of the
+warm-up lie beyond it (another room, to which the model does not know the way).  A gain that depends on the
+size of the moves was a third: two runs of one protocol differ by a third in that size, by chance, and the
+term made their bands 5 to 8 times as wide as their errors.
 
 **Ensemble disagreement.** The members of a :class:`~thermogrip.sysid.models.neural.NeuralModel` were fitted
 to the same rows from different random weights, so they agree where the data constrain them. On other drives
@@ -82,20 +60,21 @@ from dataclasses import dataclass, field
 from statistics import NormalDist
 
 import numpy as np
-from scipy.special import ndtr, stdtrit
+from scipy.special import ndtri, stdtrit
 
 from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log, column, columns, log_name
 from thermogrip.sysid.models.neural import NeuralModel
-from thermogrip.sysid.plant.fit_record import RUN_GAIN_SD, SEVERAL, TAIL
+from thermogrip.sysid.plant.fit_record import RUN_GAIN_SD, SEVERAL, TAIL, ExpectedError
 from thermogrip.sysid.plant.log_grid import cut_stretches, match_logs
 from thermogrip.sysid.plant.plant import WARMUP, Plant
 from thermogrip.sysid.plant.simulation import find_starts
 
-SHORT = 0.1  # of the level: a part on which the expected coverage falls short by more is reported
-#: Standard deviation of a black box's gain on a run whose inputs have e times the effect they had in the fit.
-GAIN_OF_SIZE = 0.4
+PRIOR_SPREAD = 0.5  # sd of ln e of the parts of a log: the median over 22 series of 14 public logs is 0.51
+PRIOR_PARTS = 4  # which that counts as: as many as one log has blocks
+MEDIAN = NormalDist().inv_cdf(0.75)  # of the size of a normal number, in standard deviations
+_RANKS = 199  # quantiles of each part, of which their sum is made
 _DIVERGED = 1e6  # of an output's spread
 _SMALL = 0.05  # change of the inputs by which their effect is found
 _UNLIKE = 0.1  # of the run's error: what a run unlike the fit adds, from which it is reported
@@ -111,6 +90,26 @@ class Band:
     draws: int  # of the parameters; 0: the plant has none, the band is the plant's own error alone
     own_error: str = "the error of the fit"  # how the plant's own error was estimated, in words
     expected: dict[str, float] = field(default_factory=dict)  # rms error of the run that it stands for
+    likely: dict[str, tuple[float, float]] = field(default_factory=dict)  # which 9 of 10 runs lie within
+
+
+def expected_error(errors: Sequence[float], gain_effect: float) -> ExpectedError:
+    """Return the error of another run, of rms errors over parts held out (at least one) and the rms that a
+    gain off by one standard deviation changes; see the module's theory.
+
+    >>> found = expected_error([0.1, 0.1, 0.1, 0.1, 0.1], 0.0)
+    >>> round(found.rmse, 3), round(found.low, 3), round(found.high, 3)
+    (0.1, 0.054, 0.186)
+    """
+    logs, n = 2 * np.log(np.maximum(errors, 1e-12)), len(errors)
+    middle, freedom = float(logs.mean()), PRIOR_PARTS + n - 1
+    squares = PRIOR_PARTS * (2 * PRIOR_SPREAD) ** 2 + float(np.sum((logs - middle) ** 2))
+    scale = float(np.sqrt(squares / freedom * (1 + 1 / n)))
+    ranks = (np.arange(_RANKS) + 0.5) / _RANKS
+    parts = np.exp(middle + scale * stdtrit(freedom, ranks))
+    gains = (gain_effect * ndtri(0.5 + ranks / 2)) ** 2
+    low, high = np.sqrt(np.quantile(parts[:, None] + gains, (0.05, 0.95))).tolist()
+    return ExpectedError(float(np.hypot(np.exp(middle / 2), MEDIAN * gain_effect)), low, high)
 
 
 def free_run_band(
@@ -136,28 +135,46 @@ def free_run_band(
     for k in range(1, taken + 1):
         variances += (plant.draw(k).over(stretches, warmup)[0] - run) ** 2 / taken
     scored = np.asarray(simulated["scored"].values) > 0
-    half, inside, expected = {}, {}, {}
+    half, inside, expected, likely = {}, {}, {}, {}
     other_run, unlike = between_runs(plant, [log]), unlike_fit(plant, log, simulated, warmup)
-    far = False
+    far, compared = False, bool(plant.scores.held_out or plant.scores.held_out_rmse)
     for at, name in enumerate(plant.outputs):
-        nominal = column(simulated, name)
-        variance = variances[:, at]
-        own = _own_variance(plant, name, variance, level) + plant.scores.reading_excess.get(name, 0.0) ** 2
-        seen = variance + own + other_run.get(name, 0.0) ** 2
+        parts, variance = part_errors(plant, name), variances[:, at]
+        own = expected_error(parts, 0.0).rmse
+        explained = variance.mean() if compared else 0.0  # errors of a fit have no part of its draws
+        seen = variance + max(own**2 - explained, 0.0) + (MEDIAN * other_run.get(name, 0.0)) ** 2
         added = unlike.get(name, 0.0) ** 2
         half[name] = wide * np.sqrt(seen + added)
-        expected[name] = float(np.sqrt(np.mean((seen + added)[scored]))) if scored.any() else float("nan")
         far = far or bool(np.mean(added) > _UNLIKE * np.mean(seen))
-        miss = np.abs(column(log, name) - nominal)
+        size = np.mean((seen + added)[scored]) if scored.any() else np.nan
+        expected[name] = float(np.sqrt(size))
+        other = np.hypot(other_run.get(name, np.zeros(1)), unlike.get(name, np.zeros(1)) / MEDIAN)
+        ends = expected_error(parts, float(np.sqrt(np.mean(other**2))))
+        rest = np.sqrt(max(size - ends.rmse**2, 0.0))  # what draws say beyond it
+        likely[name] = float(np.hypot(ends.low, rest)), float(np.hypot(ends.high, rest))
+        miss = np.abs(column(log, name) - column(simulated, name))
         known = scored & np.isfinite(miss)
         inside[name] = float(np.mean(miss[known] <= half[name][known])) if known.any() else float("nan")
-    words = _own_words(plant, level)
+    words = "the errors of free runs over parts held out of it" if compared else "the error of the fit"
     if other_run:
         words += f" and a gain that varies by {100 * RUN_GAIN_SD:.0f} % from run to run (assumed: "
         words += f"{'one log' if len(plant.logs) == 1 else 'two logs'} cannot show it)"
     if far:
-        words += ", wider because this run is unlike the fit (range of the readings, size of the moves)"
-    return Band(level, half, inside, taken, words, expected)
+        words += ", wider because this run is unlike the fit (range of the readings)"
+    return Band(level, half, inside, taken, words, expected, likely)
+
+
+def part_errors(plant: Plant, name: str) -> list[float]:
+    """Return the errors of an output over the parts that were held out: of a plant of several logs whole
+    logs, where it has them; of a fit that was not compared that of the fit, as an error of readings."""
+    scores = plant.scores
+    held = [each for each in scores.held_out if each.output == name]
+    whole = [each for each in held if not each.log.startswith(TAIL)]
+    if len(plant.logs) >= SEVERAL and whole:
+        held = whole
+    parts = [each.rmse for each in held] or scores.held_out_by_part.get(name, [])
+    parts = parts or [error for each, error in scores.held_out_rmse.items() if each == name]
+    return parts or [float(np.hypot(plant.noise.get(name, 0.0), scores.reading_excess.get(name, 0.0)))]
 
 
 def unlike_fit(plant: Plant, log: Log, simulated: Log, warmup: float) -> dict[str, Array]:
@@ -165,7 +182,7 @@ def unlike_fit(plant: Plant, log: Log, simulated: Log, warmup: float) -> dict[st
     empty for other plants."""
     if not plant.scores.held_out_by_part:
         return {}
-    effects, time = between_runs(plant, [log], 1.0), log["time"].values
+    time = log["time"].values
     begin, out = time - time[0] < max(warmup, plant.dt), {}
     for name in plant.outputs:
         run, (low, high) = column(simulated, name), plant.valid.get(name, (-np.inf, np.inf))
@@ -173,10 +190,6 @@ def unlike_fit(plant: Plant, log: Log, simulated: Log, warmup: float) -> dict[st
         first = first[np.isfinite(first)]
         start = float(np.mean(first - np.clip(first, low, high))) if first.size else 0.0
         added = np.hypot(run - np.clip(run, low, high), start)
-        effect, before = effects.get(name), plant.scores.input_effect.get(name, 0.0)
-        size = 0.0 if effect is None else float(np.sqrt(np.mean(effect**2)))
-        if effect is not None and min(size, before) > 0:
-            added = np.hypot(added, GAIN_OF_SIZE * min(abs(np.log(size / before)), 1.0) * effect)
         out[name] = np.asarray(added)
     return out
 
@@ -226,76 +239,6 @@ def gain_of_run(plant: Plant, miss: Array, log: Log) -> tuple[float, Array] | No
         return None
     left = np.where(known, miss - gain * effect, np.nan)
     return gain, np.sqrt(np.nanmean(left**2, axis=0))
-
-
-def beyond_range(plant: Plant, logs: Sequence[Log]) -> dict[str, float]:
-    """Return by output how far (rms) runs go beyond the readings of the fit if each input in percent, which
-    the logs moved over a part of its range, is moved alike over 0 to 100."""
-    parts = {name: plant.valid[name] for name in plant.inputs if plant.units.get(name) == "percent"}
-    parts = {name: (low, high) for name, (low, high) in parts.items() if 0 <= low < high <= 100}
-    out = dict.fromkeys(plant.outputs, 0.0)
-    if all(ends == (0, 100) for ends in parts.values()):
-        return out
-    moved = []
-    for log in logs:
-        log = log.copy()
-        for name, (low, high) in parts.items():
-            u = column(log, name)
-            log[name] = log[name].copy(data=100 * (u - low) / (high - low))
-        moved.append(plant.simulate(log))
-    for name in plant.outputs:
-        run = np.concatenate([column(one, name) for one in moved])
-        out[name] = float(np.sqrt(np.mean((run - np.clip(run, *plant.valid[name])) ** 2)))
-    return out
-
-
-def expected_coverage(plant: Plant, level: float = 0.9) -> dict[str, Array]:
-    """Return by output the coverage of each held-out part expected of a band of the other parts, of a black
-    box only."""
-    wide = NormalDist().inv_cdf(0.5 + level / 2)
-    out = {}
-    for name, errors in plant.scores.held_out_by_part.items():
-        squares = np.maximum(np.square(errors), 1e-24)
-        if len(squares) > 1:
-            others = (squares.sum() - squares) / (len(squares) - 1)
-            out[name] = 2 * ndtr(wide * np.sqrt(others / squares)) - 1
-    return out
-
-
-def _own_words(plant: Plant, level: float) -> str:
-    """Return how the plant's own error was estimated, and where a band of it falls short."""
-    if not plant.scores.held_out_rmse:
-        return "the error of the fit"
-    words = "the errors of free runs over parts held out of it"
-    shares = np.concatenate([np.empty(0), *expected_coverage(plant, level).values()])
-    if not shares.size or shares.min() > level - SHORT:
-        return words
-    return (
-        f"{words}, which differ: too narrow where errors are as on the worst part, "
-        f"of which a band of the others should cover {100 * shares.min():.0f} %"
-    )
-
-
-def _own_variance(plant: Plant, name: str, drawn: Array, level: float) -> float:
-    """Return s^2, of a black box what its draws do not explain of its held-out errors."""
-    held_out = plant.scores.held_out_rmse.get(name)
-    if held_out is None:
-        return float(plant.noise.get(name, 0.0) ** 2)
-    tails = [each.rmse for each in plant.scores.held_out if each.output == name and each.log.startswith(TAIL)]
-    error = max(held_out, float(np.sqrt(np.mean(np.square(tails)))) if tails else 0.0)
-    return float(max(error**2 - drawn.mean(), 0.0)) * _few_parts(plant, name, level) ** 2
-
-
-def expected_error(errors: Sequence[float], parts: int) -> float:
-    """Return the rms error to expect of one part more, of errors over ``parts`` that do not overlap."""
-    return float(np.sqrt(np.mean(np.square(errors)) * (1 + 1 / (parts or len(errors)))))
-
-
-def _few_parts(plant: Plant, name: str, level: float) -> float:
-    """Return the quantile of Student's t over that of a normal error, for an s of so many parts."""
-    parts = len(plant.scores.held_out_by_part.get(name, ()))
-    upper = 0.5 + level / 2
-    return float(stdtrit(parts, upper)) / NormalDist().inv_cdf(upper) if parts > 1 else 1.0
 
 
 MOST_DISAGREEMENT = 0.4  # of the output's spread in the data of the fit

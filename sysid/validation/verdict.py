@@ -1,21 +1,21 @@
 """What a free run says of its plant, by how large its error is beside the one that the plant states.
 
 With hours of readings a test finds what is real and does not matter: on most logs of a real board of another
-day a residual correlates with its inputs. So the verdict goes by size. With e the rms error of an output,
-less the share that the start explains, and s the rms error that the plant's bands state for this run
-(:mod:`thermogrip.sysid.validation.prediction_bands`), the plant is called another one where
+day a residual correlates with its inputs. So the verdict goes by size. A plant states for this run the rms
+error X of each output, and the ends that 9 of 10 runs lie within
+(:mod:`thermogrip.sysid.validation.prediction_bands`). With e the error and b that of the best decay without
+input, both of the same readings,
 
-    e > 2 s        of any output, or
-    e > s          of any, and one gain that is off by more than two of its assumed sd is most of the error.
+    better          e below the low end, every output
+    as stated       e within the ends
+    worse           e above the high end of any output, or above X and no better than without input
+                    (e > 0.8 b), or above X and most of it one gain
+    another plant   worse, without one cause, and no better than without input; or the run diverged
+    no test         the rows are those of the fit; or no right plant could have done better than without
+                    input, X > 0.8 b, and this one did not do clearly worse than that (e > b / 0.8)
 
-An error may be of one direction alone, a gain say, which a right plant has beyond 2 s in 4.6 % of its
-runs; of many directions that is rarer.
-
-The share of the start is taken out of the run's error and out of no baseline's: a run whose whole error is
-beyond 2 s, and only without its start within it, is judged by its start, whatever no input would have done.
-
-An output that does not beat a model without input (at most 0.8 of its error) is no ground to rely on the
-plant. Where the stated error is itself that large, no right plant could have done it, and the log is no test.
+What is worse is so by its *gain*, an *offset* or its *start* where one of them is most of the squared error
+of the worst output, else by its *dynamics*.
 """
 
 from __future__ import annotations
@@ -29,20 +29,28 @@ import numpy as np
 if TYPE_CHECKING:
     from thermogrip.sysid.validation.prediction_bands import Band
 
-__all__ = ["EXCEEDS", "NO_BETTER", "Standing", "Verdict", "judge"]
+__all__ = ["MOST", "NO_BETTER", "Cause", "Standing", "Verdict", "judge"]
 
-EXCEEDS = 2.0  # times the stated error, from which a plant is called another one
 NO_BETTER = 0.8  # of the no-input error: a free run above it has not shown that the input matters
+MOST = 0.5  # of the squared error
 
-Standing: TypeAlias = Literal["as stated", "seen", "changed", "start", "weak", "no test"]
+Standing: TypeAlias = Literal["as stated", "better", "worse", "another plant", "no test"]
+Cause: TypeAlias = Literal["", "gain", "offset", "start", "dynamics", "seen", "too little input"]
 
 _MEANING: dict[Standing, str] = {
-    "as stated": "as was stated",
-    "seen": "as was stated, over rows of its own fit; another log is a test",
-    "changed": "by more than was stated: the plant is not what it was in the fit, or was never run like this",
-    "start": "by its start: the readings of the warm-up do not set its slow states, score it after more",
-    "weak": "as was stated, which is hardly better than no input",
-    "no test": "as was stated, but the inputs do too little here to test the plant",
+    "as stated": "the error is as stated",
+    "better": "the error is smaller than stated",
+    "worse": "the error is larger than stated",
+    "another plant": "this is another plant, predicted no better than without input",
+    "no test": "no test of the plant",
+}
+_BECAUSE: dict[Cause, str] = {
+    "": "",
+    "offset": "most of it is a constant offset",
+    "start": "most of it is the start, for the readings of the warm-up do not set the slow states",
+    "dynamics": "the plant is not what it was in the fit, or was never run like this",
+    "seen": "the rows are in the fit; another log is a test",
+    "too little input": "the inputs do too little here",
 }
 
 
@@ -52,43 +60,53 @@ class Verdict:
 
     standing: Standing
     over_stated: dict[str, float]  # error over the stated one, by output
-    gain: float | None = (
-        None  # by how large a share inputs did more than in the fit, where that is most of it
-    )
+    cause: Cause = ""  # by what it is worse, or why it is no test
+    gain: float | None = None  # by how large a share inputs did more than in the fit, where that is the cause
 
     def __str__(self) -> str:
         times = ", ".join(f"{name} {ratio:.2g}" for name, ratio in self.over_stated.items())
-        how = _MEANING[self.standing]
-        if self.standing not in ("changed", "start") and max(self.over_stated.values(), default=0.0) > 1.0:
-            how = how.replace("as was stated", "by more than was stated, but no more than chance may do", 1)
-        return f"errs {how} (times the stated error: {times})"
+        because = _BECAUSE.get(self.cause, "")
+        if self.gain is not None:
+            because = f"inputs do {100 * abs(self.gain):.0f} % {'more' if self.gain > 0 else 'less'}"
+        words = _MEANING[self.standing] + (f": {because}" if because else "")
+        return f"{words} (times the stated error: {times})"
 
 
 def judge(
     band: Band,
     errors: Mapping[str, float],
-    start: Mapping[str, float],
     no_input: Mapping[str, float],
     *,
-    no_better: tuple[str, ...],
+    causes: Mapping[str, Mapping[Cause, float]],
     gain: float | None,
     seen: bool,
 ) -> Verdict:
-    """Return the verdict on a run, by output: its rms errors, which share of their squares is the start, and
-    those of the no-input baseline. ``seen``: its rows were in the fit."""
-    left = {name: error * np.sqrt(max(0.0, 1.0 - start.get(name, 0.0))) for name, error in errors.items()}
-    over = {
-        name: float(error / band.expected[name]) if band.expected[name] > 0 else float("nan")
-        for name, error in left.items()
-    }
-    worst = max((ratio for ratio in over.values() if ratio == ratio), default=0.0)
-    hopeless = [name for name in no_better if band.expected[name] > NO_BETTER * no_input[name]]
-    if worst > EXCEEDS or (gain is not None and worst > 1.0):
-        return Verdict("changed", over, gain)
-    if any(error > EXCEEDS * band.expected[name] > 0 for name, error in errors.items()):
-        return Verdict("start", over)
-    if set(no_better) - set(hopeless):
-        return Verdict("weak", over)
-    if len(hopeless) == len(errors):
-        return Verdict("no test", over)
-    return Verdict("seen" if seen else "as stated", over)
+    """Return the verdict on a run, by output: its rms errors, those of the no-input baseline, and of the
+    start and of an offset the share of its squared error. ``seen``: its rows were in the fit."""
+    stated = {name: size for name, size in band.expected.items() if size > 0}
+    over = {name: error / stated[name] if name in stated else float("nan") for name, error in errors.items()}
+    hopeless = {name for name, size in stated.items() if size > NO_BETTER * no_input[name]}
+    most = {name: no_input[name] * (1 / NO_BETTER if name in hopeless else NO_BETTER) for name in stated}
+    lost = {name for name in stated if not errors[name] <= most[name]}
+    worse = [
+        name
+        for name in stated
+        if not errors[name] <= band.likely[name][1] or (over[name] > 1 and (name in lost or gain is not None))
+    ]
+    if worse:
+        worst = max(worse, key=lambda name: over[name])
+        if not np.isfinite(errors[worst]):
+            return Verdict("another plant", over, "dynamics")
+        if gain is not None:
+            return Verdict("worse", over, "gain", gain)
+        shares = causes.get(worst, {})
+        cause = max(shares, key=lambda each: shares[each], default=None)
+        if cause is not None and shares[cause] > MOST:
+            return Verdict("worse", over, cause)
+        return Verdict("another plant" if worst in lost else "worse", over, "dynamics")
+    if seen:
+        return Verdict("no test", over, "seen")
+    if stated and len(hopeless) == len(stated):
+        return Verdict("no test", over, "too little input")
+    better = bool(stated) and all(errors[name] < band.likely[name][0] for name in stated)
+    return Verdict("better" if better else "as stated", over)

@@ -64,7 +64,8 @@ def test_a_classifier_of_0_1_0_answers_the_same(name: str, tolerance: float) -> 
 def test_a_run_folder_of_0_1_0_is_whole(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     shutil.copytree(OLD / "run", tmp_path / "run")
     assert main(["recover", str(tmp_path / "run"), "--json"]) == 0
-    assert main(["validate", str(OLD / "plant_network.json"), str(tmp_path / "run" / "samples.csv")]) == 0
+    # an offset of that run is beyond what the plant states: done, and the answer is no
+    assert main(["validate", str(OLD / "plant_network.json"), str(tmp_path / "run" / "samples.csv")]) == 3
     capsys.readouterr()
 
 

@@ -44,7 +44,7 @@ def test_a_good_free_run_is_green(run: tuple[Plant, Log, FreeRun]) -> None:
     assert section.tone == "good"
     assert section.verdict.startswith("Free run (RMSE): t to 0.0")
     assert re.search(
-        r" degC\. It errs as was stated \(times the stated error: t [\d.]+\)\.$", section.verdict
+        r" degC\. The error is as stated \(times the stated error: t [\d.]+\)\.$", section.verdict
     )
     bare = replace(found, scores={name: replace(s, unit="1") for name, s in found.scores.items()})
     assert free_run_section(bare).verdict == section.verdict.replace(" degC", "")
@@ -78,8 +78,14 @@ def test_one_whose_residual_follows_something_is_not_green_and_says_what(
     small = free_run_section(alike)  # as small as was stated
     assert small.tone == "good"
     assert words in small.verdict
-    for standing, tone in (("seen", "good"), ("changed", "warn"), ("weak", "warn"), ("no test", "warn")):
-        assert free_run_section(replace(alike, verdict=Verdict(standing, {"t": 1.0}))).tone == tone
+    for standing, cause, tone in (
+        ("better", "", "good"),
+        ("no test", "seen", "good"),
+        ("no test", "too little input", "warn"),
+        ("worse", "gain", "warn"),
+        ("another plant", "dynamics", "warn"),
+    ):
+        assert free_run_section(replace(alike, verdict=Verdict(standing, {"t": 1.0}, cause))).tone == tone
 
 
 def test_the_prior_of_a_network_stands_beside_what_was_learnt_and_a_black_box_has_none(
@@ -124,8 +130,8 @@ def test_a_band_says_what_it_is_made_of_and_covers(draws: int, words: str) -> No
     band = Band(0.9, {}, {"t": 0.876, "s": 0.95}, draws, "the noise")
     said = f"90 % band from {words}; it covers 88 % of t, 95 % of s"
     assert plant.band_words(band) == said
-    band = replace(band, expected={"t": 0.123, "s": 4.0})
-    assert plant.band_words(band) == f"{said} and stands for an RMSE of 0.12 of t, 4 of s"
+    band = replace(band, expected={"t": 0.123, "s": 4.0}, likely={"t": (0.1, 0.2), "s": (2.0, 9.0)})
+    assert plant.band_words(band) == f"{said} and stands for an RMSE of t 0.12 (0.1 to 0.2), s 4 (2 to 9)"
 
 
 def test_signals_are_shown_with_their_roles_and_guesses_are_marked() -> None:

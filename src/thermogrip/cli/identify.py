@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from thermogrip.sysid.models.model import GreyModel
     from thermogrip.sysid.plant.plant import Plant
     from thermogrip.sysid.validation import Band, FreeRun
+    from thermogrip.sysid.validation.verdict import Verdict
 
 USUAL_MODELS = ",".join(model for model in MODELS if model not in ("armax", "bj", "parsim"))
 NO_POSTERIOR = "no posterior: the model that was kept is a black box, only networks have parameters to sample"
@@ -177,12 +178,13 @@ def identify(
     more = {"dynamics": None if dynamics is None else dynamics.to_dict(), "repairs": repairs}
     console.answer(_identified(found, plant, record, out) | more)
     for doubt in found.doubts:
-        console.warn(f"a guess that decides: {doubt}")
+        console.warn(f"in doubt: {doubt}")
     if posterior and (record is None or not record.converged):
         return cli.ANSWER_IS_NO
     if found.good:
         return cli.Done("good")
-    stated = _stating(found, paths, out, dt, logs) if found.doubts else ""
+    guessed = any(s.guessed for s in found.signals) or any(log.attrs.get("clock_doubts") for log in logs)
+    stated = _stating(found, paths, out, dt, logs) if found.doubts and guessed else ""
     return cli.Done("not good", cli.ANSWER_IS_NO, stated)
 
 
@@ -316,7 +318,9 @@ def _identified(
         }
     return {
         "model": found.model,
+        "network": getattr(plant.model, "name", None),
         "good": found.good,
+        "expected_error": found.expected,
         "doubts": found.doubts,
         "verdict": found.verdict,
         "signals": found.signals,
@@ -338,10 +342,20 @@ def _identified(
 def validate(
     plant: cli.PlantFile,
     paths: cli.LogFiles,
-    warmup: Warmup = 5.0,
+    warmup: Annotated[
+        float | None,
+        cli.opt(
+            "--warmup",
+            "S",
+            "Measured outputs of these first seconds may set the state; where absent 5 s, of a black box a "
+            "tenth of its slowest time constant, at least what scored its fit, at most a tenth of the log.",
+            min=0,
+        ),
+    ] = None,
     score_from: Annotated[
-        float, cli.opt("--score-from", "S", "Samples before this are not scored.", min=0)
-    ] = 5.0,
+        float | None,
+        cli.opt("--score-from", "S", "Samples before this are not scored; where absent, the warm-up.", min=0),
+    ] = None,
     average: Average = None,
     network: cli.OwnNetwork = None,
     columns: cli.Columns = None,
@@ -362,17 +376,10 @@ def validate(
     logs = cli.load_logs(paths, known=roles_of(loaded), columns=cli.comma(columns), dt=dt)
     from thermogrip.report.html import write_report
     from thermogrip.report.plant import band_words, free_run_section, run_table
-    from thermogrip.sysid.identification import warm_up_of_fit
     from thermogrip.sysid.validation.free_run import free_run
 
     repairs = _repaired(console, logs)
-    for log in logs:
-        needed, name = warm_up_of_fit(loaded, log), log.attrs["name"]
-        if warmup < needed:
-            console.warn(
-                f"{name}: {warmup:g} s of readings set the state, the fit was scored with {needed:g} s; "
-                f"write --warmup {needed:g} --score-from {needed:g}"
-            )
+    starts = _starts(console, loaded, logs, warmup, score_from)
     for log in logs:
         for name in moved_beside(loaded, log):
             console.warn(f"{log.attrs['name']}: {name} moves in this log, and the plant has no such input")
@@ -380,11 +387,13 @@ def validate(
     with console.progress("validate") as progress:
         for k, log in enumerate(logs):
             progress(k / len(logs), log.attrs["name"])
-            runs.append(free_run(loaded, log, warmup=warmup, score_from=score_from, average=average))
+            seconds, first = starts[k]
+            runs.append(free_run(loaded, log, warmup=seconds, score_from=first, average=average))
     bands = [run.band() for run in runs]
     if report is not None:
         sections = [free_run_section(*each) for each in zip(runs, bands)]
-        lead = f"Inputs in, outputs out, nothing fed back; scored from {score_from:g} s on."
+        since = ", ".join(dict.fromkeys(f"{first:g} s" for _, first in starts))
+        lead = f"Inputs in, outputs out, nothing fed back; scored from {since} on."
         write_report(report, f"Free runs of {plant.name}", lead, sections)
     console.table(f"Free run of {plant.name}", *run_table(runs))
     for log, run, band in zip(logs, runs, bands):
@@ -393,19 +402,42 @@ def validate(
             console.say(f"{log.attrs['name']}: {note}")
     answers = [run_answer(log.attrs["name"], run, band) for log, run, band in zip(logs, runs, bands)]
     console.answer({"logs": answers, "repairs": repairs})
-    found: set[str] = {run.verdict.standing for run in runs if run.verdict is not None}
-    if "; not good: " in loaded.verdict and found & {"as stated", "seen"}:
+    found = [_urgency(run.verdict) for run in runs if run.verdict is not None]
+    if "; not good" in loaded.verdict and set(found) & {"as stated", "better", "seen"}:
         console.say(
             f"{plant.name}: identify did not call it good, and a run as was stated does not change that"
         )
-        found = found - {"as stated"} | {"weak"} if "as stated" in found else {"no test"}
+        found = ["worse" if each in ("as stated", "better") else "no test" for each in found]
     what = next((each for each in _URGENT if each in found), "")
+    code = cli.ANSWER_IS_NO if what in ("worse", "another plant", "start") else 0
     if what != "start":
-        return cli.Done(what)
+        return cli.Done(what, code)
     seconds = _start_seconds(loaded, logs)
     more = ["--warmup", f"{seconds:g}", "--score-from", f"{seconds:g}"]
     command = shlex.join(["validate", str(plant), *map(str, paths), *more])
-    return cli.Done(what, command=printable(command))
+    return cli.Done(what, code, printable(command))
+
+
+def _starts(
+    console: Console, plant: Plant, logs: Sequence[Log], warmup: float | None, score_from: float | None
+) -> list[tuple[float, float]]:
+    """Return by log the warm-up and from when it is scored [s], and warn of one shorter than the fit's."""
+    from thermogrip.sysid.identification import warm_up_of_fit
+
+    out = []
+    for log in logs:
+        needed, name = warm_up_of_fit(plant, log), log.attrs["name"]
+        # a network has few states, and begins at rest where its sensors agree
+        slowest = _start_seconds(plant, [log]) if plant.scores.held_out_by_part else 0.0
+        usual = max(5.0, plant.dt, needed, slowest)
+        seconds = usual if warmup is None else warmup
+        if seconds < needed:
+            console.warn(
+                f"{name}: {seconds:g} s of readings set the state, the fit was scored with {needed:g} s; "
+                f"write --warmup {needed:g} --score-from {needed:g}"
+            )
+        out.append((seconds, seconds if score_from is None else score_from))
+    return out
 
 
 def _start_seconds(plant: Plant, logs: Sequence[Log]) -> float:
@@ -416,8 +448,13 @@ def _start_seconds(plant: Plant, logs: Sequence[Log]) -> float:
     return float(f"{min(slowest, shortest) / 10:.2g}")
 
 
+def _urgency(verdict: Verdict) -> str:
+    """Return which of what may come next a verdict asks for."""
+    return verdict.cause if verdict.cause in ("start", "seen") else verdict.standing
+
+
 #: Of verdicts on several logs, which one says what comes next.
-_URGENT = ("changed", "start", "weak", "as stated", "no test", "seen")
+_URGENT = ("another plant", "worse", "start", "as stated", "better", "no test", "seen")
 
 
 def run_answer(name: str, run: FreeRun, band: Band) -> dict[str, Any]:
@@ -432,6 +469,7 @@ def run_answer(name: str, run: FreeRun, band: Band) -> dict[str, Any]:
             "level": band.level,
             "coverage": {output: share if share == share else None for output, share in band.inside.items()},
             "expected_rmse": band.expected,
+            "likely_rmse": band.likely,
             "own_error": band.own_error,
             "draws": band.draws,
         },

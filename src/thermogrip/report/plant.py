@@ -363,7 +363,8 @@ def free_run_section(
         times = ", ".join(f"{output} {ratio:.1f} times" for output, ratio in run.exceeds_fit.items())
         verdict += f" Above the error of the fit: {times}."
     if run.verdict is not None:
-        verdict += f" It {run.verdict}."
+        said = str(run.verdict)
+        verdict += f" {said[0].upper()}{said[1:]}."
     follows, outputs = _followed(run), tuple(run.scores)
     if follows:
         verdict += f" Residual correlation: {'; '.join(follows)}."
@@ -390,7 +391,8 @@ def free_run_section(
     if run.verdict is None:
         doubtful = bool(run.no_better or run.exceeds_fit or follows)
     else:
-        doubtful = bool(run.no_better) or run.verdict.standing not in ("as stated", "seen")
+        fine = run.verdict.standing in ("as stated", "better") or run.verdict.cause == "seen"
+        doubtful = bool(run.no_better) or not fine
     return Section(title, tuple(parts), verdict, "warn" if doubtful else "good")
 
 
@@ -411,7 +413,10 @@ def band_words(band: Band) -> str:
     inside = ", ".join(f"{100 * share:.0f} % of {name}" for name, share in band.inside.items())
     draws = f"{band.draws} draws of the parameters and " if band.draws else ""
     said = f"{100 * band.level:.0f} % band from {draws}{band.own_error}; it covers {inside}"
-    errors = ", ".join(f"{error:.2g} of {name}" for name, error in band.expected.items())
+    errors = ", ".join(
+        f"{name} {band.expected[name]:.2g} ({low:.2g} to {high:.2g})"
+        for name, (low, high) in band.likely.items()
+    )
     return said + (f" and stands for an RMSE of {errors}" if errors else "")
 
 

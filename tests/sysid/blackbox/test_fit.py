@@ -14,7 +14,7 @@ from thermogrip.datasets.schema import make_log
 from thermogrip.sysid import Plant, identify
 from thermogrip.sysid.blackbox import fit as fitting
 from thermogrip.sysid.blackbox.fit import FAMILIES, BlackBoxFit, cut_into_blocks, fit_black_box, with_refits
-from thermogrip.sysid.blackbox.order_selection import Choice, Structure
+from thermogrip.sysid.blackbox.order_selection import Choice, Fold, Structure
 from thermogrip.sysid.models.lti import StartPrior
 from thermogrip.sysid.plant import log_grid
 from thermogrip.sysid.plant.log_grid import Grid, Segment, make_grid
@@ -223,8 +223,8 @@ def test_the_warm_up_is_five_seconds_of_whole_logs_and_fifty_samples_of_parts(ro
     ("rows", "warmup"), [((100, 62), 15), ((400,), 50), ((4,), 2)]
 )  # a quarter of the shortest, 2 to 50
 def test_a_refit_errs_by_its_worst_output(monkeypatch, rows, warmup):
-    def errors_of(model, segments, *, dt, scale, warmup, priors):
-        asked.append((model, len(segments), dt, scale.tolist(), warmup, priors))
+    def errors_of(model, runs, *, dt, scale, warmup, priors):
+        asked.append((model, len(runs), dt, scale.tolist(), warmup, priors))
         return np.array([[0.3, 0.1]])
 
     asked, fit = [], SimpleNamespace(grid=stub_grid(rows, 2.0), choice=SimpleNamespace(prior="p"))
@@ -235,13 +235,14 @@ def test_a_refit_errs_by_its_worst_output(monkeypatch, rows, warmup):
 
 @pytest.mark.parametrize(("dt", "share"), [(2.0, 0.24), (20.0, 1.0)])  # (1 + 19 dt / 10) of 20 readings
 def test_a_plant_keeps_what_the_choice_found(monkeypatch, dt, share):
-    monkeypatch.setattr(fitting, "reading_excess", lambda logs, names, dt: {names[0]: dt})
+    monkeypatch.setattr(fitting, "reading_excess", lambda logs, names, dt: {names[0]: dt, names[1]: 0.0})
     monkeypatch.setattr(fitting, "rows_of", lambda *_: None)
     grid, rmse = stub_grid((100, 60), dt, why="so", ends=True), np.array([[3.0, 1.0], [4.0, 7.0]])
     model = fit_of("oe", lagged_log(0, 100), poles=1, zeros=1, delays=1).plant.model
     model = replace(model, outputs=("s", "t"), C=np.ones((2, model.n_x)), y0=np.zeros(2))
     prior = StartPrior(noise=0.1, nuisance=0.3)
-    choice = Choice(Structure("lag", 3), prior, {}, ("a", "b"), rmse, warmup=19, model=model)
+    folds = (Fold("a", grid, ()), Fold("b", grid, ()))
+    choice = Choice(Structure("lag", 3), prior, {}, folds, rmse, warmup=19, model=model)
     plant = fitting._plant(grid, choice, [lagged_log(0, 100)])
     assert plant.noise == pytest.approx({"s": 0.2 * share**0.5, "t": share**0.5})
     assert plant.nuisance == pytest.approx({"s": 0.6, "t": 3.0})
@@ -249,9 +250,12 @@ def test_a_plant_keeps_what_the_choice_found(monkeypatch, dt, share):
     assert (plant.dt, plant.logs, plant.inputs_end_at_row) == (dt, ("a", "b"), True)
     scores = plant.scores
     assert (scores.structure, scores.average_s, scores.average_why) == ("lag", dt, "so")
-    assert scores.held_out_rmse == pytest.approx({"s": 12.5**0.5, "t": 5.0})
-    assert scores.held_out_by_part == {"s": [3.0, 4.0], "t": [1.0, 7.0]}
-    assert (scores.folds, scores.reading_excess, scores.reading_sd) == (["a", "b"], {"s": dt}, {"s": np.inf})
+    # errors of readings: those of means and by how much a reading lies off its mean
+    assert scores.held_out_rmse == pytest.approx({"s": (12.5 + dt**2) ** 0.5, "t": 5.0})
+    assert scores.held_out_by_part["s"] == pytest.approx(np.hypot([3.0, 4.0], dt).tolist())
+    assert scores.held_out_by_part["t"] == [1.0, 7.0]
+    assert (scores.folds, scores.reading_excess) == (["a", "b"], {"s": dt, "t": 0.0})
+    assert scores.reading_sd == {"s": np.inf, "t": 0.0}
 
 
 @pytest.mark.parametrize(
@@ -263,18 +267,17 @@ def test_a_plant_keeps_what_the_choice_found(monkeypatch, dt, share):
         ("arx", 2.0, 2000, None, {2.0: 0.9, 0.5: None}, 2.0),
         ("arx", 2.0, 2000, None, {2.0: None, 0.5: None}, None),
         ("arx", 2.0, 2001, None, {2.0: 0.3}, 2.0),  # 8004 rows of the log
-        ("arx", 0.75, 400, None, {0.75: 0.3}, 0.75),
+        ("arx", 0.75, 540, None, {0.75: 0.3, 2.5: 0.2}, 2.5),  # 810 rows of the log: five of them too
+        ("arx", 0.75, 530, None, {0.75: 0.3}, 0.75),
         ("oe", 2.0, 400, 2.0, {2.0: 0.3}, 2.0),
-        ("subspace", 2.0, 400, 2.0, {2.0: 0.3}, 2.0),
         ("sindy", 2.0, 400, None, {2.0: 0.3}, 2.0),
         ("neural", 2.0, 400, None, {2.0: 0.3}, 2.0),
     ],
 )
-def test_the_logs_own_rate_is_tried_beside_a_chosen_one(monkeypatch, kind, dt, rows, average, errors, kept):
+def test_a_second_step_is_tried_beside_the_chosen_one(monkeypatch, kind, dt, rows, average, errors, kept):
     tried, said = [], []
 
-    def choose_by_step(grid, family, *, warmup, average, progress):
-        assert average == (kind == "subspace")
+    def choose_by_step(grid, family, *, warmup, progress):
         tried.append(grid.dt)
         progress(0.5, "x")
         if errors[grid.dt] is None:
@@ -284,6 +287,7 @@ def test_the_logs_own_rate_is_tried_beside_a_chosen_one(monkeypatch, kind, dt, r
     for module in (fitting, log_grid):
         monkeypatch.setattr(module, "make_grid", lambda *a, average, **n: stub_grid((rows,), average or dt))
     monkeypatch.setattr(fitting, "choose", choose_by_step)
+    monkeypatch.setattr(fitting, "_within_steps", lambda *grids: 0.0)
     monkeypatch.setattr(fitting, "_with_convention", lambda grid, choice, *more: (grid, choice))
     monkeypatch.setattr(fitting, "_plant", lambda *parts: None)
 
@@ -291,15 +295,27 @@ def test_the_logs_own_rate_is_tried_beside_a_chosen_one(monkeypatch, kind, dt, r
         return fit_black_box(kind, [], average=average, progress=lambda *what: said.append(what))
 
     if kept is None:
-        with pytest.raises(UserError, match=r"at 0\.5 s"):
+        with pytest.raises(UserError, match=r"at 2 s"):
             fit()
     else:
         found = fit()
         assert (found.kind, found.grid.dt, found.choice.error) == (kind, kept, errors[kept])
-        own = "the logs' own: held-out free runs err less than at 2 s"
-        assert found.grid.why == (own if kept == 0.5 else "")
+        better = "free runs over held-out parts err less than at"
+        whys = {0.5: f"the logs' own: {better} 2 s", 2.5: f"five rows: {better} 0.75 s"}
+        assert found.grid.why == whys.get(kept, "")
     assert tried == list(errors)
     assert said == [((k + 0.5) / len(errors), f"{kind}, x") for k in range(len(errors))]
+
+
+def test_errors_of_means_are_compared_as_errors_of_the_readings_that_were_averaged():
+    """A block that swings within five rows has no error left in its means, and all of it in its readings."""
+    t = np.arange(1000.0)
+    q = np.repeat([0.0, 1.0] * 50, 10)
+    y = np.sin(2 * np.pi * t / 5) + 0.2 * q
+    log = make_log(t, {"q": (q, "1", "input"), "t": (y, "degC", "output")})
+    fine, coarse = (make_grid([log], average=step) for step in (1.0, 5.0))
+    assert fitting._within_steps(fine, [fine, coarse]) == 0.0
+    assert fitting._within_steps(coarse, [fine, coarse]) == pytest.approx(0.98, abs=0.03)
 
 
 @pytest.mark.parametrize(
@@ -320,8 +336,7 @@ def test_inputs_up_to_their_rows_are_taken_where_that_errs_clearly_less(
     def choice_of(error):
         return SimpleNamespace(structure="s", errors={"s": error * np.array([1.0, 1.0, 1.0])})
 
-    def choose_next(grid, family, *, warmup, average):
-        assert average == "as before"
+    def choose_next(grid, family, *, warmup):
         asked.append((grid.ends, getattr(family, "keywords", None), warmup))
         if others[len(asked) - 1] is None:
             raise UserError("unstable")
@@ -332,7 +347,7 @@ def test_inputs_up_to_their_rows_are_taken_where_that_errs_clearly_less(
     monkeypatch.setattr(made, lambda *a, average, ends, **n: stub_grid(dt=average, ends=ends))
     monkeypatch.setattr(fitting, "choose", choose_next)
     grid = stub_grid(dt=dt, why="so")
-    found, choice = fitting._with_convention(grid, first, [], FAMILIES[family], 9.0, "as before")
+    found, choice = fitting._with_convention(grid, first, [], FAMILIES[family], 9.0)
     assert (found.ends, found.dt, found.why, choice is not first) == (moved, dt, "so", moved)
     assert asked == [(True, {"only": "s"}, 9 / dt), (True, None, 9 / dt)][: len(others)]
 
@@ -410,10 +425,10 @@ def test_the_square_of_a_heater_s_drive_is_kept_where_the_folds_show_it(kind, jo
     signals = {"q": (u, "1", "input"), "t": (y + 0.02 * rng.standard_normal(len(u)), "degC", "output")}
     found = fit_black_box(kind, [make_log(np.arange(float(len(u))), signals)], average=1.0)
     errors = {s: found.choice.error_of(s) for s, e in found.choice.errors.items() if np.isfinite(e).all()}
-    plain = min(error for s, error in errors.items() if not s.members and "with q*q" not in s.label)
+    plain = min(error for s, error in errors.items() if "with q*q" not in s.label)
     if kept:
         assert found.plant.model.terms == ("q*q",)
         assert found.choice.error < 0.5 * plain
     else:
         assert found.choice.error < 1.05 * plain
-        assert found.plant.model.terms == () or found.choice.structure.members
+        assert found.plant.model.terms == ()

@@ -4,16 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy.signal import lfilter
 
 from thermogrip.datasets.schema import make_log
-from thermogrip.sysid.blackbox import subspace
-from thermogrip.sysid.blackbox.fit import fit_black_box
-from thermogrip.sysid.blackbox.order_selection import Structure, as_state_space
 from thermogrip.sysid.blackbox.subspace import (
     _windows,
-    average,
-    balanced,
     extended_observability,
     parsim_family,
     stabilised,
@@ -142,103 +136,6 @@ def test_a_window_has_future_and_past_drives_a_constant_and_past_and_future_read
     assert _windows(z, 2, 2).tolist() == wanted
     z[0, 2] = np.nan
     assert _windows(z, 2, 2).tolist() == wanted[1:]
-
-
-def test_balanced_states_are_as_strong_in_what_moves_them_as_in_what_they_show():
-    rng = np.random.default_rng(2)
-    A, B, C = np.diag([0.95, 0.7, -0.4]), rng.standard_normal((3, 2)), rng.standard_normal((2, 3))
-    left, right = balanced(A, B, C)
-    np.testing.assert_allclose(left @ right, np.eye(3), atol=1e-9)
-    a, b, c = left @ A @ right, left @ B, C @ right
-    powers = [np.linalg.matrix_power(a, k) for k in range(800)]
-    moved = sum(p @ b @ b.T @ p.T for p in powers)
-    shown = sum(p.T @ c.T @ c @ p for p in powers)
-    np.testing.assert_allclose(moved, shown, rtol=1e-6, atol=1e-9 * moved[0, 0])
-    assert np.all(np.diff(np.diag(moved)) < 0)
-    np.testing.assert_allclose(moved - np.diag(np.diag(moved)), 0.0, atol=1e-9 * moved[0, 0])
-
-
-def members_of(grid, *parts):
-    """Members (pole, gain of q, product or none, level) with their starts."""
-    out = []
-    for pole, gain, terms, level in parts:
-        W = np.full((1, 1 + len(terms)), (1 - pole) * gain)
-        model = as_state_space(
-            grid, np.array([[pole]]), W, np.eye(1), np.array([(1 - pole) * 2.0]),
-            terms=terms, origin="subspace", y0=np.array([level]),
-        )  # fmt: skip
-        out.append((model, [np.array([0.7 * gain])] * len(grid.segments)))
-    return out
-
-
-def signed_grid():
-    rng = np.random.default_rng(3)
-    q = np.repeat(rng.uniform(-1, 1, 60), 10)
-    t = 25 + 3 * rng.standard_normal(600)
-    log = make_log(np.arange(600.0), {"q": (q, "1", "input"), "t": (t, "degC", "output")})
-    return make_grid([log], average=1.0)
-
-
-@pytest.mark.parametrize(("near", "states"), [(0.1, 2), (1e-6, 3)])
-def test_the_average_of_models_runs_as_the_mean_of_their_runs(monkeypatch, near, states):
-    monkeypatch.setattr(subspace, "_NEAR", near)
-    grid = signed_grid()
-    some = members_of(grid, (0.9, 4.0, (), 20.0), (0.5, 8.0, (), 23.0), (0.97, 3.0, ("|q|",), 26.0))
-    model = average(grid, some)
-    (segment,) = grid.segments
-    runs = [m.rollout(x[0][None], segment.u[None], segment.d[None], (), 1.0)[0][0, :-1] for m, x in some]
-    assert model.n_x == states
-    assert model.terms == ("|q|",)
-    at_rest = model.C @ np.linalg.inv(np.eye(states) - model.A)
-    np.testing.assert_allclose(at_rest @ np.hstack([model.B, model.F]), [[5.0, 1.0]])
-    np.testing.assert_allclose(
-        at_rest @ model.c + model.y0, [25.0]
-    )  # each is 2 above its level without input
-    if states == 3:
-        np.testing.assert_allclose(sorted(np.abs(model.poles())), [0.5, 0.9, 0.97])
-    late = slice(300, None)  # the start has faded
-    found = model.rollout(np.zeros((1, states)), segment.u[None], segment.d[None], (), 1.0)[0][0, :-1]
-    miss = found[late] - np.mean(runs, axis=0)[late]
-    assert 0.0 < np.sqrt(np.mean(miss**2)) < (0.3 if states == 2 else 1e-3)  # a tenth of errors of 3 degC
-
-
-def test_the_average_of_models_that_are_alike_has_no_more_states_than_one():
-    grid = signed_grid()
-    model = average(grid, members_of(grid, *[(0.9, 4.0, (), 20.0)] * 5))
-    assert model.n_x == 1
-    np.testing.assert_allclose(
-        [model.A[0, 0], model.gain()[0, 0], model.spread[0, 0]], [0.9, 4.0, model.spread[0, 0]]
-    )
-    assert model.spread[0, 0] > 0
-    # five of which one is 5 % off in its gain are within a tenth of errors of 3 degC
-    assert average(grid, members_of(grid, *[(0.9, 4.0, (), 20.0)] * 4, (0.8, 4.2, (), 20.0))).n_x == 1
-
-
-def test_the_average_of_large_models_has_the_states_of_the_smallest(monkeypatch):
-    monkeypatch.setattr(subspace, "_MOST_STATES", 0)
-    grid = signed_grid()
-    assert average(grid, members_of(grid, (0.9, 4.0, (), 20.0), (0.5, 8.0, (), 23.0))).n_x == 1
-
-
-def test_an_order_above_the_most_states_of_an_average_can_be_fixed():
-    rng = np.random.default_rng(8)
-    q = np.repeat(rng.uniform(-1, 1, 150), 10)
-    t = 25 + lfilter([0, 0.3], [1, -0.9], q) + 0.01 * rng.standard_normal(1500)
-    columns = {"q": (q, "1", "input"), "t": (t, "degC", "output")}
-    fit = fit_black_box("subspace", [make_log(np.arange(1500.0), columns)], average=1.0, order=16)
-    assert fit.choice.structure.members
-    assert fit.plant.model.n_x == 16
-
-
-def test_an_average_is_fitted_where_each_member_can_be(coupled):
-    grid = make_grid([coupled.log(1000, reading=0.05)], average=1.0)
-    some = tuple(subspace_family(grid, orders=(1, 2), rows=(5, 8)))[:3]
-    of = Structure("average of the best 3", 7, some)
-    (model,) = subspace_family(grid, only=of).values()
-    gains = [subspace_family(grid, only=each)[each].gain() for each in some]
-    np.testing.assert_allclose(model.gain(), np.mean(gains, axis=0), rtol=1e-6)
-    long = tuple(subspace_family(grid, orders=(2,), rows=(5, 30)))
-    assert not subspace_family(make_grid([coupled.log(150)], average=1.0), only=Structure("x", 7, long))
 
 
 def test_parsim_is_consistent_under_feedback_and_moesp_is_not():

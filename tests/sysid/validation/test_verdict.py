@@ -14,7 +14,7 @@ from thermogrip.sysid.plant.fit_record import fit_logs
 from thermogrip.sysid.plant.plant import Plant
 from thermogrip.sysid.validation.free_run import free_run
 from thermogrip.sysid.validation.prediction_bands import Band
-from thermogrip.sysid.validation.verdict import EXCEEDS, NO_BETTER, judge
+from thermogrip.sysid.validation.verdict import NO_BETTER, judge
 
 KEEP = 0.95
 
@@ -39,50 +39,56 @@ def log_of(
 
 
 def band(**expected: float) -> Band:
-    return Band(0.9, {}, {}, 0, expected=expected)
+    """Return a band of these stated errors, each of half to twice that."""
+    return Band(0.9, {}, {}, 0, expected=expected, likely={n: (e / 2, 2 * e) for n, e in expected.items()})
 
 
 @pytest.mark.parametrize(
-    ("errors", "start", "gain", "no_better", "standing"),
-    [
-        ((EXCEEDS, 1.0), {}, None, (), "as stated"),
-        ((EXCEEDS + 0.01, 1.0), {}, None, (), "changed"),
-        ((3.0, 1.0), {"a": 0.6}, None, (), "start"),  # most of it is the start
-        ((3.0, 1.0), {"a": 0.6}, None, ("a", "b"), "start"),  # whatever no input would have done
-        ((1.5, 1.0), {"a": 0.6}, None, (), "as stated"),
-        ((3.0, 1.0), {"b": 0.6}, None, (), "changed"),
-        ((1.1, 0.1), {}, -0.2, (), "changed"),
-        ((0.9, 0.1), {}, -0.2, (), "as stated"),  # a gain within what was stated
-        ((1.1, 1.0), {}, None, ("b",), "weak"),
-        ((1.1, 1.0), {}, None, ("a",), "as stated"),  # which could not beat it
-        ((3.0, 1.0), {}, None, ("a", "b"), "changed"),
-        ((np.inf, 1.0), {}, None, ("a",), "changed"),
+    ("errors", "causes", "gain", "says"),
+    [  # no input errs by a little less than 1.25 times what is stated of a, which cannot beat it; by 9 of b
+        ((1.1, 2.0), {}, None, ("as stated", "")),
+        ((1.1, 2.01), {}, None, ("worse", "dynamics")),
+        ((1.1, 2.01), {"start": 0.6}, None, ("worse", "start")),
+        ((1.1, 2.01), {"start": 0.4, "offset": 0.55}, None, ("worse", "offset")),
+        ((1.1, 2.01), {"start": 0.5}, None, ("worse", "dynamics")),  # not most of it
+        ((1.1, 8.0), {}, None, ("another plant", "dynamics")),  # beyond 0.8 times no input
+        ((1.1, 8.0), {"start": 0.9}, None, ("worse", "start")),
+        ((1.1, np.inf), {"start": 0.9}, -0.2, ("another plant", "dynamics")),
+        ((1.1, 1.1), {}, -0.2, ("worse", "gain")),
+        ((0.9, 0.9), {}, -0.2, ("as stated", "")),  # a gain within what was stated
+        ((1.7, 0.9), {}, None, ("another plant", "dynamics")),  # beyond no input / 0.8
+        ((0.4, 0.4), {}, None, ("better", "")),
+        ((0.4, 0.6), {}, None, ("as stated", "")),
     ],
 )
-def test_a_plant_is_another_one_beyond_twice_what_was_stated(errors, start, gain, no_better, standing):
-    no_input = {"a": 0.99 / NO_BETTER, "b": 1.01 / NO_BETTER}
+def test_the_verdict_follows_from_the_stated_error_and_from_no_input(errors, causes, gain, says):
     given = dict(zip("ab", errors))
-    found = judge(band(a=1.0, b=1.0), given, start, no_input, no_better=no_better, gain=gain, seen=False)
+    no_input = {"a": 0.99 / NO_BETTER, "b": 9.0}
+    by_output = {"a": {}, "b": causes}
+    for seen in (False, True):
+        found = judge(band(a=1.0, b=1.0), given, no_input, causes=by_output, gain=gain, seen=seen)
+        untested = seen and says[0] in ("as stated", "better")
+        assert (found.standing, found.cause) == (("no test", "seen") if untested else says)
+        assert found.over_stated == given
+        assert found.gain == (gain if found.cause == "gain" else None)
+
+
+@pytest.mark.parametrize(("error", "standing"), [(0.9, "no test"), (1.2, "no test"), (1.3, "another plant")])
+def test_where_no_output_can_beat_no_input_the_log_is_no_test_unless_it_did_far_worse(error, standing):
+    found = judge(band(a=1.0), {"a": error}, {"a": 1.0}, causes={}, gain=None, seen=False)
     assert found.standing == standing
-    assert list(found.over_stated) == ["a", "b"]
-    seen = judge(band(a=1.0, b=1.0), given, start, no_input, no_better=no_better, gain=gain, seen=True)
-    assert seen.standing == ("seen" if standing == "as stated" else standing)
+    if standing == "no test":
+        assert str(found) == (
+            f"no test of the plant: the inputs do too little here (times the stated error: a {error:.2g})"
+        )
 
 
-def test_where_no_output_can_beat_no_input_the_log_is_no_test():
-    found = judge(band(a=1.0), {"a": 0.9}, {}, {"a": 1.0}, no_better=("a",), gain=None, seen=False)
-    assert found.standing == "no test"
-    assert str(found) == (
-        "errs as was stated, but the inputs do too little here to test the plant "
-        "(times the stated error: a 0.9)"
+def test_an_error_that_the_start_explains_does_not_clear_a_plant_that_is_far_worse_than_no_input():
+    # 11.7 degC beside 3.99 without input was taken for a log that is no test
+    found = judge(
+        band(a=3.0), {"a": 11.7}, {"a": 3.99}, causes={"a": {"start": 0.95}}, gain=None, seen=False
     )
-
-
-def test_an_error_between_once_and_twice_what_was_stated_is_reported_as_larger():
-    found = judge(band(a=1.0), {"a": 1.5}, {}, {"a": 9.0}, no_better=(), gain=None, seen=False)
-    assert str(found) == (
-        "errs by more than was stated, but no more than chance may do (times the stated error: a 1.5)"
-    )
+    assert (found.standing, found.cause) == ("worse", "start")
 
 
 def test_hours_of_readings_do_not_make_another_plant_of_what_is_real_and_small():
@@ -95,14 +101,15 @@ def test_hours_of_readings_do_not_make_another_plant_of_what_is_real_and_small()
     assert run.notes[-1] == str(run.verdict)
     larger = free_run(plant, log_of(slow=2.0))
     assert larger.verdict is not None
-    assert larger.verdict.standing == "changed"
+    assert (larger.verdict.standing, larger.verdict.cause) == ("worse", "dynamics")
     assert any(note.endswith("or the plant is not what it was in the fit") for note in larger.notes)
 
 
 def test_a_gain_is_another_plant_and_the_same_is_not():
     plant = block()
     standing = {gain: free_run(plant, log_of(gain)).verdict for gain in (1.0, 0.75)}
-    assert [found.standing for found in standing.values() if found] == ["as stated", "changed"]
+    assert [found.standing for found in standing.values() if found] == ["as stated", "worse"]
+    assert standing[0.75].cause == "gain"
     assert standing[0.75].gain == pytest.approx(-0.25, abs=0.01)
     assert standing[1.0].over_stated["t"] == pytest.approx(1.0, abs=0.05)
 
@@ -127,7 +134,7 @@ def test_rows_of_the_fit_are_no_test_but_those_behind_them_are():
     used = replace(fit_logs([log])[0], stop_s=1999.0)
     plant = replace(block(), fitted_to=(used,))
     found = [free_run(plant, log, score_from=begin).verdict for begin in (5.0, 2000.0)]
-    assert [each.standing for each in found if each] == ["seen", "as stated"]
+    assert [(each.standing, each.cause) for each in found if each] == [("no test", "seen"), ("as stated", "")]
 
 
 def test_a_band_that_is_known_is_not_made_again():
