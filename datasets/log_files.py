@@ -375,7 +375,7 @@ def _states_as_columns(table: Table, clock: Clock) -> Table:
         for state in sorted(counts.keys() - {rest}):
             made.append(unused(f"{header}_{state}", numbers))
             numbers[made[-1]] = np.array([float(cell == state) if cell else np.nan for cell in cells])
-        notes.append(f"{header}: words read as columns of 0 and 1 ({', '.join(made)}), {rest} as rest")
+        notes.append(f"{header}: words read as columns of 0 and 1 ({', '.join(made)}), all 0 in {rest}")
     return replace(table, numbers=numbers, text=text, notes=(*table.notes, *notes))
 
 

@@ -69,7 +69,7 @@ NO_CLUE = "neither its name nor its unit shows what it is"
 _NEVER_MOVES, _COUNTS_ROWS = "it never moves", "it counts rows or time"
 BY_UNIT = "its unit is degC"
 FOLLOWS = "its course follows"
-FOLLOWED = "comes to its levels and stays there, as to a set point"
+FOLLOWED = "settles at its levels, as at a set point"
 _HELD_SHARE, _HELD_SIZE = 0.5, 0.05  # of rows with a move; of the range that its median has, at least
 _FEW = 20  # rows: too few to distinguish chance from rule
 _COUNTS = 0.9  # of the rows have the same step
@@ -324,7 +324,7 @@ def _followed(
         if gains[1:, 0].max(initial=0.0) > _STRONG:
             out[goal] = "other", f"{reading} {FOLLOWED}"
             if guesses.get(reading, ("", ""))[1] == NO_CLUE:
-                out[reading] = "output", f"it comes to the levels of {goal}"
+                out[reading] = "output", f"it settles at the levels of {goal}"
     return out
 
 
@@ -356,7 +356,7 @@ def _unnamed_causes(
     moved = {name: _is_moved(columns, name, drives) for name in outputs}
     for name in [n for n in outputs if guesses.get(n, ("", ""))[1].startswith((BY_UNIT, FOLLOWS))]:
         if not moved[name] and any(moved[other] for other in outputs):
-            out[name] = "disturbance", f"no drive moves it ({', '.join(drives)})"
+            out[name] = "disturbance", f"it does not respond to {', '.join(drives)}"
     return out
 
 

@@ -377,7 +377,7 @@ def test_what_a_reading_comes_to_is_its_set_point_by_whatever_name():
     y, u = under_control(GOALS, 5.0)
     roles = assign_roles({"uno": "1", "due": "1", "tre": "1"}, columns={"uno": GOALS, "due": u, "tre": y})
     assert roles.of == {"uno": "other", "due": "input", "tre": "output"}
-    assert any(line.startswith("uno is left out: tre comes to its levels") for line in roles.doubts)
+    assert any(line.startswith("uno is left out: tre settles at its levels") for line in roles.doubts)
 
 
 @pytest.mark.parametrize("names", [("Setpoint", "Input", "Output"), ("SP", "PV", "OP")])
