@@ -129,8 +129,8 @@ def effusivity_posterior(
 
     Arguments are those of :func:`material_fit`; ``coupling`` is how blocks move between touches, by default
     those of the example rig; ``other_gripper`` the probability, before the grasps are seen, that another
-    gripper of its kind took them: single touches are answered by both, as likely as each explains them all,
-    and another one's scale of effusivities, which no block anchors, is known to 0.6 in the logarithm.
+    gripper of its kind took them: three single touches or more are answered by both, as likely as each
+    explains them all, and another one's scale of effusivities, which no block anchors, is known to 0.6 in the logarithm.
     """
     (grasps,) = as_grasps(grasps)
     rows = touch_groups(grasps) if has_touch_groups(grasps) else {}
@@ -140,7 +140,7 @@ def effusivity_posterior(
     if alone.size:
         data = touches(grasps.isel(grasp=alone) if rows else grasps, until=until)
         single = grid_posteriors(gripper, data)
-        if other_gripper > 0:
+        if other_gripper > 0 and alone.size >= _SEVERAL:
             single, share = _by_either(gripper, data, single, other_gripper)
         found |= dict(zip(alone.tolist(), single))
     if rows:
@@ -151,6 +151,7 @@ def effusivity_posterior(
     return _rows(gripper, names, [found[i] for i in range(len(names))], shares)
 
 
+_SEVERAL = 3  # single touches, from which on they decide whether another gripper took them
 # grasps about which another gripper is asked one by one, until it is so unlikely, and when nobody asks more
 _ASKED, _HARDLY, _UNLIKELY = 5, 0.001, 0.01
 

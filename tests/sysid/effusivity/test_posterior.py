@@ -67,12 +67,14 @@ def test_grasps_decide_whether_another_gripper_took_them(device):
 
 
 def test_either_gripper_s_answer_is_the_mixture_of_both(device):
-    one = simulated(device, ["iron"], t_gripper=23.0, t_object=43.0, seed=4)
-    data = touches(one)
-    (own,), (other,) = (grid_posteriors(g, data) for g in (device, another_gripper(device)))
-    odds = 4.0 * np.exp(other.log_evidence - own.log_evidence)  # of a prior of 0.8
-    share = odds / (1 + odds)
-    (row,) = effusivity_posterior(device, one, other_gripper=0.8)
+    some = simulated(device, ["iron"], n=3, t_gripper=23.0, t_object=43.0, seed=4)
+    data = touches(some)
+    own, other = (grid_posteriors(g, data) for g in (device, another_gripper(device)))
+    # of a prior of 0.99, by all that the three say
+    odds = 99.0 * np.exp(sum(b.log_evidence - a.log_evidence for a, b in zip(own, other)))
+    share, own, other = odds / (1 + odds), own[0], other[0]
+    row = effusivity_posterior(device, some, other_gripper=0.99)[0]
+    assert effusivity_posterior(device, some.isel(grasp=[0, 1]), other_gripper=0.99)[0].other_gripper == 0.0
     assert row.other_gripper == pytest.approx(share, rel=1e-9)
     assert 0.05 < share < 0.95
     means = [(fit.mass * (fit.x - device.effusivity_scale(fit.x)[0])).sum() for fit in (own, other)]
