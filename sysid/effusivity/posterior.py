@@ -130,7 +130,8 @@ def effusivity_posterior(
     Arguments are those of :func:`material_fit`; ``coupling`` is how blocks move between touches, by default
     those of the example rig; ``other_gripper`` the probability, before the grasps are seen, that another
     gripper of its kind took them: three single touches or more are answered by both, as likely as each
-    explains them all, and another one's scale of effusivities, which no block anchors, is known to 0.6 in the logarithm.
+    explains them all, and another one's scale of effusivities, which no block anchors, is known to 0.6 in the
+    logarithm.
     """
     (grasps,) = as_grasps(grasps)
     rows = touch_groups(grasps) if has_touch_groups(grasps) else {}
