@@ -20,15 +20,16 @@ gripper may be (:mod:`thermogrip.sysid.effusivity.gripper_model`), and
 :meth:`PosteriorClassifier.for_another_gripper` learns it from a few of its grasps of known blocks.
 
 Nobody need say which: by default a record of three touches or more decides between the training's gripper
-and blocks, other blocks of the same materials, and another gripper, with prior odds :math:`\pi_L` of 0.784, 0.196 and 0.02.  Its grasps j
-have one gripper and one set of blocks, so
+and blocks, other blocks of the same materials, and another gripper, with prior odds :math:`\pi_L` of 0.784,
+0.196 and 0.02.  Its grasps j have one gripper and one set of blocks, so
 
 .. math:: p(m | i) \propto \sum_L \pi_L Z_{i m L} \prod_{j \ne i} Z_{j L}, \qquad
           Z_{j L} = (1 - u) \frac{1}{M} \sum_m Z_{j m L} + u Z_{j, free},
 
 u being the probability of a material that is no candidate, which shall not pass for another gripper.  Where
-the training's own numbers explain a record, the answers are theirs.  Fewer touches,
-and touches of one block, are taken for the training's, and so is any gripper where the calibration has a discrepancy, which is that one device's.
+the training's own numbers explain a record, the answers are theirs.  Fewer touches, and touches of one block,
+are taken for the training's, and so is any gripper where the calibration has a discrepancy, which is that one
+device's.
 """
 
 from __future__ import annotations
