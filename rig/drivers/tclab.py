@@ -42,6 +42,7 @@ from thermogrip.rig.serial.protocol import REFUSALS
 HEATERS, SENSORS = ("q1", "q2"), ("t1", "t2")
 LOWEST, CEILING = -49.9, 130.0  # degC: outside, the converter is at its end and the sensor open or shorted
 BAD_SCANS = 4
+TIMEOUT = 0.5  # s, of a line
 _FRESH_S = 10.0
 _NUMBER = re.compile(rb"(-?(?:0|[1-9][0-9]{0,3})\.[0-9]{3})\r?\n")
 _VERSION = re.compile(rb"TCLab Firmware [ -~]+\r?\n")
@@ -62,7 +63,7 @@ class TCLabRig(NoticeBook):
         *,
         highest: float = 80.0,
         jump: float = 3.0,
-        timeout: float = 0.5,
+        timeout: float = TIMEOUT,
         greeting: float = 6.0,
         clock: Callable[[], float] = time.monotonic,
         sleep: Callable[[float], None] = time.sleep,
@@ -279,8 +280,9 @@ class TCLabRig(NoticeBook):
 
     def _wait_for_silence(self) -> None:
         """Let late answers come, and throw them away; of what never falls silent, those of four lines."""
-        end = time.monotonic() + 4 * self.timeout
-        while time.monotonic() < end and self.port.read(self.timeout):
+        silence = min(self.timeout, TIMEOUT)  # who waits longer for answers need not wait longer for none
+        end = time.monotonic() + 4 * silence
+        while time.monotonic() < end and self.port.read(silence):
             pass
 
     def _once(self, command: bytes, count: int, form: re.Pattern[bytes]) -> list[bytes]:
