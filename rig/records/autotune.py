@@ -243,7 +243,7 @@ class Autotune:
         seconds = min(self.left_s, (HOLD + 0.5 * BITS) * slowest)
         if seconds < LEAST_S:
             return False
-        if "pi" not in self.known:
+        if "first" not in self.known:
             loops = [f"{p.drive} on {p.output}, Kc {p.Kc:.3g}, Ti {p.Ti:.3g} s" for p in loop.loops]
             self.say(f"first loop after {self.spent_s / 60:.1f} min: {'; '.join(loops)}")
             self._note(first={"minutes": round(self.spent_s / 60, 1), "loops": loops})

@@ -13,6 +13,7 @@ from thermogrip.cli.rig import (
     OnTripOption,
     PortOption,
     ProtocolOption,
+    RelaysOption,
     SpeedOption,
     TwinOption,
     guard_of,
@@ -38,6 +39,7 @@ def autotune(
     protocol: ProtocolOption = None,
     speed: SpeedOption = None,
     twin: TwinOption = None,
+    relays: RelaysOption = None,
     limit: Annotated[
         float | None, cli.opt("--limit", "DEGC", "No sensor above this [default: as the guard has it].")
     ] = None,
@@ -72,15 +74,16 @@ def autotune(
     console, pace = Console(as_json), pace_of(speed, twin, live, foxglove)
     clock, paced = ScaledClock(pace or speed or 1.0), pace is not None
     watch = watch_of("autotune", console, out, live, foxglove, on_trip, pace)
-    about: dict[str, Any] = {"port": port} if twin is None else {"twin": twin.name}
     work = Autotune(
         cli.new_folder(out),
         wanted,
-        lambda: rig_of(port, protocol, clock, twin, None, 0, None, seed=seed, t_start=None, paced=paced),
+        lambda: rig_of(
+            port, protocol, clock, twin, None, 0, None, seed=seed, t_start=None, paced=paced, relays=relays
+        ),
         lambda plant: guard_of(guard, plant, speed=speed or 1.0, limit=limit),
         minutes=minutes,
         spec=None if spec is None else read_spec(spec),
-        about=about | {"limit": limit},
+        about={"limit": limit, "twin": None if twin is None else twin.name},  # a port may be called otherwise
         clock=None if port is None else clock,
         progress=watch.progress,
         shown={"listener": watch.listen, "operator": watch.operator},

@@ -61,6 +61,10 @@ SpeedOption = Annotated[
         min=0.01,
     ),
 ]
+RelaysOption = Annotated[
+    Path | None,
+    cli.opt("--relays", "RELAYS.toml", "Drives that are relays, with their least times on and off."),
+]
 DrawOption = Annotated[
     int, cli.opt("--draw", None, "Posterior draw of the twin's plant (0: the fit).", min=0)
 ]
@@ -161,6 +165,7 @@ def run(
     speed: SpeedOption = None,
     twin: TwinOption = None,
     draw: DrawOption = 0,
+    relays: RelaysOption = None,
     start: StartOption = None,
     hold: Annotated[float, cli.opt("--hold", "S", "Regulate this long after settling.", min=0)] = 0.0,
     obj: ObjOption = None,
@@ -218,11 +223,14 @@ def run(
     about |= {"port": port} if twin is None else {"twin": twin.name, "draw": draw}
     about |= {} if profile is None else {"profile": profile.name}
     about |= {"from_degC": start, "hold_s": hold, "object_degC": obj, "material": material, "seed": seed}
-    files = files_of(learn, controller=controller, plant=twin, guard=guard, profile=profile)
+    files = files_of(
+        learn, controller=controller, plant=twin, guard=guard, profile=profile, relays=relays
+    )
     paced = pace is not None
     rig = rig_of(
-        port, protocol, clock, twin, network, draw, loaded, seed=seed, t_start=start, paced=paced
-    )
+        port, protocol, clock, twin, network, draw, loaded, seed=seed, t_start=start, paced=paced,
+        relays=relays,
+    )  # fmt: skip
     try:
         furthest = wanted if path is None else path.highest()
         for line in beyond_logs(loaded, furthest, grasps=grasp is not None):
@@ -547,17 +555,28 @@ def files_of(learn: Path | None, **named: Path | None) -> dict[str, Path]:
 def rig_of(
     port: str | None, protocol: str | None, clock: ScaledClock, twin: Path | None, network: str | None,
     draw: int, controller: Controller | None, *, seed: int, t_start: float | None, paced: bool = False,
+    relays: Path | None = None,
 ) -> Rig:  # fmt: skip
-    """Return the rig on a port, or the simulated one, ``paced`` by the clock or as fast as it goes."""
+    """Return the rig on a port, or the simulated one, ``paced`` by the clock or as fast as it goes, with the
+    relays of a file."""
     from thermogrip.rig.clock import Metronome
     from thermogrip.rig.drivers.connect import open_rig
+    from thermogrip.rig.drivers.relays import RelayRig, read_relays
 
+    switched = {} if relays is None else read_relays(relays)
     if twin is not None:
         pace = Metronome(clock, clock.sleep).wait if paced else None
-        return _twin(twin, network, draw, controller, seed=seed, t_start=t_start, pace=pace)
+        simulated = _twin(twin, network, draw, controller, seed=seed, t_start=t_start, pace=pace)
+        return RelayRig(simulated, switched, lambda: simulated.time) if switched else simulated
     if t_start is not None or draw:
         raise UserError("--from and --draw are of the twin", hint="leave them away with --port")
-    rig = open_rig(str(port), protocol, clock=clock, sleep=clock.sleep)
+    rig: Rig = open_rig(str(port), protocol, clock=clock, sleep=clock.sleep)
+    if switched:
+        try:
+            rig = RelayRig(rig, switched, clock)
+        except UserError:
+            rig.close()
+            raise
     lacking = set(controller.plant.inputs) - set(rig.units) - {"pump"} if controller is not None else ()
     if lacking:
         rig.close()

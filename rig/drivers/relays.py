@@ -1,0 +1,269 @@
+"""Relays as drives: a requested share of full power, by switching on and off with least times.
+
+A relay keeps what it owes,
+
+    debt(t) = int (requested - state) dt      [s of full power],
+
+and switches on once it owes half of its shortest pulse, off once it owes nothing, neither before its least
+time is over.  While it is on the debt falls by no more than 1 s a second, while it is off it rises by no
+more: whatever is requested,
+
+    -on_s / 2  <=  debt  <=  max(on_s / 2, off_s),
+
+so over a window of W seconds the mean of the relay is off by at most the width of that over W, and over
+a period of one requested share by nothing.  There is no period to choose: at a share d it is the shortest
+that the least times allow, but at the ends, where it takes on_s / d and off_s / (1 - d).
+
+A heater and a cooler are two such relays of one drive from -1 to 1, each asked for its own sign.  One comes
+on only when the other has been off for a dead time; what it owes by then beyond its bound is forgiven.  A
+request of the other sign takes back what is owed.
+
+The end of a session (a pump that is off, :meth:`RelayRig.close`) switches off at once, whatever the least
+times say.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields, replace
+from math import inf
+from pathlib import Path
+
+from thermogrip.datasets.atomic_files import read_toml
+from thermogrip.datasets.errors import UserError, known_names
+from thermogrip.rig.interface import UNIT_RANGES, Event, Reading, Rig, check_order
+
+_NOW_S = 1e-6  # a switching that is due within this is due
+_SHORTEST_S = 0.01  # wait between two switchings: what comes later for it is owed
+_SAME = 0.01  # of full: a device rounds what it applies
+_LONGEST_S = 3600.0
+
+
+@dataclass(frozen=True)
+class Relay:
+    """One drive that is switched: by one relay, or by two, of which the cooler is the other sign."""
+
+    heater: str  # the device's input that is full on; where both are one input, its ends are on and reversed
+    cooler: str = ""  # empty where nothing cools
+    on_s: float = 1.0  # least time on [s]
+    off_s: float = 1.0  # and off
+    dead_s: float = 0.0  # least time between heater and cooler
+
+
+class Switch:
+    """One relay: what it owes, and when it goes over."""
+
+    def __init__(self, on_s: float, off_s: float) -> None:
+        self.on, self.debt = False, 0.0
+        self.since_s = inf  # it last went over
+        self._on_s, self._off_s = on_s, off_s
+
+    def pass_time(self, seconds: float, share: float) -> None:
+        """Let time pass under a requested share, below zero where the other sign is asked for."""
+        self.since_s += seconds
+        if self.on:
+            self.debt += (max(share, 0.0) - 1.0) * seconds
+            return
+        least = min(self.debt, 0.0) if share < 0 else -inf
+        self.debt = min(max(self.debt + share * seconds, least), max(0.5 * self._on_s, self._off_s))
+
+    def due_s(self, share: float) -> float:
+        """Return in how long it goes over if this share is requested all the time."""
+        if self.on:
+            paid = self.debt / (1.0 - share) if share < 1 and self.debt > 0 else 0.0 if share < 1 else inf
+            return max(paid, self._on_s - self.since_s)
+        owed = 0.5 * self._on_s - self.debt
+        return max(owed / share, self._off_s - self.since_s, 0.0) if share > 0 else inf
+
+    def go_over(self) -> None:
+        """Switch."""
+        self.on, self.since_s = not self.on, 0.0
+
+
+class RelayRig:
+    """A rig some of whose drives are relays, behind the interface of one whose drives are graded.
+
+    A reading has the requested drive where the device applies what was switched, else what it applies.
+
+    Parameters
+    ----------
+    rig : Rig
+        Its inputs that no relay names are handed through.
+    relays : mapping of str to Relay
+        By the drive as the controller knows it.
+    clock : callable
+        Time by which relays are switched [s].
+
+    Examples
+    --------
+    >>> from thermogrip.rig.simulation.twin import Twin
+    >>> from thermogrip.rig.simulation.virtual_device import example_plant
+    >>> twin = Twin(example_plant("tclab"))
+    >>> rig = RelayRig(twin, {"q1": Relay("q1", on_s=10.0, off_s=10.0)}, lambda: twin.time)
+    >>> rig.apply({"q1": 25.0, "q2": 0.0}, 1)
+    >>> rig.wait(120.0)
+    >>> sum(row["q1"] for row in twin.history) / 120.0
+    25.0
+    """
+
+    def __init__(self, rig: Rig, relays: Mapping[str, Relay], clock: Callable[[], float]) -> None:
+        self.rig, self.relays, self._clock = rig, dict(relays), clock
+        for relay in self.relays.values():
+            for name in filter(None, (relay.heater, relay.cooler)):
+                if name not in rig.units:
+                    hint = known_names(name, rig.units, "it has {}")
+                    raise UserError(f"relays: the rig has no input {name!r}", hint=hint)
+        switched = {name for relay in self.relays.values() for name in (relay.heater, relay.cooler)}
+        self._through = {name: unit for name, unit in rig.units.items() if name not in switched}
+        self._switches = {
+            (name, sign): Switch(relay.on_s, relay.off_s)
+            for name, relay in self.relays.items()
+            for sign in ((1, -1) if relay.cooler else (1,))
+        }
+        self._requested = dict.fromkeys(self.units, 0.0)
+        self._pump, self._now = 0, clock()
+
+    @property
+    def units(self) -> dict[str, str]:
+        """Units of the drives as a controller has them; with a cooler -1...1."""
+        units = self.rig.units
+        return {
+            name: "1" if relay.cooler else units[relay.heater] for name, relay in self.relays.items()
+        } | self._through
+
+    @property
+    def expires_s(self) -> float:
+        """The device's."""
+        return self.rig.expires_s
+
+    @property
+    def has_pump(self) -> bool:
+        """Whether there is one."""
+        return self.rig.has_pump
+
+    def read(self) -> Reading:
+        """Return the newest sample."""
+        reading, orders = self.rig.read(), self._orders()
+        drive = dict(self._requested)
+        for name, relay in self.relays.items():
+            applied = {each: reading.drive[each] for each in {relay.heater, relay.cooler} - {""}}
+            differs = [abs(value - orders[each]) / self._full(each) for each, value in applied.items()]
+            if max(differs) > _SAME:
+                share = applied[relay.heater] / self._full(relay.heater)
+                if relay.cooler not in ("", relay.heater):
+                    share -= applied[relay.cooler] / self._full(relay.cooler)
+                drive[name] = share * UNIT_RANGES[self.units[name]][1]
+        return replace(reading, drive=drive)
+
+    def apply(self, drive: Mapping[str, float], pump: int) -> None:
+        """Request drives from now on; with the pump off all relays are off at once."""
+        ranges = {name: UNIT_RANGES[unit] for name, unit in self.units.items()}
+        check_order(drive, pump, ranges)
+        self._pass_time()
+        self._requested, self._pump = {name: float(value) for name, value in drive.items()}, pump
+        self._switch()
+        self.rig.apply(self._orders(), pump)
+
+    def wait(self, seconds: float) -> None:
+        """Let time pass, and switch meanwhile what is due."""
+        left = seconds
+        while left > _NOW_S:
+            due = min((self._due_s(*key) for key in self._switches), default=inf)
+            step = min(left, max(due, _SHORTEST_S))
+            self.rig.wait(step)
+            left -= step
+            self._pass_time()
+            if left > _NOW_S and self._switch():
+                self.rig.apply(self._orders(), self._pump)
+
+    def grasp(self, material: str, t_object: float) -> None:
+        """Close the gripper."""
+        self.rig.grasp(material, t_object)
+
+    def release(self) -> None:
+        """Open the gripper."""
+        self.rig.release()
+
+    def notices(self) -> list[Event]:
+        """Return what happened since the last call."""
+        return self.rig.notices()
+
+    def close(self) -> None:
+        """Switch everything off and let the rig go."""
+        self.rig.close()
+
+    def _full(self, name: str) -> float:
+        """Return what an input of the device is when it is full on."""
+        return UNIT_RANGES[self.rig.units[name]][1]
+
+    def _share(self, name: str, sign: int) -> float:
+        """Return the share that a relay is asked for, below zero for the other sign."""
+        return sign * self._requested[name] / UNIT_RANGES[self.units[name]][1]
+
+    def _pass_time(self) -> None:
+        now = self._clock()
+        for key, switch in self._switches.items():
+            switch.pass_time(now - self._now, self._share(*key))
+        self._now = now
+
+    def _due_s(self, name: str, sign: int) -> float:
+        """Return in how long a relay goes over: the other one of its drive must be off for long enough."""
+        switch, other = self._switches[name, sign], self._switches.get((name, -sign))
+        if not self._pump:
+            return 0.0 if switch.on else inf
+        due = switch.due_s(self._share(name, sign))
+        if switch.on or other is None:
+            return due
+        return inf if other.on else max(due, self.relays[name].dead_s - other.since_s)
+
+    def _switch(self) -> bool:
+        """Switch what is due; say whether anything was."""
+        due = [key for key in self._switches if self._due_s(*key) <= _NOW_S]
+        for key in due:
+            self._switches[key].go_over()
+        return bool(due)
+
+    def _orders(self) -> dict[str, float]:
+        """Return what the device is told."""
+        orders = {name: self._requested[name] for name in self._through}
+        for name, relay in self.relays.items():
+            for each in filter(None, (relay.heater, relay.cooler)):
+                orders.setdefault(each, 0.0)
+            if self._switches[name, 1].on:
+                orders[relay.heater] = self._full(relay.heater)
+            elif relay.cooler and self._switches[name, -1].on:
+                sign = -1 if relay.cooler == relay.heater else 1
+                orders[relay.cooler] = sign * self._full(relay.cooler)
+        return orders
+
+
+def read_relays(path: str | Path) -> dict[str, Relay]:
+    """Return the relays of a TOML file: a table by drive, with the keys of :class:`Relay`.
+
+    Examples
+    --------
+    >>> from tempfile import mkdtemp
+    >>> path = Path(mkdtemp()) / "relays.toml"
+    >>> n = path.write_text("[q1]\\non_s = 10\\noff_s = 10\\n")
+    >>> read_relays(path)
+    {'q1': Relay(heater='q1', cooler='', on_s=10.0, off_s=10.0, dead_s=0.0)}
+    """
+    found, keys = {}, {key.name: key.type for key in fields(Relay)}
+    content = read_toml(path, hint="write [q1] and below it on_s = 10")
+    for name, table in content.items():
+        if not isinstance(table, dict):
+            raise UserError(f"{name}: is no table", file=path, hint="write [q1] and below it on_s = 10")
+        for key, value in table.items():
+            if key not in keys:
+                raise UserError(f"{name}.{key}: no such key", file=path, hint=known_names(key, keys))
+            number = isinstance(value, int | float) and not isinstance(value, bool)
+            fits, what = isinstance(value, str), "the name of an input"
+            if keys[key] == "float":
+                fits, what = number and 0 <= value <= _LONGEST_S, f"a time of 0 to {_LONGEST_S:g} s"
+            if not fits:
+                raise UserError(f"{name}.{key}: {value!r} is not {what}", file=path, hint="correct it")
+        times = {key: float(value) for key, value in table.items() if keys[key] == "float"}
+        found[name] = Relay(table.get("heater", name), table.get("cooler", ""), **times)
+    if not found:
+        raise UserError("has no relay", file=path, hint="write [q1] and below it on_s = 10")
+    return found

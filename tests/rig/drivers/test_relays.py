@@ -1,0 +1,182 @@
+"""Relays as drives: least times, the mean, and a heater and a cooler that never meet."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.rig.makers import STILL, Constant, make_lab
+from thermogrip.datasets.arrays import Array
+from thermogrip.datasets.errors import UserError
+from thermogrip.rig.drivers.relays import Relay, RelayRig, read_relays
+from thermogrip.rig.interface import Reading, Rig
+from thermogrip.rig.session.session import run_session
+from thermogrip.rig.simulation.twin import Twin
+
+
+class Board:
+    """Inputs of a device, and when each was set to what."""
+
+    expires_s, has_pump = 2.0, True
+
+    def __init__(self, **units: str) -> None:
+        self.units, self.now = units, 0.0
+        self.drive, self.pump = dict.fromkeys(units, 0.0), 0
+        self.set: list[tuple[float, dict[str, float]]] = [(0.0, dict(self.drive))]
+
+    def apply(self, drive: Mapping[str, float], pump: int) -> None:
+        self.drive, self.pump = dict(drive), pump
+        self.set.append((self.now, self.drive))
+
+    def wait(self, seconds: float) -> None:
+        self.now += seconds
+
+    def read(self) -> Reading:
+        return Reading(self.now, {}, self.drive, self.pump)
+
+    def spells(self, name: str) -> list[tuple[float, float]]:
+        """Return each value that an input had, and for how long [s]; the last one is not over."""
+        changes = [self.set[0], *(b for a, b in pairwise(self.set) if a[1][name] != b[1][name])]
+        return [(a[1][name], b[0] - a[0]) for a, b in pairwise(changes)]
+
+    def integral(self, name: str) -> tuple[Array, Array]:
+        """Return times, and the integral of an input until then."""
+        times = np.array([at for at, _ in self.set] + [self.now])
+        values = np.array([drive[name] for _, drive in self.set])
+        return times, np.concatenate([[0.0], np.cumsum(values * np.diff(times))])
+
+
+def played(board: Board, relay: Relay, requests: Array, look_s: float = 0.5) -> RelayRig:
+    rig = RelayRig(board, {"drive": relay}, lambda: board.now)  # type: ignore[arg-type]
+    for request in requests.tolist():
+        rig.apply({"drive": request}, 1)
+        rig.wait(look_s)
+    return rig
+
+
+def restless(seed: int, low: float, n: int = 4000) -> Array:
+    """Return requests that a bad loop makes: steps of any length, the ends among them, and noise."""
+    rng = np.random.default_rng(seed)
+    steps = np.repeat(rng.uniform(low - 0.3, 1.3, n), rng.integers(1, 80, n))[:n]
+    return np.clip(steps + 0.02 * rng.standard_normal(n), low, 1.0)
+
+
+@pytest.mark.parametrize(("on_s", "off_s"), [(10.0, 10.0), (3.0, 30.0), (40.0, 5.0), (0.3, 0.2)])
+@pytest.mark.parametrize("seed", range(3))
+def test_a_relay_keeps_its_least_times_and_the_mean_of_what_is_requested(
+    on_s: float, off_s: float, seed: int
+) -> None:
+    board, requests = Board(drive="1"), restless(seed, 0.0)
+    played(board, Relay("drive", on_s=on_s, off_s=off_s), requests)
+    spells = board.spells("drive")[1:]  # the first is from before
+    assert {value for value, _ in spells} == {0.0, 1.0}
+    assert min(length for value, length in spells if value == 1.0) >= on_s - 1e-4
+    assert min(length for value, length in spells if value == 0.0) >= off_s - 1e-4
+    times, had = board.integral("drive")
+    asked = np.concatenate([[0.0], 0.5 * np.cumsum(requests)])
+    wanted = np.interp(times, 0.5 * np.arange(requests.size + 1), asked)
+    owed = wanted - had
+    assert owed.min() >= -0.5 * on_s - 1e-3
+    assert owed.max() <= max(0.5 * on_s, off_s) + 1e-3
+
+
+@pytest.mark.parametrize("share", [0.02, 0.25, 0.5, 0.8, 0.99])
+def test_over_its_period_a_relay_is_on_for_the_share_that_is_requested(share: float) -> None:
+    board = Board(drive="percent")
+    played(board, Relay("drive", on_s=5.0, off_s=5.0), np.full(6000, 100 * share))
+    spells = board.spells("drive")[-4:]
+    on = sum(length for value, length in spells if value == 100.0)
+    assert on / sum(length for _, length in spells) == pytest.approx(share, abs=1e-4)
+
+
+@pytest.mark.parametrize("request_", [0.0, 1.0])
+def test_nothing_and_everything_are_not_switched(request_: float) -> None:
+    board = Board(drive="1")
+    played(board, Relay("drive", on_s=5.0, off_s=5.0), np.full(400, request_))
+    assert len(board.spells("drive")) == request_
+
+
+@pytest.mark.parametrize("same", [False, True])
+@pytest.mark.parametrize("seed", range(3))
+def test_heater_and_cooler_never_meet(same: bool, seed: int) -> None:
+    board = Board(drive="1") if same else Board(heat="percent", cool="1")
+    relay = Relay("drive", "drive", 8.0, 12.0, 6.0) if same else Relay("heat", "cool", 8.0, 12.0, 6.0)
+    played(board, relay, restless(seed, -1.0))
+    if same:
+        states = [(at, drive["drive"]) for at, drive in board.set]
+    else:
+        assert not any(drive["heat"] and drive["cool"] for _, drive in board.set)
+        states = [(at, np.sign(drive["heat"]) - drive["cool"]) for at, drive in board.set]
+    assert {state for _, state in states} == {-1.0, 0.0, 1.0}
+    ended = {1.0: -np.inf, -1.0: -np.inf}  # when each was on last
+    for (_, before), (at, state) in pairwise(states):
+        if before:
+            ended[before] = at
+        if state and state != before:
+            assert at - ended[-state] >= 6.0 - 1e-4
+
+
+def test_a_drive_of_one_sign_gets_its_mean_from_its_own_relay() -> None:
+    board = Board(heat="1", cool="1")
+    played(board, Relay("heat", "cool", 5.0, 5.0, 10.0), np.full(4000, -0.3))
+    assert board.integral("heat")[1][-1] == 0.0
+    assert board.integral("cool")[1][-1] / 2000.0 == pytest.approx(0.3, abs=0.005)
+
+
+def test_an_end_switches_off_at_once_whatever_the_least_time() -> None:
+    board = Board(drive="1")
+    rig = played(board, Relay("drive", on_s=60.0), np.full(80, 0.9))
+    assert board.drive == {"drive": 1.0}
+    rig.apply({"drive": 0.0}, 0)
+    assert (board.drive, board.pump) == ({"drive": 0.0}, 0)
+    rig.wait(100.0)
+    assert board.drive == {"drive": 0.0}
+
+
+def test_a_reading_has_the_request_while_the_device_does_what_it_was_told() -> None:
+    board = Board(drive="1", heat="percent", cool="percent")
+    rig = RelayRig(board, {"t": Relay("heat", "cool", 9.0, 9.0)}, lambda: board.now)  # type: ignore[arg-type]
+    assert rig.units == {"t": "1", "drive": "1"}
+    rig.apply({"t": 0.25, "drive": -0.5}, 1)
+    rig.wait(40.0)
+    assert rig.read().drive == {"t": 0.25, "drive": -0.5}
+    board.drive = {"drive": -0.5, "heat": 0.0, "cool": 100.0}  # a relay that sticks
+    assert rig.read().drive == {"t": -1.0, "drive": -0.5}
+
+
+def test_a_session_under_relays_settles_and_switches_off() -> None:
+    twin = Twin(make_lab(), **STILL, skin="t1")
+    rig = RelayRig(twin, {"q1": Relay("q1", on_s=2.0, off_s=2.0)}, lambda: twin.time)
+    assert isinstance(rig, Rig)
+    half = Constant({"q1": 50.0, "q2": 0.0})  # 15.15 K, by the lab's equations
+    session = run_session(rig, half, {"t1": 40.15}, output="t1", band=0.5, settle_timeout=2000.0)
+    assert session.verdict == "settled"
+    assert session.bias == pytest.approx(0.0, abs=0.5)
+    assert {round(row["q1"], 6) for row in twin.history} == {0.0, 100.0}
+    assert set(session.log["q1"].values) == {50.0}
+    assert twin.read().drive == {"q1": 0.0, "q2": 0.0}
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [("", "has no relay; write [q1]"), ("q1 = 3\n", "q1: is no table"),
+     ("[q1]\non = 3\n", "q1.on: no such key"),
+     ("[q1]\non_s = -1\n", "q1.on_s: -1 is not a time of 0 to 3600 s"),
+     ("[q1]\non_s = true\n", "q1.on_s: True is not a time"),
+     ("[q1]\ncooler = 3\n", "q1.cooler: 3 is not the name of an input")],
+)  # fmt: skip
+def test_a_file_that_is_wrong_anywhere_is_refused(tmp_path: Path, text: str, words: str) -> None:
+    path = tmp_path / "relays.toml"
+    path.write_text(text)
+    with pytest.raises(UserError) as refused:
+        read_relays(path)
+    assert words in str(refused.value)
+
+
+def test_a_relay_of_no_input_is_refused() -> None:
+    with pytest.raises(UserError, match="the rig has no input 'q3'"):
+        RelayRig(Twin(make_lab()), {"t": Relay("q3")}, lambda: 0.0)
