@@ -48,12 +48,15 @@ class Reading:
         The drive that is applied, by input.
     pump : int
         1 running, 0 off.
+    mean_drive : mapping of str to float, optional
+        What was applied on average since the reading before, where a drive is switched between two readings.
     """
 
     time_s: float
     values: Mapping[str, float]
     drive: Mapping[str, float]
     pump: int
+    mean_drive: Mapping[str, float] | None = None
 
     def as_controller_reading(self) -> dict[str, float]:
         """Return the flat dict that a controller's ``step`` takes."""

@@ -6,13 +6,14 @@ The plants are explicit equations that share nothing with the package, stepped b
 
 * bath: 6 l of water, a 1200 W element of 600 J/K behind 15 W/K, a sensor of 15 s; its relay stays on and off
   for 10 s.  To 57 degC from 22, then 150 W of load for half an hour.
-* chamber: 12 kJ/K of air and walls, a 60 W heater of 300 J/K behind 3 W/K, a compressor of -150 W that comes
+* chamber: 12 kJ/K of air and walls, a 60 W heater of 300 J/K behind 3 W/K, a compressor of -80 W that comes
   with 40 s, a sensor of 30 s; the compressor stays on for 60 s and off for 180 s, the heater likewise, and
   60 s are between them.  To 18 degC from 24, then the room goes from 24 to 8 degC.
 
-Each is identified from one log of pulses that relays can play, and controlled by the default design through
-:class:`~thermogrip.rig.drivers.relays.RelayRig`.  A thermostat switches at its half width about the target.
-A line has: settled within the band [s], overshoot [K], rms at rest and under the load [K], switchings an hour.
+Each is identified from one log of pulses that relays can play, and controlled by a PI of that plant and by
+the MPC's default design through :class:`~thermogrip.rig.drivers.relays.RelayRig`.  A thermostat switches at
+its half width about the target.  A line has: settled within the band [s], overshoot [K], rms at rest and
+under the load [K], switchings an hour.
 """
 
 from __future__ import annotations
@@ -23,7 +24,8 @@ from typing import Any
 
 import numpy as np
 
-from thermogrip.mpc import Controller, Spec
+from thermogrip.datasets.schema import make_log
+from thermogrip.mpc import Controller, PIController
 from thermogrip.mpc.interface import Move
 from thermogrip.rig.drivers.relays import Relay, RelayRig
 from thermogrip.rig.guard.guard import Guard, GuardSettings, RuleSettings
@@ -43,7 +45,7 @@ class Plant:
     room, load = 22.0, 0.0
     relay = Relay("heat", on_s=10.0, off_s=10.0)
     units: Mapping[str, str] = {"heat": "percent"}
-    begin, target, band, hold_s = 22.0, 57.0, 0.25, 3600.0
+    begin, target, band, hold_s, bit_s = 22.0, 57.0, 0.25, 3600.0, 90.0
     full = (0.0, 100.0)
 
     def __init__(self, seed: int) -> None:
@@ -94,14 +96,14 @@ class Chamber(Plant):
     room = 24.0
     relay = Relay("heat", "cool", on_s=60.0, off_s=180.0, dead_s=60.0)
     units: Mapping[str, str] = {"heat": "percent", "cool": "percent"}
-    begin, target, band, hold_s = 24.0, 18.0, 0.5, 7200.0
+    begin, target, band, hold_s, bit_s = 24.0, 18.0, 0.5, 7200.0, 720.0
     full = (-1.0, 1.0)
 
     def rates(self, dt: float) -> None:
         """Go on by a step: air, element, compressor, sensor."""
         flow = 3.0 * (self.element - self.t)
         self.element += dt * (60.0 * self.drive["heat"] / 100 - flow) / 300.0
-        self.cold += dt * (150.0 * self.drive["cool"] / 100 - self.cold) / 40.0
+        self.cold += dt * (80.0 * self.drive["cool"] / 100 - self.cold) / 40.0
         self.t += dt * (flow - self.cold - 3.5 * (self.t - self.room)) / 12e3
         self.sensor += dt * (self.t - self.sensor) / 30.0
 
@@ -142,16 +144,14 @@ def guard() -> Guard:
 
 
 def identified(kind: type[Plant], seed: int) -> Any:
-    """Return the plant found in one log of an hour or two."""
+    """Return the plant found in one log of pulses several least times long."""
     rig = relayed(kind(seed))
     [name] = rig.units
-    schedule = excite("prbs", kind.hold_s / 60, dt=5.0, low=kind.full[0] / 100 if kind.full[0] < 0 else 0.0,
-                      high=1.0, tau_fast=kind.hold_s / 40, tau_slow=kind.hold_s / 5, seed=seed)  # fmt: skip
-    unit = rig.units[name]
-    scale = 1.0 if unit == "1" else 60.0
-    low = kind.full[0] if kind.full[0] < 0 else 0.0
-    values = np.clip(schedule["drive"].values * scale, low, kind.full[1])
-    schedule = schedule.drop_vars(["drive", "pump"]).assign({name: ("time", values, {"units": unit, "role": "input"})})
+    unit, low = rig.units[name], min(kind.full[0], 0.0)
+    minutes, times = 0.4 * kind.bit_s, {"tau_fast": kind.bit_s, "tau_slow": 4 * kind.bit_s}
+    pulses = excite("prbs", minutes, dt=5.0, low=low, high=1.0, **times, seed=seed)
+    drive = pulses["drive"].values * (1.0 if unit == "1" else 60.0)
+    schedule = make_log(pulses["time"].values, {name: (drive, unit, "input")}, name="pulses")
     log, ended = play(rig, schedule, dt=5.0, guard=guard())  # type: ignore[arg-type]
     assert not ended, ended
     return identify([log], models=("arx", "oe", "subspace"), seed=seed).plant
@@ -190,11 +190,10 @@ def main() -> None:
     print(f"{'plant':9}{'controller':18}{'settled':>9}{'over':>7}{'rest':>7}{'load':>7}{'per hour':>10}")
     for kind in (Plant, Chamber):
         found = identified(kind, seed)
-        spec = Spec.of(found)
-        loops = {"default MPC": Controller(found, spec.design(found))}
         name = found.inputs[0]
+        loops: dict[str, Any] = {"PI by SIMC": PIController(found), "default MPC": Controller(found)}
         for half in (0.1, 0.5):
-            loops[f"thermostat +-{half:g}"] = Thermostat(half, kind.full[0], name)  # type: ignore[assignment]
+            loops[f"thermostat +-{half:g}"] = Thermostat(half, kind.full[0], name)
         for title, controller in loops.items():
             settled, over, rest, load, switched = closed_loop(kind, controller, seed)
             name = "bath" if kind is Plant else "chamber"

@@ -65,7 +65,8 @@ class Switch:
             self.debt += (max(share, 0.0) - 1.0) * seconds
             return
         least = min(self.debt, 0.0) if share < 0 else -inf
-        self.debt = min(max(self.debt + share * seconds, least), max(0.5 * self._on_s, self._off_s))
+        most = max(0.5 * self._on_s, self._off_s) + _SHORTEST_S
+        self.debt = min(max(self.debt + share * seconds, least), most)
 
     def due_s(self, share: float) -> float:
         """Return in how long it goes over if this share is requested all the time."""
@@ -121,7 +122,8 @@ class RelayRig:
             for sign in ((1, -1) if relay.cooler else (1,))
         }
         self._requested = dict.fromkeys(self.units, 0.0)
-        self._pump, self._now = 0, clock()
+        self._pump, self._now, self._read_at = 0, clock(), clock()
+        self._on_s = dict.fromkeys(self.relays, 0.0)  # since the last reading, the cooler's below zero
 
     @property
     def units(self) -> dict[str, str]:
@@ -153,7 +155,18 @@ class RelayRig:
                 if relay.cooler not in ("", relay.heater):
                     share -= applied[relay.cooler] / self._full(relay.cooler)
                 drive[name] = share * UNIT_RANGES[self.units[name]][1]
-        return replace(reading, drive=drive)
+        return replace(reading, drive=drive, mean_drive=self._mean_drive())
+
+    def _mean_drive(self) -> dict[str, float] | None:
+        """Return what was applied on average since it was asked for last; None where no time has passed."""
+        self._pass_time()
+        seconds, self._read_at = self._now - self._read_at, self._now
+        means = {
+            name: on_s / seconds * UNIT_RANGES[self.units[name]][1] if seconds > 0 else 0.0
+            for name, on_s in self._on_s.items()
+        }
+        self._on_s = dict.fromkeys(self.relays, 0.0)
+        return self._requested | means if seconds > 0 else None
 
     def apply(self, drive: Mapping[str, float], pump: int) -> None:
         """Request drives from now on; with the pump off all relays are off at once."""
@@ -202,8 +215,9 @@ class RelayRig:
 
     def _pass_time(self) -> None:
         now = self._clock()
-        for key, switch in self._switches.items():
-            switch.pass_time(now - self._now, self._share(*key))
+        for (name, sign), switch in self._switches.items():
+            self._on_s[name] += sign * switch.on * (now - self._now)
+            switch.pass_time(now - self._now, self._share(name, sign))
         self._now = now
 
     def _due_s(self, name: str, sign: int) -> float:

@@ -322,6 +322,7 @@ class Guard:
         self._fresh = (now if asked is None else asked, now)
         self._seen = float("nan")
         self._drive, self._pump = dict.fromkeys(units, 0.0), reading.pump
+        self._acted = self._drive
         self._differs, self._beyond = 0, dict.fromkeys(reading.values, 0)
         if not known:
             self._released = float("-inf")
@@ -421,6 +422,7 @@ class Guard:
             self._released = reading.time_s
         self._touched = touching
         masked, rooms = self._masked(reading.time_s), self.rooms(reading.values)
+        self._acted = self._drive if reading.mean_drive is None else dict(reading.mean_drive)
         jumped = self._predict(reading)
         accepted, suspect, trip = self.sensors.check(
             reading.time_s, reading.values, touching=masked, jumped=jumped, rooms=rooms
@@ -521,7 +523,7 @@ class Guard:
         """Predict with the model and return the sensors whose innovation is too large."""
         if self.model is None:
             return frozenset()
-        self.model.predict(reading.time_s, self._drive, self._pump, self._plausible(reading.values))
+        self.model.predict(reading.time_s, self._acted, self._pump, self._plausible(reading.values))
         jumps = [n for n, v in reading.values.items() if isfinite(v) and self.model.is_jump(n, v)]
         return frozenset(jumps)
 
@@ -531,7 +533,7 @@ class Guard:
         if self.model is None:
             outputs = {n: v for n, v in outputs.items() if n not in masked}
             target = {} if masked else self.target
-            share = [self._share(name, value) for name, value in self._drive.items()]
+            share = [self._share(name, value) for name, value in self._acted.items()]
             mean = max(share, key=abs, default=0.0)
             return self.rules.check(time, mean, outputs, room=room, target=target)
         found = self.model.update(time, outputs, masked)
