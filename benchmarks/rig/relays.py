@@ -149,10 +149,10 @@ def identified(kind: type[Plant], seed: int) -> Any:
     [name] = rig.units
     unit, low = rig.units[name], min(kind.full[0], 0.0)
     minutes, times = 0.4 * kind.bit_s, {"tau_fast": kind.bit_s, "tau_slow": 4 * kind.bit_s}
-    pulses = excite("prbs", minutes, dt=5.0, low=low, high=1.0, **times, seed=seed)
+    pulses = excite("prbs", minutes, dt=kind.bit_s / 18, low=low, high=1.0, **times, seed=seed)
     drive = pulses["drive"].values * (1.0 if unit == "1" else 60.0)
     schedule = make_log(pulses["time"].values, {name: (drive, unit, "input")}, name="pulses")
-    log, ended = play(rig, schedule, dt=5.0, guard=guard())  # type: ignore[arg-type]
+    log, ended = play(rig, schedule, dt=kind.bit_s / 18, guard=guard())  # type: ignore[arg-type]
     assert not ended, ended
     return identify([log], models=("arx", "oe", "subspace"), seed=seed).plant
 
