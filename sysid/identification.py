@@ -424,7 +424,7 @@ def _fit_black_boxes(
         else:
             if others and early is not None:
                 early([row for each in others for row in fold_rows(each)])
-            found |= zip(["neural"], _fitted_side_by_side(["neural"], data, wanted, parts))
+            found["neural"] = _fitted_neural(others, data, wanted, parts)
     every = [found[kind] for kind in boxes]
     fits = [each for each in every if isinstance(each, BlackBoxFit)]
     kept = choose_black_box(fits, data.logs) if fits else None
@@ -451,6 +451,22 @@ def _fitted_side_by_side(
     return found
 
 
+def _fitted_neural(
+    others: Sequence[BlackBoxFit], data: _Data, wanted: _Wanted, parts: _Parts
+) -> BlackBoxFit | str:
+    """Return the neural models, given up where the first parts held out show that they cannot be kept."""
+    beat: dict[str, float] = {}
+    if others:
+        choice = min((fit.choice for fit in others), key=lambda choice: choice.error)
+        beat = dict(zip((fold.label for fold in choice.folds), choice.errors[choice.structure].tolist()))
+    report = parts.part("neural")
+    found = _fit_or_refusal(("neural", data, wanted, report), beat)
+    if report is not None:
+        report(1.0, _in_short(found))
+    parts.next()
+    return found
+
+
 def _portable(data: _Data) -> _Data:
     """Return the data without a network that another process cannot know: a class of the user's own."""
     from thermogrip.sysid.models.network import NetworkModel
@@ -458,16 +474,23 @@ def _portable(data: _Data) -> _Data:
     return data if isinstance(data.network, NetworkModel) else replace(data, network=None)
 
 
-def _fit_or_refusal(item: tuple[str, _Data, _Wanted, Progress | None]) -> BlackBoxFit | str:
+def _fit_or_refusal(
+    item: tuple[str, _Data, _Wanted, Progress | None], beat: Mapping[str, float] | None = None
+) -> BlackBoxFit | str:
     kind, data, wanted, report = item
     try:
-        return _fit_box(kind, data.logs, data, wanted, report)
+        return _fit_box(kind, data.logs, data, wanted, report, beat)
     except UserError as error:
         return f"{kind}: {error}"
 
 
 def _fit_box(
-    kind: str, logs: Sequence[Log], data: _Data, wanted: _Wanted, report: Progress | None
+    kind: str,
+    logs: Sequence[Log],
+    data: _Data,
+    wanted: _Wanted,
+    report: Progress | None,
+    beat: Mapping[str, float] | None = None,
 ) -> BlackBoxFit:
     return fit_black_box(
         kind,
@@ -479,6 +502,7 @@ def _fit_box(
         order=wanted.order,
         delay=wanted.delay,
         progress=report,
+        beat=beat,
     )
 
 

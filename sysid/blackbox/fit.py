@@ -31,7 +31,7 @@ References
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
@@ -115,6 +115,7 @@ def fit_black_box(
     delay: int | None = None,
     warmup: float | None = None,
     progress: Callable[[float, str], None] | None = None,
+    beat: Mapping[str, float] | None = None,
 ) -> BlackBoxFit:
     """Fit one kind of :data:`BLACK_BOXES` to one or several logs.
 
@@ -123,7 +124,8 @@ def fit_black_box(
     ``order`` (poles of each output; states, of ``subspace`` and ``parsim``) and ``delay`` (steps from an
     input to its effect, of ``arx``, ``oe``, ``armax`` and ``bj``) are searched, and the readings of 5 s for
     whole logs (they begin at rest), 50 samples for stretches cut out of a log, set the state of what is held
-    out in place of ``warmup`` [s]. A UserError where there is no such kind, order or delay, the data are too
+    out in place of ``warmup`` [s]; ``beat`` are errors by part held out, as shares of the spread, that a fit
+    has to come near to. A UserError where there is no such kind, order or delay, the data are too
     short, or no structure survives the held-out free run.
 
     >>> from scipy.signal import lfilter
@@ -149,7 +151,8 @@ def fit_black_box(
                 progress((at + done) / len(grids), f"{kind}, {what}")
 
         try:
-            choice = choose(grid, family, warmup=_warmup_rows(grid, warmup), progress=report)
+            rows = _warmup_rows(grid, warmup)
+            choice = choose(grid, family, warmup=rows, progress=report, beat=beat)
         except UserError as error:
             refused = refused or error
             continue

@@ -49,6 +49,8 @@ MORE_BY_LOGS = float(np.log(1.2))  # the same over whole logs, of which there ar
 # where none does (one structure was asked for, say) no more than twice that.
 _MOST_ON_ALL = (1.0, 2.0)
 _BLOCKS = 4  # of one or two logs
+# From twice the error on two parts of five, the other three would have to bring less than 0.6 times it each.
+_HOPELESS = 2.0
 FEWEST = 20  # rows of a block that is held out
 
 _ALIKE = 0.98  # correlation of an input with its square: a line leaves a fifth of the square's spread
@@ -226,10 +228,13 @@ def choose(
     *,
     warmup: int,
     progress: Callable[[float, str], None] | None = None,
+    beat: Mapping[str, float] | None = None,
 ) -> Choice:
-    """Fit every structure of the family on every fold and choose by the one-standard-error rule."""
+    """Fit every structure of the family on every fold and choose by the one-standard-error rule; refuse
+    where after two folds or more every structure errs :data:`_HOPELESS` times what it has to ``beat`` (errors
+    by fold)."""
     cases = folds(grid)
-    scored = _score(grid, family, cases, warmup, progress)
+    scored = _score(grid, family, cases, warmup, progress, beat or {})
     structure, fitted = _first_sound(grid, family, scored, warmup)
     errors = scored[structure]
     table = {each: item.mean for each, item in scored.items()}
@@ -272,6 +277,7 @@ def _score(
     cases: Sequence[Fold],
     warmup: int,
     progress: Callable[[float, str], None] | None = None,
+    beat: Mapping[str, float] | None = None,
 ) -> dict[Structure, _Errors]:
     """Return the errors of each structure that ``fit`` makes of the rest of the folds."""
     scale, priors = np.maximum(grid.output_spread(), 1e-9), priors_of(grid)
@@ -285,6 +291,7 @@ def _score(
             column.append(free_run_errors(model, runs, dt=grid.dt, scale=scale, warmup=warmup, priors=priors))
         for column in errors.values():  # a structure that could not be fitted on this fold is refused
             column.extend([refused] * (at + 1 - len(column)))
+        _give_up_hopeless(errors, [fold.label for fold in cases[: at + 1]], beat or {}, scale)
     out = {}
     for structure, columns in errors.items():
         by_output = np.stack(columns)  # (n_fold, n_prior, n_y)
@@ -293,6 +300,21 @@ def _score(
             at = int(np.argmin(np.log(by_prior).mean(axis=0)))
         out[structure] = _Errors(priors[at], by_prior[:, at], by_output[:, at])
     return out
+
+
+def _give_up_hopeless(
+    errors: Mapping[Structure, list[Array]], labels: Sequence[str], beat: Mapping[str, float], scale: Array
+) -> None:
+    wanted = [beat[label] for label in labels if label in beat]
+    if len(wanted) < len(labels) or len(labels) < 2:
+        return
+    best = min(
+        float(np.mean([np.log(np.min(np.mean(each / scale, axis=1)) / w) for each, w in zip(column, wanted)]))
+        for column in errors.values()
+    )
+    if best > np.log(_HOPELESS):
+        times = f"{np.exp(best):.2g} times what is best so far"
+        raise UserError(f"given up after {len(labels)} parts: errs {times}")
 
 
 def _fit_to_all(
