@@ -24,7 +24,7 @@ from thermogrip.classify.estimators.lstm import QUICK_EPOCHS
 from thermogrip.classify.evaluation.comparison import POOLED, Comparison
 from thermogrip.datasets.examples import load_example_grasps
 
-LADDER = "features-lda,pca-lda,bayes,svm-pca,posterior,expansions,rocket,lstm,lstm-paper"
+LADDER = "features-lda,pca-lda,bayes,svm-pca,posterior,rocket,lstm,lstm-paper"
 
 DEEP = {
     "inception": ("InceptionTimeClassifier", {}),

@@ -9,7 +9,6 @@ CLASSIFIERS = {
     "bayes": ("estimators.bayes", "BayesClassifier"),
     "features-lda": ("estimators.lda", "FeaturesLda"),
     "pca-lda": ("estimators.lda", "PcaLda"),
-    "expansions": ("estimators.local_polynomials", "ExpansionClassifier"),
     "forest": ("estimators.lda", "ForestClassifier"),
     "svm-pca": ("estimators.margins", "SvmPca"),
     "rocket": ("estimators.margins", "RocketClassifier"),

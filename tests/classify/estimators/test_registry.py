@@ -73,7 +73,7 @@ def test_every_name_makes_a_classifier_without_its_heavy_packages() -> None:
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     assert out.split() == ["False"] * 4
     names = {"posterior", "bayes", "features-lda", "pca-lda", "lstm", "lstm-paper"}
-    assert set(CLASSIFIERS) == names | {"expansions", "svm-pca", "rocket", "forest"}
+    assert set(CLASSIFIERS) == names | {"svm-pca", "rocket", "forest"}
 
 
 def test_what_cannot_be_saved_is_refused_before_it_is_trained() -> None:
