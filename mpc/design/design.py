@@ -111,6 +111,8 @@ LONGEST_HORIZON, MOST_UNKNOWNS = 1000, 200
 
 _LONGEST_SAMPLE = 3600.0  # s
 _COARSE = 1.0  # range of an output below which the filter's numbers, made for degC, are too coarse
+# steps of a plant, below which its apparent delay is none
+_SEEN = 0.1
 # of a bias of an output in a default design, in its unit per sqrt(sample)
 _OUTPUT_DRIFT = 0.03
 # beyond a target, in units of its output, and in standard deviations of a reading, which alone leave no such
@@ -395,10 +397,14 @@ def default_noise(plant: Plant, controlled: Sequence[str], dt: float) -> Observe
         answers = [step_response(plant, name, output) for output in controlled]
         gains = np.array([answer.gain for answer in answers]) / units
         at = int(np.argmax(np.abs(np.nan_to_num(gains))))
-        rate, theta = abs(answers[at].gain) / answers[at].lag, answers[at].delay + dt
+        rate, delay = abs(answers[at].gain) / answers[at].lag, answers[at].delay
+        # a model without a delay does not say how soon its plant answers: then by its lag
+        theta = dt + (delay if delay > _SEEN * plant.dt else answers[at].lag)
         known = reading_noise(plant, controlled[at])
         noise = NOISE * units[at] if known is None else known
         sooner = noise * dt**0.5 / (rate * theta**2) if rate > 0 else 0.0
+        if record is None and delay <= _SEEN * plant.dt:
+            sooner = DRIFT  # nothing says more
         seen = record.input.get(name, 0.0) / span if record else 0.0
         drifts[name] = float(np.nan_to_num(max(seen, sooner), nan=DRIFT, posinf=DRIFT))
     output = _OUTPUT_DRIFT / dt**0.5

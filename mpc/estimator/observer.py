@@ -29,7 +29,9 @@ the bias of a drive drifts by what its logs show, and at least by so much that a
 loop can answer it: of an output that a drive of gain k / T raises at the rate k / T, and readings of noise r
 each dt, the filter of a bias that drifts by q in a second has the bandwidth
 
-    omega^2 = q k / (T r sqrt(dt)),    which is to be 1 / theta^2,    theta = delay + dt  [2]_.
+    omega^2 = q k / (T r sqrt(dt)),    which is to be 1 / theta^2,    theta = delay + dt  [2]_,
+
+or lag + dt of a model that has no delay: it does not say how soon its plant can answer.
 
 The filter starts from a plant at rest whose sensors are off (see below).
 Where an output has an offset among the disturbance states, that is where the start finds it, and it may

@@ -157,6 +157,14 @@ def test_a_bias_is_learnt_as_soon_as_its_loop_can_answer_or_as_the_logs_show(del
         assert noise.state == 0.01
 
 
+def test_a_model_without_a_delay_is_trusted_no_sooner_than_by_its_lag():
+    plant = block(0, 100.0, dt=2.0)
+    assert step_response(plant, "q", "t").delay < 0.2
+    noise = default_design(recorded(plant), dt=2.0).noise
+    assert noise.drive["q"] < 1e-4
+    assert default_design(recorded(plant, input={"q": 0.1}), dt=2.0).noise.drive["q"] == pytest.approx(1e-3)
+
+
 def test_a_drive_moves_as_fast_as_its_logs_show_or_an_eighth_of_its_range_a_second_or_all_in_a_sample():
     for seen, slew in ((0.0, 12.5), (20.0, 20.0), (400.0, 50.0)):
         design = default_design(recorded(block(5, 100.0), fastest={"q": seen}), dt=2.0)
