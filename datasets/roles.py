@@ -353,6 +353,7 @@ def _unnamed_causes(
         helped = next((n for n in outputs if _helps_beside(columns, name, n, drives)), None)
         if helped is not None:
             out[name] = "input", f"it is held between its moves and helps to predict {helped}"
+    drives += out
     moved = {name: _is_moved(columns, name, drives) for name in outputs}
     for name in [n for n in outputs if guesses.get(n, ("", ""))[1].startswith((BY_UNIT, FOLLOWS))]:
         if not moved[name] and any(moved[other] for other in outputs):

@@ -410,3 +410,12 @@ def test_elements_without_a_clue_that_always_move_together_are_one_pair():
     roles = assign_roles({"left": "1", "right": "1", "oven": "degC"}, columns=columns)
     assert roles.of == {"left": "input", "right": "other", "oven": "output"}
     assert any("right is left out: it always moves with left" in line for line in roles.doubts)
+
+
+def test_what_a_drive_without_a_name_moves_is_no_weather():
+    fan, chiller = relay(6), relay(11)
+    kettle, pipe = 20 + plant_of(8 * chiller, 0.98, noise=0.05), 20 + plant_of(5 * fan + chiller, 0.98)
+    columns = {"fan": fan, "chiller": chiller, "kettle": kettle, "pipe": pipe}
+    units = {"fan": "1", "chiller": "1", "kettle": "degC", "pipe": "degC"}
+    roles = assign_roles(units, columns=columns).of
+    assert roles == {"fan": "input", "chiller": "input", "kettle": "output", "pipe": "output"}
