@@ -138,9 +138,9 @@ def relayed(plant: Plant) -> RelayRig:
 
 
 def guard() -> Guard:
-    """Return a guard with room for a bath, whose rules know how slow it is."""
+    """Return a guard with room for a bath, whose rules, made for a finger, are off."""
     wide = GuardSettings(skin_limits=(-20.0, 80.0), other_limits=(-20.0, 80.0))
-    return Guard(None, GuardSettings(**{**vars(wide), "rules": RuleSettings(energy=3600.0)}), skin="t")
+    return Guard(None, GuardSettings(**{**vars(wide), "rules": RuleSettings(energy=3600.0, far=0.5)}), skin="t")
 
 
 def identified(kind: type[Plant], seed: int) -> Any:
