@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -140,7 +141,7 @@ def relayed(plant: Plant) -> RelayRig:
 def guard() -> Guard:
     """Return a guard with room for a bath, whose rules, made for a finger, are off."""
     wide = GuardSettings(skin_limits=(-20.0, 80.0), other_limits=(-20.0, 80.0))
-    return Guard(None, GuardSettings(**{**vars(wide), "rules": RuleSettings(energy=3600.0, far=0.5)}), skin="t")
+    return Guard(None, replace(wide, rules=RuleSettings(energy=3600.0, far=0.5)), skin="t")
 
 
 def identified(kind: type[Plant], seed: int) -> Any:
