@@ -87,6 +87,7 @@ ALL = [
     Benchmark("classify/scale.py", "{out}/scale --files 2 20", "{out}/scale --files 1 3"),
     Benchmark("rig/fuzz.py", quick="--inputs 20000"),
     Benchmark("rig/limits.py"),
+    Benchmark("rig/relays.py"),
     Benchmark("rig/live.py", quick="--seconds 10 --block 5 --viewers 1", needs=("uvicorn",)),
     Benchmark("rig/board.py"),
     Benchmark(

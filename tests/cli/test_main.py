@@ -75,7 +75,7 @@ identify: LOG... --out --network --inputs --outputs --disturbances --columns --d
   --models=arx,oe,subspace,sindy,neural,network --average>0 --order>1<20 --delay>1<20
   --leave-one-out=False --posterior/--no-posterior=False --report --seed=0>0 --workers=1>1
   --cluster --json=False
-validate: PLANT LOG... --warmup=5.0>0 --score-from=5.0>0 --average>0 --network --columns --dt>1e-09
+validate: PLANT LOG... --warmup>0 --score-from>0 --average>0 --network --columns --dt>1e-09
   --report --seed=0>0 --json=False
 simulate: PLANT LOG --out --warmup=5.0>0 --bands=False --network --columns --dt>1e-09 --seed=0>0
   --json=False

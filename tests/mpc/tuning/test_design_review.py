@@ -638,5 +638,5 @@ def test_where_nothing_is_tried_it_does_not_say_pass(tank: Any):
     assert worst([found, *others]) == "warn"
     section = review_section([found, *others])
     name = "settles where the model lacks structure"
-    assert section.verdict == f"1 of 3 checks pass. Not tried: {name}. Warnings: b."
+    assert section.verdict == f"1 of 3 checks pass (with a warning: b; not tried: {name})."
     assert review_section([found, others[0]]).tone == "good"
