@@ -4,7 +4,8 @@
         --nominal nominal*.json --day day.txt
 
 ``--nominal``: what benchmarks/rig/nominal.py wrote, of one seed or several, and with ``--off``; ``--day``: what
-benchmarks/rig/day.py printed.  From them come the false alarms that the detection times stand beside.
+benchmarks/rig/day.py printed.  From them come the false alarms that the detection times stand beside.  Without ``--nominal`` the table
+of drills alone is written anew into a page that is there.
 
 The drills are those of tests/rig/fault_injection/test_drills.py (:mod:`tests.rig.fault_injection.drills`,
 :mod:`tests.rig.fault_injection.host_drills`).
@@ -162,8 +163,8 @@ def main() -> None:
     """Run every drill and write the page."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--record", type=Path, required=True)
-    parser.add_argument("--nominal", type=Path, nargs="+", required=True)
+    parser.add_argument("--record", type=Path)
+    parser.add_argument("--nominal", type=Path, nargs="*", default=[])
     parser.add_argument("--day", type=Path)
     options = parser.parse_args()
     out: Path = options.out
@@ -174,16 +175,22 @@ def main() -> None:
         for k, drill in enumerate(DRILLS):
             hold = 400.0 if drill.kinds else 60.0
             outcomes.append(run_drill(drill, controller, Path(folder) / f"d{k}", hold=hold))
-            print(drill.name, flush=True)
-            if _MODEL_IN in drill.why:
+            print(_row(outcomes[-1]), flush=True)
+            if options.nominal and _MODEL_IN in drill.why:
                 for share in SHARES:
                     where = Path(folder) / f"d{k}-{share}"
                     lower = run_drill(drill, controller, where, hold=hold, settings=_lower(share))
                     sooner[share][drill.name] = lower.detected
         for k, host in enumerate(HOST_DRILLS):
             hosts.append(run_host_drill(host, Path(folder) / f"h{k}"))
-            print(host.name, flush=True)
+            print(_host_row(hosts[-1]), flush=True)
     lines = [_row(one) for one in outcomes] + [_host_row(one) for one in hosts]
+    if not options.nominal:
+        page, last = out.read_text(encoding="utf-8"), HEAD[HEAD.rindex("| fault") :]
+        before, _, rest = page.partition(last)
+        after = rest[rest.index("\n\n") :]
+        out.write_text(before + last + "\n".join(lines) + after, encoding="utf-8")
+        return
     nominal = [json.loads(path.read_text(encoding="utf-8")) for path in options.nominal]
     healthy = [run for run in nominal if not run["off"] and not run.get("drift")]
     slow, record = _slow(outcomes, sooner, _merged(healthy), options.day)
