@@ -158,5 +158,5 @@ def test_what_was_found_in_a_log_is_said_by_every_verb_that_runs_over_it(bench: 
     kelvin = table(*(row(k, t_tank_degC=f"{298.15 + k % 3}") for k in range(60)))
     bench.write("kelvin.csv", kelvin)
     done = bench.run(*verb.format(log=bench.path / "kelvin.csv").split())
-    assert done.code == 0, done
+    assert done.code == (3 if verb.startswith("validate") else 0), done  # a tank that does as it likes
     assert "name the column t_tank_K if this is kelvin" in done.err

@@ -216,7 +216,7 @@ def test_where_the_session_is_killed_the_page_says_so_and_the_drive_is_zero(
         address = next(line.split()[1] for line in run.stderr if line.startswith("live: "))
         page = viewer(address)
         until(page, "#word", "running")
-        until(page, "#tiles", r"drive\s*[01]\.[1-9]")
+        until(page, "#tiles", r"drive\s*(1\.|0\.[1-9])")
         assert device.applied_drive["drive"] > 0.0
         run.kill()
         until(page, "#word", "session lost")
