@@ -145,7 +145,7 @@ def simulate_closed_loop(
     >>> from thermogrip.mpc import design_controller
     >>> run = simulate_closed_loop(design_controller(plant, dt=5.0), plant, [(40.0, 300.0)])
     >>> [(segment.output, segment.settle_s) for segment in run.segments]
-    [('t1', 64.0), ('t2', 76.0)]
+    [('t1', 64.0), ('t2', 75.0)]
     """
     around = Surroundings() if surroundings is None else surroundings
     truth = Truth(plant, controller.dt, around, start, seed)

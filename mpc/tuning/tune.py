@@ -344,7 +344,7 @@ def tune(
     >>> spec = Spec(steps=[(25.0, 35.0)], sample_time_s=5.0, output="t1", hold_s=200.0, evaluations=3)
     >>> found = tune(plant, spec)
     >>> found.verdict, [row.controller for row in found.rows]
-    ('actuator-limited', ['baseline', 'tuned', 'PI', 'LQR'])
+    ('flat', ['baseline', 'tuned', 'PI', 'LQR'])
     """
     spec = Spec.of(plant) if spec is None else spec
     plant = spec.widened(plant)

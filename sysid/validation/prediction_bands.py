@@ -99,7 +99,7 @@ def expected_error(errors: Sequence[float], gain_effect: float) -> ExpectedError
 
     >>> found = expected_error([0.1, 0.1, 0.1, 0.1, 0.1], 0.0)
     >>> round(found.rmse, 3), round(found.low, 3), round(found.high, 3)
-    (0.1, 0.054, 0.186)
+    (0.1, 0.048, 0.208)
     """
     logs, n = 2 * np.log(np.maximum(errors, 1e-12)), len(errors)
     middle, freedom = float(logs.mean()), PRIOR_PARTS + n - 1
