@@ -671,13 +671,6 @@ def holding_drive(
 _HELD = 0.25  # degC: a start that drives miss by less is held
 
 
-def held_state(
-    model: PredictionModel, controlled: tuple[str, ...], start: float, d: tuple[float, ...]
-) -> Array:
-    """Return the state (n_x,) of :func:`held_start`."""
-    return held_start(model, controlled, start, d)[0]
-
-
 def held_start(
     model: PredictionModel, controlled: tuple[str, ...], start: float, d: tuple[float, ...]
 ) -> HeldStart:

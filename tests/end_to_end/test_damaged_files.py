@@ -38,6 +38,14 @@ def test_a_damaged_file_is_read_or_refused(kind: str, whole: Path) -> None:
     assert set(ends.values()) <= {"0", "2", "3"}
 
 
+@pytest.mark.parametrize(
+    ("kind", "seed"), [("log.nc", 1292), ("one.mcap", 1283), ("features-lda/", 1247), ("posterior/", 1051)]
+)
+def test_damage_that_was_no_line_once_is_one(kind: str, seed: int, whole: Path) -> None:
+    """A lost column, a clock of centuries, a divisor of zero, a curvature that is none."""
+    assert read_many(kind, whole, [seed])[seed] in {"0", "2", "3"}
+
+
 def test_a_run_whose_grasps_cannot_be_read_gets_them_again_from_its_samples(
     whole: Path, tmp_path: Path
 ) -> None:

@@ -356,18 +356,18 @@ def free_run_section(
     name = log_name(run.log)
     units = {output: "" if score.unit == "1" else f" {score.unit}" for output, score in run.scores.items()}
     words = (f"{output} to {score.rmse:.2g}{units[output]}" for output, score in run.scores.items())
-    verdict = f"Free run (RMSE): {', '.join(words)}."
+    clauses = [f"Free run (RMSE): {', '.join(words)}"]
     if run.no_better:
-        verdict += f" {', '.join(run.no_better)}: no better than a model without input."
+        clauses.append(f"{', '.join(run.no_better)} no better than a model without input")
+    if run.verdict is not None:
+        clauses.append(str(run.verdict))
+    reasons, follows, outputs = [], _followed(run), tuple(run.scores)
     if run.exceeds_fit:
         times = ", ".join(f"{output} {ratio:.1f} times" for output, ratio in run.exceeds_fit.items())
-        verdict += f" Above the error of the fit: {times}."
-    if run.verdict is not None:
-        said = str(run.verdict)
-        verdict += f" {said[0].upper()}{said[1:]}."
-    follows, outputs = _followed(run), tuple(run.scores)
+        reasons.append(f"above the error of the fit: {times}")
     if follows:
-        verdict += f" Residual correlation: {'; '.join(follows)}."
+        reasons.append(f"residual correlation: {'; '.join(follows)}")
+    clauses += reasons if run.verdict is None else []  # else they are its details
     parts: list[Any] = [
         *(
             Plot(
@@ -386,6 +386,7 @@ def free_run_section(
             "a line below reports the inputs with which they correlate.",
         ),
     ]
+    parts += [Text(_sentence(f"{why[0].upper()}{why[1:]}")) for why in reasons if why not in clauses]
     parts += [Text(_sentence(note)) for note in run.notes if note != str(run.verdict)]
     title = title or f"Free run: {name}" + (" (in the fit)" if seen else "")
     if run.verdict is None:
@@ -393,7 +394,7 @@ def free_run_section(
     else:
         fine = run.verdict.standing in ("as stated", "better") or run.verdict.cause == "seen"
         doubtful = bool(run.no_better) or not fine
-    return Section(title, tuple(parts), verdict, "warn" if doubtful else "good")
+    return Section(title, tuple(parts), f"{'; '.join(clauses)}.", "warn" if doubtful else "good")
 
 
 def _followed(run: FreeRun) -> list[str]:

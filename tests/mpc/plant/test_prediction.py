@@ -17,7 +17,7 @@ from thermogrip.mpc.native.codegen import _OPERATIONS
 from thermogrip.mpc.plant.prediction import (
     _ARITHMETIC,
     PredictionModel,
-    held_state,
+    held_start,
     holding_drive,
     sample_time,
     steady_curve,
@@ -420,14 +420,14 @@ def test_what_balances_an_integrator_may_lie_beyond_its_drive():
         assert held.u == pytest.approx([-0.2 * leak])
         assert held.y == pytest.approx([40.0])
         assert held.miss == pytest.approx(0.0, abs=1e-6)
-        at_rest = held_state(prediction, ("t",), 40.0, (leak,))  # -8 asks for more than the drive has
+        at_rest, _ = held_start(prediction, ("t",), 40.0, (leak,))  # -8 asks for more than the drive has
         assert prediction.output(at_rest) == pytest.approx([40.0])
 
 
 def test_a_plant_that_was_held_stays_and_one_that_cannot_be_is_as_warm_all_over(tank):
     model = PredictionModel(tank, dt=2.0)
-    held = held_state(model, ("t_surface",), 38.0, (25.0,))
+    held, _ = held_start(model, ("t_surface",), 38.0, (25.0,))
     drive = holding_drive(model, ("t_surface",), [38.0], ROOM).u
     assert model.run(held[None], drive[None, None], np.array(ROOM))[1][0] == pytest.approx(held)
     assert model.output(held) == pytest.approx([25.0 + 13.0 / 0.98, 38.0])
-    assert model.output(held_state(model, ("t_surface",), 500.0, (25.0,))) == pytest.approx([500.0, 500.0])
+    assert model.output(held_start(model, ("t_surface",), 500.0, (25.0,))[0]) == pytest.approx([500.0, 500.0])
