@@ -21,7 +21,7 @@ import threading
 import time
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 HERE = Path(__file__).parent
 
@@ -35,30 +35,17 @@ class Benchmark(NamedTuple):
     needs: tuple[str, ...] = ()
 
 
-PEERS = ("sippy", "nfoursid", "sysidentpy", "jax_sysid")
-# {data}: the folder of public data; {out}: that of the results; {plant}, {controller}: of the example logs
+# {data}: the folder of public data; {out}: that of the results
 ALL = [
-    Benchmark("terminal/mistakes.py"),
     Benchmark("hostile/files.py", quick="--only csv"),
     Benchmark("hostile/logs.py"),
     Benchmark("identify/time_fit.py", quick="--rows fit"),
-    Benchmark(
-        "identify/peers.py",
-        "{data} --out {out}/peers.json",
-        "{data} --out {out}/peers.json --only tclab_prbs",
-        PEERS,
-    ),
-    Benchmark("abroad/peers.py", "{data}", "{data} --sets house", PEERS),
     Benchmark("identify/left.py", quick="--logs 5 --only tclab"),
-    Benchmark("identify/lost.py", quick="--seeds 1 --only tclab"),
     Benchmark("abroad/score.py", "{data}", "{data} --sets house,dryer"),
     Benchmark("coverage/study.py", "table", "table"),
-    Benchmark("coverage/ranks.py", "run --count 100", "run --count 5"),
-    Benchmark("coverage/starts.py"),
     Benchmark("excite/predicted_precision.py"),
     Benchmark("mpc/compare.py", quick="--quick", needs=("do_mpc",)),
     Benchmark("mpc/sizes.py", "--peer", "--quick --states 4"),
-    Benchmark("mpc/twenty_plants.py", quick="--plants 2"),
     Benchmark("control/mismatch.py", quick="--seeds 4 --only delay"),
     Benchmark(
         "control/eight_plants.py",
@@ -69,66 +56,14 @@ ALL = [
     Benchmark(
         "control/ten_plants.py", "--keep {out}/ten", "--plants tclab --without do-mpc --keep {out}/ten"
     ),
-    Benchmark("classify/engine.py", quick="--grasps 5", needs=("jax", "numpyro")),
-    Benchmark(
-        "classify/compare_classifiers.py",
-        "--out {out}/comparison",
-        "--out {out}/comparison --splits 1 --classifiers posterior,pca-lda",
-    ),
-    Benchmark("classify/block_loss.py"),
-    Benchmark("classify/own_bound.py", quick="--repeats 4"),
-    Benchmark("classify/truth.py", quick="--repeats 1"),
     Benchmark("classify/disturbed_grasps.py", quick="--parts rig --each 1"),
-    Benchmark("classify/unlike_training.py", quick="--parts stop --sets 2"),
-    Benchmark("classify/grippers.py", quick="--grippers 1"),
-    Benchmark("classify/transfer.py", quick="--sets 1 --test 3 --classifiers posterior,pca-lda"),
-    Benchmark("classify/touches.py", "--out {out}", "--splits 1 --parts two --out {out}"),
     Benchmark("classify/lstm.py", quick="--epochs 5 --blocks 2", needs=("torch",)),
-    Benchmark("classify/scale.py", "{out}/scale --files 2 20", "{out}/scale --files 1 3"),
-    Benchmark("rig/fuzz.py", quick="--inputs 20000"),
-    Benchmark("rig/limits.py"),
     Benchmark("rig/relays.py"),
-    Benchmark("rig/live.py", quick="--seconds 10 --block 5 --viewers 1", needs=("uvicorn",)),
     Benchmark("rig/board.py"),
-    Benchmark(
-        "rig/nominal.py",
-        "--plant {plant} --controller {controller} --out {out}/nominal.json",
-        "--plant {plant} --controller {controller} --minutes 1 --draws 2 --out {out}/nominal.json",
-    ),
-    Benchmark("rig/day.py", "--out {out}/day", "--hours 0.5 --grasps 5 --minutes 5 --out {out}/day"),
 ]
-#: What these write is a page of the docs, from results of the others.
-NOT_RUN = ("rig/faults.py",)
-MADE = ("plant", "controller")
-LOGS = ("prbs_heating_cooling", "step_up_down", "multisine", "pump_on_off")
+#: These write a page of the docs themselves.
+NOT_RUN = ("rig/faults.py", "rig/limits.py")
 MISSING = 77  # the exit code of a benchmark that lacks a tool of the system
-
-
-def made(name: str, out: Path) -> Path:
-    """Return what benchmarks are about, made from the examples where it is absent: see :data:`ALL`."""
-    from thermogrip.datasets.examples import copy_examples
-
-    examples = out / "examples"
-    if not examples.exists():
-        copy_examples(examples)
-    file = out / f"{name}.json"
-    if name == "controller":
-        if not file.exists():
-            default_controller(made("plant", out)).save(file)
-    elif not file.exists():
-        logs = [str(examples / f"{log}.csv.xz") for log in LOGS]
-        words = ["identify", *logs, "--network", "gripper", "--models", "network", "--out", str(file)]
-        subprocess.run([sys.executable, "-m", "thermogrip", *words], check=True)
-    return file
-
-
-def default_controller(plant: Path) -> Any:
-    """Return the controller of a plant that nobody tuned."""
-    from thermogrip.mpc import Controller, Spec
-    from thermogrip.sysid import Plant
-
-    of = Plant.load(plant)
-    return Controller(of, Spec.of(of).design(of))
 
 
 def left_out(benchmark: Benchmark, words: str, data: Path | None) -> str:
@@ -190,8 +125,7 @@ def main() -> int:
             if not given.list:
                 part.write_text(f"`{said}`: left out, {why}.\n", encoding="utf-8")
             continue
-        named = {name: made(name, given.out) for name in MADE if f"{{{name}}}" in words}
-        filled = words.format(data=given.data, out=given.out, **named).split()
+        filled = words.format(data=given.data, out=given.out).split()
         command = [sys.executable, str(HERE / benchmark.program), *filled]
         to = part_of(given.out, benchmark, ".txt")
         code, wall, cpu = ran(command, to, 60 * given.limit)

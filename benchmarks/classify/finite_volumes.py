@@ -162,9 +162,7 @@ def touched_twice(
     return record, true
 
 
-def _blocks(
-    names: list[str], rig: Rig, rng: np.random.Generator, unlike: Disturbed | None = None
-) -> Batch:
+def _blocks(names: list[str], rig: Rig, rng: np.random.Generator, unlike: Disturbed | None = None) -> Batch:
     rows = [find_material(name) for name in names]
     natural = np.where([name == "wood" for name in names], rig.natural_sd, 0.0)
     k = np.array([row.k * rig.grade.get(name, 1.0) for row, name in zip(rows, names)])

@@ -1,14 +1,12 @@
-"""How long identification takes, beside a grey box written by hand.
+"""How long identification takes.
 
-    python benchmarks/identify/time_fit.py [--rows fit,hand,...] [--threads 1]
+    python benchmarks/identify/time_fit.py [--rows fit,first,...] [--threads 1]
 
 Each name is a process of its own (Linux) on the four rig logs that come with the package:
 
     fit         network "gripper" from its priors (cold), and from the fit to the first three logs (warm);
                 logs are read and the kernel is compiled before the clock starts
-    hand        the peer (hand.py) likewise
     first       the cold fit in a new process: imports, reading, compiling, fitting
-    hand first  the peer likewise, with an empty cache of numba
     identify    ``thermogrip identify LOGS --report``: black boxes, held-out scores, intervals, figures
     posterior   ``thermogrip identify LOGS --models network --posterior``
 
@@ -67,23 +65,6 @@ def _said(plant: Any) -> Row:
     }
 
 
-def hand() -> list[Row]:
-    """The peer, compiled beforehand."""
-    from hand import fit_by_hand
-
-    logs = load_example_logs()
-    fit_by_hand({name: log.isel(time=slice(0, 400)) for name, log in logs.items()}, tolerance=0.1)
-    cold, found = clocked("hand, cold", lambda: fit_by_hand(logs))
-    three = fit_by_hand(dict(list(logs.items())[:3]))
-    warm, again = clocked("hand, warm", lambda: fit_by_hand(logs, three.z))
-    return [cold | _found(found), warm | _found(again)]
-
-
-def _found(found: Any) -> Row:
-    rmse = float(np.sqrt(np.mean(np.square(list(found.rmse.values())))))
-    return {"rmse": rmse, "note": f"{found.evaluations} evaluations, each with 23 differences"}
-
-
 def first_fit() -> list[Row]:
     """The network in a new process."""
     from thermogrip.sysid.greybox.fit import fit_network
@@ -91,19 +72,7 @@ def first_fit() -> list[Row]:
     return [_said(fit_network("gripper", list(load_example_logs().values())))]
 
 
-def first_hand() -> list[Row]:
-    """The peer in a new process."""
-    from hand import fit_by_hand
-
-    return [_found(fit_by_hand(load_example_logs()))]
-
-
-INSIDE: dict[str, Callable[[], list[Row]]] = {
-    "fit": fit,
-    "hand": hand,
-    "first": first_fit,
-    "hand first": first_hand,
-}
+INSIDE: dict[str, Callable[[], list[Row]]] = {"fit": fit, "first": first_fit}
 COMMANDS = {
     "identify": ["--report", "report.html"],
     "posterior": ["--models", "network", "--posterior"],
@@ -168,7 +137,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--rows", default="fit,hand,first,hand first", help="which, with commas")
+    parser.add_argument("--rows", default="fit,first", help="which, with commas")
     parser.add_argument("--threads", type=int, default=1, help="processor cores that the process may use")
     parser.add_argument("--inside", help=argparse.SUPPRESS)
     wanted = parser.parse_args()
@@ -178,10 +147,6 @@ def main() -> None:
     os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[: wanted.threads])  # the processes inherit it
     rows = [row for name in wanted.rows.split(",") for row in measured(name, wanted.threads)]
     sys.stdout.write(table(rows) + "\n")
-    cpu = {row["what"]: row["cpu"] for row in rows}
-    for ours, theirs in (("fit, cold", "hand, cold"), ("fit, warm", "hand, warm"), ("first", "hand first")):
-        if ours in cpu and theirs in cpu:
-            sys.stdout.write(f"{theirs} / {ours}: {cpu[theirs] / cpu[ours]:.1f}\n")
 
 
 if __name__ == "__main__":

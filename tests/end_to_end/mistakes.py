@@ -1,7 +1,4 @@
-"""Mistakes as people type them, in a folder of small files, and what mends each.
-
-``benchmarks/terminal/mistakes.py`` measures what each costs.
-"""
+"""Mistakes as people type them, in a folder of small files, and what mends each."""
 
 from __future__ import annotations
 

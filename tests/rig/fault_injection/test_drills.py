@@ -73,5 +73,5 @@ def test_the_table_has_twenty_rows() -> None:
     page = (Path(__file__).parents[3] / "docs" / "reference" / "faults.md").read_text()
     for name in names:
         assert f"| {name}" in page, (
-            "write the page anew: python benchmarks/rig/faults.py --out docs/reference/faults.md --record ..."
+            "write it anew: python benchmarks/rig/faults.py --out docs/reference/faults.md"
         )
