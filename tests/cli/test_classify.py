@@ -110,6 +110,9 @@ def test_effusivities_are_printed_written_and_answered(gripper: SimpleNamespace)
 def test_grasps_may_be_a_pattern_and_are_not_written_over(gripper: SimpleNamespace) -> None:
     run, path = gripper.bench.run, gripper.bench.path
     assert run("effusivity", "gr?sps*.csv", "--out", "e.csv").code == 0
+    assert run("effusivity", *sorted(path.glob("grasps*.csv")), "--out", "f.csv").code == 0  # by the shell
+    assert (path / "f.csv").read_text() == (path / "e.csv").read_text()
+    assert run("effusivity", "grasps_meta.csv", "--out", "e.csv").code == 2
     assert run("effusivity", "gr?ps*.csv", "--out", "e.csv").code == 2
     files = {each: each.read_bytes() for each in path.glob("*.csv")}
     for out in ("grasps.csv", "grasps_meta.csv", "grasps2.csv"):

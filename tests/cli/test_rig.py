@@ -561,7 +561,7 @@ def test_a_rig_that_nobody_knows_drifts_as_is_usual_or_as_the_guard_file_says(tm
     assert verbs._drift_of(file, plant, 0.0).drift == verbs._drift_of(file, plant, 0.1).drift == 0.1
     with pytest.raises(UserError, match=r"was learnt with a drift of 0\.1, the guard file says 0\.15"):
         verbs._drift_of(file, plant, 0.15)
-    with pytest.raises(UserError, match=r"cannot write a \.txt file here"):
+    with pytest.raises(UserError, match=r"cannot be written as a \.txt file"):
         verbs._drift_of(tmp_path / "rig.txt", plant, 0.1)
 
 

@@ -86,8 +86,8 @@ MISTAKES = {
     "identify log.csv@10-200": "a part of a log is log.csv@START:STOP",
     "simulate plant.json log.csv --out q.txt": "write .csv, .nc or .parquet",
     "excite --kind prbs --minutes 5 --out q.txt": "write .csv, .nc or .parquet",
-    "tune plant.json --out q.txt": "end it in .json",
-    "classify model grasps.csv --out q.txt": "end it in .csv",
+    "tune plant.json --out q.txt": "name it q.json",
+    "classify model grasps.csv --out q.txt": "name it q.csv",
     # another kind of file
     "identify grasps.csv": "is a file of grasps, not a log; it is for effusivity, train, classify, compare",
     "validate plant.json grasps.csv": "is a file of grasps, not a log",

@@ -260,7 +260,9 @@ def classify(
     paths: Annotated[
         list[str] | None,
         cli.arg(
-            "GRASPS...", "Grasp files (CSV with its _meta.csv, NetCDF, Parquet), folders or patterns."
+            "GRASPS...",
+            "Grasp files (CSV with its _meta.csv, NetCDF, Parquet), folders or patterns.",
+            cli.without_meta_files,
         ),
     ] = None,
     out: Annotated[Path | None, cli.opt("--out", "FILE.csv|DIR", ANSWERS_GO)] = None,

@@ -165,9 +165,21 @@ OwnNetwork = Annotated[
         "The class that the plant was fitted with, where it is your own (which runs the file).",
     ),
 ]
+
+
+def without_meta_files(paths: list[str] | None) -> list[str] | None:
+    """Leave out the meta files that a pattern of the shell gives beside the grasps they belong to."""
+    given = {*(paths or ())}
+    return paths and [path for path in paths if path.replace("_meta.", ".") not in given - {path}]
+
+
 GraspFiles = Annotated[
     list[str],
-    arg("GRASPS...", "Grasp files (CSV with its _meta.csv, NetCDF, Parquet), folders or patterns."),
+    arg(
+        "GRASPS...",
+        "Grasp files (CSV with its _meta.csv, NetCDF, Parquet), folders or patterns.",
+        without_meta_files,
+    ),
 ]
 
 
@@ -252,9 +264,9 @@ def new_file(path: Path, suffixes: Sequence[str] = ()) -> Path:
     """Return a path that can be written, its folder made; raise UserError before any work is done."""
     if suffixes and path.suffix.lower() not in suffixes:
         raise UserError(
-            f"cannot write a {path.suffix or 'nameless'} file here",
+            f"cannot be written as a {path.suffix} file" if path.suffix else "has no ending",
             file=path,
-            hint=f"end it in {suffixes[0]}",
+            hint=f"name it {path.with_suffix(suffixes[0])}",
         )
     if path.is_dir():
         raise UserError("is a folder", file=path, hint="give the name of a file")
