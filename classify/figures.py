@@ -38,7 +38,7 @@ def accuracy_figure(comparison: Comparison) -> Figure:
         key=lambda c: (c != POOLED, any(r["apart"] for r in rows if r["condition"] == c)),
     )
     count = len(comparison.classifiers)
-    figure, [[axis]] = panels(1, 1, size=(7.2, 1.5 + len(order) * (0.22 + 0.11 * count)), ticks=7)
+    figure, [[axis]] = panels(1, 1, size=(9.6, 1.5 + len(order) * (0.22 + 0.11 * count)), ticks=7)
     for row in rows:
         k = comparison.classifiers.index(row["classifier"])
         y = order.index(row["condition"]) + 0.7 * ((k + 0.5) / count - 0.5)
@@ -124,7 +124,7 @@ def effusivity_figure(
         raise UserError("there is no posterior to draw", hint="give at least one grasp")
     truth = list(materials) if materials is not None else [""] * len(rows)
     kinds = list(dict.fromkeys(truth))
-    figure, [[axis]] = panels(1, 1, size=(7.2, 1.2 + 0.16 * len(rows)), ticks=7)
+    figure, [[axis]] = panels(1, 1, size=(9.6, 1.2 + 0.16 * len(rows)), ticks=7)
     for i, (row, name) in enumerate(zip(rows, truth)):
         colour = PALETTE[kinds.index(name) % 8]
         axis.plot([row.effusivity_p05, row.effusivity_p95], [i, i], color=colour, lw=4, alpha=0.45)
@@ -151,7 +151,7 @@ def feature_figure(model: BayesClassifier, read: Readings, labels: NDArray[np.st
     means, scales = model.marginals()
     count = len(model.feature_names_)
     down = -(-count // 4)
-    figure, axes = panels(down, min(count, 4), size=(8.6, 0.4 + 2.1 * down), ticks=6)
+    figure, axes = panels(down, min(count, 4), size=(9.6, 0.4 + 2.1 * down), ticks=6)
     for axis in axes.ravel()[count:]:
         axis.set_axis_off()
     for j, (axis, name) in enumerate(zip(axes.ravel(), model.feature_names_)):
@@ -236,7 +236,7 @@ def curve_figure(rows: Sequence[Row], over: str) -> Figure:
     ``difference_K`` of rows of :mod:`thermogrip.classify.evaluation.harness`."""
     if not rows:
         raise UserError("there is no curve to draw", hint="give at least one point")
-    figure, [[left, right]] = panels(1, 2, size=(7.6, 3.0), ticks=7)
+    figure, [[left, right]] = panels(1, 2, size=(9.6, 3.0), ticks=7)
     names = list(dict.fromkeys(row["classifier"] for row in rows))
     span = max(row[over] for row in rows) - min(row[over] for row in rows)
     for k, name in enumerate(names):

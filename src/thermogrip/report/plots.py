@@ -102,7 +102,7 @@ def models_figure(rows: Sequence[Row]) -> Figure:
     outputs = list(dict.fromkeys(row.output for row in held))
     models = list(dict.fromkeys(row.model for row in held))
     logs = list(dict.fromkeys(row.log for row in held))
-    figure, axes = panels(1, len(outputs), size=(4.6 * len(outputs), 0.9 + 0.42 * len(models)))
+    figure, axes = panels(1, len(outputs), size=(max(9.6, 4.6 * len(outputs)), 0.9 + 0.42 * len(models)))
     for axis, output in zip(axes[0], outputs):
         for k, log in enumerate(logs):
             mine = {row.model: row.rmse for row in held if row.output == output and row.log == log}
@@ -170,7 +170,7 @@ def pole_figure(found: Dynamics) -> Figure:
     the time constant, and the damping ratio -Re(s) / abs(s)."""
     from thermogrip.sysid.export.dynamics import poles_of
 
-    figure, [[axis]] = panels(1, 1, size=(7.2, 2.8))
+    figure, [[axis]] = panels(1, 1, size=(9.6, 2.8))
     drawn = np.concatenate([np.empty(0, complex), *(poles_of(other) for other in found.draws)])
     for label, poles, mark, size, colour in (
         (f"{len(found.draws)} draws", drawn, ".", 4, PREDICTED),
