@@ -126,42 +126,6 @@ def labelled(
     return out
 
 
-def touched_twice(
-    materials: tuple[str, ...] = EIGHT,
-    *,
-    repeats: int = 3,
-    rest: float = 60.0,
-    t_object: tuple[float, float] = (14.0, 44.0),
-    t_room: tuple[float, float] = (21.0, 30.0),
-    seed: int = 0,
-    rig: Rig | None = None,
-) -> tuple[Grasps, Array]:
-    """Return groups of two touches of blocks of unknown temperature, and the true one at each first touch."""
-    rig = rig or Rig()
-    rng = np.random.default_rng([seed, 99])
-    names = [m for m in materials for _ in range(repeats)]
-    n = len(names)
-    true = rng.uniform(*t_object, n)
-    room = rng.uniform(*t_room, n)
-    order = np.array([rng.permutation(4)[:2] for _ in range(n)])
-    # at two levels far enough apart, as the rig's notebook does
-    order[:, 1] = (order[:, 0] + np.where(order[:, 0] < 2, 2, -2) + rng.integers(0, 2, n)) % 4
-    order[:, 1] = np.where((order[:, 0] < 2) == (order[:, 1] < 2), (order[:, 1] + 2) % 4, order[:, 1])
-    settings = np.asarray(SETTINGS)[order]
-    blocks = _blocks(names, rig, rng)
-    state = np.repeat(true[:, None], N_BLOCK, axis=1)
-    time, first, state = _touch(blocks, state, names, settings[:, 0], room, rig, rng)
-    state = _alone(blocks, state, room, rest, rig)
-    _, second, _ = _touch(blocks, state, names, settings[:, 1], room, rig, rng)
-    groups = [f"f{seed}-{i}" for i in range(n)]
-    record = make_grasps(
-        time, np.concatenate([first, second]), [f"{g}_{k}" for k in (1, 2) for g in groups],
-        name=f"finite-two-{seed}", material=names * 2, touch_group=groups * 2, touch=[1.0] * n + [2.0] * n,
-        rest=[rest] * (2 * n), t_gripper=settings.T.ravel(), t_ambient=np.tile(room, 2),
-    )  # fmt: skip
-    return record, true
-
-
 def _blocks(names: list[str], rig: Rig, rng: np.random.Generator, unlike: Disturbed | None = None) -> Batch:
     rows = [find_material(name) for name in names]
     natural = np.where([name == "wood" for name in names], rig.natural_sd, 0.0)
@@ -239,15 +203,6 @@ def _touch(
         ) * rng.standard_normal(n)
     y = y + rig.slow * drift + rig.noise * rng.standard_normal(y.shape)
     return time, np.round(y / rig.quantum) * rig.quantum, cells[:, n_g:]
-
-
-def _alone(blocks: Batch, state: Array, room: Array, seconds: float, rig: Rig) -> Array:
-    """Return the cells after the block stood in the room, its near face free."""
-    loss = blocks.loss.copy()
-    loss[:, 0] += rig.far
-    for _ in range(round(seconds / 0.1)):
-        state = _implicit(state, blocks.capacity, blocks.link, loss, room, dt=0.1)
-    return state
 
 
 def _implicit(cells: Array, capacity: Array, link: Array, loss: Array, room: Array, dt: float = DT) -> Array:

@@ -38,16 +38,6 @@ def test_heat_is_conserved_where_none_is_lost(fv: ModuleType) -> None:
     assert np.all(np.ptp(after, axis=1) < np.ptp(cells, axis=1))
 
 
-def test_a_lonely_block_goes_to_the_room_at_the_rate_of_its_losses(fv: ModuleType) -> None:
-    """Copper is even throughout: T - T_room falls as exp(-(2 far + 4 sides) t / (rho c L))."""
-    rig = fv.Rig(natural_sd=0.0)
-    blocks = fv._blocks(["copper"], rig, np.random.default_rng(0))
-    cells = fv._alone(blocks, np.full((1, fv.N_BLOCK), 45.0), np.array([25.0]), 100.0, rig)
-    row = find_material("copper")
-    rate = (2 * rig.far + 4 * rig.sides) / (row.rho * row.c_p * fv.LENGTH)
-    assert cells.mean() - 25.0 == pytest.approx(20.0 * np.exp(-100.0 * rate), rel=5e-3)
-
-
 def test_early_contact_of_one_material_with_wood_is_the_closed_form(fv: ModuleType) -> None:
     """Two half-spaces with constant conductance: the gripper's face rises by the erfcx of the closed form."""
     one = (8e-3, 1.4, 2.3e6, 200)
