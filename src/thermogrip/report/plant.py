@@ -390,11 +390,12 @@ def free_run_section(
     parts += [Text(_sentence(note)) for note in run.notes if note != str(run.verdict)]
     title = title or f"Free run: {name}" + (" (in the fit)" if seen else "")
     if run.verdict is None:
-        doubtful = bool(run.no_better or run.exceeds_fit or follows)
+        tone = "warn" if run.no_better or run.exceeds_fit or follows else "good"
+    elif run.verdict.cause == "seen":  # an answer neither for the plant nor against it
+        tone = "warn" if run.no_better else "plain"
     else:
-        fine = run.verdict.standing in ("as stated", "better") or run.verdict.cause == "seen"
-        doubtful = bool(run.no_better) or not fine
-    return Section(title, tuple(parts), f"{'; '.join(clauses)}.", "warn" if doubtful else "good")
+        tone = "good" if run.verdict.standing in ("as stated", "better") and not run.no_better else "warn"
+    return Section(title, tuple(parts), f"{'; '.join(clauses)}.", tone)
 
 
 def _followed(run: FreeRun) -> list[str]:
