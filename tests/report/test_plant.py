@@ -79,7 +79,7 @@ def test_one_whose_residual_follows_something_is_not_green_and_says_what(
     assert section.tone == "warn"
     assert words in section.verdict
     small = free_run_section(alike)  # as small as was stated
-    assert small.tone == "plain"  # of rows in the fit
+    assert small.tone == "good"
     assert Text(words.capitalize()) in small.parts
     for standing, cause, tone in (
         ("better", "", "good"),
