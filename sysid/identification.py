@@ -357,10 +357,11 @@ def _for_network(
         network = load_network(network)
     from thermogrip.sysid.models.network import NetworkModel
 
+    notes: list[str] = []
     if isinstance(network, NetworkModel):
-        from thermogrip.sysid.data.shipped_networks import in_log_units
+        from thermogrip.sysid.data.shipped_networks import in_log_units, in_logged_room
 
-        network = in_log_units(network, logs)
+        network, notes = in_logged_room(in_log_units(network, logs), logs)
     for log in logs:
         reason = misfit(network, log)
         if reason is not None:
@@ -370,7 +371,8 @@ def _for_network(
                 file=reason.file,
                 hint=f"{reason.hint}; rename columns, or name another network (or none)",
             )
-    return network, *match_logs(network, logs, keep_others=True)
+    matched, converted = match_logs(network, logs, keep_others=True)
+    return network, matched, [*notes, *converted]
 
 
 def _candidates(models: Sequence[str], network: GreyModel | None) -> list[str]:

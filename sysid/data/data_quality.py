@@ -11,7 +11,8 @@ Every finding has a verdict (``ok``, ``warn``, ``fail``) and a consequence in wo
 * **feedback** from output to input: with u[k] regressed on its own past, does the past of y help?  An F test
   in which only rows count at which the input moves: a level that is held adds nothing, and an output
   that settles under it shows how long it has been held.  A relay is asked whether it is switched at the same
-  readings.  In closed loop the noise is in the input too, and equation-error fits are biased;
+  readings; of one that is on for a share of even windows the shares are tested.  In closed loop the noise is
+  in the input too, and equation-error fits are biased;
 * **drift**: do the two halves of a log differ in the level that a static regression on their input explains,
   and the same **shift between logs**.
 
@@ -50,6 +51,8 @@ _OWN_LAGS = (3, 6, 12, 24, 48)  # rows of an input's own past, to test it for fe
 _USUAL_MOVES, _EXPLAINED_BETWEEN = 0.95, 0.25
 # Median of differences over ranges: at most 0.08 in ten thermostats, 0.14 to 1 in 60 relays of any course.
 _SAME_READING, _SWITCHINGS = 0.1, 10
+_ROWS_A_WINDOW = 3  # fewer have no shares beside none, half and all
+_EVEN_WINDOWS = 0.9  # share of a relay's switchings, within a row of a whole number of windows
 
 
 @dataclass(frozen=True)
@@ -142,10 +145,7 @@ def check_data(
         found += [_saturation(channels[name]) for name in u if name not in grid.switches]
     found += _excitation(grid)
     for at, name in enumerate(u):
-        if all(np.unique(segment.u[:, at]).size <= 2 for segment in grid.segments):
-            found.append(_relay_feedback(grid, at, name))
-        elif name not in grid.switches:
-            found.append(_feedback(grid, at, name))
+        found += _feedback_to(name, at, grid, logs)
     found += [_set_point(log_name(log), name) for log in logs for name in _set_points(log)]
     found += _shifts(grid)
     return DataCheck(tuple(found))
@@ -330,6 +330,35 @@ def _relay_feedback(grid: Grid, at: int, name: str) -> Finding:
             "closed loop; trust simulation-error fits and not one-step fits"
         )
     return Finding("feedback", "", name, least, "1", "warn" if closed else "ok", says)
+
+
+def _feedback_to(name: str, at: int, grid: Grid, logs: Sequence[Log]) -> list[Finding]:
+    """Return whether an input was driven by the outputs; nothing of a switch that is no relay's."""
+    window = _window(logs, name)
+    if any((s.time[-1] - s.time[0]) > max(_OWN_LAGS) * window > 0 for s in grid.segments):
+        first = [int(np.argmax(np.diff(column(log, name)) > 0)) + 1 for log in logs]
+        begun = [log.isel(time=slice(row, None)) for log, row in zip(logs, first)]
+        shares = _feedback(grid.of(begun, average=window), at, name)
+        if shares.verdict == "warn":
+            return [shares]
+    if window or all(np.unique(segment.u[:, at]).size <= 2 for segment in grid.segments):
+        return [_relay_feedback(grid, at, name)]
+    return [] if name in grid.switches else [_feedback(grid, at, name)]
+
+
+def _window(logs: Sequence[Log], name: str) -> float:
+    """Return the window [s] of a relay that is switched on at even times for a share of each, which is what a
+    controller moves; 0 of any other input."""
+    if any(np.unique(column(log, name)).size > 2 for log in logs):
+        return 0.0
+    on = [np.diff(log["time"].values[1:][np.diff(column(log, name)) > 0]) for log in logs]
+    between = np.concatenate(on)
+    if between.size < _SWITCHINGS:
+        return 0.0
+    row = max(float(np.median(np.diff(log["time"].values))) for log in logs)
+    window = float(np.median(between))  # two of them where the relay stays on, or off, for a whole one
+    even = np.abs(between - window * np.rint(between / window)) <= row
+    return window if window > _ROWS_A_WINDOW * row and np.mean(even) >= _EVEN_WINDOWS else 0.0
 
 
 def _set_points(log: Log) -> list[str]:

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.roles import guess_role, is_room_temperature
 from thermogrip.datasets.schema import Log, column, names
 from thermogrip.sysid.models.network import NetworkModel
 from thermogrip.sysid.models.network_spec import (
@@ -28,6 +29,7 @@ from thermogrip.sysid.plant.log_grid import SHARES, misfit
 
 # keys of elements that name signals or places
 _NAMING = ("between", "from", "to", "surroundings", "node", "face", "sink", "switch", "input")
+_BESIDE_SENSOR = 1.0  # K, by which the air at the plant may differ from that at a sensor in its room
 _TEMPERATURE = re.compile(r"(t|tc|temp|temperature)[ _]?[a-z0-9]{0,2}", re.IGNORECASE)
 
 
@@ -73,6 +75,37 @@ def in_log_units(model: NetworkModel, logs: Sequence[Log]) -> NetworkModel:
     if all(item is model.network.inputs[name] for name, item in inputs.items()):
         return model
     return NetworkModel(model.network.model_copy(update={"inputs": inputs}))
+
+
+def in_logged_room(model: NetworkModel, logs: Sequence[Log]) -> tuple[NetworkModel, list[str]]:
+    """Return a network whose room nobody measures with the prior that the logs have of it, and a line on it.
+
+    A room is a boundary with a name of surroundings.  All logs have one column of such a name, in degC, that
+    is no signal of the network, whether it moves or not.
+    """
+    network = model.network
+    rooms = [item.temperature for item in network.boundaries.values() if _is_room(item.temperature, "degC")]
+    signals = {*network.inputs, *network.disturbances, *network.outputs}
+    units = {str(name): str(item.attrs.get("units", "1")) for name, item in logs[0].items()}
+    logged = [n for n, unit in units.items() if n not in signals and _is_room(n, unit)]
+    if len(rooms) != 1 or len(logged) != 1 or any(logged[0] not in log for log in logs):
+        return model, []
+    (room,), (name,) = rooms, logged
+    readings = np.concatenate([column(log, name) for log in logs])
+    value, prior = float(np.nanmean(readings)), network.parameters[room]
+    if prior.fixed or not prior.bounds[0] <= value <= prior.bounds[1]:
+        return model, []
+    sd = float(np.hypot(_BESIDE_SENSOR, np.nanstd(readings)))
+    known = prior.model_copy(
+        update={"value": value, "sd": sd, "low": prior.bounds[0], "high": prior.bounds[1]}
+    )
+    parameters = dict(network.parameters) | {room: known}
+    note = f"{room} of the network: {value:.1f} degC, within {sd:.1f}, as {name} of the logs reads"
+    return NetworkModel(network.model_copy(update={"parameters": parameters})), [note]
+
+
+def _is_room(name: str, unit: str) -> bool:
+    return guess_role(name, unit) == "disturbance" and is_room_temperature(name, unit)
 
 
 def _fitting(network: Network, columns: Mapping[str, str] | None, logs: Sequence[Log]) -> NetworkModel | None:

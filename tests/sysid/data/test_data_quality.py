@@ -79,6 +79,23 @@ def test_a_thermostat_is_known_by_the_readings_at_which_it_switches(closed):
     assert (found.verdict, "closed loop" in found.says) == (("warn", True) if closed else ("ok", False))
 
 
+@pytest.mark.parametrize(("closed", "said"), [(True, "warn"), (False, "ok")])
+def test_a_controller_that_switches_a_relay_for_a_share_of_each_window_is_found(closed, said):
+    rng = np.random.default_rng(0)
+    y, u, share, integral = np.full(4000, 20.0), np.zeros(4000), 0.3, 0.0
+    for k in range(3999):
+        if k % 20 == 0 and closed:
+            miss = 35 + 10 * (k // 1000 % 2) - y[k]
+            integral = np.clip(integral + 0.01 * miss, 0, 1)
+            share = np.clip(0.1 * miss + integral, 0, 1)
+        elif k % (20 * rng.integers(4, 12)) == 0 and not closed:
+            share = rng.uniform()
+        u[k] = k % 20 < round(20 * share)
+        y[k + 1] = y[k] + 0.005 * (20 + 60 * u[k] - y[k]) + 0.01 * rng.standard_normal()
+    log = make_log(np.arange(4000.0), {"q": (u, "1", "input"), "t": (np.round(y, 2), "degC", "output")})
+    assert [finding.verdict for finding in check_data([log]).of("feedback")] == [said]
+
+
 def test_open_loop_logs_are_not_accused_of_feedback():
     accused = sum(one([plant_log(seed=s)], "feedback").verdict == "warn" for s in range(20))
     assert accused == 0  # the test asks for p < 1e-4: 20 logs give 0.002 false alarms

@@ -6,7 +6,13 @@ import numpy as np
 import pytest
 
 from thermogrip.datasets.schema import make_log
-from thermogrip.sysid.data.shipped_networks import in_columns, in_log_units, renamed, shipped_network
+from thermogrip.sysid.data.shipped_networks import (
+    in_columns,
+    in_log_units,
+    in_logged_room,
+    renamed,
+    shipped_network,
+)
 from thermogrip.sysid.models.network import NetworkModel
 from thermogrip.sysid.models.network_spec import builtin_networks, named_network
 from thermogrip.sysid.plant.log_grid import match_logs
@@ -156,3 +162,22 @@ def test_a_network_takes_its_inputs_in_the_unit_of_the_log(unit, values, full_sc
         heat.append(np.array(model.flows([25.0, 25.0, 25.0], [half], [], p), dtype=float))
     np.testing.assert_allclose(*heat, rtol=1e-12)
     assert heat[0].max() == pytest.approx(20.0)  # W, of a cartridge of 40
+
+
+@pytest.mark.parametrize("readings", [np.full(200, 31.0), 31 + np.sin(TIME)], ids=["still", "moving"])
+def test_a_room_that_was_logged_is_the_prior_of_one_that_a_network_does_not_measure(readings):
+    log = board(**TEMPERATURES, t_ambient=(readings, "degC", "other"))
+    tclab = NetworkModel(named_network("tclab"))
+    model, notes = in_logged_room(tclab, [log])
+    room = model.network.parameters["t_room"]
+    assert room.value == pytest.approx(31.0, abs=0.1)
+    assert room.sd == pytest.approx(np.hypot(1.0, readings.std()))
+    assert room.bounds == tclab.network.parameters["t_room"].bounds
+    assert "t_ambient" in notes[0]
+    untold = [
+        log.drop_vars("t_ambient"),
+        log.assign(t_outside=log["t_ambient"]),
+        log.assign(t_ambient=log["t_ambient"] + 50),
+    ]
+    assert all(in_logged_room(tclab, [each]) == (tclab, []) for each in untold)
+    assert in_logged_room(tclab, [log, untold[0]]) == (tclab, [])
