@@ -6,9 +6,7 @@ w are inputs, disturbances and products of inputs (``|drive|``, ``drive*|drive|`
 and cools unequally; ``drive*drive``: Joule heat), and with ``switched`` each A_i differs between a pump that
 runs and one that does not.
 It is one linear regression: the normal equations of the largest structure hold those of all smaller ones, and
-several logs only add rows.  Rows that would reach across a gap or use a lost reading are left out; where more
-than a few readings were lost, the normal equations are their expectation given all that was read
-(:mod:`thermogrip.sysid.blackbox.missing_data`).
+several logs only add rows.  Rows that would reach across a gap or use a lost reading are left out.
 
 Its weakness is known: noise on the *regressors* pulls the poles towards fast ones, the more the finer the
 sampling.  Hence block averages first, and a choice by free run and never by the one-step error that is
@@ -24,7 +22,6 @@ from itertools import product
 import numpy as np
 
 from thermogrip.datasets.arrays import Array
-from thermogrip.sysid.blackbox.missing_data import MANY, expected_moments
 from thermogrip.sysid.blackbox.order_selection import (
     Structure,
     as_state_space,
@@ -122,8 +119,6 @@ def _deepest(
 def _regress(grid: Grid, terms: tuple[str, ...], deep_y: int, deep_w: int) -> _Regression | None:
     """Form X'X and X'Y, columns [y lags | switch x y lags | w lags | 1], every lag from 1 to one depth."""
     deep = max(deep_y, deep_w)
-    if grid.lost > MANY:
-        return _expect(grid, terms, deep_y, deep_w)
     blocks, targets = [], []
     for segment, w in zip(grid.segments, drives(grid, terms)):
         n = len(segment.time)
@@ -142,20 +137,6 @@ def _regress(grid: Grid, terms: tuple[str, ...], deep_y: int, deep_w: int) -> _R
     X, Y = np.concatenate(blocks), np.concatenate(targets)
     size = column_sizes(np.linalg.norm(X, axis=0))
     return _Regression((X / size).T @ (X / size), (X / size).T @ Y, size, deep)
-
-
-def _expect(grid: Grid, terms: tuple[str, ...], deep_y: int, deep_w: int) -> _Regression | None:
-    """Return the expectation of the same sums, given every reading that was not lost."""
-    columns = [grid.inputs.index(name) for name in grid.switches]
-    on = [segment.u[:, columns] for segment in grid.segments]
-    deep = max(deep_y, deep_w)
-    if max(len(segment.time) for segment in grid.segments) <= deep + 1:
-        return None
-    found = expected_moments(grid.segments, drives(grid, terms), on, past_y=deep_y, past_w=deep_w)
-    if found.read < 2 * len(grid.outputs) * len(found.gram):
-        return None
-    size = column_sizes(np.sqrt(np.diag(found.gram)))
-    return _Regression(found.gram / size / size[:, None], found.cross / size[:, None], size, deep)
 
 
 def _solve(

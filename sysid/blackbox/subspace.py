@@ -31,12 +31,8 @@ is one that ends at its row (``Grid.ends``), which the folds choose.
 Several logs are side by side in the Hankel matrices; a window that touches a gap or a lost reading is left
 out.
 
-**Lost readings.** Where more than a few were lost hardly a window is whole. The Hankel matrices then contain
-the expectation of the lost ones given all others
-(:func:`thermogrip.sysid.blackbox.missing_data.fill_readings`), not lines through the holes; B, E and the rest
-are fitted to what was read alone. The maximum likelihood over A and C as well is no member of the family: it
-was closer to simulated plants, and farther from a real one that is not linear, where the prediction of the
-next reading and a free run ask for different models of low order.
+**Lost readings.** Where less than half of the windows are whole, short holes are lines in the Hankel matrices
+(:func:`thermogrip.sysid.plant.log_grid.whole_readings`); B, E and the rest are fitted to what was read alone.
 """
 
 from __future__ import annotations
@@ -48,7 +44,6 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from thermogrip.sysid.blackbox.missing_data import MANY, fill_readings
 from thermogrip.sysid.blackbox.order_selection import (
     Structure,
     as_state_space,
@@ -58,7 +53,7 @@ from thermogrip.sysid.blackbox.order_selection import (
 )
 from thermogrip.sysid.models.lti import scan_states
 from thermogrip.sysid.models.state_space import StateSpaceModel
-from thermogrip.sysid.plant.log_grid import Grid
+from thermogrip.sysid.plant.log_grid import Grid, whole_readings
 
 Array = NDArray[np.float64]
 
@@ -110,9 +105,8 @@ def _realised(
 ) -> dict[tuple[int, str, int], StateSpaceModel]:
     """Return the models of these block rows, weightings and orders."""
     out: dict[tuple[int, str, int], StateSpaceModel] = {}
-    readings = _readings(grid, terms) if wanted else []
     for f in dict.fromkeys(f for f, _, _ in wanted):
-        triangle = _triangle(grid, readings, f, terms)
+        triangle = _triangle(grid, f, terms)
         if triangle is None:
             continue
         n_y = len(grid.outputs)
@@ -124,13 +118,6 @@ def _realised(
             for n in (n for size, w, n in wanted if (size, w) == (f, weighting) and n < gamma.shape[1]):
                 out[f, weighting, n] = _realise(grid, gamma[:, :n], terms)
     return out
-
-
-def _readings(grid: Grid, terms: tuple[str, ...]) -> list[Array]:
-    """Return the readings of the Hankel matrices: guesses for the lost ones where windows would be few."""
-    if grid.lost > MANY:
-        return fill_readings(grid.segments, drives(grid, terms))
-    return [segment.y for segment in grid.segments]
 
 
 def extended_observability(L32: Array, L33: Array, *, n_y: int, weighting: str) -> tuple[Array, Array]:
@@ -208,8 +195,9 @@ def stabilised(A: Array, rows: int) -> Array:
     return np.asarray(np.real(vectors * poles @ np.linalg.pinv(vectors)))
 
 
-def _triangle(grid: Grid, readings: Sequence[Array], f: int, terms: tuple[str, ...]) -> Array | None:
+def _triangle(grid: Grid, f: int, terms: tuple[str, ...]) -> Array | None:
     """Return R of the QR of all windows, signals at unit spread; None with too few windows."""
+    readings = whole_readings(grid.segments, 2 * f)
     signals = [np.hstack(pair) for pair in zip(drives(grid, terms), readings)]
     whole = np.concatenate(signals)
     mean, size = np.nanmean(whole, axis=0), np.nanstd(whole, axis=0)

@@ -16,7 +16,7 @@ moves in the row of its input.  The logs of such a rig say of an input what was 
 **Readings on the grid.**  For a black box (:func:`make_grid`) a reading is the mean of the line through the
 samples over [t_k - dt/2, t_k + dt/2], so that it is not shifted in time; where the grid is the log's own,
 the samples stand as they are.  A reading lost while the input is known stays NaN: what is scored or fitted by
-free run skips it, ARX and subspace fits integrate over it (:mod:`thermogrip.sysid.blackbox.missing_data`).
+free run skips it, ARX leaves out rows that need it, and subspace fits take short holes for lines.
 SINDy needs whole rows of past readings; where most are broken it takes holes of up to :data:`BRIDGED` rows
 for lines (:func:`whole_readings`).
 
@@ -134,7 +134,6 @@ class Grid:
     native: float  # sample time of the logs before averaging [s]
     units: dict[str, str]  # unit of each signal
     why: str = ""  # where the step comes from, in words
-    lost: float = 0.0  # share of the rows of all logs that lack a reading; a part of the grid keeps it
     ends: bool = False  # whether an input was applied up to the row of the log that holds it, not from it on
 
     @property
@@ -196,11 +195,10 @@ def make_grid(
             hint="give a longer log or average less",
         )
     units = {name: str(logs[0][name].attrs.get("units", "1")) for name in (*u, *d, *y)}
-    lost = float(np.mean(np.concatenate([~np.isfinite(part.y).all(axis=1) for part in segments])))
     moves = np.concatenate([each.u for each in rows]).T
     switches = tuple(n for n, on in zip(u, moves) if units[n] == "1" and np.isin(on, (0.0, 1.0)).all())
     switches = () if len(switches) == len(u) else switches  # a heater that is only on or off is what drives
-    return Grid(u, d, y, switches, step, tuple(segments), native, units, why, lost, ends)
+    return Grid(u, d, y, switches, step, tuple(segments), native, units, why, ends)
 
 
 def cut_stretches(plant: PlantData, log: Log, *, gaps: str = "mend") -> list[Stretch]:

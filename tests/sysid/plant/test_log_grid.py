@@ -78,16 +78,13 @@ def test_a_grid_ends_with_the_last_whole_row_and_begins_with_the_first_reading()
         make_grid([log_of(y)], average=0.9)
 
 
-def test_a_bin_without_a_reading_is_lost_and_counted():
+def test_a_bin_without_a_reading_is_lost():
     y = T.copy()
     y[41:60] = np.nan
     other = np.where(T % 50 == 3, np.nan, T)
     grid = make_grid([log_of(y, t2=(other, "degC", "output"))], average=4.0)
     lost = np.isnan(grid.segments[0].y)
     assert lost[:, 0].tolist() == [44 <= t <= 56 for t in grid.segments[0].time]
-    assert grid.lost == pytest.approx(4 / 50)
-    fine = make_grid([log_of(y, t2=(other, "degC", "output"))], average=1.0)
-    assert fine.lost == pytest.approx((19 + 3) / 200)  # rows of which any sensor is missing; one in both
 
 
 # ---- what a grid says of itself ----
@@ -110,10 +107,9 @@ def test_every_signal_has_the_range_and_spread_of_its_own_readings():
     assert part.time.tolist() == [3.0, 4.0, 5.0]
     assert part.d.shape == (3, 1)
     less = grid.having([part])
-    assert (less.segments, less.inputs, less.lost) == ((part,), grid.inputs, grid.lost)
-    assert grid.lost == 1 / 200
+    assert (less.segments, less.inputs) == ((part,), grid.inputs)
     bare = Grid(("q",), (), ("t",), (), 1.0, (part,), 1.0, {})
-    assert (bare.why, bare.lost, bare.ends) == ("", 0.0, False)
+    assert (bare.why, bare.ends) == ("", False)
     named = make_grid([log_of(y, **more)], inputs=["p"], outputs=["t"], disturbances=[], average=1.0)
     assert (named.inputs, named.outputs, named.disturbances) == (("p",), ("t",), ())
     assert (part.y[:, 0].tolist(), part.u[:, 1].tolist()) == (y[3:6].tolist(), [9.0, 12.0, 15.0])
