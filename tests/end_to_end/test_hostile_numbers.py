@@ -136,7 +136,7 @@ def use_coupling(path: Path) -> None:
         pytest.param(a_guard, read_guard, id="guard"),
         pytest.param(a_stop_rule, StopRule.load, id="stop rule"),
         pytest.param(a_coupling, use_coupling, id="coupling"),
-        pytest.param(a_gripper, use_gripper, id="gripper"),
+        pytest.param(a_gripper, use_gripper, id="gripper", marks=pytest.mark.slow),
         pytest.param(an_uncertain_gripper, GripperModel.load, id="uncertain gripper"),
     ],
 )

@@ -94,7 +94,10 @@ def identify(bench: Bench) -> tuple[list[str], str]:
     return words.split(), "answer.json"
 
 
-@pytest.mark.parametrize("verb", [effusivity, compare, tune, identify], ids=lambda verb: verb.__name__)
+LONG = [pytest.param(verb, marks=pytest.mark.slow) for verb in (compare, tune, identify)]
+
+
+@pytest.mark.parametrize("verb", [effusivity, *LONG], ids=lambda verb: verb.__name__)
 def test_a_killed_worker_changes_no_byte(bench: Bench, monkeypatch, verb) -> None:
     monkeypatch.chdir(bench.path)
     (bench.path / "many").mkdir(exist_ok=True)

@@ -132,6 +132,7 @@ def test_what_cannot_be_controlled_is_one_line(lab: Bench, words: list[str], say
     assert says in done.said[0]
 
 
+@pytest.mark.slow
 def test_a_cluster_finds_the_same_controller_bit_for_bit(lab: Bench):
     distributed = pytest.importorskip("distributed")
     model = own_model(load_object(lab.path / "lab.py", "Lab"))
