@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from contextlib import redirect_stdout
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from io import StringIO
 from math import comb
 from pathlib import Path
@@ -105,7 +105,6 @@ class Repeated:
     said: str
     found: PaperResult
     table: tuple[tuple[str, ...], tuple[tuple[Any, ...], ...]]
-    regret: tuple[tuple[str, ...], tuple[tuple[Any, ...], ...]]
     out: Path
     progress: list[tuple[float, str]]
 
@@ -118,8 +117,6 @@ def small(tmp_path_factory: pytest.TempPathFactory) -> Repeated:
     tiny = {"epochs": 2, "hidden": 4, "series_per_class": 5}
 
     def make(name: str, **params: object) -> GraspClassifier:
-        if not params:  # the one that knows the simulated gripper
-            return make_classifier(name)
         return make_classifier(quick[name]) if name in quick else make_classifier(name, **tiny)
 
     def repeat(*, progress: Progress, **options: object) -> PaperResult:
@@ -137,7 +134,7 @@ def small(tmp_path_factory: pytest.TempPathFactory) -> Repeated:
         patch.setattr("thermogrip.studies.paper.repeat_paper", repeat)
         patch.setattr("thermogrip.classify.estimators.registry.make_classifier", make)
         assert main(["paper", "--quick", "--out", str(out)]) == 0
-        return Repeated(said.getvalue(), found[0], found[0].table(), found[0].regret(), out, seen)
+        return Repeated(said.getvalue(), found[0], found[0].table(), out, seen)
 
 
 def counted(predictions: Iterable[dict[str, Any]], classifier: str, condition: str) -> str:
@@ -198,8 +195,6 @@ def test_every_case_and_every_rate_is_printed(small: Repeated) -> None:
     assert {path.name for path in small.out.iterdir()} == {"bundled", "simulated", "report.html"}
     page = (small.out / "report.html").read_text(encoding="utf-8")
     assert all(cell in page for row in rows for cell in row[6:])
-    lost = [f"{value:.3f}" for row in small.regret[1] for value in row[2:]]
-    assert all(words in page for words in (*small.regret[0], *lost))
     assert all(row["copies_right"] < 0.9 * row["copies_n"] for row in small.found.copies)  # after two epochs
     assert "It has not learnt even its own copies in 1-A; 2-C, 10 K" in page
     # of a case that has not learnt its copies nothing is said
@@ -231,33 +226,10 @@ def test_the_verdict_on_copies_adds_up_all_cases() -> None:
         sizes | {"copies_right": 90, "one_right": 2, "others_right": 12, "confidence": 0.9},
         sizes | {"copies_right": 100, "one_right": 3, "others_right": 15, "others_n": 15, "confidence": 0.6},
     )
-    said = PaperResult(None, None, rows, (), 2).copies_verdict
+    said = PaperResult(None, None, rows, 2).copies_verdict
     for words in ("95 % (n = 200) of", "50 % (n = 10) of", "60 % (n = 45) of", "is 80 % sure on average."):
         assert words in said
     poor = sizes | {"copies_right": 89, "one_right": 0, "others_right": 0, "confidence": 0.1}
-    assert PaperResult(None, None, (*rows, poor), (), 2).copies_verdict == (
+    assert PaperResult(None, None, (*rows, poor), 2).copies_verdict == (
         said.removesuffix(".") + ", in the 2 cases where it learnt these."
     )
-
-
-def test_what_is_lost_to_a_known_gripper_is_a_difference_of_log_losses(small: Repeated) -> None:
-    losses = {(row["classifier"], row["condition"]): row["log_loss"] for row in small.found.twin.scores()}
-    head, rows = small.regret
-    assert head[3:] == tuple(f"{name} loses more by" for name in ("posterior", "bayes", "lstm"))
-    for row, best, case in zip(rows, small.found.known, (*FEW, AS_IN_THE_TEXT), strict=True):
-        assert (row[0], row[2], best["n"]) == (case.name, best["log_loss"], 3 * case.of)
-        for name, more in zip(("posterior", "bayes", "lstm"), row[3:], strict=True):
-            assert more + best["log_loss"] == pytest.approx(losses[name, case.record])
-    # with the numbers known, 10 K or more distinguish copper, iron and wood
-    assert small.found.known[1]["accuracy"] == 1.0
-    assert 0.0 < small.found.known[1]["log_loss"] < 0.1
-    assert small.found.known[1]["low"] == pytest.approx(0.025 ** (1 / 9))
-
-
-def test_grasps_longer_than_10_s_are_not_set_beside_a_known_gripper(
-    small: Repeated, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    longer = replace(FEW[1], seconds=CASES[-1].seconds)
-    monkeypatch.setattr("thermogrip.studies.paper.CASES", (FEW[0], longer))
-    assert longer.seconds == 40.0
-    assert small.found.regret() == (small.regret[0], (small.regret[1][0], small.regret[1][2]))

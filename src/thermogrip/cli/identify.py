@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from thermogrip.cli import options as cli
-from thermogrip.cli.completion import MODELS
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.media import printable
 from thermogrip.report.console import Console
@@ -28,6 +27,7 @@ if TYPE_CHECKING:
     from thermogrip.sysid.validation import Band, FreeRun
     from thermogrip.sysid.validation.verdict import Verdict
 
+MODELS = ("arx", "oe", "armax", "bj", "subspace", "parsim", "sindy", "neural", "network")
 USUAL_MODELS = ",".join(model for model in MODELS if model not in ("armax", "bj", "parsim"))
 NO_POSTERIOR = "no posterior: the model that was kept is a black box, only networks have parameters to sample"
 
@@ -305,9 +305,7 @@ def _show_identified(
     console.say(found.verdict)
 
 
-def _identified(
-    found: Identification, plant: Plant, record: Posterior | None, out: Path
-) -> dict[str, Any]:
+def _identified(found: Identification, plant: Plant, record: Posterior | None, out: Path) -> dict[str, Any]:
     """Return the JSON answer of ``identify``."""
     from thermogrip.sysid.greybox.identifiability import identifiability_report
 

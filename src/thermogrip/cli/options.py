@@ -11,8 +11,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Protocol
 
 import typer
 
-from thermogrip.cli.completion import PROTOCOLS as PROTOCOLS
-from thermogrip.cli.completion import completer
 from thermogrip.cli.kinds import check_exists
 from thermogrip.datasets.atomic_files import make_folder
 from thermogrip.datasets.errors import UserError, as_user_error, known_names
@@ -117,15 +115,7 @@ def opt(
     max: float | None = None,
 ) -> Any:
     """Return the Typer option of a name, what its value is called, its help, a ``callback=``, its bounds."""
-    return typer.Option(
-        name,
-        metavar=metavar or "N",
-        help=words,
-        callback=check,
-        min=min,
-        max=max,
-        autocompletion=completer(name, metavar or "N"),
-    )
+    return typer.Option(name, metavar=metavar or "N", help=words, callback=check, min=min, max=max)
 
 
 def flag(name: str, words: str) -> Any:
@@ -135,7 +125,7 @@ def flag(name: str, words: str) -> Any:
 
 def arg(metavar: str, words: str, check: Callable[..., Any] | None = None) -> Any:
     """Return the Typer argument of a place on the command line."""
-    return typer.Argument(metavar=metavar, help=words, callback=check, autocompletion=completer("", metavar))
+    return typer.Argument(metavar=metavar, help=words, callback=check)
 
 
 AsJson = Annotated[bool, flag("--json", "Print one JSON object on stdout and nothing else there.")]

@@ -35,6 +35,7 @@ if TYPE_CHECKING:
 
 
 WATCHED_SPEED = 10.0  # of a twin [times real time]: settling, minutes long, in a few tens of seconds
+PROTOCOLS = ("thermogrip", "tclab")
 LOWEST_TARGET, HIGHEST_TARGET = 10.0, 50.0  # degC, of the skin
 
 OutOption = Annotated[Path, cli.opt("--out", "DIR", "Folder of the run.")]
@@ -48,7 +49,7 @@ ProtocolOption = Annotated[
         "--protocol",
         "NAME",
         "thermogrip or tclab [default: found out].",
-        cli.one_of("--protocol", cli.PROTOCOLS),
+        cli.one_of("--protocol", PROTOCOLS),
     ),
 ]
 SpeedOption = Annotated[
@@ -223,9 +224,7 @@ def run(
     about |= {"port": port} if twin is None else {"twin": twin.name, "draw": draw}
     about |= {} if profile is None else {"profile": profile.name}
     about |= {"from_degC": start, "hold_s": hold, "object_degC": obj, "material": material, "seed": seed}
-    files = files_of(
-        learn, controller=controller, plant=twin, guard=guard, profile=profile, relays=relays
-    )
+    files = files_of(learn, controller=controller, plant=twin, guard=guard, profile=profile, relays=relays)
     paced = pace is not None
     rig = rig_of(
         port, protocol, clock, twin, network, draw, loaded, seed=seed, t_start=start, paced=paced,
@@ -479,7 +478,7 @@ def recover(
 
 def virtual(
     protocol: Annotated[
-        str, cli.opt("--protocol", "NAME", "thermogrip or tclab.", cli.one_of("--protocol", cli.PROTOCOLS))
+        str, cli.opt("--protocol", "NAME", "thermogrip or tclab.", cli.one_of("--protocol", PROTOCOLS))
     ] = "thermogrip",
     plant: Annotated[
         Path | None, cli.opt("--plant", "PLANT", "plant.json of identify [default: a bundled network].")
