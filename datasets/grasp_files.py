@@ -39,7 +39,6 @@ from thermogrip.datasets.schema import (
 )
 from thermogrip.datasets.tables import (
     Table,
-    check_table,
     read_csv_table,
     read_parquet_frame,
     text_numbers,
@@ -173,14 +172,6 @@ def _check_cells(frame: DataFrame, file: str) -> None:
     problem = f"{frame[name][at]!s} of grasp {grasp!r} was {frame[name][first]!s} in row {first + 1}"
     hint = "repeat in each row what is known of its grasp"
     raise UserError(problem, file=file, row=at + 1, column=name, hint=hint)
-
-
-def check_grasp_file(path: str | Path) -> None:
-    """Refuse what is no file or folder of grasps by names, beginnings and what is declared."""
-    for file in list_grasp_files([path]):
-        check_table(file, labels=True)
-        if file_format(file) == "csv":
-            check_table(_meta_path(file))
 
 
 def write_grasps(grasps: Grasps, path: str | Path) -> Path:

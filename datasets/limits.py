@@ -90,11 +90,11 @@ def read_within(stream: BinaryIO, most: int) -> bytes:
     return found.getvalue()
 
 
-def unpack_within(stream: BinaryIO, source: BinaryIO, *, file: str | Path, most: int | None = None) -> bytes:
-    """Return what ``stream`` unpacks from the open file ``source``, or its first ``most`` bytes; what came
-    out is compared with what has been read so far, so what grows too much is refused after 8 MiB."""
+def unpack_within(stream: BinaryIO, source: BinaryIO, *, file: str | Path) -> bytes:
+    """Return what ``stream`` unpacks from the open file ``source``; what came out is compared with what has
+    been read so far, so what grows too much is refused after 8 MiB."""
     found = io.BytesIO()
-    while most is None or found.tell() < most:
+    while True:
         left = most_unpacked(source.tell()) + 1 - found.tell()
         piece = stream.read(min(left, 4 * _MB))
         if not piece:

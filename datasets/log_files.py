@@ -31,7 +31,7 @@ from thermogrip.datasets.atomic_files import atomic_path, write_atomic
 from thermogrip.datasets.clock import EPOCH, Clock, clock_of, read_clock, since_first_row
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.file_names import file_format, file_stem, split_cut
-from thermogrip.datasets.limits import MOST_NUMBER, check_size, check_source
+from thermogrip.datasets.limits import MOST_NUMBER
 from thermogrip.datasets.media import csv_cell
 from thermogrip.datasets.netcdf import convention_unit, open_netcdf, write_netcdf
 from thermogrip.datasets.roles import Roles, assign_roles, guess_role
@@ -40,7 +40,6 @@ from thermogrip.datasets.schema import check_log, hash_columns, make_log
 from thermogrip.datasets.tables import (
     Table,
     check_header,
-    check_table,
     read_excel_table,
     read_matlab_table,
     read_parquet_table,
@@ -133,7 +132,8 @@ def read_log(
     else:
         file, start, stop = split_cut(path)
         table = _one_column_a_signal(_read_table(file, columns))
-    named = [*(inputs or ()), *(outputs or ()), *(disturbances or ())]
+    of_model = [n for role in ("input", "output", "disturbance") for n, r in (known or {}).items() if r == role]
+    named = [*(inputs or ()), *(outputs or ()), *(disturbances or ()), *of_model]
     check_header([*table.numbers, *table.text], named, str(file))
     if table.meta.get("schema") not in (None, "thermogrip.log"):
         raise UserError(f"holds a {table.meta['schema']}, not a log", file=file, hint="give a log")
@@ -144,13 +144,13 @@ def read_log(
         what = "a time column and nothing else" if read.clock.columns else "no column of numbers"
         raise UserError(f"has {what}", file=file, hint="add inputs and outputs")
     lists = {"inputs": inputs, "outputs": outputs, "disturbances": disturbances}
-    of_model = {name: role for name, role in (known or {}).items() if name in units}
+    there = {name: role for name, role in (known or {}).items() if name in units}
     in_file = {
         name: table.attrs[header]["role"]
         for header, name in read.names_of.items()
         if table.attrs.get(header, {}).get("role")
     }
-    roles = assign_roles(units, given=in_file | of_model, columns=data, file=str(file), **lists)
+    roles = assign_roles(units, given=in_file | there, columns=data, file=str(file), **lists)
     own = table.meta.get("schema") == "thermogrip.log"
     if own:
         repairs = [line for line in table.meta.get("repairs", "").splitlines() if line]
@@ -188,15 +188,6 @@ def as_logs(logs: Logs, *lists: Sequence[str] | None, known: Mapping[str, str] |
     for at, log in enumerate(found):
         log.attrs["name"] += f" {at + 1}" if log.attrs["name"] == "DataFrame" and len(given) > 1 else ""
     return found
-
-
-def check_log_file(path: str | Path) -> None:
-    """Refuse what is no log by its name, its beginning and what it declares; nothing heavy is loaded."""
-    file, _, _ = split_cut(path)
-    if _format(file) != "rosbag":
-        check_table(file, log=True)
-    elif not os.path.isdir(file):
-        check_size(check_source(file), file=file)
 
 
 def write_log(log: Log, path: str | Path) -> Path:

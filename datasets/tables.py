@@ -12,19 +12,17 @@ takes for something is noted; a row or a cell that is broken is left out as long
 
 from __future__ import annotations
 
-import codecs
 import csv
 import gzip
 import io
 import lzma
-import os
 import re
 import shlex
 import warnings
 import zipfile
 import zlib
 from collections import Counter
-from collections.abc import Callable, Collection, Container, Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
 from itertools import chain, count, islice
@@ -37,17 +35,14 @@ from numpy.typing import NDArray
 from thermogrip.datasets import limits
 from thermogrip.datasets.atomic_files import read_bytes
 from thermogrip.datasets.errors import UserError, as_user_error, os_faults, reading
-from thermogrip.datasets.file_names import file_format
 from thermogrip.datasets.media import from_csv
-from thermogrip.datasets.netcdf import check_netcdf
 from thermogrip.datasets.repair import name_rows
-from thermogrip.datasets.units import find_column, read_header
+from thermogrip.datasets.units import read_header
 
 if TYPE_CHECKING:
     from pandas import DataFrame
 
 MOST_COLUMNS = 4096  # of a table
-_BEGINNING = 16 << 20  # bytes of a file that are looked at before it is read
 _MOST_EMPTY = 1_000_000  # lines without a cell that are passed over
 
 _NULLS = ["", "nan", "NaN", "NAN", "NA", "N/A", "null", "NULL", "None", "-nan", "#N/A"]
@@ -159,18 +154,6 @@ def parse_text(data: bytes, file: str, columns: Sequence[str] | None = None) -> 
     table = _parse_table(data, replace(layout, names=names, notes=notes), file)
     kept = {name: values for name, values in table.numbers.items() if not name.startswith(_LEFT_OUT)}
     return replace(table, numbers=kept)
-
-
-def check_columns(path: Path, names: Sequence[str] | None, optional: Collection[str] = ()) -> None:
-    """Refuse names that are no columns of a text table, from its beginning; others pass, as do optional ones
-    that a header lacks."""
-    if names and path.is_file() and file_format(path) in ("csv", "text"):
-        headers = find_layout(_any_coding(_text_of(path, _BEGINNING))[0], str(path)).names
-        check_header(headers, names, str(path))
-        known = dict.fromkeys((read_header(header, headers)[0] for header in headers), "")
-        for name in names:
-            if name not in optional:
-                find_column(name, known, str(path))
 
 
 def check_header(headers: Sequence[str], names: Sequence[str], file: str) -> None:
@@ -696,45 +679,22 @@ def _to_float(column: Any) -> NDArray[np.float64]:
     return np.array(column.fill_null(np.nan).to_numpy(), dtype=float)
 
 
-def check_table(path: str | Path, *, log: bool = False, labels: bool = False) -> None:
-    """Refuse a file that is no table of numbers by its name, its beginning and what it declares.
-
-    A log may have any header, Parquet ``labels``.  Neither pandas nor xarray is loaded.  What a shell passes
-    on is read once, so it is not looked at here.
-    """
-    kind = file_format(path)
-    if os.path.exists(path) and not limits.check_source(path) and not os.path.isfile(path):
-        return
-    if kind == "text" or (kind == "csv" and log):
-        _text_of(path, _BEGINNING)
-    elif kind == "csv":
-        text = _text_of(path, _BEGINNING)
-        if len(text) < _BEGINNING // 2 or not text.startswith(b"#"):
-            _header(text, str(path))
-    elif kind == "parquet":
-        _open_parquet(path, str(path), limits.check_source(path), text=labels).close()
-    elif kind == "netcdf":
-        check_netcdf(path)
-
-
-def _text_of(path: str | Path, most: int | None = None) -> bytes:
-    """Return the text of a file, unpacked, within the limits of :mod:`thermogrip.datasets.limits`, or as much
-    of its beginning as ``most`` [bytes]."""
+def _text_of(path: str | Path) -> bytes:
+    """Return the text of a file, unpacked, within the limits of :mod:`thermogrip.datasets.limits`."""
     limits.check_size(limits.check_source(path), file=path)
     openers: dict[str, Any] = {".gz": gzip.open, ".xz": lzma.open}
     opener = openers.get(Path(path).suffix.lower())
     spoilt = reading("is damaged or not compressed as its name says", file=path, hint="copy it again")
     with os_faults(path), open(path, "rb") as file, spoilt:
         if opener is None:
-            data = limits.read_within(file, limits.most_bytes() if most is None else most)
+            data = limits.read_within(file, limits.most_bytes())
         else:
             with opener(file, "rb") as stream:
                 _check_text(stream.read(4096), path)
                 stream.seek(0)
-                data = limits.unpack_within(stream, file, file=path, most=most)
-    if most is None:
-        limits.check_size(len(data), file=path)  # a pipe says no size, and a file may grow
-    data = _as_utf8(data, path, whole=most is None).removeprefix(b"\xef\xbb\xbf")
+                data = limits.unpack_within(stream, file, file=path)
+    limits.check_size(len(data), file=path)  # a pipe says no size, and a file may grow
+    data = _as_utf8(data, path).removeprefix(b"\xef\xbb\xbf")
     if b"\n" not in data:
         data = data.replace(b"\r", b"\n")
     _check_text(data[:4096], path)
@@ -748,12 +708,12 @@ def _check_text(start: bytes, path: str | Path) -> None:
         raise UserError("is not text, so it is not CSV", file=path, hint="export it as comma-separated text")
 
 
-def _as_utf8(data: bytes, path: str | Path, *, whole: bool) -> bytes:
+def _as_utf8(data: bytes, path: str | Path) -> bytes:
     """Return UTF-16 text, as spreadsheets write it, in UTF-8; any other bytes as they are."""
     if not data.startswith((b"\xff\xfe", b"\xfe\xff")):
         return data
     with as_user_error(UnicodeDecodeError, "is damaged UTF-16 text", file=path, hint="save it as UTF-8"):
-        return codecs.getincrementaldecoder("utf-16")().decode(data, whole).encode("utf-8")
+        return data.decode("utf-16").encode("utf-8")
 
 
 def _header(data: bytes, file: str) -> tuple[list[str], int, str]:

@@ -17,7 +17,6 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.examples import example_path
 from thermogrip.datasets.grasp_files import (
     check_apart,
-    check_grasp_file,
     distinct_names,
     read_grasp_files,
     read_grasps,
@@ -283,23 +282,6 @@ def test_columns_of_the_meta_file_that_mean_nothing_are_left_out_and_reported(pa
     assert line.startswith("g_meta.csv: not used: object temp, t_room_degC; known are ")
     assert "t_ambient_degC" in line
     assert "t_object_nominal_degC" in line
-
-
-def test_what_is_no_table_is_found_in_a_folder_a_file_and_the_facts_beside_it(tmp_path, small_grasps):
-    path = write_grasps(small_grasps, tmp_path / "a.csv")
-    facts = tmp_path / "a_meta.csv"
-    check_grasp_file(tmp_path)
-    check_grasp_file(path)
-    for spoilt in (facts, path):
-        kept = spoilt.read_bytes()
-        spoilt.write_text("one,one\n1,2\n")
-        for asked in (tmp_path, path):
-            with pytest.raises(UserError, match=rf"{spoilt.name}.*column one.*occurs twice"):
-                check_grasp_file(asked)
-        spoilt.write_bytes(kept)
-    (tmp_path / "empty").mkdir()
-    with pytest.raises(UserError, match="holds no grasp files"):
-        check_grasp_file(tmp_path / "empty")
 
 
 def test_a_spreadsheet_s_semicolons_decimal_commas_and_utf_16_are_the_same_grasps(pair, tmp_path):

@@ -309,22 +309,9 @@ def test_a_table_may_have_as_many_columns_and_empty_lines_as_its_limits(
     for names in (["time_s", "a", "b"], ["time_s", "a", "b", "c"]):
         parquet.write_table(pa.table({name: [0.0, 1.0] for name in names}), tmp_path / "a.parquet")
         if len(names) > 3:
-            assert "has 4 columns, more than 3" in refused(tables.check_table, tmp_path / "a.parquet")
+            assert "has 4 columns, more than 3" in refused(tables.read_parquet_table, tmp_path / "a.parquet")
         else:
-            tables.check_table(tmp_path / "a.parquet")
-
-
-def test_comments_that_fill_half_of_what_is_looked_at_may_stand_before_the_header(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(tables, "_BEGINNING", 64)
-    path = tmp_path / "a.csv"
-    path.write_bytes(b"#" * 30 + b"\n")
-    assert "has only comments" in refused(tables.check_table, path)
-    path.write_bytes(b"#" * 31 + b"\n")
-    tables.check_table(path)  # the header may come later
-    path.write_bytes(b"time_s,time_s," + b"a" * 40)
-    assert "occurs twice" in refused(tables.check_table, path)
+            assert len(tables.read_parquet_table(tmp_path / "a.parquet").lines) == 2
 
 
 def test_a_file_of_as_many_members_as_its_limit_is_checked(

@@ -24,7 +24,7 @@ from thermogrip.datasets import tables
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.examples import example_path
 from thermogrip.datasets.file_names import split_cut
-from thermogrip.datasets.log_files import as_logs, check_log_file, read_clock, read_log, write_log
+from thermogrip.datasets.log_files import as_logs, read_clock, read_log, write_log
 from thermogrip.datasets.schema import column, make_log, names
 
 HEAD = "time_s,drive,t_tank_degC\n"
@@ -529,13 +529,7 @@ def test_which_column_is_the_time_and_in_what_unit(write, text, time, left):
     assert list(log) == left
 
 
-def test_what_a_log_may_have_is_checked_before_it_is_read(write, tmp_path):
-    check_log_file(write("a,a\n1,2\n"))
-    check_log_file(f"{write(HEAD + ROWS)}@0:2")
-    with pytest.raises(UserError, match="is not text"):
-        check_log_file(write(b"\0"))
-    with pytest.raises(UserError, match=r"a\.bag: no such file"):
-        check_log_file(tmp_path / "a.bag")
+def test_a_netcdf_file_is_repaired_and_has_names_of_its_own(tmp_path):
     late = xr.Dataset({"a": ("time", [1.0, 2.0, 3.0])}, {"time": ("time", [0.0, 2.0, 1.0], {"units": "s"})})
     late.to_netcdf(tmp_path / "late.nc", engine="h5netcdf")
     assert "row 3: time runs back from 2 s to 1 s" in refused(tmp_path / "late.nc")

@@ -117,8 +117,6 @@ def identify(
     assert out is not None  # its callback names one
     cli.new_file(out, (".json",))
     roles = cli.comma(inputs), cli.comma(outputs), cli.comma(disturbances)
-    if columns is None:
-        cli.check_columns(paths, [name for names in roles for name in names or ()])
     a_network = "network" in wanted and network != "none"
     wanted_network = cli.find_network(network) if a_network and network else None
     console = Console(as_json)
@@ -365,8 +363,6 @@ def validate(
     """Score a plant by free run.
 
     It sees the inputs and disturbances of the whole log, and measured outputs of the warm-up only."""
-    if columns is None:
-        cli.check_columns_of(plant, paths)
     from thermogrip.sysid.plant.log_grid import moved_beside, roles_of
 
     loaded = cli.load_plant(plant, network)
@@ -494,8 +490,6 @@ def simulate(
     from thermogrip.datasets.log_files import check_written, write_log
 
     check_written(cli.new_file(out))
-    if columns is None:
-        cli.check_columns_of(plant, [path])
     from thermogrip.datasets.schema import column
     from thermogrip.sysid.plant.log_grid import match_logs, roles_of
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import sys
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Protocol
 
@@ -227,27 +227,11 @@ def listed(path: Path, *keys: str) -> list[str]:
         return []
 
 
-def check_columns_of(plant: Path, paths: Sequence[str]) -> None:
-    """Refuse logs without the columns of a plant, by its JSON file; of several inputs one may be absent."""
-    inputs = listed(plant, "inputs")
-    names = [*inputs, *listed(plant, "outputs", "disturbances")]
-    check_columns(paths, names, inputs if len(inputs) > 1 else ())
-
-
 def choices(option: str, names: Iterable[str], path: Path, *keys: str) -> None:
     """Refuse names that a JSON file of ours does not list under these keys."""
     if known := listed(path, *keys):
         for name in names:
             choice(option, name, known)
-
-
-def check_columns(paths: Sequence[str], names: Sequence[str], optional: Collection[str] = ()) -> None:
-    """Refuse names, but optional ones, that are no columns of these logs, before their reader is loaded."""
-    from thermogrip.datasets.file_names import split_cut
-    from thermogrip.datasets.tables import check_columns
-
-    for path in paths:
-        check_columns(split_cut(path)[0], names, optional)
 
 
 def new_file(path: Path, suffixes: Sequence[str] = ()) -> Path:
