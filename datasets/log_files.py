@@ -36,7 +36,7 @@ from thermogrip.datasets.media import csv_cell
 from thermogrip.datasets.netcdf import convention_unit, open_netcdf, write_netcdf
 from thermogrip.datasets.roles import Roles, assign_roles, guess_role
 from thermogrip.datasets.rosbag import bag_parts, read_rosbag_table
-from thermogrip.datasets.schema import check_log, hash_columns, make_log
+from thermogrip.datasets.schema import ROLES, check_log, hash_columns, make_log
 from thermogrip.datasets.tables import (
     Table,
     check_header,
@@ -132,7 +132,8 @@ def read_log(
     else:
         file, start, stop = split_cut(path)
         table = _one_column_a_signal(_read_table(file, columns))
-    of_model = [n for role in ("input", "output", "disturbance") for n, r in (known or {}).items() if r == role]
+    by_role = {role: [n for n, of in (known or {}).items() if of == role] for role in ROLES}
+    of_model = [*by_role["input"], *by_role["output"], *by_role["disturbance"]]
     named = [*(inputs or ()), *(outputs or ()), *(disturbances or ()), *of_model]
     check_header([*table.numbers, *table.text], named, str(file))
     if table.meta.get("schema") not in (None, "thermogrip.log"):
