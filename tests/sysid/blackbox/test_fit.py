@@ -38,6 +38,7 @@ def fit_of(kind, log, **orders):
     return BlackBoxFit(kind, Plant(model, {}, dt=1.0), choice, grid)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("what", "rows"), [("_drawn_blocks", 1200), ("_drawn_errors", 600)])
 @pytest.mark.parametrize(
     ("kind", "orders"),
@@ -68,6 +69,7 @@ def curved_log(seed, n=900):
     return make_log(np.arange(float(n)), pairs), 25 + x
 
 
+@pytest.mark.slow
 def test_refits_of_sparse_equations_spread_as_fits_to_new_logs_do_and_cover_the_truth():
     fresh, true = curved_log(99)
     u, none = fresh["q"].values[None, :, None], np.zeros((1, 900, 0))
@@ -417,7 +419,9 @@ def test_rounding_gives_an_input_that_never_moves_no_gain_in_any_structure(kind)
 
 
 @pytest.mark.parametrize(("joule", "kept"), [(0.6, True), (0.0, False)])
-@pytest.mark.parametrize("kind", ["oe", "subspace", "arx"])
+@pytest.mark.parametrize(
+    "kind", ["oe", *(pytest.param(k, marks=pytest.mark.slow) for k in ("subspace", "arx"))]
+)
 def test_the_square_of_a_heater_s_drive_is_kept_where_the_folds_show_it(kind, joule, kept):
     rng = np.random.default_rng(1)
     u = np.repeat(rng.random(60), 20)
