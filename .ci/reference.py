@@ -8,6 +8,7 @@ import inspect
 import io
 import os
 import re
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +24,13 @@ CLI_HEAD = """# Command line
 
 Every verb has `--seed N`, `--json` (one JSON object on stdout and nothing else) and `--help` besides.
 Exit codes: 0 done; 1 a bug; 2 your input is at fault; 3 done, but the answer is no; 130 Ctrl-C.
-Written by `python .ci/reference.py`.
+Written by `python .ci/reference.py`. Each verb's `--help` has two examples and what comes next.
+
+## Options of several verbs
+
+```text
+{shared}
+```
 """
 ROOM_HEAD = """# thermogrip.{room}
 
@@ -31,6 +38,9 @@ ROOM_HEAD = """# thermogrip.{room}
 Written by `python .ci/reference.py`.
 """
 _WIDTH = 100
+_SEVERAL = 3  # verbs that share an option, from which on it is described once
+#: An option of a help, with what stands behind it.
+_OPTION = r"\n  (--[^\n]*?\S)(?: {2,}|\n {15,})([^\n]*(?:\n {15,}[^\n]*)*)"
 
 
 def pages() -> dict[Path, str]:
@@ -40,22 +50,37 @@ def pages() -> dict[Path, str]:
 
 
 def page_of_verbs() -> str:
-    """Return what ``thermogrip VERB --help`` prints, a section a verb."""
+    """Return what ``thermogrip VERB --help`` prints, a section a verb; options of several verbs once."""
     from thermogrip.cli.verbs import VERBS
 
-    sections = [f"## {verb}\n\n```text\n{help_of(verb)}\n```\n" for verb in VERBS]
-    return "\n".join([CLI_HEAD, *sections])
+    helps = {verb: help_of(verb) for verb in VERBS}
+    options = {verb: dict(re.findall(_OPTION, text)) for verb, text in helps.items()}
+    often = Counter((name, " ".join(about.split())) for by in options.values() for name, about in by.items())
+    shared = {name: about for (name, about), n in often.items() if n >= _SEVERAL}
+    sections = []
+    for verb, text in helps.items():
+        besides = [
+            name for name, about in options[verb].items() if shared.get(name) == " ".join(about.split())
+        ]
+        for name in besides:
+            text = re.sub(rf"\n  {re.escape(name)}(?: {{2,}}.*| *)(?:\n {{15,}}.*)*", "", text)
+        text = re.sub(r"\n\n(?:Options|Arguments):(?=\n\n|$)", "", text)
+        more = f"\nBesides: {', '.join(f'`{name.split()[0]}`' for name in besides)}.\n" if besides else ""
+        sections.append(f"## {verb}\n\n```text\n{text}\n```\n{more}")
+    rows = "\n".join(f"{name}  {about}" for name, about in sorted(shared.items()))
+    return "\n".join([CLI_HEAD.format(shared=rows), *sections])
 
 
 def help_of(verb: str) -> str:
-    """Return what ``thermogrip VERB --help`` prints, without the options that every verb has."""
+    """Return what ``thermogrip VERB --help`` prints, without examples and the options that every verb has."""
     from thermogrip.cli.main import main
 
     os.environ["COLUMNS"] = str(_WIDTH)
     out = io.StringIO()
     with contextlib.redirect_stdout(out):
         main([verb, "--help"])
-    text = re.sub(r"\n  (?:--seed N|--json|-h, --help) .*(?:\n {20,}.*)*", "", out.getvalue().rstrip())
+    text = out.getvalue().partition("\nExamples:")[0].rstrip()
+    text = re.sub(r"\n  (?:--seed N|--json|-h, --help) .*(?:\n {20,}.*)*", "", text)
     return "\n".join(line.rstrip() for line in text.splitlines())
 
 

@@ -73,9 +73,9 @@ def test_the_reference_has_every_verb_and_every_public_name() -> None:
     for verb in VERBS:
         usage = f"## {verb}\n\n```text\nUsage: thermogrip {verb} [OPTIONS]"
         assert usage in verbs
-        assert set(re.findall(r"^  (--[\w-]+)", help_of(verb), flags=re.MULTILINE)) - OF_EVERY_VERB <= set(
-            re.findall(r"^  (--[\w-]+)", verbs.partition(usage)[2].partition("```\n")[0], flags=re.MULTILINE)
-        )
+        options = set(re.findall(r"^  (--[\w-]+)", help_of(verb), flags=re.MULTILINE)) - OF_EVERY_VERB
+        part = verbs.partition(usage)[2].partition("\n## ")[0]
+        assert options <= set(re.findall(r"(?m)(?:^  |`)(--[\w-]+)", part))
     for room in ROOMS:
         headings_of_page = headings(reference / "python" / f"{room}.md")
         for name in importlib.import_module(f"thermogrip.{room}").__all__:
