@@ -151,8 +151,7 @@ def test_signals_are_shown_with_their_roles_and_guesses_are_marked() -> None:
 
 @pytest.fixture
 def no_figures(monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in ("models_figure", "posterior_figure"):
-        monkeypatch.setattr(plant.plots, name, lambda *_, **__: Figure())
+    monkeypatch.setattr(plant.plots, "models_figure", lambda *_, **__: Figure())
     monkeypatch.setattr("thermogrip.report.plots.corner_figure", lambda *_, **__: Figure())
     monkeypatch.setattr(
         "thermogrip.sysid.greybox.identifiability.identifiability_report", lambda _: ["U is known"]
@@ -268,7 +267,7 @@ def test_parameters_answer_for_themselves_and_the_sampler_only_where_it_failed()
     assert table.rows[0][3:5] == (pytest.approx(3.0, abs=0.1), pytest.approx(0.5, abs=0.1))
     assert table.rows[0][7:9] == (812, 1.003)
     assert table.rows[1][7:9] == (None, None)
-    assert "500 steps, converged: 50 autocorrelation times, 30 % accepted" in known.parts[5].text
+    assert "500 steps, converged: 50 autocorrelation times, 30 % accepted" in known.parts[4].text
     record.converged = False
     record.verdict = "not converged: 9 autocorrelation times"
     unsure = plant.parameters_section(board, record)

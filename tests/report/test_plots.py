@@ -25,13 +25,11 @@ from thermogrip.report.plots import (
     _log_scale,
     bode_chart,
     corner_figure,
-    exchange_figure,
     free_run_chart,
     grasps_chart,
     loops_chart,
     models_figure,
     pole_figure,
-    posterior_figure,
     residual_figure,
     steps_chart,
 )
@@ -189,14 +187,6 @@ def models_of() -> Figure:
     return models_figure(rows)
 
 
-def posterior_of(n: int) -> Figure:
-    samples = np.linspace(0.0, 100.0, 101)[:, None] ** 0.9 + 1000.0 * np.arange(n)
-    free = [f"p{k}" for k in range(n)]
-    return posterior_figure(
-        samples, free, {"p0": "J/K"}, {name: 1000.0 * k + 30.0 for k, name in enumerate(free)}
-    )
-
-
 def corner_of() -> Figure:
     free = ("a", "b", "c", "d")
     rng = np.random.default_rng(0)
@@ -245,8 +235,6 @@ FIGURES = {
     "free run of many rows": lambda: free_run_of(3001),
     "residuals": residuals_of,
     "models": models_of,
-    "posterior of one": lambda: posterior_of(1),
-    "posterior of seven": lambda: posterior_of(7),
     "corner": corner_of,
     "loops": loops_of,
     "steps": steps_of,
@@ -258,9 +246,6 @@ FIGURES = {
             | {"last": [grasps_of("cork", "wood")]},
             ("copper", "wood"),
         )
-    ),
-    "exchange": lambda: exchange_figure(
-        {"copper": 36e3, "wood": 350.0}, e_dev=1500.0, seconds=4.0, area=2e-4
     ),
 }
 DRAWN = Path(__file__).with_name("figures.txt")

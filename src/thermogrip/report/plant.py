@@ -244,14 +244,10 @@ def parameters_section(plant: Plant, record: Posterior | None = None) -> Section
         parts.append(Text(f"These cannot be estimated separately: {'; '.join(found.flat)}."))
         tone = "warn"
     if record is not None:
-        marginals = plots.posterior_figure(record.samples, record.free, record.units, record.fitted)
         tone = tone if record.converged else "warn"
         verdict += "" if record.converged else f" The sampler has {record.verdict}."
-        caption = "The parameters that emcee sampled, pair by pair; grey lines: the fit."
+        caption = f"{len(record.samples)} samples of the parameters that emcee moved, pair by pair; grey lines: the fit."
         parts += [
-            Picture(
-                marginals, f"Marginals of {len(record.samples)} samples: 90 % shaded, the fit as a line."
-            ),
             Picture(corner_figure(record), caption),
             Text(_sentence(record.likelihood)),
             Text(

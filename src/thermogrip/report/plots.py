@@ -186,29 +186,6 @@ def pole_figure(found: Dynamics) -> Figure:
     return figure
 
 
-def posterior_figure(
-    samples: Array, free: Sequence[str], units: Mapping[str, str], values: Mapping[str, float]
-) -> Figure:
-    """Draw the marginal posterior of each parameter from samples (n, n_free) in natural units, with its 90 %
-    interval and the fitted value."""
-    across = min(5, max(1, len(free)))
-    down = -(-len(free) // across)
-    figure, axes = panels(down, across, size=(2.1 * across, 1.55 * down))
-    for k, axis in enumerate(axes.ravel()):
-        if k >= len(free):
-            axis.set_axis_off()
-            continue
-        name = free[k]
-        low, high = np.quantile(samples[:, k], [0.05, 0.95])
-        axis.hist(samples[:, k], bins=40, color="#c9d6e6", edgecolor="none")
-        axis.axvspan(low, high, color=MODEL, alpha=0.10, lw=0)
-        axis.axvline(values[name], color=PALETTE[1], lw=1.0)
-        axis.set_yticks([])
-        axis.set_title(f"{name} [{units.get(name, '1')}]", fontsize=8)
-        axis.locator_params(axis="x", nbins=3)
-    return figure
-
-
 def loops_chart(runs: Mapping[str, Log], targets: Mapping[str, float], output: str = "t_surface") -> Chart:
     """Return closed loops side by side by title: the regulated temperature and its target [degC] above, the
     drive below."""
@@ -273,38 +250,6 @@ def grasps_chart(records: Mapping[str, Sequence[Grasps]], materials: Sequence[st
         columns.append((Panel("t_surface [degC]", tuple(curves), title, 2.2, marks=(0.0,)),))
     label = 'time since the "closed" message [s]'
     return Chart(tuple(columns), label, wide=6.4 if len(columns) == 1 else 2.9, across=4)
-
-
-def exchange_figure(
-    effusivity: Mapping[str, float], *, e_dev: float, seconds: float = 10.0, area: float = 4e-4,
-    scatter: float = 0.5,
-) -> Figure:  # fmt: skip
-    """Draw what two half-spaces in perfect contact exchange: heat, over the difference and over the area, and
-    how far the skin's surface moves, over the difference.
-
-    T_s - T_dev = dT / (1 + e_dev / e_obj); the flux e_dev (T_s - T_dev) / sqrt(pi t) has the integral
-    2 e_dev (T_s - T_dev) sqrt(t / pi).
-    """
-    figure, axes = panels(1, 3, size=(9.6, 3.0))
-    difference, areas = np.linspace(0, 20, 41), np.linspace(0, 6e-4, 41)
-    for k, (name, e_obj) in enumerate(effusivity.items()):
-        moved = 1 / (1 + e_dev / e_obj)
-        share = 2 * e_dev * np.sqrt(seconds / np.pi) * moved
-        axes[0, 0].plot(difference, share * area * difference, color=PALETTE[k % 8], label=name)
-        for dT, style in ((5.0, ":"), (20.0, "-")):
-            axes[0, 1].plot(1e4 * areas, share * areas * dT, color=PALETTE[k % 8], ls=style)
-        axes[0, 2].plot(difference, moved * difference, color=PALETTE[k % 8])
-        axes[0, 2].fill_between(
-            difference, moved * difference - scatter, moved * difference + scatter, color=PALETTE[k % 8],
-            alpha=0.15, lw=0,
-        )  # fmt: skip
-    axes[0, 0].set_xlabel(f"temperature difference [K], {1e4 * area:g} cm\u00b2")
-    axes[0, 1].set_xlabel("contact area [cm\u00b2], 20 K (lines) and 5 K (dots)")
-    axes[0, 2].set_xlabel("temperature difference [K]")
-    axes[0, 0].set_ylabel(f"heat in {seconds:g} s [J]")
-    axes[0, 2].set_ylabel(f"surface moves by [K], \u00b1 {scatter:g} K")
-    axes[0, 0].legend(frameon=False, fontsize=8)
-    return figure
 
 
 def _log_scale(axis: Axes, values: Sequence[float]) -> None:

@@ -32,8 +32,6 @@ CLASSIFIERS = ("posterior", "bayes", "lstm", "lstm-paper")
 SIMULATED = ("posterior", "bayes", "lstm")
 FIVE, THREE = ("copper", "zinc", "brass", "iron", "wood"), ("copper", "iron", "wood")
 TWIN_TRAIN, TWIN_TEST = 5, 30  # grasps a material
-E_DEV = 1500.0  # W s^0.5 m^-2 K^-1, of the figure alone
-E_UNIT = "W s\u00bd m\u207b\u00b2 K\u207b\u00b9"
 COPIES = 20  # test copies of each training grasp
 LEARNT = 0.9  # share of further copies below which training itself fell short
 
@@ -207,22 +205,14 @@ class PaperResult:
         return Section("What copies of a grasp are worth", parts, self.copies_verdict, "warn")
 
     def _figures(self) -> Section:
-        """Return the paper's figures, drawn anew: exchange, responses, confusions."""
+        """Return the paper's figures, drawn anew: responses, confusions."""
         from thermogrip.classify.figures import confusion_figure
         from thermogrip.datasets.examples import load_example_grasps
-        from thermogrip.datasets.materials import find_material
-        from thermogrip.report.plots import exchange_figure, grasps_chart
+        from thermogrip.report.plots import grasps_chart
 
         examples = load_example_grasps()
-        known = {name: find_material(name).effusivity for name in FIVE}
         traces = {case.name: [examples[case.record]] for case in CASES}
         parts: list[Any] = [
-            Picture(
-                exchange_figure(known, e_dev=E_DEV),
-                "Half-spaces in perfect contact: heat exchanged in 10 s, over difference and area, and how "
-                "far the skin's surface moves, beside half a kelvin (its repeats scatter by 0.3 to 0.7); "
-                f"skin of {E_DEV:g} {E_UNIT}, like water (the paper gives none).",
-            ),
             Plot(grasps_chart(traces, FIVE), "Responses of the bundled grasps, case by case."),
         ]
         for case in (case for case in CASES if case.confusion):
