@@ -246,7 +246,7 @@ def parameters_section(plant: Plant, record: Posterior | None = None) -> Section
     if record is not None:
         tone = tone if record.converged else "warn"
         verdict += "" if record.converged else f" The sampler has {record.verdict}."
-        caption = f"{len(record.samples)} samples of the parameters that emcee moved, pair by pair; grey lines: the fit."
+        caption = f"{len(record.samples)} samples of what emcee moved, pair by pair; grey lines: the fit."
         parts += [
             Picture(corner_figure(record), caption),
             Text(_sentence(record.likelihood)),
