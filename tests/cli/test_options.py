@@ -49,10 +49,15 @@ def test_work_is_done_by_processes_or_by_the_cluster_that_is_named(stand_in: Sta
 @pytest.mark.parametrize(
     "words",
     [
-        "compare grasps.csv --out c",
-        "identify log.csv --out p.json",
         "tune plant.json --out c.json",
-        "effusivity grasps.csv --out e.csv",
+        *(
+            pytest.param(words, marks=pytest.mark.slow)
+            for words in (
+                "compare grasps.csv --out c",
+                "identify log.csv --out p.json",
+                "effusivity grasps.csv --out e.csv",
+            )
+        ),
     ],
 )
 def test_processes_begin_to_import_before_this_one_does(tmp_path: Path, words: str) -> None:

@@ -143,6 +143,7 @@ def test_the_examples_come_out_ready_to_use(bench: Bench) -> None:
     assert Path("EXAMPLES.md").is_file()
 
 
+@pytest.mark.slow
 def test_warm_up_says_where_the_compiled_code_is_kept(bench: Bench) -> None:
     from thermogrip.sysid.contact.time_stepping import step_contacts
 

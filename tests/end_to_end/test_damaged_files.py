@@ -33,7 +33,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.parametrize("kind", [kind for kind in KINDS if kind not in SLOW])
 def test_a_damaged_file_is_read_or_refused(kind: str, whole: Path) -> None:
-    ends = read_many(kind, whole, range(-1, 4))
+    ends = read_many(kind, whole, range(-1, 2))
     assert ends.pop(-1) in ("0", "3")  # the whole one
     assert set(ends.values()) <= {"0", "2", "3"}
 

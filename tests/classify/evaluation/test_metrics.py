@@ -154,6 +154,7 @@ def test_intervals_of_repeated_tests_hold_the_mean_over_all_grasps() -> None:
     assert (held / SIMULATED > LEAST_HELD - 1 / 40).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("boast", [0.0, 0.1, 0.25])
 def test_the_interval_of_the_calibration_error_holds_the_truth(boast: float) -> None:
     rng = np.random.default_rng(3)

@@ -49,6 +49,7 @@ def calibrated(name):
         return calibrate_gripper([split_of(load_example_grasps()[name], "train")]), seen
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["exp2_dT20", "exp4_cooled5_obj18_grip38_40s"])
 def test_no_noise_nearby_is_likelier_than_that_of_a_calibration(name):
     """By more than the slope at which the last search may end allows over the way there: the cost is convex

@@ -352,6 +352,7 @@ def test_an_uncertain_bias_is_a_wider_spread_of_the_object(device, exact, touche
     np.testing.assert_allclose(found.log_evidence[metal], same.log_evidence[metal], atol=0.1)
 
 
+@pytest.mark.slow
 def test_confidence_about_another_gripper_is_its_frequency(device):
     """Of grippers drawn as stated, an answer of probability p is right in p of the cases."""
     other = another_gripper(device)

@@ -224,6 +224,7 @@ def test_clipped_samples_reach_no_average():
     np.testing.assert_array_equal(whole.y[whole.count > 0], lost.y[lost.count > 0])
 
 
+@pytest.mark.slow
 def test_intervals_of_clipped_grasps_cover(device):
     """Taken for readings, the samples at this rail leave 0.29 of the effusivities in their 90 % intervals."""
     n = 60

@@ -98,6 +98,7 @@ def problem_of(plant: Plant, logs: list[Log]) -> tuple[Problem, np.ndarray]:
     return problem, problem.standard(plant.values)
 
 
+@pytest.mark.slow
 def test_stated_widths_are_the_spread_of_repeated_fits():
     fits = [
         fit_network(heater(), [made(3 * k + j, drift=0.1, seconds=600.0) for j in range(3)])

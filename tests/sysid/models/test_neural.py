@@ -60,7 +60,7 @@ def test_slopes_are_finite_differences_of_the_run():
 
 
 def test_runs_of_a_batch_that_have_come_together_are_those_of_their_members(tank):
-    rng, rows = np.random.default_rng(12), 3000
+    rng, rows = np.random.default_rng(12), 800
     u = rng.uniform(0.2, 1.3, (rows, 1))
     x0 = rng.normal(size=(3, tank.n_x))
     x0[2] = x0[0] + 1e-9

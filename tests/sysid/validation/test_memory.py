@@ -5,6 +5,8 @@ from __future__ import annotations
 import subprocess
 import sys
 
+import pytest
+
 _CHILD = """
 import resource
 
@@ -46,6 +48,7 @@ print(peak(10000) - few)
 """
 
 
+@pytest.mark.slow
 def test_validating_ten_times_the_rows_keeps_no_run_of_each_direction_of_the_start():
     # all kept, 100 directions of 100 states over 9000 rows more are 720 MB, and 60 of 60 are 260 MB
     child = subprocess.run([sys.executable, "-c", _CHILD], capture_output=True, text=True, check=False)

@@ -78,6 +78,7 @@ def suspected(run: FreeRun) -> bool:
     return any("correlates with" in note for note in run.notes)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("drive", "keep"), [(steps, 0.0), (pulses, 0.95), (steps, 0.998), (pulses, 0.998)])
 def test_a_right_model_is_suspected_once_in_a_hundred(drive, keep: float):
     # white noise, and errors that last for 20 s and for a third of the log; two signals each (input, square)
