@@ -1,15 +1,13 @@
 import typing
 
-from thermogrip.classify.decisions.next_touch import Costs as Costs
 from thermogrip.classify.decisions.next_touch import choose_next_touch as choose_next_touch
-from thermogrip.classify.decisions.next_touch import name_or_unknown as name_or_unknown
 from thermogrip.classify.decisions.predict import Answer as Answer
-from thermogrip.classify.decisions.predict import Note as Note
 from thermogrip.classify.decisions.predict import answer as answer
 from thermogrip.classify.decisions.stopping_rule import Stream as Stream
 from thermogrip.classify.decisions.stopping_rule import load_stop_rule as load_stop_rule
 from thermogrip.classify.estimators import CLASSIFIERS as CLASSIFIERS
 from thermogrip.classify.estimators.base import GraspClassifier as GraspClassifier
+from thermogrip.classify.estimators.base import Note as Note
 from thermogrip.classify.estimators.base import as_array as as_array
 from thermogrip.classify.estimators.registry import load_classifier as load_classifier
 from thermogrip.classify.estimators.registry import make_classifier as make_classifier

@@ -1,9 +1,4 @@
-r"""Decisions: name the material or say "unknown"; touch again, and at which temperature.
-
-**Open set.**  With :math:`p_u` the probability that the object is none of the candidates, naming the
-likeliest one m is wrong with probability :math:`p_u + (1 - p_u)(1 - p_m)`, "unknown" with probability
-:math:`1 - p_u`.  The answer is the cheaper one at the user's :class:`Costs`.  Chow's rule is the case
-without unknown materials.
+r"""Touch again, and at which temperature.
 
 **Another touch** at one of several gripper temperatures is worth it where
 
@@ -33,7 +28,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import logsumexp
 
-from thermogrip.classify.estimators.base import Floats, GraspClassifier, Labels, normalised, pick
+from thermogrip.classify.estimators.base import Floats, GraspClassifier, normalised, pick
 from thermogrip.classify.estimators.posterior import PosteriorClassifier
 from thermogrip.datasets.errors import UserError, known_names
 from thermogrip.datasets.schema import make_log, unit_names
@@ -93,69 +88,7 @@ def expected_information(forecast: PosteriorPredictive, *, draws: int = 48, seed
     return Expected(np.maximum(now - later, 0.0), p.max(axis=1) + gain, gain)
 
 
-UNKNOWN = "unknown"
 TEMPERATURES = tuple(np.arange(12.5, 50.1, 2.5).tolist())
-
-
-@dataclass(frozen=True, kw_only=True)
-class Costs:
-    """What mistakes cost, a wrong name of a known material being 1.
-
-    Parameters
-    ----------
-    rejected : float
-        Weight of "unknown" as the answer for a known material.
-    missed : float
-        Weight of a name for a material that is not among the candidates.
-    """
-
-    rejected: float = 0.5
-    missed: float = 1.0
-
-    def __post_init__(self) -> None:
-        if not (self.rejected > 0 and self.missed > 0):
-            raise UserError("a cost is not positive", hint="give what a mistake costs, a wrong name being 1")
-
-
-def name_or_unknown(
-    p: ArrayLike, p_unknown: ArrayLike, names: Sequence[str], *, costs: Costs | None = None
-) -> Labels:
-    """Return the cheaper answer for each grasp: its likeliest material, or ``"unknown"``.
-
-    Parameters
-    ----------
-    p : (n, m) array_like
-        The probability of each candidate, given that it is one of them; rows sum to 1.  A row of NaN, a grasp
-        that has no answer, is "unknown".
-    p_unknown : (n,) array_like
-        Probability that it is none of them.
-    names : sequence of str
-        The m candidates.
-    costs : Costs, optional
-
-    Returns
-    -------
-    answer : (n,) ndarray of str
-
-    Raises
-    ------
-    UserError
-        If a probability is missing: the classifier has no model of other materials.
-
-    Examples
-    --------
-    >>> name_or_unknown([[0.9, 0.1], [0.9, 0.1]], [0.05, 0.8], ["iron", "wood"]).tolist()
-    ['iron', 'unknown']
-    """
-    used = costs or Costs()
-    inside, outside = np.asarray(p, dtype=float), np.asarray(p_unknown, dtype=float)
-    named = np.isfinite(inside).all(axis=1)
-    if not np.isfinite(outside[named]).all():
-        raise UserError("p_unknown is missing", hint="use the classifier 'posterior'")
-    inside, outside = np.where(named[:, None], inside, 1.0), np.where(named, outside, 1.0)
-    best = inside.argmax(axis=1)
-    wrong = used.missed * outside + (1 - outside) * (1 - inside.max(axis=1))
-    return np.where(used.rejected * (1 - outside) < wrong, UNKNOWN, np.asarray(list(names))[best])
 
 
 @dataclass(frozen=True)
@@ -247,7 +180,7 @@ def choose_next_touch(
     names = model.asked(candidates)
     forecast = next_touch(
         model.device_, grasps, names, levels,
-        coupling=model.coupling_, rest=rest, end=end, finish=model.as_taught,
+        coupling=model.coupling_, rest=rest, end=end,
     )  # fmt: skip
     forecast = forecast._replace(log_p=normalised(forecast.log_p + model.log_prior(names)))
     found = expected_information(forecast, draws=draws, seed=seed)

@@ -21,7 +21,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,40 +34,29 @@ from thermogrip.classify.decisions.stopping_rule import (
     stops,
 )
 from thermogrip.classify.estimators.base import (
+    Answered,
     Floats,
     GraspClassifier,
+    Note,
     Records,
     normalised,
     pick,
     record_list,
 )
-from thermogrip.classify.estimators.posterior import PosteriorClassifier
-from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.atomic_files import write_atomic
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.media import csv_text
 from thermogrip.datasets.schema import has_touch_groups, label_values, log_name, unit_names
-from thermogrip.sysid.effusivity.data import (
-    Touches,
-    object_range,
-    touches,
-    with_object_range,
-)
+from thermogrip.sysid.effusivity.data import touches, with_object_range
 from thermogrip.sysid.effusivity.gripper_model import GripperModel
 from thermogrip.sysid.effusivity.laplace_approximation import (
-    BUILD_UP,
-    EFFUSIVITY,
-    ONSET,
-    T_OBJECT,
-    H,
-    Hypotheses,
     fit_pairs,
     free_hypotheses,
-    material_hypotheses,
     prior_of,
+    unexplained,
 )
 from thermogrip.sysid.effusivity.posterior import EffusivityRow
-from thermogrip.sysid.effusivity.quality import NO_CONTACT, check_grasps, number_values
+from thermogrip.sysid.effusivity.quality import NO_CONTACT, check_grasps
 
 if TYPE_CHECKING:
     from thermogrip.datasets.schema import Grasps
@@ -76,23 +65,6 @@ Row: TypeAlias = dict[str, Any]
 
 
 UNKNOWN = "unknown"  # the material of a grasp that is likelier of none of the candidates
-
-
-@dataclass(frozen=True)
-class Note:
-    """One thing to know of an answer.
-
-    Parameters
-    ----------
-    code : str
-        For programs: ``readings`` (what of them was usable), ``other_touches`` (the answer is theirs),
-        ``beyond_training`` (another gripper, other blocks, a longer rest), ``not_explained``.
-    words : str
-        For people.
-    """
-
-    code: str
-    words: str
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -227,8 +199,7 @@ def _answers(
         else:
             one = _no_answer(names, quality.reason[i], float(last[i]))
         answers.append(replace(one, grasp_id=grasp_id, notes=notes))
-    # what a contact that a rule ended would have shown later is no misfit of its answer
-    return answers if rule is not None else _with_misfits(classifier, as_read, answers, object_range)
+    return answers
 
 
 def _named(
@@ -236,23 +207,21 @@ def _named(
 ) -> list[Answer]:
     """Return the answers of a classifier to grasps whose usable part is given, without their ids."""
     if rule is None:
-        units = unit_names(grasps)
-        log_p, unknown, beyond = classifier.open_set_answer(grasps, names)
-        log_p = joined_touches(classifier, log_p, units)
+        found, units = classifier.answered(grasps, names), unit_names(grasps)
+        found = found._replace(log_p=joined_touches(classifier, found.log_p, units))
         decided = _last_samples(grasps["time"].values, grasps["t_surface"].values, units)
     else:
-        log_p, unknown, decided = _stopped(classifier, grasps, names, rule)
-        beyond = classifier.beyond_training(grasps)
+        found, decided = _stopped(classifier, grasps, names, rule)
     out = []
-    for i, row in enumerate(log_p):
-        p_unknown = float(unknown[i]) if np.isfinite(unknown[i]) else None
-        none = not nearest and p_unknown is not None and p_unknown > _STRANGE
+    for i, row in enumerate(found.log_p):
+        p_unknown, misfit = (float(v[i]) if np.isfinite(v[i]) else None for v in found[1:3])
+        none = p_unknown is not None and p_unknown > _STRANGE
         out.append(
             Answer(
-                grasp_id="", material=UNKNOWN if none else names[int(row.argmax())],
+                grasp_id="", material=UNKNOWN if none and not nearest else names[int(row.argmax())],
                 probabilities={name: float(p) for name, p in zip(names, np.exp(row))}, p_unknown=p_unknown,
-                decided_at=float(decided[i]),
-                notes=(Note("beyond_training", beyond[i]),) if beyond[i] else (),
+                decided_at=float(decided[i]), misfit_sd=misfit,
+                deviates=found.deviates[i] if none else "", notes=tuple(found.notes[i]),
             )
         )  # fmt: skip
     return out
@@ -266,37 +235,10 @@ def _no_answer(names: list[str], why: str, last: float) -> Answer:
     )  # fmt: skip
 
 
-def _with_misfits(
-    classifier: GraspClassifier, grasps: Grasps, answers: list[Answer], stated: tuple[float, float] | None
-) -> list[Answer]:
-    """Return the answers to one record with what the likeliest candidate does not explain, and what it
-    requires that is unusual, of single touches by an exactly known gripper."""
-    # an uncertain gripper may be the reason itself
-    if not isinstance(classifier, PosteriorClassifier) or classifier.device_.uncertain:
-        return answers
-    single = label_values(grasps, "touch_group") == ""
-    at = np.array([i for i, one in enumerate(answers) if single[i] and one.nearest], dtype=np.int64)
-    if not at.size:
-        return answers
-    out, model = [*answers], classifier.device_
-    data, ends = _asked(grasps, at, classifier.longest_, stated)
-    named = [answers[i].nearest for i in at]
-    misfits = _unexplained(model, data, ends, _taken_for(model, named, finish=classifier.as_taught))
-    strange = np.flatnonzero([(answers[i].p_unknown or 0.0) > _STRANGE for i in at])
-    words = dict.fromkeys(range(at.size), "")
-    if strange.size:
-        unusual = deviations(model, data.take(strange), [named[k] for k in strange])
-        words |= {k: deviation_words(named[k], row) for k, row in zip(strange.tolist(), unusual)}
-    for k, (i, (misfit, why)) in enumerate(zip(at.tolist(), misfits)):
-        notes = (*out[i].notes, Note("not_explained", why)) if why else out[i].notes
-        out[i] = replace(out[i], misfit_sd=misfit, deviates=words[k], notes=notes)
-    return out
-
-
 def _stopped(
     classifier: GraspClassifier, grasps: Grasps, names: list[str], rule: StopRule
-) -> tuple[Floats, Floats, Floats]:
-    """Return log probabilities, p_unknown and times where the rule ends each contact."""
+) -> tuple[Answered, Floats]:
+    """Return the answers where the rule ends each contact, and when that is, (n,) [s]."""
     if has_touch_groups(grasps):
         problem = "touches of one block are answered together, no rule ends one of them"
         raise UserError(problem, file=log_name(grasps), hint="leave --early out, or the column touch_group")
@@ -308,14 +250,16 @@ def _stopped(
         end=contact_end(grasps, rule.end),
         gain=rule.gain > 0,
     )
-    found = stops(rule, seen, silent_windows(grasps, seen.times))
-    at = np.searchsorted(seen.times, found.time)
-    unknown = np.empty(found.time.size)
-    for time in np.unique(found.time):
-        there = found.time == time
-        cut = pick(grasps, there).sel(time=slice(None, time + 1e-9))
-        unknown[there] = classifier.p_unknown(cut, names)
-    return seen.log_p[np.arange(at.size), at], unknown, found.time
+    ended = stops(rule, seen, silent_windows(grasps, seen.times)).time
+    out = Answered.nothing(ended.size, len(names))
+    for time in np.unique(ended):
+        there = np.flatnonzero(ended == time)
+        cut = classifier.answered(pick(grasps, there).sel(time=slice(None, time + 1e-9)), names)
+        pairs: Any = zip(out, cut)
+        for whole, part in pairs:
+            for i, value in zip(there.tolist(), part):
+                whole[i] = value
+    return out, ended
 
 
 def joined_touches(classifier: GraspClassifier, log_p: Floats, units: NDArray[np.str_]) -> Floats:
@@ -355,58 +299,7 @@ def _last_samples(time: Floats, skin: Floats, units: NDArray[np.str_]) -> Floats
     return np.array([time[seen[units == unit].any(axis=0)][-1] for unit in units])
 
 
-_UNUSUAL = 2.5  # standard deviations: less is usual, one grasp in eighty
 _STRANGE = 0.5  # p_unknown
-_UNEXPLAINED = 4.0  # standard deviations of the misfit; the rig's grasps have 2.3 at most
-
-
-class Deviation(NamedTuple):
-    """One thing that a candidate must assume: how many standard deviations ``sd`` it is off, and that in
-    ``words``."""
-
-    sd: float
-    words: str
-
-
-def deviations(device: GripperModel, data: Touches, materials: Sequence[str]) -> list[list[Deviation]]:
-    """Return for each of n touches how far its nuisances and its misfit are from the usual if it is of the
-    material named for it, the farthest first."""
-    hypotheses = _taken_for(device, materials)
-    prior = prior_of(device, data, hypotheses)
-    mode = fit_pairs(device, data, np.arange(len(materials)), hypotheses)
-    found = []
-    for i in range(len(materials)):
-        rows = _nuisances(mode.u[i] - prior.mean[i], prior.sd[i], bool(np.isfinite(data.t_object[i])))
-        n = float((data.count[i] > 0).sum())
-        times = float(np.sqrt(mode.misfit[i] / n))
-        rows.append(Deviation(_misfit_sd(mode.misfit[i], n), f"a trace {times:.1f} times its noise away"))
-        found.append(sorted(rows, key=lambda row: -row.sd))
-    return found
-
-
-def _misfit_sd(square: float, n: float) -> float:
-    """Return how unusual the squared whitened residuals of n readings are, in standard deviations."""
-    return float((square - n) / np.sqrt(2 * n))
-
-
-def _unexplained(device: GripperModel, data: Touches, ends: Array, hypotheses: Hypotheses) -> list[Deviation]:
-    """Return for each of n touches, each under its own row of ``hypotheses``, its misfit, and in words why
-    its trace is not explained, if it is not.  ``ends`` (n, 2) [degC] are those of the range of its object,
-    NaN where that is known."""
-    mode = fit_pairs(device, data, np.arange(ends.shape[0]), hypotheses)
-    n = (data.count > 0).sum(axis=1)
-    if device.second is not None and data.second is not None:
-        n = n + (data.second.count > 0).sum(axis=1)
-    out = []
-    for i, (low, high) in enumerate(ends):
-        sd, found, words = _misfit_sd(mode.misfit[i], n[i]), mode.u[i, T_OBJECT], ""
-        if sd > _UNEXPLAINED:
-            words = "the trace is not explained by the model: the answer is unreliable"
-        elif found < low or found > high:  # NaN compares false
-            outside = f"explained only by an object outside of {low:.0f} to {high:.0f} degC"
-            words = f"{outside}: the answer is unreliable"
-        out.append(Deviation(sd, words))
-    return out
 
 
 def unexplained_effusivities(
@@ -414,54 +307,17 @@ def unexplained_effusivities(
     grasps: Grasps,
     rows: Sequence[EffusivityRow],
     stated: tuple[float, float] | None = None,
-) -> dict[str, Deviation]:
-    """Return the misfit of single touches under their effusivity, and in words why that does not explain
-    them, with unknown object temperatures in the range ``stated`` [degC]."""
-    alone = label_values(grasps, "touch_group") == ""
+) -> dict[str, tuple[float, str]]:
+    """Return the misfit of single touches under their effusivity [standard deviations], and in words why
+    that does not explain them, with unknown object temperatures in the range ``stated`` [degC]."""
     ln_e = np.log([row.effusivity for row in rows])
-    at = np.flatnonzero(alone & np.isfinite(ln_e))
-    if device.uncertain or not at.size:
+    at = np.flatnonzero((label_values(grasps, "touch_group") == "") & np.isfinite(ln_e))
+    if not at.size:
         return {}
+    data = touches(with_object_range(grasps, stated), at=at)
     hypotheses = free_hypotheses(device, device.found_effusivity(ln_e[at]))
     sd = np.log(10) * np.array([rows[i].log10_effusivity_sd for i in at])
-    data, ends = _asked(grasps, at, np.inf, stated)
-    found = _unexplained(device, data, ends, hypotheses._replace(ln_e_sd=sd))
+    each, row = hypotheses._replace(ln_e_sd=sd), np.arange(at.size)
+    prior = prior_of(device, data, each)
+    found = unexplained(data, row, fit_pairs(device, data, row, each, prior=prior), prior)
     return {str(name): why for name, why in zip(data.grasp_id, found)}
-
-
-def deviation_words(material: str, row: Sequence[Deviation]) -> str:
-    """Return in words which unusual values a material requires; empty where nothing is unusual."""
-    unusual = [f"{s.words} ({s.sd:.1f} sd)" for s in row if s.sd > _UNUSUAL][:2]
-    return f"as {material} it needs {' and '.join(unusual)}" if unusual else ""
-
-
-def _asked(
-    grasps: Grasps, at: NDArray[np.int64], until: float, stated: tuple[float, float] | None
-) -> tuple[Touches, Array]:
-    """Return some touches until a time [s], and the ends of each one's range of temperatures (n, 2) [degC],
-    NaN where the object's is known; ``stated`` is that of unknown ones, by default 20 K about the room."""
-    unknown = np.isnan(number_values(grasps, "t_object"))[at, None]
-    ends = np.where(unknown, object_range(grasps, stated)[at], np.nan)
-    return touches(with_object_range(grasps, stated), until=until, at=at), ends
-
-
-def _taken_for(device: GripperModel, named: Sequence[str], **finish: str) -> Hypotheses:
-    """Return the hypothesis of each named material, a row each."""
-    names = list(dict.fromkeys(named))
-    known = material_hypotheses(device, names, **finish)
-    return type(known)(*(column[[names.index(name) for name in named]] for column in known))
-
-
-def _nuisances(off: NDArray[np.float64], sd: NDArray[np.float64], nominal: bool) -> list[Deviation]:
-    """Return the deviations of one grasp's nuisances, of those that are uncertain at all."""
-    warmer = "warmer" if off[T_OBJECT] > 0 else "colder"
-    late = "late" if off[ONSET] > 0 else "early"
-    words = {
-        H: f"{np.exp(off[H]):.2f} times the usual contact conductance",
-        BUILD_UP: f"a contact that builds up in {np.exp(off[BUILD_UP]):.2f} times the usual time",
-        ONSET: f"a contact {abs(off[ONSET]):.2f} s {late}",
-        EFFUSIVITY: f"{np.exp(off[EFFUSIVITY]):.2f} times its block's effusivity",
-    }
-    if nominal:
-        words[T_OBJECT] = f"its block {abs(off[T_OBJECT]):.1f} K {warmer} than its nominal temperature"
-    return [Deviation(float(abs(off[k]) / sd[k]), text) for k, text in words.items() if sd[k] > 0]

@@ -189,7 +189,7 @@ def _window(
     if not read.any():
         return log_p, gain, None
     part, start = (grasps, u) if read.all() else (pick(grasps, read), None)
-    ahead = rest_of_contact(model.device_, part, names, until=t, end=end, finish=model.as_taught, start=start)
+    ahead = rest_of_contact(model.device_, part, names, until=t, end=end, start=start)
     log_p[read] = normalised(ahead.log_p + odds)
     if weigh:
         gain[read] = expected_information(ahead._replace(log_p=log_p[read])).gain
@@ -373,7 +373,7 @@ class Stream:
         t_ambient: float = np.nan,
         rule: StopRule | None = None,
     ) -> None:
-        self._model = with_model(classifier).certain()
+        self._model = with_model(classifier)
         self.candidates = tuple(self._model.asked(candidates))
         self._odds = self._model.log_prior(self.candidates)
         self._about = {"t_object": t_object, "t_object_sd": t_object_sd, "t_ambient": t_ambient}
@@ -436,7 +436,7 @@ class Stream:
     def _warm(self) -> None:
         """Look at a made-up contact once, so that no sample waits for the compiler."""
         made_up = make_grasps([-1.0, -0.5, 0.5], [[23.0, 23.0, 23.0]], ["warm"])
-        material_fit(self._model.device_, made_up, self.candidates[:1], finish=self._model.as_taught)
+        material_fit(self._model.device_, made_up, self.candidates[:1])
 
     def _evaluate(self) -> None:
         """Take what was read so far for what it is."""
@@ -447,9 +447,7 @@ class Stream:
         if quality.reason[0]:
             self.log_p = np.full(len(self.candidates), np.nan)
             return
-        seen = material_fit(
-            self._model.device_, grasp, self.candidates, finish=self._model.as_taught, start=self._u
-        )
+        seen = material_fit(self._model.device_, grasp, self.candidates, start=self._u)
         self._u = seen.u
         self.log_p = normalised(seen.log_evidence + self._odds)[0]
         self._decide(grasp, quality)
@@ -473,7 +471,7 @@ class Stream:
             return np.inf
         ahead = rest_of_contact(
             self._model.device_, grasp, self.candidates,
-            until=self._time[-1], end=rule.end, finish=self._model.as_taught, start=self._u,
+            until=self._time[-1], end=rule.end, start=self._u,
         )  # fmt: skip
         return float(expected_information(ahead._replace(log_p=self.log_p[None])).gain[0])
 

@@ -10,8 +10,8 @@ CLASSIFIERS = {
     "features-lda": ("estimators.lda", "FeaturesLda"),
     "pca-lda": ("estimators.lda", "PcaLda"),
     "forest": ("estimators.lda", "ForestClassifier"),
-    "svm-pca": ("estimators.margins", "SvmPca"),
-    "rocket": ("estimators.margins", "RocketClassifier"),
+    "svm-pca": ("estimators.lda", "SvmPca"),
+    "rocket": ("estimators.lda", "RocketClassifier"),
     "lstm": ("estimators.lstm", "LstmClassifier"),
     "lstm-paper": ("estimators.lstm", "PaperLstm"),
 }
@@ -30,7 +30,7 @@ def check_name(name: str) -> None:
 def classifier_names(value: str | None) -> str | None:
     """Return a list of classifiers (commas between them, or None) if each may be one; import paths are tried
     later."""
-    for name in (value or "").replace("+", ",").split(","):
+    for name in (value or "").split(","):
         if name.strip() and not set(":.") & set(name):
             check_name(name.strip())
     return value

@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from importlib.util import find_spec
 from inspect import signature
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeAlias
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Self, TypeAlias
 
 import numpy as np
 import xarray as xr
@@ -50,6 +50,39 @@ Labels: TypeAlias = NDArray[np.str_]
 
 _DIVISORS = ("scale_", "sd")  # arrays of files
 HELD_AT_AN_END = 0.5  # s; a trace that is shorter than its grid by more is refused, not continued
+
+
+@dataclass(frozen=True)
+class Note:
+    """One thing to know of an answer.
+
+    Parameters
+    ----------
+    code : str
+        For programs: ``readings`` (what of them was usable), ``other_touches`` (the answer is theirs),
+        ``beyond_training`` (a longer rest, another number of sensors), ``not_explained``.
+    words : str
+        For people.
+    """
+
+    code: str
+    words: str
+
+
+class Answered(NamedTuple):
+    """What a classifier says of the ``n`` grasps of a record; NaN and empty where it says nothing."""
+
+    log_p: Floats  # (n, n_candidate)
+    p_unknown: Floats  # (n,), that it is none of them
+    misfit_sd: Floats  # (n,), of the trace under the likeliest candidate, standardised
+    deviates: list[str]  # (n,), what that candidate requires that is unusual
+    notes: list[list[Note]]  # (n,)
+
+    @classmethod
+    def nothing(cls, n: int, n_candidate: int) -> Answered:
+        """Return answers that say nothing."""
+        unknown = np.full(n, np.nan)
+        return cls(np.zeros((n, n_candidate)), unknown, unknown.copy(), [""] * n, [[] for _ in range(n)])
 
 
 @dataclass(eq=False, repr=False, kw_only=True)
@@ -199,26 +232,28 @@ class GraspClassifier(_Sampled, _Estimator, ABC):
     def p_unknown(self, X: Records, candidates: Sequence[str] | None = None) -> Floats:
         """Return the probability that a grasp is of none of the candidates, shape (n_grasp,).
 
-        NaN where the classifier has no model of other materials, as here.
+        NaN where the classifier has no model of other materials.
         """
-        return np.full(sum(map(len, self._records(X))), np.nan)
+        return self.open_set_log_proba(X, self.asked(candidates))[1]
 
     def candidate_log_proba(self, X: Records, candidates: Sequence[str]) -> Floats:
         """Return log probabilities over a subset of ``classes_``, shape (n_grasp, n_candidate)."""
-        names, known = self.asked(candidates), self.asked()
-        return normalised(self.predict_log_proba(X)[:, [known.index(name) for name in names]])
+        return self.open_set_log_proba(X, candidates)[0]
 
     def open_set_log_proba(self, X: Records, candidates: Sequence[str]) -> tuple[Floats, Floats]:
         """Return :meth:`candidate_log_proba` and :meth:`p_unknown`."""
-        return self.candidate_log_proba(X, candidates), self.p_unknown(X, candidates)
+        found = [self.answered(part, candidates) for part in self._records(X)]
+        return np.vstack([one.log_p for one in found]), np.concatenate([one.p_unknown for one in found])
 
-    def open_set_answer(self, grasps: Grasps, candidates: Sequence[str]) -> tuple[Floats, Floats, list[str]]:
-        """Return :meth:`open_set_log_proba` and :meth:`beyond_training` of one record."""
-        return *self.open_set_log_proba(grasps, candidates), self.beyond_training(grasps)
+    def answered(self, grasps: Grasps, candidates: Sequence[str] | None = None) -> Answered:
+        """Return all that there is to say of the grasps of one checked record."""
+        return self._answered(self._as_trained(grasps), self.asked(candidates))
 
-    def beyond_training(self, grasps: Grasps) -> list[str]:
-        """Return in words what makes the answer of each grasp overconfident; empty where nothing does."""
-        return [""] * grasps.sizes["grasp"]
+    def _answered(self, grasps: Grasps, names: list[str]) -> Answered:
+        """Return the answers to a record that has the sensors of the training."""
+        known, log_p = self.asked(), normalised(self._log_proba(grasps))
+        at = [known.index(name) for name in names]
+        return Answered.nothing(len(log_p), len(names))._replace(log_p=normalised(log_p[:, at]))
 
     def asked(self, candidates: Sequence[str] | None = None) -> list[str]:
         """Return the candidates, each of which it :meth:`can_name`; by default all of ``classes_``."""

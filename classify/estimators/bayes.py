@@ -64,10 +64,10 @@ from scipy.special import expit, gammaln, logit, logsumexp, multigammaln
 from thermogrip.classify.estimators import features
 from thermogrip.classify.estimators.base import (
     HELD_AT_AN_END,
+    Answered,
     Floats,
     GraspClassifier,
     Labels,
-    Records,
     check_shapes,
     level,
     named_arrays,
@@ -330,15 +330,12 @@ class BayesClassifier(GraspClassifier):
     def _log_proba(self, grasps: Grasps) -> Floats:
         return self._log_density(grasps)[:, :-1]
 
-    def open_set_log_proba(self, X: Records, candidates: Sequence[str]) -> tuple[Floats, Floats]:
-        """Return :meth:`candidate_log_proba` and :meth:`p_unknown` from the same densities."""
-        at = [self.asked().index(name) for name in self.asked(candidates)]
-        log_p = np.vstack([self._log_density(self._as_trained(part)) for part in self._records(X)])
+    def _answered(self, grasps: Grasps, names: list[str]) -> Answered:
+        at, log_p = [self.asked().index(name) for name in names], self._log_density(grasps)
         odds = logsumexp(log_p[:, at], axis=1) - np.log(len(at)) - log_p[:, -1]
-        return normalised(log_p[:, at]), np.asarray(expit(logit(self.prior_unknown) - odds))
-
-    def p_unknown(self, X: Records, candidates: Sequence[str] | None = None) -> Floats:
-        return self.open_set_log_proba(X, self.asked(candidates))[1]
+        found = Answered.nothing(len(log_p), len(names))
+        unknown = np.asarray(expit(logit(self.prior_unknown) - odds))
+        return found._replace(log_p=normalised(log_p[:, at]), p_unknown=unknown)
 
     def _log_density(self, grasps: Grasps) -> Floats:
         """Return the log density of each grasp under each class, and last under an unknown material,

@@ -1,4 +1,4 @@
-r"""Shrinkage linear discriminants, and a door for any scikit-learn estimator.
+r"""Shrinkage linear discriminants, and a door for any scikit-learn estimator: a forest, an SVM, MiniRocket.
 
 Linear discriminant analysis is the Gaussian classifier with one covariance and equal priors; the covariance
 of 25 grasps is shrunk to a multiple of the identity by the amount of Ledoit and Wolf.  It is fitted on
@@ -19,8 +19,13 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 from sklearn.base import BaseEstimator, RegressorMixin, clone
+from sklearn.calibration import CalibratedClassifierCV
 from sklearn.decomposition import PCA
 from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
+from sklearn.linear_model import RidgeClassifierCV
+from sklearn.pipeline import make_pipeline
+from sklearn.preprocessing import StandardScaler
+from sklearn.svm import SVC
 
 from thermogrip.classify.estimators.base import (
     Floats,
@@ -182,9 +187,13 @@ class ArrayClassifier(JoinedClassifier):
     standardise: bool = True  # bring each sample time to mean 0 and spread 1 over the training grasps
     random_state: int | None = None  # passed on where the estimator takes one
 
+    def _made(self, labels: Labels) -> Any:
+        """Return the unfitted estimator for training grasps of these labels."""
+        return imported_estimator(self.estimator, self.params)
+
     def _fit(self, grasps: Grasps, labels: Labels) -> None:
         self.times_ = times_from(grasps, self.start)
-        model = imported_estimator(self.estimator, self.params)
+        model = self._made(labels)
         if self.random_state is not None and "random_state" in model.get_params():
             model.set_params(random_state=self.random_state)
         self.center_, self.scale_ = np.zeros(1), np.ones(1)
@@ -245,6 +254,54 @@ class ForestClassifier(ArrayClassifier):
     estimator: BaseEstimator | str = "sklearn.ensemble:RandomForestClassifier"
     params: dict[str, Any] | None = field(default_factory=lambda: {"n_estimators": 500})
     standardise: bool = False  # a tree's thresholds need no scale
+
+
+@dataclass(eq=False, repr=False)
+class SvmPca(ArrayClassifier):
+    """Support vector machine on ten principal components of the rise (``"svm-pca"``)."""
+
+    standardise: bool = False
+
+    def _made(self, labels: Labels) -> Any:
+        components = max(1, min(10, labels.size // 2, self.times_.size))  # a fold has fewer grasps
+        return _calibrated(make_pipeline(PCA(components, svd_solver="full"), SVC(C=100.0)), labels)
+
+
+_LEAST_SAMPLES = 9  # length of a kernel
+
+
+@dataclass(eq=False, repr=False)
+class RocketClassifier(ArrayClassifier):
+    """MiniRocket and ridge regression, aeon's and scikit-learn's (``"rocket"``).
+
+    MiniRocket convolves each trace with 84 kernels at several dilations (Dempster, Schmidt, Webb, KDD 2021);
+    the share of samples where a convolution exceeds a threshold is one feature, about 10 000 in all.
+    """
+
+    needs: ClassVar[tuple[str, str] | None] = ("aeon", "rocket")
+
+    subtract_level: bool = False  # the kernels sum to zero
+    standardise: bool = False
+
+    def _rows(self, grasps: Grasps) -> Floats:
+        rows = as_array(grasps, times=self.times_)
+        cube = rows.reshape(len(rows), -1, self.times_.size)
+        missing = max(0, _LEAST_SAMPLES - self.times_.size)  # a short contact stays where it ended
+        return np.pad(cube, ((0, 0), (0, 0), (0, missing)), mode="edge").astype(np.float32)
+
+    def _made(self, labels: Labels) -> Any:
+        from aeon.transformations.collection.convolution_based import MiniRocket
+
+        transform = MiniRocket(random_state=self.random_state)
+        alphas = np.logspace(-1, 5, 7)  # of a penalty on some 10 000 features of spread 1
+        return _calibrated(make_pipeline(transform, StandardScaler(), RidgeClassifierCV(alphas)), labels)
+
+
+def _calibrated(machine: Any, labels: Labels) -> Any:
+    """Return a classifier whose margins become probabilities by Platt's sigmoids on held-out grasps, itself
+    where a class has too few for that."""
+    folds = min(5, int(np.unique(labels, return_counts=True)[1].min()))
+    return CalibratedClassifierCV(machine, cv=folds, ensemble=False) if folds > 1 else machine
 
 
 @contextmanager

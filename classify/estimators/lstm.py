@@ -49,7 +49,7 @@ from thermogrip.classify.estimators.base import (
     times_from,
 )
 from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.schema import Grasps
+from thermogrip.datasets.schema import Grasps, unit_names
 
 
 class Augmented(NamedTuple):
@@ -116,8 +116,6 @@ class LstmClassifier(JoinedClassifier):
     random_state: int = 0  # of weights, copies and batches: the same network on the same machine
 
     def _fit(self, grasps: Grasps, labels: Labels) -> None:
-        from thermogrip.classify.estimators.margins import inner_folds
-
         self._check_params()
         self.times_ = times_from(grasps, self.start)
         real = as_array(grasps, times=self.times_)
@@ -191,6 +189,29 @@ class PaperLstm(LstmClassifier):
     own_feed: ClassVar[str] = "trace"
 
     patience: int | None = None
+
+
+def inner_folds(
+    grasps: Grasps, labels: Labels, *, count: int = 5, seed: int = 0
+) -> list[tuple[NDArray[np.int64], NDArray[np.int64]]]:
+    """Return (fitted, held out) rows of training grasps, whole sessions apart, or whole grasps where a
+    session has all of a class; a fold without a class to train on is left out."""
+    groups = unit_names(grasps)
+    session = grasps["session"].values.astype(str) if "session" in grasps else groups
+    from sklearn.model_selection import StratifiedGroupKFold
+
+    kept: list[tuple[NDArray[np.int64], NDArray[np.int64]]] = []
+    for tried in (session, groups):
+        fewest = min(np.unique(tried[labels == c]).size for c in np.unique(labels))
+        if fewest > 1:
+            split = StratifiedGroupKFold(min(count, fewest), shuffle=True, random_state=seed)
+            found = [(np.asarray(a), np.asarray(b)) for a, b in split.split(labels, labels, tried)]
+            whole = np.unique(labels).size
+            sound = [(a, b) for a, b in found if b.size and np.unique(labels[a]).size == whole]
+            if len(sound) == len(found):
+                return sound
+            kept = kept or sound
+    return kept
 
 
 Weights = dict[str, NDArray[Any]]

@@ -14,41 +14,31 @@ Touches of one block (``touch_group``) are one question: their evidence is joint
 temperature (:mod:`thermogrip.sysid.effusivity.multi_touch`), and each of their rows has the common
 answer.
 
-A calibration is of one gripper and its blocks.  For another one of the same kind its numbers are a guess, and
-an answer that takes them as exact is far too confident: ``gripper="another"`` integrates over what such a
-gripper may be (:mod:`thermogrip.sysid.effusivity.gripper_model`), and
-:meth:`PosteriorClassifier.for_another_gripper` learns it from a few of its grasps of known blocks.
-
-Nobody need say which: by default a record of three touches or more decides between the training's gripper
-and blocks, other blocks of the same materials, and another gripper, with prior odds :math:`\pi_L` of 0.784,
-0.196 and 0.02.  Its grasps j have one gripper and one set of blocks, so
-
-.. math:: p(m | i) \propto \sum_L \pi_L Z_{i m L} \prod_{j \ne i} Z_{j L}, \qquad
-          Z_{j L} = (1 - u) \frac{1}{M} \sum_m Z_{j m L} + u Z_{j, free},
-
-u being the probability of a material that is no candidate, which shall not pass for another gripper.  Where
-the training's own numbers explain a record, the answers are theirs.  Fewer touches, and touches of one block,
-are taken for the training's, and so is any gripper where the calibration has a discrepancy, which is that one
-device's.
+A calibration is of one gripper and its blocks.  What other blocks of the same materials, or another gripper
+of its kind, read beyond it is one of the ways in which a grasp may be unlike those of the training
+(:mod:`thermogrip.sysid.effusivity.data`): such grasps are answered less surely.  A few grasps of known blocks
+teach another gripper (:meth:`PosteriorClassifier.for_another_gripper`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import expit, logit, logsumexp
 
 from thermogrip.classify.estimators.base import (
+    Answered,
     Floats,
     GraspClassifier,
     Labels,
+    Note,
     Records,
     normalised,
     record_list,
@@ -57,9 +47,19 @@ from thermogrip.classify.estimators.base import (
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.materials import load_materials
 from thermogrip.datasets.schema import has_touch_groups, label_values
-from thermogrip.sysid.effusivity.data import Touches, Whitened, graded, touches
-from thermogrip.sysid.effusivity.gripper_model import GripperModel, GripperSpread, another_gripper
-from thermogrip.sysid.effusivity.laplace_approximation import fit_candidates, whitened
+from thermogrip.sysid.effusivity.data import Touches, graded, touches
+from thermogrip.sysid.effusivity.gripper_model import GripperModel, another_gripper
+from thermogrip.sysid.effusivity.laplace_approximation import (
+    BUILD_UP,
+    EFFUSIVITY,
+    ONSET,
+    T_OBJECT,
+    Fitted,
+    H,
+    fit_candidates,
+    unexplained,
+    whitened,
+)
 from thermogrip.sysid.effusivity.multi_touch import (
     Coupling,
     free_touch_fit,
@@ -73,43 +73,16 @@ from thermogrip.sysid.effusivity.quality import longest_contact
 if TYPE_CHECKING:
     from thermogrip.datasets.schema import Grasps
 
-FINISHES = ("auto", "known", "unknown")
-GRIPPERS = ("auto", "same", "uncertain", "another")
-_OTHER_GRIPPER, _OTHER_BLOCKS = 0.02, 0.2  # prior probabilities, the latter given the training's gripper
-_SEVERAL = 3  # single touches of a record, from which on it decides
-_SURE = 0.99  # of the training's gripper and blocks, from which on no free effusivity is asked against others
-_ASKED = 5  # grasps of a record about which another gripper is asked first
-_HARDLY = 0.001  # of the odds of another gripper, below which no more grasps are asked
-_NEEDED = 0.05  # of the odds of another gripper, below which its free effusivity is not asked for
-_LIKELY = 0.9  # that a grasp is of another gripper or block, from which on its row says so
-
-
-class _Level(NamedTuple):
-    """One of the explanations that a record decides between."""
-
-    prior: float
-    device: GripperModel
-    finish: str
-    words: str  # for the row of a grasp that needs it
-
-
-class _Decided(NamedTuple):
-    """Log evidence of the candidates (n, m), log odds of all of them to a free effusivity (n,), and in words
-    which grasps another gripper or block explains."""
-
-    log_evidence: Floats
-    odds: Floats
-    words: list[str]
+_UNUSUAL = 2.5  # standard deviations of a nuisance: less is usual, one grasp in eighty
+_LIKELY = 0.9  # that a grasp, or a block's loss, is unlike those of the training: then its row says so
 
 
 @dataclass(eq=False, repr=False)
 class PosteriorClassifier(GraspClassifier):
     """Evidence of each material under the calibrated gripper (``"posterior"``).
 
-    ``gripper`` is which one took the grasps: the ``same`` that was calibrated, its parameters taken as the
-    file has them (as exact, unless that marks them uncertain); the same, but ``uncertain``: integrated over;
-    ``another`` one of its kind; or ``auto``: the same or another, as each record decides.  ``device_`` is the
-    calibrated one, ``coupling_`` (or None) how blocks move between touches, where groups of those taught it.
+    ``device_`` is the calibrated gripper, ``coupling_`` (or None) how blocks move between touches, where
+    groups of those taught it.
     """
 
     learns_from_all_conditions: ClassVar[bool] = True
@@ -117,13 +90,10 @@ class PosteriorClassifier(GraspClassifier):
     leaves_samples_out: ClassVar[bool] = True
     reads_both_sensors: ClassVar[bool] = True
 
-    # the test blocks are those of the training; "unknown": others of their materials; "auto": either
-    finish: str = "auto"
     priors: dict[str, float] | None = None  # odds of the materials; equal by default
     prior_unknown: float = 0.1  # probability of a material that is not among the candidates
     device: GripperModel | None = None  # a calibration to start from: fitting is quicker
     random_state: int = 0  # of the calibration
-    gripper: str = "auto"
 
     def fit(
         self, X: Records, y: ArrayLike | None = None, *, progress: Callable[[float, str], None] | None = None
@@ -152,49 +122,31 @@ class PosteriorClassifier(GraspClassifier):
         for part in records:
             if has_touch_groups(part):
                 self.coupling_ = learn_coupling(device, part, start=self.coupling_)
-        self.device_ = _uncertain_as(device, self.gripper)
+        self.device_ = device
 
     def with_device(self, device: GripperModel, coupling: Coupling | None = None) -> Self:
         """Take up a calibration in place of fitting one; the classes are its materials."""
         self._check_params()
         self.classes_ = np.asarray(sorted(device.materials))
-        self.device_, self.coupling_ = _uncertain_as(device, self.gripper), coupling
+        self.device_, self.coupling_ = device, coupling
         return self
 
-    def for_another_gripper(
-        self, known: Records | None = None, *, spread: GripperSpread | None = None
-    ) -> PosteriorClassifier:
-        """Return this classifier for another gripper of the same kind, ``spread`` from it as their making
-        allows by default.
+    def for_another_gripper(self, known: Records) -> PosteriorClassifier:
+        """Return this classifier for another gripper of the same kind, of whose grasps some are ``known``,
+        their material stated: one helps most, three to ten of two materials reach nearly all."""
+        from thermogrip.sysid.effusivity.calibration import calibrate_gripper
 
-        Of ``known``, grasps of the other gripper whose material is known, one helps most, three to ten of two
-        materials reach nearly all.  Without them answers are as uncertain as grippers differ.
-        """
         self._check_fitted()
-        device = another_gripper(self.device_, spread)
-        if known is not None:
-            from thermogrip.sysid.effusivity.calibration import calibrate_gripper
-
-            device = calibrate_gripper(record_list(known), prior=device, seed=self.random_state)
+        prior = another_gripper(self.device_)
         other = copy(self)
-        other.device_ = device
+        other.device_ = calibrate_gripper(record_list(known), prior=prior, seed=self.random_state)
         return other
 
     def can_name(self, name: str) -> bool:
         """Return whether a material can be a candidate: also those of the table, on blocks never touched."""
         return super().can_name(name) or name in load_materials()
 
-    def certain(self) -> PosteriorClassifier:
-        """Return this classifier for the training's own gripper and blocks: no record decides otherwise."""
-        own = copy(self)
-        own.gripper, own.finish = "same", self.as_taught
-        return own
-
     def _check_params(self) -> None:
-        if self.finish not in FINISHES:
-            raise UserError(f"finish is {self.finish!r}", hint=f"use one of {', '.join(FINISHES)}")
-        if self.gripper not in GRIPPERS:
-            raise UserError(f"gripper is {self.gripper!r}", hint=f"use one of {', '.join(GRIPPERS)}")
         if not 0 < self.prior_unknown < 1:
             raise UserError(
                 f"prior_unknown is {self.prior_unknown}", hint="use a probability between 0 and 1"
@@ -203,142 +155,88 @@ class PosteriorClassifier(GraspClassifier):
             raise UserError("a prior is not positive", hint="leave a material out of the candidates instead")
 
     def _log_proba(self, grasps: Grasps) -> Floats:
-        names = self.asked()
-        return np.asarray(self._evidence(grasps, names)[0] + self.log_prior(names))
+        return self._answered(grasps, self.asked(), unknown=False).log_p
 
-    def _evidence(
-        self, grasps: Grasps, names: Sequence[str], *, unknown: bool = False
-    ) -> tuple[Floats, Floats, list[str]]:
-        """Return the log evidence of each candidate, (n_grasp, n_name), joint for touches of one block, and,
-        where it is asked for, the posterior probability of a free effusivity beside them, at equal odds of
-        these; and in words which grasps another gripper, block or loss to the room explains."""
+    def candidate_log_proba(self, X: Records, candidates: Sequence[str]) -> Floats:
+        """Return log probabilities of the candidates alone, (n_grasp, n_candidate)."""
+        names = self.asked(candidates)
+        return np.vstack([self._answered(part, names, unknown=False).log_p for part in self._records(X)])
+
+    def _answered(self, grasps: Grasps, names: list[str], *, unknown: bool = True) -> Answered:
+        """Return the answers of one record; p_unknown, which takes longest, only where it is asked for."""
         group = label_values(grasps, "touch_group")
-        single = group == ""
+        found = Answered.nothing(group.size, len(names))
+        single = np.flatnonzero(group == "")
         evidence, odds = np.empty((group.size, len(names))), np.full(group.size, np.nan)
-        words = np.full(group.size, "", dtype=object)
-        if single.any():
-            data = touches(grasps, until=self.longest_, at=np.flatnonzero(single))
-            found = self._decided(data, names, unknown)
-            evidence[single], odds[single] = found.log_evidence, found.odds if unknown else np.nan
-            words[single] = found.words
-        if not single.all():
-            fit = two_touch_fit(self.device_, grasps, names, coupling=self.coupling_, finish=self.as_taught)
-            for at, row, loss, as_taught in zip(fit.rows, fit.log_evidence, fit.loss, fit.as_taught):
-                evidence[at] = row
-                if as_taught < 1 - _LIKELY:
-                    words[at] = (
-                        f"read as of a block that loses {loss:.2g} times as much as those of the training"
-                    )
-            groups = free_touch_fit(self.device_, grasps, coupling=self.coupling_) if unknown else {}
-            for name, fits in groups.items():
-                at = group == name
-                odds[at] = logsumexp(evidence[at], axis=1) - np.log(len(names)) - fits[0].log_evidence
-        return evidence, np.asarray(expit(logit(self.prior_unknown) - odds)), words.tolist()
+        if single.size:
+            data = touches(grasps, until=self.longest_, at=single)
+            noise = whitened(self.device_, graded(data, self.device_.grades))
+            fitted = fit_candidates(self.device_, data, names, noise=noise)
+            evidence[single] = fitted.mode.log_evidence.reshape(-1, len(names))
+            best = np.arange(single.size) * len(names) + evidence[single].argmax(axis=1)
+            if unknown:
+                free = free_evidence(self.device_, data, fitted.mode.u[best], noise)
+                odds[single] = logsumexp(evidence[single], axis=1) - np.log(len(names)) - free
+                self._explain(found, single, data, names, fitted, best)
+        if single.size < group.size:
+            self._touched(found, grasps, names, evidence, odds, unknown=unknown)
+        if unknown:
+            self._warn_of_training(found, grasps)
+        log_p = normalised(evidence + self.log_prior(names))
+        return found._replace(log_p=log_p, p_unknown=expit(logit(self.prior_unknown) - odds))
 
-    @property
-    def as_taught(self) -> str:
-        """``finish`` where only the training's gripper is asked about."""
-        return "known" if self.finish == "auto" else self.finish
+    def _explain(
+        self, found: Answered, at: NDArray[np.int64], data: Touches, names: list[str], fitted: Fitted,
+        best: NDArray[np.int64],
+    ) -> None:  # fmt: skip
+        """Add to the answers what the likeliest candidate does not explain of single touches, and what it
+        requires that is unusual; ``best`` is its row of ``fitted``."""
+        mode, prior = fitted.plain.take(best), fitted.plain_prior.take(best)
+        misfits = unexplained(data, fitted.row[best], mode, prior)
+        for k, (i, (misfit, words)) in enumerate(zip(at.tolist(), misfits)):
+            found.misfit_sd[i], name = misfit, names[int(best[k]) % len(names)]
+            found.deviates[i] = deviation_words(name, mode.u[k] - prior.mean[k], prior.sd[k], misfit)
+            if words:
+                found.notes[i].append(Note("not_explained", words))
+            elif fitted.unlike[k] > _LIKELY:
+                words = "unlike the grasps of the training: answered less surely"
+                found.notes[i].append(Note("beyond_training", words))
 
-    def _levels(self, n: int) -> list[_Level]:
-        """Return what a record of ``n`` single touches decides between, the training's own gripper and blocks
-        first; a few touches that these do not explain are no evidence of others."""
-        if self.device_.uncertain or n < _SEVERAL:
-            return [_Level(1.0, self.device_, self.as_taught, "")]
-        # what another gripper reads beyond the model, nobody knows
-        other = _OTHER_GRIPPER if self.gripper == "auto" and self.device_.discrepancy is None else 0.0
-        blocks = (1 - other) * _OTHER_BLOCKS if self.finish == "auto" else 0.0
-        out = [_Level(1 - other - blocks, self.device_, self.as_taught, "")]
-        if blocks:
-            words = "read as another block of its material than those of the training"
-            out.append(_Level(blocks, self.device_, "unknown", words))
-        if other:
-            words = "read as by another gripper than the training's: a labelled grasp of it helps (--known)"
-            out.append(_Level(other, another_gripper(self.device_), self.as_taught, words))
-        return out
+    def _touched(
+        self, found: Answered, grasps: Grasps, names: list[str], evidence: Floats, odds: Floats, *,
+        unknown: bool,
+    ) -> None:  # fmt: skip
+        """Fill evidence (n, m) and odds (n,) of touches of one block, and add what there is to say of it."""
+        fit = two_touch_fit(self.device_, grasps, names, coupling=self.coupling_)
+        groups = free_touch_fit(self.device_, grasps, coupling=self.coupling_) if unknown else {}
+        for k, at in enumerate(fit.rows):
+            evidence[at] = fit.log_evidence[k]
+            if fit.as_taught[k] < 1 - _LIKELY:
+                loss = f"{fit.loss[k]:.2g} times as much as those of the training"
+                words = f"read as of a block that loses {loss}"
+                for i in at.tolist():
+                    found.notes[i].append(Note("beyond_training", words))
+            if unknown:
+                free = groups[fit.groups[k]][0].log_evidence
+                odds[at] = logsumexp(fit.log_evidence[k]) - np.log(len(names)) - free
 
-    def _decided(self, data: Touches, names: Sequence[str], unknown: bool = False) -> _Decided:
-        """Return what single touches of one record decide; the odds where a free effusivity is asked for."""
-        levels, u = self._levels(data.level.size), np.log(self.prior_unknown)
-        noise = whitened(self.device_, graded(data, self.device_.grades))
-        own = np.array([level.device is self.device_ for level in levels])
-        n_own = int(own.sum())
-        each, modes = _of_levels(levels[:n_own], data, names, noise)
-        if n_own < own.size and _unlikely(levels, data, names, each, modes[0]):
-            levels, own = levels[:-1], own[:-1]
-        elif n_own < own.size:
-            each = np.concatenate([each, _of_levels(levels[-1:], data, names)[0]])
-        prior = np.log([level.prior for level in levels])[:, None]
-        known, free = logsumexp(each, axis=2) - np.log(len(names)), np.full(each.shape[:2], -np.inf)
-        sure = _share(levels, each)[0] > _SURE
-        if unknown or not sure:
-            # the level and the candidate that explain each touch best
-            best = np.concatenate(each[own], axis=1).argmax(axis=1)
-            near = np.concatenate(modes, axis=1)[np.arange(best.size), best]
-            free[own] = free_evidence(self.device_, data, near, noise=noise)
-        explained = known if sure else np.logaddexp(np.log(1 - self.prior_unknown) + known, u + free)
-        others = explained.sum(axis=1, keepdims=True) - explained
-        weight = normalised((prior + others).T).T
-        strange = logsumexp(weight + free, axis=0)
-        share = np.exp(normalised(np.column_stack([(weight + known).T, u + strange])))
-        words = [*(level.words for level in levels), ""]
-        found = [words[int(row.argmax())] if row.max() > _LIKELY else "" for row in share]
-        if unknown and not own.all() and (at := np.flatnonzero(share[:, -2] > _NEEDED)).size:
-            free[-1, at] = free_evidence(levels[-1].device, data.take(at))
-            strange = logsumexp(weight + free, axis=0)
-        # a stranger is none of the training's blocks, whatever another block of a known material may be
-        blocks = known[0] if self.finish != "unknown" else _mean_evidence(self.device_, data, names)
-        weighed = np.where(own[:, None], blocks, known) + weight
-        candidates = logsumexp(each + weight[:, :, None], axis=0)
-        return _Decided(candidates, logsumexp(weighed, axis=0) - strange, found)
+    def _warn_of_training(self, found: Answered, grasps: Grasps) -> None:
+        """Add to the answers what of a record the training did not have."""
+        known = (self.coupling_ or Coupling()).longest_rest
+        rested = f"rested longer than the {known:g} s of the training: the answer may be too confident"
+        for i in np.flatnonzero(rested_long(grasps, self.coupling_)).tolist():
+            found.notes[i].append(Note("beyond_training", rested))
+        trained, has = self.device_.second is not None, "t_surface_2" in grasps
+        if trained != has:
+            words = "the second sensor is not read: the training had one"
+            if trained:
+                words = "answered by the first sensor alone: the record has no second one"
+            for notes in found.notes:
+                notes.append(Note("beyond_training", words))
 
     def log_prior(self, names: Sequence[str]) -> Floats:
         """Return the log prior odds of some materials, (n_name,)."""
         return np.log([(self.priors or {}).get(name, 1.0) for name in names])
-
-    def candidate_log_proba(self, X: Records, candidates: Sequence[str]) -> Floats:
-        """Return log probabilities over a subset of ``classes_``: only their evidence is computed."""
-        names = self.asked(candidates)
-        prior = self.log_prior(names)
-        return np.vstack([normalised(self._evidence(part, names)[0] + prior) for part in self._records(X)])
-
-    def open_set_log_proba(self, X: Records, candidates: Sequence[str]) -> tuple[Floats, Floats]:
-        """Return :meth:`candidate_log_proba` and :meth:`p_unknown` from one evaluation of the evidence."""
-        names = self.asked(candidates)
-        found = [self._evidence(part, names, unknown=True) for part in self._records(X)]
-        log_p = [normalised(evidence + self.log_prior(names)) for evidence, _, _ in found]
-        return np.vstack(log_p), np.concatenate([unknown for _, unknown, _ in found])
-
-    def open_set_answer(self, grasps: Grasps, candidates: Sequence[str]) -> tuple[Floats, Floats, list[str]]:
-        """Return :meth:`open_set_log_proba` and :meth:`beyond_training` of one record, from one evaluation of
-        the evidence where all materials of the training are asked about."""
-        names = self.asked(candidates)
-        (part,) = self._records(grasps)
-        few = part.sizes["grasp"] < _SEVERAL and not has_touch_groups(part)  # which decide nothing
-        if set(names) != set(self.asked()) and not few:
-            return super().open_set_answer(part, names)
-        evidence, unknown, words = self._evidence(part, names, unknown=True)
-        return normalised(evidence + self.log_prior(names)), unknown, self._beyond(part, words)
-
-    def p_unknown(self, X: Records, candidates: Sequence[str] | None = None) -> Floats:
-        names = self.asked() if candidates is None else [str(c) for c in candidates]
-        return np.concatenate([self._evidence(part, names, unknown=True)[1] for part in self._records(X)])
-
-    def beyond_training(self, grasps: Grasps) -> list[str]:
-        """Return in words which grasps another gripper or other blocks explain, which blocks rested longer
-        between touches or lose more than those of the training, and which sensor of two has no part."""
-        return self._beyond(grasps, self._evidence(grasps, self.asked())[2])
-
-    def _beyond(self, grasps: Grasps, words: Sequence[str]) -> list[str]:
-        """Return what makes the answers overconfident: these ``words``, or what else there is to say."""
-        known = (self.coupling_ or Coupling()).longest_rest
-        rested = f"rested longer than the {known:g} s of the training: the answer may be too confident"
-        trained, has = self.device_.second is not None, "t_surface_2" in grasps
-        other = "" if trained == has else "the second sensor is not read: the training had one"
-        if trained and not has:
-            other = "answered by the first sensor alone: the record has no second one"
-        notes = [rested if long else other for long in rested_long(grasps, self.coupling_)]
-        return ["; ".join(filter(None, pair)) for pair in zip(words, notes)]
 
     def get_state(self) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
         """Return how long contacts of the training lasted; the device has a file of its own."""
@@ -363,61 +261,19 @@ class PosteriorClassifier(GraspClassifier):
         self.coupling_ = Coupling.load(file) if file.exists() else None
 
 
-def _of_levels(
-    levels: Sequence[_Level], data: Touches, names: Sequence[str], noise: Whitened | None = None,
-    start: Floats | None = None,
-) -> tuple[Floats, Floats]:  # fmt: skip
-    """Return the log evidence of each candidate for each touch on each level of one gripper, (n_level, n,
-    n_name), and the nuisances there, (n_level, n, n_name, 7), from those of ``start`` on."""
-    found, modes = list[Floats](), list[Floats]()
-    for level in levels:
-        # what the first level found is near what its gripper finds with another block
-        begin = modes[0] if modes else start
-        mode, *_ = fit_candidates(level.device, data, names, level.finish, start=begin, noise=noise)
-        found.append(mode.log_evidence.reshape(-1, len(names)))
-        modes.append(mode.u.reshape(*found[0].shape, -1))
-    return np.stack(found), np.stack(modes)
-
-
-def _unlikely(
-    levels: Sequence[_Level], data: Touches, names: Sequence[str], own: Floats, modes: Floats
-) -> bool:
-    """Return whether some grasps, one after another, leave nothing of the last level, which takes longest to
-    ask; ``own`` is the evidence of the others, ``modes`` are those of the first."""
-    if data.level.size <= _ASKED:
-        return False
-    found, share = list[Floats](), 1.0
-    asked = np.unique(np.linspace(0, data.level.size - 1, _ASKED).astype(int))
-    # a grasp that moved the temperature far tells most of a gripper
-    for i in asked[np.argsort(-data.excursion[asked], kind="stable")]:
-        if share > _HARDLY:
-            at = np.array([i])
-            theirs = _of_levels(levels[-1:], data.take(at), names, start=modes[at])[0]
-            found.append(np.concatenate([own[:, at], theirs]))
-            share = float(_share(levels, np.concatenate(found, axis=1))[-1])
-    return share < 1 - _SURE
-
-
-def _share(levels: Sequence[_Level], each: Floats) -> Floats:
-    """Return the probability of each level given all touches, (n_level,)."""
-    total = np.log([level.prior for level in levels]) + logsumexp(each, axis=2).sum(axis=1)
-    return np.asarray(np.exp(normalised(total[None])[0]))
-
-
-def _mean_evidence(device: GripperModel, data: Touches, names: Sequence[str]) -> Floats:
-    """Return the log evidence of the training's own blocks, the mean over candidates, (n,)."""
-    evidence = fit_candidates(device, data, names, "known")[0].log_evidence
-    return np.asarray(logsumexp(evidence.reshape(-1, len(names)), axis=1) - np.log(len(names)))
-
-
-def _uncertain_as(device: GripperModel, gripper: str) -> GripperModel:
-    """Return a calibrated gripper with the parameter uncertainty that the question requires."""
-    if gripper == "another":
-        return another_gripper(device)
-    if gripper == "uncertain":
-        if device.uncertainty is None:
-            raise UserError(
-                "the calibration has no parameter covariance of the gripper", hint="calibrate again"
-            )
-        return replace(device, uncertain=True)
-    return device
+def deviation_words(material: str, off: Floats, sd: Floats, misfit: float) -> str:
+    """Return in words which unusual values of nuisances (7,) a material requires, ``off`` by so much of a
+    mean that is known to ``sd``, or which ``misfit`` [standard deviations]; empty where nothing is
+    unusual."""
+    warmer, late = "warmer" if off[T_OBJECT] > 0 else "colder", "late" if off[ONSET] > 0 else "early"
+    words = {
+        H: f"{np.exp(off[H]):.2f} times the usual contact conductance",
+        BUILD_UP: f"a contact that builds up in {np.exp(off[BUILD_UP]):.2f} times the usual time",
+        ONSET: f"a contact {abs(off[ONSET]):.2f} s {late}",
+        EFFUSIVITY: f"{np.exp(off[EFFUSIVITY]):.2f} times its block's effusivity",
+        T_OBJECT: f"its block {abs(off[T_OBJECT]):.1f} K {warmer} than its nominal temperature",
+    }
+    each = [(float(abs(off[k]) / sd[k]), text) for k, text in words.items() if sd[k] > 0]
+    each.append((misfit, "a trace that is not its own"))
+    unusual = [f"{text} ({far:.1f} sd)" for far, text in sorted(each, reverse=True) if far > _UNUSUAL][:2]
+    return f"as {material} it needs {' and '.join(unusual)}" if unusual else ""

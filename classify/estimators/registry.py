@@ -3,45 +3,35 @@ r"""Classifiers by name, and on disk.
 A saved classifier is a folder: ``classifier.json`` (what it is, parameters, classes, small arrays), beside it
 ``weights.safetensors`` for the LSTM and ``device.json`` for the effusivity posterior.  All are data: reading
 one runs no code, and it can be read by anything that reads JSON.
-
-Several classifiers vote by the mean of their probabilities,
-
-.. math:: p(m) = \frac{1}{n} \sum_{i=1}^{n} p_i(m).
-
-By Jensen's inequality the log loss of the mean is at most the mean of the log losses, on every set of
-grasps; where the members err on different grasps it is lower than that of the best of them.  The weights
-are equal, so that nothing is learnt from held-out grasps, of which there are few.  A member that is
-confident and wrong costs at most ln n.
 """
 
 from __future__ import annotations
 
 import inspect
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from contextlib import suppress
-from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import logsumexp
 
 from thermogrip.classify.estimators import CLASSIFIERS, check_name
-from thermogrip.classify.estimators.base import Floats, GraspClassifier, Labels
+from thermogrip.classify.estimators.base import GraspClassifier
 from thermogrip.datasets.atomic_files import make_folder, read_bytes, read_json, write_atomic, write_json
 from thermogrip.datasets.errors import UserError, known_names, reading
 from thermogrip.datasets.limits import array_within
 from thermogrip.datasets.schema import make_grasps
 
 if TYPE_CHECKING:
-    from thermogrip.datasets.schema import Grasps
+    pass
 
 _SAVED = "posterior, bayes, features-lda, pca-lda, lstm, lstm-paper"
 _NETWORKS = ("lstm", "lstm-paper")
 _SCHEMA, _VERSION = "thermogrip.classifier", 1
 _RUNTIME_ONLY = ("device",)  # a start for the next fit, not part of what was learnt
+_RETIRED = ("finish", "gripper")  # of files of 0.2.0: what they stated is decided grasp by grasp
 
 
 def make_classifier(
@@ -53,9 +43,7 @@ def make_classifier(
     ----------
     name : str
         One of :data:`CLASSIFIERS`; or the import path of a scikit-learn classifier or pipeline,
-        ``module:Class`` or ``module:object`` (the module is imported, so name only what you trust); or
-        several of these, joined by ``+``, whose probabilities are averaged
-        (:class:`~thermogrip.classify.estimators.registry.VoteClassifier`).
+        ``module:Class`` or ``module:object`` (the module is imported, so name only what you trust).
     quick : bool, optional
         200 epochs in place of 2000 for the LSTM; the others are quick as they are.
     seed : int, optional
@@ -73,12 +61,6 @@ def make_classifier(
     >>> make_classifier("lstm", quick=True).epochs
     200
     """
-    if "+" in name:
-        if params:
-            raise UserError(f"{name} has no parameters of its own", hint="make its members one by one")
-        members = [make_classifier(member, quick=quick, seed=seed) for member in name.split("+")]
-        check_members(members)  # here, not in the middle of a run
-        return VoteClassifier(members)
     if name not in CLASSIFIERS and ("." in name or ":" in name):
         from thermogrip.classify.estimators.lda import ArrayClassifier, imported_estimator
 
@@ -107,9 +89,6 @@ def classifier_name(classifier: GraspClassifier) -> str:
     for name, (_, kind) in CLASSIFIERS.items():
         if type(classifier).__name__ == kind:
             return name
-    members = getattr(classifier, "members", None)
-    if members is not None:
-        return "+".join(classifier_name(member) for member in members)
     inner = getattr(classifier, "estimator", None)
     if steps := getattr(inner, "steps", None):  # of a pipeline: its last one decides
         inner = steps[-1][1]
@@ -222,7 +201,8 @@ def load_classifier(folder: str | Path) -> GraspClassifier:
     with reading("is damaged", file=file, hint="train the classifier again"):
         if content["name"] not in CLASSIFIERS:  # never an import path: reading a file runs no code
             raise KeyError(content["name"])
-        classifier = make_classifier(content["name"], **content["params"])
+        params = {key: value for key, value in content["params"].items() if key not in _RETIRED}
+        classifier = make_classifier(content["name"], **params)
         classifier.classes_ = np.asarray([str(c) for c in content["classes"]])
         if content["name"] in _NETWORKS:
             arrays = _read_weights(path / "weights.safetensors")
@@ -244,7 +224,7 @@ def _check_answer(classifier: GraspClassifier) -> None:
     second = [rise] if getattr(classifier, "sensors_", None) == 2 else None
     grasp = make_grasps(time, [rise], ["made"], name="made", t_object=[43.0], t_surface_2=second)
     with suppress(UserError), np.errstate(all="ignore"):  # such as: the training had longer contacts
-        log_p, unknown, _ = classifier.open_set_answer(grasp, classifier.asked())
+        log_p, unknown, *_ = classifier.answered(grasp)
         if log_p.shape != (1, len(classifier.classes_)) or unknown.shape != (1,):
             raise ValueError("its numbers give no answer")
 
@@ -257,40 +237,3 @@ def _read_weights(file: Path) -> dict[str, NDArray[Any]]:
         for name in arrays:
             array_within(arrays, name)
         return arrays
-
-
-@dataclass(eq=False, repr=False)
-class VoteClassifier(GraspClassifier):
-    """The mean of the probabilities of ``members``, at least two unfitted classifiers that answer for each
-    touch alone; all learn from the grasps that the vote is given."""
-
-    members: Sequence[GraspClassifier] = ()
-
-    def _learn(self, records: list[Grasps], labels: list[Labels]) -> None:
-        from sklearn.base import clone
-
-        check_members(self.members)
-        self.members_ = [clone(member) for member in self.members]
-        for member in self.members_:
-            member._learn(records, labels)
-        self.classes_ = self.members_[0].classes_
-
-    def check_installed(self) -> None:
-        for member in self.members:
-            member.check_installed()
-
-    def _log_proba(self, grasps: Grasps) -> Floats:
-        log_p = np.stack([member.predict_log_proba(grasps) for member in self.members_])
-        return np.asarray(logsumexp(log_p, axis=0) - np.log(len(log_p)))
-
-
-def check_members(members: Sequence[GraspClassifier]) -> None:
-    """Raise :class:`UserError` where these can be no vote."""
-    if len(members) < 2:
-        raise UserError("a vote has fewer than two members", hint="name them like rocket+features-lda")
-    for member in members:
-        if member.joins_touches:
-            raise UserError(
-                f"{type(member).__name__} joins the touches of a block and can be no member of a vote",
-                hint="compare it beside the vote",
-            )

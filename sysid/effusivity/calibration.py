@@ -473,7 +473,7 @@ def calibrate_gripper(
         What is known before: an earlier calibration with its ``uncertainty``, or that of
         another gripper (:func:`~thermogrip.sysid.effusivity.gripper_model.another_gripper`).  The fit
         starts there and leans on it, so that a few grasps of one material suffice; its noise is kept, and so
-        are its other blocks, and whether it is uncertain.
+        are its other blocks.
     block_length : float, optional
         Length of the blocks behind the contact face [m]; default 0.02, or that of ``prior``.
     seed : int, optional
@@ -808,7 +808,7 @@ def _gripper_model(
     blocks = {
         label: Block(
             ln_h=float(problem.ln_h(theta)[k]),
-            ln_h_sd=float(spread["ln_h"] / np.sqrt(count[k])),
+            ln_h_sd=float(own[k]),
             ln_effusivity=float(problem.ln_e(theta)[k]),
             ln_effusivity_sd=float(own[n + k]),
             library_effusivity=float(row.effusivity),
@@ -837,7 +837,6 @@ def _gripper_model(
         blocks=blocks,
         trained_on=names,
         uncertainty=ParameterCovariance(names_of_theta, 0.5 * (covariance + covariance.T)),
-        uncertain=prior is not None and prior.uncertain,
         discrepancy=problem.discrepancy(theta),
     )
 

@@ -108,7 +108,6 @@ def at_knots(t: Array) -> Array:
     return np.stack([np.interp(t, x, row) for row in base], axis=-1)
 
 
-
 @dataclass(frozen=True)
 class Touches:
     """``n`` grasps, padded to the longest."""

@@ -14,8 +14,7 @@ library) against ln(found), which reported effusivities are divided by.
 
 A calibration ends with a posterior of theta, the parameters that all grasps share: the stack, mean build-up
 time and onset, heat loss in transit, bias of the nominal temperature, depth, and ln h and ln e of each block.
-Over an uncertain gripper's theta every answer integrates
-(:mod:`thermogrip.sysid.effusivity.laplace_approximation`).
+A later calibration on a few known grasps leans on it.
 
 **Another gripper** of the same kind differs by how such fingers are made (:class:`GripperSpread`).  With
 conductivity k, heat capacity c and thickness d, ln e = (ln k + ln c) / 2 and ln z = ln d + (ln c - ln k) / 2,
@@ -34,7 +33,7 @@ import numpy as np
 
 from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.atomic_files import read_json, write_json
-from thermogrip.datasets.errors import UserError, reading
+from thermogrip.datasets.errors import reading
 from thermogrip.datasets.limits import number_within
 from thermogrip.datasets.materials import load_materials
 from thermogrip.sysid.contact.simulation import Grip, Stack
@@ -51,12 +50,8 @@ SHARED_NAMES = (
 _FILE_KEYS = {
     "build_up": "build", "ln_build_up": "ln_build", "transit_loss": "carry", "correlation_time": "memory",
     "ln_h_of_blocks": "finish", "ln_h_level": "finish_level", "ln_h_slope": "finish_slope",
-    "uncertain": "in_doubt",
 }  # fmt: skip
 WIDER = 1.5  # GripperSpread's numbers are guesses themselves: so wide, answers are right as often as stated
-# of ln e on another gripper's scale, which no block of its own anchors: skins go from plain silicone (570) to
-# silicone filled for conduction (1800 W s^0.5 m^-2 K^-1), a factor of three
-ANOTHER_SCALE_SD = 0.6
 NOTHING = 1e-3  # in place of a conductance of nothing, which has no logarithm
 _STACK_NAMES = SHARED_NAMES[: SHARED_NAMES.index("onset")]  # these make a Stack
 _ROUNDING = 1e-6  # a correlation matrix may have an eigenvalue so far below zero by rounding alone
@@ -173,15 +168,15 @@ class GripperSpread:
 
 def another_gripper(gripper: GripperModel, spread: GripperSpread | None = None) -> GripperModel:
     """Return what one gripper's calibration leaves open about another one of its kind: the same numbers, less
-    well known, over which answers integrate and from which a calibration on a few known grasps of the other
-    one starts.  Where its file keeps no covariance its own numbers count as exact."""
+    well known, from which a calibration on a few known grasps of the other one starts.  Where its file keeps
+    no covariance its own numbers count as exact."""
     known = gripper.uncertainty
     if known is None:
         names = (*SHARED_NAMES, *block_names(gripper.materials))
         known = ParameterCovariance(names, np.zeros((len(names), len(names))))
     extra = (spread or GripperSpread()).covariance(known.names) * (WIDER**2 if spread is None else 1.0)
     return replace(
-        gripper, uncertainty=ParameterCovariance(known.names, known.covariance + extra), uncertain=True,
+        gripper, uncertainty=ParameterCovariance(known.names, known.covariance + extra),
         second=None if gripper.second is None else another_gripper(gripper.second, spread),
     )  # fmt: skip
 
@@ -298,17 +293,10 @@ class GripperModel:
         Names of the records it was calibrated on.
     uncertainty : ParameterCovariance, optional
         Of all these parameters.
-    uncertain : bool, optional
-        Whether answers integrate over the parameters, as ``uncertainty`` says; else they count as exact.
     second : GripperModel, optional
         What surrounds a second sensor of the finger (``t_surface_2``), calibrated on the same grasps.
     discrepancy : Discrepancy, optional
         What the gripper reads beyond the model, where its calibration found something.
-
-    Raises
-    ------
-    ValueError
-        If the gripper is uncertain and there is no ``uncertainty``.
     """
 
     stack: Stack
@@ -324,19 +312,14 @@ class GripperModel:
     blocks: Mapping[str, Block]
     trained_on: tuple[str, ...] = ()
     uncertainty: ParameterCovariance | None = None
-    uncertain: bool = False
     second: GripperModel | None = None
     discrepancy: Discrepancy | None = None
 
-    def __post_init__(self) -> None:
-        if self.uncertain and self.uncertainty is None:
-            raise ValueError("an uncertain gripper needs the covariance of its parameters")
-
     @property
     def grades(self) -> tuple[Grade, ...]:
-        """How unlike the training a grasp may be: where the gripper is itself uncertain, or its discrepancy
-        was learnt, the first grade stands for the others."""
-        return GRADES[:1] if self.uncertain or self.discrepancy is not None else GRADES
+        """How unlike the training a grasp may be; of a gripper whose discrepancy was learnt the first grade
+        stands for the others."""
+        return GRADES[:1] if self.discrepancy is not None else GRADES
 
     @property
     def unlisted(self) -> list[str]:
@@ -386,14 +369,6 @@ class GripperModel:
         variance = part[0, 0] + 2 * part[0, 1] * away + part[1, 1] * away**2
         return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
 
-    def require_known(self, what: str) -> None:
-        """Refuse a question that is answered only by a gripper whose numbers count as exact."""
-        if self.uncertain:
-            raise UserError(
-                f"{what} needs a known gripper, and this one is uncertain",
-                hint="calibrate it on its own grasps, or take its numbers as exact (uncertain=False)",
-            )
-
     def grip(self) -> Grip:
         """Return the gripper and its populations as a simulation draws from them.
 
@@ -435,8 +410,7 @@ class GripperModel:
 
     def to_dict(self) -> dict[str, Any]:
         """Return a JSON-able description."""
-        numbers = asdict(replace(self, uncertainty=None, uncertain=False, second=None, discrepancy=None))
-        numbers["uncertain"] = self.uncertain
+        numbers = asdict(replace(self, uncertainty=None, second=None, discrepancy=None))
         del numbers["uncertainty"], numbers["second"], numbers["discrepancy"]
         if self.discrepancy is not None:
             numbers["discrepancy"] = {k: v.tolist() for k, v in vars(self.discrepancy).items()}
@@ -464,7 +438,6 @@ class GripperModel:
                 uncertainty=ParameterCovariance.from_dict(content["knowledge"])
                 if "knowledge" in content
                 else None,
-                uncertain=bool(content.get("in_doubt", False)),
                 second=cls.from_dict(content["second"], file=file) if "second" in content else None,
                 discrepancy=Discrepancy.from_dict(content["discrepancy"], len(content["blocks"]))
                 if "discrepancy" in content

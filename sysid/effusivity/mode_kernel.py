@@ -9,7 +9,7 @@ NumPy's, for some hundred pairs at once, whose arrays stay in the processor's ca
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +19,7 @@ from thermogrip.datasets.compiled import numba
 from thermogrip.sysid.contact.time_stepping import COMPILED, N_STEPPED, VALUE, Gripper, contacts
 
 _AT_ONCE = 1024  # pairs
+_MOST_STEPS = 20  # a pair that has not settled by then is hopeless in practice
 _LONGEST = 1.5
 # after so many steps, -2 ln posterior behind the best by the quadratic model: of 943 points of a free
 # effusivity that ended within 25 nats of the best, none was farther than 1734 after one, 356 after two and
@@ -248,10 +249,15 @@ def predicted(
 def products(asked: Asked, whitener: Array, u: Array, sd: Array, *, alike: bool = False) -> Array:
     """Return J' J, and J' r and r' r in the last row and column, (n, 8, 8): J in units of ``sd`` (n, 7), r
     the readings less those that ``u`` predicts, both whitened."""
-    columns = readings(asked, u, sd > 0.0, alike=alike)[1]
+    found = []
+    for begin in range(0, len(u), _AT_ONCE):  # so many at once that they stay in the processor's cache
+        part = slice(begin, begin + _AT_ONCE)
+        some = asked.take(part)
+        columns = readings(some, u[part], sd[part] > 0.0, alike=alike)[1]
+        found.append(squares(whitener, some.row, columns))
+    matrix = found[0] if len(found) == 1 else np.concatenate(found)
     scale = np.ones((len(u), _LEFT + 1))
     scale[:, :_LEFT] = sd
-    matrix = squares(whitener, asked.row, columns)
     matrix *= scale[:, :, None]
     matrix *= scale[:, None, :]
     return matrix
@@ -272,12 +278,6 @@ class Penalty(NamedTuple):
     slope: Array
     bound: Array  # positive, bounds the curvature from above, so that a step on it cannot overshoot
     own: Array  # the curvature, kept from turning negative far out in the tail
-
-
-def penalty(u: Array, mean: Array, sd: Array, dof: Array) -> Penalty:
-    """Return the penalty of points ``u`` (n, 7): normal where ``dof`` is infinite, else Student's t; none and
-    curvature 1 where ``sd`` is zero."""
-    return Law.of(mean, sd, dof).penalty(u)
 
 
 class Law(NamedTuple):
@@ -340,26 +340,6 @@ class _Search(NamedTuple):
         return _Search(*some)
 
 
-class Pairs(Protocol):
-    """What a search asks of its pairs, ``at`` some of them."""
-
-    def products(self, at: NDArray[np.int64], u: Array, *, first: bool) -> Array:
-        """Return J' J, and J' r and r' r in the last row and column, J in units of the priors' sds."""
-        ...
-
-    def longest(self, at: NDArray[np.int64], move: Array) -> Array:
-        """Return by how much steps move the logarithms among the unknowns at most, (n,)."""
-        ...
-
-    def hopeful(self, step: int, at: NDArray[np.int64], cost: Array, decrease: Array) -> Mask | None:
-        """Return which are worth another step beside the others; None for all."""
-        ...
-
-    def slack(self, at: NDArray[np.int64]) -> Array | float:
-        """Return how many times the least decrease a last step may gain, once :meth:`hopeful` was asked."""
-        ...
-
-
 class Found(NamedTuple):
     """Where a search ended: points, products and -2 ln posterior there, and where it settled."""
 
@@ -370,10 +350,10 @@ class Found(NamedTuple):
 
 
 def search(
-    pairs: Pairs, law: Law, sd: Array, u: Array, max_steps: int, *, least: float = _LEAST_DECREASE
-) -> Found:
-    """Return where damped Gauss-Newton steps from ``u`` (n, m) end, under priors of a ``law`` and of ``sd``
-    (n, m): where the next step would gain less than ``least``, which then counts as taken.
+    asked: Asked, whitener: Any, law: Law, sd: Array, u: Array, *, rivals: bool
+) -> Found:  # fmt: skip
+    """Return where damped Gauss-Newton steps from ``u`` (n, 7) end, under priors of a ``law`` and of ``sd``
+    (n, 7): where the next step would gain less than 0.005 nat, which then counts as taken.
 
     Where readings are not explained, they may bend along a step twice as much as their slopes say, so that
     whole steps go to and fro across the mode.  So what a step gains tells how much they bend along it, and
@@ -382,23 +362,25 @@ def search(
     n, m = u.shape
     diagonal, none = np.arange(m), np.full(n, np.inf)
     found = Found(u.copy(), np.empty((n, m + 1, m + 1)), none.copy(), np.zeros(n, dtype=bool))
+    ahead = none.copy()  # what the next step should come to
     here = _Search(
         at=np.arange(n), law=law, sd=sd, trial=u, point=u, cost=none, matrix=found.matrix, slope=u, bound=u,
         damping=np.full(n, 1e-2), part=none, slope_gain=none, bend=none, stale=found.settled,
     )  # fmt: skip
-    for step in range(max_steps + 1):
-        here = _moved(*_refitted(here, pairs.products(here.at, here.trial, first=step == 0)), step)
+    for step in range(_MOST_STEPS + 1):
+        there = products(asked.take(here.at), whitener, here.trial, here.sd, alike=step == 0)
+        here = _moved(*_refitted(here, there), step)
         rhs, curved = here.matrix[:, :m, m] - here.slope, here.matrix[:, :m, :m].copy()
         curved[:, diagonal, diagonal] += here.bound
         last = np.linalg.solve(curved, rhs[:, :, None])[:, :, 0]
         decrease = (last * rhs).sum(axis=1)
-        hopeful = pairs.hopeful(step, here.at, here.cost, decrease)
-        near = (decrease < least * pairs.slack(here.at)) & ~here.stale
+        near = (decrease < _LEAST_DECREASE) & ~here.stale
         left = ~near & (here.damping <= 1e9)
-        if step == max_steps:
+        if step == _MOST_STEPS:
             near[:], left[:] = False, False
-        if hopeful is not None:
-            left &= hopeful
+        if rivals:
+            ahead[here.at] = here.cost - decrease
+            left &= _hopeful(asked, step, ahead)[here.at]
         if not left.all():
             done = ~left
             at = here.at[done]
@@ -421,13 +403,22 @@ def search(
             gain = np.where(damped, (shorter * rhs).sum(axis=1), gain)
         move = move * here.sd
         # no logarithm moves too far
-        part = np.minimum(here.part, _LONGEST / np.maximum(pairs.longest(here.at, move), 1e-300))
+        part = np.minimum(here.part, _LONGEST / np.maximum(np.abs(move[:, _CONTACT]).max(axis=1), 1e-300))
         part = np.where(here.stale, 0.0, part)  # slopes anew before another step
         here = here._replace(
             trial=here.point + part[:, None] * move, slope_gain=2.0 * part * gain,
             bend=part * part * (gain - kept),
         )  # fmt: skip
     return found
+
+
+def _hopeful(asked: Asked, step: int, ahead: Array) -> Mask:
+    """Return which pairs are worth another step beside the best of their touch."""
+    best = np.full(asked.data.level.size, np.inf)
+    np.minimum.at(best, asked.row, ahead)
+    stated = np.isfinite(asked.data.t_object)
+    limit = np.where(stated, _HOPELESS_STATED[step], _HOPELESS.get(step, np.inf))
+    return np.asarray(ahead < (best + limit + _UNEXPLAINED * np.maximum(best, 0.0))[asked.row])
 
 
 def _refitted(here: _Search, there: Array) -> tuple[_Search, Array, Mask]:
@@ -485,67 +476,19 @@ def _moved(here: _Search, there: Array, stale: Mask, step: int) -> _Search:
     )  # fmt: skip
 
 
-class _Touched(NamedTuple):
-    """Pairs of one gripper, as :func:`modes` searches them."""
-
-    asked: Asked
-    whitener: Any
-    sd: Array
-    rivals: bool
-    rough: float  # nats behind the best of its touch, up to which a pair may be the rougher the farther it is
-    ahead: Array  # (n,), what the next step should come to
-    best: Array  # (n_touch,), of that
-
-    def products(self, at: NDArray[np.int64], u: Array, *, first: bool) -> Array:
-        """Return the products of some pairs, so many at once that they stay in the processor's cache."""
-        parts = [at[begin : begin + _AT_ONCE] for begin in range(0, at.size, _AT_ONCE)]
-        points = np.split(u, range(_AT_ONCE, at.size, _AT_ONCE))
-        found = [
-            products(self.asked.take(part), self.whitener, point, self.sd[part], alike=first)
-            for part, point in zip(parts, points)
-        ]
-        return found[0] if len(found) == 1 else np.concatenate(found)
-
-    def longest(self, at: NDArray[np.int64], move: Array) -> Array:
-        """Return by how much steps move the logarithms among the unknowns at most, (n,)."""
-        return np.asarray(np.abs(move.take(_CONTACT, axis=1)).max(axis=1))
-
-    def hopeful(self, step: int, at: NDArray[np.int64], cost: Array, decrease: Array) -> Mask | None:
-        """Return which are worth another step beside the best of their touch."""
-        if not self.rivals:
-            return None
-        row, stated, best = self.asked.row, np.isfinite(self.asked.data.t_object), self.best
-        self.ahead[at], best[:] = cost - decrease, np.inf
-        np.minimum.at(best, row, self.ahead)
-        limit = np.where(stated, _HOPELESS_STATED[step], _HOPELESS.get(step, np.inf))
-        limit = limit + _UNEXPLAINED * np.maximum(best, 0.0)
-        return np.asarray(self.ahead[at] < (best + limit)[row[at]])
-
-    def slack(self, at: NDArray[np.int64]) -> Array | float:
-        """Return how many times the least decrease a last step may gain: where pairs are summed one counts
-        the less the farther it is behind."""
-        if not (self.rivals and self.rough):
-            return 1.0
-        behind = 0.5 * (self.ahead[at] - self.best[self.asked.row[at]])
-        return np.asarray(np.exp(np.minimum(behind, self.rough)))
-
-
 def modes(
-    asked: Asked, whitener: Any, law: Array, u: Array, max_steps: int, *, rivals: bool = False,
-    rough: float = 0.0,
+    asked: Asked, whitener: Any, law: Array, u: Array, *, rivals: bool = False
 ) -> tuple[Array, Array, Array, Mask]:  # fmt: skip
     """Move ``u`` (n, 7) to the mode of each pair; return covariance (n, 7, 7), objective, misfit and where
     the search settled.
 
     The prior of each is its ``law`` (n, 3, 7): mean, sd, degrees of freedom.  The objective is -2 ln
     (likelihood x prior density relative to its peak) + ln det of its curvature in units of sd.  Where pairs
-    of one row are ``rivals``, one that is hopeless beside the best of them is left there, unsettled, and one
-    k nats behind may be exp(k) times as far from its mode, k up to ``rough``.
+    of one row are ``rivals``, one that is hopeless beside the best of them is left there, unsettled.
     """
-    (mean, sd, dof), n = law.transpose(1, 0, 2), len(u)
+    mean, sd, dof = law.transpose(1, 0, 2)
     own = Law.of(mean, sd, dof)
-    ahead, best = np.full(n, np.inf), np.full(asked.data.level.size, np.inf)
-    found = search(_Touched(asked, whitener, sd, rivals, rough, ahead, best), own, sd, u, max_steps)
+    found = search(asked, whitener, own, sd, u, rivals=rivals)
     u[:] = found.u
     inverse, log_det = curvature(found.matrix, own.penalty(u).own)
     covariance = inverse * (sd[:, :, None] * sd[:, None, :])
@@ -562,25 +505,3 @@ def curvature(matrix: Array, own: Array) -> tuple[Array, Array]:
         raise np.linalg.LinAlgError("the curvature of a grasp's posterior is not positive definite")
     inverse = np.linalg.inv(curved)
     return 0.5 * (inverse + inverse.transpose(0, 2, 1)), log_det
-
-
-def marginals(asked: Asked, whitener: Array, u: Array, sd: Array) -> Array:
-    """Return ln p(y | u) up to a constant for points ``u`` (n, 7), integrated over level and T_obj, whose
-    prior means are in ``u``; ``sd`` (m, n, 2) are their sds, each with a row of the answer (m, n)."""
-    at, out = [_LEVEL, _T, _LEFT], np.empty((len(sd), len(u)))
-    for begin in range(0, len(u), _AT_ONCE):
-        part = slice(begin, begin + _AT_ONCE)
-        vary = np.zeros((len(u[part]), _LEFT), dtype=bool)
-        vary[:, at[:2]] = True
-        some = asked.take(part)
-        alike = bool((some.row == some.row[0]).all())
-        columns = readings(some, u[part], vary, alike=alike)[1].take(at, axis=1)
-        known = squares(whitener, some.row, columns)
-        a, b, d, square = known[:, 0, 0], known[:, 1, 1], known[:, 0, 1], known[:, 2, 2]
-        g, h = known[:, 0, 2], known[:, 1, 2]
-        for row, (s, t) in zip(out, sd[:, part].transpose(0, 2, 1)):
-            p, q, r = 1.0 + s * s * a, 1.0 + t * t * b, s * t * d
-            det = p * q - r * r
-            x, y = s * g, t * h
-            row[part] = -0.5 * (square - (q * x * x - 2.0 * r * x * y + p * y * y) / det + np.log(det))
-    return out

@@ -360,13 +360,13 @@ def _longest_rests(grasps: Grasps) -> dict[str, float]:
 
 def two_touch_fit(
     gripper: GripperModel, grasps: Grasps, candidates: Sequence[str | Material], *,
-    coupling: Coupling | None = None, finish: str = "known", until: float | None = None,
+    coupling: Coupling | None = None, until: float | None = None,
 ) -> TouchGroups:  # fmt: skip
     """Return the evidence of each candidate from all touches, any number, of each ``touch_group``; the
     nominal temperature of the first alone counts, for the later ones it is what the touches before left."""
     rows = touch_groups(grasps)
     groups = list(rows.values())
-    hypotheses = material_hypotheses(gripper, candidates, finish)
+    hypotheses = material_hypotheses(gripper, candidates)
     view = _view(gripper, grasps, hypotheses, coupling or Coupling(), until)
     skin, m = view.data.level, hypotheses.ln_h.size
 
@@ -400,7 +400,6 @@ def free_touch_fit(
     """Return the posterior of a free effusivity from all touches of each group, one entry a touch, which
     share ln e and differ in temperature and contact conductance; prior and grid are those of
     :func:`~thermogrip.sysid.effusivity.posterior_grid.grid_posteriors`."""
-    gripper.require_known("a question of several touches of one block")
     rows = touch_groups(grasps)
     used = coupling or Coupling()
     data = touches(grasps, until=until)
@@ -533,12 +532,12 @@ def learn_coupling(gripper: GripperModel, grasps: Grasps, *, start: Coupling | N
 
 def next_touch_prior(
     gripper: GripperModel, grasps: Grasps, candidates: Sequence[str | Material], *,
-    coupling: Coupling | None = None, rest: float = 60.0, finish: str = "known",
+    coupling: Coupling | None = None, rest: float = 60.0,
 ) -> tuple[Array, Array, Array]:  # fmt: skip
     """Return the log evidence (m,) from the touches of one block, and the prior mean (m, 4) and covariance
     (m, 4, 4) of another touch's x = (T_obj, ln h, ln e, ln C) after a ``rest`` [s]."""
     at = _one_block(grasps)
-    hypotheses = material_hypotheses(gripper, candidates, finish)
+    hypotheses = material_hypotheses(gripper, candidates)
     view = _view(gripper, grasps, hypotheses, coupling or Coupling())
     k = len(_LOSSES) if np.isfinite(view.traces.room[at]).any() else 1
     each = [_moved_on(_losing(view, loss), at, rest) for loss in _LOSSES[:k]]
@@ -594,7 +593,6 @@ class _View(NamedTuple):
 def _view(
     gripper: GripperModel, grasps: Grasps, one: Hypotheses, coupling: Coupling, until: float | None = None
 ) -> _View:
-    gripper.require_known("a question of several touches of one block")
     data = touches(grasps, until=until)
     traces = traces_of(gripper, data, number_values(grasps, "rest"), one)
     return _View(gripper, data, whiten(data, gripper.noise), one, traces, coupling)

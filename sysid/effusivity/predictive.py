@@ -78,12 +78,11 @@ class PosteriorPredictive(NamedTuple):
 
 def rest_of_contact(
     gripper: GripperModel, grasps: Grasps, candidates: Sequence[str | Material], *, until: float,
-    end: float = 10.0, finish: str = "known", start: Array | None = None,
+    end: float = 10.0, start: Array | None = None,
 ) -> PosteriorPredictive:  # fmt: skip
     """Return what the readings from ``until`` to ``end`` [s] will be, given those before."""
-    gripper.require_known("a prediction of the rest of a contact")
     data = touches(grasps, until=until)
-    mode, prior, row = fit_candidates(gripper, data, candidates, finish, start=start)
+    mode, prior, row, *_ = fit_candidates(gripper, data, candidates, start=start)
     n, m = data.level.size, len(candidates)
     log_p = mode.log_evidence.reshape(n, m)
     log_p = log_p - logsumexp(log_p, axis=1, keepdims=True)
@@ -115,13 +114,11 @@ def rest_of_contact(
 
 def next_touch(
     gripper: GripperModel, grasps: Grasps, candidates: Sequence[str | Material], t_gripper: ArrayLike, *,
-    coupling: Coupling | None = None, rest: float = 60.0, end: float = 10.0, finish: str = "known",
+    coupling: Coupling | None = None, rest: float = 60.0, end: float = 10.0,
 ) -> PosteriorPredictive:  # fmt: skip
     """Return what another touch of the block would read at each gripper temperature."""
     temperature = np.atleast_1d(np.asarray(t_gripper, dtype=float))
-    evidence, x_mean, x_cov = next_touch_prior(
-        gripper, grasps, candidates, coupling=coupling, rest=rest, finish=finish
-    )
+    evidence, x_mean, x_cov = next_touch_prior(gripper, grasps, candidates, coupling=coupling, rest=rest)
     n, m = temperature.size, evidence.size
     room = float(grasps["t_ambient"].values[-1]) if "t_ambient" in grasps else np.nan
     data = _coming(np.repeat(temperature, m), room, end, _sample_time(grasps))
@@ -135,7 +132,7 @@ def next_touch(
     log_p = np.tile(evidence - logsumexp(evidence), (n, 1))
     last = touches(grasps)
     if gripper.second is not None and last.second is not None:
-        one = material_hypotheses(gripper, candidates, finish)
+        one = material_hypotheses(gripper, candidates)
         other = Hypotheses(*(np.tile(part, n) for part in hypotheses_of_second(gripper, gripper.second, one)))
         begin = last.second.level[-1]
         level = data.level if abs(begin - last.level[-1]) < _ALIKE else np.full(n * m, begin)

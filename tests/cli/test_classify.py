@@ -15,7 +15,7 @@ import pandas as pd
 import pytest
 
 from tests.cli.conftest import Bench, StandIn, shares, words_of
-from thermogrip.classify.decisions.predict import Answer, Deviation, Note
+from thermogrip.classify.decisions.predict import Answer, Note
 from thermogrip.classify.estimators.posterior import PosteriorClassifier
 from thermogrip.cli import classify as verb
 from thermogrip.cli.classify import SHOWN, say_names, touched_part, training_part
@@ -68,14 +68,12 @@ def gripper(bench: Bench, stand_in: StandIn) -> SimpleNamespace:
     stand_in(f"{QUALITY}.check_grasps", quality)
     made.posteriors = stand_in(
         "thermogrip.sysid.effusivity.posterior.effusivity_posterior",
-        lambda device, record, coupling, other_gripper: [
-            effusivity_row(str(n), 1e3) for n in record["grasp"].values
-        ],
+        lambda device, record, coupling: [effusivity_row(str(n), 1e3) for n in record["grasp"].values],
     )
     made.explained = stand_in(
         "thermogrip.classify.decisions.predict.unexplained_effusivities",
         lambda device, record, *_: (
-            {"a": Deviation(4.5, "odd"), "b": Deviation(-0.25, "")} if "a" in record["grasp"].values else {}
+            {"a": (4.5, "odd"), "b": (-0.25, "")} if "a" in record["grasp"].values else {}
         ),
     )
     return made
@@ -123,21 +121,6 @@ def test_grasps_may_be_a_pattern_and_are_not_written_over(gripper: SimpleNamespa
     assert {each: each.read_bytes() for each in path.glob("*.csv")} == files
 
 
-def test_the_bundled_gripper_may_be_another_one(gripper: SimpleNamespace, stand_in: StandIn) -> None:
-    posteriors = stand_in(
-        "thermogrip.sysid.effusivity.posterior.effusivity_posterior",
-        lambda device, record, coupling, other_gripper: [
-            replace(effusivity_row(str(n), 1e3), other_gripper=0.9 * (other_gripper == 0.5))
-            for n in record["grasp"].values
-        ],
-    )
-    done = gripper.bench.run("effusivity", "grasps.csv", "--out", "e.csv")
-    assert "read as by another gripper than the bundled one" in done.err
-    done = gripper.bench.run("effusivity", "grasps.csv", "--calibrate", "more.csv", "--out", "e.csv")
-    assert "another gripper" not in done.err
-    assert len(posteriors) == 4  # both records, twice
-
-
 def test_a_grasp_without_a_contact_has_no_effusivity(gripper: SimpleNamespace) -> None:
     gripper.why = ["no contact", ""]
     done = gripper.bench.run("effusivity", "grasps.csv", "--out", "e.csv")
@@ -148,7 +131,7 @@ def test_a_grasp_without_a_contact_has_no_effusivity(gripper: SimpleNamespace) -
     assert answer["without_contact"] == ["a", "c"]
     first = answer["grasps"][0]
     unknown = {key for key, value in first.items() if value is None}
-    assert set(first) - {"grasp_id", "misfit_sd", "other_gripper"} == unknown
+    assert set(first) - {"grasp_id", "misfit_sd"} == unknown
     assert answer["grasps"][1]["effusivity"] == 1000.0
     assert len(gripper.posteriors) == 2  # of the first record alone, twice
 
@@ -484,16 +467,6 @@ def test_requests_are_answered_by_lines_or_over_http(named: SimpleNamespace, sta
     assert (refused.code, "thermogrip[live]" in refused.said[0]) == (2, True)
 
 
-@pytest.mark.parametrize("option", ["--early", "--next-touch"])
-@pytest.mark.parametrize("other", [["--other-gripper"], ["--known", "more.csv"]])
-def test_of_another_gripper_nothing_is_foreseen(
-    option: str, other: list[str], named: SimpleNamespace
-) -> None:
-    done = named.bench.run("classify", "m", "grasps.csv", *other, option, "--out", "p.csv")
-    assert (done.code, done.said[0].startswith(f"thermogrip: {option} needs a known gripper")) == (2, True)
-    assert not named.loaded
-
-
 def test_another_gripper_is_known_by_its_grasps_or_not_at_all(
     named: SimpleNamespace, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -505,24 +478,16 @@ def test_another_gripper_is_known_by_its_grasps_or_not_at_all(
         lambda self, known: (asked.append(known), "another")[1],
     )
     words = ["classify", "m", "grasps.csv", "--out", "p.csv"]
-    for other in (["--other-gripper"], ["--known", "more.csv"], []):
+    for other in (["--known", "more.csv"], []):
         assert named.bench.run(*words, *other).code == 0
-    assert asked == [None, [named.record]]
-    assert [call.args[0] for call in named.asked] == ["another", "another", named.model]
-    assert named.bench.run(*words, "--same-gripper").code == 0
-    certain = named.asked[-1].args[0]
-    assert (certain.gripper, certain.finish) == ("same", "known")
-    assert (named.model.gripper, named.model.finish) == ("auto", "auto")
-    refused = named.bench.run(*words, "--same-gripper", "--known", "more.csv")
-    assert (refused.code, "--same-gripper contradicts" in refused.said[0]) == (2, True)
+    assert asked == [[named.record]]
+    assert [call.args[0] for call in named.asked] == ["another", named.model]
     named.model = "a model"
-    refused = named.bench.run(*words, "--other-gripper")
+    refused = named.bench.run(*words, "--known", "more.csv")
     assert (refused.code, "train a posterior classifier" in refused.said[0]) == (2, True)
 
 
-def test_another_touch_is_a_column_of_its_own(
-    named: SimpleNamespace, stand_in: StandIn
-) -> None:
+def test_another_touch_is_a_column_of_its_own(named: SimpleNamespace, stand_in: StandIn) -> None:
     def advise(*_: Any, **__: Any) -> list[dict[str, Any]]:
         return [{"next_touch_degC": 15.0, "next_touch_accuracy": 0.9}, {"next_touch_degC": None} | {
             "next_touch_accuracy": None}]  # fmt: skip

@@ -106,7 +106,7 @@ effusivity: GRASPS... --out --calibrate --object-range --report --seed=0>0 --wor
   --json=False
 train: GRASPS... --classifier --out --split --stop-error>0.001<0.5 --quick=False --seed=0>0 --json=False
 classify: MODEL_DIR GRASPS... --out --materials --early=False --next-touch=False --nearest=False
-  --other-gripper=False --same-gripper=False --known --object-range --serve=False --port>0<65535
+  --known --object-range --serve=False --port>0<65535
   --seed=0>0 --workers=1>1 --cluster --json=False
 compare: GRASPS... --out --test --classifiers --repeats=20>0 --train-per-class=5>1 --by --curves=False
   --quick=False --seed=0>0 --workers=1>1 --cluster --json=False

@@ -101,7 +101,7 @@ def a_gripper() -> dict[str, Any]:
     return load_default_gripper().to_dict() | {"schema": "thermogrip.device", "version": 2}
 
 
-def an_uncertain_gripper() -> dict[str, Any]:
+def a_gripper_with_a_covariance() -> dict[str, Any]:
     return a_gripper() | another_gripper(load_default_gripper()).to_dict()
 
 
@@ -137,7 +137,7 @@ def use_coupling(path: Path) -> None:
         pytest.param(a_stop_rule, StopRule.load, id="stop rule"),
         pytest.param(a_coupling, use_coupling, id="coupling"),
         pytest.param(a_gripper, use_gripper, id="gripper", marks=pytest.mark.slow),
-        pytest.param(an_uncertain_gripper, GripperModel.load, id="uncertain gripper"),
+        pytest.param(a_gripper_with_a_covariance, GripperModel.load, id="gripper with a covariance"),
     ],
 )
 def test_any_number_of_a_settings_file_is_used_or_refused(

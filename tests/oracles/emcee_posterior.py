@@ -1,7 +1,7 @@
 """Samples of one grasp's posterior by emcee, without Laplace's method or a grid: the engine's check.
 
-The five unknowns of :class:`~thermogrip.sysid.effusivity.posterior_grid.MarginalPosterior` have a
-posterior that is curved and, in metals, long.  A sampler is quick where its target is a standard normal, so
+Given level and object temperature, which are integrated exactly, five unknowns are left, whose posterior
+is curved and, in metals, long.  A sampler is quick where its target is a standard normal, so
 it samples in whitened coordinates z, in which Laplace's method on the grid makes the posterior one,
 
     x = Q(Phi(z_0)),   (ln h, ln tau_b, t0, ln C) = m(x) + L(x) (z_1, ..., z_4),
@@ -21,10 +21,16 @@ from numpy.typing import NDArray
 from scipy.special import ndtr
 
 from thermogrip.datasets.schema import Grasps
-from thermogrip.sysid.effusivity.data import Touches, touches
+from thermogrip.sysid.effusivity.data import Touches, touches, whiten
 from thermogrip.sysid.effusivity.gripper_model import GripperModel
-from thermogrip.sysid.effusivity.laplace_approximation import fit_pairs, free_hypotheses
-from thermogrip.sysid.effusivity.posterior_grid import LN_E_RANGE, SAMPLED, MarginalPosterior, grid_posteriors
+from thermogrip.sysid.effusivity.laplace_approximation import (
+    fit_pairs,
+    free_hypotheses,
+    nodes_for,
+    predict,
+    prior_of,
+)
+from thermogrip.sysid.effusivity.posterior_grid import LN_E_RANGE, grid_posteriors
 
 Array = NDArray[np.float64]
 
@@ -51,10 +57,57 @@ class ChainPosterior:
     acceptance: float
 
 
+SAMPLED = [5, 0, 1, 2, 6]  # of the nuisances: ln e, ln h, ln tau_b, t0, ln C
+
+
+class MarginalPosterior:
+    """Log posterior of (ln e, ln h, ln tau_b, t0, ln C), up to a constant, level and object temperature
+    integrated: these enter the readings linearly."""
+
+    def __init__(self, device: GripperModel, data: Touches) -> None:
+        self.device, self.data, self.nodes = device, data, nodes_for(data)
+        self.whitener = whiten(data, device.noise)[0][0]
+
+    def __call__(self, points: Array) -> Array:
+        """Return the log posterior (n_point,) at points (n_point, 5); -inf outside the prior's range."""
+        rows = self.data.take(np.zeros(len(points), dtype=np.int64))
+        prior = prior_of(self.device, rows, free_hypotheses(self.device, points[:, 0]))
+        u = prior.mean.copy()
+        u[:, SAMPLED] = points
+        y = predict(self.device.stack, self.nodes, rows, u)
+        residual, columns = (rows.y - y) @ self.whitener.T, []
+        for k in (3, 4):
+            moved = u.copy()
+            moved[:, k] += 1.0
+            step = predict(self.device.stack, self.nodes, rows, moved) - y
+            columns.append(step @ self.whitener.T * prior.sd[:, k, None])
+        known = self._log_normal(residual, np.stack(columns, axis=2))
+        if np.isfinite(self.data.t_object[0]):  # one stated temperature in twenty is three times as far off
+            columns[1] = 3.0 * columns[1]
+            slip = self._log_normal(residual, np.stack(columns, axis=2))
+            known = np.logaddexp(np.log(0.95) + known, np.log(0.05) + slip)
+        for k in SAMPLED[1:]:
+            w, dof = (points[:, SAMPLED.index(k)] - prior.mean[:, k]) / prior.sd[:, k], prior.dof[:, k]
+            nu = np.where(np.isinf(dof), 1.0, dof)
+            student = -0.5 * (nu + 1) * np.log1p(w**2 / nu)
+            known += np.where(np.isinf(dof), -0.5 * w**2, student) - np.log(prior.sd[:, k])
+        inside = (points[:, 0] >= LN_E_RANGE[0]) & (points[:, 0] <= LN_E_RANGE[1])
+        return np.where(inside, known, -np.inf)
+
+    @staticmethod
+    def _log_normal(residual: Array, columns: Array) -> Array:
+        """Return the log density of residuals (n, n_bin) of covariance I + V V', V (n, n_bin, 2), but for a
+        constant."""
+        matrix = np.eye(2) + columns.transpose(0, 2, 1) @ columns
+        along = np.einsum("nbk,nb->nk", columns, residual)
+        explained = (along * np.linalg.solve(matrix, along[:, :, None])[:, :, 0]).sum(axis=1)
+        return np.asarray(-0.5 * ((residual**2).sum(axis=1) - explained + np.linalg.slogdet(matrix)[1]))
+
+
 class WhitenedPosterior:
     """The posterior in coordinates z (n_point, 5) in which it is nearly a standard normal."""
 
-    n = MarginalPosterior.n
+    n = len(SAMPLED)
 
     def __init__(self, device: GripperModel, data: Touches) -> None:
         self.target = MarginalPosterior(device, data)

@@ -133,8 +133,7 @@ def effusivity(
 ) -> int:
     """Find the effusivity of what was touched, grasp by grasp.
 
-    Without --calibrate the calibration of the bundled example gripper is used, with a warning, and where
-    another gripper explains a file better, as wide as such grippers differ. Touches of one
+    Without --calibrate the calibration of the bundled example gripper is used, with a warning. Touches of one
     block (touch_group) share one posterior of the effusivity, which needs no object temperature. A grasp that
     shows no contact, or moves away from its t_object, has none: its numbers are nan. Readings at the end of
     the sensor's range are left out, and of single touches what is later than the calibration's contacts. A
@@ -148,8 +147,7 @@ def effusivity(
     pool = cli.workers_of(workers, cluster, *NEEDED)
     console = Console(as_json)
     device, coupling, longest = calibrated_device(console, calibrate or [], seed)
-    # the bundled gripper may have taken these grasps or not
-    ask = _Effusivity(device, coupling, longest, stated, 0.0 if calibrate else 0.5)
+    ask = _Effusivity(device, coupling, longest, stated)
     found = answer_files(console, "effusivity", grasps, ask.answer, out, pool, "nan")
     rows = [row for each in found for row in each["rows"]]
     shown = [
@@ -287,16 +285,13 @@ def classify(
     nearest: Annotated[
         bool, cli.flag("--nearest", "Name the likeliest candidate also where none is likelier [posterior].")
     ] = False,
-    other_gripper: Annotated[
-        bool, cli.flag("--other-gripper", "Another gripper of the same kind took these grasps [posterior].")
-    ] = False,
-    same_gripper: Annotated[
-        bool,
-        cli.flag("--same-gripper", "The gripper and the blocks of the training for certain [posterior]."),
-    ] = False,
     known: Annotated[
         list[str] | None,
-        cli.opt("--known", "GRASPS", "Labelled grasps of that other gripper, one or more; may be repeated."),
+        cli.opt(
+            "--known",
+            "GRASPS",
+            "Labelled grasps of the gripper that took these, if it is another one of the kind [posterior].",
+        ),
     ] = None,
     between: ObjectRange = None,
     serve: Annotated[
@@ -319,9 +314,8 @@ def classify(
     each contact could have ended. --next-touch adds next_touch_degC, empty where no touch gains 0.001 of
     accuracy a second, and the accuracy expected after it. The material is 'unknown' where it is likelier none
     of the candidates, but for --nearest. A model is trained on
-    one gripper and its blocks; each file decides whether another gripper or other blocks explain it better,
-    and is then answered as unsurely as these differ. --same-gripper and --other-gripper say which it is,
-    --known what the other one reads of blocks it knows.
+    one gripper and its blocks; a grasp unlike those, by another gripper or of another block, is answered
+    less surely. --known says what another gripper reads of blocks it knows.
 
     Files are read one by one, workers share them out. Where --out is a folder each file's table is written
     there when it is done. --serve takes one object a line,
@@ -331,15 +325,6 @@ def classify(
     stated = _range(between)
     if serve == bool(paths) or serve == (out is not None) or (port is not None and not serve):
         raise UserError("give GRASPS and --out, or --serve alone", hint="--port belongs to --serve")
-    other_gripper = other_gripper or bool(known)
-    if same_gripper and other_gripper:
-        problem = "--same-gripper contradicts --other-gripper and --known"
-        raise UserError(problem, hint="give one of them")
-    if other_gripper and (early or next_touch):
-        problem = (
-            f"{'--early' if early else '--next-touch'} needs a known gripper, and another one is uncertain"
-        )
-        raise UserError(problem, hint="leave it out, or train on grasps of the new gripper")
     if out is not None:
         check_place(out, [*(paths or ()), *(known or ())])
     pool = cli.workers_of(workers, cluster, *NEEDED)
@@ -351,7 +336,7 @@ def classify(
     anywhere = Path.absolute if cluster else Path  # its workers run in other folders
     ask = _Question(
         anywhere(model_dir), cli.comma(candidates), stated, early=early, next_touch=next_touch,
-        nearest=nearest, other_gripper=other_gripper, same_gripper=same_gripper,
+        nearest=nearest,
         known=tuple(str(anywhere(Path(path))) for path in known or ()),
         changed_at=_changed_at([model_dir, *(known or ())]),
     )  # fmt: skip
@@ -425,8 +410,6 @@ class _Question:
     early: bool = False
     next_touch: bool = False
     nearest: bool = False
-    other_gripper: bool = False
-    same_gripper: bool = False
     known: tuple[str, ...] = ()
     changed_at: int = 0  # of the model's files [ns]: a worker of a cluster loads another model then
 
@@ -452,11 +435,8 @@ class _Question:
 
         model = load_classifier(self.model_dir)
         rule = load_stop_rule(self.model_dir) if self.early else None
-        if self.other_gripper:
-            known = read_grasp_files(self.known) if self.known else None
-            model = _with_gripper(model).for_another_gripper(known)
-        if self.same_gripper:
-            model = _with_gripper(model).certain()
+        if self.known:
+            model = _with_gripper(model).for_another_gripper(read_grasp_files(self.known))
 
         def rows_of(record: Grasps) -> list[dict[str, Any]]:
             found = answer(
@@ -499,13 +479,12 @@ class Said:
 
 @dataclass(frozen=True)
 class _Effusivity:
-    """What is asked about the effusivity of each grasp; ``other`` is the probability of another gripper."""
+    """What is asked about the effusivity of each grasp."""
 
     device: GripperModel
     coupling: Coupling | None
     longest: float
     stated: tuple[float, float] | None
-    other: float
 
     def answer(self, record: Grasps) -> dict[str, Any]:
         """Return the rows of a record, what is not explained or missing, and warnings of it."""
@@ -516,17 +495,12 @@ class _Effusivity:
         cli.warn_of_contacts(said, [record])
         record = _as_taught(said, record, self.longest, self.coupling)
         ranged = with_object_range(record, self.stated)
-        found = _effusivities(self.device, ranged, self.coupling, self.other)
-        if max(row.other_gripper for row in found) > 0.5:
-            said.warn(
-                f"{record.attrs['name']}: read as by another gripper than the bundled one: intervals are as "
-                "wide as grippers differ"
-            )
+        found = _effusivities(self.device, ranged, self.coupling)
         misfits = unexplained_effusivities(self.device, record, found, self.stated)
         rows = [asdict(row) for row in found]
         for row in rows:
-            row["misfit_sd"] = misfits[row["grasp_id"]].sd if row["grasp_id"] in misfits else float("nan")
-        unexplained = {name: found.words for name, found in misfits.items() if found.words}
+            row["misfit_sd"] = misfits.get(row["grasp_id"], (float("nan"), ""))[0]
+        unexplained = {name: words for name, (_, words) in misfits.items() if words}
         return {
             "rows": rows, "unexplained": unexplained, "missed": _missed(record, rows), "warnings": said.words
         }  # fmt: skip
@@ -573,25 +547,16 @@ def _as_taught(console: cli.Warner, record: Grasps, longest: float, coupling: Co
     return record.sel(time=slice(None, quality.until + 1e-9))
 
 
-def _effusivities(
-    device: GripperModel, record: Grasps, coupling: Coupling | None, other: float
-) -> list[EffusivityRow]:
+def _effusivities(device: GripperModel, record: Grasps, coupling: Coupling | None) -> list[EffusivityRow]:
     """Return a row a grasp; one without contact has no numbers, and no part in its block."""
     from thermogrip.sysid.effusivity import EffusivityRow, check_grasps, effusivity_posterior
 
     quality = check_grasps(record)
     touched = quality.usable_grasps(record)
-    found = (
-        []
-        if touched is None
-        else effusivity_posterior(device, touched, coupling=coupling, other_gripper=other)
-    )
-    left = iter(found)
-    nothing = [float("nan")] * 8
-    names = [str(name) for name in record["grasp"].values]
-    return [
-        next(left) if usable else EffusivityRow(name, *nothing) for name, usable in zip(names, quality.usable)
-    ]
+    found = iter([] if touched is None else effusivity_posterior(device, touched, coupling=coupling))
+    names, nothing = map(str, record["grasp"].values), [float("nan")] * 8
+    pairs = zip(names, quality.usable)
+    return [next(found) if usable else EffusivityRow(name, *nothing) for name, usable in pairs]
 
 
 def _range(text: str | None) -> tuple[float, float] | None:

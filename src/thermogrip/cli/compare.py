@@ -39,7 +39,7 @@ def compare(
         cli.opt(
             "--classifiers",
             "LIST",
-            "Those of train, forest, svm-pca, rocket, A+B (their mean), or module:Class or "
+            "Those of train, forest, svm-pca, rocket, or module:Class or "
             "module:object of scikit-learn (imported) [default: lstm where PyTorch is installed, posterior, "
             "bayes, features-lda, pca-lda].",
             classifier_names,

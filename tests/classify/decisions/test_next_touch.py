@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import multivariate_normal, norm
 
-from thermogrip.classify import Costs, choose_next_touch, make_classifier, name_or_unknown
+from thermogrip.classify import choose_next_touch, make_classifier
 from thermogrip.classify.decisions import next_touch
 from thermogrip.classify.decisions.next_touch import (
     NextTouch,
@@ -107,44 +107,6 @@ def test_readings_never_cost_accuracy_nor_add_more_than_is_missing(m: int, width
     assert 0 <= found.information[0] <= entropy(log_p)[0] + 1e-9
     assert found.gain[0] >= 0
     assert found.accuracy[0] <= 1 + 1e-9
-
-
-def test_unknown_is_answered_where_it_is_the_cheaper_mistake() -> None:
-    names, p = ["iron", "wood"], [[0.95, 0.05], [0.55, 0.45], [0.95, 0.05]]
-    outside = [0.02, 0.02, 0.6]
-    assert name_or_unknown(p, outside, names).tolist() == ["iron", "iron", "unknown"]
-    # a rejection that costs little is used where the candidates are alike, too
-    careful = Costs(rejected=0.3)
-    assert name_or_unknown(p, outside, names, costs=careful).tolist() == ["iron", "unknown", "unknown"]
-    assert Costs() == Costs(rejected=0.5, missed=1.0)
-    assert name_or_unknown([[0.5, 0.5]], [0.0], names).tolist() == ["iron"]  # at equal costs a name
-    bold = Costs(rejected=1e6)
-    assert name_or_unknown(p, outside, names, costs=bold).tolist() == ["iron"] * 3
-    # a grasp without an answer is unknown whatever that costs
-    nothing = name_or_unknown([[np.nan, np.nan], [0.9, 0.1]], [np.nan, 0.0], names, costs=bold)
-    assert nothing.tolist() == ["unknown", "iron"]
-    with pytest.raises(UserError, match="p_unknown is missing"):
-        name_or_unknown(p, [np.nan, 0.0, 0.0], names)
-    for none in ({"missed": 0.0}, {"rejected": 0.0}, {"rejected": -1.0}):
-        with pytest.raises(UserError, match="not positive"):
-            Costs(**none)
-
-
-@given(
-    st.lists(st.floats(0.01, 1.0), min_size=2, max_size=4),
-    st.floats(0.0, 1.0),
-    st.floats(0.05, 3.0),
-    st.floats(0.05, 3.0),
-)
-def test_the_answer_is_the_one_of_the_least_expected_cost(
-    share: list[float], outside: float, rejected: float, missed: float
-) -> None:
-    p = np.array(share) / np.sum(share)
-    names = [f"m{k}" for k in range(p.size)]
-    costs = {name: outside * missed + (1 - outside) * (1 - q) for name, q in zip(names, p)}
-    costs["unknown"] = (1 - outside) * rejected
-    said = name_or_unknown([p], [outside], names, costs=Costs(rejected=rejected, missed=missed))[0]
-    assert costs[said] <= min(costs.values()) + 1e-12
 
 
 def test_the_second_touch_is_asked_far_from_the_first(known: PosteriorClassifier, touched: Grasps) -> None:

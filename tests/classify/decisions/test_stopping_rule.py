@@ -368,7 +368,7 @@ def test_a_record_ends_when_its_stream_did_also_where_the_contact_is_late(
             decided = p if decided is None and touch.decided_at is not None else decided
         assert row["decided_at_s"] == (touch.decided_at or 10.0)
         np.testing.assert_allclose([row[f"p_{name}"] for name in THREE], decided or p, atol=1e-3)
-        batch = np.exp(known.certain().candidate_log_proba(pick(some, [i]), THREE)[0])
+        batch = np.exp(known.candidate_log_proba(pick(some, [i]), THREE)[0])
         np.testing.assert_allclose(p, batch, atol=1e-3)
         np.testing.assert_allclose(list(touch.result().values()), batch, atol=1e-12)
 

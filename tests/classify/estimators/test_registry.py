@@ -15,14 +15,13 @@ import pytest
 
 from thermogrip.classify import (
     CLASSIFIERS,
-    evaluate,
     load_classifier,
     make_classifier,
     save_classifier,
 )
 from thermogrip.classify.estimators.base import GraspClassifier
 from thermogrip.classify.estimators.lda import ArrayClassifier
-from thermogrip.classify.estimators.registry import VoteClassifier, can_be_saved, classifier_name
+from thermogrip.classify.estimators.registry import can_be_saved
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Grasps
 from thermogrip.sysid.effusivity.gripper_model import GripperModel, load_default_gripper
@@ -153,9 +152,7 @@ def test_a_network_of_other_classes_is_refused(
         load_classifier(damaged(folder, lambda head: head["classes"].pop()))
 
 
-@pytest.mark.parametrize(
-    ("name", "value"), [("prior_unknown", "x"), ("finish", 3), ("priors", {"wood": "x"})]
-)
+@pytest.mark.parametrize(("name", "value"), [("prior_unknown", "x"), ("priors", {"wood": "x"})])
 def test_a_damaged_parameter_is_refused(
     name: str, value: object, known: GraspClassifier, tmp_path: Path
 ) -> None:
@@ -183,40 +180,3 @@ def test_a_gripper_that_no_material_makes_is_refused(name: str, value: float) ->
     inner[name] = value
     with pytest.raises(UserError, match=re.escape(f"{name} is {value:g}, not ")):
         GripperModel.from_dict(content)
-
-
-def test_a_vote_is_the_mean_of_its_members_probabilities(three: Grasps) -> None:
-    names = ("bayes", "features-lda", "pca-lda")
-    vote = make_classifier("+".join(names)).fit(three)
-    alone = [make_classifier(name).fit(three).predict_proba(three) for name in names]
-    np.testing.assert_allclose(vote.predict_proba(three), np.mean(alone, axis=0), rtol=1e-12, atol=1e-300)
-    found = evaluate(["bayes+pca-lda", "bayes"], [three], probe=False)
-    assert [row["classifier"] for row in found.scores()] == ["bayes+pca-lda", "bayes"]
-
-
-def test_its_name_is_its_members_and_it_gives_each_the_seed() -> None:
-    vote = make_classifier("svm-pca+lstm", quick=True, seed=5)
-    assert isinstance(vote, VoteClassifier)
-    assert classifier_name(vote) == "svm-pca+lstm"
-    assert [member.get_params()["random_state"] for member in vote.members] == [5, 5]
-    assert vote.members[1].get_params()["epochs"] == 200
-    assert not can_be_saved(vote)
-
-
-@pytest.mark.parametrize(
-    ("name", "params", "said"),
-    [
-        ("bayes+posterior", {}, "joins the touches of a block"),
-        ("bayes+", {}, "no classifier is called"),
-        ("bayes+nothing", {}, "nothing"),
-        ("bayes+pca-lda", {"n": 3}, "no parameters"),
-    ],
-)
-def test_what_can_be_no_vote_is_refused(name: str, params: dict[str, int], said: str) -> None:
-    with pytest.raises(UserError, match=said):
-        make_classifier(name, **params)
-
-
-def test_a_vote_of_one_is_refused(three: Grasps) -> None:
-    with pytest.raises(UserError, match="fewer than two"):
-        VoteClassifier([make_classifier("bayes")]).fit(three)

@@ -16,7 +16,7 @@ from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 
 from thermogrip.classify import evaluate, make_classifier
-from thermogrip.classify.estimators.base import JoinedClassifier, pick
+from thermogrip.classify.estimators.base import Answered, JoinedClassifier, pick
 from thermogrip.classify.estimators.bayes import BayesClassifier
 from thermogrip.classify.evaluation import harness
 from thermogrip.classify.evaluation.comparison import Comparison
@@ -322,8 +322,9 @@ def test_two_touches_of_a_block_are_one_decision(make_touches: Maker) -> None:
 
 def test_materials_that_were_no_candidates_are_counted_apart(make_touches: Maker) -> None:
     class Novelty(ReadsTheName):
-        def p_unknown(self, X: Grasps, candidates: object = None) -> np.ndarray:
-            return np.where(np.isin(X["material"].values, ["copper", "wood"]), 0.1, 0.9)
+        def _answered(self, grasps: Grasps, names: list[str]) -> Answered:
+            p_unknown = np.where(np.isin(grasps["material"].values, ["copper", "wood"]), 0.1, 0.9)
+            return super()._answered(grasps, names)._replace(p_unknown=p_unknown)
 
     known = make_touches(("copper", "wood"), name="known")
     strange = make_touches(("zinc",), name="strange", seed=3).assign(split=("grasp", np.full(8, "test")))

@@ -69,4 +69,4 @@ def drawn_gripper(gripper: GripperModel, seed: int) -> GripperModel:
         for name, b in gripper.blocks.items()
     }
     shared = {name: getattr(gripper, name) + by[name] for name in ("onset", "transit_loss", "bias")}
-    return replace(gripper, stack=stack_of(numbers), blocks=blocks, uncertain=False, **shared)
+    return replace(gripper, stack=stack_of(numbers), blocks=blocks, **shared)

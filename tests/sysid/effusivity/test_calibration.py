@@ -216,13 +216,11 @@ def test_a_few_known_grasps_teach_the_other_gripper(device):
     fresh = simulated(truth, FIVE, n=4, t_gripper=23.0, t_object=43.0, seed=2)
     at = np.array([FIVE.index(name) for name in fresh["material"].values])
     model = calibrate_gripper([known], prior=other)
-    taught, untaught, first = (
+    taught, untaught = (
         -np.log(np.maximum(material_posterior(g, fresh, FIVE)[np.arange(at.size), at], 1e-12)).mean()
-        for g in (model, other, device)
+        for g in (model, device)
     )
     assert taught < untaught - 0.1
-    assert taught < first
-    assert model.uncertain
     assert set(model.materials) == set(FIVE)
 
 
@@ -261,7 +259,6 @@ def test_one_calibration_after_another_is_both_at_once(device, files, learnt):
         one, other = (numbers_of(d)[name] for d in (then, learnt))
         assert abs(one - other) < 1.0 * sd, name
         assert 0.7 < then.uncertainty.sd(name) / sd < 1.4, name
-    assert not then.uncertain
     assert then.trained_on == (*first.trained_on, "exp2_dT20")
     assert then.blocks["copper"].n_grasp == learnt.blocks["copper"].n_grasp
 

@@ -25,7 +25,8 @@ DOF = np.array([np.inf, 6.0, 4.0, np.inf, np.inf, 5.0, np.inf])
 
 
 def law(u, mean):
-    return kernel.Penalty(*(part[0] for part in kernel.penalty(u[None], mean[None], SD[None], DOF[None])))
+    found = kernel.Law.of(mean[None], SD[None], DOF[None]).penalty(u[None])
+    return kernel.Penalty(*(part[0] for part in found))
 
 
 def test_the_penalty_is_the_priors_density_beside_its_peak():
@@ -129,7 +130,7 @@ def test_a_candidate_far_behind_is_left_and_changes_no_other():
     gripper, record = load_default_gripper(), load_example_grasps()["exp1A_obj43_grip23"]
     data = touches(record.isel(grasp=np.flatnonzero(record["material"].values == "copper")[:3]))
     names = ["copper", "iron", "wood"]
-    raced, _, row = fit_candidates(gripper, data, names)
+    raced, _, row, *_ = fit_candidates(gripper, data, names)
     one = material_hypotheses(gripper, names)
     alone = fit_pairs(gripper, data, row, type(one)(*(np.tile(column, 3) for column in one)))
     found = raced.log_evidence.reshape(3, 3)

@@ -18,7 +18,7 @@ from scipy.stats import t as student_t
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.materials import find_material, load_materials
 from thermogrip.sysid.effusivity.data import KNOTS, touches, whiten
-from thermogrip.sysid.effusivity.gripper_model import Discrepancy, another_gripper
+from thermogrip.sysid.effusivity.gripper_model import Discrepancy
 from thermogrip.sysid.effusivity.laplace_approximation import (
     find_modes,
     fit_pairs,
@@ -29,7 +29,7 @@ from thermogrip.sysid.effusivity.laplace_approximation import (
     prior_of,
 )
 from thermogrip.sysid.effusivity.posterior import (
-    _rows,
+    _row,
     effusivity_posterior,
     material_evidence,
     material_fit,
@@ -45,45 +45,6 @@ from thermogrip.sysid.effusivity.posterior_grid import (
 
 from ...oracles.emcee_posterior import emcee_posterior
 from .makers import FIVE, drawn_from_the_prior, simulated, split_of
-
-
-def test_grasps_decide_whether_another_gripper_took_them(device):
-    home = simulated(device, FIVE, t_gripper=23.0, t_object=43.0, seed=1)
-    own = effusivity_posterior(device, home)
-    either = effusivity_posterior(device, home, other_gripper=0.5)
-    assert 0 < either[0].other_gripper < 0.01
-    assert [replace(row, other_gripper=0.0) for row in either] == own
-    stack = replace(device.stack, lag=2.5 * device.stack.lag, z_outer=1.3 * device.stack.z_outer)
-    strange = simulated(
-        replace(device, stack=stack), ["copper", "iron", "wood"], t_gripper=23.0, t_object=43.0, seed=2
-    )
-    e = np.array([find_material(name).effusivity for name in strange["material"].values])
-    found = [effusivity_posterior(device, strange, other_gripper=p) for p in (0.0, 0.5)]
-    assert min(row.other_gripper for row in found[1]) > 0.99
-    holds = [[row.effusivity_p05 <= x <= row.effusivity_p95 for row, x in zip(rows, e)] for rows in found]
-    assert sum(holds[1]) == 3
-    widths = [[np.log(row.effusivity_p95 / row.effusivity_p05) for row in rows] for rows in found]
-    assert np.mean(widths[1]) > np.mean(widths[0])
-
-
-def test_either_gripper_s_answer_is_the_mixture_of_both(device):
-    some = simulated(device, ["iron"], n=3, t_gripper=23.0, t_object=43.0, seed=4)
-    data = touches(some)
-    own, other = (grid_posteriors(g, data) for g in (device, another_gripper(device)))
-    # of a prior of 0.99, by all that the three say
-    odds = 99.0 * np.exp(sum(b.log_evidence - a.log_evidence for a, b in zip(own, other)))
-    share, own, other = odds / (1 + odds), own[0], other[0]
-    row = effusivity_posterior(device, some, other_gripper=0.99)[0]
-    assert effusivity_posterior(device, some.isel(grasp=[0, 1]), other_gripper=0.99)[0].other_gripper == 0.0
-    assert row.other_gripper == pytest.approx(share, rel=1e-9)
-    assert 0.05 < share < 0.95
-    means = [(fit.mass * (fit.x - device.effusivity_scale(fit.x)[0])).sum() for fit in (own, other)]
-    apart = _rows(device, ["", ""], [own, other], np.zeros(2))
-    alone = [row.log10_effusivity_sd * np.log(10) for row in apart]
-    alone[1] = np.hypot(alone[1], 0.6)  # no block anchors the other one's scale
-    mean = (1 - share) * means[0] + share * means[1]
-    variance = sum(w * (s**2 + (m - mean) ** 2) for w, s, m in zip((1 - share, share), alone, means))
-    assert row.log10_effusivity_sd * np.log(10) == pytest.approx(np.sqrt(variance), rel=1e-6)
 
 
 def test_every_solid_lies_in_the_prior_s_range_with_room_for_the_scale(device):
@@ -216,10 +177,9 @@ def test_a_measured_object_temperature_is_taken(device, files):
     assert row.t_object_p95 - row.t_object_p05 == pytest.approx(2 * 1.645 * 0.01, rel=0.05)
 
 
-@pytest.mark.parametrize("less", [{"finish": "unknown"}, {"until": 0.5}])
-def test_another_block_and_less_contact_time_are_less_certain(device, files, less):
+def test_less_contact_time_is_less_certain(device, files):
     test = split_of(files["exp1A_obj43_grip23"], "test")
-    own, other = (material_posterior(device, test, FIVE, **given) for given in ({}, less))
+    own, other = (material_posterior(device, test, FIVE, until=until) for until in (None, 0.5))
     assert other.max(axis=1).mean() < own.max(axis=1).mean()
 
 
@@ -249,7 +209,6 @@ def test_lost_samples_and_order_of_grasps_do_not_matter(device, files):
         (lambda d, g: material_evidence(d, g, ["copper", "unobtainium"]), "unobtainium"),
         (lambda d, g: material_evidence(d, g, ["copper", "copper"]), "twice"),
         (lambda d, g: material_evidence(d, g, []), "no candidate"),
-        (lambda d, g: material_evidence(d, g, ["copper"], finish="polished"), "finish"),
         (lambda d, g: effusivity_posterior(d, g, until=0.0), "after contact"),
         (lambda d, g: effusivity_posterior(d, g.assign(t_surface=g["t_surface"] + 273.15)), "give deg"),
         (
@@ -267,16 +226,16 @@ def test_a_row_is_made_of_two_mixtures(device):
     """Over two effusivities and two temperatures; the scale's error and an insulator's scatter on top."""
     x, mass, weight = np.array([7.0, 7.2]), np.array([0.3, 0.7]), np.array([0.25, 0.75])
     for shift in (0.0, 2.0):  # an insulator, a metal
-        t, t_sd, x_sd = np.array([20.0, 24.0]), np.array([0.1, 0.2]), shift * np.array([0.0, 0.3])
-        made = GridPosterior(x + shift, mass, 0.0, weight, t, t_sd, x, x_sd)
-        (row,) = _rows(device, ["g"], [made], np.zeros(1))
+        t, t_sd = np.array([20.0, 24.0]), np.array([0.1, 0.2])
+        made = GridPosterior(x + shift, mass, 0.0, weight, t, t_sd, x)
+        row = _row(device, "g", made)
         scale, sd = device.effusivity_scale(made.x)
-        sd = np.sqrt(sd**2 + x_sd**2 + (device.spreads.ln_effusivity**2 if shift == 0 else 0.0) + 1e-8)
+        sd = np.sqrt(sd**2 + (device.spreads.ln_effusivity**2 if shift == 0 else 0.0) + 1e-8)
         below = [
             (mass * norm.cdf((np.log(e) - made.x + scale) / sd)).sum()
             for e in (row.effusivity_p05, row.effusivity, row.effusivity_p95)
         ]
-        np.testing.assert_allclose(below, [0.05, 0.5, 0.95], atol=1e-7)
+        np.testing.assert_allclose(below, [0.05, 0.5, 0.95], atol=1e-5)
         mean = mass @ (made.x - scale)
         variance = mass @ ((made.x - scale) ** 2 + sd**2) - mean**2
         assert row.log10_effusivity_sd == pytest.approx(np.sqrt(variance) / 2.302585)
@@ -284,7 +243,7 @@ def test_a_row_is_made_of_two_mixtures(device):
             weight @ norm.cdf((t - made.t_object) / made.t_object_sd)
             for t in (row.t_object_p05, row.t_object, row.t_object_p95)
         ]
-        np.testing.assert_allclose(below, [0.05, 0.5, 0.95], atol=1e-7)
+        np.testing.assert_allclose(below, [0.05, 0.5, 0.95], atol=1e-5)
         assert (row.grasp_id, row.h_c) == ("g", pytest.approx(np.exp(7.15)))
 
 
@@ -341,4 +300,4 @@ def test_a_gripper_with_a_discrepancy_answers_as_unsurely_as_its_evidence(device
     np.testing.assert_allclose(np.diff(np.log(found.mass[::25])[near]), np.diff(value[near]), atol=0.05)
     (row,) = effusivity_posterior(odd, grasp)
     on_its_own = mixture_quantiles(found.weight, found.t_object, found.t_object_sd, (0.05, 0.5, 0.95))
-    assert [row.t_object_p05, row.t_object, row.t_object_p95] == pytest.approx(on_its_own - 0.8)
+    assert [row.t_object_p05, row.t_object, row.t_object_p95] == pytest.approx(np.array(on_its_own) - 0.8)
