@@ -20,11 +20,13 @@ MODULES = {
 
 
 @pytest.mark.parametrize(
-    ("skips", "counts"),
-    [("listed", "1 failed, 1 skipped, 1 xfailed, 2 errors"), ("", "4 skipped, 1 xfailed")],
+    ("skips", "counts", "shared"),
+    [
+        ("listed", "1 failed, 1 skipped, 1 xfailed, 2 errors", ["-n", "1"]),
+        ("", "4 skipped, 1 xfailed", []),
+    ],
     ids=["listed", "any"],
 )
-@pytest.mark.parametrize("shared", [[], ["-n", "1"]], ids=["one process", "shared out"])
 def test_a_skip_that_is_not_allowed_is_a_failure(
     tmp_path: Path, skips: str, counts: str, shared: list[str]
 ) -> None:
