@@ -233,6 +233,8 @@ def roles_of_data(
     clear = {role for name, role in roles.items() if name not in open_}
     if len(open_) == 1 and "disturbance" in clear and "output" not in clear:
         roles[open_[0]], out[open_[0]] = "output", ("output", "there is nothing else to predict")
+    elif len(names) == 1 and open_:
+        roles[open_[0]], out[open_[0]] = "output", ("output", "no other column moves")
     elif open_ and "input" not in roles.values():
         lead = dict(zip(names, gain.sum(axis=1)))
         for name in [n for n in open_ if net[n] > 0] or [max(open_, key=lambda n: lead[n])]:

@@ -273,7 +273,7 @@ def identify(
     kind = choose_model(held_out.rows, sum(len(case.held) for case in cases))
     kind = kind or (boxes.kept.kind if boxes.kept is not None else None)
     if kind is None:
-        raise _nothing_fitted((*boxes.refused, *held_out.refused), data.checked)
+        raise _nothing_fitted((*boxes.refused, *held_out.refused), data)
     plant, lost = _refit(kind, boxes.kept, held_out, data, wanted, parts)
     return _judged(kind, plant, lost, boxes, held_out, data, wanted)
 
@@ -773,10 +773,10 @@ def relative_error(row: Row) -> float:
     return row.rmse / max(row.no_input_rmse, 1e-12)
 
 
-def _nothing_fitted(refused: Sequence[str], checked: DataCheck) -> UserError:
-    noisy = [finding.says for finding in checked.of("noise") if finding.verdict != "ok"]
+def _nothing_fitted(refused: Sequence[str], data: _Data) -> UserError:
+    noisy = [finding.says for finding in data.checked.of("noise") if finding.verdict != "ok"]
     problem = f"no model could be fitted ({refused[0] if refused else 'none was asked for'})"
-    return UserError(problem, hint="; ".join(noisy) or None)
+    return UserError(problem, hint="; ".join([*noisy, *data.doubts]) or None)
 
 
 # refit: the chosen one on all logs, with what its uncertainty is drawn from

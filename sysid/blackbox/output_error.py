@@ -154,7 +154,7 @@ def refine(
                 best, damping = trial, damping / 5
                 break
             damping *= 5
-        if before - best.cost < ENOUGH * before:
+        if before - best.cost <= ENOUGH * before:  # both are 0 where every reading was lost
             break
     return best
 

@@ -314,11 +314,14 @@ def signals(
                 column=name,
                 hint="check the sensor, or leave it out with --outputs",
             )
-    for chosen, what in ((u, "input"), (y, "output")):
-        if not chosen:
-            have = ", ".join(str(name) for name in logs[0].data_vars)
-            hint = f"name it with --{what}s, of {have}" + (moved_before(logs[0]) if what == "input" else "")
-            raise UserError(f"no {what} among the columns", file=log_name(logs[0]), hint=hint)
+    lacking = [role for role, chosen in (("input", u), ("output", y)) if not chosen]
+    if lacking:
+        moving = [str(name) for name, item in logs[0].items() if np.nanmax(item) > np.nanmin(item)]
+        options = " and ".join(f"--{role}s" for role in lacking)
+        hint = f"name {'it' if len(lacking) == 1 else 'them'} with {options}, of {', '.join(moving)}"
+        hint += moved_before(logs[0]) if "input" in lacking else ""
+        problem = " and ".join(f"no {role}" for role in lacking) + " among the columns"
+        raise UserError(problem, file=log_name(logs[0]), hint=hint)
     return u, y, d
 
 

@@ -194,6 +194,12 @@ def test_one_column_beside_the_weather_is_the_output():
     assert roles == {"oat": "disturbance", "meter": "output"}
 
 
+def test_one_column_alone_is_read_and_not_moved():
+    columns = {"value": np.sin(np.arange(200.0) / 9), "feed_id": np.full(200, 635051.0)}
+    roles = assign_roles(dict.fromkeys(columns, "1"), columns=columns)
+    assert roles.of == {"value": "output", "feed_id": "other"}
+
+
 def test_columns_beyond_all_use_have_no_role_and_overflow_nothing():
     columns = {"u": HELD, "a": 8.988e307 * np.sign(NOISY), "b": plant_of(HELD)}
     roles = assign_roles(dict.fromkeys("uab", "1"), columns=columns).of

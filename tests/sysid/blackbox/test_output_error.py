@@ -64,6 +64,12 @@ def test_each_segment_has_an_initial_state_of_its_own(fit_one):
     assert model.gain()[0, 0] == pytest.approx(10.0, rel=1e-5)
 
 
+def test_a_search_ends_where_every_reading_was_lost():
+    drive = np.random.default_rng(0).random((80, 1))
+    found = Search()(Records([np.full(80, np.nan)], [drive]), 2, 1, 1)
+    assert found is None or np.isfinite(found.a).all()
+
+
 def test_lost_readings_carry_no_weight(first_order, fit_one):
     log = first_order.log(1000, noise=0.0)
     log["t"].values[::3] = np.nan

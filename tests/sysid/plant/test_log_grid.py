@@ -259,6 +259,10 @@ def test_what_cannot_be_fitted_is_refused_by_name():
         signals([make_log(T, {"q": (T, "1", "input")})])
     with pytest.raises(UserError, match=r"no input among the columns; name it with --inputs"):
         signals([make_log(T, {"t": (T, "degC", "output")})])
+    still = {"t": (T, "degC", "other"), "number": (0 * T, "1", "other")}
+    both = r"no input and no output among the columns; name them with --inputs and --outputs, of t$"
+    with pytest.raises(UserError, match=both):
+        signals([make_log(T, still)])
     with pytest.raises(UserError, match="no stretch has 20 rows of 20 s"):
         make_grid([log_of(T)], average=20.0)
     mute = log_of(3.0 * T, name="b")
