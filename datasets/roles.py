@@ -64,6 +64,7 @@ _BOOKKEEPING = re.compile(
     r"^(error|err|control_error|integral|derivative|[pid]_?(term|part|action)|k_?[pidc]|pid_[pid]"
     r"|hour|day|month|year|week|weekday|row|index|id|iteration|sample|record|counter)(_of_[a-z]+|_?no|_?\d+)?$"
 )
+_MODES = {"auto", "automatic", "manual", "mode", "status"}  # of a controller
 IS_SET_POINT = "its name is that of a set point"
 NO_CLUE = "neither its name nor its unit shows what it is"
 _NEVER_MOVES, _COUNTS_ROWS = "it never moves", "it counts rows or time"
@@ -189,9 +190,10 @@ def _controllers(
     reads, drives = (
         by_name.keys() & set(words) for words in (("input", "pv"), ("output", "op", "out", "co"))
     )
-    if reads and drives:
+    if drives and (reads or any(role == "output" for role, _ in guesses.values())):
         out |= {by_name[name]: ("output", f"{of_controller} what it reads") for name in reads}
         out |= {by_name[name]: ("input", f"{of_controller} what it drives") for name in drives}
+    out |= {by_name[n]: ("other", f"{of_controller} its mode") for n in by_name.keys() & _MODES}
     terms = by_name.keys() & {"p", "i", "d"}
     if len(terms) > 1:
         out |= {by_name[name]: ("other", f"{of_controller} one of its terms") for name in terms}

@@ -49,7 +49,7 @@ _NULLS = ["", "nan", "NaN", "NAN", "NA", "N/A", "null", "NULL", "None", "-nan", 
 _LOST = [*_NULLS, "-", "--", "---", "?", "*", "NaT", "unknown", "unavailable"]
 _COMMENT = ("#", "%", "//")  # how a line begins that is no row
 _LEFT_OUT = "\x1f"  # how the name of a column begins that is not kept
-_NAMELESS = "no header: columns named c1 to c{} by position; --columns a,b,... names them"
+_NAMELESS = "columns named c1 to c{} by position; --columns a,b,... names them"
 _HEAD_LINES = 200  # of a file, that show how it is a table
 #: A date, a time of day, or both, as a whole cell.
 STAMP = re.compile(
@@ -198,7 +198,11 @@ def find_layout(data: bytes, file: str) -> Layout:
     names, used = _names_above(head[:first], n, separator)
     hollow = not names[-1] and all(row[-1] == "" for row in rows)  # every line ends with a separator
     nameless = [f"c{at}" for at, name in enumerate(names[: n - hollow], 1) if not name]
-    notes = [_NAMELESS.format(n - hollow)] if len(nameless) == n - hollow else []
+    notes = []
+    if len(nameless) == n - hollow:
+        above = len(_split(head[first - 1][1].lstrip("#%/ "), separator)) if first else 0
+        why = f"{above} names above rows of {n} cells" if above > n else "no header"
+        notes = [f"{why}: {_NAMELESS.format(n - hollow)}"]
     if nameless and not notes:
         notes.append(f"without a name: {', '.join(nameless)}")
     for at, name in enumerate(names):
@@ -539,7 +543,7 @@ def read_matlab_table(path: str | Path, columns: Sequence[str] | None = None) ->
     if len(parts) == 1 and len(numbers) > 1:
         numbers = {f"c{at}": values for at, values in enumerate(numbers.values(), 1)}
         if columns is None:
-            notes.append(_NAMELESS.format(len(numbers)))
+            notes.append(f"no header: {_NAMELESS.format(len(numbers))}")
     if columns is not None:
         if len(columns) != len(numbers):
             raise _other_count(path, len(numbers), len(columns))

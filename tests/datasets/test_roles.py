@@ -184,6 +184,10 @@ def test_beside_a_set_point_input_and_output_are_the_controllers():
     roles = assign_roles(units, columns=columns).of
     assert roles == {"set": "other", "input": "output", "output": "input"}
     assert assign_roles(units, columns=columns, inputs=["input"]).of["input"] == "input"
+    named = {"automatic": 1.0 * (goal > 40), "temperature": columns["input"], "setpoint": goal, "output": pwm}
+    found = assign_roles(dict.fromkeys(named, "1"), columns=named)
+    assert [found.of[name] for name in named] == ["other", "output", "other", "input"]
+    assert not found.doubts
     del units["set"], columns["set"]
     assert assign_roles(units, columns=columns).of["input"] == "input"
 

@@ -22,6 +22,7 @@ from thermogrip.datasets.tables import (
     read_csv_table,
     read_matlab_table,
     read_parquet_table,
+    read_text_table,
     text_numbers,
     unused,
 )
@@ -386,3 +387,13 @@ def test_utf_16_text_is_read_and_is_refused_where_it_ends_within_a_letter(tmp_pa
     assert shown(read_csv_table(path)) == ({"a": "1", "b": "2"}, [2])
     path.write_bytes(path.read_bytes()[:-1])
     assert "is damaged UTF-16 text; save it as UTF-8" in refusal(read_csv_table, path)
+
+
+def test_names_that_are_more_than_the_cells_are_not_given_to_them(tmp_path):
+    path = tmp_path / "a.csv"
+    path.write_text("time,round,output,temperature\n" + "".join(f"{k},{k % 7},{20 + k}\n" for k in range(30)))
+    table = read_text_table(path)
+    assert list(table.numbers) == ["c1", "c2", "c3"]
+    assert any(
+        note.startswith("4 names above rows of 3 cells: columns named c1 to c3") for note in table.notes
+    )
