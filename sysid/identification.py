@@ -668,10 +668,10 @@ def _fitted(
 ) -> Plant:
     """Return a candidate fitted to some logs: of the black box that is kept the same structure."""
     if kind == "network":
-        from thermogrip.sysid.greybox.fit import fit_network  # pulls in llvmlite and nlopt at the first fit
+        from thermogrip.sysid.greybox.fit import fit_network  # pulls in llvmlite at the first fit
 
         assert data.network is not None
-        return fit_network(data.network, train, seed=wanted.seed, progress=report)
+        return fit_network(data.network, train, progress=report)
     if kept is None:
         return _fit_box(kind, train, data, wanted, report).plant
     grid = kept.grid.of(train, ends=kept.grid.ends)

@@ -31,7 +31,7 @@ DOORS = {
     "foxglove": {"live.foxglove"},
     "llvmlite": {"sysid.models.jit_rollout"},
     "mcap": {"rig.records.run_folder", "datasets.rosbag"},
-    "nlopt": {"sysid.greybox.fit", "mpc.tuning.tune"},
+    "nlopt": {"mpc.tuning.tune"},
     "numba": {"datasets.compiled"},
     "pysindy": {"sysid.blackbox.sindy"},
     "rosbags": {"datasets.rosbag"},

@@ -2,13 +2,10 @@
 
 1. Levenberg-Marquardt with priors as residuals, from the prior medians
    (:mod:`thermogrip.sysid.greybox.problem`).
-2. Where that ends badly (an error of many sensor sd, or several parameters on their bounds), or on request,
-   a controlled random search (NLopt's CRS2) on a coarser grid gives further starting points; the best end
-   is kept.
-3. The correlation of residuals (tau) is measured on the fit. The estimate gives the data at least the
+2. The correlation of residuals (tau) is measured on the fit. The estimate gives the data at least the
    weight of one reading a minute, so that a slow error of the model does not leave the fit to the priors;
    where residuals are whiter than that the fit is repeated with more weight.
-4. Covariance, from the learnt model of the error, the random effects of each log and the disagreement
+3. Covariance, from the learnt model of the error, the random effects of each log and the disagreement
    between logs (:mod:`thermogrip.sysid.greybox.sandwich`), and which parameters are practically
    identifiable (:mod:`thermogrip.sysid.greybox.identifiability`).
 
@@ -155,8 +152,7 @@ def _bounded(r: Array) -> Array:
     return np.asarray(np.clip(np.nan_to_num(r, nan=_HUGE, posinf=_HUGE, neginf=-_HUGE), -_HUGE, _HUGE))
 
 
-_STUCK = 5.0  # rms residual in sensor sd from which the end of the local fit is not accepted
-_COARSE = 6  # times the usual bins, for the global search
+_STUCK = 5.0  # rms residual in sensor sd from which a fit does not explain the logs
 
 
 def fit_network(
@@ -164,8 +160,6 @@ def fit_network(
     logs: Logs,
     *,
     average: float | None = None,
-    seed: int = 0,
-    starts: int | None = None,
     near: Mapping[str, float] | None = None,
     progress: Progress | None = None,
 ) -> Plant:
@@ -180,11 +174,6 @@ def fit_network(
     average : float, optional
         Length of the bins that are compared [s]; the model's own where absent: for a network 5 s, or five
         steps if that is longer.
-    seed : int, optional
-        Of the global search.
-    starts : int, optional
-        Starting points from the global search beside the prior medians; by default none unless the first fit
-        ended badly, then 2.
     near : mapping of str to float, optional
         Values to start from in place of the prior medians, as of an earlier fit; what is not named or not
         free keeps its prior median.
@@ -236,9 +225,6 @@ def fit_network(
     problem = make_problem(model, logs, average=average, independent=model.independent)
     report(0.0, "fitting from the priors" if near is None else "fitting from an earlier fit")
     solution = _descend(problem, problem.standard(near or {}), report, (0.0, 0.6))
-    wanted = starts if starts is not None else (2 if _looks_stuck(problem, solution) else 0)
-    if wanted:
-        solution = _search(problem, solution, logs, wanted, seed, report)
     tau = residual_tau(problem.errors(solution.z), problem.tau)
     whiter = (tau < 0.8 * problem.tau) & np.array([slow is None for slow in problem.drift])
     if whiter.any():
@@ -256,7 +242,6 @@ def fit_network(
         plant.scores,
         reading_excess=reading_excess(rows, model.outputs, problem.average),
         seconds=round(time.perf_counter() - began, 2),
-        starts=wanted,
     )
     valid = {name: (float(np.nanmin(values)), float(np.nanmax(values))) for name, values in seen.items()}
     plant = plant.with_medians({name: seen[name] for name in model.disturbances})
@@ -295,10 +280,6 @@ def _descend(problem: Problem, z0: Array, report: Progress, part: tuple[float, f
     return levenberg_marquardt(problem.linearise, problem.trials, z0, low=low, high=high, callback=callback)
 
 
-def _looks_stuck(problem: Problem, solution: Solution) -> bool:
-    return max(_rms_in_sd(problem, solution)) > _STUCK or len(_on_bound(problem, solution.z)) > 2
-
-
 def _rms_in_sd(problem: Problem, solution: Solution) -> list[float]:
     errors = problem.errors(solution.z)
     return [_rms([s[k] for log in errors for s in log]) / sd for k, sd in enumerate(problem.sd)]
@@ -318,43 +299,6 @@ def _on_bound(problem: Problem, z: Array) -> dict[str, str]:
         for name, at_low, at_high in zip(names, z <= low + width, z >= high - width)
         if at_low or at_high
     }
-
-
-def _search(
-    problem: Problem, best: Solution, logs: Sequence[Log], starts: int, seed: int, report: Progress
-) -> Solution:
-    """Return the best of ``best`` and of fits that start where random searches ended."""
-    model = problem.model
-    wide, step = _COARSE * model.average, model.search_step
-    coarse = make_problem(model, logs, average=wide, independent=model.independent, dt=step)
-    for k in range(starts):
-        report(0.6 + 0.2 * k / starts, f"global search {k + 1} of {starts}")
-        found = _descend(problem, _random_search(coarse, seed + k), lambda *_: None, (0.0, 1.0))
-        if found.cost < best.cost:
-            best = found
-    return best
-
-
-def _random_search(problem: Problem, seed: int, evaluations: int = 1500) -> Array:
-    """Return the end of a controlled random search within 2 prior sd."""
-    import nlopt
-
-    low, high = problem.box
-    low, high = np.maximum(low, -2.0), np.minimum(high, 2.0)
-    problem.linearise(np.clip(np.zeros(len(low)), low, high))  # sets the starts that the trials share
-
-    def cost(z: Array, _gradient: Array) -> float:
-        r = problem.trials(z[None])[0]
-        return float(np.log1p((np.clip(np.nan_to_num(r, nan=1e6), -1e6, 1e6) ** 2).sum()))
-
-    nlopt.srand(seed)
-    optimiser = nlopt.opt(nlopt.GN_CRS2_LM, len(low))
-    optimiser.set_lower_bounds(low)
-    optimiser.set_upper_bounds(high)
-    optimiser.set_min_objective(cost)
-    optimiser.set_maxeval(evaluations)
-    rng = np.random.default_rng(seed)
-    return np.asarray(optimiser.optimize(np.clip(0.5 * rng.standard_normal(len(low)), low, high)))
 
 
 def _as_plant(problem: Problem, solution: Solution, tau: Array) -> Plant:

@@ -242,16 +242,12 @@ def prior_plant(model: GreyModel) -> Plant:
     )
 
 
-def make_problem(
-    model: GreyModel, logs: Sequence[Log], *, average: float, independent: float, dt: float | None = None
-) -> Problem:
+def make_problem(model: GreyModel, logs: Sequence[Log], *, average: float, independent: float) -> Problem:
     """Put logs on the model's grid and into bins of ``average`` [s], or of a row where rows are longer."""
     if not logs:
         raise UserError("no log to fit", hint="give at least one")
     average = max(average, *(float(np.median(np.diff(log["time"].values))) for log in logs))
     plant = prior_plant(model)
-    if dt is not None:
-        plant = replace(plant, dt=dt)
     steps = max(1, round(average / plant.dt))
     parts = []
     for log in logs:

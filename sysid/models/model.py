@@ -152,7 +152,6 @@ class GreyModel(Model, Protocol):
     average: float  # length of the bins of a fit [s], where none is asked for
     independent: float  # seconds per independent residual, until that is measured
     warmup: float  # seconds of a log from which a fit may estimate how it starts
-    search_step: float  # of a global search [s], which may be coarser
 
     def prepared(self, free_runs: FreeRuns, spread: Mapping[str, float], p: Array | None = None) -> GreyModel:
         """Return the model made ready for the logs of these runs, ``spread`` the sd of each of their outputs.

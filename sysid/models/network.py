@@ -506,7 +506,6 @@ class NetworkModel(Described):
         }
         self.command_steps = {k: item.step for k, item in network.inputs.items() if item.step is not None}
         self.average = network.average or max(5.0, 5 * self.dt)
-        self.search_step = max(self.dt, 2.0)
         sd = np.full(self.n_x, 0.5)
         sd[: len(network.nodes)] = [node.start_sd for node in network.nodes.values()]
         self.spread = np.diag(sd**2)

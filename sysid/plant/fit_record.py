@@ -149,7 +149,6 @@ class PlantScores:
     per_log: dict[str, dict[str, tuple[float, float]]] = field(default_factory=dict)  # by effect: value, sd
     innovations: InnovationNoise | None = None
     seconds: float | None = None  # that the fit took
-    starts: int | None = None  # of the global search
     posterior: Sampling | None = None
     held_out: list[HeldOut] = field(default_factory=list)  # free runs over what the fit had not seen
     expected: dict[str, ExpectedError] = field(default_factory=dict)  # by output, of another run

@@ -80,7 +80,7 @@ class TwoGains:
     smooth = 0.0
     command_steps: Mapping[str, float] = {}
     drift: Mapping[str, tuple[float, float]] = {}
-    name, dt, average, independent, warmup, search_step = "two gains", 1.0, 4.0, 60.0, 5.0, 2.0
+    name, dt, average, independent, warmup = "two gains", 1.0, 4.0, 60.0, 5.0
     reference: str | None = None
     units: Mapping[str, str] = {"q": "1", "t": "degC", "a": "K", "b": "K"}
     sensor_sd: Mapping[str, float] = {"t": 0.1}

@@ -122,7 +122,7 @@ def test_a_parameter_that_may_differ_from_log_to_log_has_an_effect_of_each():
         logs.append(
             log.assign(q=log["q"].copy(data=log["q"].values / share))
         )  # the same heat from another supply
-    plant = fit_network(NetworkModel(network_from_dict(content)), logs, starts=0)
+    plant = fit_network(NetworkModel(network_from_dict(content)), logs)
     found = [log["P"][0] for log in plant.scores.per_log.values()]
     # what is common to all logs is the parameter's own; the differences are the logs'
     np.testing.assert_allclose(np.diff(found), np.diff(np.log(shares)), atol=0.02)

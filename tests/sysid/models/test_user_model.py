@@ -118,7 +118,7 @@ def one_step(what: str) -> Log:
 @pytest.mark.parametrize("what", ["as modelled", "cooling"])
 def test_one_step_leaves_no_parameter_less_known_than_its_prior_and_can_be_drawn(what: str):
     log, model = one_step(what), own_model(varied(Block, parameters=SCALED))
-    plant = fit_network(model, [log], starts=0)
+    plant = fit_network(model, [log])
     prior = np.array([model.specs[name].sd_log for name in plant.free])
     assert (np.sqrt(np.diag(plant.covariance)) <= prior * (1 + 1e-9)).all()
     for name, (low, high) in plant.intervals(0.9).items():  # 90 % of the prior: exp(2 * 1.645 sd)
@@ -300,8 +300,8 @@ def test_the_search_for_rest_ends_where_its_cost_does(
 
 def test_what_a_class_does_not_state_follows_from_its_step():
     plain, said = own_model(Block), own_model(varied(Block, average=7.0, warmup=33.0, dt=0.5))
-    assert (plain.average, plain.independent, plain.warmup, plain.search_step) == (5.0, 20.0, 50.0, 1.0)
-    assert (said.average, said.independent, said.warmup, said.search_step) == (7.0, 28.0, 33.0, 0.5)
+    assert (plain.average, plain.independent, plain.warmup) == (5.0, 20.0, 50.0)
+    assert (said.average, said.independent, said.warmup) == (7.0, 28.0, 33.0)
     assert (plain.pieces, plain.compiled, plain.sensor_sd, plain.spread.tolist()) == (
         1,
         True,
@@ -430,7 +430,7 @@ def test_a_saved_plant_needs_its_class_and_then_is_the_same(tmp_path):
     file = written(tmp_path)
     model = own_model(load_object(file, "Tank"))
     log = pumped(3)
-    plant = fit_network(model, [log], starts=0)
+    plant = fit_network(model, [log])
     path = plant.save(tmp_path / "plant.json")
     with pytest.raises(
         UserError, match=r"plant\.json: its equations are the class Tank of tank\.py.*--network"

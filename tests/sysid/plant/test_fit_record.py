@@ -25,7 +25,7 @@ NETWORK = {
         "stretches": 1, "pull": [[9.5]], "error": "model error t 0.0075 degC over 30 s",
         "between_logs": 6.598, "spread_over_logs": {},
     },
-    "per_log": {"step": {"bias of room": [0.2, 0.1]}}, "seconds": 10.75, "starts": 0,
+    "per_log": {"step": {"bias of room": [0.2, 0.1]}}, "seconds": 10.75,
     "held_out": [{"log": "last 30 % of step", "output": "t", "rmse": 0.08, "fit_percent": 98.0,
                   "unit": "degC", "n": 240}],
 }  # fmt: skip
