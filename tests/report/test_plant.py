@@ -320,3 +320,25 @@ def test_blocks_of_a_log_share_a_row_that_shows_each() -> None:
     assert both[4:7] == ("degC", 85.0, 40)
     assert both[7] == pytest.approx(np.sqrt((10 * 36 + 30 * 4) / 40))
     assert tail == ("oe", "last 30 % of a", "t", 5.0, "degC", 50.0, 7, 8.0, "held out")
+
+
+def test_a_parameter_is_known_as_well_as_half_its_interval_is_wide() -> None:
+    ends = {"a": (9.0, 11.0), "b": (1.6, 2.4), "c": (-3.0, 1.0)}
+    known = SimpleNamespace(
+        free=tuple(ends),
+        units={"b": "W/K"},
+        values={"a": 10.0, "b": 2.0, "c": -1.0},
+        intervals=lambda level: ends,
+    )
+    share, least = plant.known_words(known)
+    assert share.startswith("1 of 3 parameters are known within \N{PLUS-MINUS SIGN}10 %, 2 within")
+    assert least == "Known least: c (-3 to 1), b (1.6 to 2.4 W/K), a (9 to 11)."
+
+
+def test_a_pair_of_poles_is_said_once_with_its_period() -> None:
+    poles = np.array([-0.05 + 0.5j, -0.05 - 0.5j, -1.0])
+    found = SimpleNamespace(
+        near=SimpleNamespace(inputs=("q",), w=(0.5,)), units={"q": "W"}, poles=poles, draws=(), level=0.9,
+        time_constants=-1 / poles.real, gain=SimpleNamespace(low=np.array([np.nan])),
+    )  # fmt: skip
+    assert "time constants 20 s (period 12.6 s), 1 s; no intervals" in plant.time_constant_words(found)
