@@ -45,7 +45,6 @@ ALL = [
     Benchmark("coverage/study.py", "table", "table"),
     Benchmark("excite/predicted_precision.py"),
     Benchmark("mpc/compare.py", quick="--quick", needs=("do_mpc",)),
-    Benchmark("mpc/sizes.py", "--peer", "--quick --states 4"),
     Benchmark("control/mismatch.py", quick="--seeds 4 --only delay"),
     Benchmark(
         "control/eight_plants.py",

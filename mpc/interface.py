@@ -6,7 +6,7 @@ This module imports nothing heavy, so that the PI baseline, a session and a robo
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Protocol, TypeAlias
 
 #: One sample: ``{"time_s": .., "t_tank": .., "t_surface": .., "t_ambient": ..}``, degC.  Without ``time_s``
@@ -37,8 +37,6 @@ class Move:
         One clause for the operator; empty while all is well.
     seconds : float
         Time that the step took [s].
-    plan : dict of str to tuple of float
-        The predicted outputs over the horizon, for plots; may be empty.
     """
 
     drive: float | dict[str, float]
@@ -46,7 +44,6 @@ class Move:
     status: str = "ok"
     advice: str = ""
     seconds: float = 0.0
-    plan: dict[str, tuple[float, ...]] = field(default_factory=dict)
 
     def drives(self, names: Sequence[str]) -> list[float]:
         """Return what to apply in the order of these inputs; a pump among them that is switched has its own

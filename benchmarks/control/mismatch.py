@@ -36,7 +36,6 @@ from thermogrip.mpc.controllers.loop_monitor import LoopMonitor
 from thermogrip.mpc.controllers.mpc import Controller
 from thermogrip.mpc.design.design import default_design
 from thermogrip.mpc.interface import Move
-from thermogrip.mpc.native.runtime import wanted
 from thermogrip.sysid.models.jit_rollout import Kernel
 from thermogrip.sysid.plant.plant import Plant as Model
 
@@ -240,7 +239,6 @@ def asked(doc: str | None, seeds: str, **counts: str) -> argparse.Namespace:
     for name, meaning in counts.items():
         parser.add_argument(f"--{name}", type=int, default=0, help=meaning)
     parser.add_argument("--only", default="", help="rows whose name has this in it")
-    parser.add_argument("--python", action="store_true", help="without compiled parts")
     parser.add_argument("--markdown", type=Path, help="also write the table here")
     return parser.parse_args()
 
@@ -262,7 +260,7 @@ def honest(controller: Controller, count: int) -> str:
 def main() -> None:
     """Run, print, write."""
     given, model = asked(__doc__, "0,1", draws="of the posterior, in place of the rows"), model_of()
-    controller = Controller(model, default_design(model), compiled=wanted() and not given.python)
+    controller = Controller(model, default_design(model))
     controller = RecordedController(controller, LoopMonitor(model, controller.design))
     lines = [
         "| plant | settling / full drive: mean, worst | overshoot [degC] | offset [degC] "

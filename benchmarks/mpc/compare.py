@@ -4,9 +4,9 @@
     OMP_NUM_THREADS=1 peers/bin/python benchmarks/mpc/compare.py --out mpc.json
 
 Prints Markdown tables.  Times are process CPU time of one call, children included.  In the first table it is
-the call that makes a move of an estimate, of thermogrip compiled the C alone; in the second the public call,
-``Controller.step``, whose filter and checks count.  ``--quick`` leaves the slow ones at 150 samples, GEKKO at
-60.
+the call that makes a move of an estimate; in the second the public call, ``Controller.step``, whose filter
+and checks count, in C and in Python: of the reference problem, a TCLab (4 states, two heaters) and a gripper
+(28 states) of the bundled networks.  ``--quick`` leaves the slow ones at 150 samples, GEKKO at 60.
 """
 
 from __future__ import annotations
@@ -20,21 +20,21 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from floor import Floor
 from ours import Ours, design_of
 from peers import PEERS
 from problem import HORIZON, MODEL, TRUE, Answer, Loop, plant_of, run_loop
 
 from thermogrip.mpc.closed_loop.simulate import Surroundings, simulate_closed_loop
-from thermogrip.mpc.closed_loop.simulate_native import compiled_loop
 from thermogrip.mpc.controllers.mpc import Controller
+from thermogrip.mpc.controllers.reference import ReferenceController
+from thermogrip.mpc.design.design import Design, default_design
 from thermogrip.mpc.native.runtime import wanted
+from thermogrip.sysid.models.network import load_network
+from thermogrip.sysid.plant.plant import Plant
 
 OURS: dict[str, Callable[[], Answer]] = {
-    "thermogrip, Python, N = 50": lambda: Ours(compiled=False),
-    "thermogrip, Python, 10 blocks": lambda: Ours(compiled=False, blocks=10),
-    "thermogrip, compiled, N = 50": lambda: Ours(compiled=True),
-    "thermogrip, compiled, 10 blocks": lambda: Ours(compiled=True, blocks=10),
+    "thermogrip, Python, N = 50": Ours,
+    "thermogrip, Python, 10 blocks": lambda: Ours(blocks=10),
 }
 SHORT = {"GEKKO": 60}
 SCHEDULE = [(18.0, 75.0), (38.0, 75.0), (23.0, 75.0), (48.0, 75.0)]
@@ -49,7 +49,7 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="150 samples of the slow ones")
     parser.add_argument("--only", default="", help="names to run, by semicolons")
     given = parser.parse_args()
-    chosen = {**PEERS, **{k: v for k, v in OURS.items() if wanted() or "compiled" not in k}}
+    chosen = PEERS | OURS
     if given.only:
         chosen = {name: make for name, make in chosen.items() if name in given.only.split(";")}
     rows: dict[str, dict[str, Any]] = {}
@@ -61,8 +61,8 @@ def main() -> None:
     found: dict[str, Any] = {"steps": rows, "public_steps": public_steps()}
     print_public(found["public_steps"])
     if not given.only:
-        found |= {"floor_us": floor(), "trials": throughput(), "reversal": reversal()}
-        print_rest(found)
+        found["reversal"] = reversal()
+        print_reversal(found["reversal"])
     if given.out is not None:
         given.out.write_text(json.dumps(found, indent=1, default=float), encoding="utf-8")
 
@@ -86,19 +86,33 @@ def measured(answer: Answer, steps: int | None) -> dict[str, Any]:
 
 
 def public_steps() -> dict[str, dict[str, float]]:
-    """Return CPU times of ``Controller.step`` [ms] in a closed loop of 600 samples."""
+    """Return CPU times of ``Controller.step`` [ms] in closed loops."""
     model, true = plant_of(MODEL), plant_of(TRUE, dt=0.05)
     around = Surroundings(ambient=0.0, noise=0.02, quantum=0.0)
-    found = {}
+    cases: dict[str, tuple[Plant, Design, Plant, dict[str, Any]]] = {}
     for blocks in (HORIZON, 10):
-        for compiled in (False, True) if wanted() else (False,):
-            controller = Controller(model, design_of(blocks), compiled=compiled)
+        about = {"schedule": SCHEDULE, "start": 25.0, "surroundings": around, "band": 0.2}
+        cases[f"reference problem, {blocks} blocks"] = model, design_of(blocks), true, about
+    for name, low, high in (("tclab", 0.0, 100.0), ("gripper", -1.0, 1.0)):
+        network = load_network(name)
+        values = dict(zip(network.parameters, network.prior.tolist(), strict=True))
+        valid = dict.fromkeys(network.inputs, (low, high))
+        plant = Plant(network, values, dt=network.dt, units=network.units, valid=valid)
+        schedule = [(35.0, 600.0), (30.0, 600.0)]
+        cases[f"{name}, {network.n_x} states"] = plant, default_design(plant), plant, {"schedule": schedule}
+    found = {}
+    for name, (plant, design, truth, about) in cases.items():
+        makers = (
+            {"C": Controller, "Python": ReferenceController} if wanted() else {"Python": ReferenceController}
+        )
+        for language, make in makers.items():
+            controller = make(plant, design)
             seconds: list[float] = []
             vars(controller)["step"] = timed(controller.step, seconds)
-            simulate_closed_loop(controller, true, SCHEDULE, start=25.0, surroundings=around, band=0.2)
+            simulate_closed_loop(controller, truth, **about)
             ms = 1e3 * np.array(seconds[1:])  # the first call sets things up
-            name = f"{'compiled' if compiled else 'Python'}, {blocks} blocks"
-            found[name] = {"median_ms": float(np.median(ms)), "p99_ms": float(np.percentile(ms, 99))}
+            row = {"median_ms": float(np.median(ms)), "p99_ms": float(np.percentile(ms, 99))}
+            found[f"{language}, {name}"] = row
     return found
 
 
@@ -120,43 +134,11 @@ def part_cost(loop: Loop, n: int) -> float:
     return replace(loop, y=loop.y[:n], u=loop.u[:n], target=loop.target[:n]).cost
 
 
-def floor() -> dict[str, float]:
-    """Return the median of DAQP's own solve time [us], by the number of blocks."""
-    found = {}
-    for blocks in (HORIZON, 10):
-        ours = Ours(compiled=False, blocks=blocks)
-        own = Floor(ours.optimiser.qp)
-        run_loop(ours)
-        found[f"{blocks}"] = 1e6 * float(np.median(own.seconds))
-    return found
-
-
-def throughput(seconds: float = 10.0) -> dict[str, float]:
-    """Return closed-loop trials of 600 samples a minute on this core, plant and observer included."""
-    model, true = plant_of(MODEL), plant_of(TRUE, dt=0.05)
-    around = Surroundings(ambient=0.0, noise=0.02, quantum=0.0)
-    found = {}
-    for blocks in (HORIZON, 10):
-        for compiled in (True, False) if wanted() else (False,):
-            run = compiled_loop if compiled else simulate_closed_loop
-            design = design_of(blocks)
-            Controller(model, design, compiled=compiled)  # built, if it must be
-            began, trials = time.process_time(), 0
-            while not trials or time.process_time() - began < seconds:
-                other = replace(design, move=design.move * (1 + 0.01 * trials))
-                controller = Controller(model, other, compiled=compiled)
-                run(controller, true, SCHEDULE, start=25.0, surroundings=around, band=0.2, seed=trials)
-                trials += 1
-            name = f"{'compiled' if compiled else 'Python'}, {blocks} blocks"
-            found[name] = 60.0 * trials / (time.process_time() - began)
-    return found
-
-
 def reversal() -> dict[str, Any]:
     """Return the case in which more current ends up heating: 9 A, and a target too cold to be reached."""
     found = {}
     for blocks in (HORIZON, 10):
-        answer = Ours(compiled=wanted(), blocks=blocks, current=9.0)
+        answer = Ours(blocks=blocks, current=9.0)
         loop = run_loop(answer, targets=(18.0, 38.0, 8.0, 48.0), current=9.0)
         cold = loop.u[300:450]
         found[f"{blocks} blocks"] = {
@@ -193,15 +175,9 @@ def print_public(rows: dict[str, dict[str, float]]) -> None:
         print(f"| {name} | {row['median_ms']:.3f} | {row['p99_ms']:.3f} |")
 
 
-def print_rest(found: dict[str, Any]) -> None:
-    """Print the floor, the throughput and the reversal."""
-    print("\nDAQP's own solve, median us:", {k: round(v, 2) for k, v in found["floor_us"].items()})
-    for blocks, value in found["floor_us"].items():
-        name = f"thermogrip, compiled, {'N = 50' if blocks == '50' else '10 blocks'}"
-        if name in found["steps"]:
-            print(f"{name}: {1e3 * found['steps'][name]['median_ms'] / value:.1f} times the floor")
-    print("Trials of 600 samples a minute:", {k: round(v) for k, v in found["trials"].items()})
-    for name, row in found["reversal"].items():
+def print_reversal(found: dict[str, Any]) -> None:
+    """Print the case in which more current ends up heating."""
+    for name, row in found.items():
         settling = " / ".join(f"{value:.1f}" for value in row["settling_s"])
         low, last = row["current"]
         print(

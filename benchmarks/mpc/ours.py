@@ -1,17 +1,13 @@
-"""thermogrip's own controllers of the reference problem: its optimiser on the filter's estimates."""
+"""thermogrip's own controller of the reference problem: its optimiser on the filter's estimates."""
 
 from __future__ import annotations
-
-import ctypes
-from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 from problem import DRIVE, HORIZON, LAST, MODEL, MOVE, OVERSHOOT, PRICE, TANK, TRACK, plant_of
 
-from thermogrip.mpc.controllers.mpc import Controller
+from thermogrip.mpc.controllers.reference import ReferenceController
 from thermogrip.mpc.design.design import Design, make_blocks
-from thermogrip.mpc.native.runtime import CompiledOptimiser
 from thermogrip.mpc.optimiser.rti import Sample
 
 __all__ = ["TEN_BLOCKS", "Ours", "design_of"]
@@ -49,35 +45,21 @@ def design_of(blocks: int, current: float = 5.0) -> Design:
 
 
 class Ours:
-    """One controller: Python (DAQP) or compiled, any number of blocks."""
+    """The optimiser with any number of blocks."""
 
-    def __init__(self, *, compiled: bool, blocks: int = HORIZON, current: float = 5.0) -> None:
+    def __init__(self, *, blocks: int = HORIZON, current: float = 5.0) -> None:
         plant, design = plant_of(MODEL, current=current), design_of(blocks, current)
-        self.optimiser = Controller(plant, design, compiled=compiled).optimiser
+        self.optimiser = ReferenceController(plant, design).optimiser
         self.blocks = np.asarray(self.optimiser.blocks)
         self.plan: Array | None = None
         self.begins = np.cumsum(self.blocks) - self.blocks
         self.zero = np.zeros(3), np.zeros(1)
-        if isinstance(self.optimiser, CompiledOptimiser):
-            self._bind(self.optimiser)
         self(np.full(13, 25.0), np.zeros(2), 0.0, 25.0, -100.0, 100.0)  # whatever is made at the first call
         self.optimiser.forget()
         self.plan = None
 
-    def _bind(self, optimiser: CompiledOptimiser) -> None:
-        """Take the C that improves the plan of the last call, a sample later; the guess stays there."""
-        self.drive = np.zeros(1)
-        self.given = [part for at, part in enumerate(optimiser._parts[:-1]) if at != 2]
-        into = optimiser._arguments[:3] + optimiser._arguments[4:9]
-        out = ctypes.c_void_p(self.drive.ctypes.data), ctypes.byref(optimiser._iterations)
-        self.replan = partial(optimiser._c.library.tg_host_replan, *into, *out)
-
     def __call__(self, x: Array, q: Array, before: float, goal: float, low: float, high: float) -> float:
         side = 1.0 if high < 100.0 else -1.0 if low > -100.0 else 0.0
-        if isinstance(self.optimiser, CompiledOptimiser):
-            for part, values in zip(self.given, (x, before, q, goal, side, 0.0, 0.0), strict=True):
-                part[:] = values
-            return float(self.drive[0]) if self.replan() == 0 else float("nan")
         last = np.array([before])
         guess = np.repeat(last[None], len(self.blocks), axis=0)
         if self.plan is not None:

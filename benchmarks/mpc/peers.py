@@ -197,7 +197,7 @@ class Osqp(Ours):
     """Our condensing, with OSQP for its program: a slack for each soft row."""
 
     def __init__(self) -> None:
-        super().__init__(compiled=False)
+        super().__init__()
         self.optimiser.qp = _OsqpProgram(self.optimiser.qp.soft)  # type: ignore[assignment]
 
 

@@ -99,7 +99,6 @@ class _Run:
 def _run_mpc(c: CompiledController, controller: Controller, run: _Run, target: Array, *, told: bool) -> None:
     """Run an MPC that was reset to targets (n, n_controlled) [degC], told of the drives before or not."""
     estimate = controller.observer.estimate()
-    estimate["P"] = c.kept(estimate["P"])
     observed = np.concatenate([values.ravel() for values in estimate.values()])
     c.library.tg_host_loop(
         c.state,

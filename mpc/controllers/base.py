@@ -6,21 +6,17 @@ finite, inside its range, and within the slew limit of the one before.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from thermogrip.datasets.arrays import Array, Mask
+from thermogrip.mpc.controllers import advice
 from thermogrip.mpc.estimator.call_times import SAME, CallTimes
 from thermogrip.mpc.interface import Move, Readings, Trajectory, number, target_now
 from thermogrip.mpc.plant.prediction import PredictionModel
-
-#: What a controller reports of a call that comes before its move is due.
-TOO_EARLY = "called before its sample time: the move is held"
-#: And of a reading that it has seen already.
-STALE = "reading is stale: its time has not moved on"
 
 
 class SampledController:
@@ -83,7 +79,7 @@ class SampledController:
         value = number(reading, name)
         return value if self.model.coldest <= value <= self.model.hottest else float("nan")
 
-    def _measured(self, reading: Readings) -> Array:
+    def measured(self, reading: Readings) -> Array:
         """Return the measured disturbances (n_d,) of a reading, NaN where they cannot be."""
         model = self.model
         d = np.array([number(reading, name) for name in model.disturbances], dtype=float)
@@ -92,7 +88,7 @@ class SampledController:
     def _read(self, reading: Readings) -> tuple[Array, Array]:
         """Return the outputs (n_y,) and disturbances (n_d,) of a reading [degC], NaN where they cannot be."""
         y = np.array([self._clean(reading, name) for name in self.model.outputs])
-        return y, self._measured(reading)
+        return y, self.measured(reading)
 
     def _given(self, reading: Readings, target: Trajectory) -> tuple[Array, Array, Array, str]:
         """Return outputs, disturbances and targets in force [degC], and what is wrong; a stale reading is
@@ -101,7 +97,7 @@ class SampledController:
         self._target = wanted
         y, d = self._read(reading)
         if self.times.stale:
-            return np.full(len(y), np.nan), d, wanted, wrong or STALE
+            return np.full(len(y), np.nan), d, wanted, wrong or advice.STALE
         return y, d, wanted, wrong
 
     def _wanted(self, target: Trajectory) -> tuple[Array, str]:
@@ -111,13 +107,12 @@ class SampledController:
         if isinstance(now, Mapping):
             wanted = np.array([self._clean(now, name) for name in controlled])
             unknown = [name for name in now if name not in controlled]
-            wrong = f"target names {unknown[0]}, controlled is {', '.join(controlled)}" if unknown else ""
+            wrong = advice.bad_target(controlled, unknown[0]) if unknown else ""
         else:
             wanted, wrong = np.full(len(controlled), self._clean({"": now}, "")), ""
         lost = ~np.isfinite(wanted)
         if lost.any():
-            name = controlled[int(np.argmax(lost))]
-            wrong = f"target of {name} is missing or absurd: the last good one is kept"
+            wrong = advice.bad_target(controlled[int(np.argmax(lost)) :])
         return np.where(lost, self._target, wanted), wrong
 
     def _within(self, u: Array, seconds: float) -> Array:
@@ -144,13 +139,7 @@ class SampledController:
             self._placed[j], self._stayed[j] = at, 0.0
         return max(0.0, self._stays[j][at] - self._stayed[j] - self.times.waited_s - 1e-6)
 
-    def _answer(
-        self,
-        status: str,
-        advice: str,
-        started: float,
-        plan: dict[str, tuple[float, ...]] | None = None,
-    ) -> Move:
+    def _answer(self, status: str, why: str, started: float) -> Move:
         """Return the move of the drives in force; without any, the pump may rest. One that is switched is no
         drive of the move, but its pump."""
         names, u = self.model.drives, self._u
@@ -165,22 +154,34 @@ class SampledController:
             pump = self._placed[switched[0]]
             names, u = tuple(np.delete(names, switched).tolist()), np.delete(u, switched)
         drive, seconds = as_drive(names, u), self.clock() - started
-        self._move = Move(drive, pump, status, advice, seconds, plan or {})
+        self._move = Move(drive, pump, status, why, seconds)
         return self._move
 
     def _held_move(self, started: float) -> Move:
         """Return the last move again, for a call before the next one is due; its advice stays."""
-        return replace(self._move, advice=self._move.advice or TOO_EARLY, seconds=self.clock() - started)
+        return replace(
+            self._move, advice=self._move.advice or advice.TOO_EARLY, seconds=self.clock() - started
+        )
 
-    def _unseen(self, parked: list[str]) -> str:
-        """Return what becomes of the loops whose sensors are lost while others go on."""
-        lost = self._lost
-        if not lost.any():
-            names = [name for name, seconds in zip(self.controlled, self._unread_s) if seconds]
-            return f"{', '.join(names)}: no usable reading, the model replaces it"
-        names = [name for name, gone in zip(self.controlled, lost) if gone]
-        rest = f"{', '.join(parked)} to rest, the others go on" if parked else "the others go on"
-        return f"no reading of {', '.join(names)} for {self._unread_s.max():.0f} s: {rest}"
+    def _unseen(self, parked: Sequence[str], unread_s: Array) -> str:
+        """Return what becomes of the loops whose sensors were not read for so long (n_controlled,) while
+        others are, drives parked."""
+        lost = unread_s > self._patience_s
+        gone = bool(lost.any())
+        names = [name for name, at in zip(self.controlled, lost if gone else unread_s > 0) if at]
+        return advice.unseen(names, parked, float(unread_s.max()), lost=gone)
+
+
+def targets_ahead(
+    target: Trajectory, controlled: Sequence[str], now: Array, at: NDArray[np.int_], low: float, high: float
+) -> Array | None:
+    """Return the targets (len(at), n_controlled) of samples ``at`` from now, of which the last stays; None
+    where targets do.  What is not from low to high is the target now (n_controlled,)."""
+    if not isinstance(target, Mapping) or not any(isinstance(v, Sequence) for v in target.values()):
+        return None
+    lines = [np.atleast_1d(target.get(name, each)) for name, each in zip(controlled, now)]
+    ahead = np.column_stack([line[np.minimum(at, len(line) - 1)] for line in lines]).astype(float)
+    return np.where((ahead >= low) & (ahead <= high), ahead, now)  # NaN is neither
 
 
 def as_drive(drives: tuple[str, ...], u: ArrayLike) -> float | dict[str, float]:

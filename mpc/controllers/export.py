@@ -19,11 +19,10 @@ from __future__ import annotations
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Callable, Sequence
-from copy import copy
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -34,26 +33,22 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.media import markdown
 from thermogrip.datasets.parallel import Progress
 from thermogrip.mpc.controllers.mpc import Controller
+from thermogrip.mpc.controllers.reference import ReferenceController
 from thermogrip.mpc.design.design import DAY
 from thermogrip.mpc.interface import STATUSES
 from thermogrip.mpc.native import design_struct
 from thermogrip.mpc.native.codegen import write_model
 from thermogrip.mpc.native.runtime import SOURCES, c_source, compiler
-from thermogrip.mpc.native.single_precision import in_single
 from thermogrip.mpc.optimiser.active_set import ActiveSetQP
 
 if TYPE_CHECKING:
     from thermogrip.mpc.design.design import Design
-    from thermogrip.mpc.estimator.observer import Observer
 
 _COPIED = (*SOURCES, "tg_design.h", "Makefile", "example.c", "check.c")
 # of a drive's range; where dozens of soft rows are broken, a plan is a small difference of large multipliers,
 # and C as well as Python is up to 1e-10 off the exact one; with hard limits, a thousand times as dear, 3e-9
 _TOLERANCE, _HARD_TOLERANCE = 1e-9, 1e-8
-# in numbers of four bytes, and of how many states one may be answered otherwise: where rows depend on others
-# (ranges, slews that end on them), a float may not tell which of them hold, and the last plan goes on
 _TIES = 0.005  # of the states, in which two rows may be as far broken and either be taken in first
-_SINGLE_TOLERANCE, _SINGLE_STATES = 0.05, 1000
 _RESTS = 100  # from which random states depart
 
 
@@ -63,9 +58,6 @@ class Export:
 
     folder: Path
     files: tuple[str, ...]
-    ram: int  # bytes of one controller, everything it needs at run time but the stack
-    constants: int  # bytes of the design
-    single: bool = False  # whether its numbers have four bytes
 
 
 @dataclass(frozen=True)
@@ -77,45 +69,35 @@ class Agreement:
     free: int  # in how many states the drive stood at no limit of range or slew, so that every weight counts
     same_status: int  # in how many states
     same_iterations: int
-    # bytes: code with constants, static data with one controller, and the largest frame of a function
+    # bytes: code with constants, one controller, its design, and the largest frame of a function
     flash: int
     ram: int
+    constants: int
     stack: int
     tolerance: float = _TOLERANCE  # of the difference
-    single: bool = False  # in numbers of four bytes, whose iterations are others
-    others: int = 0  # states that these answer otherwise; they are not in the difference
 
     @property
     def passed(self) -> bool:
         """Whether C and Python do the same."""
         ties = self.states - self.same_iterations <= max(1, _TIES * self.states)
-        exact = self.same_status == self.states and ties
-        if self.single:
-            exact = _SINGLE_STATES * self.others <= self.states
-        return exact and self.difference <= self.tolerance
+        return self.same_status == self.states and ties and self.difference <= self.tolerance
 
 
-def export_controller(
-    controller: Controller, folder: str | Path, *, arduino: bool = False, single: bool = False
-) -> Export:
+def export_controller(controller: Controller, folder: str | Path, *, arduino: bool = False) -> Export:
     """Write a controller as C99 into a folder, made where absent; files of the same names are replaced.
 
-    With ``arduino`` the folder is a library of the Arduino IDE, its example a loop to fill in; with
-    ``single`` numbers have four bytes.
+    With ``arduino`` the folder is a library of the Arduino IDE, its example a loop to fill in.
     """
     if controller.design.on_off:
         problem = f"on_off: C does not choose when {', '.join(controller.design.on_off)} goes over"
         raise UserError(problem, hint="export a controller whose spec leaves it on")
-    if single and controller.design.hard:
-        problem = "a hard limit is a thousand times as dear as a soft one, which single numbers cannot hold"
-        raise UserError(problem, hint="export it without, or tune with soft limits")
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     model = controller.model
     code = write_model(model.model, model.drive_index, model.dt / model.sub)
-    sizes = design_struct.sizes_of(controller, code, room=False, single=single)
+    sizes = design_struct.sizes_of(controller, code, room=False)
     constants_of = np.array(code.constants(model.p.tolist()))
-    numbers = design_struct.numbers_of(controller, constants_of, single=single)
+    numbers = design_struct.numbers_of(controller, constants_of)
     files = {name: c_source(name) for name in _COPIED} | code.files
     files |= {
         "tg_config.h": design_struct.config_header(sizes),
@@ -123,16 +105,13 @@ def export_controller(
         + design_struct.initialiser(sizes, numbers)
         + "\n};\n",
     }
-    ram, constants = design_struct.bytes_of(sizes, single=single)
-    files["README.md"] = _readme(controller, sizes, ram, constants)
+    files["README.md"] = _readme(controller, sizes)
     if arduino:
         files = _as_library(controller, files)
-    if single:
-        files = in_single(files)
     for name, content in files.items():
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         write_atomic(folder / name, content)
-    return Export(folder, tuple(sorted(files)), ram, constants, single)
+    return Export(folder, tuple(sorted(files)))
 
 
 def _as_library(controller: Controller, files: dict[str, str]) -> dict[str, str]:
@@ -184,7 +163,7 @@ def check_export(
         for name in export.files:
             shutil.copyfile(export.folder / name, build.folder / name)
         _make(build.folder, "all", *(("sanitized",) if sanitize else ()))
-        answers = _answers(build, given, sanitize)
+        (ram, constants), answers = _answers(build, given, sanitize)
         flash, stack = _footprint(build.folder)
     found = np.zeros((states, 4))
     for at, (state, answer) in enumerate(zip(given, answers, strict=True)):
@@ -192,21 +171,17 @@ def check_export(
         if progress is not None and at % 100 == 0:
             progress(at / states, "states")
     difference, free, status, iterations = found.T
-    alike = np.ones(states, dtype=bool)
-    if export.single:
-        alike = (status > 0) & (difference <= _SINGLE_TOLERANCE)
     return Agreement(
         states,
-        float(np.max(difference, where=alike, initial=0.0)),
+        float(np.max(difference)),
         int(np.sum(free)),
         int(np.sum(status)),
         int(np.sum(iterations)),
         flash,
-        export.ram,
+        ram,
+        constants,
         stack,
-        _SINGLE_TOLERANCE if export.single else _HARD_TOLERANCE if controller.design.hard else _TOLERANCE,
-        export.single,
-        int(np.sum(~alike)),
+        _HARD_TOLERANCE if controller.design.hard else _TOLERANCE,
     )
 
 
@@ -249,7 +224,7 @@ class _State:
         return np.concatenate([*before, *after])
 
 
-class _Twin(Controller):
+class _Twin(ReferenceController):
     """A controller that can be put into the middle of things."""
 
     _rests: tuple[tuple[Array, Array, Array], ...] = ()
@@ -268,7 +243,7 @@ class _Twin(Controller):
 
     def place(self, state: _State) -> None:
         """Put the loop into the middle of things; what is not named there is as after a reset."""
-        self._start(np.full(self.model.n_y, self.design.ambient), state.d)
+        self._start(np.full(self.model.n_y, self.design.ambient), state.d, self.observer.reset_in_room)
         self.observer.found_offset = np.zeros(self.model.n_y)
         self.observer.x, self.observer.w = state.x.copy(), state.w.copy()
         self._u = self._in_force = state.u.copy()
@@ -286,26 +261,7 @@ def _twin(controller: Controller) -> _Twin:
     twin = _Twin(controller.plant, design, clock=_Clock())
     qp = twin.optimiser.qp
     twin.optimiser.qp = ActiveSetQP(soft=qp.soft, linear=qp.linear, quadratic=qp.quadratic)
-    # the C's own start, too: the other takes longer than a step, and each state brings its own estimate
-    vars(twin.observer)["reset"] = _remembered(twin.observer)
     return twin
-
-
-def _remembered(observer: Observer) -> Callable[[Array, Array], None]:
-    """Return the C's start of an observer, worked out once for each reading and room: there are a hundred."""
-    kept: dict[bytes, dict[str, Any]] = {}
-
-    def reset(y: Array, d: Array) -> None:
-        key = y.tobytes() + d.tobytes()
-        if key not in kept:
-            observer.reset_in_room(y, d)
-            kept[key] = {
-                name: copy(v) for name, v in vars(observer).items() if isinstance(v, np.ndarray | float)
-            }
-        fresh = {name: v.copy() if isinstance(v, np.ndarray) else v for name, v in kept[key].items()}
-        vars(observer).update(fresh)
-
-    return reset
 
 
 def _random_state(twin: _Twin, rng: np.random.Generator) -> _State:
@@ -346,8 +302,8 @@ def _random_state(twin: _Twin, rng: np.random.Generator) -> _State:
     )
 
 
-def _range_of(controller: Controller) -> tuple[float, float]:
-    low, high = controller.plant.valid.get(controller.controlled[0], (15.0, 45.0))
+def _range_of(controller: Controller | ReferenceController) -> tuple[float, float]:
+    low, high = controller.model.plant.valid.get(controller.controlled[0], (15.0, 45.0))
     return float(low), float(high)
 
 
@@ -385,16 +341,14 @@ def _run(program: Path, text: str) -> list[str]:
     return done.stdout.splitlines()
 
 
-def _answers(export: Export, given: list[_State], sanitize: bool) -> list[str]:
-    """Return what the C program answers to these states, a line each."""
+def _answers(export: Export, given: list[_State], sanitize: bool) -> tuple[tuple[int, int], list[str]]:
+    """Return the bytes of a controller and of a design, and what the C program answers to these states."""
     text = "\n".join(" ".join(float(v).hex() for v in state.flat()) for state in given) + "\n"
     head, *answers = _run(export.folder / "check", text)
     if sanitize:  # other flags, another program: it must live, and say the same
         _same_answers(answers, _run(export.folder / "sanitized", text)[1:])
-    sizes = head.split()
-    if (int(sizes[1]), int(sizes[3])) != (export.ram, export.constants):
-        raise RuntimeError(f"the export says it takes {head}, not {export.ram} and {export.constants}")
-    return answers
+    _, ram, _, constants = head.split()
+    return (int(ram), int(constants)), answers
 
 
 def _same_answers(plain: list[str], sanitized: list[str]) -> None:
@@ -432,7 +386,7 @@ def _listed(names: Sequence[str]) -> str:
     return ", ".join(markdown(name) for name in names)
 
 
-def _readme(controller: Controller, sizes: design_struct.Sizes, ram: int, constants: int) -> str:
+def _readme(controller: Controller, sizes: design_struct.Sizes) -> str:
     model, design = controller.model, controller.design
     low, high = _range_of(controller)
     ranges = "; ".join(f"{markdown(name)} in [{a:g}, {b:g}]" for name, (a, b) in design.drive_range.items())
@@ -443,8 +397,6 @@ def _readme(controller: Controller, sizes: design_struct.Sizes, ram: int, consta
         model=model,
         design=design,
         sizes=sizes,
-        ram=ram,
-        constants=constants,
         outputs=_listed(controlled),
         drives=_listed(model.drives),
         y_example=", ".join(["25.0"] * model.n_y),

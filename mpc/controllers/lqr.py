@@ -166,7 +166,9 @@ class LQRController(SampledController):
         else:
             u, status = self.propose(wanted, passed / self.dt), "ok" if seen.all() else "fallback_plan"
             if seen.any() and not seen.all():
-                said = said or self._unseen([self.model.drives[j] for j in self._parked(lost)])
+                said = said or self._unseen(
+                    [self.model.drives[j] for j in self._parked(lost)], self._unread_s
+                )
             said = said or ("" if seen.all() else "reading lost: the state is predicted")
         self._u = self._within(u, passed)
         return self._answer(status, said, started)

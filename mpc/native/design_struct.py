@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from thermogrip.datasets.arrays import Array
-from thermogrip.mpc.native.modes import Modes, modes_of
 from thermogrip.mpc.native.shared_constants import shared_definitions
 
 if TYPE_CHECKING:
@@ -114,11 +113,6 @@ _FIELDS: dict[str, tuple[bool, tuple[str, ...], str]] = {
     "by_d": (False, ("NO", "ND"), "by the disturbances,"),
     "by_none": (False, ("NO",), "and without them"),
     "P_rest": (False, ("NX", "NX"), "covariance of the states in which the plant may rest"),
-    "H": (False, ("NY", "NX"), "outputs from the states of P, which are modes of the plant where it has NJ:"),
-    "modes": (False, ("NX", "NJ"), "states by modes,"),
-    "mode_step": (False, ("3", "NJ"), "in a sample by the mode before, itself, and the mode behind,"),
-    "mode_by_w": (False, ("NW", "NJ"), "by the disturbance states,"),
-    "Q_modes": (False, ("NJ", "NJ"), "and what a sample adds to their covariance"),
 }
 
 
@@ -143,7 +137,6 @@ class Sizes:
     NK: int  # what the model's ``prepare``, ``hold`` and ``partials`` hand over
     NF: int
     NM: int
-    NJ: int  # modes in which a linear plant's covariance is kept: as many as states, or 0
     LEAN: int  # whether soft rows are so many that the broken ones are eliminated
 
     @property
@@ -163,10 +156,10 @@ class Sizes:
 
     def shape(self, name: str) -> tuple[int, ...]:
         """Return the shape of a field, as NumPy has it."""
-        return tuple(int(size) if size.isdigit() else getattr(self, size) for size in _FIELDS[name][1])
+        return tuple(getattr(self, size) for size in _FIELDS[name][1])
 
 
-def sizes_of(controller: ControllerParts, code: ModelCode, *, room: bool, single: bool = False) -> Sizes:
+def sizes_of(controller: ControllerParts, code: ModelCode, *, room: bool) -> Sizes:
     """Return the sizes of a controller; with ``room``, such that its variants in a search fit too."""
     model, design = controller.model, controller.design
     N, n_y = sum(design.blocks), model.n_y
@@ -193,17 +186,8 @@ def sizes_of(controller: ControllerParts, code: ModelCode, *, room: bool, single
         NK=code.n_k,
         NF=code.n_h,
         NM=code.n_m,
-        NJ=0 if filter_modes(controller, single=single) is None else model.n_x,
         LEAN=int(N * (len(design.controlled) + len(design.limits)) >= 4 * len(design.blocks) * model.n_u),
     )
-
-
-def filter_modes(controller: ControllerParts, *, single: bool = False) -> Modes | None:
-    """Return the modes in which the C keeps P, where there are any; ``single`` numbers have no digits to
-    spare for that, and derivatives of a plant that does not settle are asked for in its states."""
-    if single or not controller.disturbance.n_w or not _settles(controller.model):
-        return None
-    return modes_of(controller.model, tuple(controller.observer.unit.tolist()))
 
 
 def _settles(model: PredictionModel) -> bool:
@@ -240,11 +224,11 @@ def config_header(sizes: Sizes) -> str:
     return "\n".join([*lines, "} tg_design;", "", "#endif", ""])
 
 
-def structure_of(sizes: Sizes, number: Any = ctypes.c_double) -> type[ctypes.Structure]:
-    """Return ``tg_design`` as ctypes sees it, of numbers of this kind."""
+def structure_of(sizes: Sizes) -> type[ctypes.Structure]:
+    """Return ``tg_design`` as ctypes sees it."""
     fields = []
     for name, (whole, shape, _) in _FIELDS.items():
-        kind = ctypes.c_int if whole else number
+        kind: Any = ctypes.c_int if whole else ctypes.c_double
         fields.append((name, kind * max(1, int(np.prod(sizes.shape(name)))) if shape else kind))
     return type("tg_design", (ctypes.Structure,), {"_fields_": fields})
 
@@ -273,7 +257,7 @@ def initialiser(sizes: Sizes, numbers: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def numbers_of(controller: ControllerParts, k: Array, *, single: bool = False) -> dict[str, Any]:
+def numbers_of(controller: ControllerParts, k: Array) -> dict[str, Any]:
     """Return every number of the table for a controller; ``k`` is what ``prepare`` gave."""
     model, design, optimiser = controller.model, controller.design, controller.optimiser
     observer, disturbance, loops = controller.observer, controller.disturbance, design.loops
@@ -325,26 +309,6 @@ def numbers_of(controller: ControllerParts, k: Array, *, single: bool = False) -
         "P_rest": rest.P,
         **_free_response(model, design, rows),
         **_settled(model, disturbance),
-        **_of_modes(model, controller, filter_modes(controller, single=single)),
-    }
-
-
-def _of_modes(model: PredictionModel, controller: ControllerParts, modes: Modes | None) -> dict[str, Any]:
-    """Return what the filter's covariance needs of a plant in modes."""
-    disturbance, observer = controller.disturbance, controller.observer
-    if modes is None or model.affine is None:
-        shapes = {"modes": (model.n_x, 0), "mode_step": (3, 0), "mode_by_w": (disturbance.n_w, 0)}
-        nothing = {name: np.zeros(shape) for name, shape in (shapes | {"Q_modes": (0, 0)}).items()}
-        return {"H": model.C} | nothing
-    _, B, E, _ = model.affine
-    by_w = B @ (disturbance.on_drive * model.span[:, None]) + E @ disturbance.on_disturbance
-    return {
-        "P_rest": modes.into(observer.rest_in_room().P),
-        "H": model.C @ modes.states,
-        "modes": modes.states,
-        "mode_step": modes.step,
-        "mode_by_w": (modes.inverse @ by_w).T,
-        "Q_modes": modes.into(np.diag(observer.Q[: model.n_x])),
     }
 
 
@@ -382,74 +346,3 @@ def _padded(sizes: Sizes, name: str, values: Any) -> Array:
     full = np.zeros(sizes.shape(name))
     full[tuple(slice(0, n) for n in given.shape)] = given
     return full
-
-
-def bytes_of(s: Sizes, *, single: bool = False) -> tuple[int, int]:
-    """Return what ``sizeof`` says of a controller and of a design."""
-    number = ctypes.c_float if single else ctypes.c_double
-    parts = {"_fields_": _laid_out(_controller_parts(s, number))}
-    controller = type("tg_controller", (ctypes.Structure,), parts)
-    return ctypes.sizeof(controller), ctypes.sizeof(structure_of(s, number))
-
-
-def _laid_out(parts: list[tuple[Any, int]]) -> list[tuple[str, Any]]:
-    return [(f"part{at}", kind * max(1, count)) for at, (kind, count) in enumerate(parts)]
-
-
-def _controller_parts(s: Sizes, number: Any) -> list[tuple[Any, int]]:
-    """Return kind and length of each part of ``tg_controller``, in order."""
-    whole = ctypes.c_int
-    n, z, some = s.NB * s.NU, s.NZ, max(1, s.NS)
-    wide = _whole(max(s.NX + s.NU + s.ND, n))
-    qp = type("tg_qp", (ctypes.Structure,), {"_fields_": _laid_out(_qp_parts(s, number))})
-    return [
-        (ctypes.c_void_p, 4),
-        *((number, count) for count in (s.NX, s.NW, z * z, s.NY, s.NY)),
-        (whole, z),
-        *((number, count) for count in (3, s.NU, s.NX, s.NY)),
-        (ctypes.c_double, 2),
-        (number, 7),
-        (whole, 2),
-        *((number, count) for count in (s.ND, s.NY, s.NU, s.NU, s.NC, s.NC, s.NC, s.NH * s.NU, s.NC, 2)),
-        *((number, count) for count in (s.NY, s.NY, s.NX, s.NC, 1, s.NB, s.NC)),
-        *((number, count) for count in (s.NX, s.NU, 1)),
-        (whole, 3),
-        (whole, 7 + s.NY + s.NC),
-        *((number, count) for count in (n, s.NH * s.NY, n, 1)),
-        (whole, 2),
-        (number, 1),
-        (whole, s.NC + 3),
-        (qp, 1),
-        (number, max(1, s.NR)),
-        *((number, count) for count in (max(1, s.NE), s.NH * s.NY, s.NH * s.NY, s.NH * some + s.NP)),
-        *((number, count) for count in (2 * s.NX * wide, s.NU * wide, max(1, s.ND) * wide)),
-        *((number, count) for count in (4 * max(1, s.NF), s.NM, z * z, z * z)),
-    ]
-
-
-def _qp_parts(s: Sizes, number: Any) -> list[tuple[Any, int]]:
-    whole, small = ctypes.c_int, ctypes.c_byte
-    n, soft = s.NB * s.NU, s.NH * s.NS + s.NP
-    rows, w = 2 * n + soft, _whole(n)
-    kept = 4 * n + 8 if s.LEAN else rows
-    return [
-        (whole, 5),
-        *((number, count) for count in (n * w, w, 2 * rows)),
-        (ctypes.c_void_p, 1),
-        *((whole, max(1, soft)) for _ in range(2)),
-        *((number, count) for count in (max(1, s.NS),) * 3),
-        (number, 1),
-        (whole, 2),
-        (ctypes.c_void_p, 2),
-        (number, w),
-        (whole, 2 + 2 * rows),
-        (small, 2 * rows),
-        *(
-            (number, count)
-            for count in (rows, w + rows, (rows + 3) * w, kept * (kept + 1) // 2 + 3, kept, rows)
-        ),
-        *((number, count) for count in ((n * w, n * w, kept * w) if s.LEAN else (1, 1, 1))),
-        (whole, kept + 2),
-        (number, 2 * rows),
-        (small, rows),
-    ]

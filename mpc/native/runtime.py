@@ -1,12 +1,12 @@
-"""The controller's C, built where gcc is there, in place of the same thing in Python.
+"""The controller's C, built where gcc is there.
 
 The sources of an export (:mod:`thermogrip.mpc.controllers.export`), with a model's step written by
 :mod:`thermogrip.mpc.native.codegen`, become a library in the user's cache directory.  It is named by the hash
 of all that went into it: sources, flags, and what the compiler says of the machine.  A second controller of
 the same structure (any parameters, any weights) finds it built; anything else is built beside it.
 
-:class:`CompiledOptimiser` and :class:`CompiledObserver` answer what their Python parents answer, to 1e-10.
-Nothing needs them: without gcc, or with ``THERMOGRIP_COMPILED=0`` in the environment, Python does the work.
+Without gcc, or with ``THERMOGRIP_COMPILED=0`` in the environment, steps are done in Python
+(:mod:`thermogrip.mpc.controllers.reference`).
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import os
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 from importlib import resources
 from pathlib import Path
@@ -28,17 +28,14 @@ from numpy.typing import NDArray
 
 from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.code_cache import code_cache, only_ours
-from thermogrip.mpc.estimator.observer import Observer
 from thermogrip.mpc.native.codegen import ModelCode, write_model
 from thermogrip.mpc.native.design_struct import (
     Sizes,
     as_structure,
     config_header,
-    filter_modes,
     numbers_of,
     sizes_of,
 )
-from thermogrip.mpc.optimiser.rti import Optimiser, Outcome, Sample
 
 if TYPE_CHECKING:
     from thermogrip.mpc.optimiser.rti import ControllerParts
@@ -91,6 +88,8 @@ def build_library(files: dict[str, str]) -> Path:
     path = code_cache() / f"mpc-{key}.so"
     if path.is_file() and only_ours(path):
         return path
+    if key in _refused:
+        raise RuntimeError(_refused[key])
     with tempfile.TemporaryDirectory(dir=path.parent) as folder:
         for name, content in files.items():
             (Path(folder) / name).write_text(content, encoding="utf-8")
@@ -98,11 +97,15 @@ def build_library(files: dict[str, str]) -> Path:
         command = [gcc, *_FLAGS, *units, "-lm", "-o", "built.so"]
         done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
         if done.returncode:
-            raise RuntimeError(f"gcc refused: {done.stderr.strip()[:300]}")
+            _refused[key] = f"gcc refused: {done.stderr.strip()[:300]}"
+            raise RuntimeError(_refused[key])
         built = Path(folder) / "built.so"
         built.chmod(0o755)
         os.replace(built, path)  # whole, or not there
     return path
+
+
+_refused: dict[str, str] = {}  # what gcc said of libraries that it did not build, so as not to ask it again
 
 
 @cache
@@ -176,88 +179,71 @@ def _truth_library(model: _ByStructure, drives: tuple[int, ...], h: float) -> ct
 @cache
 def _library(path: Path) -> ctypes.CDLL:
     library = ctypes.CDLL(str(path))
-    doubles, integers = "x w P found_offset innovation between", "held lost"
+    doubles, integers = "x w P found_offset seen target y ramped unread_s nearest", "stays qp_status"
     for names, kind in ((doubles, ctypes.c_double), (integers, ctypes.c_int)):
         for name in names.split():
             getattr(library, f"tg_host_{name}").restype = ctypes.POINTER(kind)
-    library.tg_advice_text.restype = ctypes.c_char_p
     library.tg_host_size.restype = library.tg_host_design_size.restype = ctypes.c_long
     return library
 
 
 class CompiledController:
-    """The C of one controller, loaded: its design and one state, for optimiser, observer and trials."""
+    """The C of one controller, loaded: its design and one state.
 
-    def __init__(self, controller: ControllerParts) -> None:
+    ``given`` holds what a step is given, in this order: outputs, disturbances, drives that were applied, time
+    and targets, NaN where there is none; ``answer`` what it answers, as ``tg_host_step`` of ``tg_host.c``
+    says.  ``late`` says whether a step has taken too long; without it the clock of the C does, by the
+    design's deadline.
+    """
+
+    def __init__(self, controller: ControllerParts, late: Callable[[], bool] | None = None) -> None:
         model = controller.model
-        step = _code_of(model)
-        self.sizes: Sizes = sizes_of(controller, step, room=True)
-        files = {name: c_source(name) for name in (*SOURCES, "tg_host.c")} | step.files
+        code = _code_of(model)
+        self.sizes: Sizes = sizes_of(controller, code, room=True)
+        files = {name: c_source(name) for name in (*SOURCES, "tg_host.c")} | code.files
         self.library = _library(build_library(files | {"tg_config.h": config_header(self.sizes)}))
-        k = np.zeros(max(1, step.n_k))
+        k = np.zeros(max(1, code.n_k))
         self.library.tg_host_prepare(address(np.ascontiguousarray(model.p)), address(k))
-        self.design = as_structure(self.sizes, numbers_of(controller, k[: step.n_k]))
+        self.design = as_structure(self.sizes, numbers_of(controller, k[: code.n_k]))
         if ctypes.sizeof(self.design) != self.library.tg_host_design_size():
             raise RuntimeError("the C struct and its table disagree")
-        self.modes = filter_modes(controller)
-        self.advice = ""  # of the last step
-        self._room = np.zeros(self.library.tg_host_size() // 8 + 8)
-        self.state = ctypes.c_void_p(self._room.ctypes.data)
-        self.begin()
-
-    def begin(self) -> None:
-        """Clear the state."""
+        self._memory = np.zeros(self.library.tg_host_size() // 8 + 8)
+        self.state = ctypes.c_void_p(self._memory.ctypes.data)
         self.library.tg_host_begin(self.state, ctypes.byref(self.design))
+        n_u = self.sizes.NU
+        self.given = (ctypes.c_double * (model.n_y + model.n_d + n_u + 1 + self.sizes.NC))()
+        self.answer = (ctypes.c_double * (n_u + 7))()
+        self._step, self._seconds = self.library.tg_host_step, ctypes.c_double(controller.design.deadline_s)
+        self._places = ctypes.byref(self.given), ctypes.byref(self.answer)
+        self._until = ctypes.c_double()
+        self.ask_late(late)
 
-    def reset(self, y: Array, d: Array, like: Observer | None = None) -> None:
-        """Start at rest at reading y (n_y,), disturbances d (n_d,); with the estimate of an observer, where
-        one is given, in place of the one of the plant linearised in its room."""
-        given = np.ascontiguousarray(y, float), np.ascontiguousarray(d, float)
-        self.library.tg_host_reset(self.state, address(given[0]), address(given[1]))
-        if like is not None:
-            estimate = like.estimate()
-            estimate["P"] = self.kept(estimate["P"])
-            for name, values in estimate.items():
-                self.view(name, values.shape)[...] = values
+    def ask_late(self, late: Callable[[], bool] | None) -> None:
+        """Ask ``late``, or the clock of the C, whether a step has taken too long."""
+        if late is None:
+            self._late: Any = self.library.tg_host_clock
+        else:
+            self._late = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p)(lambda _: int(late()))
+        self.library.tg_host_late(self.state, self._late, ctypes.byref(self._until))
 
-    def step(
-        self,
-        y: Array,
-        d: Array,
-        target: Array,
-        *,
-        time_s: float = np.nan,
-        applied: Array | None = None,
-    ) -> tuple[Array, int, int]:
-        """Do one step of the whole controller in C and return drives (n_u,), pump, and the place in
-        :data:`thermogrip.mpc.interface.STATUSES`, for readings, disturbances and targets in degC, NaN where
-        lost; without a time one sample has passed, without ``applied`` (n_u,) the last answer was."""
-        given = [np.ascontiguousarray(values, float) for values in (y, d, target)]
-        did = None if applied is None else np.ascontiguousarray(applied, float)
-        drive, over, what = np.zeros(self.sizes.NU), ctypes.c_double(), np.zeros(4, dtype=np.int32)
-        self.library.tg_host_step(
-            self.state,
-            ctypes.c_double(time_s),
-            address(given[0]),
-            address(given[1]),
-            None if did is None else address(did),
-            *(address(given[2]), address(drive), ctypes.byref(over), address(what)),
-        )
-        self.advice = self.library.tg_advice_text(int(what[2])).decode()
-        return drive, int(what[0]), int(what[1])
+    def reset(self, estimate: Mapping[str, Array] | None = None) -> None:
+        """Start at rest at what is ``given``, with this estimate in place of the one of the plant linearised
+        in its room."""
+        self.library.tg_host_reset(self.state, self._places[0])
+        for name, values in ({} if estimate is None else estimate).items():
+            self.view(name, values.shape)[...] = values
 
-    def kept(self, P: Array) -> Array:
-        """Return the filter's covariance (n_z, n_z) of states, modes or not, as the C keeps it."""
-        return P if self.modes is None else self.modes.into(P)
+    def step(self, paused: bool = False) -> None:
+        """Do one step with what is ``given``; ``paused`` while the pump is off."""
+        self._step(self.state, self._places[0], paused, self._seconds, self._places[1])
 
-    def covariance(self) -> Array:
-        """Return the filter's covariance (n_z, n_z) of states."""
-        P = self.view("P", (self.sizes.NZ, self.sizes.NZ)).copy()
-        return P if self.modes is None else self.modes.out_of(P)
+    def plan(self) -> Array | None:
+        """Return the drives (N, n_u) that are planned from now on, if any are."""
+        plan = np.zeros((self.design.N, self.sizes.NU))
+        return plan if self.library.tg_host_plan(self.state, address(plan)) else None
 
     def view(self, name: str, shape: tuple[int, ...]) -> NDArray[Any]:
-        """Return an array that shares memory with a part of the state: ``x``, ``w``, ``P``
-        (see :meth:`kept`), ``found_offset``, ``innovation``, ``between`` or ``held``."""
+        """Return an array that shares memory with a part of the state, one of those of :func:`_library`."""
         pointer = getattr(self.library, f"tg_host_{name}")(self.state)
         return np.ctypeslib.as_array(pointer, shape=shape)
 
@@ -288,130 +274,6 @@ class CompiledTruth:
         held = (np.array(x, dtype=float), np.zeros(len(x)), self._k, self._C, self._level + offset)
         after = ctypes.cast(self._library.tg_model_next, ctypes.c_void_p)
         return _Truth(after, len(x), *(address(values) for values in held)), held
-
-
-class CompiledOptimiser(Optimiser):
-    """:class:`Optimiser` whose samples are solved in C."""
-
-    def __init__(self, like: Optimiser, c: CompiledController) -> None:
-        self.__dict__.update(like.__dict__)
-        self._c = c
-        n, n_u, model = self.n_b * self.model.n_u, self.model.n_u, self.model
-        self._plan, self._y = np.zeros((self.n_b, n_u)), np.zeros((self.N, model.n_y))
-        self._authority_now, self._over = np.zeros((self.n_b, n_u)), ctypes.c_double()
-        self._iterations = ctypes.c_int()
-        self._lost = c.view("lost", (len(self.design.controlled),))
-        n_c = len(self.design.controlled)
-        # one block of memory for what goes in, so that a call costs next to nothing
-        lengths = (model.n_x, n_u, n, model.n_d, n_c, n_c, model.n_y, n_u, 2 + self.n_b)
-        self._given = np.zeros(sum(lengths))
-        ends = np.cumsum(lengths)
-        self._parts = [self._given[end - length : end] for end, length in zip(ends, lengths)]
-        self._arguments = (
-            c.state,
-            *(address(part) for part in self._parts),
-            *(address(values) for values in (self._plan, self._y, self._authority_now)),
-            ctypes.byref(self._over),
-            ctypes.byref(self._iterations),
-        )
-        self._run = c.library.tg_host_optimise
-
-    def solve(self, sample: Sample) -> Outcome:
-        """Improve a plan; see :meth:`Optimiser.solve`."""
-        if sample.d.ndim > 1:
-            return super().solve(sample)
-        *parts, slew = self._parts
-        for part, values in zip(parts, sample[:8], strict=True):
-            part[:] = values.ravel()
-        slew[:2] = self.design.dt if sample.slew_s is None else sample.slew_s, sample.caution
-        slew[2:] = self.counted(sample.prices)
-        self._lost[:] = 0 if sample.lost is None else sample.lost
-        if sample.ahead is None:
-            status = QP_STATUS[self._run(*self._arguments)]
-        else:
-            ahead = np.ascontiguousarray(sample.ahead, float)
-            self._c.library.tg_host_goals(self._c.state, address(ahead))
-            status = QP_STATUS[self._run(*self._arguments)]
-            self._c.library.tg_host_goals(self._c.state, None)
-        y, authority, iterations = self._y.copy(), self._authority_now[0].copy(), self._iterations.value
-        if status != "solved":
-            plan = np.full(self._plan.shape, np.nan)
-            return Outcome(plan, y, status, {}, iterations, authority)
-        broken = self._broken(y) if self._over.value > 0.1 else {}
-        return Outcome(self._plan.copy(), y, status, broken, iterations, authority)
-
-    def forget(self) -> None:
-        """Start afresh."""
-        super().forget()
-        self._c.library.tg_host_forget(self._c.state)
-
-
-class CompiledObserver(Observer):
-    """:class:`Observer` whose filter runs in C."""
-
-    def __init__(self, like: Observer, c: CompiledController) -> None:
-        self._c = c
-        n_x, n_w, n_z = like.model.n_x, like.disturbance.n_w, c.sizes.NZ
-        self._views = {
-            "x": c.view("x", (n_x,)),
-            "w": c.view("w", (n_w,)),
-            "_P": c.view("P", (n_z, n_z)),
-            "_held": c.view("held", (n_z,)),
-            "found_offset": c.view("found_offset", (like.model.n_y,)),
-            "innovation": c.view("innovation", (like.model.n_y,)),
-        }
-        for name, value in like.__dict__.items():
-            setattr(self, name, value)
-
-    def __setattr__(self, name: str, value: Any) -> None:
-        if name in self.__dict__.get("_views", ()):
-            self._views[name][...] = self._c.kept(value) if name == "_P" else value
-        else:
-            object.__setattr__(self, name, value)
-
-    def __getattr__(self, name: str) -> Any:
-        views = self.__dict__.get("_views", {})
-        if name not in views:
-            raise AttributeError(name)
-        if name == "_P":
-            return self._c.covariance()
-        return views[name] if name == "_held" else views[name].copy()
-
-    def _on_sample(self) -> None:
-        self._c.view("between", (3,))[...] = 0.0
-        super()._on_sample()
-
-    @property
-    def now(self) -> Array:
-        """The state (n_x,) where readings are compared."""
-        n_u, n_x = self.model.n_u, self.model.n_x
-        between = self._c.view("between", (3 + n_u + n_x,))
-        return between[3 + n_u :].copy() if between[1] > 0 else self.x
-
-    def update(self, y: Array) -> Array:
-        """Correct the estimate with a reading (n_y,), NaN where lost; return the innovation (n_y,)."""
-        innovation = y - self.reading()
-        self._c.library.tg_observer_update(self._c.state, address(np.ascontiguousarray(y, float)))
-        return np.asarray(innovation)
-
-    def refine(self, y: Array) -> None:
-        """Correct the estimate with a reading (n_y,) between two moves."""
-        self._c.library.tg_observer_refine(self._c.state, address(np.ascontiguousarray(y, float)))
-
-    def predict(self, u: Array, d: Array) -> None:
-        """Carry the estimate one sample on under drives u (n_u,) and disturbances d (n_d,)."""
-        drives, held = np.ascontiguousarray(u, float), np.ascontiguousarray(d, float)
-        self._c.library.tg_observer_predict(self._c.state, address(drives), address(held))
-
-    def advance(self, seconds: float, u: Array, d: Array) -> None:
-        """Let so many seconds pass under drives u (n_u,) and disturbances d (n_d,)."""
-        drives, held = np.ascontiguousarray(u, float), np.ascontiguousarray(d, float)
-        passed = ctypes.c_double(seconds)
-        self._c.library.tg_observer_advance(self._c.state, passed, address(drives), address(held))
-
-    def look(self, d: Array) -> None:
-        """Look where :meth:`advance` has come to."""
-        self._c.library.tg_observer_look(self._c.state, address(np.ascontiguousarray(d, float)))
 
 
 def address(values: NDArray[Any]) -> ctypes.c_void_p:

@@ -26,9 +26,7 @@ _SHARED: dict[ModuleType, tuple[str, ...]] = {
         *("BEYOND_LIMIT", "CAN", "CANNOT", "CONVERGED", "LEAST_SD", "MISS_ALARM", "MISS_ALLOWANCE"),
         *("MISS_CLIP", "STEADY_STEPS", "STRIDE", "SWEEPS", "TAKE_BACK"),
     ),
-    reading_checks: (
-        *("LEFT_OUT", "SHARE"),
-    ),
+    reading_checks: (*("LEFT_OUT", "SHARE"),),
     rti: ("BARELY", "CURVED", "FADING", "FIRST", "LITTLE", "LOOK_AROUND", "SAFE", "SHARES"),
 }
 

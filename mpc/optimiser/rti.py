@@ -80,7 +80,7 @@ class Sample(NamedTuple):
     x: Array  # (n_x,) state
     last: Array  # (n_u,) drives that are applied now
     guess: Array  # (n_b, n_u) plan to linearise along
-    d: Array  # (n_d,) disturbances, their bias included; or (N, n_d) of each sample ahead
+    d: Array  # (n_d,) disturbances, their bias included
     target: Array  # (n_controlled,) [degC]
     side: Array  # (n_controlled,) from where a target is approached: +1 below, -1 above, 0 neither
     bias: Array  # (n_y,) reading minus model
@@ -362,8 +362,7 @@ class Optimiser:
         if self._along is not None:
             return self._along.outputs(x, plans, d)
         states = np.repeat(x[None, :], len(plans), axis=0)
-        held = d if d.ndim == 1 else d[None]
-        y, _ = self.model.run(states, np.repeat(plans, self.blocks, axis=1), held)
+        y, _ = self.model.run(states, np.repeat(plans, self.blocks, axis=1), d)
         return y[:, 1:]
 
     def _ramps(self, last: Array, more: float) -> Array:
@@ -408,8 +407,7 @@ class Optimiser:
         return np.asarray(cost)
 
     def forget(self) -> None:
-        """Start afresh: no warm start, and the ramps are tried at the first solve."""
-        self.qp.forget()
+        """Start afresh: the ramps are tried at the first solve."""
         self._solves = 0
 
     def linear_gains(self, G: Array, rows: list[int]) -> tuple[Array, Array, Array]:
@@ -512,8 +510,13 @@ def allowed_share(end: Array, best: Array, span: Array) -> Array:
 class ControllerParts(Protocol):
     """The parts of a model-predictive controller, as its C code and its linear equivalent read them."""
 
-    model: PredictionModel
-    design: Design
-    disturbance: DisturbanceModel
-    observer: Observer
-    optimiser: Optimiser
+    @property
+    def model(self) -> PredictionModel: ...
+    @property
+    def design(self) -> Design: ...
+    @property
+    def disturbance(self) -> DisturbanceModel: ...
+    @property
+    def observer(self) -> Observer: ...
+    @property
+    def optimiser(self) -> Optimiser: ...

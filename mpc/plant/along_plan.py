@@ -54,8 +54,8 @@ class AlongPlan:
         self._plans = Batch(kernel, batch=_PLANS, n=rows, h=step)
 
     def trajectory(self, x: Array, plan: Array, d: Array) -> tuple[Array, Array]:
-        """Return outputs (N, n_y) of a plan (n_b, n_u) from state x (n_x,) under disturbances d, (n_d,) or
-        (N, n_d), and their derivatives (N, n_y, n_b, n_u), which lie output by output."""
+        """Return outputs (N, n_y) of a plan (n_b, n_u) from state x (n_x,) under disturbances d (n_d,), and
+        their derivatives (N, n_y, n_b, n_u), which lie output by output."""
         n_y, batch = self._sizes[2], self._by_drive
         self._run(batch, slice(None), x, plan[self._block], d)
         y = batch.y[:, self._sub :: self._sub]
@@ -76,7 +76,7 @@ class AlongPlan:
         batch.x0[members, :n_x] = x
         batch.u[members, :, :n_u] = u
         if n_d:
-            batch.d[0, :, :n_d] = d if d.ndim == 1 or self._sub == 1 else np.repeat(d, self._sub, axis=0)
+            batch.d[0, :, :n_d] = d
         batch.run()
 
 

@@ -295,19 +295,11 @@ class PredictionModel:
 
     def trajectory(self, x: Array, plan: Array, d: Array, blocks: Sequence[int]) -> tuple[Array, Array]:
         """Return the outputs (N, n_y) after 1...N samples of a plan (n_b, n_u) of blocks, from state x under
-        disturbances d, (n_d,) or (N, n_d), and their derivatives (N, n_y, n_b, n_u), of a linear plant the
-        same array each time."""
+        disturbances d (n_d,), and their derivatives (N, n_y, n_b, n_u), of a linear plant the same array
+        each time."""
         if self.affine is not None:
             _, _, E, added = self.affine
             by_x, by_rest, G = self.response(tuple(blocks))
-            if d.ndim > 1:  # what a sample's disturbances do reaches as far as any
-                B = self.affine[1]
-                inputs = np.repeat(plan, np.asarray(blocks), axis=0) @ B.T + d @ E.T + added
-                states = []
-                for each in inputs:
-                    x = self.affine[0] @ x + each
-                    states.append(x)
-                return np.stack(states) @ self.C.T + self.output(np.zeros(self.n_x)), G
             y = by_x @ x + by_rest @ (E @ d + added) + np.tensordot(G, plan, axes=2)
             return y + self.output(np.zeros(self.n_x)), G
         along = self.along(blocks, np.ones(self.n_u))
@@ -356,8 +348,7 @@ class PredictionModel:
         outputs, gains = list[Array](), list[Array]()
         for block, length in enumerate(blocks):
             for _ in range(length):
-                now = d if d.ndim == 1 else d[len(outputs)]
-                x_next, A, B, _ = self._casadi_sample(x, plan[block], now)
+                x_next, A, B, _ = self._casadi_sample(x, plan[block], d)
                 sensitivity = np.asarray(np.tensordot(A, sensitivity, axes=1), dtype=np.float64)
                 sensitivity[:, block, :] += B
                 x = x_next.ravel()

@@ -32,6 +32,7 @@ from thermogrip.mpc.controllers.linear_equivalent import LinearLaw, linear_law, 
 from thermogrip.mpc.controllers.mpc import Controller
 from thermogrip.mpc.design.spec import Asked, Spec, spec_from_dict
 from thermogrip.mpc.estimator.observer import choose_disturbances, detectability_margin
+from thermogrip.mpc.interface import Move, Readings, Trajectory
 from thermogrip.mpc.native.design_struct import ITERATION_LIMIT
 from thermogrip.mpc.optimiser.rti import Optimiser
 from thermogrip.mpc.plant.prediction import PredictionModel, holding_drive, steady_curve, step_response
@@ -275,10 +276,11 @@ class _Counted(Controller):
 
     iterations: tuple[int, ...] = ()
 
-    def _decide(self, wanted: Array, started: float) -> tuple[Array, str, str]:
-        answer = super()._decide(wanted, started)
+    def step(self, reading: Readings, target: Trajectory) -> Move:
+        """Return the move for this sample."""
+        move = super().step(reading, target)
         self.iterations += (self.last_iterations,)
-        return answer
+        return move
 
 
 def _effort(controller: Controller, span: tuple[float, float]) -> list[Check]:

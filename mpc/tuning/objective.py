@@ -36,7 +36,6 @@ only ramp is in the band no sooner than its ramp brings it there, which is the b
 from __future__ import annotations
 
 import threading
-import warnings
 from collections import defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -565,7 +564,7 @@ class Search:
 
     def _begin_c(self) -> tuple[bool, list[Any]]:
         """Return whether C can be had, and the model's code."""
-        if self._compiled and self._in_c(self.baseline) is not None:
+        if self._compiled and self._controller(self.baseline).c is not None:
             CompiledTruth(prediction_model(self.plant, self.plant.dt))
         return self._compiled, known_codes()
 
@@ -773,7 +772,7 @@ class Search:
             prediction_model(drawn(self.plant, draw), self.plant.dt).held_starts |= self._starts[draw]
 
     def _builds(self, design: Design) -> bool:
-        return self._in_c(design) is not None
+        return self._controller(design).c is not None
 
     def _build_once(self, design: Design) -> None:
         """Have one process build the C of a structure, which the others find built: it takes seconds."""
@@ -822,18 +821,10 @@ class Search:
         return made
 
     def _controller(self, design: Design) -> Controller:
-        made = self._in_c(design) if self._compiled else None
-        return Controller(self.plant, design) if made is None else made
-
-    def _in_c(self, design: Design) -> Controller | None:
-        """Return the controller in C, None from the first time on that it cannot be had."""
-        try:
-            return Controller(self.plant, design, compiled=True)
-        except (RuntimeError, NotImplementedError, TypeError, OSError) as error:
-            # a gcc without headers, a step that has no C, a home that cannot be written
-            warnings.warn(f"trials run in Python, ten times slower: {error}", stacklevel=2)
-            self._compiled = False
-            return None
+        """Return an MPC; from the first time on that its steps cannot be had in C, none are expected to."""
+        made = Controller(self.plant, design)
+        self._compiled = self._compiled and made.c is not None
+        return made
 
 
 def _called(function: Callable[[], Any]) -> Any:

@@ -26,7 +26,6 @@ from thermogrip.datasets.parallel import Progress, Workers, sub_progress
 from thermogrip.datasets.schema import Log
 from thermogrip.mpc.controllers.mpc import Controller
 from thermogrip.mpc.design.spec import Spec
-from thermogrip.mpc.native.runtime import wanted
 from thermogrip.mpc.tuning.objective import StepResult, draws_of, run_trials
 from thermogrip.mpc.tuning.tune import Tuning, tune
 from thermogrip.sysid.identification import Identification, cases_of, identify, run_held_out
@@ -110,11 +109,8 @@ def retune(
         return result
     tuned = tune(found.plant, spec, progress=sub_progress(progress, 0.3, 0.9), workers=workers, seed=seed)
     plant, both = tuned.controller.plant, (controller, tuned.controller)
-    compiled, draws = wanted(), draws_of(plant, spec.check_draws)
-    old, new = (
-        tuple(run_trials(Controller(c.plant, c.design, compiled=compiled), plant, spec, draws, seed=seed))
-        for c in both
-    )
+    draws = draws_of(plant, spec.check_draws)
+    old, new = (tuple(run_trials(Controller(c.plant, c.design), plant, spec, draws, seed=seed)) for c in both)
     return Retuning(found, result.errors, tuned, old, new)
 
 

@@ -86,7 +86,7 @@ tune: PLANT --out --spec --report --network --seed=0>0 --workers=1>1 --cluster -
 retune: DIR LOG... --out=retuned.json --controller --spec --report --network --seed=0>0 --workers=1>1
   --json=False
 review: CONTROLLER --report --network --seed=0>0 --json=False
-export: CONTROLLER --out --check=False --states=3000>1 --arduino=False --single=False --ros2=False
+export: CONTROLLER --out --check=False --states=3000>1 --arduino=False --ros2=False
   --network --seed=0>0 --json=False
 autotune: --target --out --port --protocol --speed>0.01 --twin --relays --limit --minutes=30.0>1<1440
   --spec --guard --live>0<65535 --foxglove>1<65535 --on-trip --workers=1>1 --seed=0>0 --json=False

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Mapping
 
 import numpy as np
+import pytest
+from numpy.typing import ArrayLike
 
 from thermogrip.mpc.controllers.mpc import Controller
-from thermogrip.mpc.design.design import Design, default_design
-from thermogrip.mpc.interface import STATUSES, Move, Target, number
-from thermogrip.mpc.native.runtime import QP_STATUS, CompiledController
+from thermogrip.mpc.controllers.reference import ReferenceController
+from thermogrip.mpc.design.design import default_design
+from thermogrip.mpc.native.runtime import QP_STATUS, CompiledController, compiler
 from thermogrip.sysid.models.network import load_network
 from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.plant import Plant
+
+GCC = pytest.mark.skipif(compiler() is None, reason="no gcc here")
 
 
 def make_tank(
@@ -71,25 +74,31 @@ def crossed(q2: str = "percent") -> Plant:
     return Plant(model, {}, dt=2.0, units=units, valid={"q1": (0.0, 100.0), "q2": (0.0, 100.0)})
 
 
-def heater(**changes) -> Controller:
+def heater(make=Controller, **changes) -> Controller:
     """Return the controller of one drive and one output, nothing measured beside."""
     a = float(np.exp(-0.05))
     A, B = [[a, 40 * (1 - a)], [0, 0]], [[0], [1]]
     model = StateSpaceModel(("q",), (), ("t",), A=A, B=B, C=[[1.0, 0]], dt=5.0, y0=[25.0])
     plant = Plant(model, {}, dt=5.0, units={"q": "1"}, valid={"q": (0.0, 1.0), "t": (20.0, 60.0)})
-    return Controller(plant, default_design(plant, **changes))
+    return make(plant, default_design(plant, **changes))
 
 
-def kit(*, dt: float = 5.0, **changes) -> Controller:
+def kit(make=Controller, *, dt: float = 5.0, **changes) -> Controller:
     """Return the controller of two heaters and two sensors in a fan's room: drives in percent."""
     plant = network_plant("tclab", t1=(20.0, 60.0), t2=(20.0, 60.0))
-    return Controller(plant, default_design(plant, dt=dt, **changes))
+    return make(plant, default_design(plant, dt=dt, **changes))
 
 
-def ask_late(c: CompiledController, late: bool) -> None:
-    """Let the C of a controller find at every question that time is up, or never."""
-    c.asked = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p)((lambda _: 1) if late else 0)  # lives with c
-    c.library.tg_host_late(c.state, c.asked)
+#: What makes a controller of a plant and a design whose steps are in Python, in C.
+WAYS = [ReferenceController, pytest.param(Controller, marks=GCC)]
+
+
+def start_in_c(controller: Controller, y: ArrayLike) -> np.ndarray:
+    """Return the state (n_x,) at which the C alone starts from outputs y (n_y,)."""
+    y, c = np.asarray(y, dtype=float), controller.c
+    c.given[:] = [*y.tolist(), *[float("nan")] * (len(c.given) - len(y))]
+    c.reset()
+    return c.view("x", (controller.model.n_x,)).copy()
 
 
 def solve_in_c(c: CompiledController, H, f, A, lower, upper, *, linear: float, quadratic: float, warm=False):
@@ -103,31 +112,3 @@ def solve_in_c(c: CompiledController, H, f, A, lower, upper, *, linear: float, q
         c.state, len(f), len(A), *pointers[:-1], *weights, int(warm), pointers[-1], ctypes.byref(iterations)
     )
     return x, QP_STATUS[flag], iterations.value
-
-
-class InC:
-    """A controller whose whole step is in C, behind the interface of every controller."""
-
-    def __init__(self, plant: Plant, design: Design) -> None:
-        self.python = Controller(plant, design)  # whose estimate the C starts from
-        self.c, self.dt, self.model = CompiledController(self.python), self.python.dt, self.python.model
-
-    def reset(self, reading: Mapping[str, float]) -> None:
-        self.python.reset(reading)
-        self.c.reset(self._of(reading, "outputs"), self._of(reading, "disturbances"), self.python.observer)
-
-    def step(self, reading: Mapping[str, float], target: Target) -> Move:
-        wanted = target if isinstance(target, Mapping) else dict.fromkeys(self.python.controlled, target)
-        applied = self._of(reading, "drives")
-        drive, pump, status = self.c.step(
-            self._of(reading, "outputs"),
-            self._of(reading, "disturbances"),
-            np.array([wanted[name] for name in self.python.controlled]),
-            time_s=number(reading, "time_s"),
-            applied=applied if np.isfinite(applied).any() else None,
-        )
-        found = dict(zip(self.model.drives, drive.tolist(), strict=True))
-        return Move(found if len(found) > 1 else float(drive[0]), pump, STATUSES[status], self.c.advice)
-
-    def _of(self, reading: Mapping[str, float], what: str) -> np.ndarray:
-        return np.array([number(reading, name) for name in getattr(self.model, what)])

@@ -22,7 +22,7 @@ def test_what_is_no_number_is_none(value: object):
 
 
 def test_a_move_says_no_more_than_it_must():
-    assert Move(0.5) == Move(0.5, pump=1, status="ok", advice="", seconds=0.0, plan={})
+    assert Move(0.5) == Move(0.5, pump=1, status="ok", advice="", seconds=0.0)
 
     assert Move({"q1": 1.0, "q2": 2.0}).drives(("q2", "q1")) == [2.0, 1.0]
     assert Move(3).drives(("q",)) == [3.0]

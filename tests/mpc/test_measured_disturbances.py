@@ -12,7 +12,7 @@ from typing import Any, ClassVar
 import numpy as np
 import pytest
 
-from tests.mpc.makers import InC, make_tank
+from tests.mpc.makers import make_tank, start_in_c
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import make_log
 from thermogrip.mpc.closed_loop.simulate import Surroundings, Truth, simulate_closed_loop
@@ -20,6 +20,7 @@ from thermogrip.mpc.controllers.export import check_export, export_controller
 from thermogrip.mpc.controllers.lqr import LQRController
 from thermogrip.mpc.controllers.mpc import Controller
 from thermogrip.mpc.controllers.pi import PIController
+from thermogrip.mpc.controllers.reference import ReferenceController
 from thermogrip.mpc.design.design import default_design
 from thermogrip.mpc.design.spec import Spec, spec_from_dict
 from thermogrip.mpc.native.runtime import compiler
@@ -214,7 +215,7 @@ def test_a_loop_without_the_reading_begins_as_one_that_reads_it(case):
 @CASES
 def test_a_reading_far_from_any_temperature_counts(case):
     plant, spec = case.plant(), case.spec()
-    controller = Controller(plant, spec.design(plant))
+    controller = ReferenceController(plant, spec.design(plant))
     controller.reset({"t": 25.0, "t_out": 15.0, case.name: case.logs[1]})
     assert controller._d.tolist() == [15.0, case.logs[1]]
     controller.step({"t": 25.0, "t_out": 15.0, case.name: case.logs[0]}, 26.0)
@@ -235,8 +236,8 @@ def test_c_does_the_same_beside_python(case, tmp_path):
     plant, spec = case.plant(), case.spec()
     design, target = spec.design(plant), case.steps[0][1]
     for read, d in ((False, case.nominal), (True, case.logs[1]), (True, case.logs[0])):
-        ours = case.loop(Controller(plant, design), target, 600.0, d=d, read=read)
-        theirs = case.loop(InC(plant, design), target, 600.0, d=d, read=read)
+        ours = case.loop(ReferenceController(plant, design), target, 600.0, d=d, read=read)
+        theirs = case.loop(Controller(plant, design), target, 600.0, d=d, read=read)
         np.testing.assert_allclose(theirs[1], ours[1], atol=1e-6)
         assert theirs[2] == ours[2]
     controller = Controller(plant, design)
@@ -253,13 +254,9 @@ def test_c_does_the_same_beside_python(case, tmp_path):
 def test_the_c_alone_starts_amid_it(case, tmp_path):
     plant, spec = case.plant(), case.spec()
     controller = Controller(plant, spec.design(plant))
-    c = InC(plant, controller.design)
-    lost = np.full(controller.model.n_d, np.nan)
     y = np.array([case.steps[0][0]])
-    c.python.observer.reset_in_room(y, controller.model.undisturbed(case.room))
-    expected = c.python.observer.x.copy()
-    c.c.reset(y, lost, None)
-    np.testing.assert_allclose(c.c.view("x", expected.shape), expected, atol=1e-9)
+    controller.observer.reset_in_room(y, controller.model.undisturbed(case.room))
+    np.testing.assert_allclose(start_in_c(controller, y), controller.observer.x, atol=1e-9)
 
 
 def test_review_says_amid_what_targets_are_held():
@@ -343,11 +340,9 @@ def test_only_temperatures_share_a_level_at_the_start():
 @needs_gcc
 def test_nor_do_they_in_c():
     controller = mixed()
-    c = InC(controller.plant, controller.design)
-    y, d = np.array([90.0, 31.0]), np.zeros(0)
-    controller.observer.reset_in_room(y, d)
-    c.c.reset(y, d)
-    np.testing.assert_allclose(c.c.view("x", (2,)), controller.observer.x, atol=1e-9)
+    y = np.array([90.0, 31.0])
+    controller.observer.reset_in_room(y, np.zeros(0))
+    np.testing.assert_allclose(start_in_c(controller, y), controller.observer.x, atol=1e-9)
 
 
 def test_a_drive_that_serves_a_limit_alone_is_not_held_to_its_gain_on_a_target():

@@ -8,8 +8,6 @@ from typing import NamedTuple
 
 import pytest
 
-from thermogrip.mpc.native.runtime import wanted
-
 FOLDER = Path(__file__).parents[2] / "benchmarks" / "mpc"
 
 #: What IPOPT's own solution of the same program costs in the same loop (compare.py).
@@ -34,7 +32,7 @@ def bench():
 
 
 def test_all_four_steps_settle_as_with_an_exact_solver(bench):
-    loop = bench.problem.run_loop(bench.ours.Ours(compiled=wanted()))
+    loop = bench.problem.run_loop(bench.ours.Ours())
     assert loop.failed == 0
     assert loop.cost == pytest.approx(EXACT, rel=1e-4)
     assert all(found <= limit for found, limit in zip(loop.settling(), (47.5, 57.0, 72.0, 65.0), strict=True))
@@ -42,7 +40,7 @@ def test_all_four_steps_settle_as_with_an_exact_solver(bench):
 
 
 def test_ten_blocks_cost_half_a_percent_at_most(bench):
-    loop = bench.problem.run_loop(bench.ours.Ours(compiled=wanted(), blocks=10))
+    loop = bench.problem.run_loop(bench.ours.Ours(blocks=10))
     assert loop.cost <= 1.005 * EXACT
     assert all(found <= limit for found, limit in zip(loop.settling(), (47.5, 57.0, 72.0, 65.0), strict=True))
     assert max(loop.overshoot()) <= 0.3
@@ -51,7 +49,7 @@ def test_ten_blocks_cost_half_a_percent_at_most(bench):
 @pytest.mark.parametrize("blocks", [50, 10])
 def test_where_more_current_heats_the_drive_stays_on_the_safe_side(bench, blocks):
     # 9 A are allowed, the optimum of the true element is near 6.3 A, and 8 degC is not reached in 75 s
-    answer = bench.ours.Ours(compiled=wanted(), blocks=blocks, current=9.0)
+    answer = bench.ours.Ours(blocks=blocks, current=9.0)
     loop = bench.problem.run_loop(answer, targets=(18.0, 38.0, 8.0, 48.0), current=9.0)
     first, second, _, last = loop.settling()
     assert max(first, second, last) < 75.0  # False where one is NaN

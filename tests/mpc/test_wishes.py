@@ -8,20 +8,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.mpc.makers import crossed, heater, kit, make_tank, network_plant
+from tests.mpc.makers import GCC, WAYS, heater, kit, make_tank, network_plant
 from thermogrip.datasets.errors import UserError
-from thermogrip.mpc.closed_loop.simulate import ClosedLoop, Surroundings, Truth, simulate_closed_loop
+from thermogrip.mpc.closed_loop.simulate import ClosedLoop, Surroundings, simulate_closed_loop
 from thermogrip.mpc.closed_loop.simulate_native import compiled_loop
 from thermogrip.mpc.controllers.mpc import Controller, design_controller
+from thermogrip.mpc.controllers.reference import ReferenceController
 from thermogrip.mpc.design.design import default_design
 from thermogrip.mpc.design.spec import spec_from_dict
-from thermogrip.mpc.native.runtime import compiler
 from thermogrip.mpc.tuning.design_review import lacks_structure
 from thermogrip.mpc.tuning.objective import StepResult, bounds_of, meets_spec, paced, ramped_bounds, score
 from thermogrip.mpc.tuning.tune import rows_of, verdict_of
 from thermogrip.sysid.plant.plant import Plant
-
-GCC = pytest.mark.skipif(compiler() is None, reason="no gcc here")
 
 QUIET = Surroundings(noise=0.02, quantum=0.0)
 # the board that closes the loops is not the model: 8 % less heat of one heater, a tenth more loss
@@ -85,7 +83,9 @@ def test_a_tariff_heats_before_it_rises(board):
 
 def test_a_tariff_begins_anew_each_day_and_counts_from_the_readings_time():
     tariff = ((100.0, 2.0), (200.0, 5.0))
-    controller = kit(zones={"t1": 1.0, "t2": 1.0}, energy_price={"q1": 1.0}, tariff=tariff)
+    controller = kit(
+        ReferenceController, zones={"t1": 1.0, "t2": 1.0}, energy_price={"q1": 1.0}, tariff=tariff
+    )
     reading = {"t1": 25.0, "t2": 25.0, "t_ambient": 25.0}
     for now, expected in ((0.0, 5.0), (86400.0 + 150.0, 2.0), (3 * 86400.0 + 201.0, 5.0)):
         controller.reset(reading)
@@ -107,13 +107,13 @@ def test_targets_ramp_no_faster_than_they_may_and_arrive(board):
 SETTLING = {"t2": {"within_s": 600.0, "band_degC": 0.5}}
 
 
-def paced_kit(settling, *, compiled: bool = False) -> Controller:
+def paced_kit(settling, make=Controller):
     """The controller that tune begins with, of a spec whose second output may take its time."""
     plant = network_plant("tclab", t1=(20.0, 60.0), t2=(20.0, 60.0))
     keys = {"steps": [[25.0, 40.0]], "sample_time_s": 5.0, "settle_within_s": 150.0, "hold_s": 900.0}
     spec = spec_from_dict(keys | ({"settling": settling} if settling else {}))
     design = spec.design(plant)
-    return Controller(plant, paced(design, spec, bounds_of(plant, design, spec, [0])), compiled=compiled)
+    return make(plant, paced(design, spec, bounds_of(plant, design, spec, [0])))
 
 
 def test_an_output_that_may_take_its_time_takes_it_and_the_other_settles_as_soon(board):
@@ -132,8 +132,8 @@ def test_an_output_that_may_take_its_time_takes_it_and_the_other_settles_as_soon
 
 @GCC
 def test_a_loop_that_takes_its_time_is_the_same_in_c(board):
-    ours = run(paced_kit(SETTLING), board)
-    compiled = paced_kit(SETTLING, compiled=True)
+    ours = run(paced_kit(SETTLING, ReferenceController), board)
+    compiled = paced_kit(SETTLING)
     for loop in (
         run(compiled, board),
         compiled_loop(compiled, board, [(40.0, 2400.0)], surroundings=QUIET, seed=3),
@@ -206,76 +206,28 @@ def test_a_hard_limit_gives_way_last():
     assert beyond[("t_tank",)] < 0.1
 
 
-def test_a_forecast_of_the_room_is_acted_on_before_it_comes():
-    # a fan's room falls by 10 degC at a time that is known: half a minute ahead the heaters already answer
-    worst, nonsense = {}, {"room": "cold", "a": [1.0]}
-    for told in (False, True):
-        plant = crossed()
-        controller = design_controller(plant, controlled=("a", "b"))
-        truth = Truth(plant, controller.dt, QUIET, 25.0, 0)
-        truth.d = np.array([25.0])
-        controller.reset(truth.reading())
-        errors = []
-        for k in range(200):
-            truth.d = np.array([25.0 if k < 100 else 15.0])
-            ahead = {"room": [25.0 if k + 1 + i < 100 else 15.0 for i in range(60)]}
-            truth.apply(controller.step(truth.reading(), 30.0, coming=ahead if told else None))
-            errors.append(np.abs(truth.y[-1] - 30.0).max())
-        worst[told] = float(np.max(errors[60:]))
-    assert worst[True] < 0.6 * worst[False]
-    for wrong in (nonsense, {"room": []}, {"room": [float("nan"), 1e9]}):
-        move = controller.step(truth.reading(), 30.0, coming=wrong)
-        assert move.status == "ok"
-        truth.apply(move)
-
-
-def test_a_forecast_of_a_plant_that_is_not_linear_is_in_its_prediction():
-    controller = design_controller(make_tank(joule=0.1), dt=2.0)
-    controller.reset({"t_tank": 25.0, "t_surface": 25.0, "t_ambient": 25.0})
-    model, N = controller.model, controller.optimiser.N
-    assert model.affine is None
-    x, plan = controller.observer.x, np.full((controller.optimiser.n_b, 1), 0.3)
-    d = np.full((N, model.n_d), 25.0)
-    d[N // 2 :] = 5.0
-    y, _ = model.trajectory(x, plan, d, controller.design.blocks)
-    by_hand, state = [], x
-    u = np.repeat(plan, controller.design.blocks, axis=0)
-    for k in range(N):
-        state = model.next_state(state, u[k], d[k])
-        by_hand.append(model.output(state))
-    np.testing.assert_allclose(y, by_hand, atol=1e-9)
-    assert y[-1, 0] < model.trajectory(x, plan, d[0], controller.design.blocks)[0][-1, 0] - 0.5
-
-
-@pytest.mark.parametrize("compiled", [False, pytest.param(True, marks=GCC)])
-def test_a_failing_loop_goes_to_its_safe_drive(compiled):
+@pytest.mark.parametrize("make", WAYS)
+def test_a_failing_loop_goes_to_its_safe_drive(make):
     plant = network_plant("tclab", t1=(20.0, 60.0), t2=(20.0, 60.0))
     design = default_design(plant, dt=5.0, safe_drive={"q1": 20.0, "q2": 5.0})
-    controller = Controller(plant, design, compiled=compiled)
+    controller = make(plant, design)
     controller.reset({"t1": 30.0, "t2": 30.0})
     for k in range(30):
         lost = float("nan") if k > 3 else 30.0
         move = controller.step({"t1": lost, "t2": lost}, 35.0)
     assert (move.status, move.drive, move.pump) == ("off", {"q1": 20.0, "q2": 5.0}, 1)
-    if compiled:
-        drive = np.zeros(2)
-        controller.c.reset(np.array([30.0, 30.0]), np.array([25.0] * controller.model.n_d))
-        lost, room, target = np.full(2, np.nan), np.full(controller.model.n_d, 25.0), np.full(2, 35.0)
-        for _ in range(30):
-            drive, _, _ = controller.c.step(lost, room, target)
-        assert drive.tolist() == [20.0, 5.0]
 
 
 def test_programs_to_convergence_end_where_one_more_changes_nothing():
     plant = make_tank(joule=0.1)  # its cooling turns over
     moved, plans = {}, {}
     for n in (1, 30):
-        controller = design_controller(plant, dt=2.0, iterations=n)
+        controller = ReferenceController(plant, default_design(plant, dt=2.0, iterations=n))
         reading = {"t_tank": 30.0, "t_surface": 30.0, "t_ambient": 25.0}
         controller.reset(reading)
         controller.step(reading, 16.0)
         plans[n] = controller.plan
-        again = controller._optimise(controller._target)  # from its own plan, of the same state
+        again = controller._optimise(controller._target, None)  # from its own plan, of the same state
         moved[n] = np.max(np.abs(np.repeat(again.plan, controller.design.blocks, axis=0) - plans[n]))
     assert moved[30] < 2e-5 * 2
     assert moved[1] > 20 * moved[30]
@@ -352,9 +304,9 @@ WISHES = {
 @GCC
 @pytest.mark.parametrize("wish", WISHES)
 def test_a_loop_of_tariffs_or_ramps_is_the_same_in_c(board, wish):
-    """Step by step with C's parts, and wholly in C, whose first reading is at 0 s too."""
-    controller = kit(**WISHES[wish])
-    compiled = Controller(controller.plant, controller.design, compiled=True)
+    """Step by step, and as a whole loop, whose first reading is at 0 s too."""
+    controller = kit(ReferenceController, **WISHES[wish])
+    compiled = Controller(controller.model.plant, controller.design)
     plain = run(
         kit(**{key: WISHES[wish][key] for key in WISHES[wish] if key not in ("tariff", "ramp_per_s")}), board
     )

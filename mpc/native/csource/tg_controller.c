@@ -80,7 +80,7 @@ void tg_reset(tg_controller *c, const tg_design *design, const double *y, const 
 /* Note a call at this time: the seconds that passed, each once, whether a move is due, and for how many seconds
  * the slew limit counts.  A stale reading gives no elapsed time; such a call is taken to be as
  * far from the last as calls usually are.  A clock that went back by far and runs on from there was restarted. */
-static int is_due(tg_controller *c, tg_time now)
+static void note_call(tg_controller *c, tg_time now)
 {
     const tg_time before = c->time_s;
     double dt = c->design->dt, passed;
@@ -115,7 +115,7 @@ static int is_due(tg_controller *c, tg_time now)
     c->slew_s = c->waited_s;
     if (c->stale || c->passed_s > TG_RESTART_S + dt) /* elapsed time and drives are unknown */
         c->slew_s = fmin(c->slew_s, dt);
-    return passed >= dt * (1.0 - TG_SAME) - 0.5 * c->interval_s;
+    c->due = passed >= dt * (1.0 - TG_SAME) - 0.5 * c->interval_s;
 }
 
 static void note_move(tg_controller *c)
@@ -125,8 +125,6 @@ static void note_move(tg_controller *c)
     else
         c->since_s = c->assumed_s = c->spent_s = 0.0;
 }
-
-void tg_advance_plan(tg_controller *c) { c->age_s += c->design->dt; }
 
 /* Let estimate and plan go on by the seconds that passed under the drives that were applied. */
 static void pass(tg_controller *c, const double *applied)
@@ -174,7 +172,7 @@ static int drop_stuck(tg_controller *c, double *y)
 static int screen(tg_controller *c, double *y)
 {
     double mean[TG_NY];
-    int stays[TG_NY], count = 0, seen = 0;
+    int *stays = c->stays, count = 0, seen = 0;
     tg_expected(c, mean);
     for (int i = 0; i < TG_NY; i++) {
         int jumped = fabs(y[i] - mean[i]) > c->design->spike[i];
@@ -220,11 +218,12 @@ static void refine(tg_controller *c, double *y)
     memcpy(c->seen, tg_now(c), sizeof c->seen);
 }
 
-/* Correct the estimate with this reading; return what the operator should know. */
-static int absorb(tg_controller *c, double *y, const double *d, const double *applied)
+/* Correct the estimate with this reading; return what the operator should know, and how long nobody called. */
+static int absorb(tg_controller *c, double *y, const double *d, const double *applied, double *silent)
 {
     const tg_design *s = c->design;
     int any = 0, lost = 0, stuck, jumped;
+    *silent = c->silent_s;
     for (int i = 0; i < TG_NY; i++)
         any = any || isfinite(y[i]);
     if (c->silent_s > 0.0 && any) {
@@ -511,15 +510,15 @@ static void follow(tg_controller *c, tg_move *move, int status, int advice)
         move->status = TG_FALLBACK_PI;
 }
 
-/* By how much the target of controlled output r lies beyond that output's own limits [degC]. */
-static double beyond_own_limit(const tg_controller *c, int r)
+/* What of the target of controlled output r that output's own limits allow. */
+static double own_limit(const tg_controller *c, int r)
 {
     const tg_design *s = c->design;
-    double beyond = 0.0;
+    double allowed = c->target[r];
     for (int l = 0; l < s->n_l; l++)
         if (s->limited[l] == s->controlled[r])
-            beyond = fmax(beyond, fmax(s->limit_low[l] - c->target[r], c->target[r] - s->limit_high[l]));
-    return beyond;
+            allowed = fmin(fmax(allowed, s->limit_low[l]), s->limit_high[l]);
+    return allowed;
 }
 
 /* In place of targets that ramp where they are now, and with zones what of them is nearest to the end of the plan; the
@@ -573,7 +572,7 @@ static double missed_by(tg_controller *c)
         inflation = fmax(inflation, fabs(c->innovation[i]) / TG_INNOVATION_SD);
     for (int r = 0; r < s->n_c; r++) {
         const double *J = by_w + r * TG_SOME(TG_NW);
-        double sd = 0.0, miss, beyond = beyond_own_limit(c, r);
+        double sd = 0.0, miss, beyond = fabs(c->target[r] - own_limit(c, r));
         int is_barred = beyond > TG_CANNOT;
         if (c->unread_s[r] > 0.0)
             continue;
@@ -585,7 +584,13 @@ static double missed_by(tg_controller *c)
         scaled = fmax(scaled, (miss - TG_CANNOT) / (sd * inflation));
         out = out || miss > limit || is_barred;
         alarm = alarm || is_barred;
-        worst = fmax(worst, fmax(miss > limit ? miss : 0.0, is_barred ? beyond : 0.0));
+        miss = miss > limit ? miss : 0.0;
+        beyond = is_barred ? beyond : 0.0;
+        if (fmax(miss, beyond) > worst) {
+            worst = fmax(miss, beyond);
+            c->missing = s->controlled[r];
+            c->nearest = miss > beyond ? held[r] : own_limit(c, r);
+        }
     }
     if (!lost)
         c->miss_sum = fmin(fmax(0.0, c->miss_sum + fmin(scaled, TG_MISS_CLIP) - TG_MISS_ALLOWANCE), TG_MISS_ALARM);
@@ -681,10 +686,12 @@ static void decide(tg_controller *c, tg_move *move)
     if (missed = missed_by(c), missed > 0.0) {
         move->status = TG_INFEASIBLE;
         move->advice = TG_OUT_OF_REACH;
+        move->which = c->missing;
         move->over = missed;
     } else if (c->broken > 0.1) {
         move->status = c->broken > 0.5 ? TG_INFEASIBLE : TG_OK;
         move->advice = TG_LIMIT_BREAKS;
+        move->which = c->breaks;
         move->over = c->broken;
     } else if (time_is_up(c)) {
         move->status = TG_LATE;
@@ -715,31 +722,45 @@ static void set_pump(tg_move *move)
         move->pump = move->pump || move->drive[j] != 0.0;
 }
 
-tg_move tg_step(tg_controller *c, tg_time time_s, const double *y, const double *d, const double *applied,
-                const double *target)
+/* Take a call at this time with what was applied; readings that cannot be become NAN. */
+static void receive(tg_controller *c, tg_time time_s, const double *y, const double *d, const double *applied,
+                    double *clean_y, double *clean_d, double *did)
 {
-    tg_move move;
-    int due = is_due(c, time_s);
-    double clean_y[TG_NY], clean_d[TG_SOME(TG_ND)], did[TG_NU], in_force[TG_NU];
-    int said, wrong;
-    memset(&move, 0, sizeof move);
+    note_call(c, time_s);
     for (int i = 0; i < TG_NY; i++)
         clean_y[i] = c->stale ? NAN : clean(c->design, y[i]);
     for (int i = 0; i < TG_ND; i++)
         clean_d[i] = clean_measured(c->design, i, d[i]);
     for (int j = 0; j < TG_NU; j++)
         did[j] = applied && isfinite(applied[j]) ? applied[j] : c->in_force[j];
+}
+
+/* The last move again, before the next one is due; its advice stays. */
+static tg_move hold(tg_controller *c, double *y)
+{
+    tg_move move;
+    memset(&move, 0, sizeof move);
+    if (!c->stale)
+        refine(c, y);
+    memcpy(move.drive, c->u, sizeof move.drive);
+    move.status = c->status;
+    move.advice = c->advice == TG_ALL_WELL ? TG_TOO_EARLY : c->advice;
+    set_pump(&move);
+    return move;
+}
+
+tg_move tg_step(tg_controller *c, tg_time time_s, const double *y, const double *d, const double *applied,
+                const double *target)
+{
+    tg_move move;
+    double clean_y[TG_NY], clean_d[TG_SOME(TG_ND)], did[TG_NU], in_force[TG_NU], silent;
+    int said, wrong;
+    receive(c, time_s, y, d, applied, clean_y, clean_d, did);
     pass(c, did);
-    if (!due) { /* its advice stays */
-        if (!c->stale)
-            refine(c, clean_y);
-        memcpy(move.drive, c->u, sizeof move.drive);
-        move.status = c->status;
-        move.advice = c->advice == TG_ALL_WELL ? TG_TOO_EARLY : c->advice;
-        set_pump(&move);
-        return move;
-    }
-    said = absorb(c, clean_y, clean_d, did);
+    if (!c->due)
+        return hold(c, clean_y);
+    memset(&move, 0, sizeof move);
+    said = absorb(c, clean_y, clean_d, did, &silent);
     if (said == TG_ALL_WELL && c->stale)
         said = TG_STALE;
     memcpy(in_force, c->u, sizeof in_force);
@@ -754,6 +775,8 @@ tg_move tg_step(tg_controller *c, tg_time time_s, const double *y, const double 
         move.advice = TG_BAD_TARGET;
     else if (move.advice == TG_ALL_WELL)
         move.advice = said;
+    if (move.advice == TG_RESTARTED)
+        move.over = silent;
     keep_within(c, move.drive);
     memcpy(c->u, move.drive, sizeof c->u);
     /* where the computer is slow, the present drive stays while the new one is computed */
@@ -761,6 +784,29 @@ tg_move tg_step(tg_controller *c, tg_time time_s, const double *y, const double 
     set_pump(&move);
     c->status = move.status;
     c->advice = move.advice;
+    note_move(c);
+    return move;
+}
+
+tg_move tg_pause(tg_controller *c, tg_time time_s, const double *y, const double *d, const double *target)
+{
+    tg_move move;
+    double clean_y[TG_NY], clean_d[TG_SOME(TG_ND)], kept[TG_NC], did[TG_NU];
+    memset(&move, 0, sizeof move);
+    receive(c, time_s, y, d, NULL, clean_y, clean_d, did);
+    memcpy(move.drive, c->design->neutral, sizeof move.drive);
+    keep_within(c, move.drive);
+    for (int i = 0; i < TG_ND; i++)
+        clean_d[i] = isfinite(clean_d[i]) ? clean_d[i] : c->d[i];
+    for (int r = 0; r < TG_NC; r++) /* the last good one stays */
+        kept[r] = r < c->design->n_c && isfinite(clean(c->design, target[r])) ? target[r] : c->target[r];
+    start(c, clean_y, clean_d);
+    set_target(c, kept);
+    memcpy(c->u, move.drive, sizeof c->u);
+    memcpy(c->in_force, move.drive, sizeof c->in_force);
+    move.pump = 1; /* nobody would switch it on again */
+    move.status = c->status = TG_OFF;
+    move.advice = c->advice = TG_PUMP_OFF;
     note_move(c);
     return move;
 }
@@ -791,6 +837,7 @@ const char *tg_advice_text(int advice)
         "a jump of a reading stays: taken for an offset of the sensor",
         "a jump of the readings stays: the estimate was started again",
         "a controlled output has no usable reading: the model replaces it, then its drive rests; the others go on",
+        "the pump is off: drive to zero until it runs",
     };
-    return advice >= TG_ALL_WELL && advice <= TG_UNSEEN ? text[advice] : "?";
+    return advice >= TG_ALL_WELL && advice <= TG_PUMP_OFF ? text[advice] : "?";
 }

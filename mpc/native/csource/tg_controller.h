@@ -44,7 +44,8 @@ enum tg_advice {
     TG_TOO_LATE,
     TG_SENSOR_OFFSET,
     TG_WORLD_CHANGED,
-    TG_UNSEEN
+    TG_UNSEEN,
+    TG_PUMP_OFF
 };
 
 typedef struct {
@@ -52,8 +53,9 @@ typedef struct {
     int pump;       /* 1 running, 0 off */
     int status;     /* enum tg_status */
     int advice;     /* enum tg_advice; tg_advice_text has its sentence */
+    int which;      /* where one output is advised of: which */
     int iterations; /* of the quadratic program */
-    double over;    /* by how much a limit will be broken, a target missed [degC], an output late; its period [s]: where advised */
+    double over;    /* by how much a limit will be broken, a target missed [degC]; how long nobody called [s]: where advised */
 } tg_move;
 
 typedef double tg_time; /* seconds of any clock */
@@ -65,7 +67,6 @@ typedef struct {
     void *about;
     /* observer */
     double x[TG_NX], w[TG_SOME(TG_NW)];
-    /* P and jacobian are of modes in place of x, where the design has TG_NJ of them */
     double P[TG_Z * TG_Z], found_offset[TG_NY], innovation[TG_NY];
     int held[TG_Z];
     double into_s, share, noised;      /* seconds since x; of a sample: time of the estimate, and the noise in P */
@@ -74,7 +75,7 @@ typedef struct {
     /* when it was called */
     tg_time time_s, back_s;
     double interval_s, passed_s, since_s, assumed_s, spent_s, waited_s, slew_s;
-    int repeats, stale;
+    int repeats, stale, due;
     /* loop */
     double d[TG_SOME(TG_ND)], y[TG_NY], u[TG_NU], in_force[TG_NU], target[TG_NC], side[TG_NC], aim[TG_NC];
     double plan[TG_NH * TG_NU], unread_s[TG_NC], age_s, silent_s;
@@ -85,13 +86,14 @@ typedef struct {
     double dear[TG_NB];                 /* samples of each block, each as often as the price of energy counts then */
     double ramped[TG_NC];               /* where targets are that may only ramp */
     double steady_x[TG_NX], steady_u[TG_NU], miss_sum; /* nearest to the targets, and evidence that they are missed */
-    int has_steady, in, unreachable;                   /* samples in a row within reach again */
-    int has_plan, fresh, solves, on_pi, status, advice, spikes[TG_NY];
+    double nearest;                                    /* what the output that misses its target most can be held at */
+    int has_steady, in, unreachable, missing;          /* samples in a row within reach again; that output */
+    int has_plan, fresh, solves, on_pi, status, advice, spikes[TG_NY], stays[TG_NY];
     int ramps; /* whether targets are on their way in path */
     int lost[TG_NC]; /* outputs that cost nothing */
     /* what the last optimisation gave */
     double best[TG_Q_N], y_best[TG_NH * TG_NY], authority[TG_Q_N], broken;
-    int qp_status, iterations;
+    int qp_status, iterations, breaks; /* and which output will break its limit by so much */
     double kept_caution; /* of a linear plant: for what H was made, and whether there is a G */
     int kept_lost[TG_NC], has_gains, laid_out, has_jacobian;
     /* room to work in */
@@ -119,6 +121,10 @@ void tg_reset(tg_controller *c, const tg_design *design, const double *y, const 
 tg_move tg_step(tg_controller *c, tg_time time_s, const double *y, const double *d, const double *applied,
                 const double *target);
 
+/* The same where the pump is off: no water moves the heat, so the drives go back to none, and the estimate starts
+ * again when the pump runs. */
+tg_move tg_pause(tg_controller *c, tg_time time_s, const double *y, const double *d, const double *target);
+
 const char *tg_status_text(int status);
 const char *tg_advice_text(int advice);
 
@@ -142,7 +148,6 @@ void tg_hold_drives(tg_controller *c);
 double tg_planned(const tg_controller *c, int k, int j); /* drive j in the k-th sample from now */
 void tg_guess(const tg_controller *c, const double *last, double *guess);
 void tg_keep_plan(tg_controller *c);
-void tg_advance_plan(tg_controller *c);
 void tg_set_prices(tg_controller *c); /* of the samples ahead of its time */
 /* Outputs of a plan, sample by sample, plus the output bias. */
 void tg_simulate(tg_controller *c, const double *start, const double *plan, const double *drive_bias, const double *d,

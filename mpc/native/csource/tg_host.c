@@ -1,10 +1,12 @@
-/* What a program that loads this code as a library calls: the parts by pointers to plain arrays, and a whole
- * closed loop against another plant. Not part of an export. */
+/* What a program that loads this code as a library calls: a step by plain arrays, and a whole closed loop against
+ * another plant. Not part of an export. */
+#define _POSIX_C_SOURCE 199309L /* for the clock */
 #include "tg_controller.h"
 #include "tg_model.h"
 
 #include <math.h>
 #include <string.h>
+#include <time.h>
 
 long tg_host_size(void) { return (long)sizeof(tg_controller); }
 long tg_host_design_size(void) { return (long)sizeof(tg_design); }
@@ -19,91 +21,76 @@ double *tg_host_x(tg_controller *c) { return c->x; }
 double *tg_host_w(tg_controller *c) { return c->w; }
 double *tg_host_P(tg_controller *c) { return c->P; }
 double *tg_host_found_offset(tg_controller *c) { return c->found_offset; }
-double *tg_host_innovation(tg_controller *c) { return c->innovation; }
-int *tg_host_lost(tg_controller *c) { return c->lost; }
-int *tg_host_held(tg_controller *c) { return c->held; }
-double *tg_host_between(tg_controller *c) { return &c->into_s; }
-void tg_host_forget(tg_controller *c)
-{
-    tg_qp_forget(&c->qp);
-    c->solves = 0;
-    c->has_plan = 0;
-}
-
-/* Whether each output has a target or a limit. */
-static int all_count(const tg_design *s)
-{
-    int counts[TG_NY] = {0}, sum = 0;
-    for (int r = 0; r < s->n_c; r++)
-        counts[s->controlled[r]] = 1;
-    for (int r = 0; r < s->n_l; r++)
-        counts[s->limited[r]] = 1;
-    for (int i = 0; i < TG_NY; i++)
-        sum += counts[i];
-    return sum == TG_NY;
-}
-
-int tg_host_optimise(tg_controller *c, const double *x, const double *last, const double *guess,
-                     const double *d, const double *target, const double *side, const double *bias,
-                     const double *drive_bias, const double *slew_s, double *plan, double *y, double *authority,
-                     double *over, int *iterations)
-{
-    int status;
-    c->slew_s = slew_s[0];
-    c->caution = slew_s[1];
-    c->ramps = 0; /* goals ramp already */
-    memcpy(c->dear, slew_s + 2, (size_t)c->design->n_b * sizeof(double));
-    status = tg_optimise(c, x, last, guess, d, target, side, bias, drive_bias);
-    memcpy(plan, c->best, (size_t)c->qp.n * sizeof(double));
-    if (status == TG_QP_SOLVED && c->design->linear && !all_count(c->design))
-        tg_simulate(c, x, plan, drive_bias, d, bias, y);
-    else
-        memcpy(y, c->y_best, (size_t)c->design->N * TG_NY * sizeof(double));
-    memcpy(authority, c->authority, (size_t)c->qp.n * sizeof(double));
-    *over = c->broken;
-    *iterations = c->iterations;
-    return status;
-}
-
-/* One optimisation from the plan of the last call, a sample later; its first move into drive. */
-int tg_host_replan(tg_controller *c, const double *x, const double *last, const double *d,
-                   const double *target, const double *side, const double *bias, const double *drive_bias,
-                   double *drive, int *iterations)
-{
-    double guess[TG_Q_N];
-    int status;
-    tg_advance_plan(c);
-    c->slew_s = 0.0;
-    c->caution = 1.0;
-    tg_set_prices(c);
-    tg_guess(c, last, guess);
-    status = tg_optimise(c, x, last, guess, d, target, side, bias, drive_bias);
-    if (status == TG_QP_SOLVED)
-        tg_keep_plan(c);
-    memcpy(drive, c->best, TG_NU * sizeof(double));
-    *iterations = c->iterations;
-    return status;
-}
+double *tg_host_seen(tg_controller *c) { return c->seen; }
+double *tg_host_target(tg_controller *c) { return c->target; }
+double *tg_host_y(tg_controller *c) { return c->y; }
+double *tg_host_ramped(tg_controller *c) { return c->ramped; }
+double *tg_host_unread_s(tg_controller *c) { return c->unread_s; }
+double *tg_host_nearest(tg_controller *c) { return &c->nearest; }
+int *tg_host_stays(tg_controller *c) { return c->stays; }
+int *tg_host_qp_status(tg_controller *c) { return &c->qp_status; }
 
 /* What is asked of each sample ahead. */
 void tg_host_goals(tg_controller *c, const double *goals) { c->goals = goals; }
 
 /* Who is asked whether time is up. */
-void tg_host_late(tg_controller *c, int (*late)(void *about)) { c->late = late; }
-
-/* Reset, and one step; what is in the answer goes into drive, over and what: pump, status, advice, iterations. */
-void tg_host_reset(tg_controller *c, const double *y, const double *d) { tg_reset(c, c->design, y, d); }
-
-void tg_host_step(tg_controller *c, double time_s, const double *y, const double *d, const double *applied,
-                  const double *target, double *drive, double *over, int *what)
+void tg_host_late(tg_controller *c, int (*late)(void *about), void *about)
 {
-    tg_move move = tg_step(c, time_s, y, d, applied, target);
-    memcpy(drive, move.drive, sizeof move.drive);
-    *over = move.over;
-    what[0] = move.pump;
-    what[1] = move.status;
-    what[2] = move.advice;
-    what[3] = move.iterations;
+    c->late = late;
+    c->about = about;
+}
+
+static double now_s(void)
+{
+    struct timespec now;
+    clock_gettime(CLOCK_MONOTONIC, &now);
+    return (double)now.tv_sec + 1e-9 * (double)now.tv_nsec;
+}
+
+/* about: when a step must be over [s of the clock] */
+int tg_host_clock(void *about) { return now_s() >= *(const double *)about; }
+
+/* given: y, d, drives that were applied, NAN where they are none. */
+void tg_host_reset(tg_controller *c, const double *given)
+{
+    int (*late)(void *about) = c->late;
+    void *about = c->about;
+    const double *applied = given + TG_NY + TG_ND;
+    tg_reset(c, c->design, given, given + TG_NY);
+    tg_host_late(c, late, about);
+    for (int j = 0; j < TG_NU; j++)
+        if (isfinite(applied[j]))
+            c->u[j] = c->in_force[j] = applied[j];
+}
+
+/* given: y, d, applied as at a reset, then time and targets; answer: drives, over, pump, status, advice, which,
+ * iterations, and whether a move was due. */
+void tg_host_step(tg_controller *c, const double *given, int paused, double seconds, double *answer)
+{
+    const double *applied = given + TG_NY + TG_ND, *target = applied + TG_NU + 1;
+    tg_move move;
+    if (c->late == tg_host_clock)
+        *(double *)c->about = now_s() + seconds;
+    move = paused ? tg_pause(c, applied[TG_NU], given, given + TG_NY, target)
+                  : tg_step(c, applied[TG_NU], given, given + TG_NY, applied, target);
+    memcpy(answer, move.drive, sizeof move.drive);
+    answer += TG_NU;
+    answer[0] = move.over;
+    answer[1] = move.pump;
+    answer[2] = move.status;
+    answer[3] = move.advice;
+    answer[4] = move.which;
+    answer[5] = move.iterations;
+    answer[6] = paused || c->due;
+}
+
+/* The plan from now on, N rows of drives; whether there is one. */
+int tg_host_plan(const tg_controller *c, double *plan)
+{
+    for (int k = 0; k < c->design->N; k++)
+        for (int j = 0; j < TG_NU; j++)
+            plan[k * TG_NU + j] = tg_planned(c, k, j);
+    return c->has_plan;
 }
 
 /* One QP of n unknowns and s soft rows (A: s rows of n), for tests. */

@@ -4,9 +4,6 @@
  *
  * x is kept on a grid of samples, because a delay of shift registers advances by whole samples only;
  * a reading the share s of a sample after it is one of (1 - s) x + s f(x, u, d), u the mean of the drives since.
- *
- * Of a linear plant the filter's covariance P, its gain and its derivatives are those of the modes z of x = V z, where
- * the design has them: a sample is tridiagonal there, so that J P J' takes 4 n^2 operations in place of n^3.
  */
 #include "tg_controller.h"
 #include "tg_model.h"
@@ -14,15 +11,9 @@
 #include <math.h>
 #include <string.h>
 
-#ifdef TG_SINGLE
-#define ROUNDED 6e-8
-#define LEAST_SHARE 1e-6
-#define LEAST_TRACE 1e-30
-#else
 #define ROUNDED 1e-16 /* of the length of a row, that its sum is rounded by at least */
 #define LEAST_SHARE 1e-12 /* of the trace, added to a curvature that may be 0 */
 #define LEAST_TRACE 1e-300
-#endif
 
 static double output(const tg_controller *c, int i, const double *x)
 {
@@ -76,7 +67,7 @@ static void sensitivity(const tg_controller *c, int i, double *h)
 {
     const tg_design *s = c->design;
     double plain[TG_Z];
-    memcpy(plain, s->H + i * TG_NX, TG_NX * sizeof *plain);
+    memcpy(plain, s->C + i * TG_NX, TG_NX * sizeof *plain);
     for (int j = 0; j < TG_NW; j++)
         plain[TG_NX + j] = s->on_output[i * TG_NW + j];
     if (!(c->share > 0.0)) {
@@ -142,17 +133,6 @@ static void eliminate(double *S, double *B)
         }
 }
 
-/* Add to a state what has changed, in modes where there are any. */
-static void add_states(const tg_controller *c, const double *change, double *x)
-{
-    for (int i = 0; i < TG_NX; i++) {
-        double sum = TG_NJ ? 0.0 : change[i];
-        for (int j = 0; j < TG_NJ; j++)
-            sum += c->design->modes[i * TG_NJ + j] * change[j];
-        x[i] += sum;
-    }
-}
-
 /* Change the states. */
 static void apply(tg_controller *c, double *change)
 {
@@ -165,13 +145,10 @@ static void apply(tg_controller *c, double *change)
         change[TG_NX + k] = w - c->w[k];
         c->w[k] = w;
     }
-    if (c->share > 0.0) {
-        double ahead[TG_NX];
-        for (int i = 0; i < TG_NX; i++)
-            ahead[i] = seen_by(c->jacobian + i * TG_Z, change);
-        add_states(c, ahead, c->ahead);
-    }
-    add_states(c, change, c->x);
+    for (int i = 0; c->share > 0.0 && i < TG_NX; i++)
+        c->ahead[i] += seen_by(c->jacobian + i * TG_Z, change);
+    for (int i = 0; i < TG_NX; i++)
+        c->x[i] += change[i];
 }
 
 static void add_two(double *restrict into, double a, const double *restrict x, double b, const double *restrict y)
@@ -326,33 +303,11 @@ static double *sample_jacobian(tg_controller *c, const double *u, const double *
     return now;
 }
 
-/* The Jacobian of a linear plant in modes. */
-static void fill_modes(tg_controller *c)
-{
-    const tg_design *s = c->design;
-    memset(c->jacobian, 0, sizeof c->jacobian);
-    for (int k = 0; k < TG_Z; k++)
-        c->jacobian[k * (TG_Z + 1)] = 1.0;
-    for (int i = 0; i < TG_NJ; i++) {
-        double *row = c->jacobian + i * TG_Z;
-        for (int k = 0; k < TG_NW; k++)
-            row[TG_NX + k] = s->mode_by_w[k * TG_NJ + i];
-        if (i > 0)
-            row[i - 1] = s->mode_step[i];
-        row[i] = s->mode_step[TG_NJ + i];
-        if (i + 1 < TG_NJ)
-            row[i + 1] = s->mode_step[2 * TG_NJ + i];
-    }
-    c->has_jacobian = 1;
-}
-
 /* The state one sample later into next, and the Jacobian, which of a linear plant stays. */
 static void look_ahead(tg_controller *c, const double *u, const double *d, double *next)
 {
     const tg_design *s = c->design;
     double x[TG_NX];
-    if (TG_NJ && !c->has_jacobian)
-        fill_modes(c);
     if (!s->linear || !c->has_jacobian) {
         sample_jacobian(c, u, d, next);
         return;
@@ -617,69 +572,11 @@ static void find_band(const double *row, int *from, int *to)
         --*to;
 }
 
-static void add_row(int n, double *restrict into, double a, const double *restrict x)
-{
-    for (int j = 0; j < n; j++)
-        into[j] += a * x[j];
-}
-
-static void add_each(int n, double *restrict into, const double *restrict a, const double *restrict x)
-{
-    for (int j = 0; j < n; j++)
-        into[j] += a[j] * x[j];
-}
-
-/* into = a x + b y, where a and x go by number. */
-static void set_each(int n, double *restrict into, const double *restrict a, const double *restrict x, double b,
-                     const double *restrict y)
-{
-    for (int j = 0; j < n; j++)
-        into[j] = a[j] * x[j] + b * y[j];
-}
-
 /* Add what a share of a sample adds to the covariance. */
 static void add_noise(tg_controller *c, double share)
 {
-    const double *Q = c->design->Q, *of_modes = c->design->Q_modes;
-    for (int i = 0; i < TG_NJ; i++)
-        add_row(TG_NJ, c->P + i * TG_Z, share, of_modes + i * TG_NJ);
-    for (int i = TG_NJ; i < TG_Z; i++)
-        c->P[i * TG_Z + i] += c->held[i] ? 0.0 : share * Q[i];
-}
-
-/* P = J P J' where the states are modes: J P row by row, and each of its rows times J'. */
-static void carry_modes(tg_controller *c)
-{
-    const tg_design *s = c->design;
-    const double *before = s->mode_step, *own = before + TG_NJ, *behind = own + TG_NJ, *by_w = s->mode_by_w;
-    const double *of_w = c->P + TG_NX * TG_Z;
-    int pairs = 0;
-    memset(c->spare, 0, sizeof c->spare);
-    for (int i = 0; i < TG_NJ; i++) {
-        double *row = c->spare + i * TG_Z;
-        const double *P = c->P + i * TG_Z;
-        add_two(row, own[i], P, by_w[i], of_w);
-        for (int k = 1; k < TG_NW; k++)
-            add_row(TG_Z, row, by_w[k * TG_NJ + i], of_w + k * TG_Z);
-        if (before[i] != 0.0)
-            add_row(TG_Z, row, before[i], P - TG_Z);
-        if (behind[i] != 0.0)
-            add_row(TG_Z, row, behind[i], P + TG_Z);
-        pairs |= before[i] != 0.0;
-    }
-    memcpy(c->spare + TG_NJ * TG_Z, c->P + TG_NJ * TG_Z, (TG_Z - TG_NJ) * TG_Z * sizeof(double));
-    for (int i = 0; i < TG_Z; i++) {
-        const double *row = c->spare + i * TG_Z;
-        double *P = c->P + i * TG_Z;
-        set_each(TG_NJ, P, own, row, row[TG_NX], by_w);
-        for (int k = 1; k < TG_NW; k++)
-            add_row(TG_NJ, P, row[TG_NX + k], by_w + k * TG_NJ);
-        if (pairs) {
-            add_each(TG_NJ - 1, P + 1, before + 1, row);
-            add_each(TG_NJ - 1, P, behind, row + 1);
-        }
-        memcpy(P + TG_NX, row + TG_NX, (TG_Z - TG_NX) * sizeof(double));
-    }
+    for (int i = 0; i < TG_Z; i++)
+        c->P[i * TG_Z + i] += c->held[i] ? 0.0 : share * c->design->Q[i];
 }
 
 /* P = J P J', twice by rows of J, which is sparse in its last rows, and often in all: J P, and J times its transpose,
@@ -687,10 +584,6 @@ static void carry_modes(tg_controller *c)
 static void carry_covariance(tg_controller *c)
 {
     int from[TG_Z], to[TG_Z];
-    if (TG_NJ) {
-        carry_modes(c);
-        return;
-    }
     memset(c->spare, 0, sizeof c->spare);
     for (int i = 0; i < TG_Z; i++) {
         find_band(c->jacobian + i * TG_Z, from + i, to + i);

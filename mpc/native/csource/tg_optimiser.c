@@ -22,13 +22,6 @@
 #include <math.h>
 #include <string.h>
 
-#ifdef TG_SINGLE
-#define LITTLE 1e-5
-#define UNMOVED 1e-3 /* of its range, that costs no travel: two bounds a rounding apart would take turns */
-#else
-#define UNMOVED 0.0
-#define LITTLE TG_LITTLE
-#endif
 #define NONE 1e30
 
 static int row_of(const tg_design *s, int r) { return r < s->n_c ? s->controlled[r] : s->limited[r - s->n_c]; }
@@ -352,8 +345,8 @@ static void set_bounds(tg_controller *c, const double *guess, const double *driv
                     high = s->neutral[j] + room;
             }
             if (is_parked(c, j)) {
-                low = guess[at] - LITTLE * s->span[j];
-                high = guess[at] + LITTLE * s->span[j];
+                low = guess[at] - TG_LITTLE * s->span[j];
+                high = guess[at] + TG_LITTLE * s->span[j];
             }
             q->lower[at] = low / s->span[j];
             q->upper[at] = high / s->span[j];
@@ -506,8 +499,7 @@ static void set_soft_rows(tg_controller *c, const double *target, const double *
     }
     for (int i = 0, at = 2 * q->n + s->N * rows; i < q->moves; i++) {
         double before = i < TG_NU ? last[i] / s->span[i] : 0.0;
-        q->lower[at + i] = before - UNMOVED;
-        q->upper[at + i] = before + UNMOVED;
+        q->lower[at + i] = q->upper[at + i] = before;
     }
 }
 
@@ -609,9 +601,11 @@ static void find_broken(tg_controller *c)
     for (int r = 0; r < s->n_l; r++)
         for (int k = 0; k < s->N; k++) {
             double value = c->y_best[k * TG_NY + s->limited[r]];
-            double under = s->limit_low[r] - value, over = value - s->limit_high[r];
-            most = under > most ? under : most;
-            most = over > most ? over : most;
+            double over = fmax(s->limit_low[r] - value, value - s->limit_high[r]);
+            if (over > most) {
+                most = over;
+                c->breaks = s->limited[r];
+            }
         }
     c->broken = most;
 }

@@ -20,7 +20,7 @@
  * Rows may depend on one another: a range and a sum of slews that ends on it.  Every K_ii therefore includes a
  * share of 1e-11 of itself, which keeps the factor regular and the dual strictly concave; multipliers that
  * contradict each other diverge until one reaches its bound. The effect of that share on x is removed at
- * the end by a step of refinement with K itself (in single numbers, whose share is 3e-7, by as many as it takes). Hard rows that cannot be fulfilled together show there.
+ * the end by a step of refinement with K itself. Hard rows that cannot be fulfilled together show there.
  *
  * Soft rows may be broken by the dozen, the others are hardly more than there are unknowns. Where soft rows are many
  * (TG_LEAN), the broken ones, b, are eliminated from K z = r, D their diagonal:
@@ -33,17 +33,6 @@
 #include <math.h>
 #include <string.h>
 
-#ifdef TG_SINGLE
-#define LARGEST 3.4e38
-#define TOLERANCE 1e-5
-#define REGULAR 3e-7
-#define CONTRADICTION 3e-2
-#define SHORT 1e-3
-#define CONVEX 1e-6
-#define REACHED 1e-6
-#define REFINEMENTS 8
-#define LOOSER(changes) ((double)(1 << (changes) / 50)) /* or rows that a rounding breaks take turns for ever */
-#else
 #define LARGEST 1.7e308 /* number that is finite */
 #define TOLERANCE TG_TOLERANCE /* of a row, in units of its own length */
 #define REGULAR TG_REGULAR /* share of K_ii that keeps its factor regular */
@@ -51,9 +40,6 @@
 #define SHORT TG_SHORT /* a soft row shorter than this cannot be kept by any plan */
 #define CONVEX 1e-14    /* of H_ii, that a pivot is at least */
 #define REACHED 1e-13   /* of the largest multiplier: what ends by less beyond its bound is on it */
-#define REFINEMENTS 1
-#define LOOSER(changes) 1.0
-#endif
 
 static double *fit_row(tg_qp *q, int i) { return q->fit + (size_t)i * (size_t)(i + 1) / 2; }
 
@@ -793,7 +779,7 @@ static int go(tg_qp *q, int *upward)
 /* Find the row that is broken most; 0 where none is. */
 static int worst(tg_qp *q, int *row, int *side)
 {
-    double most_broken = TOLERANCE * LOOSER(q->iterations), *value = q->wanted;
+    double most_broken = TOLERANCE, *value = q->wanted;
     int found = 0, n = q->n;
     for (int j = 0; j < n; j++) {
         value[j] = q->x[j];
@@ -899,10 +885,7 @@ static int search(tg_qp *q)
         }
         make_x(q);
         if (!worst(q, &row, &side)) {
-            int held = 0;
-            for (int turn = 0; turn < REFINEMENTS && !held; turn++)
-                held = refine(q);
-            if (!held)
+            if (!refine(q))
                 return failed(q, TG_QP_INFEASIBLE);
             return all_finite(q->x, TG_WHOLE(q->n)) ? TG_QP_SOLVED : failed(q, TG_QP_NOT_FINITE);
         }

@@ -200,7 +200,6 @@ def export(
     ] = False,
     states: Annotated[int, cli.opt("--states", None, "Random states of --check.", min=1)] = 3_000,
     arduino: Annotated[bool, cli.flag("--arduino", "Write it as a library of the Arduino IDE.")] = False,
-    single: Annotated[bool, cli.flag("--single", "Use numbers of four bytes.")] = False,
     ros2: Annotated[bool, cli.flag("--ros2", "Write it as a ROS 2 node in Python, not as C.")] = False,
     network: cli.OwnNetwork = None,
     seed: cli.Seed = 0,
@@ -212,8 +211,8 @@ def export(
     needs thermogrip; topics.toml in its folder says which topic is what.
     """
     if ros2:
-        if arduino or check or single:
-            raise UserError("--ros2 writes a node, no C", hint="leave --arduino, --single and --check out")
+        if arduino or check:
+            raise UserError("--ros2 writes a node, no C", hint="leave --arduino and --check out")
         from thermogrip.mpc.controllers.ros2_node import write_node
 
         console = Console(as_json)
@@ -227,12 +226,9 @@ def export(
         raise UserError("--check builds a plain export", hint="check it without --arduino first")
     console = Console(as_json)
     loaded = load_controller(controller, network)
-    written = export_controller(loaded, cli.new_folder(out), arduino=arduino, single=single)
-    console.say(
-        f"Wrote {len(written.files)} files to {out}: {written.ram} bytes of RAM a controller, "
-        f"{written.constants} of constants."
-    )
-    result: dict[str, Any] = {"out": out, "ram": written.ram, "constants": written.constants}
+    written = export_controller(loaded, cli.new_folder(out), arduino=arduino)
+    console.say(f"Wrote {len(written.files)} files to {out}.")
+    result: dict[str, Any] = {"out": out}
     if not check:
         console.answer(result)
         return 0
@@ -242,12 +238,10 @@ def export(
         f"{found.states} random states under the sanitizers: drives differ by at most {found.difference:.1e} "
         f"of their range ({found.free} of them at no limit), same status in {found.same_status}, "
         f"same iterations in {found.same_iterations}. "
-        f"Flash {found.flash} bytes, largest stack frame {found.stack} bytes."
+        f"RAM of a controller {found.ram} bytes, constants {found.constants}, flash {found.flash}, largest "
+        f"stack frame {found.stack}."
     )
-    same = "do the same"
-    if found.single:
-        same += f" to {found.tolerance:g} of a range, but in {found.others} states"
-    console.say(f"C and Python {same if found.passed else 'differ'}.")
+    console.say(f"C and Python {'do the same' if found.passed else 'differ'}.")
     console.answer({**result, **asdict(found), "passed": found.passed})
     return 0 if found.passed else cli.ANSWER_IS_NO
 

@@ -73,13 +73,7 @@ def test_an_answer_rests_the_pump_only_where_it_is_off_without_a_drive(controlle
         controller._u = np.array(u)
         controller.times.call({})
         move = controller._answer(status, "why", 2.0)
-        assert (move.status, move.advice, move.pump, move.seconds, move.plan) == (
-            status,
-            "why",
-            pump,
-            3.0,
-            {},
-        )
+        assert (move.status, move.advice, move.pump, move.seconds) == (status, "why", pump, 3.0)
         assert controller.times.since == 0.0
     held = controller._held_move(1.0)
     assert (held.seconds, held.advice) == (4.0, "why")
@@ -95,8 +89,7 @@ def test_an_answer_rests_the_pump_only_where_it_is_off_without_a_drive(controlle
     ],
 )
 def test_what_becomes_of_lost_loops_is_reported(controller, unread, parked, said):
-    controller._unread_s = np.array(unread)
-    assert controller._unseen(parked) == said
+    assert controller._unseen(parked, np.array(unread)) == said
 
 
 def test_a_stale_reading_is_none_and_says_so(controller):

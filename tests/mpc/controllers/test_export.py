@@ -22,11 +22,8 @@ from thermogrip.mpc.design.design import default_design
 from thermogrip.mpc.interface import STATUSES, Move
 from thermogrip.mpc.native.codegen import write_model
 from thermogrip.mpc.native.runtime import compiler
-from thermogrip.mpc.native.single_precision import in_single
 from thermogrip.sysid.models.network import load_network
 
-#: The word, outside of comments.
-DOUBLE = r"(?s)/\*.*?\*/|\b(double)\b"
 needs_gcc = pytest.mark.skipif(compiler() is None or shutil.which("make") is None, reason="no gcc here")
 
 
@@ -54,8 +51,8 @@ def test_c_and_python_do_the_same_from_random_states(controller, tmp_path):
     assert found.same_status == found.same_iterations == 150
     assert found.passed
     assert found.free > 30
-    assert found.ram == export.ram  # what Python counts is what sizeof says
-    assert found.flash > export.constants
+    assert found.ram > 8 * controller.model.n_x**2  # its covariance, for one
+    assert found.flash > found.constants > 0
     assert 0 < found.stack < 10_000
     done = run_example(export)
     last = done.stdout.splitlines()[-1].split()
@@ -187,9 +184,7 @@ def test_a_wrong_number_in_the_export_is_found(controller, tmp_path):
         long(heater, {"blocks": (1,), "move_delay": 1}, True),
         long(kit, {"dt": 10.0, "controlled": ("t2",), "limits": {"t1": (0.0, 50.0)}}, True),
         long(kit, {"travel": 20.0, "limits": {"t1": (20.0, 42.0)}}, True),
-        long(
-            kit, {"blocks": (1, 2, 3)}, True
-        ),  # slews that end on ranges, a broken band
+        long(kit, {"blocks": (1, 2, 3)}, True),  # slews that end on ranges, a broken band
     ],
 )
 def test_controllers_of_any_size_build_and_do_the_same(make, changes, sanitize, tmp_path):
@@ -199,48 +194,6 @@ def test_controllers_of_any_size_build_and_do_the_same(make, changes, sanitize, 
     assert found.difference <= (1e-8 if "hard" in changes else 1e-9)
     assert (found.same_status, found.same_iterations >= 39) == (40, True)  # two rows may be as far broken
     assert found.passed
-
-
-@needs_gcc
-@pytest.mark.parametrize(
-    ("make", "changes"),
-    [
-        (heater, {"travel": 2.0}),
-        long(heater, {"ramp_per_s": {"t": 0.1}}),
-        long(
-            kit, {"limits": {"t1": (20.0, 42.0)}}
-        ),  # a factor of the rows that hold
-    ],
-)
-def test_in_single_numbers_the_same_states_are_solved(make, changes, tmp_path):
-    """Statuses are the same, and drives to 5 % of their range, in half the memory; no double is left."""
-    controller = make(**changes)
-    double = export_controller(controller, tmp_path / "double")
-    single = export_controller(controller, tmp_path / "single", single=True)
-    found = check_export(single, controller, states=100, sanitize=False)
-    assert found.passed
-    assert found.others == 0
-    assert 1e-9 < found.difference < 0.05
-    assert single.ram < 0.55 * double.ram
-    sources = [path.read_text() for path in (tmp_path / "single").glob("tg_*.[ch]")]
-    assert [word for text in sources for word in re.findall(DOUBLE, text) if word] == ["double"]  # seconds
-    example = run_example(single)
-    last = example.stdout.splitlines()[-1].split()
-    assert abs(float(last[3]) - float(last[5])) < 0.05
-
-
-def test_a_hard_limit_is_not_exported_in_single_numbers(tmp_path):
-    controller = kit(limits={"t1": (20.0, 42.0)}, hard=("t1",))
-    with pytest.raises(UserError, match="a hard limit is a thousand times as dear") as refused:
-        export_controller(controller, tmp_path / "c", single=True)
-    assert "\n" not in str(refused.value)
-    assert not (tmp_path / "c").exists()
-
-
-def test_constants_become_single_and_texts_stay():
-    text = '/* 1.5 double */ double a = 1.5e-3 + x[2] * 1e-50; char *s = "1.5 double"; int n = 12; // 2.0'
-    wanted = '/* 1.5 double */ float a = 1.5e-3f + x[2] * 0.0f; char *s = "1.5 double"; int n = 12; // 2.0'
-    assert in_single({"a.c": text, "README.md": text}) == {"a.c": wanted, "README.md": text}
 
 
 @pytest.mark.skipif(os.name == "nt", reason="links need a privilege there")
@@ -261,7 +214,6 @@ def test_an_export_asks_for_no_memory_and_for_nothing_of_python(controller, tmp_
         includes = set(re.findall(r"#include <(.*?)>", text))
         assert includes <= {"math.h", "string.h"}, path.name
     readme = (tmp_path / "README.md").read_text()
-    assert f"{export.ram} bytes" in readme
     assert not re.search(r"\{\w*[:}]", readme)  # nothing left to fill in
 
 
@@ -295,40 +247,22 @@ def test_what_the_parameters_fix_is_worked_out_without_a_compiler(name):
 def test_an_export_passes_where_drives_and_statuses_are_the_same_and_all_iterations_but_one(
     difference: float, status: int, iterations: int, passed: bool
 ):
-    assert Agreement(7, difference, 3, status, iterations, 1, 1, 1).passed == passed
+    assert Agreement(7, difference, 3, status, iterations, 1, 1, 1, 1).passed == passed
 
 
-@pytest.mark.parametrize(
-    ("difference", "others", "passed"), [(0.02, 2, True), (0.02, 3, False), (0.06, 0, False)]
-)
-def test_single_numbers_pass_with_iterations_of_their_own_and_hardly_another_status(
-    difference: float, others: int, passed: bool
-):
-    found = Agreement(2000, difference, 3, 2000, 7, 1, 1, 1, 0.05, single=True, others=others)
-    assert found.passed == passed
-
-
-@pytest.mark.parametrize(
-    ("single", "answers", "wanted"),
-    [
-        (False, [(0.0, True, True, True), (2e-3, False, True, False), (1e-4, True, True, True)],
-         Agreement(3, 2e-3, 2, 3, 2, 7000, 100, 300)),
-        (True, [(0.01, True, True, False), (0.7, True, False, False), (0.2, True, True, True)],
-         Agreement(3, 0.01, 3, 2, 1, 7000, 100, 300, 0.05, single=True, others=2)),
-    ],
-)  # fmt: skip
 def test_a_check_says_the_largest_difference_and_how_often_each_was_the_same(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, single: bool, answers: list[Any], wanted: Agreement
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    """In single numbers states that are answered otherwise are counted, and not in the difference."""
+    answers = [(0.0, True, True, True), (2e-3, False, True, False), (1e-4, True, True, True)]
     built, left = [], iter(answers)
     monkeypatch.setattr(exports, "compiler", lambda: "gcc")
     monkeypatch.setattr(exports, "_make", lambda folder, *targets: built.append(targets))
-    monkeypatch.setattr(exports, "_answers", lambda export, given, sanitize: ["0 1"] * len(given))
+    answered = (100, 50), ["0 1"] * 3
+    monkeypatch.setattr(exports, "_answers", lambda export, given, sanitize: answered)
     monkeypatch.setattr(exports, "_compare", lambda twin, state, answer: next(left))
     monkeypatch.setattr(exports, "_footprint", lambda folder: (7000, 300))
-    found = exports.check_export(exports.Export(tmp_path, (), 100, 50, single=single), heater(), states=3)
-    assert found == wanted
+    found = exports.check_export(exports.Export(tmp_path, ()), heater(), states=3)
+    assert found == Agreement(3, 2e-3, 2, 3, 2, 7000, 100, 50, 300)
     assert built == [("all", "sanitized")]
 
 
@@ -421,12 +355,10 @@ def test_every_random_state_in_time_whose_output_is_read_is_one_for_the_optimise
 
 def test_the_readme_gives_the_controllers_own_numbers(tmp_path: Path):
     controller = kit(limits={"t1": (0.0, 50.0)})
-    made = exports.export_controller(controller, tmp_path)
+    exports.export_controller(controller, tmp_path)
     text = " ".join((tmp_path / "README.md").read_text().split())
     assert "q1 in [0, 100]; q2 in [0, 100]" in text
     assert "double target[2] = {35.0, 35.0};" in text
-    for number in (made.ram, made.constants):
-        assert f"{number} bytes" in text or str(number) in text
     low, high = exports._range_of(controller)
     assert (low, high) == (20.0, 60.0)
     room = np.full(controller.model.n_d, controller.design.ambient)

@@ -6,12 +6,11 @@ import re
 from dataclasses import replace
 
 import numpy as np
-import pytest
 from scipy.linalg import block_diag
 
 from tests.mpc.makers import heater, kit, make_tank
 from thermogrip.mpc.controllers.mpc import Controller
-from thermogrip.mpc.design.design import default_design, make_blocks
+from thermogrip.mpc.design.design import default_design
 from thermogrip.mpc.native import design_struct
 from thermogrip.mpc.native.codegen import ModelCode, _Line
 from thermogrip.mpc.native.design_struct import numbers_of, sizes_of
@@ -37,13 +36,6 @@ def test_rows_of_the_response_are_as_long_as_the_last_of_four_samples_in_whole_g
     """Blocks 1, 1, 3, 2 of two drives: samples 1 to 4 end in block 3, 5 to 7 in block 4, 8 numbers each."""
     assert design_struct._row_lengths((1, 1, 3, 2), 2) == 4 * 8 + 3 * 8
     assert design_struct._row_lengths((1,) * 9, 1) == 4 * 4 + 4 * 8 + 12
-
-
-def test_with_a_blocked_plan_memory_grows_with_the_horizon_and_not_with_its_square():
-    sizes = sizes_of(heater(blocks=make_blocks(50, 10)), CODE, room=False)
-    bytes_at = [design_struct.bytes_of(replace(sizes, NH=N, NE=12 * N, NO=N))[0] for N in (50, 100, 200)]
-    assert bytes_at[2] - bytes_at[1] == pytest.approx(2 * (bytes_at[1] - bytes_at[0]), rel=0.01)
-    assert bytes_at[2] < 3 * bytes_at[0]
 
 
 def test_numbers_of_a_design_are_the_plants_offsets_and_its_rest_in_any_room():

@@ -14,6 +14,7 @@ from tests.mpc.makers import crossed
 from thermogrip.mpc.closed_loop.simulate import simulate_closed_loop
 from thermogrip.mpc.closed_loop.simulate_native import compiled_loop
 from thermogrip.mpc.controllers.mpc import Controller
+from thermogrip.mpc.controllers.reference import ReferenceController
 from thermogrip.mpc.design.design import Design, default_design
 from thermogrip.mpc.estimator.observer import Observer, choose_disturbances
 from thermogrip.mpc.native.runtime import wanted
@@ -50,7 +51,7 @@ ROWS = {
 
 def test_where_the_steady_state_is_no_longer_found_the_report_is_kept(tank_maker, monkeypatch):
     plant = tank_maker(**OPTIMUM)
-    controller = Controller(plant, default_design(plant, dt=2.0, deadline_s=1e9))
+    controller = ReferenceController(plant, default_design(plant, dt=2.0, deadline_s=1e9))
     reading = {"t_tank": 25.0, "t_surface": 25.0, "t_ambient": 25.0}
     controller.reset(reading)
     before = [controller.step(reading, -20.0) for _ in range(4)][-1]
@@ -73,7 +74,7 @@ def test_a_target_out_of_reach_is_reported_soon_and_kept_and_no_other_is(row, ta
     truth, model, limits, schedule, latest, value = ROWS[row]
     plant, truth = tank_maker(**model), tank_maker(**truth)
     design = default_design(plant, dt=2.0, limits=limits, deadline_s=1e9)
-    loop = simulate_closed_loop(Controller(plant, design), truth, schedule)
+    loop = simulate_closed_loop(ReferenceController(plant, design), truth, schedule)
     first = sum(round(seconds / 2) for _, seconds in schedule[:-1])
     before, after = loop.status[:first], loop.status[first:]
     assert set(before) <= {"ok"}
@@ -86,7 +87,7 @@ def test_a_target_out_of_reach_is_reported_soon_and_kept_and_no_other_is(row, ta
         found = re.search(r"no drive holds .* degC: (-?[0-9.]+) degC can be held", loop.advice[-1])
         assert float(found[1]) == pytest.approx(value, abs=0.7)
     if wanted():
-        compiled = compiled_loop(Controller(plant, design, compiled=True), truth, schedule)
+        compiled = compiled_loop(Controller(plant, design), truth, schedule)
         assert compiled.status == loop.status
         np.testing.assert_allclose(compiled.drive["drive"], loop.drive["drive"], atol=1e-5)
 

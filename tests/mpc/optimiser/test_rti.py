@@ -9,12 +9,11 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from tests.mpc.makers import crossed
+from tests.mpc.makers import WAYS, crossed
 from thermogrip.mpc.closed_loop.simulate import Surroundings, simulate_closed_loop
 from thermogrip.mpc.controllers.mpc import Controller, design_controller
-from thermogrip.mpc.design.design import Design, PILoop
+from thermogrip.mpc.design.design import Design, PILoop, default_design
 from thermogrip.mpc.design.spec import Spec
-from thermogrip.mpc.native.runtime import wanted
 from thermogrip.mpc.optimiser.qp import QPAnswer
 from thermogrip.mpc.optimiser.rti import Optimiser, Sample, allowed_share
 from thermogrip.mpc.plant.prediction import PredictionModel
@@ -23,7 +22,6 @@ from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.plant import Plant
 
 OPTIMUM = -0.55  # of the reversing tank, whose range ends at -1
-WAYS = [False, pytest.param(True, marks=pytest.mark.skipif(not wanted(), reason="no gcc here"))]
 
 
 def lowest_allowed(optimiser, bias: float, effective: float) -> float:
@@ -50,20 +48,19 @@ def test_a_range_that_ends_before_the_optimum_is_had_whole(reversing_tank, end, 
     assert lowest_allowed(optimiser, 0.0, -0.4) == pytest.approx(allowed, abs=1e-6)
 
 
-@pytest.mark.parametrize("compiled", WAYS)
+@pytest.mark.parametrize("make", WAYS)
 @pytest.mark.parametrize(("joule", "coldest"), [(0.05, -1.0), (0.1, 0.85 * OPTIMUM)])
-def test_far_below_what_can_be_held_the_drive_stays_where_it_may(tank_maker, compiled, joule, coldest):
+def test_far_below_what_can_be_held_the_drive_stays_where_it_may(tank_maker, make, joule, coldest):
     # optima at -1.1, beyond the range, and at -0.55
     plant = tank_maker(heat=0.11, joule=joule)
-    controller = Controller(plant, design_controller(plant, dt=2.0).design, compiled=compiled)
+    controller = make(plant, default_design(plant, dt=2.0))
     run = simulate_closed_loop(
         controller, plant, [(5.0, 200.0)], start=25.0, surroundings=Surroundings(noise=0.0, quantum=0.0)
     )
     assert np.min(run.drive["drive"][20:]) == pytest.approx(coldest, abs=0.02)
 
 
-@pytest.mark.parametrize("compiled", WAYS)
-def test_a_drive_leaves_an_end_of_its_range_where_the_model_answers_nothing(compiled):
+def test_a_drive_leaves_an_end_of_its_range_where_the_model_answers_nothing():
     """Cooled by the square of a drive of 0 to 100, from 80 degC at 5 less a bias of 5: its gain is 0."""
     a = float(np.exp(-1 / 60))
     F = np.full((1, 1), -60.0 / 100**2 * (1 - a))
@@ -72,7 +69,7 @@ def test_a_drive_leaves_an_end_of_its_range_where_the_model_answers_nothing(comp
         terms=("q*q",), F=F,
     )  # fmt: skip
     plant = Plant(model, {}, dt=1.0, units={"q": "percent"}, valid={"q": (0.0, 100.0), "t": (20.0, 80.0)})
-    controller = Controller(plant, design_controller(plant).design, compiled=compiled)
+    controller = design_controller(plant)
     at, n_b = np.array([5.0]), controller.optimiser.n_b
     asked = np.array([[40.0], [-1.0], [0.0]])
     now = Sample(np.zeros(1), at, np.full((n_b, 1), 5.0), np.zeros(0), *asked, -at)
@@ -81,10 +78,10 @@ def test_a_drive_leaves_an_end_of_its_range_where_the_model_answers_nothing(comp
     assert plan.max() > 50.0
 
 
-@pytest.mark.parametrize("compiled", WAYS)
-def test_a_tank_that_cools_better_than_its_model_arrives_as_soon_as_its_drive_allows(tank_maker, compiled):
+@pytest.mark.parametrize("make", WAYS)
+def test_a_tank_that_cools_better_than_its_model_arrives_as_soon_as_its_drive_allows(tank_maker, make):
     plant, truth = tank_maker(heat=0.11, joule=0.055), tank_maker(heat=0.13, joule=0.045)
-    controller = Controller(plant, design_controller(plant, dt=2.0).design, compiled=compiled)
+    controller = make(plant, default_design(plant, dt=2.0))
     spec = Spec(steps=[(25.0, 15.0)], hold_s=400.0, sensor_offset_degC=0.0)
     flat_out = full_drive_bound(truth, controller.design, (25.0, 15.0), spec)
     segment = simulate_closed_loop(controller, truth, [(15.0, 400.0)], start=25.0).segments[0]
@@ -362,12 +359,11 @@ def test_the_bias_of_a_drive_counts_where_the_range_is_looked_for(optimiser, mon
             np.testing.assert_allclose(value, want, rtol=1e-9)
 
 
-@pytest.mark.parametrize("compiled", WAYS)
-def test_caution_counts_as_so_many_times_the_weight_of_moves(compiled):
+def test_caution_counts_as_so_many_times_the_weight_of_moves():
     plant = crossed()
     design = replace(design_controller(plant, dt=2.0).design, move=0.5, price=0.0)
-    more = Controller(plant, replace(design, move=2.0), compiled=compiled).optimiser
-    own = Controller(plant, design, compiled=compiled).optimiser
+    more = Controller(plant, replace(design, move=2.0)).optimiser
+    own = Controller(plant, design).optimiser
     sample = Sample(
         np.array([24.0, 22.0]), np.array([20.0, 30.0]), np.full((own.n_b, 2), 25.0), np.array([20.0]),
         np.array([24.5, 24.5]), np.ones(2), np.zeros(2), np.zeros(2), caution=4.0,

@@ -1,0 +1,393 @@
+r"""The model-predictive controller's step in Python, written to be read: what the C is compared with.
+
+Each sample: advance the estimate under the drive that was applied, correct it with the reading, improve
+the plan (:mod:`thermogrip.mpc.optimiser.rti`), answer with its first move.  The reading of a lost sensor is
+left out; the room's temperature is fed forward as measured.
+
+A loop must never be left without an answer, so every failure has a next best one, and the status says which:
+
+* ``ok``: the optimiser's move;
+* ``late``: the deadline passed, so the last plan goes on (the PI, where there is none);
+* ``infeasible``: what was asked cannot be (a target that is no number or out of reach, a limit that must
+  break, an applied drive out of range); the move is the nearest that can be;
+* ``fallback_plan``: no usable reading, or the solver failed; the last plan goes on, for ``patience_s``.  Of
+  several controlled outputs one may be lost: the optimiser goes on, for ``patience_s`` with the model in
+  place of the reading, then without that output, and the drive that is there for it goes to rest;
+* ``fallback_pi``: the plan has run out; PI on the reading, taken over without a bump (and without
+  feed-forward: the drive that is taken over has it);
+* ``off``: no reading to act on, or the pump is off; the drive goes to zero.
+
+Where mean innovations exceed 3 standard deviations, the weight of moves is multiplied by their third, up
+to 30 times: a gain that is off by 30 % does not swing.
+
+What a loop shows beyond one sample, an output that swings or does not arrive, another plant than the model,
+:class:`thermogrip.mpc.controllers.loop_monitor.LoopMonitor` watches from beside it.
+
+Whatever the status, a drive is finite, inside its range, and within the slew limit of the one before.  What
+cannot be a reading is found by :mod:`thermogrip.mpc.estimator.reading_checks`.
+
+It may be called at any rate (:mod:`thermogrip.mpc.estimator.call_times`).  Estimate and plan go on by the
+seconds that passed, fractions of a sample included, and the slew limit counts from the last move.  Before a
+move is due the last one is held, with its status; called more seldom than its sample time, it answers with
+the mean of the plan over the time until it is likely to be called again.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from thermogrip.datasets.arrays import Array, Mask
+from thermogrip.mpc.controllers import advice
+from thermogrip.mpc.controllers.base import SampledController, targets_ahead
+from thermogrip.mpc.controllers.pi import PIController
+from thermogrip.mpc.design.design import DAY, Design
+from thermogrip.mpc.estimator.call_times import RESTART_S, opening, shifted
+from thermogrip.mpc.estimator.observer import DisturbanceModel
+from thermogrip.mpc.estimator.reading_checks import ReadingMonitor, is_off
+from thermogrip.mpc.interface import Move, Readings, Trajectory
+from thermogrip.mpc.native.shared_constants import CAUTION, MOST_CAUTION, STAYS, WEAK
+from thermogrip.mpc.optimiser.reach import Reach
+from thermogrip.mpc.optimiser.rti import Optimiser, Outcome, Sample
+from thermogrip.mpc.optimiser.switching import choose
+from thermogrip.mpc.plant.prediction import prediction_model
+
+if TYPE_CHECKING:
+    from thermogrip.sysid.plant.plant import Plant
+
+
+class ReferenceController(SampledController):
+    """The controller of a plant and a design whose step runs in Python; ``clock`` gives step times [s]."""
+
+    def __init__(
+        self, plant: Plant, design: Design, *, clock: Callable[[], float] = time.perf_counter
+    ) -> None:
+        model = prediction_model(plant, design.dt)
+        slew = design.dt * np.array([design.slew_per_s[name] for name in model.drives])
+        super().__init__(
+            *(model, design.controlled, design.drive_range, slew, design.patience_s, clock),
+            design.safe_drive,
+            design.on_off,
+        )
+        self.design = design
+        self.observer = design.observer(model)
+        self.optimiser = Optimiser(model, design)
+        self.pi = PIController.of(plant, design, tuple(replace(p, feedforward=0.0) for p in design.loops))
+        self.monitor = ReadingMonitor(model.n_y, spike=model.spike)
+        self.reach = Reach(self.optimiser, self.observer)
+        self.last_iterations = 0  # of the program, in the last step
+        self._waits = 0.0  # seconds until an on/off drive may go over, where it is to
+        self._in_force: Array
+        self._plan: Array | None  # (N, n_u), as it was made ``_age_s`` ago
+        self._ramped: Array  # where targets are that may only ramp, NaN before the first
+        lost = np.full(model.n_y, np.nan)
+        self._start(lost, model.undisturbed(design.ambient), self.observer.reset)
+
+    @property
+    def disturbance(self) -> DisturbanceModel:
+        """Where the disturbance states enter."""
+        return self.observer.disturbance
+
+    @property
+    def plan(self) -> Array | None:
+        """The plan that is still ahead, (N, n_u)."""
+        return None if self._plan is None else shifted(self._plan, self._age_s / self.dt)
+
+    def reset(self, reading: Readings) -> None:
+        """Forget the past; see :meth:`thermogrip.mpc.controllers.mpc.Controller.reset`."""
+        self._start(*self._read(reading), self.observer.reset)
+        self._begin_positions()
+        self._u = self._in_force = self._applied(reading, self._u)
+        self.pi.reset(reading)
+        self.times.reset()
+
+    def step(self, reading: Readings, target: Trajectory) -> Move:
+        """Return the move for this sample; see :meth:`thermogrip.mpc.controllers.mpc.Controller.step`."""
+        started = self.clock()
+        self.last_iterations = 0
+        self.times.call(reading)
+        y, d = self._read(reading)
+        if self.times.stale:
+            y = np.full(self.model.n_y, np.nan)
+        if is_off([name for name in self.model.model.switches if name not in self.model.drives], reading):
+            return self._pause(y, d, target, started)
+        applied = self._applied(reading, self._in_force)
+        self._pass(self.times.seconds, applied)
+        if not self.times.due:
+            self._refine(y)
+            return self._held_move(started)
+        event = self._absorb(y, d, applied) or (advice.STALE if self.times.stale else "")
+        in_force = self._u.copy()
+        wanted, wrong = self._wanted(target)
+        if not np.array_equal(wanted, self._target):
+            self._side = self._sides(wanted)
+        self._target = wanted
+        at = self.design.move_delay + np.arange(1, self.optimiser.N + 1)
+        ahead = targets_ahead(target, self.controlled, wanted, at, self.model.coldest, self.model.hottest)
+        if self.design.ramp_per_s:
+            wanted, ahead = self._ramp(wanted, ahead)
+        u, status, lasting = self._decide(wanted, ahead, started)
+        if status == "ok":  # what happened in this sample, before what has been so for long
+            lasting = event or lasting
+        if wrong and status == "ok":
+            status = "infeasible"
+        self._u = self._within(u, self.times.slew_s)
+        # where the computer is slow, the drive of now goes on while the new one is worked out
+        self._in_force = in_force if self.design.move_delay else self._u
+        return self._answer(status, wrong or lasting or event, started)
+
+    def _start(self, y: Array, d: Array, begin: Callable[[Array, Array], None]) -> None:
+        """Forget the past at readings y, disturbances d; the estimate is begun by one of the observer's two
+        ways: in the middle of a loop there is no time for the better one."""
+        self._d = np.where(np.isfinite(d), d, self.model.undisturbed(self.design.ambient))
+        begin(y, self._d)
+        self._forget()
+        self._in_force = self._u
+        self._side = np.zeros(len(self._rows))
+        self._plan = None
+        self._age_s = 0.0  # since the plan was made
+        self._ramped = np.full(len(self._rows), np.nan)
+        self._silent_s = 0.0  # that nobody called, where it was too long to know the past
+        self._y = y
+        self._seen = self.observer.now  # where the estimate stood after the last reading
+        self._fresh = True
+        self._on_pi = False
+        self.monitor.forget(y)
+        self.reach.forget()
+        self.optimiser.forget()
+
+    def _pass(self, seconds: float, applied: Array) -> None:
+        """Let the estimate and the plan go on by so many seconds under the drives that were applied."""
+        if self._fresh:
+            return  # it begins with this reading
+        if seconds > RESTART_S + self.dt:
+            # until a reading comes to start again from, no more is predicted than a silence that would count
+            self._silent_s, seconds = seconds, RESTART_S
+        self.observer.advance(seconds, applied, self._d)
+        self._age_s += seconds
+
+    def _absorb(self, y: Array, d: Array, applied: Array) -> str:
+        """Correct the estimate with this reading; return what the operator should know."""
+        elapsed, silent = self.times.waited_s, self._silent_s
+        if silent and np.isfinite(y).any():
+            u, target, side = self._u, self._target, self._side
+            self._start(y, np.where(np.isfinite(d), d, self._d), self.observer.reset_in_room)
+            self._u, self._in_force, self._fresh = u, applied, False
+            self._target, self._side, self._y = target, side, y
+            return advice.silence(silent)
+        if not self._fresh:
+            self.observer.look(self._d)
+            self.monitor.expect(self.model.C @ (self.observer.now - self._seen))
+        self._fresh = False
+        if not self.design.move_delay:
+            self._u = applied  # the slew limit counts from what was really applied
+        self._d = np.where(np.isfinite(d), d, self._d)
+        y, stays = self.monitor.screen(y, self.observer.reading())
+        jumped = self._accept_jump(y, stays) if stays.any() else ""
+        self.observer.update(y)
+        self._y, self._seen = y, self.observer.now
+        lost = [name for name, value in zip(self.model.outputs, y) if not np.isfinite(value)]
+        lost += [name for name, value in zip(self.model.disturbances, d) if not np.isfinite(value)]
+        self._unread_s = np.where(np.isfinite(y[self._rows]), 0.0, self._unread_s + elapsed)
+        return jumped or advice.lost_readings(lost, stuck=bool(self.monitor.stuck.any()))
+
+    def _refine(self, y: Array) -> None:
+        """Correct the estimate with a reading that comes before a move is due."""
+        if self._fresh or not np.isfinite(y).any():
+            return
+        self.observer.look(self._d)
+        self.monitor.expect(self.model.C @ (self.observer.now - self._seen))
+        self.observer.refine(self.monitor.screen_between(y, self.observer.reading()))
+        self._seen = self.observer.now
+
+    def _accept_jump(self, y: Array, stays: Mask) -> str:
+        """Take a jump that stays for an offset of its sensor, or for another world; return what it was."""
+        names = [name for name, jumped in zip(self.model.outputs, stays) if jumped]
+        offset = bool(2 * stays.sum() < np.isfinite(y).sum())
+        if offset:
+            self.observer.set_offsets(y, stays)
+        else:
+            self.observer.reset_in_room(y, self._d)
+        return advice.jump(names, offset=offset)
+
+    def _sides(self, wanted: Array) -> Array:
+        """Return from where the targets are approached: +1 from below, -1 from above, 0 neither."""
+        return np.where(np.isfinite(wanted), np.sign(wanted - self.observer.reading()[self._rows]), 0.0)
+
+    def _pause(self, y: Array, d: Array, target: Trajectory, started: float) -> Move:
+        """Take the drive back while no water moves its heat; the estimate starts again afterwards."""
+        u = self._within(self._neutral, self.times.slew_s)
+        wanted, _ = self._wanted(target)
+        self._start(y, np.where(np.isfinite(d), d, self._d), self.observer.reset_in_room)
+        self._u = self._in_force = u
+        self._target, self._side = wanted, self._sides(wanted)
+        stands = advice.pump_off(self.model.model.switches)
+        # without a pump that is asked for nobody would switch it on again
+        self._move = replace(self._answer("off", stands, started), pump=1)
+        return self._move
+
+    def _first_of(self, plan: Array) -> Array:
+        """Return what of a plan (N, n_u) to apply until the next call."""
+        return opening(plan, self.times.slew_s / self.dt)
+
+    def _decide(self, wanted: Array, ahead: Array | None, started: float) -> tuple[Array, str, str]:
+        """Return the drives, the status and the advice: optimiser, else plan, else PI, else off."""
+        if not np.isfinite(wanted).all():
+            return self._safe, "off", advice.no_target(safe=bool(self.design.safe_drive))
+        if (self._unread_s > 0).all():
+            return self._without_readings()
+        if self.clock() - started >= self.design.deadline_s:
+            return self._fall_back("late", advice.TOO_LATE)
+        low, high = self.optimiser.lowest - 1e-9, self.optimiser.highest + 1e-9
+        outside = bool(np.any((self._u < low) | (self._u > high)))
+        try:
+            outcome = self._optimise(wanted, ahead)
+        except (np.linalg.LinAlgError, ArithmeticError):
+            return self._fall_back("fallback_plan", advice.solver("not finite"))
+        self.last_iterations = outcome.iterations
+        self.observer.hold_drives(outcome.authority < WEAK)
+        if outcome.status == "time limit":
+            return self._fall_back("late", advice.TOO_LATE)
+        if outcome.status != "solved":
+            status = "infeasible" if outcome.status == "infeasible" else "fallback_plan"
+            return self._fall_back(status, advice.solver(outcome.status))
+        self._plan = np.repeat(outcome.plan, self.design.blocks, axis=0)
+        self._age_s, self._on_pi = 0.0, False
+        if outside:
+            return self._first_of(self._plan), "infeasible", advice.OUT_OF_RANGE
+        return (self._first_of(self._plan), *self._judge(outcome, wanted, started))
+
+    def _judge(self, outcome: Outcome, wanted: Array, started: float) -> tuple[str, str]:
+        """Return the status and the advice of a plan that was found."""
+        end, zone = outcome.y[-1, self._rows], self.optimiser.zone
+        missed = self.reach.missed(
+            self.observer,
+            self._u,
+            self._d,
+            target=np.where(zone > 0, np.clip(end, wanted - zone, wanted + zone), wanted),
+            side=self._side,
+            ahead=end,
+            seen=self._unread_s == 0,
+        )
+        if missed is not None:
+            which, nearest = missed
+            return "infeasible", advice.out_of_reach(self.controlled[which], wanted[which], nearest)
+        if outcome.broken:
+            name, over = max(outcome.broken.items(), key=lambda item: item[1])
+            return "infeasible" if over > 0.5 else "ok", advice.limit_breaks(name, over)
+        if self.clock() - started > self.design.deadline_s:
+            return "late", advice.TOO_LATE
+        if (self._unread_s > 0).any():
+            return "fallback_plan", self.say_unseen(self._unread_s)
+        waits = f"{', '.join(self.design.on_off)} may go over in {self._waits:.0f} s" if self._waits else ""
+        return "ok", waits
+
+    def say_unseen(self, unread_s: Array) -> str:
+        """Return what is said where controlled outputs were not read for so long (n_controlled,)."""
+        lost = unread_s > self._patience_s
+        parked = [name for name, at in zip(self.model.drives, self.optimiser.pair) if lost[at]]
+        return self._unseen(parked, unread_s)
+
+    def _optimise(self, wanted: Array, ahead: Array | None) -> Outcome:
+        last = np.clip(self._u, self.optimiser.lowest, self.optimiser.highest)
+        observer = self.observer
+        d = self._d + observer.disturbance_bias
+        x = observer.now
+        if self.design.move_delay:  # the drive applied now stays for one more sample
+            x = self.model.next_state(x, last + observer.drive_bias, d)
+        guess, biases = self._guess(wanted, last), (observer.output_bias, observer.drive_bias)
+        caution = min(max(1.0, float(np.max(np.abs(observer.innovation))) / CAUTION), MOST_CAUTION)
+        slew_s = self.times.slew_s
+        sample = Sample(x, last, guess, d, wanted, self._side, *biases, slew_s, self._lost, caution)
+        sample = sample._replace(ahead=ahead, prices=self._prices())
+        self._waits = 0.0
+        if not self.design.on_off:
+            return self._converged(sample)
+        ((name, (on_s, off_s, price)),) = self.design.on_off.items()
+        j = self.model.drives.index(name)
+        at = float(round(last[j]))
+        choice = choose(
+            self.optimiser,
+            j,
+            lambda: self._converged(sample),
+            position=at,
+            wait_s=self._wait_s(j),
+            stays_s=off_s if at else on_s,
+            price=price,
+        )
+        self._waits = choice.wait_s
+        return choice.outcome
+
+    def _converged(self, sample: Sample) -> Outcome:
+        """Return what one program gives, or as many as the design asks for until the plan stays."""
+        found, changes = self.optimiser.solve(sample), 0
+        for _ in range(1, self.design.iterations if self.model.affine is None else 1):
+            moved = np.abs(found.plan - sample.guess) > STAYS * self.model.span
+            if found.status != "solved" or not moved.any():
+                break
+            sample, changes = sample._replace(guess=found.plan), changes + found.iterations
+            found = self.optimiser.solve(sample)
+        return replace(found, iterations=found.iterations + changes)
+
+    def _prices(self) -> Array | None:
+        """Return how many times the energy price counts in the samples (N,) that are predicted."""
+        tariff = self.design.tariff
+        if not tariff or not np.isfinite(self.times.now):
+            return None
+        seconds = (self.times.now + self.dt * np.arange(self.optimiser.N)) % DAY
+        starts, factors = np.array(tariff).T
+        at = np.searchsorted(starts, seconds, side="right") - 1  # -1: of the day before
+        return np.asarray(factors[at], dtype=np.float64)
+
+    def _ramp(self, wanted: Array, ahead: Array | None) -> tuple[Array, Array | None]:
+        """Return the targets now (n_controlled,), of those that may only ramp a sample further on the way,
+        and what is ahead (N, n_controlled) from there."""
+        rates = np.array([self.design.ramp_per_s.get(name, np.inf) for name in self.controlled])
+        shown = self._y[self._rows]
+        begun = np.where(np.isfinite(self._ramped), self._ramped, shown)
+        reach = rates * self.times.waited_s
+        now = np.where(np.isfinite(begun), np.clip(wanted, begun - reach, begun + reach), wanted)
+        self._ramped = now
+        later = (self.design.move_delay + np.arange(1, self.optimiser.N + 1))[:, None] * rates * self.dt
+        if ahead is None and np.array_equal(now, wanted):
+            return now, None
+        ends = np.broadcast_to(wanted, later.shape) if ahead is None else ahead
+        return now, np.clip(ends, now - later, now + later)
+
+    def _guess(self, wanted: Array, last: Array) -> Array:
+        """Return the plan to linearise along: the last one, shifted, by blocks; else the drive of now."""
+        plan = self.plan
+        if plan is None:
+            return np.repeat(last[None, :], self.optimiser.n_b, axis=0)
+        lengths = np.asarray(self.design.blocks)
+        begins = np.cumsum(lengths) - lengths
+        return np.asarray(np.add.reduceat(plan, begins, axis=0) / lengths[:, None])
+
+    def _without_readings(self) -> tuple[Array, str, str]:
+        if not self._lost.all():
+            plan = self._young_plan()
+            return self._u if plan is None else self._first_of(plan), "fallback_plan", ""
+        self._plan = None
+        return self._safe, "off", advice.blind(self._unread_s.min())
+
+    def _young_plan(self) -> Array | None:
+        return None if self._on_pi or self._age_s > self._patience_s else self.plan
+
+    def _fall_back(self, status: str, why: str) -> tuple[Array, str, str]:
+        """Follow the plan while it is young; then PI, then off."""
+        plan = self._young_plan()
+        if plan is not None:
+            return self._first_of(plan), status, why
+        y = self._y[self._rows]
+        if not self.pi.loops or not np.isfinite(y).all():
+            return self._safe, "off", why
+        if not self._on_pi:
+            self.pi.follow(self._u, y, self._target, self._d)
+        self._on_pi = True
+        self.pi.hold(np.clip(self._u, self.optimiser.lowest, self.optimiser.highest))
+        u = self.pi.propose(y, self._target, self._d, seconds=self.times.slew_s)
+        return u, "fallback_pi" if status == "fallback_plan" else status, why
