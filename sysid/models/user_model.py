@@ -331,9 +331,6 @@ def _tuple(what: str, names: Mapping[str, Any]) -> Callable[..., Any]:
 
 
 _SENSOR_WEIGHT, _INPUT_WEIGHT = 1e2, 1e-2
-_NUDGE = 1e-6
-_ITERATIONS = 40
-_SETTLED = 1e-9  # relative fall of the cost at which to stop
 _STEP_ERROR = 0.1  # of a sensor's sd (rms), between n pieces and 2 n
 _MOST_PIECES = 256
 _SENSOR_SHARE = 0.02  # of an output's spread in the logs, where the class states no sd
@@ -402,19 +399,22 @@ def still(code: OwnCode, y: Array, u: Array, d: Array, p: Array, *, sd: Array, s
     moved = np.array([not item.switch for item in code.inputs.values()], dtype=bool)
 
     def residuals(z: Array) -> Array:
-        """Return (n_r, B) at the columns of z: states, then inputs, in units of their scale."""
-        x = z[:n_x] * scale[:, None]
-        v = np.where(moved[:, None], z[n_x:] * wide[:, None], u[:, None])
-        flow = seconds * _rows(code.rhs(list(x), list(v), list(d), list(p)), z.shape[1])
-        read = _rows(code.output(list(x), list(p)), z.shape[1])
-        miss = (_SENSOR_WEIGHT * (read - y[:, None]) / sd[:, None])[known]
-        return np.concatenate([flow / scale[:, None], miss, _INPUT_WEIGHT * (z[n_x:] - (u / wide)[:, None])])
+        """Return the residuals (n_r,) at states, then inputs, in units of their scale."""
+        x, v = z[:n_x] * scale, np.where(moved, z[n_x:] * wide, u)
+        flow = seconds * np.array(code.rhs(list(x), list(v), list(d), list(p)), dtype=float)
+        read = np.array(code.output(list(x), list(p)), dtype=float)
+        miss = (_SENSOR_WEIGHT * (read - y) / sd)[known]
+        return np.concatenate([flow / scale, miss, _INPUT_WEIGHT * (z[n_x:] - u / wide)])
 
     limits = [code.limits.get(name, (-np.inf, np.inf)) for name in code.states]
     ends = np.array([*limits, *((ends or (-np.inf, np.inf)) for ends in ranges)], dtype=float)
     low, high = (ends / np.concatenate([scale, wide])[:, None]).T
     z = np.clip(np.concatenate([_guess(code, y) / scale, u / wide]), low, high)
-    return np.asarray(_settle(residuals, z, low, high)[:n_x] * scale)
+    if not np.isfinite(residuals(z)).all():
+        return np.full(n_x, np.nan)
+    from scipy.optimize import least_squares  # a class with a rest of its own needs none
+
+    return np.asarray(least_squares(residuals, z, bounds=(low, high)).x[:n_x] * scale)
 
 
 def _guess(code: OwnCode, y: Array) -> Array:
@@ -422,41 +422,6 @@ def _guess(code: OwnCode, y: Array) -> Array:
     mean, read = float(np.nanmean(y)), dict(zip(code.outputs, y.tolist()))
     guess = [read.get(name, mean) for name in code.states]
     return np.array([value if np.isfinite(value) else mean for value in guess])
-
-
-def _settle(residuals: Callable[[Array], Array], z: Array, low: Array, high: Array) -> Array:
-    """Return where bounded, damped Gauss-Newton ends; its best point, however it ends."""
-    damping, n = 1e-3, len(z)
-    moves = np.hstack([np.zeros((n, 1)), _NUDGE * np.eye(n)])
-    rows = residuals(z[:, None] + moves)
-    cost = float(rows[:, 0] @ rows[:, 0])
-    if not np.isfinite(cost):
-        return np.full(n, np.nan)
-    for _ in range(_ITERATIONS):
-        jacobian = np.nan_to_num((rows[:, 1:] - rows[:, :1]) / _NUDGE)
-        slope = jacobian.T @ rows[:, 0]
-        # what rests on a bound and would leave it stays there, and the others move without it
-        jacobian[:, (z <= low) & (slope > 0) | (z >= high) & (slope < 0)] = 0.0
-        step = np.linalg.solve(jacobian.T @ jacobian + damping * np.eye(n), -jacobian.T @ rows[:, 0])
-        trial = np.clip(z + step, low, high)
-        again = residuals(trial[:, None] + moves)
-        fallen = float(again[:, 0] @ again[:, 0])
-        if not fallen < cost:  # or NaN
-            damping *= 100
-            if damping > 1e9:
-                break
-            continue
-        done = fallen > (1 - _SETTLED) * cost or float(np.abs(trial - z).max()) < 1e-9
-        z, rows, cost, damping = trial, again, fallen, damping / 10
-        if done:
-            break
-    return z
-
-
-def _rows(values: Values, n: int) -> Array:
-    """Return values, each a number or a row, as an array (len(values), n)."""
-    rows = [np.broadcast_to(value, n) for value in values]
-    return np.array(rows, dtype=float).reshape(len(values), n)
 
 
 @dataclass(eq=False)

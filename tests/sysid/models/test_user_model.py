@@ -20,7 +20,7 @@ from thermogrip.datasets.schema import Log, make_log
 from thermogrip.sysid.greybox.fit import fit_network, free_runs
 from thermogrip.sysid.greybox.posterior import fit_problem, with_draws
 from thermogrip.sysid.greybox.problem import prior_plant
-from thermogrip.sysid.models.user_model import OwnModel, _settle, load_object, own_model
+from thermogrip.sysid.models.user_model import OwnModel, load_object, own_model
 from thermogrip.sysid.plant.plant import Plant
 
 PARAMETERS = {
@@ -256,46 +256,6 @@ def test_rest_is_found_near_the_readings(state: str, second: float, root: float)
                 rhs=lambda self, x, u, d, p: [u.q + 0 * x[0]],
                 output=lambda self, x, p: [abs(x[0] - 4.0) * (1 + 0 * p.k), second + 0 * x[0]])  # fmt: skip
     np.testing.assert_allclose(model.rest([2.0, second], [0.0], [0.0], [1.0]), root, atol=1e-3)
-
-
-def settled(residual: Any, z: float, low: float = -np.inf, high: float = np.inf) -> tuple[float, int]:
-    """Where the search ends in one unknown, and after how many evaluations."""
-    seen = []
-
-    def rows(at: np.ndarray) -> np.ndarray:
-        seen.append(at)
-        return np.asarray(residual(at))
-
-    return float(_settle(rows, np.array([z]), np.array([low]), np.array([high]))[0]), len(seen)
-
-
-@pytest.mark.parametrize(
-    ("residual", "start", "ends", "end", "evaluations"),
-    [
-        (lambda z: z - 3.0, 0.0, (), 3.0, 5),  # what is left: 3, 3e-3, 3e-7, 3e-12; then no move
-        (
-            lambda z: z - 3.0,
-            0.0,
-            (-1.0, 2.0),
-            2.0,
-            9,
-        ),  # on the bound no step helps: 1e-5 grows hundredfold to 1e9
-        (lambda z: np.arctan(z), 3.0, (), 0.0, 10),  # a whole step overshoots: damped until it does not
-        (lambda z: 1 + np.abs(z), 0.0, (), 0.0, 8),  # no step helps: 1e-3 grows a hundredfold to 1e11
-        (lambda z: np.sqrt(z - 1.0), 0.0, (), np.nan, 1),
-        (lambda z: np.where(z > 2.5, np.nan, z - 3.0), 0.0, (), 2.5, None),  # not past where it is known
-    ],
-)
-def test_the_search_for_rest_ends_where_its_cost_does(
-    residual: Any, start: float, ends: tuple[float, ...], end: float, evaluations: int | None
-):
-    with np.errstate(invalid="ignore"):
-        found, count = settled(residual, start, *ends)
-    if evaluations:
-        np.testing.assert_allclose(found, end, atol=1e-9)
-        assert count == evaluations
-    else:
-        assert 2.0 < found <= end
 
 
 def test_what_a_class_does_not_state_follows_from_its_step():
