@@ -33,9 +33,7 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.file_names import file_format, file_stem, split_cut
 from thermogrip.datasets.limits import MOST_NUMBER
 from thermogrip.datasets.media import csv_cell
-from thermogrip.datasets.netcdf import convention_unit, open_netcdf, write_netcdf
 from thermogrip.datasets.roles import Roles, assign_roles, guess_role
-from thermogrip.datasets.rosbag import bag_parts, read_rosbag_table
 from thermogrip.datasets.schema import ROLES, check_log, hash_columns, make_log
 from thermogrip.datasets.tables import (
     Table,
@@ -220,7 +218,11 @@ def write_log(log: Log, path: str | Path) -> Path:
     kind = check_written(path)
     if kind == "csv":
         return write_atomic(path, _pack(_to_csv(log), path))
-    return write_netcdf(log, path) if kind == "netcdf" else _write_parquet(log, path)
+    if kind == "parquet":
+        return _write_parquet(log, path)
+    from thermogrip.datasets.netcdf import write_netcdf
+
+    return write_netcdf(log, path)
 
 
 def check_written(path: str | Path) -> str:
@@ -236,6 +238,8 @@ def _format(path: Path) -> str:
     """Return the format of a log: that of a folder is known by what is in it."""
     if not os.path.isdir(path):
         return file_format(path)
+    from thermogrip.datasets.rosbag import bag_parts
+
     if not bag_parts(path):
         raise UserError("is a folder, and no ROS 2 bag", file=path, hint="name a file in it")
     return "rosbag"
@@ -243,6 +247,8 @@ def _format(path: Path) -> str:
 
 def _read_netcdf_table(path: str | Path) -> Table:
     """Return the variables over ``time`` of a NetCDF file as a table."""
+    from thermogrip.datasets.netcdf import convention_unit, open_netcdf
+
     data = open_netcdf(path)
     if "time" not in data.dims or "time" not in data.variables:
         problem = "no time axis"
@@ -271,7 +277,6 @@ def _read_netcdf_table(path: str | Path) -> Table:
 _WITHOUT_NAMES = {
     "csv": read_text_table, "text": read_text_table, "matlab": read_matlab_table, "excel": read_excel_table
 }  # fmt: skip
-_WITH_NAMES = {"netcdf": _read_netcdf_table, "parquet": read_parquet_table, "rosbag": read_rosbag_table}
 
 
 def _read_table(file: Path, columns: Sequence[str] | None) -> Table:
@@ -280,7 +285,11 @@ def _read_table(file: Path, columns: Sequence[str] | None) -> Table:
         return _WITHOUT_NAMES[kind](file, columns)
     if columns is not None:
         raise UserError("has names of its own", file=file, hint="leave --columns out")
-    return _WITH_NAMES[kind](file)
+    if kind == "rosbag":
+        from thermogrip.datasets.rosbag import read_rosbag_table
+
+        return read_rosbag_table(file)
+    return _read_netcdf_table(file) if kind == "netcdf" else read_parquet_table(file)
 
 
 def _frame_table(frame: Any, columns: Sequence[str] | None) -> Table:

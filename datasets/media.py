@@ -9,7 +9,8 @@ medium is written, so that records keep the text as it was:
   characters are escaped by the template),
 * :func:`csv_text` for every CSV with a cell of text, undone by :func:`from_csv` when one is read,
 * :func:`markdown` for the README of an export,
-* :func:`thermogrip.report.html.literal` for figures, whose axes :func:`panels` makes.
+* :func:`thermogrip.report.html.literal` for figures, whose axes :func:`panels` makes,
+* :class:`Shown` for results at the prompt of Python and in notebooks.
 """
 
 from __future__ import annotations
@@ -17,7 +18,8 @@ from __future__ import annotations
 import csv
 import io
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from html import escape
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -102,3 +104,21 @@ def panels(
 def _written_out(found: re.Match[str]) -> str:
     code = ord(found[0])
     return f"\\x{code:02x}" if code < 256 else f"\\u{code:04x}"
+
+
+class Shown:
+    """Base of results that show a few facts of themselves."""
+
+    def _facts(self) -> Mapping[str, object]:
+        """Return what is shown, by name."""
+        raise NotImplementedError
+
+    def __repr__(self) -> str:
+        lines = [printable(f"  {name:16}  {what}") for name, what in self._facts().items()][:18]
+        cut = [line if len(line) <= 110 else f"{line[:107]}..." for line in lines]
+        return "\n".join([type(self).__name__, *cut])
+
+    def _repr_html_(self) -> str:
+        rows = ((escape(printable(f"{part}")) for part in fact) for fact in self._facts().items())
+        body = "".join(f"<tr><th>{name}</th><td>{what}</td></tr>" for name, what in rows)
+        return f'<table style="text-align: left"><caption>{type(self).__name__}</caption>{body}</table>'

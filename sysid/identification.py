@@ -43,9 +43,9 @@ import numpy as np
 from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.errors import UserError, known_names
 from thermogrip.datasets.log_files import Logs, as_logs
+from thermogrip.datasets.media import Shown
 from thermogrip.datasets.parallel import Workers, run_parallel
 from thermogrip.datasets.schema import Log, log_name
-from thermogrip.datasets.shown import Shown
 from thermogrip.sysid.blackbox.fit import (
     BLACK_BOXES,
     FAMILIES,

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.atomic_files import read_json, write_json
 from thermogrip.datasets.errors import UserError, reading
-from thermogrip.datasets.shown import Shown
+from thermogrip.datasets.media import Shown
 from thermogrip.mpc.controllers.compiled import CompiledStep
 from thermogrip.mpc.controllers.linear_equivalent import to_control
 from thermogrip.mpc.controllers.reference import ReferenceController

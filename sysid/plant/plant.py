@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,11 +16,10 @@ import numpy as np
 
 from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.atomic_files import check_json, read_json, write_json
-from thermogrip.datasets.errors import UserError, reading
+from thermogrip.datasets.errors import UserError, known_names, reading
+from thermogrip.datasets.media import Shown
 from thermogrip.datasets.schema import Log, column, log_name, make_log
-from thermogrip.datasets.shown import Shown
 from thermogrip.sysid.models.model import Model
-from thermogrip.sysid.models.saved import load_model
 from thermogrip.sysid.plant import plant_data
 from thermogrip.sysid.plant.log_grid import Stretch, at_rows, cut_stretches, match_logs
 from thermogrip.sysid.plant.simulation import AFTER_GAP, Start, find_starts, predict
@@ -30,6 +30,14 @@ if TYPE_CHECKING:
 WARMUP = 5.0  # s of readings that set the state, where nothing else is asked for
 _SHOWN = 10  # free parameters where a plant shows itself
 _INSIDE = 64  # so many samples stand in the plant's own file
+#: By ``kind``, where a model's class is; a file can name no other code.
+_MODELS = {
+    "network": ("network", "NetworkModel"),
+    "statespace": ("state_space", "StateSpaceModel"),
+    "neural": ("neural", "NeuralModel"),
+    "sindy": ("polynomial", "SindyModel"),
+    "own": ("user_model", "OwnModel"),
+}
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -241,8 +249,8 @@ class Plant(Shown, plant_data.PlantData):
     def _of(cls, content: Mapping[str, Any], model: Model | None, samples: Array | None) -> Plant:
         fields = plant_data.fields_of(content)
         with plant_data.whole_plant():
-            equations = load_model(content["model"], code=model)
-            refits = tuple(load_model(one) for one in content.get("refits") or ())
+            equations = _load_model(content["model"], code=model)
+            refits = tuple(_load_model(one) for one in content.get("refits") or ())
             return cls(model=equations, samples=samples, refits=refits, **fields)
 
     def to_control(self, **point: Any) -> Any:
@@ -264,3 +272,17 @@ class Plant(Shown, plant_data.PlantData):
         from thermogrip.sysid.plant.linearise import to_casadi
 
         return to_casadi(self, dt=dt)
+
+
+def _load_model(content: Mapping[str, Any], *, code: Model | None = None) -> Model:
+    """Return the model that ``Model.to_dict`` wrote, by its ``kind``; ``code`` is the class of a user's own
+    model, which is in no file."""
+    kind = content.get("kind") if isinstance(content, Mapping) else None
+    if kind not in _MODELS:
+        raise UserError(f"model of kind {kind!r} is unknown", hint=known_names(kind, _MODELS))
+    if code is not None and (kind != code.kind or not hasattr(code, "restored")):
+        raise UserError(f"its model ({kind}) needs no class", hint="leave the class out")
+    module, name = _MODELS[kind]
+    kept: Any = getattr(import_module(f"thermogrip.sysid.models.{module}"), name) if code is None else code
+    model: Model = kept.from_dict(content) if code is None else kept.restored(content)
+    return model

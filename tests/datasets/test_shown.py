@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import pytest
 
 from tests.end_to_end.conftest import small_plant
-from thermogrip.datasets.shown import Shown
+from thermogrip.datasets.media import Shown
 from thermogrip.mpc import Controller
 from thermogrip.sysid import load_network
 from thermogrip.sysid.experiment.information import plant_from_prior
