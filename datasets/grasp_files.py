@@ -41,7 +41,6 @@ from thermogrip.datasets.tables import (
     Table,
     read_csv_table,
     read_parquet_frame,
-    text_numbers,
 )
 from thermogrip.datasets.units import rename_hint, split_header, to_record_unit
 
@@ -104,7 +103,7 @@ def read_grasps(path: str | Path, *, name: str | None = None) -> Grasps:
     if file_format(path) == "netcdf":
         return _whole(_of_dataset(open_netcdf(path), path, name), path)
     samples, meta = _sample_table(path), _meta_path(path)
-    return _of_tables(samples, read_csv_table(meta, text=None), name or file_stem(path))
+    return _of_tables(samples, _meta_table(meta), name or file_stem(path))
 
 
 def _whole(grasps: Grasps, path: str | Path) -> Grasps:
@@ -143,7 +142,7 @@ def from_frame(frame: DataFrame, name: str = "DataFrame", *, file: str | Path | 
         _check_cells(frame, where)
         rest = rest.drop_duplicates("grasp_id")
     long = _sample_table(where, frame[samples].to_csv(index=False).encode())
-    meta = read_csv_table(where, text=None, data=rest.to_csv(index=False).encode())
+    meta = _meta_table(where, rest.to_csv(index=False).encode())
     return _of_tables(replace(long, lines=long.lines - 1), meta, name)
 
 
@@ -433,6 +432,13 @@ def _meta_path(path: str | Path) -> Path:
     return found
 
 
+def _meta_table(path: str | Path, data: bytes | None = None) -> Table:
+    def is_text(header: str) -> bool:
+        return _meta_name(header, str(path))[0] not in GRASP_NUMBERS
+
+    return read_csv_table(path, text=is_text, data=data)
+
+
 def _meta_name(header: str, file: str | None = None) -> tuple[str, str]:
     """Return what a record calls a column of the meta file, and its unit; no name where it means nothing."""
     if not re.fullmatch(r"\S+", header) or not header.lower().startswith(
@@ -451,18 +457,18 @@ def _meta_of(table: Table, order: list[str], file: str) -> tuple[dict[str, Any],
     rows = _matched(table, order, path, file)
     found: dict[str, Any] = {}
     strange = []
-    for header, cells in table.text.items():
+    for header in (*table.text, *table.numbers):
         name, unit = _meta_name(header, str(path))
         if name in found:
             raise UserError(f"gives {name} a second time", file=path, column=header, hint="keep one")
         if name in GRASP_NUMBERS:
-            numbers, got = to_record_unit(text_numbers(table, header), unit)
+            numbers, got = to_record_unit(table.numbers[header], unit)
             if got != GRASP_NUMBERS[name]:
                 hint = f"it is in {GRASP_NUMBERS[name]}: write {name}_{GRASP_NUMBERS[name]}"
                 raise UserError(f"unit {got!r} does not fit", file=path, column=header, hint=hint)
             found[name] = numbers[rows]
         elif name in GRASP_LABELS:
-            found[name] = [cells[at] for at in rows]
+            found[name] = [table.text[header][at] for at in rows]
         elif name != "grasp_id":
             strange.append(header)
     known = [*(f"{META_NAMES.get(name, name)}_{unit}" for name, unit in GRASP_NUMBERS.items()), *GRASP_LABELS]

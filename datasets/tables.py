@@ -45,7 +45,7 @@ if TYPE_CHECKING:
 MOST_COLUMNS = 4096  # of a table
 _MOST_EMPTY = 1_000_000  # lines without a cell that are passed over
 
-_NULLS = ["", "nan", "NaN", "NAN", "NA", "N/A", "null", "NULL", "None", "-nan", "#N/A"]
+_NULLS = ["", "nan", "NaN", "NAN", "NA", "na", "N/A", "null", "NULL", "None", "-nan", "#N/A"]
 _LOST = [*_NULLS, "-", "--", "---", "?", "*", "NaT", "unknown", "unavailable"]
 _COMMENT = ("#", "%", "//")  # how a line begins that is no row
 _LEFT_OUT = "\x1f"  # how the name of a column begins that is not kept
@@ -90,7 +90,6 @@ class Table:
     attrs: dict[str, dict[str, str]] = field(default_factory=dict)  # by column: ``units``, ``role``
     meta: dict[str, str] = field(default_factory=dict)  # the format's entries for the whole file
     notes: tuple[str, ...] = ()  # what the reader repaired
-    separator: str = ","
 
 
 def read_csv_table(
@@ -415,7 +414,7 @@ def _parse_table(
     if faults:
         raise _joined(faults, names if broken else ())  # what may be broken is a log
     notes = tuple(dict.fromkeys([*layout.notes, *notes]))
-    return Table(file, numbers, text, lines, notes=notes, separator=separator)
+    return Table(file, numbers, text, lines, notes=notes)
 
 
 def _read_cells(
@@ -495,21 +494,6 @@ def _joined(faults: Sequence[UserError], names: Sequence[str]) -> UserError:
         return UserError(first.problem, file=first.file, row=first.row, column=first.column, hint=hint)
     each = [f"row {f.row}" + (f", column {f.column}" if f.column else "") + f": {f.problem}" for f in faults]
     return UserError(f"{len(faults)} faults: " + "; ".join(each), file=first.file, hint=hint)
-
-
-def text_numbers(table: Table, header: str) -> NDArray[np.float64]:
-    """Return the numbers (n_row,) of a column that was left as text, NaN where a cell is empty."""
-    cells = table.text[header]
-    values = np.full(len(cells), np.nan)
-    for at, cell in enumerate(cells):
-        if cell.lower() in ("", "nan", "na"):
-            continue
-        decimal_comma = table.separator != "," and re.fullmatch(r"[+-]?\d+,\d+", cell)
-        hint = "write a number, or leave the cell empty if it is unknown"
-        where = {"file": table.file, "row": int(table.lines[at]), "column": header, "hint": hint}
-        with as_user_error(ValueError, f"{cell!r} is not a number", **where):
-            values[at] = float(cell.replace(",", ".") if decimal_comma else cell)
-    return values
 
 
 def read_matlab_table(path: str | Path, columns: Sequence[str] | None = None) -> Table:

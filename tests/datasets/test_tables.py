@@ -16,14 +16,12 @@ from scipy.io import savemat
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.file_names import file_format, file_stem
 from thermogrip.datasets.tables import (
-    Table,
     find_layout,
     parse_text,
     read_csv_table,
     read_matlab_table,
     read_parquet_table,
     read_text_table,
-    text_numbers,
     unused,
 )
 
@@ -274,15 +272,6 @@ def test_a_table_of_thermogrip_is_read_strictly(tmp_path, text, words, found):
     table = read_csv_table(path, text=words)
     assert shown(table) == found
     assert [*table.text] == (["a", "b"] if words is None else ["b"] if callable(words) else [*words])
-
-
-def test_a_text_cell_becomes_a_number_where_one_is_wanted():
-    cells = ["1.5", "", "NaN", "na", "-3", "2,5"]
-    lines = np.array([3, 4, 5, 6, 8, 9])
-    table = Table("a.csv", {}, {"x": cells}, lines, separator=";")
-    np.testing.assert_array_equal(text_numbers(table, "x"), [1.5, np.nan, np.nan, np.nan, -3.0, 2.5])
-    line = refusal(text_numbers, Table("a.csv", {}, {"x": cells}, lines), "x")
-    assert "a.csv, row 9, column x: '2,5' is not a number; write a number, or leave the cell empty" in line
 
 
 A = np.arange(6.0)
