@@ -10,7 +10,7 @@ from types import ModuleType
 
 from thermogrip.mpc.design import design
 from thermogrip.mpc.estimator import call_times, observer, reading_checks
-from thermogrip.mpc.optimiser import active_set, reach, rti
+from thermogrip.mpc.optimiser import qp, reach, rti
 
 CAUTION, MOST_CAUTION = 3.0, 30.0  # of a mean innovation, from which on moves weigh more; how much more
 STAYS = 1e-5  # of its range: a plan that moves by less has converged
@@ -18,10 +18,10 @@ UNCUT = 1e-9  # of its range: a drive of the PI that is cut by less is not limit
 WEAK = 0.05  # of its gain at rest, below which a drive's bias is not learnt
 
 _SHARED: dict[ModuleType, tuple[str, ...]] = {
-    active_set: ("CONTRADICTION", "FAR", "REGULAR", "SHORT", "TOLERANCE"),
     call_times: ("RESTART_S", "SAME"),
     design: ("DAY",),
     observer: ("LARGEST_BIAS", "NEWEST_INNOVATION"),
+    qp: ("SHORT", "TOLERANCE"),
     reach: (
         *("BEYOND_LIMIT", "CAN", "CANNOT", "CONVERGED", "LEAST_SD", "MISS_ALARM", "MISS_ALLOWANCE"),
         *("MISS_CLIP", "STEADY_STEPS", "STRIDE", "SWEEPS", "TAKE_BACK"),

@@ -48,8 +48,8 @@ _FLAGS = {
     -7: "time limit",
 }
 _SOFT = 8  # DAQP's flag of a row that may be broken at a penalty
-_TOLERANCE = 1e-10  # of a scaled row
-_SHORT = 1e-5  # a soft row shorter than this, scaled, cannot be kept by any answer
+TOLERANCE = 1e-10  # of a scaled row
+SHORT = 1e-5  # a soft row shorter than this, scaled, cannot be kept by any answer
 _FAR = 1e20  # means "no bound"; DAQP takes 1e30 as infinite
 
 
@@ -128,7 +128,7 @@ class CondensedQP:
             self._given = H, A
         back, length, rows = self._scaled
         least, most = np.maximum(lower / length, -_FAR), np.minimum(upper / length, _FAR)
-        idle = self.soft & (length < _SHORT)
+        idle = self.soft & (length < SHORT)
         if idle.any():
             least[idle], most[idle] = -_FAR, _FAR
         z, multipliers, flag, iterations = self._run(f @ back, rows, least, most, length)
@@ -151,7 +151,7 @@ class CondensedQP:
         settings = {
             "iter_limit": self.iteration_limit,
             "time_limit": self.time_limit_s,
-            "primal_tol": _TOLERANCE,
+            "primal_tol": TOLERANCE,
         }
         model.settings = settings
         sense = np.where(self.soft, _SOFT, 0).astype(np.int32)

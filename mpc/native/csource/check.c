@@ -1,4 +1,4 @@
-/* Read states, one a line, and answer what the controller does there: status, iterations, drives, plan.
+/* Read states, one a line, and answer what the controller does there: status, drives, plan.
  *
  * A line: x, w, measured disturbances, drives, whether there is a plan, the plan, target and side of before,
  * reading, its disturbances, target, whether time is up, the time of before, where targets ramp; numbers as %a or
@@ -55,7 +55,7 @@ int main(void)
         c->has_plan = planned != 0.0;
         memcpy(c->in_force, c->u, sizeof c->in_force);
         move = tg_step(c, NAN, y, d, NULL, target);
-        printf("%d %d", move.status, move.iterations);
+        printf("%d", move.status);
         for (int j = 0; j < TG_NU; j++)
             printf(" %a", move.drive[j]);
         for (int j = 0; c->has_plan && j < tg_the_design.N * TG_NU; j++)

@@ -35,8 +35,8 @@
 
 #define LARGEST 1.7e308 /* number that is finite */
 #define TOLERANCE TG_TOLERANCE /* of a row, in units of its own length */
-#define REGULAR TG_REGULAR /* share of K_ii that keeps its factor regular */
-#define CONTRADICTION TG_CONTRADICTION /* by which a hard row may stay broken, in units of its length */
+#define REGULAR 1e-11 /* share of K_ii that keeps its factor regular */
+#define CONTRADICTION 1e-6 /* by which a hard row may stay broken, in units of its length */
 #define SHORT TG_SHORT /* a soft row shorter than this cannot be kept by any plan */
 #define CONVEX 1e-14    /* of H_ii, that a pivot is at least */
 #define REACHED 1e-13   /* of the largest multiplier: what ends by less beyond its bound is on it */

@@ -12,6 +12,8 @@
 
 #include "tg_config.h"
 
+#define TG_FAR 1e15 /* a bound beyond it is none */
+
 #define TG_Q_N (TG_NB * TG_NU)
 #define TG_Q_S (TG_NH * TG_NS + TG_NP)
 #define TG_Q_M (2 * TG_Q_N + TG_Q_S)

@@ -236,8 +236,7 @@ def export(
         found = check_export(written, loaded, states=states, seed=seed, progress=progress)
     console.say(
         f"{found.states} random states under the sanitizers: drives differ by at most {found.difference:.1e} "
-        f"of their range ({found.free} of them at no limit), same status in {found.same_status}, "
-        f"same iterations in {found.same_iterations}. "
+        f"of their range ({found.free} of them at no limit), same status in {found.same_status}. "
         f"RAM of a controller {found.ram} bytes, constants {found.constants}, flash {found.flash}, largest "
         f"stack frame {found.stack}."
     )

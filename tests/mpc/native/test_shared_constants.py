@@ -36,7 +36,6 @@ def in_python() -> set[tuple[str, float]]:
 @pytest.mark.parametrize("path", SOURCES, ids=lambda path: path.name)
 def test_no_number_of_python_is_written_into_c(path: Path) -> None:
     text = path.read_text(encoding="utf-8")
-    text = re.sub(r"#ifdef TG_SINGLE.*?#(?:else|endif)", "", text, flags=re.DOTALL)
     found = {(name, float(value)) for name, value in NUMBER.findall(text)}
     assert not found & in_python()
     assert not {name for name, _ in found} & shared_constants.shared_constants().keys()
