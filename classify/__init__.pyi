@@ -22,7 +22,6 @@ if typing.TYPE_CHECKING:  # doors of 0.1.0, which are found and not listed
     from thermogrip.classify.decisions.stopping_rule import learn_stop_rule as learn_stop_rule
     from thermogrip.classify.decisions.stopping_rule import session_stop as session_stop
     from thermogrip.classify.estimators.base import join_grasps as join_grasps
-    from thermogrip.classify.estimators.features import extract_features as extract_features
     from thermogrip.classify.estimators.lda import ArrayClassifier as ArrayClassifier
     from thermogrip.classify.estimators.registry import can_be_saved as can_be_saved
     from thermogrip.classify.evaluation.comparison import Comparison as Comparison

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from thermogrip.classify.decisions.predict import Row
 from thermogrip.classify.evaluation.comparison import POOLED, Comparison
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.media import panels
@@ -21,7 +20,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from thermogrip.classify.estimators.bayes import BayesClassifier, Readings
     from thermogrip.sysid.effusivity.posterior import EffusivityRow
 
 PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#8a8a2a")
@@ -143,46 +141,6 @@ def effusivity_figure(
     return figure
 
 
-def feature_figure(model: BayesClassifier, read: Readings, labels: NDArray[np.str_]) -> Figure:
-    """Draw each feature's density under every class of ``bayes``, below it the grasps that ``read`` has, with
-    the sd of their noise; ``labels`` (n_grasp,) are their materials."""
-    x, noise = read.normalised() if model.reader_.normalise else (read.y, read.noise)
-    sd = np.sqrt(np.diagonal(noise, axis1=1, axis2=2))
-    means, scales = model.marginals()
-    count = len(model.feature_names_)
-    down = -(-count // 4)
-    figure, axes = panels(down, min(count, 4), size=(9.6, 0.4 + 2.1 * down), ticks=6)
-    for axis in axes.ravel()[count:]:
-        axis.set_axis_off()
-    for j, (axis, name) in enumerate(zip(axes.ravel(), model.feature_names_)):
-        seen = np.concatenate([x[np.isfinite(x[:, j]), j], means[:, j]])
-        ends = np.quantile(seen, [0.01, 0.99]) + np.array([-3, 3]) * np.median(scales[:, j])
-        grid = np.linspace(ends[0], ends[1], 400)
-        for m, material in enumerate(model.classes_):
-            z = (grid - means[m, j]) / scales[m, j]
-            density = (1 + z**2 / model.dof_) ** (-0.5 * (model.dof_ + 1)) / scales[m, j]
-            top = density * float(np.min(scales[:, j]))
-            axis.plot(grid, top, color=PALETTE[m % 8], lw=1.2, label=str(material) if j == 0 else None)
-            own = labels == material
-            at = np.full(int(own.sum()), -0.08 - 0.09 * m)
-            axis.errorbar(
-                x[own, j],
-                at,
-                xerr=sd[own, j],
-                fmt=MARKERS[m % 8],
-                ms=2,
-                lw=0.4,
-                color=PALETTE[m % 8],
-                alpha=0.6,
-            )
-        unit = "" if model.reader_.normalise else " [K/s]" if "slope" in name else " [K]"
-        words = name.replace("change_", "change at ").replace("_", " ")
-        axis.set(xlim=ends, ylim=(-0.1 - 0.09 * len(model.classes_), 1.05), yticks=())
-        axis.set_xlabel((words[:-1] + " s" if "change" in name else words) + unit, fontsize=7)
-    figure.legend(loc="outside upper center", ncols=min(8, model.classes_.size), frameon=False, fontsize=8)
-    return figure
-
-
 def _confusion(axis: Axes, names: list[str], counts: NDArray[np.float64]) -> None:
     share = counts / np.maximum(counts.sum(axis=1, keepdims=True), 1e-12)
     axis.imshow(share, cmap="Blues", vmin=0, vmax=1)
@@ -222,43 +180,3 @@ def _library_lines(axis: Axes, library: Mapping[str, float]) -> None:
             ha="center",
             va="bottom",
         )
-
-
-_LABELS = {
-    "train_per_class": "training grasps of each material",
-    "contact_s": "contact time [s]",
-    "difference_K": "object warmer than skin by [K]",
-}
-
-
-def curve_figure(rows: Sequence[Row], over: str) -> Figure:
-    """Draw accuracy with its interval, and log loss, against the column ``train_per_class``, ``contact_s`` or
-    ``difference_K`` of rows of :mod:`thermogrip.classify.evaluation.harness`."""
-    if not rows:
-        raise UserError("there is no curve to draw", hint="give at least one point")
-    figure, [[left, right]] = panels(1, 2, size=(9.6, 3.0), ticks=7)
-    names = list(dict.fromkeys(row["classifier"] for row in rows))
-    span = max(row[over] for row in rows) - min(row[over] for row in rows)
-    for k, name in enumerate(names):
-        mine = sorted((row for row in rows if row["classifier"] == name), key=lambda row: row[over])
-        shift = 0.008 * span * (k - (len(names) - 1) / 2)  # so that intervals do not cover each other
-        at, colour = [row[over] + shift for row in mine], PALETTE[k % 8]
-        left.vlines(at, [r["low"] for r in mine], [r["high"] for r in mine], color=colour, lw=1, alpha=0.6)
-        line = "" if over == "difference_K" else "-"
-        left.plot(at, [r["accuracy"] for r in mine], line + MARKERS[k % 8], color=colour, ms=4, lw=1.1)
-        right.plot(
-            at, [r["log_loss"] for r in mine], line + MARKERS[k % 8], color=colour, ms=4, lw=1.1, label=name
-        )
-    chance = {round(row["log_loss_chance"], 6) for row in rows}
-    if len(chance) == 1:
-        guess = chance.pop()  # in the legend too: the axis of a good classifier ends below it
-        right.axhline(guess, color="#9aa7b5", lw=0.8, ls=":", label=f"chance: log loss {guess:.2f}")
-    left.set(ylim=(0, 1.02), ylabel="accuracy, 95 % interval", xlabel=_LABELS[over])
-    right.set(ylabel="log loss", xlabel=_LABELS[over])
-    worst = 2 * max(row["log_loss_chance"] for row in rows)  # a log loss above that is off the page
-    right.set_ylim(0, min(worst, 1.1 * max(row["log_loss"] for row in rows)))
-    if over == "train_per_class":
-        for axis in (left, right):
-            axis.set_xticks(sorted({row[over] for row in rows}))
-    figure.legend(loc="outside upper center", ncols=min(6, len(names) + 1), frameon=False, fontsize=8)
-    return figure

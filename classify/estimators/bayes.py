@@ -53,7 +53,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any, ClassVar
 
 import numpy as np
@@ -63,7 +62,6 @@ from scipy.special import expit, gammaln, logit, logsumexp, multigammaln
 
 from thermogrip.classify.estimators import features
 from thermogrip.classify.estimators.base import (
-    HELD_AT_AN_END,
     Answered,
     Floats,
     GraspClassifier,
@@ -90,7 +88,6 @@ _T_OBJECT_SD = 0.5  # K, of a nominal object temperature
 _SD_WEIGHT = 4.0  # grasps that this prior counts for
 _STEPS, _STILL = 100, 1e-5  # of the expectation maximisation, and when it ends
 _DROWNED = 1e9  # in units of the scatter within a class
-_ORDER = ("initial_slope", "response_", "change_", "fitted_rise", "log_time_constant", "late_slope")
 _SECOND = "second_"  # prefix of the features of a second sensor
 _NEAR = 1.4  # the end of a contact is a time of its own where it is so many times as late as the one before
 _WIDE = 2.0  # K; an object's temperature that is less certain is integrated over
@@ -102,8 +99,7 @@ class Readings:
     """Features in kelvin of n grasps, what multiplies the normalised ones in them, and their noise."""
 
     y: Floats  # (n, d), NaN where a grasp lacks a feature
-    # (n, d), the difference of temperature [K], NaN where the object's is unknown, 1 for a time constant and
-    # everywhere in kelvin
+    # (n, d), the difference of temperature [K], NaN where the object's is unknown, 1 everywhere in kelvin
     gain: Floats
     noise: Floats  # (n, d, d)
     t_object_sd: Floats  # (n,) [K], NaN where no file has it
@@ -122,13 +118,8 @@ class Readings:
 
 @dataclass(eq=False)
 class FeatureReader:
-    """Which features a classifier was trained on, and how to read them again.
-
-    A shorter contact has fewer linear features, and those that it has are the same numbers.  The others come
-    from a rise that is fitted to the whole of a contact, up to 10 s: of a shorter one they are other numbers,
-    and stated probabilities would be too high.  So with these a contact that is shorter than those of the
-    training is refused.
-    """
+    """Which features a classifier was trained on, and how to read them again; a shorter contact has fewer,
+    and those that it has are the same numbers."""
 
     names: list[str]
     normalise: bool
@@ -140,22 +131,20 @@ class FeatureReader:
         records: Sequence[Grasps],
         labels: Labels,
         *,
-        linear: bool = False,
         both: bool = False,
     ) -> tuple[FeatureReader, Readings, NDArray[np.bool_], list[str]]:
         """Return a reader of the features that most grasps of any record have, and what it reads.
 
         The mask is of grasps that can be learnt from, the list has the others in words: where features
         are normalised, grasps of unknown temperature, and materials that were only touched at the skin's own.
-        ``linear``: features that are sums of samples; ``both``: those of a second sensor, too.
+        ``both``: those of a second sensor, too.
         """
         end = min(float(np.median(np.concatenate([_last(part) for part in records]))), features.FIT_END)
         names, tables = [], []
         for part in records:
-            table = _table(part, _times(part, end if linear else 0.0), linear=linear, both=both)
+            table = _table(part, _times(part, end), both=both)
             known = np.isfinite(table.values).mean(axis=0) > 0.5
-            found = [str(f) for f in table["feature"].values[known]]
-            names += [f for f in found if linear or f.startswith(features.MATERIAL_FEATURES)]
+            names += [str(f) for f in table["feature"].values[known]]
             tables.append(table)
         names = sorted(set(names), key=_order)
         if not names:
@@ -181,24 +170,15 @@ class FeatureReader:
     @classmethod
     def from_dict(cls, content: dict[str, Any]) -> FeatureReader:
         """Return the reader that :meth:`to_dict` described."""
+        if not all(name.removeprefix(_SECOND).startswith(features.KINDS) for name in content["features"]):
+            raise ValueError("features of an earlier version")
         return cls(list(content["features"]), bool(content["normalise"]), float(content["end"]))
 
     def read(self, grasps: Grasps) -> Readings:
-        """Return the features of other grasps; unless they are linear, one that is more than half a second
-        shorter than those of the training is a :class:`UserError`."""
-        last = _last(grasps)
-        linear = any("change_" in f for f in self.names)
-        if not linear and (last < self.end - HELD_AT_AN_END).any():
-            i = int(last.argmin())
-            raise UserError(
-                f"grasp {str(grasps['grasp'].values[i])!r} ends at {last[i]:g} s, "
-                f"the classifier was trained on contacts of {self.end:g} s",
-                file=log_name(grasps),
-                hint="leave it out, or train on contacts of that length",
-            )
+        """Return the features of other grasps."""
         times = sorted({_time(f) for f in self.names if f.endswith("s")})
         both = any(f.startswith(_SECOND) for f in self.names)
-        return self._readings(grasps, _table(grasps, times, linear=linear, both=both).sel(feature=self.names))
+        return self._readings(grasps, _table(grasps, times, both=both).sel(feature=self.names))
 
     def _readings(self, grasps: Grasps, table: xr.DataArray) -> Readings:
         y = np.asarray(table.values, dtype=float)
@@ -210,8 +190,7 @@ class FeatureReader:
         for prefix, part in _sensors(grasps):
             own = [k for k, f in enumerate(self.names) if f.startswith(_SECOND) == bool(prefix)]
             names = [self.names[k].removeprefix(_SECOND) for k in own]
-            linear = [k for k, f in zip(own, names) if f != "log_time_constant"]
-            gain[:, linear] = features.object_difference(part)[:, None]
+            gain[:, own] = features.object_difference(part)[:, None]
             if own:  # a feature that nobody has is without noise
                 noise[np.ix_(range(n), own, own)] = np.nan_to_num(features.feature_noise(part, names))
         sd = grasps["t_object_sd"].values if "t_object_sd" in grasps else np.full(n, np.nan)
@@ -251,7 +230,7 @@ class BayesClassifier(GraspClassifier):
         two_or_more(labels, "+".join(map(log_name, records)))
         self.sensors_ = 2 if all("t_surface_2" in part for part in records) else 1
         self.reader_, all_read, usable, self.notes_ = FeatureReader.learn(
-            records, labels, linear=True, both=self.sensors_ == 2
+            records, labels, both=self.sensors_ == 2
         )
         self.feature_names_ = self.reader_.names
         self.classes_ = np.unique(labels[usable])
@@ -386,26 +365,6 @@ class BayesClassifier(GraspClassifier):
                 out[rows, m] = _log_t(y_has - gain * mean[has], scale, dof)
         return out
 
-    def marginals(self) -> tuple[Floats, Floats]:
-        """Return mean and scale of each class's t distribution by feature, (n_class, d) each; normalised
-        features have no unit."""
-        scale = np.sqrt(np.diagonal(self.covariance_ + self.mean_covariance_, axis1=1, axis2=2))
-        return self.means_ * self.scale_ + self.center_, scale * self.scale_
-
-    def separation(self, noise: Floats, difference: float) -> Floats:
-        """Return how many standard deviations each two classes are apart, (n_class, n_class), in grasps of
-        this difference [K] and noise [K], (d, d); where features are in kelvin neither counts."""
-        k, off = self.classes_.size, np.zeros((self.classes_.size,) * 2)
-        within = self.covariance_
-        if self.reader_.normalise:
-            within = within + noise / np.outer(self.scale_, self.scale_) / difference**2
-        for i, j in zip(*np.triu_indices(k, 1)):
-            ray = (self.means_[i] + self.means_[j]) / 2 + self.center_ / self.scale_
-            both = within + (self.t_object_sd_ / difference) ** 2 * np.outer(ray, ray)
-            step = self.means_[i] - self.means_[j]
-            off[i, j] = off[j, i] = np.sqrt(step @ np.linalg.solve(both, step))
-        return off
-
     def get_state(self) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
         numbers = self.reader_.to_dict() | {
             "dof": self.dof_,
@@ -470,12 +429,11 @@ def _sensors(grasps: Grasps) -> list[tuple[str, Grasps]]:
     return [("", grasps), (_SECOND, beside)]
 
 
-def _table(grasps: Grasps, times: Sequence[float], *, linear: bool, both: bool) -> xr.DataArray:
+def _table(grasps: Grasps, times: Sequence[float], *, both: bool) -> xr.DataArray:
     """Return the features in kelvin (n, d), those of a second sensor behind those of the first."""
     tables = []
     for prefix, part in _sensors(grasps)[: 2 if both else 1]:
-        read = features.linear_features if linear else partial(features.extract_features, normalise=False)
-        table = read(part, times=times)
+        table = features.linear_features(part, times)
         tables.append(table.assign_coords(feature=[f"{prefix}{f}" for f in table["feature"].values]))
     return tables[0] if len(tables) == 1 else xr.concat(tables, "feature")
 
@@ -490,7 +448,7 @@ def _times(grasps: Grasps, end: float) -> list[float]:
 def _order(name: str) -> tuple[bool, int, float]:
     """Return the place of a feature: by sensor, in the order of the table, responses by time."""
     own = name.removeprefix(_SECOND)
-    kind = next(i for i, prefix in enumerate(_ORDER) if own.startswith(prefix))
+    kind = next(i for i, prefix in enumerate(features.KINDS) if own.startswith(prefix))
     return own != name, kind, _time(name) if name.endswith("s") else 0.0
 
 

@@ -42,7 +42,8 @@ _LEFT = 7  # the column of what is left, after those of the derivatives
 RATE = 5  # the row of the slope, after the stepped curves
 _CURVES = np.array([_H, _BUILD_UP, _E, _C, _ONSET])  # by which the curves after the value are derivatives
 _CONTACT = np.array([_E, _C, _H, _BUILD_UP])
-EARLIEST_ONSET, LATEST_ONSET = -1.5, 0.8  # s after the closed message
+# s after the closed message: five sds of what the onset of a grasp unlike the training may be
+EARLIEST_ONSET, LATEST_ONSET = -1.5, 1.5
 
 Nodes = tuple[Array, NDArray[np.int64], Array]
 

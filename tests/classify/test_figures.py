@@ -15,17 +15,13 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator
 
 from tests.report.conftest import described
-from thermogrip.classify.estimators.bayes import BayesClassifier
 from thermogrip.classify.figures import (
     accuracy_figure,
     confusion_figure,
-    curve_figure,
     effusivity_figure,
-    feature_figure,
     reliability_figure,
 )
 from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.schema import Grasps
 
 DRAWN = Path(__file__).with_name("figures.txt")
 NINE = tuple("abcdefghi")  # one more than there are colours and markers
@@ -98,18 +94,6 @@ def several(count: int, condition: str = "wet") -> Any:
     return SimpleNamespace(**vars(found) | {"classifiers": NINE[:count], "scores": lambda: rows})
 
 
-def points(
-    over: str, at: tuple[float, ...], names: tuple[str, ...], chance: float = 1.1
-) -> list[dict[str, Any]]:
-    """Return a curve, its points in no order."""
-    return [
-        {"classifier": name, over: x, "accuracy": 0.05 * x + 0.03 * k, "low": 0.04 * x, "high": 0.08 * x,
-         "log_loss": 1.3 - 0.1 * x + 0.01 * k, "log_loss_chance": chance + (0.2 if x > 6 else 0)}
-        for k, name in enumerate(names)
-        for x in at
-    ]  # fmt: skip
-
-
 STRIPS = [strip(c, 300.0 * (k + 1), 250.0 * (k + 1), 420.0 * (k + 1)) for k, c in enumerate("abcdefghi")]
 LIBRARY = {
     "cork": 200.0,
@@ -131,9 +115,6 @@ FIGURES: dict[str, Callable[[], Figure]] = {
     "reliability": lambda: reliability_figure(compared(), "dry"),
     "strips": lambda: effusivity_figure(STRIPS, LIBRARY, materials=[*"zyxwvutsz"[:8], "q"]),
     "strips of nobody knows what": lambda: effusivity_figure(STRIPS[:2], {"air": 1.0, "copper": 36e3}),
-    "curve of grasps": lambda: curve_figure(points("train_per_class", (5, 2), NINE), "train_per_class"),
-    "curve of time": lambda: curve_figure(points("contact_s", (10.0, 3.0), ("a", "b")), "contact_s"),
-    "curve of warmth": lambda: curve_figure(points("difference_K", (4.0, 1.0), ("a",), 0.5), "difference_K"),
 }
 
 
@@ -159,37 +140,8 @@ def untested() -> Any:
     [
         (lambda: confusion_figure(untested(), "c"), "tested in 'c'; there are dry, wet"),
         (lambda: effusivity_figure([], {}), "no posterior to draw"),
-        (lambda: curve_figure([], "contact_s"), "there is no curve to draw"),
     ],
 )
 def test_nothing_is_not_drawn(draw: Callable[[], Figure], message: str) -> None:
     with pytest.raises(UserError, match=message):
         draw()
-
-
-def test_each_feature_has_the_density_of_every_class_above_its_grasps(three: Grasps) -> None:
-    model = BayesClassifier().fit(three)
-    read = model.reader_.read(three)
-    figure = feature_figure(model, read, three["material"].values.astype(str))
-    means, scales = model.marginals()
-    x, noise = read.normalised()
-    for j, name in enumerate(model.feature_names_):
-        axis = figure.axes[j]
-        assert axis.get_xlabel().replace("change at ", "change_").replace(" s", "s") == name.replace(
-            "late_slope", "lateslope"
-        )
-        curves = [line for line in axis.get_lines() if len(line.get_xdata()) == 400]
-        for m, curve in enumerate(curves):
-            at, height = curve.get_xdata(), np.asarray(curve.get_ydata())
-            assert at[height.argmax()] == pytest.approx(means[m, j], abs=0.02 * np.ptp(at))
-            z = (at - means[m, j]) / scales[m, j]
-            t = (1 + z**2 / model.dof_) ** (-(model.dof_ + 1) / 2)
-            np.testing.assert_allclose(height, t * scales[:, j].min() / scales[m, j])
-        points = [line for line in axis.get_lines() if len(line.get_xdata()) == 8]
-        np.testing.assert_allclose(np.concatenate([p.get_xdata() for p in points]), x[:, j])
-        bars = np.concatenate([np.array(c.get_segments())[:, :, 0] for c in axis.collections])
-        np.testing.assert_allclose(np.ptp(bars, axis=1), 2 * np.sqrt(noise[:, j, j]))
-    kelvin = three.drop_vars("t_object")
-    model = BayesClassifier().fit(kelvin)
-    figure = feature_figure(model, model.reader_.read(kelvin), three["material"].values.astype(str))
-    assert [a.get_xlabel() for a in figure.axes[:6:5]] == ["change at 0.5 s [K]", "late slope [K/s]"]

@@ -12,15 +12,10 @@ import numpy as np
 import pytest
 
 from tests.cli.conftest import Bench, StandIn, shares, words_of
-from thermogrip.classify import make_classifier
 from thermogrip.classify.evaluation.comparison import POOLED, Caution
 from thermogrip.cli import compare as verb
-from thermogrip.cli.compare import _features
 from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.datasets.schema import Grasps, make_grasps
-from thermogrip.report.console import Console
-from thermogrip.report.html import Section
 
 HEAD = ("classifier", "condition", "accuracy", "Brier", "fit [s]")
 
@@ -134,8 +129,8 @@ def test_what_is_split_how_and_by_whom_it_is_scored(
     assert [call.quick for call in scored.asked] == [False, True]
     assert {call.seed for call in scored.asked} == {4}
     [call] = scored.threads
-    assert ([*call.args[1]], call.args[2]) == ([*splits, "features"], 3)
-    assert [call.args[0] for call in scored.drawn] == [*([f"of {name}"] for name in splits), []]
+    assert ([*call.args[1]], call.args[2]) == (splits, 3)
+    assert [call.args[0] for call in scored.drawn] == [[f"of {name}"] for name in splits]
     [page] = scored.pages
     assert page.args[0] == Path("c/report.html")
     assert page.args[3] == [f"of {name}" for name in splits]
@@ -216,88 +211,8 @@ def test_the_bar_goes_to_each_part_by_its_work() -> None:
     def shares_of(*parts: bool) -> dict[str, float]:
         return {name: share for name, (share, _) in verb._shares(*parts).items()}
 
-    widths = {"given": 3 / 35, "random": 7 / 35, "by": 5 / 35, "curves": 20 / 35}
-    assert shares_of(True, True, True, True) == pytest.approx(widths)
-    assert shares_of(False, True, False, True) == pytest.approx({"random": 7 / 27, "curves": 20 / 27})
-    assert [title for _, title in verb._shares(True, True, True, True).values()] == [
-        "given split", "random splits", "held out in turn", "curves",
-    ]  # fmt: skip
-
-
-def test_curves_show_what_more_grasps_time_and_difference_bring(
-    stand_in: StandIn, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def curve(*_: Any, progress: Any, **__: Any) -> str:
-        progress(0.5, "x")
-        return "rows"
-
-    seen: list[tuple[float, str]] = []
-    models: Any = {"bayes": "model"}
-    found: Any = {"shipped": "first", "random": "second"}
-    curves = "thermogrip.classify.evaluation.harness"
-    learning = stand_in(f"{curves}.learning_curve", curve)
-    stand_in(f"{curves}.contact_time_curve", UserError("too few grasps"))
-    differences = stand_in(f"{curves}.difference_curve", "difference rows")
-    drawn = stand_in("thermogrip.report.classification.curves_section", "curves")
-    strips = stand_in("thermogrip.report.classification.strips_section", "strips")
-    calibrated = stand_in("thermogrip.sysid.effusivity.calibration.calibrate_gripper", "device")
-    posteriors = stand_in("thermogrip.sysid.effusivity.posterior.effusivity_posterior", lambda d, r: ["row"])
-    record = record_of(["train", "test"], t_object=[43.0, 43.0], material=["iron", "wood"])
-
-    def progress(fraction: float, what: str) -> None:
-        seen.append((fraction, what))
-
-    given = (Console(), models, [record], found, 4, 3, progress)
-    assert verb._curves(*given) == ["curves", "strips"]
-    assert (learning[0].args, learning[0].seed, learning[0].workers) == ((models, [record]), 4, 3)
-    assert learning[0].repeats == 5
-    assert seen == [(0.3, "learning curve: x")]
-    assert "warning: no contact time: too few grasps" in capsys.readouterr().err
-    assert differences[0].args == ("first", [record])
-    assert drawn[0].args == ({"train_per_class": "rows", "difference_K": "difference rows"},)
-    assert calibrated[0].seed == 4
-    assert calibrated[0].args[0][0]["grasp"].values.tolist() == ["g0"]
-    assert posteriors[0].args[0] == "device"
-    assert posteriors[0].args[1]["grasp"].values.tolist() == ["g1"]
-    assert strips[0].args == (["row"], ["wood"])
-    stand_in(f"{curves}.contact_time_curve", curve)
-    seen.clear()
-    plain = verb._curves(*given[:2], [record.drop_vars("t_object")], *given[3:])
-    assert plain == ["curves"]
-    assert seen[1] == (pytest.approx(0.8), "contact time: x")
-    assert verb._curves(*given[:2], [record.drop_vars("split")], *given[3:]) == ["curves"]
-
-
-def test_a_fault_of_the_features_is_said_after_that_nothing_was_scored(
-    scored: SimpleNamespace, stand_in: StandIn
-) -> None:
-    stand_in("thermogrip.cli.compare._features", UserError("no features"))
-    words = ["compare", "grasps.csv", "--classifiers", "bayes", "--repeats", "0", "--out", "c"]
-    assert "no features" in scored.bench.run(*words).err
-    scored.of["shipped"] = Found("shipped", empty=True)
-    assert "nothing to score" in scored.bench.run(*words).err
-
-
-def test_the_curves_stand_after_the_scores(scored: SimpleNamespace, stand_in: StandIn) -> None:
-    asked = stand_in("thermogrip.cli.compare._curves", [Section("More", ())])
-    options = ["--classifiers", "bayes", "--repeats", "0", "--curves", "--seed", "4", "--workers", "3"]
-    assert scored.bench.run("compare", "grasps.csv", *options, "--out", "c").code == 0
-    [call] = asked
-    assert (call.args[1], call.args[2], list(call.args[3])) == ({"bayes": True}, [MARKED], ["shipped"])
-    assert call.args[4:6] == (4, 3)
-    first, last = scored.pages[0].args[3]
-    assert (first, last.title) == ("of shipped", "More")
-
-
-def test_the_features_of_bayes_are_those_of_the_training_grasps(capsys: pytest.CaptureFixture[str]) -> None:
-    record = load_example_grasps()["exp2_dT20"]
-    [section] = _features({"bayes": make_classifier("bayes")}, [record])
-    half = record.isel(grasp=record["split"].values == "train")
-    model = make_classifier("bayes").fit(half)
-    expected = float(np.max(model.separation(model.reader_.read(half).noise.mean(axis=0), 20.0)))
-    assert section.parts[1].rows[-1][-1] == pytest.approx(expected, abs=0.05)
-    assert _features({"pca-lda": make_classifier("pca-lda")}, [record]) == []
-    untrained = record.assign(split=("grasp", ["test"] * record.sizes["grasp"]))
-    assert len(_features({"bayes": make_classifier("bayes")}, [untrained])) == 1
-    [same] = _features({"bayes": make_classifier("bayes")}, [record, untrained.assign_attrs(name="other")])
-    assert (same.parts[1], capsys.readouterr().err) == (section.parts[1], "")
+    widths = {"given": 3 / 15, "random": 7 / 15, "by": 5 / 15}
+    assert shares_of(True, True, True) == pytest.approx(widths)
+    assert shares_of(False, True, False) == pytest.approx({"random": 1.0})
+    titles = [title for _, title in verb._shares(True, True, True).values()]
+    assert titles == ["given split", "random splits", "held out in turn"]

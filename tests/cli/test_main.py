@@ -108,7 +108,7 @@ train: GRASPS... --classifier --out --split --stop-error>0.001<0.5 --quick=False
 classify: MODEL_DIR GRASPS... --out --materials --early=False --next-touch=False --nearest=False
   --known --object-range --serve=False --port>0<65535
   --seed=0>0 --workers=1>1 --cluster --json=False
-compare: GRASPS... --out --test --classifiers --repeats=20>0 --train-per-class=5>1 --by --curves=False
+compare: GRASPS... --out --test --classifiers --repeats=20>0 --train-per-class=5>1 --by
   --quick=False --seed=0>0 --workers=1>1 --cluster --json=False
 paper: --out --quick=False --seed=0>0 --workers=1>1 --cluster --json=False
 materials: [NAME] --json=False

@@ -19,9 +19,7 @@ from thermogrip.datasets.schema import make_log
 from thermogrip.report import classification
 from thermogrip.report.classification import (
     comparison_sections,
-    curves_section,
     effusivity_section,
-    feature_section,
     touch_section,
 )
 from thermogrip.report.html import Picture, Section, Text
@@ -31,7 +29,7 @@ from thermogrip.sysid.effusivity import EffusivityRow
 @pytest.fixture(autouse=True)
 def _no_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Figures have tests of their own."""
-    for name in ("accuracy", "confusion", "curve", "effusivity", "feature", "reliability"):
+    for name in ("accuracy", "confusion", "effusivity", "reliability"):
         monkeypatch.setattr(f"thermogrip.classify.figures.{name}_figure", lambda *_, **__: Figure())
     monkeypatch.setattr(classification, "loops_chart", lambda *_, **__: Chart(()))
 
@@ -57,16 +55,6 @@ def test_each_kind_of_split_has_its_title(name: str, title: str) -> None:
     models = {"features-lda": make_classifier("features-lda")}
     found = evaluate(models, [load_example_grasps()["exp2_dT20"]], seed=0, probe=False)
     assert [s.title for s in comparison_sections(name, found)] == [f"Which material? {title}"]
-
-
-def test_what_lies_above_a_curve_is_named() -> None:
-    row = {"accuracy": 0.5, "low": 0.4, "high": 0.6, "log_loss_chance": 1.1}
-    rows = [
-        row | {"classifier": name, "train_per_class": n, "log_loss": loss}
-        for name, n, loss in (("a", 2, 2.3), ("a", 5, 0.5), ("b", 2, 0.6), ("b", 5, 0.4))
-    ]
-    said = list(captions([curves_section({"train_per_class": rows})]))
-    assert said[0].endswith("Off the page, above twice chance: a.")
 
 
 def test_touches_are_counted_by_what_was_taught_and_what_was_not() -> None:
@@ -127,40 +115,6 @@ def test_sessions_that_did_not_settle_are_counted_and_their_advice_shown() -> No
 def test_a_score_stands_with_both_ends_or_alone(ends: tuple[float, float], said: str) -> None:
     assert classification._between(0.5, *ends) == said
     assert classification._between(0.5, None, None) == "0.500"
-
-
-def test_more_grasps_are_worth_what_the_best_of_the_most_gains() -> None:
-    row = {"accuracy": 0.5, "low": 0.4, "high": 0.6, "log_loss_chance": 1.1}
-    learning = [
-        row | {"classifier": name, "train_per_class": n, "log_loss": loss}
-        for name, n, loss in (("a", 5, 0.5), ("a", 2, 2.3), ("a", 3, 0.1), ("b", 2, 0.6), ("b", 5, 0.4))
-    ]
-    timed = [row | {"classifier": "a", "contact_s": s, "log_loss": 1 / s} for s in (1.0, 2.0, 10.0)]
-    far = [row | {"classifier": "a", "difference_K": 5.0, "log_loss": 0.3}]
-    section = classification.curves_section(
-        {"train_per_class": learning, "contact_s": timed, "difference_K": far}
-    )
-    assert section.verdict == (
-        "From 2 to 5 training grasps a material the log loss of b goes from 0.60 to 0.40. "
-        "From 1 to 10 s of contact the log loss of a goes from 1.00 to 0.10."
-    )
-    assert [picture.caption.split(":")[0] for picture in section.parts] == ["Learning curve", "Contact time"]
-
-
-def test_effusivities_inside_their_interval_are_counted_in_the_order_of_the_library() -> None:
-    drawn: list[Any] = []
-    rows = [
-        SimpleNamespace(grasp_id=name, effusivity_p05=low, effusivity_p95=high)
-        for name, low, high in (("w", 100.0, 1e3), ("c", 1e4, 1e5), ("i", 1.0, 2.0))
-    ]
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(
-            "thermogrip.classify.figures.effusivity_figure",
-            lambda rows, library, materials: (drawn.extend(materials), Figure())[1],
-        )
-        section = classification.strips_section(rows, ["wood", "copper", "iron"])
-    assert drawn == ["wood", "iron", "copper"]
-    assert "2 of 3 test grasps have the library's value" in section.verdict
 
 
 @pytest.mark.parametrize(
@@ -230,20 +184,6 @@ def test_a_leak_and_an_unseen_material_stand_in_the_verdict_as_caution() -> None
     assert "of copper, which training lacks, and are not scored; features-lda answered" in before.verdict
     assert "labels can be predicted" not in before.verdict
     assert section.verdict.startswith(f"{leak['condition']}: labels can be predicted from samples before")
-
-
-@pytest.mark.parametrize("known", [True, False])
-def test_the_page_of_bayes_names_the_pair_that_is_hardest_to_tell_apart(known: bool) -> None:
-    grasps = load_example_grasps()["exp1A_obj43_grip23"]
-    grasps = grasps if known else grasps.drop_vars("t_object")
-    model = make_classifier("bayes").fit(grasps)
-    section = feature_section(model, [grasps])
-    assert " and ".join(section.parts[1].rows[0][0].split(", ")) in section.verdict
-    columns = list(zip(*section.parts[1].rows))
-    assert len(columns) == (4 if known else 2)
-    assert list(columns[-1]) == sorted(columns[-1])
-    assert section.parts[1].rows[0][0] in ("brass, copper", "brass, zinc")
-    assert ("at 20 K" in section.verdict) == known
 
 
 def test_a_page_of_effusivities_has_every_grasp_and_says_what_is_missing() -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -11,14 +11,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from thermogrip.classify.estimators import classifier_names
 from thermogrip.cli import options as cli
-from thermogrip.cli.classify import Quick, touched_part, training_part
+from thermogrip.cli.classify import Quick, touched_part
 from thermogrip.datasets.errors import UserError
 from thermogrip.report.console import Console
 
 if TYPE_CHECKING:
-    from thermogrip.classify.estimators.base import GraspClassifier
     from thermogrip.classify.evaluation.comparison import Comparison
-    from thermogrip.datasets.parallel import Progress
     from thermogrip.datasets.schema import Grasps
     from thermogrip.report.html import Section
 
@@ -60,12 +58,6 @@ def compare(
             cli.one_of("--by", ("session", "block")),
         ),
     ] = None,
-    curves: Annotated[
-        bool,
-        cli.flag(
-            "--curves", "Also learning curve, contact time, difference, effusivity strips."
-        ),
-    ] = False,
     quick: Quick = False,
     seed: cli.Seed = 0,
     workers: cli.Workers = 1,
@@ -111,7 +103,7 @@ def compare(
         if given and anew and (why := _unsplittable(records, repeats, train_per_class, seed)):
             console.warn(f"no random splits: {why}")
             anew = False
-        parts = _shares(given, anew, by is not None, curves)
+        parts = _shares(given, anew, by is not None)
         widths = joint_progress(progress, [share for share, _ in parts.values()])
         shares = {
             name: sub_progress(width, 0.0, 1.0, title)
@@ -132,39 +124,16 @@ def compare(
             asked[by] = partial(evaluate, fast, records, split=by, progress=shares["by"], **again)
         page = _Page(left_out)
 
-        def work(name: str) -> Comparison | None:
-            if name == "features":  # which need no other process
-                page.add(name, partial(_features, models, records))
-                return None
+        def work(name: str) -> Comparison:
             return page.compared(name, asked[name]())
 
         # side by side: processes that one of them leaves idle work for another, the page is drawn meanwhile
-        parallel = [*asked, "features"]
-        done = dict(zip(parallel, run_threads(work, parallel, pool), strict=True))
+        done = dict(zip(asked, run_threads(work, list(asked), pool), strict=True))
         found = {name: each for name, each in done.items() if each and _scored(console, name, each, left_out)}
         if not found:
             raise UserError("nothing to score", hint="test on grasps of the materials that were trained")
-        more = page.sections("features")
-        if curves:
-            more += _curves(console, fast, records, found, seed, pool, shares["curves"])
-    _write_comparisons(console, found, out, [*page.sections(*found), *more])
+    _write_comparisons(console, found, out, page.sections(*found))
     return 0
-
-
-def _features(models: Mapping[str, GraspClassifier], records: Sequence[Grasps]) -> list[Section]:
-    """Return the section of the features of ``bayes``, where it is among the classifiers."""
-    from sklearn.base import clone
-
-    from thermogrip.classify.estimators.bayes import BayesClassifier
-    from thermogrip.report.classification import feature_section
-
-    if not isinstance(models.get("bayes"), BayesClassifier):
-        return []
-    training = list(records)
-    if _has_split(records):
-        training = [r.isel(grasp=r["split"].values == "train") if "split" in r else r for r in records]
-    training = [part for part in training if part.sizes["grasp"]]
-    return [feature_section(clone(models["bayes"]).fit(training), training)]
 
 
 def _unsplittable(records: Sequence[Grasps], repeats: int, train_per_class: int, seed: int) -> str:
@@ -178,13 +147,12 @@ def _unsplittable(records: Sequence[Grasps], repeats: int, train_per_class: int,
     return ""
 
 
-def _shares(given: bool, random: bool, by: bool, curves: bool) -> dict[str, tuple[float, str]]:
+def _shares(given: bool, random: bool, by: bool) -> dict[str, tuple[float, str]]:
     """Return the share of the bar of each part of the work, and the part's name."""
     weights = {
         "given": (3.0 * given, "given split"),
         "random": (7.0 * random, "random splits"),
         "by": (5.0 * by, "held out in turn"),
-        "curves": (20.0 * curves, "curves"),
     }
     total = sum(weight for weight, _ in weights.values())
     return {name: (weight / total, title) for name, (weight, title) in weights.items() if weight}
@@ -234,42 +202,6 @@ def _scored(console: Console, name: str, comparison: Comparison, known: Sequence
     for note in comparison.notes[len(known) :]:
         console.warn(f"{name}: {note}")
     return False
-
-
-def _curves(
-    console: Console,
-    models: dict[str, GraspClassifier],
-    records: Sequence[Grasps],
-    found: dict[str, Comparison],
-    seed: int,
-    workers: int | str,
-    progress: Progress | None,
-) -> list[Section]:
-    """Return what more grasps, time or difference would bring, and the strips of the shipped test grasps."""
-    from thermogrip.classify.evaluation.harness import contact_time_curve, difference_curve, learning_curve
-    from thermogrip.datasets.parallel import sub_progress
-    from thermogrip.report.classification import curves_section, strips_section
-    from thermogrip.sysid.effusivity import calibrate_gripper, effusivity_posterior
-
-    settings: dict[str, Any] = {"seed": seed, "workers": workers, "repeats": 5}
-    rows = {}
-    for key, title, curve, span in (
-        ("train_per_class", "learning curve", learning_curve, (0.0, 0.6)),
-        ("contact_s", "contact time", contact_time_curve, (0.6, 1.0)),
-    ):
-        try:
-            rows[key] = curve(models, records, **settings, progress=sub_progress(progress, *span, title))
-        except UserError as error:  # so few grasps are scored all the same
-            console.warn(f"no {title}: {error}")
-    rows["difference_K"] = difference_curve(next(iter(found.values())), records)
-    sections = [curves_section(rows)]
-    if _has_split(records) and all("t_object" in record for record in records):
-        device = calibrate_gripper(training_part(Console(True), records, "train"), seed=seed)
-        tests = [r.isel(grasp=r["split"].values == "test") for r in records]
-        strips = [row for record in tests for row in effusivity_posterior(device, record)]
-        names = [str(m) for record in tests for m in record["material"].values]
-        sections.append(strips_section(strips, names))
-    return sections
 
 
 def _write_comparisons(

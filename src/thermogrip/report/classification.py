@@ -16,7 +16,6 @@ from thermogrip.report.plots import grasps_chart, loops_chart
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from thermogrip.classify.estimators.bayes import BayesClassifier
     from thermogrip.classify.evaluation.comparison import Comparison
     from thermogrip.datasets.schema import Grasps
     from thermogrip.mpc.tuning.design_review import Check
@@ -194,63 +193,6 @@ def _between(value: float, low: float | None, high: float | None) -> str:
     return f"{value:.3f} ({low_text}\N{EN DASH}{high_text})"
 
 
-def curves_section(curves: Mapping[str, Sequence[dict[str, Any]]]) -> Section:
-    """Return the section of what more grasps, more time or another temperature would bring, from rows by what
-    they run over: ``train_per_class``, ``contact_s``, ``difference_K``."""
-    from thermogrip.classify.figures import curve_figure
-
-    captions = {
-        "train_per_class": "Learning curve: random splits, all conditions pooled.",
-        "contact_s": "Contact time: training and test grasps are cut alike.",
-        "difference_K": "Temperature difference: a point a condition; more materials are harder.",
-    }
-    parts = tuple(
-        Picture(curve_figure(rows, over), captions[over] + _off_the_page(rows))
-        for over, rows in curves.items()
-        if len({row[over] for row in rows}) > 1  # one point is no curve
-    )
-    gains = [_gain(over, rows) for over, rows in curves.items() if over != "difference_K" and rows]
-    return Section("What would help?", parts, " ".join(gains), "plain")
-
-
-def _off_the_page(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Say which classifiers have a log loss above twice that of chance, where the picture ends."""
-    limit = 2 * max(row["log_loss_chance"] for row in rows)
-    beyond = dict.fromkeys(str(row["classifier"]) for row in rows if row["log_loss"] > limit)
-    return f" Off the page, above twice chance: {', '.join(beyond)}." if beyond else ""
-
-
-def _gain(over: str, rows: Sequence[dict[str, Any]]) -> str:
-    """Return how the log loss of the best classifier changes from one end of a curve to the other."""
-    places = sorted({row[over] for row in rows})
-    last = min((row for row in rows if row[over] == places[-1]), key=lambda row: row["log_loss"])
-    first = next(r for r in rows if r[over] == places[0] and r["classifier"] == last["classifier"])
-    unit = {"train_per_class": "training grasps a material", "contact_s": "s of contact"}[over]
-    return (
-        f"From {places[0]:g} to {places[-1]:g} {unit} the log loss of {last['classifier']} goes from "
-        f"{first['log_loss']:.2f} to {last['log_loss']:.2f}."
-    )
-
-
-def strips_section(rows: Sequence[Any], materials: Sequence[str]) -> Section:
-    """Return the section of effusivity posteriors: a strip a test grasp in front of the library's lines;
-    ``materials`` is what each grasp really was."""
-    from thermogrip.classify.figures import effusivity_figure
-    from thermogrip.datasets.materials import find_material
-
-    known = {name: find_material(name) for name in dict.fromkeys(materials)}
-    library = {name: material.effusivity for name, material in known.items()}
-    spread = sorted(100 * material.effusivity_sd_ln for material in known.values())
-    order = sorted(range(len(rows)), key=lambda k: (library[materials[k]], rows[k].grasp_id))
-    figure = effusivity_figure([rows[k] for k in order], library, materials=[materials[k] for k in order])
-    inside = sum(r.effusivity_p05 <= library[m] <= r.effusivity_p95 for r, m in zip(rows, materials))
-    verdict = (
-        f"Without knowledge of the material, {inside} of {len(rows)} test grasps have the library's value in "
-        f"their 90 % interval; the library's own rows are uncertain by {spread[0]:.0f} to {spread[-1]:.0f} %."
-    )
-    return Section("What effusivity?", (Picture(figure, "Posterior strips of the test grasps."),), verdict)
-
-
 def effusivity_section(rows: Sequence[tuple[Mapping[str, Any], str]], of: int) -> Section:
     """Return the section of what ``effusivity`` found: each grasp's numbers with what was not explained
     of it, strips of those that have an answer; ``of`` counts all grasps."""
@@ -282,39 +224,6 @@ def effusivity_section(rows: Sequence[tuple[Mapping[str, Any], str]], of: int) -
     parts.append(Table(head, tuple(cells), caption, dense=True))
     good = len(answered) == len(rows) and not strange
     return Section("What effusivity?", tuple(parts), verdict, "good" if good else "warn")
-
-
-def feature_section(model: BayesClassifier, records: Sequence[Grasps]) -> Section:
-    """Return the section of what ``bayes`` looks at: the features of the grasps that it was fitted to, their
-    densities, and which materials are hard to tell apart at which difference."""
-    import numpy as np
-
-    from thermogrip.classify.figures import feature_figure
-
-    parts = [model.reader_.read(record) for record in records]
-    read = type(parts[0])(**{k: np.concatenate([getattr(p, k) for p in parts]) for k in vars(parts[0])})
-    labels = np.concatenate([record["material"].values.astype(str) for record in records])
-    names, noise = [str(c) for c in model.classes_], read.noise.mean(axis=0)
-    gaps = (5.0, 10.0, 20.0) if model.reader_.normalise else (1.0,)
-    apart = [model.separation(noise, gap) for gap in gaps]
-    pairs = [(i, k) for i in range(len(names)) for k in range(i)]
-    order = sorted(pairs, key=lambda pair: float(apart[-1][pair]))
-    head = ("materials", *((f"at {g:g} K" for g in gaps) if model.reader_.normalise else ("apart",)))
-    rows = tuple(
-        (f"{names[k]}, {names[i]}", *(round(float(a[i, k]), 1) for a in apart)) for i, k in order[:8]
-    )
-    i, k = order[0]
-    verdict = (
-        f"{names[k]} and {names[i]} are the hardest to tell apart: {apart[-1][i, k]:.1f} standard deviations"
-        + (f" at {gaps[-1]:g} K, {apart[0][i, k]:.1f} at {gaps[0]:g} K." if len(gaps) > 1 else ".")
-    )
-    caption = (
-        "Changes after contact, over the difference of object and skin where it is known, and the slope from "
-        "5 s to 10 s. Above, the density under each material; below, the grasps with the sd of their noise."
-    )
-    table = Table(head, rows, "Standard deviations between two materials, by difference of temperature")
-    figure = feature_figure(model, read, labels)
-    return Section("What does bayes look at?", (Picture(figure, caption), table), verdict, "plain")
 
 
 def _who_wins(comparison: Comparison, condition: str) -> tuple[str, str]:

@@ -185,20 +185,6 @@ def test_bayes_reads_of_a_shorter_contact_the_features_that_it_has() -> None:
         assert found.mean() > p.max(axis=1).mean() - 0.15  # with changes read too early 0.3 of 1.0 was right
 
 
-def test_features_of_a_shorter_contact_are_other_numbers_and_refused() -> None:
-    """Asked all the same, they were right in 0.2 to 0.5 of simulated grasps of 3 s, and said 0.8 to 1.0."""
-    model = fitted("features-lda")
-    grasps = load_example_grasps()["exp2_dT20"].isel(grasp=[8])
-    short = grasps.assign(t_surface=grasps["t_surface"].where(grasps["time"] < 3.05))
-    with pytest.raises(
-        UserError, match="ends at 3 s, the classifier was trained on contacts of 10 s; leave it"
-    ):
-        model.predict(short)
-    with pytest.raises(UserError, match="ends at 3 s"):
-        model.predict(grasps.sel(time=slice(None, 3.05)))
-    assert model.predict(grasps.sel(time=slice(None, 9.65))).size == 1
-
-
 @pytest.mark.parametrize("name", ["posterior", "pca-lda"])
 def test_a_spike_is_no_reading(name: str) -> None:
     grasps = load_example_grasps()["exp2_dT20"].isel(grasp=[0, 8, 16])

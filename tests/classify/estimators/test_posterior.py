@@ -248,6 +248,17 @@ def test_a_grasp_unlike_the_training_is_not_named_wrong_for_certain(
     assert -np.log(p[np.arange(true.size), true]).mean() < np.log(known.classes_.size)
 
 
+def test_a_contact_long_after_the_message_is_not_named_wrong_for_certain(known: PosteriorClassifier) -> None:
+    """Onsets of more than 0.8 s were none: iron was copper for certain."""
+    record = load_example_grasps()["exp2_dT20"]
+    late = pick(record, np.flatnonzero(record["split"].values == "test"))
+    t, y = late["time"].values, late["t_surface"].values
+    late = late.assign(t_surface=(("grasp", "time"), np.array([np.interp(t - 1.0, t, row) for row in y])))
+    true = np.searchsorted(known.classes_, late["material"].values)
+    p = np.exp([known.predict_log_proba(pick(late, [i]))[0] for i in range(true.size)])
+    assert not ((p.max(axis=1) > 0.95) & (p.argmax(axis=1) != true)).any()
+
+
 def test_one_block_far_from_its_stated_temperature_makes_no_other_gripper(known: PosteriorClassifier) -> None:
     """Copper at 16.3 degC, stated as 18 +- 0.36, touched 0.17 s before the message."""
     device = known.device_
