@@ -12,13 +12,17 @@ from __future__ import annotations
 import os
 import re
 import signal
+import sys
 from collections.abc import Generator
 
 import pytest
 from hypothesis import settings
+from threadpoolctl import threadpool_limits
 
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
+if "numpy" in sys.modules:  # a plugin of another package imported it, which has read them already
+    threadpool_limits(1)
 for _name in ("FORCE_COLOR", "NO_COLOR", "COLUMNS"):  # what a program shows is not what this terminal wishes
     os.environ.pop(_name, None)
 
