@@ -346,7 +346,7 @@ def _labelled(line: str) -> dict[str, str]:
         line = line[stamp.end() :]
     words: list[str] = []
     for piece in re.split(r"[,;\t]", line.replace("/", " /")):
-        joined = re.sub(r" ?([:=/]) (?=[-+.\dn])", r"\1", piece.strip())
+        joined = re.sub(r" ?([:=/]) (?=[-+.\dn])| (=)(?=[-+.\dn])", r"\1\2", piece.strip())
         words += [joined] if _LABELLED.fullmatch(joined) else joined.split()
     for word in words:
         mark = next((sign for sign in "=:" if sign in word), "")

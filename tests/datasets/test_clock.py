@@ -172,6 +172,18 @@ def test_logs_of_programs_are_read_with_their_clocks(tmp_path, name, head, line,
     np.testing.assert_allclose(column(log, reading), np.round(PLATE[: log.sizes["time"]], 2))
 
 
+def test_a_kiln_s_log_keeps_the_reading_that_has_a_blank_before_its_sign(tmp_path):
+    stamp = "Jan 21 06:{:02}:{:02} pi python[286]: 2019-01-21 06:25:40,390 INFO oven: "
+    drive = np.repeat([1.0, 0.2, 0.7], 20)
+    cells = "temp ={:.2f}, target=90.0, pid={}, run_time={}\n"
+    rows = [stamp.format(*divmod(2 * k, 60)) + cells.format(PLATE[k], drive[k], 2 * k) for k in range(60)]
+    (tmp_path / "daemon.log").write_text("".join(rows))
+    log = read_log(tmp_path / "daemon.log")
+    roles = {str(name): item.attrs["role"] for name, item in log.items()}
+    assert roles == {"oven_temp": "output", "oven_target": "other", "pid": "input"}
+    np.testing.assert_allclose(column(log, "oven_temp"), np.round(PLATE[:60], 2))
+
+
 def test_a_hub_s_switch_is_read_though_its_words_are_few_beside_the_readings(tmp_path):
     moment = "2024-02-11T06:{:02}:{:02}.000Z"
     readings = [f"sensor.hall,{PLATE[k]:.2f},{moment.format(k // 60, k % 60)}\n" for k in range(120)]
