@@ -5,29 +5,18 @@
 The candidates are ``arx``, ``oe``, ``subspace``, ``sindy``, ``neural`` (black boxes) and ``network``
 (physics). Each black box chooses its step and orders by free run over parts held out of the data that it is
 given (:mod:`thermogrip.sysid.blackbox.order_selection`); with ``leave_one_out`` a log that is left out has no
-part in that choice either.
+part in that choice either.  What is held out is in :mod:`thermogrip.sysid.validation.held_out`, when a plant
+is called good in :mod:`thermogrip.sysid.validation.goodness`.
 
 The plant that is returned is fitted to everything; its scores on its own logs are listed beside, marked as
 in-sample.
 
-**What is held out.**  With ``leave_one_out`` each log in turn.  Otherwise black boxes are compared on the
-parts that chose their orders: four blocks and the last 30 percent, or whole logs where there are three. The
-one that is kept, and the network, are scored besides on the last 30 percent of each log, fitted without them
-and run freely from the log's start, where its state is known.
-
-**Which candidate is kept.**  Among black boxes the rule is that of orders: the smallest within one standard
-error and 5 percent of the least error, a linear one before others.  On another run the gain differs besides
-(:mod:`thermogrip.sysid.validation.prediction_bands`): of one or two logs that is added to the errors, and
-where even no error at all would not be 10 percent better neural models are not fitted.  On whole logs, and
-beside a network, that of the least held-out error over that of a model without input; the network also when
-it is within 10 percent of the best, for its parameters mean something.
-
-**When it is called good.**  Over all parts held out, and over the logs of the fit, each output errs by less
-than half of the error without input; a part in which nothing moves, where nothing can be better, weighs
-nothing. On another run like these it errs by X, in one run of twenty by more than the high end
-(:func:`thermogrip.sysid.validation.prediction_bands.expected_error`): X is below half of the error without
-input over whole logs, and the high end below that error, for a plant that may be no better than its mean is
-not good.
+**Which candidate is kept.**  Among black boxes the one of the least error on parts held out, a linear one
+where another kind errs less by no more than a standard error and 5 percent.  On another run the gain differs
+besides (:mod:`thermogrip.sysid.validation.prediction_bands`): of one or two logs that is added to the errors,
+and where even no error at all would not be 10 percent better neural models are not fitted.  On whole logs,
+and beside a network, that of the least held-out error over that of a model without input; the network also
+when it is within 10 percent of the best, for its parameters mean something.
 """
 
 from __future__ import annotations
@@ -54,11 +43,7 @@ from thermogrip.sysid.blackbox.fit import (
     fit_black_box,
     with_refits,
 )
-from thermogrip.sysid.blackbox.order_selection import (
-    HARDLY_MORE,
-    MORE_BY_LOGS,
-    smallest_near_the_best,
-)
+from thermogrip.sysid.blackbox.order_selection import HARDLY_MORE, MORE_BY_LOGS, excess_within_noise
 from thermogrip.sysid.data.data_quality import DataCheck, Evidence, check_data, evidence
 from thermogrip.sysid.data.rest_before import with_rest
 from thermogrip.sysid.data.signal_roles import (
@@ -69,84 +54,47 @@ from thermogrip.sysid.data.signal_roles import (
     without_still,
 )
 from thermogrip.sysid.plant.fit_record import (
-    HELD_OUT_SHARE,
-    RUN_GAIN_SD,
     SEVERAL,
     TAIL,
     ExpectedError,
     HeldOut,
 )
 from thermogrip.sysid.plant.innovations import innovation_noise
-from thermogrip.sysid.plant.log_grid import match_logs, misfit, moved_before, signals
+from thermogrip.sysid.plant.log_grid import Grid, match_logs, misfit, moved_before, signals
 from thermogrip.sysid.plant.log_grid import rows_of as log_rows
 from thermogrip.sysid.plant.plant import Plant
-from thermogrip.sysid.validation.free_run import FreeRun, free_run, no_input_baseline
-from thermogrip.sysid.validation.prediction_bands import (
-    between_runs,
-    check_ensemble,
-    expected_error,
-    part_errors,
+from thermogrip.sysid.validation.free_run import FreeRun
+from thermogrip.sysid.validation.goodness import doubts_of, verdict_of
+from thermogrip.sysid.validation.held_out import (
+    Case,
+    Held,
+    Row,
+    Searched,
+    cases_of,
+    fold_rows,
+    relative_error,
+    rows_of,
+    run_held_out,
+    searched_rows,
+    warm_up_of,
 )
+from thermogrip.sysid.validation.prediction_bands import between_runs, expected_error, part_errors
 
 if TYPE_CHECKING:
     from thermogrip.sysid.models.model import GreyModel
 
 MODELS = (*BLACK_BOXES, "network")
-# these err least on held-out parts of some logs, and more than others on another day
-ON_REQUEST = ("armax", "bj", "parsim")
+# armax, bj, parsim err least on held-out parts of some logs, and more than others on another day; of 14
+# public logs and four of a gripper none keeps sindy
+ON_REQUEST = ("armax", "bj", "parsim", "sindy")
 USUAL_MODELS = tuple(model for model in MODELS if model not in ON_REQUEST)
 LINEAR = ("arx", "oe", "armax", "bj", "subspace", "parsim")  # kept where another kind errs hardly less
 WITHIN_NOISE = 1.1  # of the best error: then the network is preferred, and a linear kind to neural models
-SHOWN = 12  # structures of a kind
-USEFUL = 0.5  # of the no-input error: below it a model is called good
-FAR_FROM_PRIOR = 3.3  # sd: beyond it lies one parameter of a right network in a thousand
 NO_DRAWS = (UserError, np.linalg.LinAlgError)  # what draws of a fit may fail with; the fit itself is sound
 #: Of the candidates, by time for a fit.
 _LONGEST = ("neural", "bj", "armax", "subspace", "parsim", "oe", "sindy", "network")
 
 Progress = Callable[[float, str], None]
-
-
-@dataclass(frozen=True)
-class Row:
-    """One line of the table: one model, one log, one output."""
-
-    model: str  # kind of the candidate
-    structure: str  # its orders, delays or network
-    log: str  # what was simulated
-    output: str
-    rmse: float  # of the free run
-    fit_percent: float
-    unit: str  # of the output
-    n: int  # scored samples
-    no_input_rmse: float  # the same of the no-input baseline
-    held_out: bool  # whether the model was fitted without these rows
-
-
-class Held(NamedTuple):
-    """A log to run freely, what to call it, and the seconds since its start from which it is scored."""
-
-    log: Log
-    name: str
-    score_from: float
-
-
-class Case(NamedTuple):
-    """Training logs, and what is held out of them."""
-
-    train: list[Log]
-    held: list[Held]
-
-
-@dataclass(frozen=True)
-class Searched:
-    """A structure of a black box (orders, delay) that was compared over the folds."""
-
-    model: str  # kind of the candidate
-    structure: str
-    error: float  # geometric mean over the folds of RMSE over the outputs' spread
-    folds: tuple[float, ...]  # the same by fold
-    kept: bool  # whether it represents its kind
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -204,7 +152,7 @@ def identify(
     seed: int = 0,
     workers: Workers = 1,
     progress: Progress | None = None,
-    early: Callable[[Sequence[Row]], None] | None = None,
+    early: Callable[[Identification], None] | None = None,
 ) -> Identification:
     """Find the plant behind one or several logs.
 
@@ -237,8 +185,7 @@ def identify(
     progress : callable, optional
         Called with (fraction done, what).
     early : callable, optional
-        Called once with the rows of the other black boxes before neural models, which take longest, are
-        fitted; with one worker only.
+        Called once with what subspace models say, within seconds, before the other candidates are fitted.
 
     Returns
     -------
@@ -408,25 +355,26 @@ def _fit_black_boxes(
     data: _Data,
     wanted: _Wanted,
     parts: _Parts,
-    early: Callable[[Sequence[Row]], None] | None,
+    early: Callable[[Identification], None] | None,
 ) -> _Boxes:
-    """Fit each black box to all logs; neural models take longest, so they come last, and not at all where
-    they are beyond reach. With ``leave_one_out`` they are fitted by case instead."""
+    """Fit each black box to all logs: subspace models first, whose step the others take; neural models, which
+    take longest, last, and not at all where they are beyond reach. With ``leave_one_out`` they are fitted by
+    case instead."""
     boxes = [] if wanted.leave_one_out else [kind for kind in kinds if kind != "network"]
-    first = [kind for kind in boxes if kind != "neural"]
-    found = dict(zip(first, _fitted_side_by_side(first, data, wanted, parts)))
+    found: dict[str, BlackBoxFit | str] = {}
+    grid = None
+    if "subspace" in boxes:
+        first = found["subspace"] = _fitted_here("subspace", data, wanted, parts)
+        if isinstance(first, BlackBoxFit):
+            grid = first.grid
+            if early is not None:
+                alone = _Boxes([first], [], first)
+                early(_judged("subspace", first.plant, [], alone, _HeldOut([], [], {}), data, wanted))
+    others = [kind for kind in boxes if kind not in ("subspace", "neural")]
+    found |= dict(zip(others, _fitted_side_by_side(others, data, wanted, parts, grid)))
     if "neural" in boxes:
-        others = [each for each in found.values() if isinstance(each, BlackBoxFit)]
-        if others and beyond_reach(others, data.logs):
-            found["neural"] = (
-                "neural: left out, for even without any error on held-out parts it would not be kept: "
-                "another run differs by more than the linear models err (--models neural fits it)"
-            )
-            parts.next()
-        else:
-            if others and early is not None:
-                early([row for each in others for row in fold_rows(each)])
-            found["neural"] = _fitted_neural(others, data, wanted, parts)
+        fits = [each for each in found.values() if isinstance(each, BlackBoxFit)]
+        found["neural"] = _fitted_neural(fits, data, wanted, parts)
     every = [found[kind] for kind in boxes]
     fits = [each for each in every if isinstance(each, BlackBoxFit)]
     kept = choose_black_box(fits, data.logs) if fits else None
@@ -434,39 +382,49 @@ def _fit_black_boxes(
 
 
 def _fitted_side_by_side(
-    kinds: Sequence[str], data: _Data, wanted: _Wanted, parts: _Parts
+    kinds: Sequence[str], data: _Data, wanted: _Wanted, parts: _Parts, grid: Grid | None
 ) -> list[BlackBoxFit | str]:
     """Return each kind fitted to all logs, or why it could not be."""
-    if wanted.workers != 1 and len(kinds) > 1:
-        items = [(kind, _portable(data), wanted, None) for kind in kinds]
-        report = parts.part("black boxes", of=len(kinds))
-        found = run_parallel(_fit_or_refusal, items, wanted.workers, report, what="fitting")
-        parts.next(len(kinds))
-        return found
-    found = []
-    for kind in kinds:
-        report = parts.part(kind)
-        found.append(_fit_or_refusal((kind, data, wanted, report)))
-        if report is not None:
-            report(1.0, _in_short(found[-1]))
-        parts.next()
+    if wanted.workers == 1 or len(kinds) < 2:
+        return [_fitted_here(kind, data, wanted, parts, grid) for kind in kinds]
+    items = [(kind, _portable(data), wanted, None, grid) for kind in kinds]
+    report = parts.part("black boxes", of=len(kinds))
+    found = run_parallel(_fit_or_refusal, items, wanted.workers, report, what="fitting")
+    parts.next(len(kinds))
+    return found
+
+
+def _fitted_here(
+    kind: str,
+    data: _Data,
+    wanted: _Wanted,
+    parts: _Parts,
+    grid: Grid | None = None,
+    beat: Mapping[str, float] | None = None,
+) -> BlackBoxFit | str:
+    report = parts.part(kind)
+    found = _fit_or_refusal((kind, data, wanted, report, grid), beat)
+    if report is not None:
+        report(1.0, _in_short(found))
+    parts.next()
     return found
 
 
 def _fitted_neural(
     others: Sequence[BlackBoxFit], data: _Data, wanted: _Wanted, parts: _Parts
 ) -> BlackBoxFit | str:
-    """Return the neural models, given up where the first parts held out show that they cannot be kept."""
-    beat: dict[str, float] = {}
-    if others:
-        choice = min((fit.choice for fit in others), key=lambda choice: choice.error)
-        beat = dict(zip((fold.label for fold in choice.folds), choice.errors[choice.structure].tolist()))
-    report = parts.part("neural")
-    found = _fit_or_refusal(("neural", data, wanted, report), beat)
-    if report is not None:
-        report(1.0, _in_short(found))
-    parts.next()
-    return found
+    """Return the neural models, or why they were left out, or given up after the first parts held out."""
+    if not others:
+        return _fitted_here("neural", data, wanted, parts)
+    if beyond_reach(others, data.logs):
+        parts.next()
+        return (
+            "neural: left out, for even without any error on held-out parts it would not be kept: "
+            "another run differs by more than the linear models err (--models neural fits it)"
+        )
+    choice = min((fit.choice for fit in others), key=lambda choice: choice.error)
+    beat = dict(zip((fold.label for fold in choice.folds), choice.errors[choice.structure].tolist()))
+    return _fitted_here("neural", data, wanted, parts, beat=beat)
 
 
 def _portable(data: _Data) -> _Data:
@@ -477,11 +435,11 @@ def _portable(data: _Data) -> _Data:
 
 
 def _fit_or_refusal(
-    item: tuple[str, _Data, _Wanted, Progress | None], beat: Mapping[str, float] | None = None
+    item: tuple[str, _Data, _Wanted, Progress | None, Grid | None], beat: Mapping[str, float] | None = None
 ) -> BlackBoxFit | str:
-    kind, data, wanted, report = item
+    kind, data, wanted, report, grid = item
     try:
-        return _fit_box(kind, data.logs, data, wanted, report, beat)
+        return _fit_box(kind, data.logs, data, wanted, report, grid, beat)
     except UserError as error:
         return f"{kind}: {error}"
 
@@ -492,6 +450,7 @@ def _fit_box(
     data: _Data,
     wanted: _Wanted,
     report: Progress | None,
+    grid: Grid | None = None,
     beat: Mapping[str, float] | None = None,
 ) -> BlackBoxFit:
     return fit_black_box(
@@ -503,6 +462,7 @@ def _fit_box(
         average=wanted.average,
         order=wanted.order,
         delay=wanted.delay,
+        grid=grid,
         progress=report,
         beat=beat,
     )
@@ -515,55 +475,7 @@ def _in_short(found: BlackBoxFit | str) -> str:
     return f"{choice.structure.label}, errs {100 * choice.error:.1f} % of the spread on held-out parts"
 
 
-def fold_rows(fit: BlackBoxFit) -> list[Row]:
-    """Return a row for each output of each part that chose the structure of a black box."""
-    rows = []
-    for fold, by_output in zip(fit.choice.folds, np.transpose([*fit.plant.scores.held_out_by_part.values()])):
-        for k, (output, rmse) in enumerate(zip(fit.grid.outputs, by_output.tolist())):
-            firsts = [max(fit.choice.warmup, run.scored_from) for run in fold.runs]
-            scored = [(run.segment.time[at:], run.segment.y[at:, k]) for run, at in zip(fold.runs, firsts)]
-            scored = [(t, y) for t, y in scored if np.isfinite(y).any()]
-            y = np.concatenate([y for _, y in scored])
-            idle = np.concatenate([y - no_input_baseline(t, y) for t, y in scored])
-            n, spread = int(np.isfinite(y).sum()), float(np.nanstd(y))
-            percent = 100 * (1 - rmse / spread) if spread > 0 else float("nan")
-            idle_rmse = float(np.sqrt(np.nanmean(idle**2)))
-            what, unit = (fit.kind, fit.choice.structure.label, fold.label, output), fit.grid.units[output]
-            rows.append(Row(*what, rmse, percent, unit, n, idle_rmse, held_out=True))
-    return rows
-
-
-def searched_rows(fit: BlackBoxFit) -> list[Searched]:
-    """Return the structures of a kind that are usable on every fold, the best first, at most ``SHOWN``."""
-    chosen, error_of = fit.choice.structure, fit.choice.error_of
-    rows = [
-        Searched(fit.kind, each.label, error_of(each), tuple(errors.tolist()), each == chosen)
-        for each, errors in fit.choice.errors.items()
-        if np.isfinite(errors).all()
-    ]
-    rows.sort(key=lambda row: row.error)
-    return [row for at, row in enumerate(rows) if at < SHOWN or row.kept]
-
-
 # held out: the finalists on what they were fitted without
-
-
-def cases_of(logs: Sequence[Log], leave_one_out: bool) -> list[Case]:
-    """Return what is held out: each log in turn, or the last part of all."""
-    if len({log_name(log) for log in logs}) < len(logs):
-        raise UserError("two logs have the same name", hint="give each file its own name")
-    if leave_one_out:
-        return [
-            Case([log for log in logs if log is not held], [Held(held, log_name(held), 0.0)]) for held in logs
-        ]
-    case = Case([], [])
-    for log in logs:
-        time = log["time"].values
-        at = int(np.searchsorted(time, time[0] + (1 - HELD_OUT_SHARE) * (time[-1] - time[0])))
-        case.train.append(log.isel(time=slice(0, at)))
-        # run from the log's start: there its state is known
-        case.held.append(Held(log, f"{TAIL}{log_name(log)}", float(time[at] - time[0])))
-    return [case]
 
 
 @dataclass(frozen=True, eq=False)
@@ -681,56 +593,22 @@ def _fitted(
     return replace(kept.plant, model=model)
 
 
-def run_held_out(plant: Plant, held: Held, *, unseen: bool = False) -> FreeRun:
-    """Return the free run over what is held out; ``unseen`` by the fit, a neural model may be refused for it.
-
-    Members of a neural model that disagree over what they have not seen have a mean that means nothing.
-    """
-    # a log may begin warm, and then its state needs more readings than one that begins at rest
-    warmup = max(5.0 if held.score_from == 0 else warm_up_of(held.log["time"].values), plant.dt)
-    if unseen and plant.model.kind == "neural":
-        check_ensemble(plant, held.log, warmup=warmup)
-    return free_run(plant, held.log, warmup=warmup, score_from=max(warmup, held.score_from), tests=False)
-
-
-def warm_up_of(time: Array) -> float:
-    """Return the warm-up [s] of a log that may begin warm: fifty rows, a minute at most."""
-    return min(50.0 * float(np.median(np.diff(time))), 60.0)
-
-
-def warm_up_of_fit(plant: Plant, log: Log) -> float:
-    """Return the warm-up [s] that scored a black box of one or two logs; 0 for other plants."""
-    black_box = bool(plant.scores.held_out_by_part)
-    return warm_up_of(log["time"].values) if black_box and 0 < len(plant.logs) < SEVERAL else 0.0
-
-
-def rows_of(model: str, plant: Plant, name: str, run: FreeRun, *, held_out: bool) -> list[Row]:
-    """Return a row for each output of a free run; ``held_out``: the plant was fitted without it."""
-    structure = plant.scores.structure or _network_name(plant) or model
-    return [
-        Row(model, structure, name, output, s.rmse, s.fit_percent, s.unit, s.n, baseline.rmse, held_out)
-        for (output, s), baseline in zip(run.scores.items(), run.naive["no_input"].values())
-    ]
-
-
-def _network_name(plant: Plant) -> str:
-    return str(getattr(plant.model, "name", ""))
-
-
 # choice
 
 
 def choose_black_box(fits: Sequence[BlackBoxFit], logs: Sequence[Log]) -> BlackBoxFit:
-    """Return the smallest fit near the least error on the parts, a linear one before others."""
+    """Return the fit of the least error on the parts, a linear one where another kind errs hardly less.
+
+    Among linear kinds the smaller one of two that tie was no better on 14 public logs (in the geometric mean
+    both err 1.34 times the best structure of all), nor was the one of the less error on the whole log of its
+    fit, run from its start (1.69 times, 1.37 where it decides within 5 percent)."""
     run = _run_error(fits, logs)
     most = HARDLY_MORE if len(fits[0].grid.logs) < SEVERAL else MORE_BY_LOGS
-    errors = {k: np.hypot(fit.choice.errors[fit.choice.structure], run) for k, fit in enumerate(fits)}
-
-    def size(k: int) -> float:
-        nonlinear = fits[k].kind not in LINEAR
-        return fits[k].choice.structure.size + (1e6 if nonlinear else 0.0)
-
-    return fits[smallest_near_the_best(errors, most, size=size)]
+    errors = [np.log(np.hypot(fit.choice.errors[fit.choice.structure], run)) for fit in fits]
+    by_error = sorted(range(len(fits)), key=lambda k: float(errors[k].mean()))
+    best = by_error[0]
+    linear = next((k for k in by_error if fits[k].kind in LINEAR), best)
+    return fits[linear if excess_within_noise(errors[linear] - errors[best], most) else best]
 
 
 def beyond_reach(fits: Sequence[BlackBoxFit], logs: Sequence[Log]) -> bool:
@@ -766,11 +644,6 @@ def choose_model(rows: Sequence[Row], complete: int) -> str | None:
         return None
     best = min(mean, key=lambda model: mean[model])
     return "network" if mean.get("network", np.nan) <= WITHIN_NOISE * mean[best] else best
-
-
-def relative_error(row: Row) -> float:
-    """Return the error over that of a model without input."""
-    return row.rmse / max(row.no_input_rmse, 1e-12)
 
 
 def _nothing_fitted(refused: Sequence[str], data: _Data) -> UserError:
@@ -854,7 +727,9 @@ def _judged(
     for held, run in zip(whole, runs):
         rows += rows_of(kind, plant, held.name, run, held_out=False)
     plant = _with_expected(plant, kind, rows, data.logs)
-    doubts = (*data.doubts, *_far_from_prior(plant), *_heaters_that_cool(plant))
+    # a fit without the last part that could not be run over it says nothing of another run either
+    not_scored = [note for note in held_out.refused if note.startswith(f"{kind} without ")]
+    doubts = (*data.doubts, *doubts_of(plant), *not_scored)
     good, verdict = verdict_of(kind, plant, rows, data.checked, doubts)
     covered = evidence(plant, [log_rows(log, plant.inputs, plant.outputs, ()) for log in data.logs])
     verdict += "; " + covered.sentence(plant.units)
@@ -891,86 +766,6 @@ def _with_expected(plant: Plant, kind: str, rows: Sequence[Row], logs: Sequence[
     }
     noise = innovation_noise(plant, logs)
     return replace(plant, scores=replace(plant.scores, expected=expected, innovations=noise))
-
-
-def verdict_of(
-    model: str, plant: Plant, rows: Sequence[Row], checked: DataCheck, doubts: Sequence[str] = ()
-) -> tuple[bool, str]:
-    """Return whether the kept candidate may be called good, and why, in a sentence; a doubt forbids it."""
-    expected, named = plant.scores.expected, _network_name(plant)
-    errors = ", ".join(f"{name} {each.words(plant.units.get(name, '1'))}" for name, each in expected.items())
-    head = f"{f'network {named}' if named else model}: on another run like these about {errors}"
-    if 0 < len(plant.logs) < SEVERAL:
-        head += f" (its gain off by {100 * RUN_GAIN_SD:.0f} %, assumed: it takes {SEVERAL} logs to show how "
-        head += "runs differ)"
-    kept = [row for row in rows if row.model == model]
-    for name, error in expected.items():
-        parts, parts_idle = _pooled([row for row in kept if row.output == name and row.held_out])
-        whole, whole_idle = _pooled([row for row in kept if row.output == name and not row.held_out])
-        if not parts < USEFUL * parts_idle:
-            errs = f"on parts held out {name} errs by {parts:.2g}, without input by {parts_idle:.2g}"
-            return False, f"{head}; not good: {errs}; it needs more excitation, or another model"
-        if not whole < USEFUL * whole_idle:
-            errs = f"on the logs of its own fit {name} errs by {whole:.2g}, without input by {whole_idle:.2g}"
-            return False, f"{head}; not good: {errs}; try other models, or longer logs"
-        if not (error.rmse < USEFUL * whole_idle and error.high < whole_idle):
-            errs = f"without input {name} errs by {whole_idle:.2g}, so on another run it may be no better"
-            return False, f"{head}; not good: {errs}; it needs more excitation, or more logs"
-    failed = [finding.says for finding in checked.findings if finding.verdict == "fail"]
-    if failed:
-        return False, f"{head}; not good: {failed[0]}"
-    if doubts:
-        more = f" (and {len(doubts) - 1} more)" if len(doubts) > 1 else ""
-        return False, f"{head}; not good as long as this is in doubt: {doubts[0]}{more}"
-    return True, f"{head}; good for simulation and control on runs like these"
-
-
-def _pooled(rows: Sequence[Row]) -> tuple[float, float]:
-    """Return the rms errors of a candidate and of no input over all of some rows: a part in which nothing
-    moves weighs nothing."""
-    both = [(row.rmse, row.no_input_rmse) for row in rows] or [(0.0, np.inf)]
-    error, idle = np.sqrt(np.mean(np.square(both), axis=0)).tolist()
-    return error, idle
-
-
-def _far_from_prior(plant: Plant) -> list[str]:
-    specs, out = getattr(plant.model, "specs", {}), []
-    for name in plant.free:
-        spec, value = specs[name], plant.values[name]
-        off = (
-            np.log(value / spec.value) / spec.sd_log
-            if spec.sd_log
-            else (value - spec.value) / (spec.sd or np.inf)
-        )
-        if abs(off) > FAR_FROM_PRIOR:
-            unit = plant.units.get(name, "1")
-            out.append(
-                f"{name} of the network {_network_name(plant)} is fitted as "
-                f"{value:.3g}{'' if unit == '1' else f' {unit}'}, "
-                f"{abs(off):.1f} standard deviations of its prior from {spec.value:.3g}: is it that plant?"
-            )
-    return out
-
-
-def _heaters_that_cool(plant: Plant) -> list[str]:
-    heaters = [name for name in plant.inputs if "heat" in name.lower()]
-    warmed = [name for name in plant.outputs if plant.units.get(name) == "degC"]
-    if not heaters or not warmed:
-        return []
-    from thermogrip.sysid.export.dynamics import plant_dynamics
-
-    try:
-        found = plant_dynamics(plant, draws=0)
-    except UserError:  # it does not settle
-        return []
-    gains = {(row["input"], row["output"]): row["gain"] for row in found.rows()}
-    return [
-        f"{heater} lowers {output} (gain {gains[heater, output]:.2g}): recorded in closed loop, or not what "
-        "heats it?"
-        for heater in heaters
-        for output in warmed
-        if gains.get((heater, output), 0.0) < 0
-    ]
 
 
 def _plant_notes(model: str, plant: Plant) -> list[str]:

@@ -28,8 +28,9 @@ from thermogrip.mpc.controllers.mpc import Controller
 from thermogrip.mpc.design.spec import Spec
 from thermogrip.mpc.tuning.objective import StepResult, draws_of, run_trials
 from thermogrip.mpc.tuning.tune import Tuning, tune
-from thermogrip.sysid.identification import Identification, cases_of, identify, run_held_out
+from thermogrip.sysid.identification import Identification, identify
 from thermogrip.sysid.models.model import BlackBox
+from thermogrip.sysid.validation.held_out import cases_of, run_held_out
 
 if TYPE_CHECKING:
     from thermogrip.sysid.models.model import GreyModel

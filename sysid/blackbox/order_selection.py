@@ -352,23 +352,15 @@ def column_sizes(norms: Array) -> Array:
     return np.where(norms > 1e-12, norms, np.inf)
 
 
-def default_terms(grid: Grid, *, switched: bool = True) -> tuple[tuple[str, ...], ...]:
-    """Return sets of products worth trying: none, magnitudes of signed inputs, squares of others that show
-    their curvature (Joule heat), those with a moving switch."""
+def default_terms(grid: Grid) -> tuple[tuple[str, ...], ...]:
+    """Return sets of products worth trying: none, and where there are any the magnitudes of signed inputs (a
+    Peltier element heats and cools unequally) or the squares of others that show their curvature (Joule
+    heat)."""
     u = np.concatenate([segment.u for segment in grid.segments])
     signed = [n for i, n in enumerate(grid.inputs) if u[:, i].min() < 0 < u[:, i].max()]
-    moving = [n for n in grid.switches if np.ptp(u[:, grid.inputs.index(n)])]
     curved = [n for n, each in zip(grid.inputs, u.T) if n not in signed and _shows_curvature(each)]
-    sets: list[tuple[str, ...]] = [()]
-    if signed:
-        sets.append(tuple(f"|{n}|" for n in signed))
-        sets.append(tuple(t for n in signed for t in (f"|{n}|", f"{n}*|{n}|")))
-    if curved:
-        sets.append(tuple(f"{n}*{n}" for n in curved))
-    if moving and switched:
-        others = [n for n in (*grid.inputs, *grid.disturbances) if n not in moving]
-        sets += [(*some, *(f"{s}*{n}" for s in moving for n in others)) for some in list(sets)]
-    return tuple(sets)
+    products = tuple(f"|{n}|" for n in signed) or tuple(f"{n}*{n}" for n in curved)
+    return ((), products) if products else ((),)
 
 
 def _shows_curvature(u: Array) -> bool:

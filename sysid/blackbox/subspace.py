@@ -74,7 +74,7 @@ def subspace_family(
     the magnitudes of signed inputs, or else the squares of others."""
     found: dict[Structure, StateSpaceModel] = {}
     longest = max(len(segment.time) for segment in grid.segments)
-    sets = default_terms(grid)[:2] if terms is None else terms
+    sets = default_terms(grid) if terms is None else terms
     n_drive, n_y = len(grid.inputs) + len(grid.disturbances), len(grid.outputs)
     few = 1.5 * _columns(3, n_drive, n_y) > sum(max(len(s.time) - 5, 0) for s in grid.segments)
     sizes = rows or (2, 3, 5, 8, 15, 30)

@@ -22,6 +22,7 @@ References
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
@@ -87,71 +88,101 @@ def _as_long(stretches: Sequence[Stretch]) -> list[Stretch]:
     return kept
 
 
-def _most_likely(
-    plant: PlantData, stretches: Sequence[Stretch], sd: Array, graded: list[int]
-) -> tuple[float, Array, Array] | None:
-    """Return the noise of the states, of readings (n_y,) and of the inputs (n,), in a second."""
-    model, p, dt = plant.model, plant.p, plant.dt
-    n_x, n_y, n_w = model.n_x, len(sd), len(graded)
+@dataclass(frozen=True, eq=False)
+class _Filter:
+    """A plant with a bias for each graded input, linear amid its logs."""
+
+    plant: PlantData
+    graded: list[int]  # which inputs
+    F: Array  # transition of states and biases
+    H: Array  # readings of states and biases
+    level: Array  # (n_y,) readings at states of 0
+    offset: Array  # (n_y,) of the sensors
+    middle: Array  # (n_y,) mean readings
+    state_unit: Array  # (n_x,) each state's spread, in that of the outputs
+    input_range: Array  # (n,) of the graded inputs in the logs
+
+    def gains(self, sd: Array, ratios: Sequence[tuple[float, float]]) -> tuple[Array, Array]:
+        """Return the gains and the covariances of innovations that the filter settles at, by ratio."""
+        dt, r = self.plant.dt, float(np.sqrt(np.mean(sd**2)))
+        # what moves nothing by itself has a gain all the same
+        trace = 1e-12 * np.diag(np.concatenate([(r * self.state_unit) ** 2, self.input_range**2]))
+        gains, spreads = [], []
+        for q, b in ratios:
+            drift = np.concatenate([(q * r * self.state_unit) ** 2, (b * self.input_range) ** 2])
+            P = solve_discrete_are(self.F.T, self.H.T, dt * np.diag(drift) + trace, np.diag(sd**2))
+            S = self.H @ P @ self.H.T + np.diag(sd**2)
+            gains.append(np.linalg.solve(S, self.H @ P).T)
+            spreads.append(S)
+        return np.array(gains), np.array(spreads)
+
+    def squares(self, stretches: Sequence[Stretch], gains: Array, spreads: Array) -> tuple[Array, int]:
+        """Return the sum of e' S^-1 e by gain, and of how many innovations."""
+        model, n_x, inverse = self.plant.model, self.plant.model.n_x, np.linalg.inv(spreads)
+        squares, count = np.zeros(len(gains)), 0
+        for part in stretches:
+            readings = _on_grid(part, self.plant.dt) - self.offset
+            z = np.zeros((len(gains), self.F.shape[0]))
+            first = np.where(np.isfinite(readings[0]), readings[0], self.middle - self.offset)
+            z[:, :n_x] = model.rest(first, part.u[0], part.d[0], self.plant.p)
+            for k, y in enumerate(readings):
+                if np.isfinite(y).all():
+                    e = y - (z @ self.H.T + self.level)
+                    if k >= _SETTLES:
+                        squares += np.einsum("bi,bij,bj->b", e, inverse, e)
+                        count += 1
+                    z = z + np.einsum("bij,bj->bi", gains, e)
+                u = np.repeat(part.u[k][None], len(z), axis=0)
+                u[:, self.graded] += z[:, n_x:]
+                z = np.hstack([_step(self.plant, z[:, :n_x], u, part.d[k]), z[:, n_x:]])
+        return squares, count
+
+
+def _step(plant: PlantData, x: Array, u: Array, d: Array) -> Array:
+    """Return states (B, n_x) a step later under inputs (B, n_u)."""
+    held = np.ascontiguousarray(np.broadcast_to(d, (len(x), 1, d.size)))
+    numbers = np.repeat(plant.p[None], len(x), axis=0)
+    x, u = np.ascontiguousarray(x), np.ascontiguousarray(u[:, None])
+    return np.asarray(plant.model.rollout(x, u, held, numbers, plant.dt)[1])
+
+
+def _filter_of(plant: PlantData, stretches: Sequence[Stretch], graded: list[int]) -> _Filter | None:
+    """Return the plant linearised once, amid the logs; None where it diverges there."""
+    model, p, n_x, n_w = plant.model, plant.p, plant.model.n_x, len(graded)
     offset = np.array([plant.offsets.get(name, 0.0) for name in plant.outputs])
     level = np.array(model.output([0.0] * n_x, p.tolist()))
     C = np.array([model.output(row, p.tolist()) for row in np.eye(n_x).tolist()]).T - level[:, None]
     spread = np.sqrt(np.maximum(np.diag(np.atleast_2d(model.spread)), 1e-12))
     unit = spread / np.sqrt(np.einsum("ij,j,ij->i", C, spread**2, C)).max()
-    inputs, around = (np.concatenate([getattr(part, key) for part in stretches]) for key in "ud")
-    size = np.ptp(inputs, axis=0)[graded]
-    middle = np.nanmean(np.concatenate([part.y for part in stretches]), axis=0)
-    u0, d0 = inputs.mean(axis=0), around.mean(axis=0)
+    u, d, y = (np.concatenate([getattr(part, key) for part in stretches]) for key in "udy")
+    size, middle, u0, d0 = np.ptp(u, axis=0)[graded], np.nanmean(y, axis=0), u.mean(axis=0), d.mean(axis=0)
     x0 = np.asarray(model.rest(middle - offset, u0, d0, p), dtype=float)
-
-    def step(x: Array, u: Array, d: Array) -> Array:
-        """Return states (B, n_x) a step later under inputs (B, n_u)."""
-        held = np.ascontiguousarray(np.broadcast_to(d, (len(x), 1, d.size)))
-        numbers = np.repeat(p[None], len(x), axis=0)
-        x = np.ascontiguousarray(x)
-        return np.asarray(model.rollout(x, np.ascontiguousarray(u[:, None]), held, numbers, dt)[1])
-
     tried = 1e-3 * np.concatenate([unit, size])
-    about = np.concatenate([np.zeros((1, n_x + n_w)), np.diag(tried)])
-    pushed = np.repeat(u0[None], len(about), axis=0)
-    pushed[:, graded] += about[:, n_x:]
-    after = step(x0 + about[:, :n_x], pushed, d0)
+    moves = np.concatenate([np.zeros((1, n_x + n_w)), np.diag(tried)])
+    pushed = np.repeat(u0[None], len(moves), axis=0)
+    pushed[:, graded] += moves[:, n_x:]
+    after = _step(plant, x0 + moves[:, :n_x], pushed, d0)
     into = (after[1:] - after[0]).T / tried  # (n_x, n_x + n_w)
     if not np.isfinite(into).all():
         return None
     F = np.vstack([into, np.hstack([np.zeros((n_w, n_x)), np.eye(n_w)])])
-    H = np.hstack([C, np.zeros((n_y, n_w))])
-    R, r = np.diag(sd**2), float(np.sqrt(np.mean(sd**2)))
-    ratios = list(product(_STATE_RATIOS, _INPUT_RATIOS))
-    gains, spreads = [], []
-    for q, b in ratios:
-        Q = dt * np.diag(np.concatenate([(q * r * unit) ** 2, (b * size) ** 2]))
-        # what moves nothing by itself has a gain all the same
-        P = solve_discrete_are(F.T, H.T, Q + 1e-12 * np.diag(np.concatenate([(r * unit) ** 2, size**2])), R)
-        S = H @ P @ H.T + R
-        gains.append(np.linalg.solve(S, H @ P).T)
-        spreads.append(S)
-    K, inverse = np.array(gains), np.linalg.inv(spreads)
-    squares, count = np.zeros(len(ratios)), 0
-    for part in stretches:
-        readings = _on_grid(part, dt) - offset
-        z = np.zeros((len(ratios), n_x + n_w))
-        first = np.where(np.isfinite(readings[0]), readings[0], middle - offset)
-        z[:, :n_x] = model.rest(first, part.u[0], part.d[0], p)
-        for k, y in enumerate(readings):
-            if np.isfinite(y).all():
-                e = y - (z[:, :n_x] @ C.T + level)
-                if k >= _SETTLES:
-                    squares += np.einsum("bi,bij,bj->b", e, inverse, e)
-                    count += 1
-                z = z + np.einsum("bij,bj->bi", K, e)
-            u = np.repeat(part.u[k][None], len(z), axis=0)
-            u[:, graded] += z[:, n_x:]
-            z = np.hstack([step(z[:, :n_x], u, part.d[k]), z[:, n_x:]])
+    H = np.hstack([C, np.zeros((len(C), n_w))])
+    return _Filter(plant, graded, F, H, level, offset, middle, unit, size)
+
+
+def _most_likely(
+    plant: PlantData, stretches: Sequence[Stretch], sd: Array, graded: list[int]
+) -> tuple[float, Array, Array] | None:
+    """Return the noise of the states, of readings (n_y,) and of the inputs (n,), in a second."""
+    filtered = _filter_of(plant, stretches, graded)
+    if filtered is None:
+        return None
+    gains, spreads = filtered.gains(sd, list(product(_STATE_RATIOS, _INPUT_RATIOS)))
+    squares, count = filtered.squares(stretches, gains, spreads)
     if count <= _SETTLES:
         return None
-    scale = squares / (count * n_y)
-    cost = n_y * np.log(scale) + np.linalg.slogdet(np.array(spreads))[1]
+    scale = squares / (count * len(sd))
+    cost = len(sd) * np.log(scale) + np.linalg.slogdet(spreads)[1]
     if not np.isfinite(cost).any():
         return None
     best = int(np.nanargmin(np.where(np.isfinite(cost), cost, np.nan)))
@@ -160,7 +191,7 @@ def _most_likely(
     q = _between(_STATE_RATIOS, table[:, by_input], by_state)
     b = _between(_INPUT_RATIOS, table[by_state], by_input)
     times = float(np.sqrt(scale[best]))
-    return times * q * r, times * sd, times * b * size
+    return times * q * float(np.sqrt(np.mean(sd**2))), times * sd, times * b * filtered.input_range
 
 
 def _between(ratios: Sequence[float], cost: Array, best: int) -> float:

@@ -26,12 +26,15 @@ and 95 % quantiles of their sum.
 
 **Bands.** With v the free run, a reading is expected within
 
-    v +- z sqrt(var_k v_k + s^2 + (median g)^2 effect^2 + unlike^2),        z = 1.645 for 90 %,
+    v +- z sqrt(var_k v_k + s^2 + (median g)^2 (effect^2 + mean effect^2)/2 + unlike^2),   z = 1.645 for 90 %,
 
-v_k the free runs of draws of the parameters, each with a start of its own, and s^2 what these do not explain
-of the error of parts held out, so that on average a band is as wide as stated, and wider where its draws
-disagree.  A plant that was not compared (a fit alone) has the error of its fit, and the white noise of one
-reading where that was of means (:func:`thermogrip.sysid.data.data_quality.reading_excess`).
+of which the constant half stands for a level: on another day a sensor or the air about the plant is off where
+the inputs are 0 as well, and nothing says how much of the difference is gain.  (In proportion to the effect
+alone the bands of two heaters that were off by half a degree on another day held 69 and 52 percent.)  Here
+v_k are the free runs of draws of the parameters, each with a start of its own, and s^2 what these do not
+explain of the error of parts held out, so that on average a band is as wide as stated, and wider where its
+draws disagree.  A plant that was not compared (a fit alone) has the error of its fit, and the white noise of
+one reading where that was of means (:func:`thermogrip.sysid.data.data_quality.reading_excess`).
 
 **A run unlike the fit.** A black box knows nothing of where it has not been. Two things are added to its
 variance, both 0 on a run like those of the fit: the part of v that lies beyond the range of the readings of
@@ -141,8 +144,9 @@ def free_run_band(
     for at, name in enumerate(plant.outputs):
         parts, variance = part_errors(plant, name), variances[:, at]
         own = expected_error(parts, 0.0).rmse
+        effect = (MEDIAN * other_run.get(name, np.zeros(1))) ** 2
         explained = variance.mean() if compared else 0.0  # errors of a fit have no part of its draws
-        seen = variance + max(own**2 - explained, 0.0) + (MEDIAN * other_run.get(name, 0.0)) ** 2
+        seen = variance + max(own**2 - explained, 0.0) + (effect + effect.mean()) / 2  # gain, and level
         added = unlike.get(name, 0.0) ** 2
         half[name] = wide * np.sqrt(seen + added)
         far = far or bool(np.mean(added) > _UNLIKE * np.mean(seen))

@@ -25,7 +25,6 @@ from thermogrip.sysid.data.data_quality import Finding
 from thermogrip.sysid.data.signal_roles import SignalRole
 from thermogrip.sysid.experiment.information import plant_from_prior
 from thermogrip.sysid.export.dynamics import plant_dynamics
-from thermogrip.sysid.identification import Row, Searched
 from thermogrip.sysid.models.network import load_network
 from thermogrip.sysid.models.network_spec import builtin_networks
 from thermogrip.sysid.models.state_space import StateSpaceModel
@@ -34,6 +33,7 @@ from thermogrip.sysid.plant.linearise import linearise_plant, save_linear
 from thermogrip.sysid.plant.log_grid import roles_of
 from thermogrip.sysid.plant.plant import Plant
 from thermogrip.sysid.validation.free_run import Score
+from thermogrip.sysid.validation.held_out import Row, Searched
 from thermogrip.sysid.validation.prediction_bands import Band
 from thermogrip.sysid.validation.verdict import Standing, Verdict
 
@@ -460,7 +460,7 @@ def test_a_plant_that_is_not_good_is_identified_anew_whatever_a_run_says(
 
 
 def test_a_warm_up_shorter_than_that_of_the_fit_is_told(bench: Bench, stand_in: StandIn) -> None:
-    stand_in("thermogrip.sysid.identification.warm_up_of_fit", 50.0)
+    stand_in("thermogrip.sysid.validation.held_out.warm_up_of_fit", 50.0)
     stand_in(
         "thermogrip.sysid.validation.free_run.free_run",
         SimpleNamespace(notes=(), band=lambda: None, verdict=None),

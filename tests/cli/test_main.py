@@ -72,7 +72,7 @@ def test_the_verbs_are_those_of_the_contract() -> None:
 OPTIONS = """
 demo: --out=thermogrip-demo --seed=0>0 --workers=2>1 --cluster --json=False
 identify: LOG... --out --network --inputs --outputs --disturbances --columns --dt>1e-09
-  --models=arx,oe,subspace,sindy,neural,network --average>0 --order>1<20 --delay>1<20
+  --models=arx,oe,subspace,neural,network --average>0 --order>1<20 --delay>1<20
   --leave-one-out=False --posterior/--no-posterior=False --report --seed=0>0 --workers=1>1
   --cluster --json=False
 validate: PLANT LOG... --warmup>0 --score-from>0 --average>0 --network --columns --dt>1e-09

@@ -14,13 +14,14 @@ from thermogrip.datasets.schema import Log, make_log
 from thermogrip.report import plant
 from thermogrip.report.html import Picture, Plot, Table, Text
 from thermogrip.report.plant import _prior_intervals, free_run_section, parameter_table
+from thermogrip.sysid.data.signal_roles import SignalRole
 from thermogrip.sysid.experiment.information import plant_from_prior
-from thermogrip.sysid.identification import Searched, SignalRole
 from thermogrip.sysid.models.network import load_network
 from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.fit_record import Identifiability
 from thermogrip.sysid.plant.plant import Plant
 from thermogrip.sysid.validation.free_run import FreeRun, free_run
+from thermogrip.sysid.validation.held_out import Searched
 from thermogrip.sysid.validation.prediction_bands import Band
 from thermogrip.sysid.validation.residual_tests import CorrelationTest, ResidualCorrelations
 from thermogrip.sysid.validation.verdict import Verdict

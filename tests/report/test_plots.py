@@ -35,8 +35,8 @@ from thermogrip.report.plots import (
 )
 from thermogrip.rig import Session
 from thermogrip.sysid.export.dynamics import Estimate
-from thermogrip.sysid.identification import Row
 from thermogrip.sysid.plant.fit_record import PlantScores
+from thermogrip.sysid.validation.held_out import Row
 from thermogrip.sysid.validation.prediction_bands import Band
 from thermogrip.sysid.validation.residual_tests import Correlation
 

@@ -81,13 +81,13 @@ def coupled() -> SimpleNamespace:
 
 
 def _fit_one(kind: str, grid: Grid, *, variant: str = "", **orders: Any) -> Model:
-    plain = {"arx": {"terms": (), "delays": 1}, "subspace": {"terms": ()}}
-    plain |= {"oe": plain["arx"], "sindy": {"degrees": 2, "thresholds": 0.01, "memories": 1, "widths": 0}}
+    plain: dict[str, dict[str, Any]] = {"subspace": {"terms": ()}}
+    plain |= {kind: {"terms": (), "delays": 1} for kind in ("arx", "oe")}
+    plain |= {"sindy": {"degrees": 2, "thresholds": 0.01, "memories": 1, "widths": 0}}
     orders = plain.get(kind, {}) | orders
     tried = {name: value if name == "members" else (value,) for name, value in orders.items()}
     found = {s.label: m for s, m in FAMILIES[kind](grid, **tried).items() if variant in s.label}
-    if kind == "arx":  # coupled where it can be, switched only where that is asked for
-        found = {s: m for s, m in found.items() if ("switched" in s) == (variant == "switched")}
+    if kind == "arx":  # coupled where it can be
         found = {s: m for s, m in found.items() if "coupled" in s} or found
     (model,) = found.values()  # ValueError where no structure could be fitted
     return model

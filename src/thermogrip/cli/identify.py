@@ -21,14 +21,14 @@ if TYPE_CHECKING:
     from thermogrip.datasets.schema import Log
     from thermogrip.sysid.export.dynamics import Dynamics
     from thermogrip.sysid.greybox import Posterior
-    from thermogrip.sysid.identification import Identification, Row
+    from thermogrip.sysid.identification import Identification
     from thermogrip.sysid.models.model import GreyModel
     from thermogrip.sysid.plant.plant import Plant
     from thermogrip.sysid.validation import Band, FreeRun
     from thermogrip.sysid.validation.verdict import Verdict
 
 MODELS = ("arx", "oe", "armax", "bj", "subspace", "parsim", "sindy", "neural", "network")
-USUAL_MODELS = ",".join(model for model in MODELS if model not in ("armax", "bj", "parsim"))
+USUAL_MODELS = ",".join(model for model in MODELS if model not in ("armax", "bj", "parsim", "sindy"))
 NO_POSTERIOR = "no posterior: the model that was kept is a black box, only networks have parameters to sample"
 
 
@@ -83,7 +83,7 @@ def identify(
         cli.opt(
             "--models",
             "LIST",
-            "Which candidate models to fit, of these, armax, bj and parsim.",
+            "Which candidate models to fit, of these, armax, bj, parsim and sindy.",
             _known_models,
         ),
     ] = USUAL_MODELS,
@@ -148,7 +148,7 @@ def identify(
             seed=seed,
             workers=pool,
             progress=sub_progress(progress, 0.0, 0.6 if posterior else 1.0),
-            early=lambda rows: console.early(*_so_far(rows)),
+            early=None if network else partial(_write_early, console, out),
         )
         plant = found.plant
         if network and wanted_network is not None and all(row.model != "network" for row in found.rows):
@@ -239,17 +239,13 @@ def _sampled(
     return plant, record, ""
 
 
-def _so_far(rows: Sequence[Row]) -> tuple[Any, ...]:
-    """Return in a line, and as a table, how the models that are fitted before neural ones err."""
+def _write_early(console: Console, out: Path, found: Identification) -> None:
+    """Write and show the plant of the first kind of models, before the others are fitted."""
     from thermogrip.report.plant import held_out_table
-    from thermogrip.sysid.identification import relative_error
 
-    errors: dict[str, list[float]] = {}
-    for row in rows:
-        errors.setdefault(row.model, []).append(relative_error(row))
-    means = ", ".join(f"{model} {sum(each) / len(each):.2g}" for model, each in errors.items())
-    line = f"so far {means} of the error without input; neural models are fitted next"
-    return line, "So far (RMSE of free runs); neural models are fitted next", *held_out_table(rows)
+    found.plant.save(out)
+    line = f"wrote {out} so far, and goes on with other models: {found.verdict}"
+    console.early(line, "So far (RMSE of simulations)", *held_out_table(found.rows))
 
 
 def _repaired(console: Console, logs: Sequence[Log]) -> dict[str, list[str]]:
@@ -416,7 +412,7 @@ def _starts(
     console: Console, plant: Plant, logs: Sequence[Log], warmup: float | None, score_from: float | None
 ) -> list[tuple[float, float]]:
     """Return by log the warm-up and from when it is scored [s], and warn of one shorter than the fit's."""
-    from thermogrip.sysid.identification import warm_up_of_fit
+    from thermogrip.sysid.validation.held_out import warm_up_of_fit
 
     out = []
     for log in logs:

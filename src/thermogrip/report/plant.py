@@ -21,9 +21,10 @@ if TYPE_CHECKING:
     from thermogrip.datasets.schema import Log
     from thermogrip.sysid.export.dynamics import Dynamics
     from thermogrip.sysid.greybox import Posterior
-    from thermogrip.sysid.identification import Identification, Row, Searched
+    from thermogrip.sysid.identification import Identification
     from thermogrip.sysid.plant.plant import Plant
     from thermogrip.sysid.validation import Band, FreeRun
+    from thermogrip.sysid.validation.held_out import Row, Searched
 
 _BASELINES = (
     "Beside the free run: the best decay without input, the log's mean, and one step from each last "

@@ -33,8 +33,8 @@ if TYPE_CHECKING:
     from thermogrip.mpc.closed_loop.simulate import ClosedLoop
     from thermogrip.sysid.export.dynamics import Dynamics, Estimate
     from thermogrip.sysid.greybox import Posterior
-    from thermogrip.sysid.identification import Row
     from thermogrip.sysid.validation import Band, FreeRun
+    from thermogrip.sysid.validation.held_out import Row
 
 MODEL, TARGET = PALETTE[0], INK
 MEASURED, PREDICTED = "#9dabb9", PALETTE[1]  # a broad line, and a thin one of dashes over it

@@ -8,7 +8,6 @@ from scipy.signal import lfilter
 
 from thermogrip.datasets.schema import make_log
 from thermogrip.sysid.blackbox.arx import _columns, _Orders, arx_family
-from thermogrip.sysid.blackbox.order_selection import default_terms
 from thermogrip.sysid.plant.log_grid import make_grid
 
 
@@ -22,7 +21,7 @@ def arx_noise_log(n: int = 2000, sd: float = 0.05, seed: int = 0):
 
 def test_arx_finds_pole_and_gain_within_four_standard_errors_when_its_noise_model_holds(fit_one):
     log = arx_noise_log()
-    model = fit_one("arx", make_grid([log], average=1.0), poles=1, zeros=1, delays=3)
+    model = fit_one("arx", make_grid([log], average=1.0), poles=1, delays=3)
     y, u = log["t"].values - 25, log["q"].values
     X = np.column_stack([y[2:-1], u[: len(u) - 3]])  # y[k-1], u[k-3]
     sd = 0.05 * np.sqrt(np.diag(np.linalg.inv(X.T @ X)))  # of (pole, b) by least squares theory
@@ -33,7 +32,7 @@ def test_arx_finds_pole_and_gain_within_four_standard_errors_when_its_noise_mode
 
 def test_a_noise_free_system_is_found_exactly_whatever_the_offset(first_order, fit_one):
     log = first_order.log(600, noise=0.0, level=-40.0)
-    model = fit_one("arx", make_grid([log], average=1.0), poles=1, zeros=1, delays=first_order.delay)
+    model = fit_one("arx", make_grid([log], average=1.0), poles=1, delays=first_order.delay)
     assert np.abs(model.poles()).max() == pytest.approx(first_order.pole, abs=1e-6)
     assert model.gain()[0, 0] == pytest.approx(first_order.gain / (1 - first_order.pole), rel=1e-5)
 
@@ -44,7 +43,7 @@ def test_no_regressor_reaches_across_a_gap(first_order, fit_one):
     grid = make_grid([cut], average=1.0)
     assert [len(s.time) for s in grid.segments] == [600, 559]
     for log in (whole, cut):  # had one reached across, the fit would not be exact
-        model = fit_one("arx", make_grid([log], average=1.0), poles=1, zeros=1, delays=first_order.delay)
+        model = fit_one("arx", make_grid([log], average=1.0), poles=1, delays=first_order.delay)
         assert np.abs(model.poles()).max() == pytest.approx(first_order.pole, abs=1e-6)
 
 
@@ -53,55 +52,24 @@ def test_rows_with_lost_readings_are_left_out_and_several_logs_are_one_regressio
     lost["t"].values[np.random.default_rng(1).random(1200) < 0.1] = np.nan
     several = [first_order.log(300, noise=0.0, seed=s, name=str(s)) for s in (1, 2, 3)]
     for logs in ([lost], several):
-        model = fit_one("arx", make_grid(logs, average=1.0), poles=1, zeros=1, delays=first_order.delay)
+        model = fit_one("arx", make_grid(logs, average=1.0), poles=1, delays=first_order.delay)
         assert np.abs(model.poles()).max() == pytest.approx(first_order.pole, abs=1e-6)
 
 
-def peltier_log(seed: int = 0, n: int = 1500):
-    """Heating by u and by |u|: cooling is weaker; the pump couples the two bodies."""
-    rng = np.random.default_rng(seed)
-    u = np.repeat(2 * rng.random(n // 25) - 1, 25)
-    pump = np.repeat((rng.random(n // 100) > 0.4).astype(float), 100)
-    y = np.zeros((n + 1, 2))
-    for k in range(n):
-        flow = 0.08 * pump[k] * (y[k, 0] - y[k, 1])
-        y[k + 1] = y[k] + [0.5 * u[k] + 0.2 * abs(u[k]) - 0.02 * y[k, 0] - flow, flow - 0.03 * y[k, 1]]
-    signals = {"drive": (u, "1", "input"), "pump": (pump, "1", "input")}
-    readings = {"a": (25 + y[:-1, 0], "degC", "output"), "b": (25 + y[:-1, 1], "degC", "output")}
-    return make_log(np.arange(float(n)), signals | readings)
-
-
-def test_an_unequal_peltier_with_a_pump_needs_the_magnitude_and_the_switch(fit_one):
-    grid = make_grid([peltier_log()], average=1.0)
-    assert grid.switches == ("pump",)
-    assert ("|drive|",) in default_terms(grid)
-    segment = grid.segments[0]
-
-    def errors(model):
-        start = np.array([model.start(segment.y[:20], segment.u[:20], segment.d[:20])])
-        return model.rollout(start, segment.u[None], segment.d[None], (), 1.0)[0][0, :-1] - segment.y
-
-    best = fit_one("arx", grid, poles=1, zeros=1, variant="switched", terms=("|drive|",))
-    assert np.abs(errors(best)).max() < 0.05  # of a range of tens of degrees
-    assert np.sqrt(np.mean(errors(fit_one("arx", grid, poles=1, zeros=1)) ** 2)) > 0.5
-
-
 def test_too_few_rows_give_no_model(first_order):
-    assert not arx_family(make_grid([first_order.log(40)], average=1.0), poles=(9,), zeros=(9,))
+    assert not arx_family(make_grid([first_order.log(40)], average=1.0), poles=(9,))
 
 
 @pytest.mark.parametrize(
-    ("orders", "n_s", "output", "columns"),  # of 2 outputs and 3 drives at lags 1 to 4, and a constant
+    ("orders", "output", "columns"),  # of 2 outputs and 3 drives at lags 1 to 4, and a constant
     [
-        ((2, 1, 3, True, False), 0, 1, [0, 1, 2, 3, 14, 15, 16, 20]),
-        ((2, 2, 1, False, False), 0, 1, [1, 3, 8, 9, 10, 11, 12, 13, 20]),
-        ((1, 1, 4, False, False), 1, 0, [0, 25, 26, 27, 28]),  # a switch that is not used
-        ((2, 1, 1, True, True), 1, 0, [0, 1, 2, 3, 8, 9, 10, 11, 16, 17, 18, 28]),
-        ((1, 1, 2, False, True), 2, 1, [1, 9, 17, 27, 28, 29, 36]),
+        ((2, 2, True), 1, [0, 1, 2, 3, 11, 12, 13, 14, 15, 16, 20]),
+        ((2, 1, False), 1, [1, 3, 8, 9, 10, 11, 12, 13, 20]),
+        ((1, 4, False), 0, [0, 17, 18, 19, 20]),
     ],
 )
-def test_a_structure_uses_its_lags_of_the_one_regression(orders, n_s, output, columns):
-    assert _columns(_Orders(*orders), 4, 2, n_s, 3, output) == columns
+def test_a_structure_uses_its_lags_of_the_one_regression(orders, output, columns):
+    assert _columns(_Orders(*orders), 4, 2, 3, output) == columns
 
 
 def test_a_short_log_of_many_signals_is_fitted_with_what_its_rows_allow(many_signals):

@@ -42,7 +42,7 @@ def fit_of(kind, log, **orders):
 @pytest.mark.parametrize(("what", "rows"), [("_drawn_blocks", 1200), ("_drawn_errors", 600)])
 @pytest.mark.parametrize(
     ("kind", "orders"),
-    [("oe", {"poles": 2, "zeros": 1, "delays": 2}), ("subspace", {"orders": 2, "rows": 15})],
+    [("oe", {"poles": 2, "delays": 2}), ("subspace", {"orders": 2, "rows": 15})],
 )
 def test_refits_spread_as_fits_to_new_logs_do(monkeypatch, kind, orders, what, rows):
     monkeypatch.setattr(fitting, "_drawn_blocks", getattr(fitting, what))
@@ -186,7 +186,7 @@ def test_a_plant_slower_than_its_blocks_is_refitted_to_its_errors():
     q, e = np.repeat(rng.random(16), 50), lfilter([0.6], [1, -0.8], rng.standard_normal(800))
     y = lfilter([0, 0.01], [1, -1.96, 0.9604], q) + 0.02 * e  # two lags of 25 s, blocks of 50 rows
     log = make_log(np.arange(800.0), {"q": (q, "1", "input"), "t": (25 + y, "degC", "output")})
-    fit, said = fit_of("oe", log, poles=2, zeros=1, delays=1), []
+    fit, said = fit_of("oe", log, poles=2, delays=1), []
     refits = with_refits(fit, 6, progress=lambda _, what: said.append(what)).refits
     assert len(refits) == 6
     assert {what.rpartition(" ")[2] for what in said} == {"blocks", "errors"}
@@ -194,7 +194,7 @@ def test_a_plant_slower_than_its_blocks_is_refitted_to_its_errors():
 
 
 def test_kinds_whose_fit_takes_long_are_refused():
-    fit = fit_of("oe", lagged_log(0), poles=2, zeros=1, delays=2)
+    fit = fit_of("oe", lagged_log(0), poles=2, delays=2)
     with pytest.raises(ValueError, match="neural is not refitted"):
         with_refits(replace(fit, kind="neural"))
 
@@ -240,7 +240,7 @@ def test_a_plant_keeps_what_the_choice_found(monkeypatch, dt, share):
     monkeypatch.setattr(fitting, "reading_excess", lambda logs, names, dt: {names[0]: dt, names[1]: 0.0})
     monkeypatch.setattr(fitting, "rows_of", lambda *_: None)
     grid, rmse = stub_grid((100, 60), dt, why="so", ends=True), np.array([[3.0, 1.0], [4.0, 7.0]])
-    model = fit_of("oe", lagged_log(0, 100), poles=1, zeros=1, delays=1).plant.model
+    model = fit_of("oe", lagged_log(0, 100), poles=1, delays=1, terms=()).plant.model
     model = replace(model, outputs=("s", "t"), C=np.ones((2, model.n_x)), y0=np.zeros(2))
     prior = StartPrior(noise=0.1, nuisance=0.3)
     folds = (Fold("a", grid, ()), Fold("b", grid, ()))
@@ -358,7 +358,7 @@ def test_inputs_up_to_their_rows_are_taken_where_that_errs_clearly_less(
 def test_refits_that_err_more_than_half_as_much_again_are_left_out(monkeypatch, agree, n):
     made = []
 
-    def family(grid, *, only):
+    def family(grid, *, only, searches):
         made.append((only, len(grid.segments)))
         return {only: None if len(made) == 1 else len(made)}
 
@@ -366,7 +366,7 @@ def test_refits_that_err_more_than_half_as_much_again_are_left_out(monkeypatch, 
     monkeypatch.setitem(fitting.FAMILIES, "oe", family)
     monkeypatch.setattr(fitting, "_error", lambda fit, model: errors[model])
     monkeypatch.setattr(fitting, "_drawn_errors", fitting._drawn_blocks)
-    plant = fit_of("arx", lagged_log(0, 320), poles=1, zeros=1, delays=1, terms=()).plant
+    plant = fit_of("arx", lagged_log(0, 320), poles=1, delays=1, terms=()).plant
     choice = SimpleNamespace(structure="s", model=0)
     fit, said = BlackBoxFit("oe", plant, choice, stub_grid((320,))), []
     if agree < n:

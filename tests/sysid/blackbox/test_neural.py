@@ -49,42 +49,32 @@ def test_eight_rows_at_an_end_are_a_rail(rows, scatter, stands):
         assert saturation_levels(grid_of(low - 1, part))[0].tolist() == [-1.0 if stands else -np.inf, -np.inf]
 
 
-def test_a_structure_has_its_numbers_and_all_together_the_least():
-    one, other = (neural.structure_of(grid_of(np.eye(2)), *size) for size in ((4, 3), (3, 8)))
-    # A 16, B 12, c 4; V and W 24, U 9, b 3
-    assert (one, other) == (Structure("4 states, 3 units", 68), Structure("3 states, 8 units", 101))
-    assert [neural._together(some).size for some in ([other, one], [])] == [68, 0]
-
-
 @pytest.mark.parametrize(
-    ("readings", "how", "only", "seeds"),
+    ("readings", "how", "last", "sizes", "each"),
     [
-        (2500, {}, None, {(3, 3): 6, (3, 8): 6, (4, 3): 6, (4, 8): 6}),
-        (2502, {}, None, {(3, 3): 3, (3, 8): 3, (4, 3): 3, (4, 8): 3}),
-        (2500, {"members": 2}, None, {(3, 3): 2, (3, 8): 2, (4, 3): 2, (4, 8): 2}),
-        (2500, {}, "4 states, 8 units", {(4, 8): 16}),
-        (2502, {}, "4 states, 8 units", {(4, 8): 8}),
-        (2502, {}, "members of all sizes", {(3, 3): 12, (3, 8): 12, (4, 3): 12, (4, 8): 12}),
-        (2500, {"states": (5,), "units": (2,)}, None, {(5, 2): 6}),
-        (2500, {"states": (3, 9), "units": (2,)}, None, {(3, 2): 6}),  # no stable start of nine states
+        (2500, {}, False, [(3, 3), (3, 8), (4, 3), (4, 8)], 2),
+        (2502, {}, False, [(3, 3), (3, 8), (4, 3), (4, 8)], 1),
+        (2500, {"members": 5}, False, [(3, 3), (3, 8), (4, 3), (4, 8)], 5),
+        (2500, {}, True, [(3, 3), (3, 8), (4, 3), (4, 8)], 6),
+        (2502, {}, True, [(3, 3), (3, 8), (4, 3), (4, 8)], 3),
+        (2500, {"states": (3, 9), "units": (2,)}, False, [(3, 2)], 2),  # no stable start of nine states
     ],
 )
-def test_how_many_members_are_trained(monkeypatch, readings, how, only, seeds):
+def test_how_many_members_are_trained(monkeypatch, readings, how, last, sizes, each):
     y = np.column_stack([np.arange(1300.0), np.arange(1300.0)])
     y[readings // 2 :] = np.nan
     made = []
     monkeypatch.setattr(neural, "_linear_starts", lambda grid, data, orders: {n: n for n in orders if n < 9})
     monkeypatch.setattr(neural, "_train", lambda data, n, h, *, seed: made.append((n, h, seed)) or (n, h))
     monkeypatch.setattr(neural, "_averaged", lambda grid, data, parts: list(parts))
-    named = {neural.structure_of(grid_of(y), *size).label: size for size in seeds}
-    structures = [neural.structure_of(grid_of(y), n, h) for n in (3, 4) for h in (3, 8)]
-    together = neural._together(structures)
-    chosen = {some.label: some for some in [*structures, together]}.get(only)
-    found = {s.label: parts for s, parts in neural.neural_family(grid_of(y), **how, only=chosen).items()}
-    assert made == [(*size, k) for size, count in seeds.items() for k in range(count)]
-    every = [size for size, count in seeds.items() for _ in range(count)]
-    want = {label: [size] * seeds[size] for label, size in named.items()} if only != together.label else {}
-    assert found == want | ({together.label: every} if len(seeds) > 1 else {})
+    # the smallest of three states and three units: A 9, B 9, c 3; V and W 18, U 9, b 3
+    whole = Structure("members of all sizes", 51)
+    found = neural.neural_family(grid_of(y), **how, only=whole if last else None)
+    assert made == [(*size, k) for size in sizes for k in range(each)]
+    assert list(found.values()) == [[size for size in sizes for _ in range(each)]]
+    if "states" not in how:
+        assert list(found) == [whole]
+    assert not neural.neural_family(grid_of(y), only=Structure("3 states, 8 units", 101))
 
 
 def test_data_are_scaled_by_their_spread_and_what_never_moves_is_zero():
