@@ -17,6 +17,9 @@ Target: TypeAlias = float | Mapping[str, float]
 #: The same, or by name the target now and those of the samples ahead, of which the last stays.
 Trajectory: TypeAlias = float | Mapping[str, float | Sequence[float]]
 
+#: Newest version of a controller's file, by the kind of controller.
+FILE_VERSIONS = {"MPC": 1, "PI": 2}
+
 STATUSES = ("ok", "late", "infeasible", "fallback_plan", "fallback_pi", "off", "mismatch")
 
 

@@ -57,6 +57,8 @@ class Surroundings:
     # measured disturbances by name; where absent, what the plant has where nobody reads them
     disturbances: dict[str, float] = field(default_factory=dict)
     play: float = 0.0  # share of its range by which every drive moves before what it drives follows
+    # what a load adds to the outputs (n, n_y), at the plant's own steps from the start on; its last row stays
+    load: Array | None = field(default=None, compare=False)
 
     def noises_of(self, names: tuple[str, ...]) -> Array:
         """Return the standard deviation of a reading of each of these sensors (n,) [degC]."""
@@ -152,8 +154,8 @@ def simulate_closed_loop(
     controlled = tuple(controller.controlled)
     begun = truth.begun()
     controller.reset(truth.reading() | begun)
-    targets: list[dict[str, float]] = []
-    readings: list[dict[str, float]] = []
+    targets: list[list[float]] = []
+    readings: list[list[float]] = []
     moves: list[Move] = []
     ends: list[int] = []
     for target, seconds in schedule:
@@ -162,11 +164,19 @@ def simulate_closed_loop(
             reading = truth.reading()
             move = controller.step(reading if moves else reading | begun, target)
             truth.apply(move)
-            targets.append(wanted)
-            readings.append(reading)
+            targets.append([wanted[name] for name in controlled])
+            readings.append([reading[name] for name in truth.sensors])
             moves.append(move)
         ends.append(len(moves))
-    return record_loop(truth, controlled, targets, readings, moves, ends, band)
+    calls = Calls(
+        np.array(targets),
+        np.array(readings),
+        np.array([move.drives(truth.model.drives) for move in moves]),
+        tuple(move.status for move in moves),
+        tuple(move.advice for move in moves),
+        np.array([move.seconds for move in moves]),
+    )
+    return record_loop(truth, controlled, calls, ends, band)
 
 
 class Truth:
@@ -204,8 +214,19 @@ class Truth:
             found = native.neutral + np.linalg.lstsq(by_drive, self.x - after[0], rcond=None)[0]
             self.before = np.clip(found, native.lowest, native.highest)
         self.stem = self.before  # what follows the drives
-        self.y = [native.output(self.x) + self.offset]
+        self.y = [native.output(self.x) + self.offset]  # without the load
         self.time = 0.0
+
+    @property
+    def sensors(self) -> tuple[str, ...]:
+        """What a reading holds beside its time."""
+        return *self.model.outputs, *self.model.disturbances
+
+    def loaded(self, steps: int) -> Array:
+        """Return what the load adds to the outputs (steps, n_y) at so many of the plant's own steps."""
+        if self.around.load is None:
+            return np.zeros((steps, self.model.n_y))
+        return np.asarray(self.around.load[np.minimum(np.arange(steps), len(self.around.load) - 1)])
 
     def begun(self) -> dict[str, float]:
         """Return the drives that hold the start by name, as a reading has them; none where none do."""
@@ -213,9 +234,10 @@ class Truth:
 
     def reading(self) -> dict[str, float]:
         """Return what the sensors show now."""
-        values = self.y[-1] + self.around.noises_of(self.model.outputs) * self.rng.standard_normal(
-            self.model.n_y
-        )
+        noise = self.around.noises_of(self.model.outputs) * self.rng.standard_normal(self.model.n_y)
+        values = self.y[-1] + noise
+        if self.around.load is not None:
+            values = values + self.around.load[min(len(self.y), len(self.around.load)) - 1]
         found = dict(zip(self.model.outputs, values.tolist(), strict=True))
         for name, value in zip(self.model.disturbances, self.d, strict=True):
             found[name] = float(value) + self.around.offset.get(name, 0.0)
@@ -247,44 +269,50 @@ class Truth:
         return np.stack(follows)
 
 
+@dataclass(frozen=True)
+class Calls:
+    """What a controller was given and answered, k times."""
+
+    target: Array  # (k, n_controlled) [degC]
+    reading: Array  # (k, n_y + n_d) [degC]
+    drive: Array  # (k, n_u)
+    status: tuple[str, ...]
+    advice: tuple[str, ...]
+    seconds: Array  # (k,)
+
+
 def record_loop(
     truth: Truth,
     controlled: tuple[str, ...],
-    targets: list[dict[str, float]],
-    readings: list[dict[str, float]],
-    moves: list[Move],
+    calls: Calls,
     stops: list[int],
     band: float | Mapping[str, float],
 ) -> ClosedLoop:
-    """Return the record of a run: targets and readings [degC] and moves by sample, a segment, which ends at
-    one of the samples ``stops``, for each stop and controlled output; ``band`` is that of settling [degC]."""
+    """Return the record of a run, a segment, which ends at one of the calls ``stops``, for each stop and
+    controlled output; ``band`` is that of settling [degC]."""
     model = truth.model
-    y = np.stack(truth.y)
+    y = np.stack(truth.y) + truth.loaded(len(truth.y))
     fine = np.asarray(model.dt * np.arange(y.shape[0]), dtype=np.float64)
-    drives = np.array([move.drives(model.drives) for move in moves])
-    scaled, full = drive_shares(drives, model.lowest, model.highest)
+    scaled, full = drive_shares(calls.drive, model.lowest, model.highest)
     before, _ = drive_shares(truth.before[None], model.lowest, model.highest)
     jumps = np.abs(np.diff(scaled, axis=0, prepend=before)).sum(axis=1)
     segments = []
     for first, last in zip([0, *stops[:-1]], stops):
         rows, part = slice(first * truth.sub, last * truth.sub + 1), slice(first, last)
-        for i, name in ((model.outputs.index(name), name) for name in controlled):
-            goal = targets[first][name]
-            width = band_of(band, name)
-            found = segment_of(name, fine[rows], y[rows, i], goal, scaled[part], full[part], width)
+        for k, name in enumerate(controlled):
+            output, goal = y[rows, model.outputs.index(name)], float(calls.target[first, k])
+            found = segment_of(name, fine[rows], output, goal, scaled[part], full[part], band_of(band, name))
             segments.append(replace(found, travel=float(jumps[part].sum())))
     return ClosedLoop(
         time=fine,
         outputs={name: y[:, i] for i, name in enumerate(model.outputs)},
-        sample_time=np.asarray(truth.dt * np.arange(len(moves)), dtype=np.float64),
-        readings={
-            name: np.array([row[name] for row in readings]) for name in readings[0] if name != "time_s"
-        },
-        drive={name: drives[:, j] for j, name in enumerate(model.drives)},
-        target={name: np.array([row[name] for row in targets]) for name in controlled},
-        status=tuple(move.status for move in moves),
-        advice=tuple(move.advice for move in moves),
-        seconds=np.array([move.seconds for move in moves]),
+        sample_time=np.asarray(truth.dt * np.arange(len(calls.drive)), dtype=np.float64),
+        readings=dict(zip(truth.sensors, calls.reading.T)),
+        drive=dict(zip(model.drives, calls.drive.T)),
+        target=dict(zip(controlled, calls.target.T)),
+        status=calls.status,
+        advice=calls.advice,
+        seconds=calls.seconds,
         band=band,
         drive_range={n: (float(a), float(b)) for n, a, b in zip(model.drives, model.lowest, model.highest)},
         segments=tuple(segments),

@@ -14,16 +14,16 @@ import numpy as np
 
 from thermogrip.datasets.arrays import Array
 from thermogrip.mpc.closed_loop.simulate import (
+    Calls,
     ClosedLoop,
     Surroundings,
     Truth,
     record_loop,
     simulate_closed_loop,
 )
-from thermogrip.mpc.controllers.base import as_drive
 from thermogrip.mpc.controllers.mpc import Controller
 from thermogrip.mpc.controllers.pi import PIController
-from thermogrip.mpc.interface import STATUSES, Move
+from thermogrip.mpc.interface import STATUSES
 from thermogrip.mpc.native.runtime import CompiledController, CompiledTruth, address
 from thermogrip.mpc.native.shared_constants import UNCUT
 
@@ -62,12 +62,10 @@ def compiled_loop(
         _run_mpc(controller.c, controller, run, target, told=truth.known)
     elif len(schedule) > 1 or not _run_pi(controller.c, controller, run, target[0], begun):
         return simulate_closed_loop(controller, plant, schedule, **about)
-    names = (*truth.model.outputs, *truth.model.disturbances)
-    readings = [dict(zip(names, row)) for row in run.reading.tolist()]
-    targets = [dict(zip(controlled, row)) for row in target.tolist()]
-    drives, truth.y = truth.model.drives, list(run.y)
-    moves = [Move(as_drive(drives, row), status=STATUSES[code]) for row, code in zip(run.drive, run.status)]
-    return record_loop(truth, controlled, targets, readings, moves, np.cumsum(counts).tolist(), band)
+    truth.y = list(run.y)
+    status = tuple(STATUSES[code] for code in run.status)
+    calls = Calls(target, run.reading, run.drive, status, ("",) * len(status), np.zeros(len(status)))
+    return record_loop(truth, controlled, calls, np.cumsum(counts).tolist(), band)
 
 
 class _Around(ctypes.Structure):
@@ -85,6 +83,7 @@ class _Run:
     def __init__(self, truth: Truth, n: int) -> None:
         model, around = truth.model, truth.around
         noise = around.noises_of(model.outputs) * truth.rng.standard_normal((n, model.n_y))
+        noise += truth.loaded(n * truth.sub)[:: truth.sub]  # what is read of a load
         offset = np.array([around.offset.get(name, 0.0) for name in model.disturbances])
         quanta = around.steps_of((*model.outputs, *model.disturbances))
         self.y = np.zeros((n * truth.sub + 1, model.n_y))

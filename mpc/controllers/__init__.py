@@ -1,1 +1,1 @@
-"""Controllers behind one interface: MPC, PI, LQR, and the MPC's linear equivalent."""
+"""Controllers behind one interface: MPC, PI, and the MPC's linear equivalent."""

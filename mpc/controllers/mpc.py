@@ -13,13 +13,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from thermogrip.datasets.arrays import Array
-from thermogrip.datasets.atomic_files import read_json, write_json
 from thermogrip.datasets.errors import UserError, reading
 from thermogrip.datasets.media import Shown
 from thermogrip.mpc.controllers.compiled import CompiledStep
+from thermogrip.mpc.controllers.controller_file import Parts, read_parts
 from thermogrip.mpc.controllers.linear_equivalent import to_control
 from thermogrip.mpc.controllers.reference import ReferenceController
-from thermogrip.mpc.design.design import SCHEMA, VERSION, Design, check_design, default_design
+from thermogrip.mpc.design.design import Design, check_design, default_design
 from thermogrip.mpc.estimator.observer import DisturbanceModel, Observer
 from thermogrip.mpc.interface import Move, Readings, Trajectory
 from thermogrip.mpc.native.runtime import CompiledController, wanted
@@ -29,8 +29,6 @@ from thermogrip.mpc.plant.prediction import PredictionModel
 if TYPE_CHECKING:
     from thermogrip.sysid.models.model import Model
     from thermogrip.sysid.plant.plant import Plant
-
-_KEPT_DRAWS = 50  # of the posterior, in the controller's file for its review
 
 
 class Controller(Shown):
@@ -139,17 +137,14 @@ class Controller(Shown):
 
     def save(self, path: str | Path) -> Path:
         """Write the controller with its plant as JSON and return the path."""
-        return write_json(path, self.to_dict(), schema=SCHEMA, version=VERSION)
+        return self._parts().save(path)
 
     def to_dict(self) -> dict[str, Any]:
         """Return what the file has, as plain JSON."""
-        return {
-            "schema": SCHEMA,
-            "version": VERSION,
-            "design": self.design.to_dict(),
-            "notes": self.notes,
-            "plant": self.plant.to_dict(draws=_KEPT_DRAWS),
-        }
+        return self._parts().to_dict()
+
+    def _parts(self) -> Parts:
+        return Parts("MPC", self.plant, self.design, self.notes)
 
     @classmethod
     def load(cls, path: str | Path, *, model: Model | None = None) -> Controller:
@@ -178,18 +173,12 @@ class Controller(Shown):
         ...     Controller.load(path).dt
         5.0
         """
-        from thermogrip.sysid.plant.plant import Plant
-
-        content = read_json(path, SCHEMA, VERSION)
-        # numbers each of which may be can leave no gain or no estimate together
+        parts = read_parts(path, model=model)
+        if parts.kind != "MPC":
+            problem = f"holds a {parts.kind}, not an MPC"
+            raise UserError(problem, file=path, hint="thermogrip.mpc.load_controller reads every kind")
         with reading("its numbers make no controller", file=path, hint="tune the controller again"):
-            for key in ("design", "notes", "plant"):
-                if not isinstance(content.get(key), dict):
-                    raise UserError(f"{key} is missing", hint="tune the controller again")
-            equations = content["plant"].get("model")
-            own = isinstance(equations, dict) and equations.get("kind") == "own"
-            plant = Plant.from_dict(content["plant"], model=model if own else None)
-            return cls(plant, Design.from_dict(content["design"]), notes=content["notes"])
+            return cls(parts.plant, parts.design, notes=parts.notes)
 
     def to_control(self) -> Any:
         """Return the controller without its limits as a python-control ``StateSpace`` from readings,

@@ -19,14 +19,25 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import lru_cache
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from thermogrip.datasets.arrays import Array
 from thermogrip.mpc.controllers.base import SampledController
-from thermogrip.mpc.design.design import Design, PILoop, default_controlled, pair_loops
+from thermogrip.mpc.controllers.controller_file import Parts
+from thermogrip.mpc.design.design import (
+    Design,
+    PILoop,
+    check_design,
+    default_controlled,
+    default_design,
+    pair_loops,
+)
+from thermogrip.mpc.estimator.call_times import SAME
 from thermogrip.mpc.interface import Move, Readings, Trajectory
 from thermogrip.mpc.native.shared_constants import UNCUT
 from thermogrip.mpc.plant.prediction import ROOM, PredictionModel, holding_drive, prediction_model
@@ -62,6 +73,8 @@ class PIController(SampledController):
         Where drives go without readings, in their units; 0 where absent.
     on_off : dict of str to tuple of float, optional
         As in :class:`~thermogrip.mpc.design.design.Design`.
+    notes : dict, optional
+        What the tuner found, kept in the file.
 
     Examples
     --------
@@ -89,6 +102,7 @@ class PIController(SampledController):
         clock: Callable[[], float] = time.perf_counter,
         safe_drive: Mapping[str, float] | None = None,
         on_off: Mapping[str, tuple[float, float, float]] | None = None,
+        notes: Mapping[str, Any] | None = None,
     ) -> None:
         model = PredictionModel(plant) if dt is None else prediction_model(plant, dt)
         ranges = dict(zip(model.drives, zip(model.lowest.tolist(), model.highest.tolist())))
@@ -103,7 +117,9 @@ class PIController(SampledController):
             safe_drive,
             on_off,
         )
+        self.plant, self.notes = plant, dict(notes or {})
         self.loops = pair_loops(plant, self.controlled) if loops is None else loops
+        self._design: Design | None = None
         # of each loop its drive and its controlled output, counted from 0
         self.ends = [(model.drives.index(p.drive), self.controlled.index(p.output)) for p in self.loops]
         self.integral, self._begun = np.zeros(len(self.loops)), np.full(len(self.controlled), np.nan)
@@ -112,19 +128,52 @@ class PIController(SampledController):
         self.c: CompiledController | None = None
 
     @classmethod
-    def of(cls, plant: Plant, design: Design, loops: tuple[PILoop, ...]) -> PIController:
-        """Return PI loops under the limits of a design."""
-        return cls(
+    def of(
+        cls,
+        plant: Plant,
+        design: Design,
+        loops: tuple[PILoop, ...] | None = None,
+        *,
+        notes: Mapping[str, Any] | None = None,
+    ) -> PIController:
+        """Return the PI loops of a design, or others, under its limits."""
+        design = check_design(design if loops is None else replace(design, loops=loops), plant)
+        made = cls(
             plant,
             dt=design.dt,
-            loops=loops,
+            loops=design.loops,
             controlled=design.controlled,
             drive_range=design.drive_range,
             slew_per_s=design.slew_per_s,
             patience_s=design.patience_s,
             safe_drive=design.safe_drive,
             on_off=design.on_off,
+            notes=notes,
         )
+        made._design = design
+        return made
+
+    @property
+    def design(self) -> Design:
+        """What it is beside its plant; of what no PI has, the plant's default."""
+        if self._design is None:
+            ranges = dict(zip(self.model.drives, zip(self.lowest.tolist(), self.highest.tolist())))
+            self._design = default_design(
+                self.plant,
+                controlled=self.controlled,
+                dt=self.dt,
+                loops=self.loops,
+                drive_range=ranges,
+                slew_per_s=dict(zip(self.model.drives, (self.slew / self.dt).tolist())),
+                safe_drive=dict(zip(self.model.drives, self._safe.tolist())),
+                patience_s=self._patience_s / (1 + SAME),
+            )
+        return self._design
+
+    def save(self, path: str | Path) -> Path:
+        """Write the controller with its plant as JSON and return the path;
+        :func:`thermogrip.mpc.load_controller` reads it."""
+        return Parts("PI", self.plant, self.design, self.notes).save(path)
 
     def reset(self, reading: Readings) -> None:
         """Forget the past; the plant is at rest at this reading, under the drive that holds it or that the

@@ -27,7 +27,9 @@ from thermogrip.datasets.rosbag import (
     read_topic_map,
     write_bag,
 )
+from thermogrip.mpc.controllers.controller_file import load_controller
 from thermogrip.mpc.controllers.mpc import Controller
+from thermogrip.mpc.controllers.pi import PIController
 from thermogrip.mpc.interface import STATUSES
 
 #: An output that was not heard for so many sample times is lost; a measured disturbance stays.
@@ -58,7 +60,9 @@ class TopicLoop:
         If the map lacks a controlled output, its target or a drive, or a unit or a type cannot be.
     """
 
-    def __init__(self, controller: Controller, topics: TopicMap, *, file: str | Path = "topics") -> None:
+    def __init__(
+        self, controller: Controller | PIController, topics: TopicMap, *, file: str | Path = "topics"
+    ) -> None:
         self.controller, self._columns = controller, dict(topics.columns)
         model = controller.model
         self._targets = {TARGET + name: name for name in controller.controlled}
@@ -146,7 +150,7 @@ class TopicLoop:
         return {self._columns[name].topic: answer[name] for name in self._published}
 
 
-def write_node(controller: Controller, folder: str | Path) -> tuple[str, ...]:
+def write_node(controller: Controller | PIController, folder: str | Path) -> tuple[str, ...]:
     """Write a controller as a ROS 2 node into a folder, made where absent, and return the names of its files.
 
     ``topics.toml`` is left as it is where it is there already.
@@ -165,7 +169,7 @@ def write_node(controller: Controller, folder: str | Path) -> tuple[str, ...]:
 def load_loop(folder: str | Path) -> TopicLoop:
     """Return the loop of a folder that :func:`write_node` wrote."""
     file = Path(folder) / "topics.toml"
-    return TopicLoop(Controller.load(Path(folder) / "controller.json"), read_topic_map(file), file=file)
+    return TopicLoop(load_controller(Path(folder) / "controller.json"), read_topic_map(file), file=file)
 
 
 def replay_bag(loop: TopicLoop, bag: str | Path, out: str | Path) -> int:
@@ -197,7 +201,7 @@ def _ticks(loop: TopicLoop, bag: str | Path) -> Iterator[tuple[float, dict[str, 
             return
 
 
-def _topics_of(controller: Controller) -> str:
+def _topics_of(controller: Controller | PIController) -> str:
     """Return a topic map to edit."""
     model, units = controller.model, controller.plant.units
     lines = [

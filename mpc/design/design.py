@@ -273,7 +273,7 @@ def _check_wishes(design: Design, drives: Sequence[str]) -> None:
     _refuse(wrong, f"iterations must be a whole number from 1 to {MOST_ITERATIONS}")
 
 
-SCHEMA, VERSION = "thermogrip.controller", 1
+SCHEMA = "thermogrip.controller"
 DAY = 86400.0  # s
 MOST_ITERATIONS = 50
 

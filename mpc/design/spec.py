@@ -108,8 +108,8 @@ class Spec(BaseModel):
     settling: dict[str, Settling] | None = None  # of single outputs, what differs from the four above
     hold_s: Annotated[float, Field(ge=10, le=36000)] = 600.0  # how long a step is simulated
     energy_weight: NotNegative = 0.0  # seconds of settling that are worth one second at full drive
-    moves_weight: NotNegative = 0.01  # share of the minimum time that is worth one move by a full drive less
-    # times the moves of the PI by SIMC, beyond which moves are charged as overshoot is; 0: no limit
+    moves_weight: NotNegative = 0.002  # share of the minimum time that is worth one move by a full drive less
+    # times the moves of the default design, beyond which moves are charged as overshoot is; 0: no limit
     moves_limit: NotNegative = 1.5
     # between moves; read off the plant where absent, like the next ones
     sample_time_s: Positive | None = None
@@ -124,7 +124,7 @@ class Spec(BaseModel):
     sensor_offset_degC: Deviation = 0.2  # by how much sensors are off there
     search_draws: Annotated[int, Field(ge=1, le=50)] = 2  # of the plant, in the search
     check_draws: Annotated[int, Field(ge=1, le=200)] = 5  # of the plant, in the final comparison
-    evaluations: Annotated[int, Field(ge=1, le=10000)] = 20  # designs that the search may try
+    evaluations: Annotated[int, Field(ge=1, le=10000)] = 40  # designs of each kind that the search may try
     # what the plant may have that the model lacks: a lag of every sensor and a delay of the drives, in its
     # apparent delays, and a share of the drives that does nothing; 0 is not tried, more than this is expected
     extra_lag: Annotated[NotNegative, Field(le=10)] = 0.5

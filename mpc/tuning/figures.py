@@ -1,6 +1,6 @@
 """Closed loops on a sheet: what the skin did, what it was asked, what it cost, and how long a step took.
 
-And what a tuning leaves to be chosen: designs over settling and energy, and how far each weight may go.
+And what a tuning leaves to be chosen: designs over settling and energy.
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ from thermogrip.datasets.charts import INK, PALETTE, SOFT, Chart, Curve, Panel, 
 from thermogrip.datasets.limits import LARGEST
 from thermogrip.datasets.media import panels
 from thermogrip.mpc.closed_loop.simulate import ClosedLoop, band_of
-from thermogrip.mpc.tuning.trade_offs import PARAMETER_WORDS, Sensitivity
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -24,7 +23,7 @@ if TYPE_CHECKING:
 
     from thermogrip.mpc.tuning.trade_offs import Pareto
 
-_MARKS = {"MPC": "o", "LQR": "s", "PI": "^"}
+_MARKS = {"MPC": "o", "PI": "^"}
 
 
 def closed_loop_figure(
@@ -158,35 +157,13 @@ def pareto_figure(pareto: Pareto) -> Figure:
             label=name if mine else None,
         )
     axis.margins(0.12)
-    ends = ("tuned", "found by the search", "% of the drive")
-    named = [row for row in rows if row["name"].startswith("tuned") or row["name"].endswith(ends)]
-    _note_all(axis, named)
+    _note_all(axis, [row for row in rows if row["name"] in ("baseline", "tuned", "PI")])
     bar = figure.colorbar(ScalarMappable(colour, "viridis_r"), ax=axis, pad=0.12)
     bar.set_label("overshoot, worst [K]", fontsize=8)
     bar.ax.tick_params(labelsize=8)
     axis.set_xlabel("settling, mean of steps and draws [s]")
     axis.set_ylabel("energy [s at full drive]")
     _legend(axis)
-    return figure
-
-
-def sensitivity_figure(found: Sequence[Sensitivity]) -> Figure:
-    """Draw by what factor each parameter may change before anything that can be seen does."""
-    figure, [[axis]] = panels(1, 1, size=(8.6, 0.9 + 0.34 * len(found)))
-    for k, item in enumerate(found):
-        low, high = item.free_low / item.value, item.free_high / item.value
-        if low < high:
-            axis.barh(k, high - low, left=low, height=0.5, color="#c9d6e6")
-        label = f"  costs {100 * item.elasticity * np.log(1.3):+z.1f} % at 30 % more"
-        axis.plot(1.0, k, "o", ms=5, color=PALETTE[0] if low < 1 < high else "#a3262a")
-        axis.annotate(label, (max(high, 1.0), k), fontsize=7, va="center", color="#5b6776")
-    axis.set_yticks(range(len(found)), [f"{PARAMETER_WORDS[item.knob]}, {item.value:.3g}" for item in found])
-    axis.set_ylim(len(found) - 0.5, -0.5)
-    axis.set_xscale("log")
-    axis.set_xlim(0.07, 60.0)
-    axis.set_xticks([0.1, 0.3, 1.0, 3.0, 10.0], ["1/10", "1/3", "1", "3", "10"])
-    axis.minorticks_off()
-    axis.set_xlabel("factor on the value that was found")
     return figure
 
 
@@ -206,7 +183,7 @@ def _note_all(axis: Axes, rows: Sequence[Mapping[str, Any]]) -> None:
     (left, right), (low, high) = axis.get_xlim(), axis.get_ylim()
     shared: list[tuple[float, float, list[str]]] = []
     for row in sorted(rows, key=lambda row: (row["settle_s"], row["energy_s"])):
-        x, y, name = row["settle_s"], row["energy_s"], row["name"].removesuffix(", tuned")
+        x, y, name = row["settle_s"], row["energy_s"], row["name"]
         near = [s for s in shared if abs(s[0] - x) < (right - left) / 8 and abs(s[1] - y) < (high - low) / 25]
         if near:
             near[0][2].append(name)

@@ -1,67 +1,82 @@
-r"""What a tuner searches: the parameters, the design that they make, and its score on trials.
+r"""What a controller is tried on, and what that costs.
 
-A :class:`Search` is made of plain data (its plant travels as JSON; of a class of the user's own, its file and
-name travel, and the file is run where it arrives), so that other processes can evaluate designs too.
+**Trials.**  A step of the spec begins where drives have held its start for long, and the controller is told
+these drives, as a running loop knows them; the moves M count from there.  Readings are as noisy as those of
+the logs were found to be (which includes the logs' quantum), unless the spec states a noise; where the logs
+did not tell, they have the spec's and a thermocouple's quantum.  An MPC's filter takes every reading that
+comes between two moves; of n it is shown one here, with the noise of their mean.  A PI has the last one.
+Plants are draws of the posterior.  A step is run for twice as long as the default design takes on the slowest
+draw, since the moves of a longer rest say nothing of the step.
+
+**Loads.**  At rest at the first target comes a load, and stays: on each drive a tenth of its range, on each
+controlled output a tenth of the first step (four times the band that a spec has by default), with the
+apparent delay of that output for its lag.  A load on a drive is what it does to the outputs of the
+undisturbed plant there, added to them: the same thing where the plant is linear.  A trial lasts
+six integral times of the slowest PI by SIMC, in which that PI has settled, and as long as a drive
+takes to go as far as its load.  Readings have neither
+noise nor offset then, so that all of the error is the load's: over such a time noise alone would make most of
+it, and steps show what noise does.
 
 **Score.**  A step's settling time counts in units of the bound, so that short and long steps weigh alike;
 what the spec forbids is charged on top, steeply:
 
-    score = (settle + energy_weight E) / bound + moves_weight M
-            + 3 (overshoot / allowed - 0.9)+ + (|bias| / allowed - 0.9)+ / 2 + 3 (M / allowed - 0.9)+
+    step = (settle + energy_weight E) / bound + moves_weight M
+           + 3 (overshoot / allowed - 0.9)+ + (|bias| / allowed - 0.9)+ / 2 + 3 (M / allowed - 0.9)+
+    load = IAE / (IAE of the reference) + moves_weight M + 3 (M / allowed - 0.9)+
 
-M is by how many full drives the drives move in all: of two designs that settle alike, the one that answers
-less to noise wins. The moves allowed are ``moves_limit`` times those of the PI by SIMC in the same trial,
-where that settles: what moves more wears a valve for little. A step that never settles is charged its whole
-length and half of its last error in bands.
-So a plant in mK, with a spec in mK, has the score of the same plant in K. Where a design is tried in several
-noises, a step on a draw costs their mean. Over the runs, the score is the mean plus half of what the worst is
-above it: the draws stand for what the plant may be. All of them have the model's structure. What that may
-lack (sensors that are slower, a longer delay, a weaker drive) is tried one by one on the first draw, for as
-long as a step is held, since such runs settle last; their mean counts a little. What a spec doubts more
-than the default does is expected: it counts as any other draw. Beyond five bounds a run that lacks structure
-counts by its logarithm: one that does not settle lasts as long as the spec holds a step, which has nothing to
-do with the plant.
+The reference is the PI by SIMC or the default MPC, whichever has the smaller IAE of that load.  The moves
+allowed are ``moves_limit`` times those of the default MPC in the same trial: what moves more wears a valve
+for little.  What never settles is charged half of its last error in bands, a step
+its whole length besides.  A trial in several noises costs their mean; steps as well as loads cost the mean
+of their trials plus half of what the worst is above it, since the draws stand for what the plant may be, and
+the score is the sum of both.
 
-**Trials.**  A step begins where drives have held its start for long, and the controller is told these drives,
-as a running loop knows them; M counts from there. Readings are as noisy as those of the logs were found to be
-(which includes the logs' quantum), unless the spec states a noise; where the logs did not tell, they have the
-spec's and a thermocouple's quantum.
+All draws have the model's structure.  What that may lack (sensors that are slower, a longer delay, a weaker
+drive) is tried on the first draw, and its mean counts a little; what a spec doubts more than the default does
+is expected, and counts as any other draw.  Beyond five bounds a run that lacks structure counts by its
+logarithm: one that does not settle lasts as long as the spec holds a step, which has nothing to do with the
+plant.
 
 **Bound.**  Before :func:`thermogrip.mpc.tuning.minimum_time.full_drive_bound` no drive inside its limits
-brings the skin into the band.  Staying there takes longer still, since the drive must be taken back in time,
-so a settling time near the bound cannot be improved by weights: the actuator is the limit.  A target that may
-only ramp is in the band no sooner than its ramp brings it there, which is the bound where it is later.
+brings the output into the band.  Staying there takes longer still, since the drive must be taken back in
+time, so a settling time near the bound cannot be improved by weights: the actuator is the limit.  A target
+that may only ramp is in the band no sooner than its ramp brings it there, which is the bound where it is
+later.
 """
 
 from __future__ import annotations
 
-import threading
-from collections import defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache, partial
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
+from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.parallel import Progress, Workers, pack, run_parallel, unpack
 from thermogrip.mpc.closed_loop.simulate import ClosedLoop, Segment, Surroundings, simulate_closed_loop
-from thermogrip.mpc.controllers.lqr import LQRController
 from thermogrip.mpc.controllers.mpc import Controller
 from thermogrip.mpc.controllers.pi import PIController
-from thermogrip.mpc.design.design import Design, PILoop, make_blocks
+from thermogrip.mpc.design.design import Design
 from thermogrip.mpc.design.spec import Spec
+from thermogrip.mpc.estimator.observer import reading_noise
 from thermogrip.mpc.interface import Regulator
-from thermogrip.mpc.native.runtime import CompiledTruth, known_codes, remember_codes, wanted
-from thermogrip.mpc.optimiser.rti import Optimiser
-from thermogrip.mpc.plant.prediction import HeldStarts, graded_drives, prediction_model, step_response
+from thermogrip.mpc.plant.prediction import graded_drives, held_start, prediction_model, step_response
 from thermogrip.mpc.tuning.minimum_time import full_drive_bound
 
 if TYPE_CHECKING:
-    from thermogrip.mpc.native.runtime import CompiledController
     from thermogrip.sysid.plant.plant import Plant
+
+#: How much runs that lack structure count in the score, and beyond what one counts by its logarithm.
+LACKING, LATE = 0.05, 5.0
+# what the whole allowed overshoot, bias or moves more cost, and a band of error where a trial does not settle
+_OVERSHOOT, _BIAS, _MOVES, _ERROR = 3.0, 0.5, 3.0, 0.5
+#: Of what is allowed, that costs nothing.
+FREE = 0.9
+_LOAD = 0.1  # of a drive's range, and of the first step: see the module's text
+_LOAD_TIMES = 6.0  # integral times that a load's trial lasts
+_SENSOR_OFF = 0.02  # of what the logs showed, a sensor of a disturbance that is no temperature of the room
 
 
 class Record:
@@ -76,21 +91,64 @@ class Record:
 
 
 @dataclass(frozen=True)
+class Load:
+    """What disturbs a plant at rest."""
+
+    on: str  # a drive or a controlled output
+    size: float  # in its unit
+    lag_s: float = 0.0  # with which it comes [s]
+
+    @property
+    def words(self) -> str:
+        """What it is, e.g. ``"q1 by -10"``."""
+        return f"{self.on} by {self.size:.3g}"
+
+
+@dataclass(frozen=True)
+class Case:
+    """One closed loop: a step, or a load where start and target are one, on a draw of the plant."""
+
+    start: float  # [degC]
+    target: float
+    draw: int
+    lacks: str = ""  # which of :func:`lacking` the plant has besides
+    load: Load | None = None
+    seconds: float | None = None  # how long it runs; ``hold_s`` of the spec where absent
+
+
+#: Start, target, draw and load of a case, by which controllers are compared.
+Key: TypeAlias = tuple[float, float, int, str]
+
+
+@dataclass(frozen=True)
 class StepResult(Record):
-    """One step on one draw; of the worst output where several are controlled."""
+    """What one case came to; of the worst output where several are controlled."""
 
     start: float  # [degC]
     target: float
     draw: int  # which draw of the plant was the truth
     settle_s: float  # NaN where it did not settle
-    overshoot: float  # [degC]; the bias is signed, of the output where it is largest
-    bias: float
+    overshoot: float  # [degC]; of a load the largest error
+    bias: float  # signed, of the output where it is largest
     last_error: float
     energy_s: float  # see :class:`thermogrip.mpc.closed_loop.simulate.Segment`
     travel: float
     full_share: float
     length_s: float
     output: str = ""  # the one it is of, where each is judged by itself
+    lacks: str = ""
+    load: str = ""  # in words
+    iae: float = 0.0  # integral of the absolute error [degC s]
+
+    @property
+    def step(self) -> tuple[float, float]:
+        """Start and target [degC]."""
+        return self.start, self.target
+
+    @property
+    def key(self) -> Key:
+        """What it is compared by, whatever the plant lacks."""
+        return self.start, self.target, self.draw, self.load
 
 
 def draws_of(plant: Plant, count: int) -> list[int]:
@@ -98,54 +156,60 @@ def draws_of(plant: Plant, count: int) -> list[int]:
     return list(range(1, count + 1)) if plant.uncertain else [0]
 
 
-#: From this number on a draw lacks structure: 2001 is draw 1 with the second of :func:`lacking`.
-STRUCTURE = 1000
-#: How much runs on such draws count in the score beside the others, and beyond what one counts by its log.
-LACKING, LATE = 0.05, 5.0
-# what the whole allowed overshoot and bias more cost, and a band of error where a step does not settle
-_OVERSHOOT, _BIAS, _ERROR, _MOVES = 3.0, 0.5, 0.5, 3.0
-#: Of what is allowed, that costs nothing.
-FREE = 0.9
-#: In which an MPC is tried where its trials run in C: one noise alone moves a score by a tenth.
-NOISES = 3
-_LEAST_SLOPE = 0.02  # of the largest, of a drive that is there for an output
-_SENSOR_OFF = 0.02  # of what the logs showed, a sensor of a disturbance that is no temperature of the room
-
-
 @lru_cache(maxsize=16)
-def apparent_delay(plant: Plant, controlled: tuple[str, ...]) -> float:
-    """Return the longest apparent delay [s] of a controlled output behind the drive that moves it most."""
+def apparent_delays(plant: Plant, controlled: tuple[str, ...]) -> tuple[float, ...]:
+    """Return the apparent delay [s] of each controlled output behind the drive that moves it most."""
     drives = graded_drives(plant)
     answers = [[step_response(plant, drive, output) for drive in drives] for output in controlled]
-    delays = [max(of, key=lambda answer: abs(answer.gain)).delay for of in answers]
-    return max(*delays, plant.dt)
+    return tuple(max(max(of, key=lambda answer: abs(answer.gain)).delay, plant.dt) for of in answers)
 
 
-def lacking(plant: Plant, spec: Spec, controlled: Sequence[str]) -> list[tuple[str, dict[str, Any]]]:
+def lacking(plant: Plant, spec: Spec, controlled: Sequence[str]) -> dict[str, dict[str, float]]:
     """Return what a plant may have that its model lacks: in words, and as changes of the surroundings."""
-    delay = apparent_delay(plant, tuple(controlled))
+    delay = max(apparent_delays(plant, tuple(controlled)))
     lag, late, lost = spec.extra_lag * delay, spec.extra_delay * delay, spec.lost_gain
     tried = [
         (lag, f"sensors slower by {lag:.2g} s", {"sensor_lag_s": lag}),
         (late, f"delay longer by {late:.2g} s", {"move_delay_s": late}),
         (lost, f"drive weaker by {100 * lost:.2g} %", {"drive_share": 1.0 - lost}),
     ]
-    return [(words, changes) for value, words, changes in tried if value > 0]
+    return {words: changes for value, words, changes in tried if value > 0}
 
 
-_DOUBTS = ("extra_lag", "extra_delay", "lost_gain")  # in the order of :func:`lacking`
+def expected(plant: Plant, spec: Spec, controlled: Sequence[str]) -> set[str]:
+    """Return which of :func:`lacking` the spec doubts more than the default does: a user who states that the
+    sensor may be slower by 6 s wants a design for it."""
+    doubts = ("extra_lag", "extra_delay", "lost_gain")  # in the order of lacking
+    tried = [name for name in doubts if getattr(spec, name) > 0]
+    words = zip(tried, lacking(plant, spec, controlled), strict=True)
+    return {said for name, said in words if getattr(spec, name) > Spec.model_fields[name].default}
 
 
-def expected(spec: Spec) -> set[int]:
-    """Return which structures of :func:`lacking`, counted from 1, the spec doubts more than the default does:
-    a user who states that the sensor may be slower by 6 s wants a design for it."""
-    tried = [name for name in _DOUBTS if getattr(spec, name) > 0]
-    usual = {name: Spec.model_fields[name].default for name in tried}
-    return {at for at, name in enumerate(tried, start=1) if getattr(spec, name) > usual[name]}
+def loads_of(plant: Plant, spec: Spec, design: Design) -> list[Load]:
+    """Return the loads that are tried, see the module's text; a drive's goes where it has more room."""
+    (start, target), found = spec.steps[0], []
+    model = prediction_model(plant, plant.dt)
+    d = tuple(model.undisturbed(spec.ambient_degC).tolist())
+    _, held = held_start(model, design.controlled, target, d)
+    for name in graded_drives(plant):
+        low, high = design.drive_range[name]
+        at = 0.0 if held is None else float(held[model.drives.index(name)])
+        side = 1.0 if high - at >= at - low else -1.0
+        found.append(Load(name, side * _LOAD * (high - low)))
+    delays = zip(design.controlled, apparent_delays(plant, design.controlled))
+    return found + [Load(name, _LOAD * (start - target), delay) for name, delay in delays]
+
+
+def load_seconds(design: Design) -> float:
+    """Return how long the trial of a load lasts [s], see the module's text."""
+    spans = {name: high - low for name, (low, high) in design.drive_range.items()}
+    moving = max(_LOAD * span / design.slew_per_s[name] for name, span in spans.items())
+    slowest = max((loop.Ti for loop in design.loops), default=0.0)
+    return max(_LOAD_TIMES * slowest + moving, 10 * design.dt)
 
 
 def meets_spec(result: StepResult | Segment, spec: Spec) -> bool:
-    """Return whether one run is as wanted."""
+    """Return whether one step is as wanted."""
     asked = spec.asked(result.output)
     return (
         result.settle_s <= asked.within_s  # False where NaN
@@ -154,37 +218,40 @@ def meets_spec(result: StepResult | Segment, spec: Spec) -> bool:
     )
 
 
-def counting(results: Sequence[StepResult], spec: Spec) -> list[StepResult]:
-    """Return the results whose plant is as its model is, or as the spec expects it to be."""
-    planned = expected(spec) | {0}
-    return [result for result in results if result.draw // STRUCTURE in planned]
-
-
-def cold_steps(plant: Plant, spec: Spec, controlled: Sequence[str]) -> list[tuple[float, float]]:
-    """Return the step from rest in the room to the first target, where a log was as cold and it is further
-    than any step of the spec, else none: a run begins there, its integrator has all of the drive to find."""
-    cold, target = spec.ambient_degC, spec.steps[0][1]
-    seen = [plant.valid.get(name, (np.inf, -np.inf)) for name in controlled]
-    begun = all(low - spec.band_degC <= cold <= high for low, high in seen)
-    warm = all(plant.units.get(name, "degC") == "degC" for name in controlled)
-    further = abs(target - cold) > max(abs(end - start) for start, end in spec.steps)
-    return [(cold, target)] if begun and warm and further else []
-
-
 @lru_cache(maxsize=64)
 def drawn(plant: Plant, draw: int) -> Plant:
     """Return a draw, the same one each time: its models and held states are worked out once."""
     return plant.draw(draw)
 
 
+def readings_a_move(plant: Plant, output: str, dt: float) -> float:
+    """Return how many readings of an output, as often as in the logs, come in a sample time [s].
+
+    Where rows of a log were averaged, one reading has the variance s^2, a mean of n of them s^2 / n, and what
+    the fit recorded as the excess of one over a mean is their difference.
+    """
+    sd, excess = (of.get(output, 0.0) for of in (plant.scores.reading_sd, plant.scores.reading_excess))
+    averaged = 1 / (1 - (excess / sd) ** 2) if 0 <= excess < sd < np.inf else 1.0
+    return max(1.0, averaged * dt / plant.dt)
+
+
+def as_tried(design: Design, plant: Plant) -> Design:
+    """Return the design of an MPC whose filter expects the mean of the readings that come between moves."""
+    known = {name: design.noise.reading.get(name, reading_noise(plant, name)) for name in plant.outputs}
+    means = {
+        name: sd / readings_a_move(plant, name, design.dt) ** 0.5
+        for name, sd in known.items()
+        if sd is not None
+    }
+    return replace(design, noise=replace(design.noise, reading=means))
+
+
 def surroundings_of(
-    spec: Spec,
-    controlled: Sequence[str],
-    plant: Plant,
+    spec: Spec, controlled: Sequence[str], plant: Plant, *, filtered_s: float = 0.0
 ) -> Surroundings:
     """Return the room and the sensors of the trials: the controlled ones are off, the room's are, and those
     of other disturbances by a share of what the logs showed; noise is that of the logs by output, of which
-    their quantum is a part."""
+    their quantum is a part, and of the mean of the readings in ``filtered_s``, where that is given."""
     known = {name: sd for name, sd in plant.scores.reading_sd.items() if np.isfinite(sd)}
     stated = "noise_degC" in spec.model_fields_set
     offset = dict.fromkeys(controlled, spec.sensor_offset_degC)
@@ -192,15 +259,40 @@ def surroundings_of(
     for name in plant.disturbances:
         low, high = plant.valid.get(name, (0.0, 0.0))
         offset[name] = _SENSOR_OFF * (high - low) if name in others else 1.5 * spec.sensor_offset_degC
-    room = spec.ambient_degC
-    return Surroundings(
-        ambient=room,
+    usual = Surroundings(
+        ambient=spec.ambient_degC,
         noise=spec.noise_degC,
         noises={} if stated else known,
         quanta=dict.fromkeys([*known, *others], 0.0),
         offset=offset,
         held=tuple(controlled),
     )
+    if not filtered_s:
+        return usual
+    steps = usual.steps_of(plant.outputs)
+    each = np.hypot(usual.noises_of(plant.outputs), steps / np.sqrt(12))  # a quantum is even noise
+    counts = [readings_a_move(plant, name, filtered_s) for name in plant.outputs]
+    means = dict(zip(plant.outputs, (each / np.sqrt(counts)).tolist()))
+    return replace(usual, noises=means, quanta=usual.quanta | dict.fromkeys(plant.outputs, 0.0))
+
+
+@lru_cache(maxsize=256)
+def signal_of(
+    load: Load, plant: Plant, controlled: tuple[str, ...], at: float, ambient: float, n: int
+) -> Array:
+    """Return what a load adds to the outputs (n, n_y) of a plant at rest at a temperature [degC]."""
+    model = prediction_model(plant, plant.dt)
+    if load.on in model.outputs:
+        added = np.zeros((n, model.n_y))
+        rise = 1.0 - np.exp(-model.dt * np.arange(n) / load.lag_s)
+        added[:, model.outputs.index(load.on)] = load.size * rise
+        return added
+    d = model.undisturbed(ambient)
+    x, held = held_start(model, controlled, at, tuple(d.tolist()))
+    plans = np.tile(model.neutral if held is None else held, (2, n - 1, 1))
+    plans[1, :, model.drives.index(load.on)] += load.size
+    y, _ = model.run(np.repeat(x[None], 2, axis=0), plans, d)
+    return np.asarray(y[1] - y[0])
 
 
 def bands_of(spec: Spec, controlled: Sequence[str]) -> float | dict[str, float]:
@@ -212,59 +304,88 @@ def trial(
     controller: Regulator,
     plant: Plant,
     spec: Spec,
-    step: tuple[float, float],
-    draw: int,
-    length_s: float,
-    seed: int,
+    case: Case,
     *,
+    seed: int = 0,
     around: Surroundings | None = None,
+    called: bool = False,
 ) -> ClosedLoop:
-    """Run a step (start, target) [degC] of the spec on one draw of the plant for so many seconds, wholly in C
-    where the controller is in C; in the surroundings of the spec where there are no others."""
-    structure, draw = divmod(draw, STRUCTURE)
+    """Run a case, wholly in C where the controller is in C, unless it is to be ``called`` step by step, which
+    its record has the times and the advice of; in the surroundings of the spec where there are no others."""
+    seconds = spec.hold_s if case.seconds is None else case.seconds
+    truth, controlled = drawn(plant, case.draw), tuple(controller.controlled)
     if around is None:
-        around = surroundings_of(spec, controller.controlled, plant)
-    if structure:
-        around = replace(around, **lacking(plant, spec, controller.controlled)[structure - 1][1])
-    truth, schedule = drawn(plant, draw), [(step[1], length_s)]
+        filtered_s = controller.dt if isinstance(controller, Controller) else 0.0
+        around = surroundings_of(spec, controlled, plant, filtered_s=filtered_s)
+    if case.lacks:
+        around = replace(around, **lacking(plant, spec, controlled)[case.lacks])  # type: ignore[arg-type]
+    if case.load is not None:
+        n = round(seconds / truth.dt) + 1
+        load = signal_of(case.load, truth, controlled, case.target, spec.ambient_degC, n)
+        around = replace(around, load=load, noise=0.0, noises={}, quantum=0.0, quanta={}, offset={})
     about: dict[str, Any] = {
+        "start": case.start,
         "surroundings": around,
-        "band": bands_of(spec, controller.controlled),
-        "seed": 1000 * seed + draw,
+        "band": bands_of(spec, controlled),
+        "seed": 1000 * seed + case.draw,
     }
-    if isinstance(controller, Controller | PIController) and controller.c is not None:
+    schedule = [(case.target, seconds)]
+    if isinstance(controller, Controller | PIController) and controller.c is not None and not called:
         from thermogrip.mpc.closed_loop.simulate_native import compiled_loop
 
-        return compiled_loop(controller, truth, schedule, start=step[0], **about)
-    return simulate_closed_loop(controller, truth, schedule, start=step[0], **about)
+        return compiled_loop(controller, truth, schedule, **about)
+    return simulate_closed_loop(controller, truth, schedule, **about)
 
 
 def run_trials(
     controller: Regulator,
     plant: Plant,
     spec: Spec,
-    draws: Sequence[int],
+    cases: Iterable[Case],
     *,
-    lengths: Sequence[float] | None = None,
     seed: int = 0,
 ) -> list[StepResult]:
-    """Run every step of the spec on these draws; ``lengths`` are seconds by step, ``hold_s`` where absent.
-    Where the spec has ``settling`` there is a result for each output, else one of the worst."""
+    """Run cases: of each a result, or where the spec has ``settling`` one for each output."""
     results = []
-    for at, step in enumerate(spec.steps):
-        length = spec.hold_s if lengths is None else lengths[at]
-        for draw in draws:
-            run = trial(controller, plant, spec, step, draw, length, seed)
-            results += results_of(run, spec, step, draw)
+    for case in cases:
+        results += results_of(trial(controller, plant, spec, case, seed=seed), spec, case)
     return results
 
 
-def results_of(run: ClosedLoop, spec: Spec, step: tuple[float, float], draw: int) -> list[StepResult]:
-    """Return what a step on a draw comes to: for each output where the spec has ``settling``, else of the
-    worst."""
+def steps_on(spec: Spec, draws: Iterable[int], lacks: str = "") -> list[Case]:
+    """Return every step of a spec on these draws."""
+    return [Case(start, target, draw, lacks) for start, target in spec.steps for draw in draws]
+
+
+def results_of(run: ClosedLoop, spec: Spec, case: Case) -> list[StepResult]:
+    """Return what a case came to: for each output where the spec has ``settling``, else of the worst."""
     if spec.settling:
-        return [_result(run, [part], step, draw, part.output) for part in run.segments]
-    return [_result(run, run.segments, step, draw)]
+        return [_result(run, [part], case, part.output) for part in run.segments]
+    return [_result(run, run.segments, case)]
+
+
+def _result(run: ClosedLoop, parts: Sequence[Segment], case: Case, output: str = "") -> StepResult:
+    worst = max(parts, key=lambda part: abs(part.bias))
+    errors = [run.outputs[part.output] - part.target for part in parts]
+    length = parts[0].end_s - parts[0].begin_s
+    beyond = [part.overshoot for part in parts] if case.load is None else [np.max(np.abs(e)) for e in errors]
+    return StepResult(
+        start=case.start,
+        target=case.target,
+        draw=case.draw,
+        settle_s=float(np.max([part.settle_s for part in parts])),  # NaN wins, as it should
+        overshoot=float(max(beyond)),
+        bias=worst.bias,
+        last_error=float(max((error[-1] for error in errors), key=abs)),
+        energy_s=parts[0].energy_s,
+        travel=parts[0].travel,
+        full_share=parts[0].full_share,
+        length_s=length,
+        output=output,
+        lacks=case.lacks,
+        load=case.load.words if case.load else "",
+        iae=length * float(max(np.mean(np.abs(error)) for error in errors)),
+    )
 
 
 #: By start, target and draw; where outputs are judged apart by output too.
@@ -273,51 +394,80 @@ Bounds = dict[tuple[float, float, int] | tuple[float, float, int, str], float]
 
 def bound_of(bounds: Bounds, result: StepResult) -> float:
     """Return the shortest time [s] of what a result is of."""
-    key = (result.start, result.target, result.draw % STRUCTURE)
+    key = (result.start, result.target, result.draw)
     return bounds[(*key, result.output) if result.output else key]
 
 
-#: Of the PI by SIMC, by start, target and draw: how many full drives its drives move, where it settles.
-PIMoves = dict[tuple[float, float, int], float]
+@dataclass(frozen=True)
+class Scales:
+    """What trials are counted in."""
+
+    bounds: Bounds  # shortest times [s]
+    # by start, target, draw and load: full drives that the default MPC moves, the reference's IAE [degC s]
+    moves: dict[Key, float]
+    iae: dict[Key, float]
 
 
-def moves_of(results: Sequence[StepResult]) -> PIMoves:
-    """Return how far drives moved in the runs that settled; one that held its start says nothing."""
-    settled = [result for result in results if np.isfinite(result.settle_s) and result.travel > 0]
-    return {(result.start, result.target, result.draw): result.travel for result in settled}
+@dataclass(frozen=True)
+class Score:
+    """What a controller costs; lower is better."""
+
+    steps: float
+    loads: float = 0.0
+    lacking: float = 0.0
+
+    @property
+    def total(self) -> float:
+        """The sum."""
+        return self.steps + self.loads + self.lacking
 
 
-def score(
-    results: Sequence[StepResult], spec: Spec, bounds: Bounds, pi_moves: PIMoves | None = None
-) -> float:
-    """Return the score of a set of trials, see the module's text; lower is better; ``bounds`` are shortest
-    times [s]; moves have no limit where those of a PI are not given."""
-    costs: dict[tuple[float, float, int, str], list[float]] = {}
-    times_pi = spec.moves_limit or np.inf
+def score(results: Sequence[StepResult], spec: Spec, scales: Scales, *, expects: Iterable[str] = ()) -> Score:
+    """Return the score of a set of trials, see the module's text; ``expects`` are those of :func:`lacking`
+    that count as any draw."""
+    costs: dict[tuple[Any, ...], list[float]] = {}
     for result in results:
-        bound, asked = bound_of(bounds, result), spec.asked(result.output)
-        unit = max(bound if np.isfinite(bound) else result.length_s, asked.pace_s, 1.0)
-        settled = np.isfinite(result.settle_s)
-        taken = max(result.settle_s, asked.pace_s)  # sooner than an output's own time wins nothing
-        cost = taken / unit
-        if not settled:
-            cost = result.length_s / unit + _ERROR * abs(result.last_error) / asked.band_degC
-        cost += _OVERSHOOT * max(0.0, result.overshoot / asked.overshoot_degC - FREE)
-        cost += _BIAS * max(0.0, abs(result.bias) / asked.bias_degC - FREE) if settled else 0.0
-        cost += spec.energy_weight * result.energy_s / unit + spec.moves_weight * result.travel
-        most = (pi_moves or {}).get((result.start, result.target, result.draw % STRUCTURE), np.inf)
-        cost += _MOVES * max(0.0, result.travel / (times_pi * most) - FREE)
-        costs.setdefault((result.start, result.target, result.draw, result.output), []).append(cost)
-    of = {key: float(np.mean(noises)) for key, noises in costs.items()}
-    planned = expected(spec) | {0}
-    own: list[float] = []
+        cost = _cost_of_load(result, spec, scales) if result.load else _cost_of_step(result, spec, scales)
+        # a plant that lacks structure is run for longer than the reference was
+        known = np.inf if result.lacks else scales.moves.get(result.key, np.inf)
+        most = (spec.moves_limit or np.inf) * known
+        cost += spec.moves_weight * result.travel + _MOVES * max(0.0, result.travel / most - FREE)
+        costs.setdefault((result.load, result.lacks, *result.key[:3], result.output), []).append(cost)
+    steps: list[float] = []
+    loads: list[float] = []
     others: list[float] = []
-    for (_, _, draw, _), cost in of.items():
-        structure = draw // STRUCTURE
-        if structure and cost > LATE:
+    planned = {"", *expects}
+    for (load, lacks, *_), noises in costs.items():
+        cost = float(np.mean(noises))
+        if lacks and cost > LATE:
             cost = LATE * (1 + np.log(cost / LATE))
-        (own if structure in planned else others).append(cost)
-    return float(0.5 * (np.mean(own) + np.max(own)) + LACKING * np.sum(others) / max(1, len(others)))
+        (loads if load else steps if lacks in planned else others).append(cost)
+    return Score(_spread(steps), _spread(loads), LACKING * float(np.mean(others)) if others else 0.0)
+
+
+def _spread(costs: Sequence[float]) -> float:
+    """Return the mean, and half of what the worst is above it."""
+    return float(0.5 * (np.mean(costs) + np.max(costs))) if costs else 0.0
+
+
+def _cost_of_step(result: StepResult, spec: Spec, scales: Scales) -> float:
+    bound, asked = bound_of(scales.bounds, result), spec.asked(result.output)
+    unit = max(bound if np.isfinite(bound) else result.length_s, asked.pace_s, 1.0)
+    # sooner than an output's own time wins nothing
+    cost = max(result.settle_s, asked.pace_s) / unit
+    if np.isfinite(result.settle_s):
+        cost += _BIAS * max(0.0, abs(result.bias) / asked.bias_degC - FREE)
+    else:
+        cost = result.length_s / unit + _ERROR * abs(result.last_error) / asked.band_degC
+    cost += _OVERSHOOT * max(0.0, result.overshoot / asked.overshoot_degC - FREE)
+    return float(cost + spec.energy_weight * result.energy_s / unit)
+
+
+def _cost_of_load(result: StepResult, spec: Spec, scales: Scales) -> float:
+    cost = result.iae / max(scales.iae[result.key], 1e-12)
+    if not np.isfinite(result.settle_s):
+        cost += _ERROR * abs(result.last_error) / spec.asked(result.output).band_degC
+    return float(cost)
 
 
 def bounds_of(plant: Plant, design: Design, spec: Spec, draws: Sequence[int]) -> Bounds:
@@ -368,512 +518,3 @@ def check_steps(bounds: Bounds) -> None:
             f"steps: full drive does not reach {first[1]:g} degC, nor any other target",
             hint="choose nearer targets, a wider drive range, or a longer hold_s",
         )
-
-
-def _result(
-    run: ClosedLoop, parts: Sequence[Segment], step: tuple[float, float], draw: int, output: str = ""
-) -> StepResult:
-    settles = [part.settle_s for part in parts]
-    worst = max(parts, key=lambda part: abs(part.bias))
-    last = max((run.outputs[p.output][-1] - p.target for p in parts), key=abs)
-    return StepResult(
-        start=step[0],
-        target=step[1],
-        draw=draw,
-        settle_s=float(np.max(settles)),  # NaN wins, as it should
-        overshoot=max(part.overshoot for part in parts),
-        bias=worst.bias,
-        last_error=float(last),
-        energy_s=parts[0].energy_s,
-        travel=parts[0].travel,
-        full_share=parts[0].full_share,
-        length_s=parts[0].end_s - parts[0].begin_s,
-        output=output,
-    )
-
-
-#: What the search varies: name, smallest, largest; all on a logarithmic scale, walks as factors of the noise.
-MPC_PARAMETERS = (
-    ("move", 0.02, 5000.0),
-    ("terminal", 0.3, 300.0),
-    ("overshoot_share", 0.05, 0.9),
-    ("drive_walk", 0.03, 10.0),
-    ("output_walk", 0.03, 10.0),
-    ("state_walk", 0.1, 1.0),
-)
-PI_PARAMETERS = (
-    ("Kc", 0.2, 5.0),
-    ("Ti", 0.2, 5.0),
-    ("setpoint", 0.1, 1.0),
-    ("feedforward", 0.05, 1.0),
-)
-#: Of a PI whose delay is below two steps of the plant: no log shows it, SIMC's gain is the highest tried.
-PI_OF_UNSEEN_DELAY = (("Kc", 0.2, 1.0), ("Ti", 0.6, 5.0), *PI_PARAMETERS[2:])
-LONGEST_TI = 1.5  # of a PI's gain, both in those of SIMC: a load's integrated error is at most half more
-LQR_PARAMETERS = (
-    ("move", 0.02, 500.0),
-    ("drive", 1e-4, 100.0),
-    ("state_walk", 0.1, 1.0),
-    ("drive_walk", 0.03, 10.0),
-    ("output_walk", 0.03, 10.0),
-)
-
-#: What a design that prices travel is searched by: of the error that a spec allows, what moves no drive.
-STILL = ("still", 0.003, 0.6)
-_CHECK_FROM = 100  # draws of the comparison, apart from those of the search
-
-
-@dataclass(frozen=True)
-class Trial:
-    """One design that was tried, over all steps and draws."""
-
-    controller: str  # ``"MPC"``, ``"LQR"`` or ``"PI"``
-    parameters: dict[str, float]  # what made it
-    score: float  # lower is better, see :func:`thermogrip.mpc.tuning.objective.score`
-    settle_s: float  # means over steps and draws; NaN where one did not settle
-    overshoot: float  # the worst [degC]
-    energy_s: float  # means over steps and draws; NaN where one did not settle
-    travel: float = 0.0  # mean of how many full drives the drives move
-
-
-#: Draws, a seed, and whether a run is for as long as steps are held.
-_Runs: TypeAlias = tuple[Sequence[int], int, bool]
-# closed loops that a process is given at once: a tenth of a second and more
-_RUNS_IN_C, _RUNS_IN_PYTHON, _PI_IN_C = 9, 3, 6
-_TRIALS_IN_C = 4  # of PIs
-
-
-class _Part(NamedTuple):
-    """A share of a trial, for one process."""
-
-    name: str
-    parameters: dict[str, float] | None  # None: the default design
-    whole: bool  # whether of all steps, the cold start too
-    runs: Sequence[_Runs]
-
-
-class _Built:
-    """Structures of designs whose C is built."""
-
-    def __init__(self) -> None:
-        self.structures: set[Any] = set()
-        self.locks: defaultdict[Any, threading.Lock] = defaultdict(threading.Lock)
-
-
-def _structure(design: Design) -> Any:
-    """Return on what it depends which C a design needs."""
-    return design.blocks, tuple(design.ramp_per_s)
-
-
-def _unpacked_here(packed: bytes) -> Search:
-    """Return a search that came to this process: the same one each time, of which a thread has its own."""
-    return _unpacked(packed, threading.get_ident())
-
-
-@lru_cache(maxsize=16)
-def _unpacked(packed: bytes, thread: int) -> Search:
-    state = unpack(packed)
-    search = object.__new__(Search)
-    search.__dict__.update(state, plant=_plant_of(state["plant"], thread), workers=1)
-    search._made, search._library, search._packed, search._built = {}, None, None, _Built()
-    remember_codes(search._codes)
-    return search
-
-
-@lru_cache(maxsize=16)
-def _plant_of(packed: bytes, thread: int) -> Plant:
-    """Return a plant as it travels, with all that is worked out for it; a user's own class is read here."""
-    from thermogrip.sysid.models.user_model import load_object, own_model
-    from thermogrip.sysid.plant.plant import Plant
-
-    content, where = unpack(packed)
-    return Plant.from_dict(content, model=None if where is None else own_model(load_object(*where)))
-
-
-class Search:
-    """Evaluates designs on the search's draws.
-
-    It is made of plain data, so that it travels to other processes: what one trial consists of is shared out
-    among ``workers``.  What each process would work out for itself (where draws are at rest, the C of the
-    model) travels along, and a process unpacks the same search once.
-    """
-
-    def __init__(
-        self, plant: Plant, spec: Spec, baseline: Design, seed: int, *, workers: Workers = 1
-    ) -> None:
-        self.plant, self.spec, self.seed, self.workers = plant, spec, seed, workers
-        self._compiled = wanted() and not baseline.on_off
-        self._library: CompiledController | None = None  # in which trials of PI loops run
-        self._made: dict[str, tuple[dict[str, float] | None, Regulator]] = {}  # for the last part of a name
-        self._built = _Built()
-        self._packed: bytes | None = None
-        self._starts: dict[int, HeldStarts] = {}  # by draw
-        self._codes: list[Any] = []
-        self._by_pi: dict[int, list[StepResult]] = {}  # of SIMC's PI, by draw
-        self.draws = draws_of(plant, spec.search_draws)
-        self.certain = self.draws == [0]  # no draws: the comparison takes the same plant, and fresh noise
-        self.check_seed = seed + 1 if self.certain else seed
-        # the comparison takes draws that the search has not seen
-        self.unseen = [draw + _CHECK_FROM if draw else 0 for draw in draws_of(plant, spec.check_draws)]
-        cold = cold_steps(plant, spec, baseline.controlled)
-        self.whole_spec = spec.model_copy(update={"steps": [*spec.steps, *cold]})  # of trials at full length
-        self.baseline = baseline
-        self.bounds = self._first_bounds(sorted({*self.draws, *self.unseen}))
-        self.baseline = baseline = paced(baseline, spec, self.bounds)
-        self.bounds = ramped_bounds(self.bounds, baseline, spec)
-        if cold:
-            begun = spec.model_copy(update={"steps": cold})
-            self.bounds |= bounds_of(plant, baseline, begun, self.draws)
-        count = len(lacking(plant, spec, baseline.controlled))
-        self.lacking = [STRUCTURE * (k + 1) + self.draws[0] for k in range(count)]
-        check_steps(self.bounds)
-        unseen = apparent_delay(plant, baseline.controlled) < 2 * plant.dt
-        own = PI_OF_UNSEEN_DELAY if unseen else PI_PARAMETERS
-        self.pi: Sequence[tuple[str, float, float]] = own[:-1] if self.certain else own
-        self.pi_moves = self._moves_of_pi()
-        # long enough to see it settle and stay, short enough to try many in Python
-        slowest = [max(self.bounds[(*step, draw)] for draw in self.draws) for step in spec.steps]
-        least = min(120.0, spec.hold_s)
-        self.lengths = [float(np.clip(1.35 * bound + 40.0, least, spec.hold_s)) for bound in slowest]
-        # a plant that settles long after the bound (its delay, what is not known of it) is watched for longer
-        for at, settled in enumerate(self._settled()):
-            self.lengths[at] = float(np.clip(1.25 * settled + 40.0, self.lengths[at], spec.hold_s))
-        self._packed = None
-
-    def _first_bounds(self, draws: Sequence[int]) -> Bounds:
-        """Return the bounds on these draws; meanwhile one of several workers writes and builds the C, and
-        what else needs no bounds is worked out."""
-        if self.workers == 1:
-            return bounds_of(self.plant, self.baseline, self.spec, draws)
-        items: list[Callable[[], Any]] = [self._begin_c, *(partial(self._begin, draw) for draw in draws)]
-        if not self.spec.settling:  # else bounds may pace the default design
-            items.append(self._price)
-        (self._compiled, self._codes), *found = run_parallel(_called, items, self.workers, what="bounds")
-        self._built.structures.add(_structure(self.baseline))
-        remember_codes(self._codes)
-        self._packed = None
-        bounds: Bounds = {}
-        for draw, (starts, of, by_pi) in zip(draws, found):
-            self._starts[draw] = starts
-            bounds |= of
-            if by_pi:
-                self._by_pi[draw] = by_pi
-        if not self.spec.settling:
-            self.travel = found[-1]
-        return bounds
-
-    def _begin_c(self) -> tuple[bool, list[Any]]:
-        """Return whether C can be had, and the model's code."""
-        if self._compiled and self._controller(self.baseline).c is not None:
-            CompiledTruth(prediction_model(self.plant, self.plant.dt))
-        return self._compiled, known_codes()
-
-    def _begin(self, draw: int) -> tuple[HeldStarts, Bounds, list[StepResult]]:
-        """Return where a draw is at rest, its bounds and, if these cannot pace the default design, what
-        SIMC's PI does."""
-        of = bounds_of(self.plant, self.baseline, self.spec, [draw])
-        by_pi = self._by_simc(draw) if self.spec.moves_limit and not self.spec.settling else []
-        return prediction_model(drawn(self.plant, draw), self.plant.dt).held_starts, of, by_pi
-
-    def _moves_of_pi(self) -> PIMoves:
-        """Return what the PI by SIMC moves, on the search's draws and on those of the comparison."""
-        if not self.spec.moves_limit:
-            return {}
-        known, self._by_pi = self._by_pi, {}
-        if not known:
-            draws = sorted({*self.unseen, *self.draws})
-            found = run_parallel(self._by_simc, draws, self.workers, what="moves of a PI")
-            known = dict(zip(draws, found, strict=True))
-        return moves_of([result for results in known.values() for result in results])
-
-    def _by_simc(self, draw: int) -> list[StepResult]:
-        """Return the results on a draw of SIMC's PI by itself, at the rate at which readings come; it is not
-        told what drive holds a target."""
-        self._know([draw])
-        loops = tuple(replace(loop, feedforward=0.0) for loop in self.baseline.loops)
-        made = PIController.of(self.plant, replace(self.baseline, dt=self.plant.dt), loops)
-        return run_trials(made, self.plant, self.whole_spec, [draw], seed=self.check_seed)
-
-    def _settled(self) -> list[float]:
-        """Return when the default design has settled on the slowest draw [s], by step; inf where never."""
-        spec = self.spec
-        found = self._results("MPC", None, [(self.draws, self.seed, True)], whole=False)
-        times = {step: [r.settle_s for r in found if (r.start, r.target) == step] for step in spec.steps}
-        return [float(np.nan_to_num(times[step], nan=np.inf).max()) for step in spec.steps]
-
-    def __reduce__(self) -> Any:
-        if self._packed is None:
-            own = getattr(self.plant.model, "code", None)
-            where = None if own is None else (str(Path(own.file).resolve()), own.name)
-            apart = ("_made", "_library", "_packed", "_built", "workers")
-            state = {key: value for key, value in self.__dict__.items() if key not in apart}
-            self._packed = pack({**state, "plant": pack((self.plant.to_dict(), where))})
-        return _unpacked_here, (self._packed,)
-
-    def __copy__(self) -> Search:
-        made = object.__new__(type(self))
-        made.__dict__.update(self.__dict__)
-        return made
-
-    def design(self, parameters: dict[str, float]) -> Design:
-        """Return the baseline with these parameters; those that are not named stay."""
-        base = self.baseline
-        noise = replace(
-            base.noise,
-            state=parameters.get("state_walk", 1.0) * base.noise.state,
-            drive={n: parameters.get("drive_walk", 1.0) * sd for n, sd in base.noise.drive.items()},
-            output=parameters.get("output_walk", 1.0) * base.noise.output,
-        )
-        horizon = max(10, round(parameters.get("horizon", sum(base.blocks))))
-        count = max(2, round(parameters.get("blocks", len(base.blocks))))
-        same = (horizon, count) == (sum(base.blocks), len(base.blocks))
-        share = parameters.get("overshoot_share")
-        return replace(
-            base,
-            blocks=base.blocks if same else make_blocks(horizon, count),
-            move=parameters.get("move", base.move),
-            terminal=parameters.get("terminal", base.terminal),
-            travel=parameters["still"] * self.travel if "still" in parameters else base.travel,
-            drive=parameters.get("drive", base.drive),
-            overshoot=base.overshoot if share is None else share * self.spec.overshoot_degC,
-            noise=noise,
-            drive_range=_capped(base.drive_range, parameters.get("drive_share", 1.0)),
-            ramp_per_s={**base.ramp_per_s, **self._ramps(parameters["ramp"])}
-            if "ramp" in parameters
-            else base.ramp_per_s,
-        )
-
-    @cached_property
-    def travel(self) -> float:
-        """The price of travel at which a prediction that is off by the allowed bias moves no drive."""
-        return _price_of_travel(self.plant, self.baseline, self.spec)
-
-    def _price(self) -> float:
-        return self.travel
-
-    @property
-    def at_once(self) -> list[str]:
-        """The controlled outputs whose targets need not ramp."""
-        return [name for name in self.baseline.controlled if name not in self.baseline.ramp_per_s]
-
-    def _ramps(self, times: float) -> dict[str, float]:
-        """Return how fast targets may change: a step's ramp lasts so many times its bound, or longer."""
-        spec, rates = self.spec, dict.fromkeys(self.at_once, np.inf)
-        for step in spec.steps:
-            found = np.array([self.bounds[(*step, draw)] for draw in self.draws])
-            if np.isfinite(found).any():
-                lasts = times * float(np.mean(found[np.isfinite(found)]))
-                rates = {name: min(rate, spec.way(step, name) / lasts) for name, rate in rates.items()}
-        return rates
-
-    def evaluate(
-        self,
-        parameters: dict[str, float],
-        name: str = "MPC",
-        *,
-        at_length: bool = False,
-        other_noise: int = 0,
-        noises: int = NOISES,
-    ) -> Trial:
-        """Return the trial of an ``"MPC"``, ``"PI"`` or ``"LQR"``, at full length if asked; other noise
-        than the search's is counted from 1, and only an MPC in C is tried in several ``noises``."""
-        quick = name == "MPC" and self._compiled  # whole loops in C: under a tenth of the time
-        # a PI for as long as a step is held, to see what its integrator has still to do; and what is quick:
-        # the end of a short run is not the bias that stays
-        whole = quick or name == "PI" or at_length
-        count = noises if quick else 1
-        # the comparison of a plant without draws has a seed of its own
-        others = range(count * other_noise, count * (other_noise + 1))
-        seeds = [self.seed + (noise and noise + 1) for noise in others]
-        counted = expected(self.spec)
-        lacks = [draw for draw in self.lacking if draw // STRUCTURE not in counted]
-        planned = [draw for draw in self.lacking if draw // STRUCTURE in counted]
-        runs = []
-        for seed in seeds:
-            runs.append((self.draws, seed, whole))
-            if planned:  # which settles last: for as long as a step is held
-                runs.append((planned, seed, True))
-        if name != "LQR":
-            runs.append((lacks, seeds[0], True))
-        found = self._results(name, parameters, runs, whole=whole)
-        results = counting(found, self.spec)
-        return Trial(
-            controller=name,
-            parameters=dict(parameters),
-            score=score(found, self.spec, self.bounds, self.pi_moves),
-            settle_s=float(np.mean([result.settle_s for result in results])),
-            overshoot=max(result.overshoot for result in results),
-            energy_s=float(np.mean([result.energy_s for result in results])),
-            travel=float(np.mean([result.travel for result in results])),
-        )
-
-    def evaluate_each(
-        self, name: str, several: Sequence[dict[str, float]], progress: Progress | None = None, *, what: str
-    ) -> list[Trial]:
-        """Return the trial of each of several sets of parameters; a process is given some at once."""
-        n = _TRIALS_IN_C if self._compiled else 1
-        parts = [several[at : at + n] for at in range(0, len(several), n)]
-        of = partial(self._trials, name)
-        done = run_parallel(of, parts, self.workers, progress, what=what, elsewhere=True)
-        return [tried for part in done for tried in part]
-
-    def _trials(self, name: str, several: Sequence[dict[str, float]]) -> list[Trial]:
-        return [self.evaluate(parameters, name) for parameters in several]
-
-    def _results(
-        self, name: str, parameters: dict[str, float] | None, runs: Sequence[_Runs], *, whole: bool
-    ) -> list[StepResult]:
-        """Return the results of runs, in their order; those of a draw go to one process."""
-        if self.workers == 1:
-            return [result for part in self._run(_Part(name, parameters, whole, runs)) for result in part]
-        if name != "PI" and self._compiled:
-            self._build_once(self.baseline if parameters is None else self.design(parameters))
-        each = [([draw], seed, full) for draws, seed, full in runs for draw in draws]
-        n = _RUNS_IN_C if self._compiled and name != "LQR" else _RUNS_IN_PYTHON
-        n = max(1, (_PI_IN_C if name == "PI" and self._compiled else 1) * n // len(self.spec.steps))
-        if name != "PI":  # whose searches have others beside them
-            n = min(n, -(-len(each) // 2))
-        parts = [_Part(name, parameters, whole, each[at : at + n]) for at in range(0, len(each), n)]
-        done = run_parallel(self._run, parts, self.workers, elsewhere=True)
-        of = iter([results for part in done for results in part])
-        steps = len((self.whole_spec if whole else self.spec).steps)
-        found: list[StepResult] = []
-        for draws, _, _ in runs:
-            by_draw = [next(of) for _ in draws]
-            for at in range(steps):  # the order of one process: by step, then by draw
-                for results in by_draw:
-                    count = len(results) // steps
-                    found += results[count * at : count * (at + 1)]
-        return found
-
-    def _run(self, part: _Part) -> list[list[StepResult]]:
-        """Return the results of each of a part's runs."""
-        name, parameters, whole, runs = part
-        if name not in self._made or self._made[name][0] != parameters:
-            self._made[name] = (parameters, self._regulator(name, parameters))
-        controller, spec = self._made[name][1], self.whole_spec if whole else self.spec
-        found = []
-        for draws, seed, full in runs:
-            self._know(draws)
-            lengths = None if full else self.lengths
-            found.append(run_trials(controller, self.plant, spec, draws, lengths=lengths, seed=seed))
-        return found
-
-    def _regulator(self, name: str, parameters: dict[str, float] | None) -> Regulator:
-        if parameters is None:
-            return self.made(name, self.baseline)
-        if name == "PI":
-            return self._pi(scaled_loops(self.baseline.loops, parameters))
-        return self.made(name, self.design(parameters))
-
-    def _know(self, draws: Sequence[int]) -> None:
-        """Take over where these draws are at rest, which another process has found."""
-        for draw in {draw % STRUCTURE for draw in draws} & self._starts.keys():
-            prediction_model(drawn(self.plant, draw), self.plant.dt).held_starts |= self._starts[draw]
-
-    def _builds(self, design: Design) -> bool:
-        return self._controller(design).c is not None
-
-    def _build_once(self, design: Design) -> None:
-        """Have one process build the C of a structure, which the others find built: it takes seconds."""
-        structure = _structure(design)
-        with self._built.locks[structure]:
-            if structure not in self._built.structures:
-                run_parallel(self._builds, [design], self.workers, elsewhere=True)
-                self._built.structures.add(structure)
-
-    def evaluate_at_length(self, item: tuple[str, dict[str, float]]) -> Trial:
-        """Return a trial at full length: slow ones settle too."""
-        name, parameters = item
-        return self.evaluate(parameters, name, at_length=True)
-
-    def at_length(self, trial: Trial) -> bool:
-        """Return whether a trial of the search was already at full length."""
-        return trial.controller == "PI" or (trial.controller == "MPC" and self._compiled)
-
-    def evaluate_in_other_noise(self, item: tuple[dict[str, float], int]) -> Trial:
-        """Return a trial of an MPC at full length in another noise than the search's, counted from 1."""
-        parameters, other = item
-        return self.evaluate(parameters, at_length=True, other_noise=other)
-
-    def check(self, item: tuple[str, Design, int]) -> list[StepResult]:
-        """Return the results of a controller on one draw, at full length."""
-        name, design, draw = item
-        self._know([draw])
-        return run_trials(self.made(name, design), self.plant, self.spec, [draw], seed=self.check_seed)
-
-    def made(self, name: str, design: Design) -> Regulator:
-        """Return the controller of a design, ``"PI"``, ``"LQR"`` or by any other name an MPC, with filter and
-        optimiser in C where there is a compiler."""
-        if name == "PI":
-            return self._pi(design.loops)
-        controller = self._controller(design)
-        if name == "LQR":
-            return LQRController(self.plant, design, observer=controller.observer)
-        return controller
-
-    def _pi(self, loops: tuple[PILoop, ...]) -> PIController:
-        """Return PI loops whose trials run in C where the default design's do."""
-        made = PIController.of(self.plant, self.baseline, loops)
-        if self._library is None and self._compiled:
-            self._library = self._controller(self.baseline).c
-        made.c = self._library
-        return made
-
-    def _controller(self, design: Design) -> Controller:
-        """Return an MPC; from the first time on that its steps cannot be had in C, none are expected to."""
-        made = Controller(self.plant, design)
-        self._compiled = self._compiled and made.c is not None
-        return made
-
-
-def _called(function: Callable[[], Any]) -> Any:
-    return function()
-
-
-def _price_of_travel(plant: Plant, design: Design, spec: Spec) -> float:
-    """Return the price of travel at which a whole prediction that is off by the allowed bias moves no drive:
-    the slope of its squared errors along the drive that answers least over the horizon."""
-    optimiser = Optimiser(prediction_model(plant, design.dt), design)
-    bias = np.array([spec.asked(name).bias_degC for name in design.controlled]) * optimiser.weight
-    slopes = 2 * design.track * np.abs(optimiser.at_rest.sum(axis=0)) * bias[optimiser.strongest]
-    return float(np.min(slopes, where=slopes > _LEAST_SLOPE * slopes.max(), initial=slopes.max()))
-
-
-def _capped(ranges: dict[str, tuple[float, float]], share: float) -> dict[str, tuple[float, float]]:
-    """Return this share of each range, about no drive or what is nearest to none."""
-    rests = {name: min(max(0.0, low), high) for name, (low, high) in ranges.items()}
-    return {
-        name: (rests[name] + share * (low - rests[name]), rests[name] + share * (high - rests[name]))
-        for name, (low, high) in ranges.items()
-    }
-
-
-def parameters_of(design: Design, spec: Spec) -> dict[str, float]:
-    """Return the parameters of the MPC that make a design."""
-    return {
-        "move": design.move,
-        "terminal": design.terminal,
-        "overshoot_share": design.overshoot / spec.overshoot_degC,
-        "state_walk": 1.0,
-        "drive_walk": 1.0,
-        "output_walk": 1.0,
-        "horizon": float(sum(design.blocks)),
-        "blocks": float(len(design.blocks)),
-    }
-
-
-def scaled_loops(loops: tuple[PILoop, ...], factors: dict[str, float]) -> tuple[PILoop, ...]:
-    """Return PI loops with each number times its factor, feed-forward and setpoint weight as given; a step of
-    the load leaves an integrated error of Ti / Kc, at most half more than that of the loops given."""
-    Ti = min(factors["Ti"], LONGEST_TI * factors["Kc"])
-    return tuple(
-        replace(
-            loop,
-            Kc=factors["Kc"] * loop.Kc,
-            Ti=Ti * loop.Ti,
-            feedforward=factors["feedforward"],
-            setpoint=factors["setpoint"],
-        )
-        for loop in loops
-    )

@@ -25,8 +25,9 @@ import numpy as np
 from thermogrip.datasets.parallel import Progress, Workers, sub_progress
 from thermogrip.datasets.schema import Log
 from thermogrip.mpc.controllers.mpc import Controller
+from thermogrip.mpc.controllers.pi import PIController
 from thermogrip.mpc.design.spec import Spec
-from thermogrip.mpc.tuning.objective import StepResult, draws_of, run_trials
+from thermogrip.mpc.tuning.objective import StepResult, draws_of, run_trials, steps_on
 from thermogrip.mpc.tuning.tune import Tuning, tune
 from thermogrip.sysid.identification import Identification, identify
 from thermogrip.sysid.models.model import BlackBox
@@ -67,7 +68,7 @@ class Retuning:
 
 
 def retune(
-    controller: Controller,
+    controller: Controller | PIController,
     loop: Log,
     logs: Sequence[Log] = (),
     *,
@@ -80,7 +81,7 @@ def retune(
 
     Parameters
     ----------
-    controller : Controller
+    controller : Controller or PIController
         That closed the loop.
     loop : Log
         The loop's.
@@ -91,7 +92,7 @@ def retune(
     progress : callable, optional
         Called with (fraction done, what is being done).
     workers : int or str, optional
-        Local processes, or the address of a Dask cluster.
+        Local processes for the identification, or the address of a Dask cluster.
     seed : int, optional
 
     Raises
@@ -108,10 +109,10 @@ def retune(
     result = Retuning(found, _errors(controller.plant, found, loop), None, (), ())
     if not result.better:
         return result
-    tuned = tune(found.plant, spec, progress=sub_progress(progress, 0.3, 0.9), workers=workers, seed=seed)
+    tuned = tune(found.plant, spec, progress=sub_progress(progress, 0.3, 0.9), seed=seed)
     plant, both = tuned.controller.plant, (controller, tuned.controller)
-    draws = draws_of(plant, spec.check_draws)
-    old, new = (tuple(run_trials(Controller(c.plant, c.design), plant, spec, draws, seed=seed)) for c in both)
+    cases = steps_on(spec, draws_of(plant, spec.check_draws))
+    old, new = (tuple(run_trials(c, plant, spec, cases, seed=seed)) for c in both)
     return Retuning(found, result.errors, tuned, old, new)
 
 

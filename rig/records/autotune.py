@@ -202,7 +202,7 @@ class Autotune:
 
     def _identify(self) -> None:
         """Find the plant behind all logs so far, and keep it with the controller by default."""
-        from thermogrip.mpc.controllers.mpc import Controller
+        from thermogrip.mpc.controllers.pi import PIController
         from thermogrip.mpc.design.design import default_design
         from thermogrip.sysid.data.shipped_networks import shipped_network
         from thermogrip.sysid.identification import identify
@@ -215,7 +215,7 @@ class Autotune:
         plant = self.found.plant
         plant.save(self.folder / "plant.json")
         design = default_design(plant, controlled=tuple(self._targets(plant)))
-        Controller(plant, design).save(self.folder / "controller.json")
+        PIController.of(plant, design).save(self.folder / "controller.json")
         self.say(self.found.verdict)
 
     def _targets(self, plant: Plant) -> dict[str, float]:
@@ -292,10 +292,10 @@ class Autotune:
             step = float(np.mean(begin)), float(np.mean(list(targets.values())))
             wanted = Spec.of(plant).model_dump(exclude_unset=True)
             spec = Spec(**(wanted | {"steps": [step], "output": list(targets)}))
-        self.tuning = tune(
-            plant, spec, progress=self._part(0.5, 0.9), workers=self.workers, seed=self.seed
-        )
+        self.tuning = tune(plant, spec, progress=self._part(0.5, 0.9), seed=self.seed)
         self.tuning.save(self.folder / "controller.json")
+        if self.tuning.interrupted:
+            raise KeyboardInterrupt
         known = {"minutes": round(self.spent_s / 60, 1), "good": self.identified.good}
         self._note(tuned=known | {"verdict": self.tuning.verdict})
         self.say(f"{self.tuning.verdict}: {self.tuning.finding}")

@@ -202,13 +202,16 @@ _MOST_ERROR, _MOST_READING = 1e6, 1e9  # of a sensor, in any unit
 _PLAIN = ("values", "units", "scales", "noise", "offsets", "nuisance", "reference", "verdict")
 
 
-def check_plant_file(path: str | Path, *, inside: str | None = None) -> dict[str, Any]:
-    """Look through a plant, or that inside a file of another schema, before what its model needs is loaded.
+def check_plant_file(
+    path: str | Path, *, inside: str | None = None, version: int = VERSION
+) -> dict[str, Any]:
+    """Look through a plant, or that inside a file of another schema, up to a version, before what its model
+    needs is loaded.
 
     Returns what the file holds; UserError if it is beyond the limits of a document or a field is not what it
     should be.
     """
-    content = read_json(path, inside or SCHEMA, VERSION)
+    content = read_json(path, inside or SCHEMA, version)
     with reading("is not whole", file=path, hint="write the file again"):
         if inside and not isinstance(content.get("plant"), dict):
             raise UserError("plant is missing", hint="write the file again")

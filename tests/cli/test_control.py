@@ -19,9 +19,9 @@ from thermogrip.mpc.design.spec import Spec
 from thermogrip.mpc.tuning.design_review import Check
 from thermogrip.mpc.tuning.objective import StepResult
 from thermogrip.mpc.tuning.retune import RunError
-from thermogrip.mpc.tuning.trade_offs import Sensitivity
+from thermogrip.mpc.tuning.tune import Row
 
-MOVE = Sensitivity("move", 2.0, 0.1, 90.0, 100.0, 110.0, 0.1, 0.2, 0.5, 3.0)
+ROW = Row("tuned", 28.0, 38.0, 90.0, 95.0, 0.1, 0.2, 0.01, 0.01, 7.0, 7.0, 2.0, 0.5, 80.0)
 ROWS = (("tuned", "28 to 38", 90.0, 95.0, 0.1, 0.2, 0.01, 7.0, 80.0),)
 
 
@@ -35,13 +35,12 @@ def tuned(stand_in: StandIn) -> SimpleNamespace:
 
     found = SimpleNamespace(
         save=lambda out: out.write_text("{}"), verdict="tuned", finding="faster", meets_spec=True,
-        scores={"tuned": 1.5}, rows=(MOVE,), sensitivity=(MOVE,),
+        scores={"tuned": 1.5}, rows=(ROW,), interrupted=False, controller=None,
         pareto=SimpleNamespace(rows=lambda: [{"a": 1}]),
     )  # fmt: skip
     found.asked = stand_in("thermogrip.mpc.tuning.tune.tune", tune)
     stand_in("thermogrip.report.control.tuning_table", (tuple("abcdefghi"), ROWS))
     stand_in("thermogrip.report.control.tuning_caption", "Closed loops on 5 draws of the plant")
-    stand_in("thermogrip.mpc.tuning.trade_offs.sensitivity_words", ["move matters", "horizon does not"])
     stand_in("thermogrip.report.control.tuning_sections", ["a section"])
     found.pages = stand_in("thermogrip.report.html.write_report")
     return found
@@ -53,15 +52,15 @@ def test_a_tuning_is_an_answer_of_yes_where_it_meets_the_spec(
 ) -> None:
     tuned.meets_spec = meets
     bench.write("spec.toml", "steps = [[25, 29]]\nhold_s = 77\n")
-    options = ["--spec", "spec.toml", "--seed", "3", "--workers", "2", "--out", "c.json"]
+    options = ["--spec", "spec.toml", "--seed", "3", "--out", "c.json"]
     done = bench.run("tune", "plant.json", *options, "--report", "t.html")
     assert done.code == code, done
     [call] = tuned.asked
     assert (call.args[0].inputs, call.args[1].hold_s) == (("drive", "pump"), 77.0)
-    assert (call.workers, call.seed) == (2, 3)
+    assert call.seed == 3
     said = words_of(done.out)
-    assert "tuned 28 to 38 90 95 0.1 0.2 0.01 7 80 tuned: faster move matters horizon does not" in said
-    assert said.endswith(f"The controller {words} the spec on every draw; wrote c.json")
+    assert "tuned 28 to 38 90 95 0.1 0.2 0.01 7 80 tuned: faster" in said
+    assert said.endswith(f"The MPC {words} the spec on every draw; wrote c.json")
     assert shares(done.err, "tune") == [50]
     [page] = tuned.pages
     assert page.args == (
@@ -69,12 +68,18 @@ def test_a_tuning_is_an_answer_of_yes_where_it_meets_the_spec(
         ["a section"],
     )  # fmt: skip
     assert json.loads(bench.run("tune", "plant.json", "--out", "c.json", "--json").out) == {
-        "verdict": "tuned", "finding": "faster", "meets_spec": meets, "scores": {"tuned": 1.5},
-        "rows": [asdict(MOVE)], "sensitivity": [asdict(MOVE)],
-        "in_words": ["move matters", "horizon does not"],
+        "kind": "MPC", "verdict": "tuned", "finding": "faster", "meets_spec": meets, "interrupted": False,
+        "scores": {"tuned": 1.5}, "rows": [asdict(ROW)],
         "pareto": [{"a": 1}], "out": "c.json", "report": None,
     }  # fmt: skip
-    assert (tuned.asked[1].args[1], tuned.asked[1].workers, len(tuned.pages)) == (Spec(), 1, 1)
+    assert (tuned.asked[1].args[1], len(tuned.pages)) == (Spec(), 1)
+
+
+def test_an_interrupted_tuning_is_written_and_ends_with_130(bench: Bench, tuned: SimpleNamespace) -> None:
+    tuned.interrupted = True
+    done = bench.run("tune", "plant.json", "--out", "c.json")
+    assert (done.code, Path("c.json").exists()) == (130, True)
+    assert "wrote c.json" in words_of(done.out)
 
 
 def a_run(bench: Bench, *, controller: str = "controller.json", phases: str = "000114") -> None:
@@ -226,7 +231,7 @@ def test_a_review_is_an_answer_of_no_where_a_check_fails(
 def test_the_class_of_a_plant_of_one_s_own_is_handed_in(controller: Bench, stand_in: StandIn) -> None:
     controller.write("own.py", "")
     stand_in("thermogrip.cli.options.find_network", lambda text: f"model of {text}")
-    loaded = stand_in("thermogrip.mpc.controllers.mpc.Controller.load", "a controller")
+    loaded = stand_in("thermogrip.mpc.controllers.controller_file.load_controller", "a controller")
     stand_in("thermogrip.mpc.tuning.design_review.review", [])
     for network in ((), ("--network", "own.py:Own")):
         assert controller.run("review", "c.json", *network).code == 0

@@ -1,4 +1,4 @@
-"""tune and run from the command line: their pages, a class of one's own, two outputs, a cluster."""
+"""tune and run from the command line: their pages, a class of one's own, two outputs, a PI that is best."""
 
 from __future__ import annotations
 
@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from tests.end_to_end.conftest import Bench, small_plant
-from thermogrip.mpc.design.spec import Spec
-from thermogrip.mpc.tuning.tune import tune
+from thermogrip.mpc.native.runtime import compiler
 from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.models.user_model import load_object, own_model
 from thermogrip.sysid.plant.plant import Plant
@@ -97,7 +96,7 @@ def test_a_class_of_ones_own_with_two_outputs_is_tuned_and_run(lab: Bench):
     own = ("--network", "lab.py:Lab")
     done = lab.run("tune", "lab.json", *own, "--spec", "lab.toml", "--out", "c.json", "--json")
     assert done.code in (0, 3), done
-    assert {row["controller"] for row in json.loads(done.out)["rows"]} >= {"tuned", "LQR"}
+    assert {row["controller"] for row in json.loads(done.out)["rows"]} == {"baseline", "tuned", "PI"}
     ran = lab.run(
         *("run", "c.json", "--twin", "lab.json", *own, "--target", "t1=31,t2=28", "--out", "r", "--json")
     )
@@ -113,7 +112,6 @@ def test_a_class_of_ones_own_with_two_outputs_is_tuned_and_run(lab: Bench):
     [
         (["tune", "lab.json", "--out", "c.json"], "hand the class in with --network lab.py:Lab"),
         (["tune", "lab.json", "--network", "lab.py:Lap", "--out", "c.json"], "Lab"),
-        (["tune", "plant.json", "--cluster", "localhost", "--out", "c.json"], "write tcp://HOST:PORT"),
         (["tune", "volt.json", "--out", "c.json"], "level moves by 0.5 V in the logs"),
         (["tune", "still.json", "--out", "c.json"], "no drive moves t_surface"),
     ],
@@ -132,30 +130,39 @@ def test_what_cannot_be_controlled_is_one_line(lab: Bench, words: list[str], say
     assert says in done.said[0]
 
 
-@pytest.mark.slow
-def test_a_cluster_finds_the_same_controller_bit_for_bit(lab: Bench):
-    distributed = pytest.importorskip("distributed")
-    model = own_model(load_object(lab.path / "lab.py", "Lab"))
-    plant = Plant.load(lab.path / "lab.json", model=model)
-    spec = Spec(
-        steps=[(25, 29)], hold_s=200.0, evaluations=2, search_draws=1, check_draws=1, sample_time_s=4.0
+def test_where_a_pi_is_best_the_pi_is_tuned_run_reviewed_and_exported(lab: Bench):
+    """An output that is its drive a sample later: a filter that trusts such a model meets loads late."""
+    model = StateSpaceModel(("q",), ("room",), ("t",), A=[[0.0]], B=[[1.0]], E=[[1.0]], C=[[1.0]], dt=1.0)
+    units, valid = {"q": "percent", "room": "degC", "t": "degC"}, {"q": (0.0, 100.0), "t": (0.0, 90.0)}
+    Plant(model, {}, dt=1.0, units=units, valid=valid, noise={"t": 0.05}).save(lab.path / "lag.json")
+    lab.write(
+        "lag.toml",
+        "steps = [[30, 40]]\nhold_s = 300\nsettle_within_s = 250\nevaluations = 3\nslew_per_s = 0.3",
     )
-    here = tune(plant, spec)
-    cluster = distributed.LocalCluster(
-        n_workers=1,
-        threads_per_worker=1,
-        processes=False,
-        protocol="tcp",
-        host="127.0.0.1",
-        dashboard_address=":0",
+    done = lab.run(
+        *("tune", "lag.json", "--spec", "lag.toml", "--out", "pi.json", "--report", "t.html", "--json")
     )
-    try:
-        there = tune(plant, spec, workers=cluster.scheduler_address)
-    finally:
-        cluster.close()
-    assert there.controller.design == here.controller.design
-    assert there.scores == here.scores
-    assert str(there.history) == str(here.history)  # a PI that does not settle has nan
-    assert [row.to_dict() for row in there.rows] == [row.to_dict() for row in here.rows]
-    assert there.pareto.rows() == here.pareto.rows()
-    assert [item.to_dict() for item in there.sensitivity] == [item.to_dict() for item in here.sensitivity]
+    assert done.code in (0, 3), done
+    answer = json.loads(done.out)
+    assert answer["kind"] == "PI"
+    assert answer["finding"].startswith("The PI is best and is what is saved: it scores ")
+    page = (lab.path / "t.html").read_text(encoding="utf-8")
+    assert answer["finding"].split(". ")[0] in page
+    assert "q by 10" in page  # a load
+    ran = lab.run(*("run", "pi.json", "--twin", "lag.json", "--target", "40", "--out", "r", "--json"))
+    assert ran.code == 0, ran
+    reviewed = json.loads(lab.run("review", "pi.json", "--json").out)
+    assert "comes back after a load" in [
+        check["name"] for check in reviewed["checks"] if check["verdict"] == "pass"
+    ]
+    node = lab.run("export", "pi.json", "--ros2", "--out", "node")
+    assert (node.code, (lab.path / "node" / "topics.toml").exists()) == (0, True)
+    refused = lab.run("export", "pi.json", "--arduino", "--out", "library")
+    assert (refused.code, len(refused.said)) == (2, 1)
+    if compiler() is None:
+        pytest.skip("no gcc here")
+    checked = lab.run("export", "pi.json", "--check", "--states", "300", "--out", "c", "--json")
+    assert checked.code == 0, checked
+    found = json.loads(checked.out)
+    assert (found["same_status"], found["free"] > 20) == (300, True)
+    assert found["difference"] < 1e-13

@@ -7,7 +7,6 @@ import math
 import pytest
 
 from thermogrip import mpc
-from thermogrip.mpc.controllers.lqr import LQRController
 from thermogrip.mpc.controllers.mpc import Controller
 from thermogrip.mpc.controllers.pi import PIController
 from thermogrip.mpc.design.design import default_design
@@ -35,14 +34,13 @@ def test_the_room_offers_what_it_lists_and_nothing_else():
         getattr(mpc, "nothing")  # noqa: B009
 
 
-@pytest.mark.parametrize("name", ["mpc", "pi", "lqr"])
+@pytest.mark.parametrize("name", ["mpc", "pi"])
 def test_a_controller_starts_from_the_drive_that_its_first_reading_has(tank, name: str):
     """Asked for less where 40 % holds 30 degC, each goes down from there by the slew of a sample."""
     design = default_design(tank, dt=2.0, slew_per_s={"drive": 0.05})
     made = {
         "mpc": lambda: Controller(tank, design),
         "pi": lambda: PIController.of(tank, design, design.loops),
-        "lqr": lambda: LQRController(tank, design),
     }[name]()
     reading = {"t_tank": 30.2, "t_surface": 30.0, "t_ambient": 25.0}
     made.reset(reading | {"drive": 0.4})

@@ -17,7 +17,6 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import make_log
 from thermogrip.mpc.closed_loop.simulate import Surroundings, Truth, simulate_closed_loop
 from thermogrip.mpc.controllers.export import check_export, export_controller
-from thermogrip.mpc.controllers.lqr import LQRController
 from thermogrip.mpc.controllers.mpc import Controller
 from thermogrip.mpc.controllers.pi import PIController
 from thermogrip.mpc.controllers.reference import ReferenceController
@@ -25,7 +24,8 @@ from thermogrip.mpc.design.design import default_design
 from thermogrip.mpc.design.spec import Spec, spec_from_dict
 from thermogrip.mpc.native.runtime import compiler
 from thermogrip.mpc.tuning.design_review import reachable
-from thermogrip.mpc.tuning.objective import STRUCTURE, run_trials, surroundings_of, trial
+from thermogrip.mpc.tuning.objective import Case as Trial
+from thermogrip.mpc.tuning.objective import lacking, run_trials, surroundings_of, trial
 from thermogrip.rig.guard.guard import Guard
 from thermogrip.rig.session.session import run_session
 from thermogrip.rig.simulation.twin import Twin
@@ -164,16 +164,17 @@ def test_trials_run_amid_it_and_every_controller_settles_without_offset(case):
     assert shown == pytest.approx(case.nominal, abs=0.03 * (case.logs[1] - case.logs[0]))
     for regulator in (
         Controller(plant, design),
-        LQRController(plant, design),
         PIController.of(plant, design, design.loops),
     ):
-        run = trial(regulator, plant, spec, case.steps[0], 0, spec.hold_s, 0)
+        run = trial(regulator, plant, spec, Trial(*case.steps[0], 0))
         (segment,) = run.segments
         assert segment.settle_s < 900.0
         assert abs(segment.bias) < 0.05
         end = case.held(segment.target - 0.2, case.nominal)  # its sensor reads 0.2 too much
         assert float(run.drive["heat"][-20:].mean()) == pytest.approx(end, abs=1.0)
-    found = run_trials(Controller(plant, design), plant, spec, [0, 3 * STRUCTURE])
+    weaker = list(lacking(plant, spec, design.controlled))[2]
+    cases = [Trial(*step, 0, words) for step in case.steps for words in ("", weaker)]
+    found = run_trials(Controller(plant, design), plant, spec, cases)
     assert all(np.isfinite(result.settle_s) and abs(result.bias) < 0.1 for result in found)
 
 
@@ -190,7 +191,7 @@ def test_a_spec_says_otherwise_and_a_line_tells_what_is_taken(case, tmp_path):
     said = case.spec().surroundings_in_words(case.plant(nominal={}))
     assert said == f"{case.name} is taken as {np.mean(case.logs):.4g} (the middle of the logs)"
     assert Spec().surroundings_in_words(make_tank()) == ""
-    run = trial(Controller(wide, spec.design(wide)), wide, spec, case.steps[0], 0, 900.0, 0)
+    run = trial(Controller(wide, spec.design(wide)), wide, spec, Trial(*case.steps[0], 0, seconds=900.0))
     end = case.held(case.steps[0][1] - 0.2, value)
     assert float(run.drive["heat"][-10:].mean()) == pytest.approx(np.clip(end, 0, 100), abs=1.5)
     with pytest.raises(UserError, match="the plant has no measured disturbance wind; these are: t_out"):
@@ -222,7 +223,7 @@ def test_a_reading_far_from_any_temperature_counts(case):
     assert controller._d.tolist() == [15.0, case.logs[0]]
     controller.step({"t": 25.0, "t_out": 300.0, case.name: -9999.0}, 26.0)  # broken wires
     assert controller._d.tolist() == [15.0, case.logs[0]]
-    # what PI and LQR look up for a target is another one where the disturbance is
+    # what a PI looks up for a target is another one where the disturbance is
     loops = [PIController.of(plant, controller.design, controller.design.loops)]
     for d in (case.logs[0], case.nominal):
         assert loops[0]._held(np.array([30.0]), np.array([15.0, d])) == pytest.approx(

@@ -17,7 +17,15 @@ from thermogrip.mpc.controllers.reference import ReferenceController
 from thermogrip.mpc.design.design import default_design
 from thermogrip.mpc.design.spec import spec_from_dict
 from thermogrip.mpc.tuning.design_review import lacks_structure
-from thermogrip.mpc.tuning.objective import StepResult, bounds_of, meets_spec, paced, ramped_bounds, score
+from thermogrip.mpc.tuning.objective import (
+    Scales,
+    StepResult,
+    bounds_of,
+    meets_spec,
+    paced,
+    ramped_bounds,
+    score,
+)
 from thermogrip.mpc.tuning.tune import rows_of, verdict_of
 from thermogrip.sysid.plant.plant import Plant
 
@@ -152,19 +160,20 @@ def test_each_output_is_judged_by_what_is_asked_of_it():
     }
     assert [meets_spec(one, spec) for one in of.values()] == [False, True]
     bounds = {(*step, 0, "t1"): 100.0, (*step, 0, "t2"): 480.0, (*step, 0): 480.0}
-    assert score([of["t1"]], spec, bounds) == pytest.approx(3.0)
+    scales = Scales(bounds, {}, {})
+    assert score([of["t1"]], spec, scales).total == pytest.approx(3.0)
     # sooner than within_s wins nothing, later costs in its units
-    assert score([of["t2"]], spec, bounds) == pytest.approx(1.0)
-    assert score([replace(of["t2"], settle_s=900.0)], spec, bounds) == pytest.approx(1.5)
-    rows = rows_of("tuned", list(of.values()), spec, bounds)
+    assert score([of["t2"]], spec, scales).total == pytest.approx(1.0)
+    assert score([replace(of["t2"], settle_s=900.0)], spec, scales).total == pytest.approx(1.5)
+    rows = rows_of("tuned", list(of.values()), bounds)
     assert [(row.output, row.settle_mean_s, row.bound_s) for row in rows] == [
         ("t1", 300.0, 100.0),
         ("t2", 300.0, 480.0),
     ]
-    _, said = verdict_of(spec, {"tuned": 1.0, "baseline": 1.0}, rows)
+    _, said = verdict_of(spec, 1.0, 1.0, rows)
     assert "25 to 40 of t2 may take 600 s, yours takes 300 s" in said
     beyond = [replace(row, bound_s=700.0) for row in rows if row.output == "t2"]
-    _, said = verdict_of(spec, {"tuned": 1.0, "baseline": 1.0}, beyond)
+    _, said = verdict_of(spec, 1.0, 1.0, beyond)
     assert said.startswith("25 to 40 degC of t2 cannot settle under 700 s at this drive, and 600 s are asked")
 
 
@@ -188,8 +197,8 @@ def test_a_review_says_of_each_output_how_long_it_takes_where_structure_is_missi
         controller.notes["spec"] = spec | {"settling": {"t2": {"within_s": within, "band_degC": 0.5}}}
         check = lacks_structure(controller, (25.0, 40.0))
         assert check.verdict == verdict
-        assert check.finding.count(": t1 ") == check.finding.count(": t2 ") == 3
-        assert check.finding.count("(asked 300 s)") == (3 if within == 300.0 else 0)
+        assert check.finding.count(": t1 ") == check.finding.count(": t2 ") == 4
+        assert check.finding.count("(asked 300 s)") == (4 if within == 300.0 else 0)
 
 
 def test_a_hard_limit_gives_way_last():

@@ -214,7 +214,7 @@ def steps_of() -> Figure:
             time=time, sample_time=time[:4], outputs=out, drive={"u": drive["u"][:4]}, target=target
         )
 
-    runs = {"28 to 38, MPC": loop(37.0), "28 to 38, PI": loop(36.0), "28 to 18, LQR": loop(18.0)}
+    runs = {"28 to 38, MPC": loop(37.0), "28 to 38, PI": loop(36.0), "28 to 18, PI": loop(18.0)}
     return draw_chart(steps_chart(runs))
 
 

@@ -13,7 +13,6 @@ MODULES = (
     *classify.NEEDED,
     *compare.NEEDED,
     "thermogrip.sysid.identification",
-    "thermogrip.mpc.tuning.tune",
 )
 
 

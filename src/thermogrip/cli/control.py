@@ -15,6 +15,7 @@ from thermogrip.report.console import Console
 
 if TYPE_CHECKING:
     from thermogrip.mpc.controllers.mpc import Controller
+    from thermogrip.mpc.controllers.pi import PIController
     from thermogrip.mpc.tuning.tune import Tuning
 
 ControllerFile = Annotated[Path, cli.arg("CONTROLLER", "controller.json of tune.")]
@@ -34,17 +35,14 @@ def tune(
     report: cli.Report = None,
     network: cli.OwnNetwork = None,
     seed: cli.Seed = 0,
-    workers: cli.Workers = 1,
-    cluster: cli.Cluster = None,
     as_json: cli.AsJson = False,
 ) -> int:
-    """Find the MPC's weights for what you want.
+    """Find the best controller for what you want, MPC or PI.
 
-    You say settling time, overshoot, energy. Runs closed loops on posterior draws of the plant; shows
-    baseline, tuned, PI and LQR side by side, what can be traded, and which weights matter.
+    You say settling time, overshoot, energy. Runs closed loops on posterior draws of the plant, steps and
+    loads; shows baseline, tuned and PI side by side, and what can be traded. Ctrl-C keeps the best so far.
     """
     cli.new_file(out, (".json",))
-    pool = cli.workers_of(workers, cluster, "thermogrip.mpc.tuning.tune")
     from thermogrip.mpc.design.spec import Spec, read_spec
     from thermogrip.mpc.tuning.tune import tune as search
 
@@ -62,16 +60,17 @@ def tune(
             f"In the trials, and where nobody reads it: {taken}; 'disturbances' in the spec replaces it"
         )
     with console.progress("tune") as progress, _naming(spec, tuple(Spec.model_fields)):
-        found = search(loaded, wanted, progress=progress, workers=pool, seed=seed)
+        found = search(loaded, wanted, progress=progress, seed=seed)
     result = _written(console, found, f"A controller for {plant.name}", out, report)
     console.answer(result)
+    if found.interrupted:
+        raise KeyboardInterrupt
     return 0 if found.meets_spec else cli.ANSWER_IS_NO
 
 
 def _written(console: Console, found: Tuning, lead: str, out: Path, report: Path | None) -> dict[str, Any]:
     """Write and show what a search found; return the answer."""
-    from thermogrip.mpc.tuning.trade_offs import sensitivity_words
-    from thermogrip.report.control import tuning_caption, tuning_sections, tuning_table
+    from thermogrip.report.control import kind_of, tuning_caption, tuning_sections, tuning_table
     from thermogrip.report.html import write_report
 
     found.save(out)
@@ -80,14 +79,11 @@ def _written(console: Console, found: Tuning, lead: str, out: Path, report: Path
         write_report(report, "Tuning", lead, tuning_sections(found))
     console.table(tuning_caption(found), *tuning_table(found))
     console.say(f"{found.verdict}: {found.finding}")
-    words = sensitivity_words(found.sensitivity)
-    for line in words:
-        console.say(line)
-    meets = "meets" if found.meets_spec else "does not meet"
-    console.say(f"The controller {meets} the spec on every draw; wrote {out}")
-    keys = ("verdict", "finding", "meets_spec", "scores", "rows", "sensitivity")
-    result = {key: getattr(found, key) for key in keys}
-    return result | {"in_words": words, "pareto": found.pareto.rows(), "out": out, "report": report}
+    kind, meets = kind_of(found.controller), "meets" if found.meets_spec else "does not meet"
+    console.say(f"The {kind} {meets} the spec on every draw; wrote {out}")
+    keys = ("verdict", "finding", "meets_spec", "interrupted", "scores", "rows")
+    result = {"kind": kind} | {key: getattr(found, key) for key in keys}
+    return result | {"pareto": found.pareto.rows(), "out": out, "report": report}
 
 
 def retune(
@@ -221,21 +217,33 @@ def export(
         console.answer({"out": out, "files": files})
         return 0
     from thermogrip.mpc.controllers.export import check_export, export_controller
+    from thermogrip.mpc.controllers.export_pi import check_pi, export_pi
+    from thermogrip.mpc.controllers.pi import PIController
 
     if arduino and check:
         raise UserError("--check builds a plain export", hint="check it without --arduino first")
     console = Console(as_json)
     loaded = load_controller(controller, network)
-    written = export_controller(loaded, cli.new_folder(out), arduino=arduino)
+    if isinstance(loaded, PIController):
+        if arduino:
+            hint = "leave --arduino out, and put its three files of C beside the sketch"
+            raise UserError("a PI needs no library", hint=hint)
+        written = export_pi(loaded, cli.new_folder(out))
+    else:
+        written = export_controller(loaded, cli.new_folder(out), arduino=arduino)
     console.say(f"Wrote {len(written.files)} files to {out}.")
     result: dict[str, Any] = {"out": out}
     if not check:
         console.answer(result)
         return 0
     with console.progress("check") as progress:
-        found = check_export(written, loaded, states=states, seed=seed, progress=progress)
+        about: dict[str, Any] = {"states": states, "seed": seed, "progress": progress}
+        if isinstance(loaded, PIController):
+            found, how = check_pi(written, loaded, **about), "samples of random readings"
+        else:
+            found, how = check_export(written, loaded, **about), "random states under the sanitizers"
     console.say(
-        f"{found.states} random states under the sanitizers: drives differ by at most {found.difference:.1e} "
+        f"{found.states} {how}: drives differ by at most {found.difference:.1e} "
         f"of their range ({found.free} of them at no limit), same status in {found.same_status}. "
         f"RAM of a controller {found.ram} bytes, constants {found.constants}, flash {found.flash}, largest "
         f"stack frame {found.stack}."
@@ -245,8 +253,8 @@ def export(
     return 0 if found.passed else cli.ANSWER_IS_NO
 
 
-def load_controller(path: Path, network: str | None) -> Controller:
+def load_controller(path: Path, network: str | None) -> Controller | PIController:
     """Return a controller; ``network`` is the class of its plant, where that is the user's own."""
-    from thermogrip.mpc.controllers.mpc import Controller
+    from thermogrip.mpc.controllers.controller_file import load_controller as load
 
-    return Controller.load(path, model=None if network is None else cli.find_network(network))
+    return load(path, model=None if network is None else cli.find_network(network))

@@ -43,9 +43,11 @@ class Done(int):
 def check_controller(path: str) -> None:
     """Look through a controller before what its model needs is loaded."""
     from thermogrip.datasets.limits import STEP_RANGE, number_within
+    from thermogrip.mpc.interface import FILE_VERSIONS
     from thermogrip.sysid.plant.plant_data import check_plant_file
 
-    content = check_plant_file(path, inside="thermogrip.controller")
+    newest = max(FILE_VERSIONS.values())
+    content = check_plant_file(path, inside="thermogrip.controller", version=newest)
     try:
         number_within(content["design"], "dt", *STEP_RANGE)
     except (KeyError, TypeError, ValueError) as error:

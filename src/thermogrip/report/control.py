@@ -1,4 +1,4 @@
-"""Sections of the page of a controller: its tuning, trade-offs, sensitivities and closed loops.
+"""Sections of the page of a controller: its tuning, trade-offs and closed loops.
 
 As in :mod:`thermogrip.report.classification`, each function returns sections whose verdict is a sentence.
 """
@@ -11,16 +11,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from thermogrip.mpc.closed_loop.simulate import session_loop
+from thermogrip.mpc.controllers.mpc import Controller
+from thermogrip.mpc.controllers.pi import PIController
 from thermogrip.mpc.design.spec import OnOff, Settling
 from thermogrip.mpc.tuning.design_review import range_text
 from thermogrip.mpc.tuning.figures import (
     closed_loop_chart,
     pareto_figure,
-    sensitivity_figure,
     step_time_figure,
 )
-from thermogrip.mpc.tuning.objective import bands_of, cold_steps, meets_spec
-from thermogrip.mpc.tuning.trade_offs import sensitivity_words
+from thermogrip.mpc.tuning.objective import bands_of, meets_spec
 from thermogrip.report.console import Cells, Columns, cells, short
 from thermogrip.report.html import Picture, Plot, Section, Table, Text
 from thermogrip.report.plots import grasps_chart, steps_chart
@@ -30,16 +30,15 @@ if TYPE_CHECKING:
 
     from thermogrip.datasets.schema import Grasps
     from thermogrip.mpc.closed_loop.simulate import ClosedLoop
-    from thermogrip.mpc.controllers.mpc import Controller
     from thermogrip.mpc.design.design import Design
     from thermogrip.mpc.design.spec import Spec
     from thermogrip.mpc.interface import Move
-    from thermogrip.mpc.tuning.tune import Tuning
+    from thermogrip.mpc.tuning.tune import Row, Tuning
     from thermogrip.rig.session.session import Session
 
 _STEPS_CAPTION = (
-    "Closed loops on one draw of the plant; dash and dot: the target. MPC is drawn broad, LQR dotted and PI "
-    "dashed, so that all show where they do the same."
+    "Closed loops on one draw of the plant, steps and then loads; dash and dot: the target. MPC is drawn "
+    "broad and PI dashed, so that both show where they do the same."
 )
 
 _SPEC_WORDS = {
@@ -50,7 +49,7 @@ _SPEC_WORDS = {
     "hold_s": "each step is simulated for [s]",
     "energy_weight": "seconds of settling given for one at full drive",
     "moves_weight": "share of the minimum time given for one move of full drive less",
-    "moves_limit": "moves charged beyond so many times those of a PI by SIMC",
+    "moves_limit": "moves charged beyond so many times those of the default design",
     "ambient_degC": "room of the simulations [degC]",
     "noise_degC": "noise of one reading [degC]",
     "sensor_offset_degC": "sensors are off by [degC]",
@@ -78,21 +77,28 @@ _WISHES = {
 
 
 def tuning_table(tuning: Tuning) -> Cells:
-    """Return the comparison of baseline, tuned, PI and LQR, step by step."""
+    """Return the comparison of baseline, tuned and PI, step by step and load by load."""
     columns: Columns = (
         ("controller", lambda row: row.controller),
-        ("step [degC]", lambda row: f"{row.start:g} to {row.target:g}{row.output and f', {row.output}'}"),
+        ("step [degC] or load", _case),
         ("settles in [s], mean", lambda row: _shown(row.settle_mean_s)),
         ("worst", lambda row: _shown(row.settle_worst_s)),
         ("overshoot [K], mean", lambda row: _rounded(row.overshoot_mean)),
         ("worst", lambda row: _rounded(row.overshoot_worst)),
         ("bias [K], worst", lambda row: _rounded(row.bias_worst)),
+        ("IAE [K s]", lambda row: _rounded(row.iae_mean)),
+        ("moves", lambda row: _rounded(row.travel_mean)),
         ("energy [s at full drive]", lambda row: _shown(row.energy_mean_s)),
-        ("minimum time [s]", lambda row: _shown(row.bound_s)),
+        ("minimum time [s]", lambda row: "" if row.load else _shown(row.bound_s)),
     )
-    return cells(
-        columns, sorted(tuning.rows, key=lambda row: tuning.spec.steps.index((row.start, row.target)))
-    )
+    order = list(dict.fromkeys((row.start, row.target, row.load) for row in tuning.rows))
+    ordered = sorted(tuning.rows, key=lambda row: order.index((row.start, row.target, row.load)))
+    return cells(columns, ordered)
+
+
+def _case(row: Row) -> str:
+    """Return what a row is of, in words."""
+    return f"{row.load or f'{row.start:g} to {row.target:g}'}{row.output and f', {row.output}'}"
 
 
 def tuning_caption(tuning: Tuning) -> str:
@@ -105,19 +111,22 @@ def tuning_caption(tuning: Tuning) -> str:
 
 def tuning_sections(tuning: Tuning) -> list[Section]:
     """Return the whole report of a tuning."""
-    design = tuning.controller.design
-    steps = {title.rpartition(", ")[0]: run for title, run in tuning.runs.items() if title.endswith(", MPC")}
-    return [
-        tuning_section(tuning),
-        pareto_section(tuning),
-        sensitivity_section(tuning),
-        *(
-            loop_section(run, design, f"The step from {step} degC", tone=_tone(tuning.spec, run))
-            for step, run in steps.items()
-        ),
-        timing_section([float(seconds) for run in steps.values() for seconds in run.seconds], design),
-        spec_section(tuning),
-    ]
+    design, kind = tuning.controller.design, kind_of(tuning.controller)
+    runs = {title.rpartition(", ")[0]: run for title, run in tuning.runs.items() if title.endswith(kind)}
+    steps = {f"{a:g} to {b:g}": f"The step from {a:g} to {b:g} degC" for a, b in tuning.spec.steps}
+    sections = [tuning_section(tuning), pareto_section(tuning)]
+    for title, run in runs.items():
+        tone = _tone(tuning.spec, run) if title in steps else ""
+        sections.append(loop_section(run, design, steps.get(title, f"A load on {title}"), tone=tone))
+    seconds = [float(each) for run in runs.values() for each in run.seconds]
+    if seconds:
+        sections.append(timing_section(seconds, design))
+    return [*sections, spec_section(tuning)]
+
+
+def kind_of(controller: Controller | PIController) -> str:
+    """Return ``"MPC"`` or ``"PI"``."""
+    return "PI" if isinstance(controller, PIController) else "MPC"
 
 
 def _tone(spec: Spec, run: ClosedLoop) -> str:
@@ -134,7 +143,7 @@ def tuning_section(tuning: Tuning) -> Section:
     )
     scores = ", ".join(f"{name} {value:.3f}" for name, value in tuning.scores.items())
     parts: list[Any] = [
-        Plot(steps_chart(tuning.runs), _STEPS_CAPTION),
+        *([Plot(steps_chart(tuning.runs), _STEPS_CAPTION)] if tuning.runs else []),
         Table(*tuning_table(tuning), tuning_caption(tuning)),
         Text(f"{tuning.verdict.capitalize()}. {tuning.finding}"),
         Text(
@@ -143,9 +152,9 @@ def tuning_section(tuning: Tuning) -> Section:
             f"the controllers. {_before_the_last_column(tuning.spec)}"
         ),
         Text(
-            f"Scores on these draws, lower is better: {scores}. MPC and LQR were tuned with "
-            f"{tuning.spec.evaluations} trials each, PI with three times as many; a settling time counts in "
-            "units of the last column."
+            f"Scores on these draws, lower is better: {scores}. At most {tuning.spec.evaluations} designs of "
+            "each kind were tried; a settling time counts in units of the last column, the IAE of a load in "
+            "that of the PI by SIMC or the default MPC, whichever is smaller."
         ),
     ]
     tone = "good" if tuning.meets_spec else "warn"
@@ -162,7 +171,7 @@ def pareto_section(tuning: Tuning) -> Section:
         ("settling [s]", lambda row: _shown(row["settle_s"])),
         ("overshoot, worst [K]", lambda row: _rounded(row["overshoot_degC"])),
         ("energy [s at full drive]", lambda row: _shown(row["energy_s"])),
-        ("unbeaten", lambda row: "yes" if row["best"] else ""),
+        ("non-dominated", lambda row: "yes" if row["best"] else ""),
     )
     parts = (
         Picture(
@@ -172,39 +181,10 @@ def pareto_section(tuning: Tuning) -> Section:
         ),
         Table(
             *cells(columns, rows),
-            f"Means over steps and the draws of the search ({draws}), {tuning.spec.hold_s:g} s each"
-            f"{_cold(tuning)}",
+            f"Means over steps and the draws of the search ({draws}), {tuning.spec.hold_s:g} s each",
         ),
     )
     return Section("What can be traded?", parts, _trade(rows))
-
-
-def _cold(tuning: Tuning) -> str:
-    """Return that trials begin in the cold too, where they do."""
-    controller = tuning.controller
-    cold = cold_steps(controller.plant, tuning.spec, controller.controlled)
-    return "".join(f", the way from {start:g} to {end:g} degC included" for start, end in cold)
-
-
-def sensitivity_section(tuning: Tuning) -> Section:
-    """Return the section of what each weight does."""
-    words = sensitivity_words(tuning.sensitivity)
-    matter = [line for line in words if not line.startswith("settling does not depend")]
-    verdict = (
-        f"{len(matter)} of {len(words)} numbers matter within 30 %."
-        if matter
-        else "None of the numbers matters within 30 %: there is nothing to gain from tuning them by hand."
-    )
-    parts: list[Any] = [
-        Picture(
-            sensitivity_figure(tuning.sensitivity),
-            "How far each number may go, by factors of up to ten, before settling moves by 1 s or 1 %, "
-            "overshoot by 0.02 K or the score by 1 %. Horizon and blocks were moved by 30 % only. Settling "
-            f"is the mean of steps and draws of the search{_cold(tuning)}.",
-        ),
-        *(Text(f"{line[0].upper()}{line[1:]}.") for line in words),
-    ]
-    return Section("Which numbers matter?", tuple(parts), verdict)
 
 
 def loop_section(run: ClosedLoop, design: Design, title: str, *, tone: str = "") -> Section:
@@ -258,19 +238,23 @@ def spec_section(tuning: Tuning) -> Section:
     ]
     design_rows: list[tuple[str, Any]] = [
         ("regulated", ", ".join(design.controlled)),
+        ("controller", kind_of(tuning.controller)),
         ("sample time [s]", design.dt),
-        ("horizon [s]", design.horizon_s),
-        ("blocks [samples]", " ".join(map(str, design.blocks))),
         *((f"range of {name}", f"{low:g} to {high:g}") for name, (low, high) in design.drive_range.items()),
         *((f"slew of {name} [1/s]", value) for name, value in design.slew_per_s.items()),
-        ("move weight", design.move),
-        ("price of travel", design.travel),
-        ("terminal weight", design.terminal),
-        ("overshoot band [degC]", design.overshoot),
-        *((f"process noise of {name}'s disturbance", sd) for name, sd in design.noise.drive.items()),
-        ("process noise of an output's disturbance", design.noise.output),
-        ("disturbances estimated", ", ".join(tuning.controller.disturbance.names)),
+        *((f"Kc, Ti [s] of {p.output} by {p.drive}", f"{p.Kc:.4g}, {p.Ti:.4g}") for p in design.loops),
     ]
+    if isinstance(tuning.controller, Controller):
+        design_rows += [
+            ("horizon [s]", design.horizon_s),
+            ("blocks [samples]", " ".join(map(str, design.blocks))),
+            ("move weight", design.move),
+            ("terminal weight", design.terminal),
+            ("overshoot band [degC]", design.overshoot),
+            *((f"process noise of {name}'s disturbance", sd) for name, sd in design.noise.drive.items()),
+            ("process noise of an output's disturbance", design.noise.output),
+            ("disturbances estimated", ", ".join(tuning.controller.disturbance.names)),
+        ]
     parts = tuple(
         Table(head, tuple((words, short(value)) for words, value in rows), caption)
         for head, rows, caption in (
@@ -305,7 +289,7 @@ def _listed(value: Any) -> str:
 
 
 def session_sections(
-    session: Session, moves: list[tuple[float, Move]], controller: Controller, rig: str
+    session: Session, moves: list[tuple[float, Move]], controller: Controller | PIController, rig: str
 ) -> list[Section]:
     """Return the report of a session on ``rig`` (in words): its events, its grasp, and its closed loop as the
     sensors read it, from the moves that ``RecordedController`` kept and within the controller's limits."""
@@ -350,7 +334,7 @@ def _contact_section(grasps: Grasps, contact: float) -> Section:
 
 def _trade(rows: list[dict[str, Any]]) -> str:
     """Return the sentence of the two ends of the front."""
-    front = [row for row in rows if row["best"] and row["controller"] == "MPC"]
+    front = [row for row in rows if row["best"]]
     if not front:
         return "No design settled on all draws."
     fast = min(front, key=lambda row: row["settle_s"])
@@ -374,7 +358,7 @@ def _before_the_last_column(spec: Spec) -> str:
     if spec.ramps:
         return (
             "Before the last column no drive inside its limits brings the output into the band, or the ramp "
-            "has not brought the target there; PI and LQR take the target at once."
+            "has not brought the target there; a PI takes the target at once."
         )
     return (
         "Before the last column no drive inside its limits brings the output into the band, whatever the "

@@ -216,9 +216,8 @@ def steps_chart(runs: Mapping[str, ClosedLoop]) -> Chart:
     below: dict[str, list[Curve]] = {step: [] for step in steps}
     for title, run in runs.items():
         step, controller = title.rsplit(", ", 1)
-        # the one under another is broader, so that it shows where both do the same
-        looks = {"MPC": (PALETTE[5], 3.2, "-"), "LQR": (TARGET, 1.1, ":")}
-        colour, width, dash = looks.get(controller, (PALETTE[1], 1.4, "--"))
+        # the MPC is broader, so that it shows where both do the same
+        colour, width, dash = (PALETTE[5], 3.2, "-") if controller == "MPC" else (PALETTE[1], 1.4, "--")
         for name, target in run.target.items():
             if not any(curve.label == "target" for curve in above[step]):
                 above[step].append(Curve("target", run.sample_time, target, SOFT, 1.0, "-.", step=True))
@@ -228,8 +227,7 @@ def steps_chart(runs: Mapping[str, ClosedLoop]) -> Chart:
             for drive in run.drive.values()
         ]
     columns = tuple(
-        (Panel("temperature [degC]", tuple(above[s]), f"{s} degC", 2.2), Panel("drive", tuple(below[s])))
-        for s in steps
+        (Panel("temperature [degC]", tuple(above[s]), s, 2.2), Panel("drive", tuple(below[s]))) for s in steps
     )
     return Chart(columns, wide=3.6)
 

@@ -133,7 +133,7 @@ def _tune(
     out: Path, plant: Plant, seed: int, workers: Workers, progress: Progress | None
 ) -> tuple[Tuning, Sequence[Check]]:
     """Tune on few whole draws with few evaluations, and review the controller as its file has it."""
-    from thermogrip.mpc.controllers.mpc import Controller
+    from thermogrip.mpc.controllers.controller_file import load_controller
     from thermogrip.mpc.design.spec import Spec
     from thermogrip.mpc.tuning.design_review import review
     from thermogrip.mpc.tuning.tune import tune
@@ -141,10 +141,10 @@ def _tune(
     spec = Spec(steps=list(STEPS), evaluations=6, search_draws=1, check_draws=2)
     # plants that lack structure would take twice the time, to the same design
     spec = spec.model_copy(update={"extra_lag": 0.0, "extra_delay": 0.0, "lost_gain": 0.0})
-    tuning = tune(plant, spec, seed=seed, workers=workers, progress=progress)
+    tuning = tune(plant, spec, seed=seed, progress=progress)
     tuning.save(out / "controller.json")
     # what `thermogrip review` will say of the file, which holds some of the posterior's draws
-    return tuning, review(Controller.load(out / "controller.json"))
+    return tuning, review(load_controller(out / "controller.json"))
 
 
 def _run(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pickle
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -23,10 +22,8 @@ from thermogrip.mpc.design.design import (
     pair_loops,
     simc,
 )
-from thermogrip.mpc.design.spec import Spec
 from thermogrip.mpc.plant.prediction import step_response
 from thermogrip.mpc.tuning.design_review import review
-from thermogrip.mpc.tuning.objective import Search
 from thermogrip.sysid.greybox.problem import prior_plant
 from thermogrip.sysid.models.network import load_network
 from thermogrip.sysid.models.state_space import StateSpaceModel
@@ -43,20 +40,12 @@ def sampled() -> Plant:
     return replace(plant, samples=samples)
 
 
-def test_a_controller_keeps_some_draws_and_a_worker_gets_them_all(sampled, tmp_path):
+def test_the_file_of_a_controller_keeps_some_draws(sampled, tmp_path):
     controller = Controller(sampled, default_design(sampled))
     some = read_json(controller.save(tmp_path / "c.json"), "thermogrip.controller", 1)["plant"]
     every = sampled.to_dict()
     assert (len(some["draws"]), len(every["draws"])) == (50, 400)
     assert all(row in every["draws"] for row in some["draws"])
-
-
-def test_a_search_that_travels_evaluates_the_same_draws(sampled):
-    spec = Spec(steps=[(28, 30)], hold_s=120.0, search_draws=1, check_draws=1)
-    search = Search(sampled, spec, default_design(sampled), seed=0)
-    there = pickle.loads(pickle.dumps(search))  # noqa: S301, what a process pool does
-    for draw in (*search.draws, *search.unseen):
-        assert there.plant.draw(draw).values == search.plant.draw(draw).values
 
 
 def block(

@@ -11,7 +11,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from thermogrip.mpc.controllers.lqr import LQRController
 from thermogrip.mpc.controllers.mpc import Controller
 from thermogrip.mpc.controllers.pi import PIController
 from thermogrip.mpc.controllers.reference import ReferenceController
@@ -39,7 +38,6 @@ def makers(plant: Any) -> dict[str, Callable[[], Any]]:
     made = {
         "mpc": lambda: ReferenceController(plant, design),
         "pi": lambda: PIController(plant, dt=DT),
-        "lqr": lambda: LQRController(plant, design),
     }
     return made | ({"c": lambda: Controller(plant, design)} if compiler() else {})
 
@@ -88,7 +86,7 @@ def nominal(tank) -> dict[str, dict[str, Any]]:
 
 
 @pytest.mark.parametrize("rate", RATES)
-@pytest.mark.parametrize("name", ["mpc", "pi", "lqr", "c"])
+@pytest.mark.parametrize("name", ["mpc", "pi", "c"])
 def test_at_any_rate_the_loop_is_that_of_the_sample_time(tank, nominal, name, rate):
     if name not in nominal:
         pytest.skip("no gcc here")

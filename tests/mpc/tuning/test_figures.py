@@ -16,7 +16,6 @@ from thermogrip.mpc.tuning.figures import (
     closed_loop_chart,
     closed_loop_figure,
     pareto_figure,
-    sensitivity_figure,
     step_time_figure,
 )
 
@@ -27,9 +26,9 @@ def designs() -> Any:
     row = {"settle_s": 100.0, "energy_s": 200.0, "overshoot_degC": 0.2, "best": True}
     return SimpleNamespace(rows=lambda: [
         row | {"name": "tuned", "controller": "MPC"},
-        row | {"name": "60 % of the drive", "controller": "MPC", "settle_s": 160.0, "energy_s": 90.0},
-        row | {"name": "PI, tuned", "controller": "PI", "settle_s": 130.0, "best": False},
-        row | {"name": "lost", "controller": "LQR", "settle_s": None},
+        row | {"name": "move x 4", "controller": "MPC", "settle_s": 160.0, "energy_s": 90.0},
+        row | {"name": "PI", "controller": "PI", "settle_s": 130.0, "best": False},
+        row | {"name": "lost", "controller": "PI", "settle_s": None},
     ])  # fmt: skip
 
 
@@ -44,19 +43,12 @@ def run() -> Any:
     )  # fmt: skip
 
 
-def factors() -> list[Any]:
-    item = {"knob": "move", "value": 2.0, "free_low": 1.0, "free_high": 8.0, "elasticity": 0.1}
-    ends = ({}, {"free_low": 2.0, "free_high": 2.0}, {"free_low": 2.5})
-    return [SimpleNamespace(**item | end) for end in ends]
-
-
 def test_each_figure_shows_what_it_should_in_the_colours_widths_and_units_of_the_record() -> None:
     """``figures.txt`` has every artist; THERMOGRIP_FIGURES=write writes it anew: read the difference."""
     alone: Any = SimpleNamespace(**{**vars(run()), "outputs": {"skin": run().outputs["skin"]}})
     figures: dict[str, Figure] = {
         "designs": pareto_figure(designs()),
         "step times": step_time_figure({"MPC": [0.001, 0.002, 0.0], "PI": [1e-4]}, 0.5, 1.0),
-        "factors": sensitivity_figure(factors()),
         "closed loop": closed_loop_figure(
             run(), "a run", limits={"tank": (20.0, 45.0)}, slew_per_s={"q": 0.01}
         ),

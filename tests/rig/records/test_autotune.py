@@ -13,7 +13,7 @@ import pytest
 from tests.rig.makers import DirectPort, SteppedClock, make_lab
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import column
-from thermogrip.mpc import Controller, Spec
+from thermogrip.mpc import PIController, Spec, load_controller
 from thermogrip.rig.drivers.tclab import TCLabRig
 from thermogrip.rig.guard.guard import Guard, GuardSettings
 from thermogrip.rig.interface import Rig
@@ -76,7 +76,7 @@ class Done:
     desk: Desk
     known: dict[str, Any]
     stopped: list[list[str]]  # the runs that were there at each stop
-    first_controller: Controller
+    first_controller: PIController
 
 
 @pytest.fixture(scope="module")
@@ -89,7 +89,7 @@ def tuned(tmp_path_factory: pytest.TempPathFactory) -> Done:
         stopped.append(sorted(path.name for path in desk.folder.glob("0*")))
         if when:
             tear(desk.folder / stopped[-1][-1])
-    first = Controller.load(desk.folder / "controller.json")
+    first = load_controller(desk.folder / "controller.json")
     work = desk.autotune()
     work.run()
     return Done(desk, work.known, stopped, first)
@@ -104,7 +104,7 @@ def test_a_board_that_nobody_has_seen_is_brought_to_its_target(tuned: Done) -> N
     assert known["checked"]["overshoot"] < 0.6
     assert tuned.desk.device.applied_drive == {"q1": 0.0, "q2": 0.0}
     assert max(max(moment.temperatures.values()) for moment in tuned.desk.device.trace) < LIMIT
-    assert Controller.load(tuned.desk.folder / "controller.json").notes["verdict"]
+    assert load_controller(tuned.desk.folder / "controller.json").notes["verdict"]
 
 
 def test_what_was_stopped_goes_on_with_what_is_there(tuned: Done) -> None:

@@ -1,0 +1,106 @@
+"""The file of a controller: what each kind writes, and how it is read again.
+
+A file has the kind of its controller, its design, the plant that it is of, and what the tuner found.  That of
+an MPC is as it always was, without its kind; a PI's has a newer version, so that an older thermogrip refuses
+it and does not run the MPC of its design.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from thermogrip.datasets.atomic_files import read_json, write_json
+from thermogrip.datasets.errors import UserError, reading
+from thermogrip.mpc.design.design import SCHEMA, Design
+from thermogrip.mpc.interface import FILE_VERSIONS
+
+if TYPE_CHECKING:
+    from thermogrip.mpc.controllers.mpc import Controller
+    from thermogrip.mpc.controllers.pi import PIController
+    from thermogrip.sysid.models.model import Model
+    from thermogrip.sysid.plant.plant import Plant
+
+_KEPT_DRAWS = 50  # of the posterior, for the controller's review
+
+
+class Parts(NamedTuple):
+    """What a file holds."""
+
+    kind: str  # ``"MPC"`` or ``"PI"``
+    plant: Plant
+    design: Design
+    notes: dict[str, Any]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the file's content as plain JSON."""
+        content: dict[str, Any] = {"schema": SCHEMA, "version": FILE_VERSIONS[self.kind]}
+        if self.kind != "MPC":
+            content["kind"] = self.kind
+        plant = self.plant.to_dict(draws=_KEPT_DRAWS)
+        return content | {"design": self.design.to_dict(), "notes": self.notes, "plant": plant}
+
+    def save(self, path: str | Path) -> Path:
+        """Write the file and return its path."""
+        return write_json(path, self.to_dict(), schema=SCHEMA, version=FILE_VERSIONS[self.kind])
+
+    def controller(self) -> Controller | PIController:
+        """Return the controller."""
+        from thermogrip.mpc.controllers.mpc import Controller
+        from thermogrip.mpc.controllers.pi import PIController
+
+        if self.kind == "PI":
+            return PIController.of(self.plant, self.design, notes=self.notes)
+        return Controller(self.plant, self.design, notes=self.notes)
+
+
+def load_controller(path: str | Path, *, model: Model | None = None) -> Controller | PIController:
+    """Return the controller of a file, of whatever kind.
+
+    Parameters
+    ----------
+    path : str or Path
+    model : Model, optional
+        The equations of its plant, where they are a class of the user's own; ignored otherwise.
+
+    Raises
+    ------
+    UserError
+        If the file is absent, is no controller, or its numbers make none.
+
+    Examples
+    --------
+    >>> from thermogrip.sysid import Plant, load_network
+    >>> from thermogrip.mpc import PIController, load_controller
+    >>> kit = load_network("tclab")
+    >>> p, heaters = dict(zip(kit.parameters, kit.prior)), dict.fromkeys(kit.inputs, (0.0, 100.0))
+    >>> plant = Plant(kit, p, dt=kit.dt, units=kit.units, valid=heaters)
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     path = PIController(plant, dt=5.0).save(f"{folder}/controller.json")
+    ...     type(load_controller(path)).__name__
+    'PIController'
+    """
+    # numbers each of which may be can leave no gain or no estimate together
+    with reading("its numbers make no controller", file=path, hint="tune the controller again"):
+        return read_parts(path, model=model).controller()
+
+
+def read_parts(path: str | Path, *, model: Model | None = None) -> Parts:
+    """Return what a file holds; a :class:`UserError` names what is wrong."""
+    from thermogrip.sysid.plant.plant import Plant
+
+    content = read_json(path, SCHEMA, max(FILE_VERSIONS.values()))
+    with reading("its numbers make no controller", file=path, hint="tune the controller again"):
+        kind = content.get("kind", "MPC")
+        if kind not in FILE_VERSIONS:
+            raise UserError(
+                f"kind is {kind!r:.40}, not one of {', '.join(FILE_VERSIONS)}", hint="tune it again"
+            )
+        for key in ("design", "notes", "plant"):
+            if not isinstance(content.get(key), dict):
+                raise UserError(f"{key} is missing", hint="tune the controller again")
+        equations = content["plant"].get("model")
+        own = isinstance(equations, dict) and equations.get("kind") == "own"
+        plant = Plant.from_dict(content["plant"], model=model if own else None)
+        return Parts(kind, plant, Design.from_dict(content["design"]), content["notes"])
