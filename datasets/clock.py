@@ -46,6 +46,7 @@ _MONOTONE = 0.9  # share of a clock's steps that do not run backward, and that a
 _EVEN = 0.2  # of their median, by which nearly even steps differ
 _COUNTS_APART, _MICROSECONDS_APART = 20.0, 1e5  # see the module's text
 _PIECE_ROWS = 20  # of a part of a log that stands alone
+_ELAPSED = " as minutes and seconds"  # how times of two numbers are taken that begin at 00:00 or pass 23
 _MONTH_NAMES = ("jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec")
 _MONTHS = {month: str(number) for number, month in enumerate(_MONTH_NAMES, 1)}
 
@@ -105,7 +106,8 @@ def _of_text(header: str, table: Table) -> Clock | None:
     seconds, how = read
     zero = float(seconds[np.isfinite(seconds).argmax()])
     note = f"time: {' and '.join(parts)} counted from the first row, {cells[0]}{how}"
-    return Clock(seconds - zero, frozenset(parts), (note,), zero)
+    doubt = f"{header} is taken{how}; --dt S sets another step" if how == _ELAPSED else ""
+    return Clock(seconds - zero, frozenset(parts), (note,), zero, doubt)
 
 
 def _of_numbers(header: str, table: Table, read: tuple[str, str, float]) -> Clock | None:
@@ -222,6 +224,8 @@ def read_clock(cells: Sequence[str]) -> tuple[Floats, str] | None:
     minute = minute - np.nan_to_num(np.asarray(shift.where(offset[0] == "+", -shift), dtype=float))
     of_day = 3600 * hour + 60 * minute + second
     of_day[parts[[1, 4]].isna().all(axis=1)] = np.nan
+    if parts[1].isna().all() and parts[6].isna().all() and (hour.max() > 23 or not (hour[0] or minute[0])):
+        return 60 * hour + minute, _ELAPSED
     if parts[1].isna().all():
         steps = np.diff(of_day, prepend=of_day[0])
         return of_day + 86400.0 * np.cumsum(np.nan_to_num(steps) < -43200), ""

@@ -365,7 +365,7 @@ def _states_as_columns(table: Table, clock: Clock) -> Table:
     numbers, text, notes = dict(table.numbers), dict(table.text), []
     for header in [header for header in table.text if header not in clock.columns]:
         counts = Counter(cell for cell in text[header] if cell)
-        if not 2 <= len(counts) <= MOST_STATES or len(text[header]) < 5 * len(counts):
+        if not 2 <= len(counts) <= MOST_STATES or counts.total() < 5 * len(counts):
             continue
         cells = text.pop(header)
         rest = next(

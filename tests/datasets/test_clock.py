@@ -184,6 +184,18 @@ def test_a_kiln_s_log_keeps_the_reading_that_has_a_blank_before_its_sign(tmp_pat
     np.testing.assert_allclose(column(log, "oven_temp"), np.round(PLATE[:60], 2))
 
 
+def test_a_roaster_s_minutes_and_seconds_are_its_clock_and_its_events_no_states(tmp_path):
+    events = {5: "Charge", 40: "Dry End", 90: "Drop"}
+    rows = [
+        f"{k // 60:02}:{k % 60:02}\t{PLATE[k]:.2f}\t{events.get(k, '')}\t{60 + 20 * (k // 40 % 2)}\n"
+        for k in range(120)
+    ]
+    (tmp_path / "roast.csv").write_text("Time1\tBT_degC\tEvent\tGas_percent\n" + "".join(rows))
+    log = read_log(tmp_path / "roast.csv")
+    assert (float(log["time"][-1]), list(log)) == (119.0, ["BT", "Gas"])
+    assert "Time1 is taken as minutes and seconds" in log.attrs["clock_doubts"]
+
+
 def test_a_hub_s_switch_is_read_though_its_words_are_few_beside_the_readings(tmp_path):
     moment = "2024-02-11T06:{:02}:{:02}.000Z"
     readings = [f"sensor.hall,{PLATE[k]:.2f},{moment.format(k // 60, k % 60)}\n" for k in range(120)]
