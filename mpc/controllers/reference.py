@@ -52,7 +52,7 @@ from thermogrip.mpc.estimator.reading_checks import ReadingMonitor, is_off
 from thermogrip.mpc.interface import Move, Readings, Trajectory
 from thermogrip.mpc.native.shared_constants import CAUTION, MOST_CAUTION, STAYS, WEAK
 from thermogrip.mpc.optimiser.reach import Reach
-from thermogrip.mpc.optimiser.rti import Optimiser, Outcome, Sample
+from thermogrip.mpc.optimiser.rti import BREAKS_FAR, Optimiser, Outcome, Sample
 from thermogrip.mpc.optimiser.switching import choose
 from thermogrip.mpc.plant.prediction import prediction_model
 
@@ -277,8 +277,10 @@ class ReferenceController(SampledController):
             which, nearest = missed
             return "infeasible", advice.out_of_reach(self.controlled[which], wanted[which], nearest)
         if outcome.broken:
-            name, over = max(outcome.broken.items(), key=lambda item: item[1])
-            return "infeasible" if over > 0.5 else "ok", advice.limit_breaks(name, over)
+            units = dict(zip(self.model.outputs, self.model.unit.tolist()))
+            name, over = max(outcome.broken.items(), key=lambda item: item[1] / units[item[0]])
+            far = over > BREAKS_FAR * units[name]
+            return "infeasible" if far else "ok", advice.limit_breaks(name, over)
         if self.clock() - started > self.design.deadline_s:
             return "late", advice.TOO_LATE
         if (self._unread_s > 0).any():

@@ -76,6 +76,7 @@ _FIELDS: dict[str, tuple[bool, tuple[str, ...], str]] = {
     "least_d": (False, ("ND",), "what they may be"),
     "most_d": (False, ("ND",), ""),
     "spike": (False, ("NY",), "off its prediction a reading is a loose plug, unless it stays [degC]"),
+    "unit": (False, ("NY",), "in what figures of an output count"),
     "coldest": (False, (), "what a reading may be [degC]"),
     "hottest": (False, (), ""),
     "reach": (False, ("NB",), "samples of slew from now to the middle of a block"),
@@ -265,7 +266,7 @@ def numbers_of(controller: ControllerParts, k: Array) -> dict[str, Any]:
     rows = [model.outputs.index(name) for name in (*design.controlled, *design.limits)]
     limits = np.array(list(design.limits.values()), dtype=float).reshape(-1, 2)
     same_names = (
-        (model, "sub dt span C spike coldest hottest least_d most_d warm"),
+        (model, "sub dt span C spike unit coldest hottest least_d most_d warm"),
         (
             design,
             "move_delay iterations blocks track terminal move travel drive price overshoot "

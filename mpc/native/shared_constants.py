@@ -27,7 +27,18 @@ _SHARED: dict[ModuleType, tuple[str, ...]] = {
         *("MISS_CLIP", "STEADY_STEPS", "STRIDE", "SWEEPS", "TAKE_BACK"),
     ),
     reading_checks: (*("LEFT_OUT", "SHARE"),),
-    rti: ("BARELY", "CURVED", "FADING", "FIRST", "LITTLE", "LOOK_AROUND", "SAFE", "SHARES"),
+    rti: (
+        "BARELY",
+        "BREAKS",
+        "BREAKS_FAR",
+        "CURVED",
+        "FADING",
+        "FIRST",
+        "LITTLE",
+        "LOOK_AROUND",
+        "SAFE",
+        "SHARES",
+    ),
 }
 
 

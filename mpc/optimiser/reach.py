@@ -16,14 +16,15 @@ one such step.  Where the plant integrates there may be no answer, and then the 
 
 P_w is right while the innovations are white: sigma is multiplied by the mean normalised innovation of the
 last samples, in its own standard deviations, where that is above 1 (while a large bias is being learnt it is
-10 and more).  Misses beyond 0.1 degC then sum up as in Page's test,
+10 and more).  Misses beyond a tenth of an output's unit (:func:`thermogrip.mpc.plant.prediction.unit_of`)
+then sum up as in Page's test,
 
-    S+ = max(0, S + min((miss - 0.1) / sigma, 2) - 1/2),    unreachable at S >= 3:
+    S+ = max(0, S + min((miss - unit / 10) / sigma, 2) - 1/2),    unreachable at S >= 3:
 
 two samples where the target is out of reach by 2 sigma, more where it is by less.
 
-**The design's answer.**  A target that lies more than 0.1 degC beyond its output's own limits is reported at
-once: those are known.
+**The design's answer.**  A target that lies more than a tenth of a unit beyond its output's own limits is
+reported at once: those are known.
 
 A target is asked about until five samples in a row say that it can be held, then no more until it moves:
 that a load takes it out of reach later, :mod:`thermogrip.mpc.controllers.loop_monitor` says.  Where no steady
@@ -48,10 +49,10 @@ Mask = NDArray[np.bool_]
 
 STEADY_STEPS, SWEEPS = 12, 200
 STRIDE = 0.3  # of its range, that a drive may go in a step
-CONVERGED = 1e-4  # degC and of the range: the steady state is found
+CONVERGED = 1e-4  # of the largest unit, and of the range: the steady state is found
 BEYOND_LIMIT = 100.0  # weight of an output beyond its limits
-CANNOT, CAN = 0.1, 0.05  # degC from the target: it cannot be had, it can
-LEAST_SD = 0.05  # degC, of a steady output where no bias is estimated
+CANNOT, CAN = 0.1, 0.05  # of its unit that an output is from the target: it cannot be had, it can
+LEAST_SD = 0.05  # of its unit, of a steady output where no bias is estimated
 MISS_CLIP, MISS_ALLOWANCE, MISS_ALARM = 2.0, 0.5, 3.0  # of Page's test
 TAKE_BACK = 5  # samples in a row
 
@@ -98,22 +99,23 @@ class Reach:
             self._target, self._sum, self._in, self._unreachable = target.copy(), 0.0, 0, False
         if self._in >= TAKE_BACK and not self._unreachable:
             return None
-        limit, lost = CAN if self._unreachable else CANNOT, False
-        if np.any(np.abs(target - ahead)[seen] > limit):
+        unit = self.model.unit[self._rows]
+        limit, lost = unit * (CAN if self._unreachable else CANNOT), False
+        if np.any(seen & (np.abs(target - ahead) > limit)):
             held, J = self._held(observer, u, d + observer.disturbance_bias, target, side, seen)
             lost = held is target and self._sum >= MISS_ALARM  # none was found
         else:
             held, J = target, np.zeros((len(target), observer.w.size))
         w_at = slice(self.model.n_x, self.model.n_x + observer.w.size)
         P = observer.estimate()["P"][w_at, w_at]
-        sd = np.maximum(np.sqrt(np.einsum("ij,jk,ik->i", J, P, J)), LEAST_SD)
+        sd = np.maximum(np.sqrt(np.einsum("ij,jk,ik->i", J, P, J)), LEAST_SD * unit)
         miss = np.where(seen, np.abs(target - held), 0.0)
-        scaled = (miss - CANNOT) / (sd * max(1.0, observer.innovation_bias))
+        scaled = (miss - CANNOT * unit) / (sd * max(1.0, observer.innovation_bias))
         if not lost:
             step = float(np.clip(scaled.max(), -1, MISS_CLIP)) - MISS_ALLOWANCE
             self._sum = min(max(0.0, self._sum + step), MISS_ALARM)
         allowed = np.clip(target, *self._own)
-        barred = seen & (np.abs(target - allowed) > CANNOT)
+        barred = seen & (np.abs(target - allowed) > CANNOT * unit)
         out = (miss > limit) | barred
         self._in = 0 if out.any() or lost else self._in + 1
         if self._unreachable:
@@ -158,7 +160,8 @@ class Reach:
             high = np.maximum(np.minimum((high - u_s) / model.span, STRIDE), low)
             z = self._nearest(G, y, target, side, seen, low, high)
             x_s, u_s = x_s + by[:, 0] + by[:, 1 : 1 + model.n_u] @ z, u_s + z * model.span
-            if np.max(np.abs(by[:, 0])) < CONVERGED and np.max(np.abs(z)) < CONVERGED:
+            moved = max(np.max(np.abs(by[:, 0])) / model.unit.max(), np.max(np.abs(z)))
+            if moved < CONVERGED:
                 self._x, self._u = x_s, u_s
                 return (y + G @ z)[rows], (model.C @ by[:, 1 + model.n_u :] + found.on_output)[rows]
         return nothing
@@ -168,6 +171,7 @@ class Reach:
     ) -> Array:
         """Return the change z (n_u,) of the drives, in ranges, that brings the outputs y nearest."""
         rows, limited = self._rows, self._limited
+        near, near_limit = CAN * self.model.unit[rows], CAN * self.model.unit[limited]
         weight = np.where(seen, 1.0, 0.0)
         over = np.zeros(len(limited))  # +1 where the upper limit is in force, -1 the lower
         z = np.zeros(len(low))
@@ -182,9 +186,9 @@ class Reach:
             z = _least_squares_in_box(own, e, low, high)
             new = y + G @ z
             before = weight, over
-            weight = np.where(seen & (side * (new[rows] - target) > CAN), self._beyond, weight)
-            over = np.where(new[limited] > self._limits[1] + CAN, 1.0, over)
-            over = np.where(new[limited] < self._limits[0] - CAN, -1.0, over)
+            weight = np.where(seen & (side * (new[rows] - target) > near), self._beyond, weight)
+            over = np.where(new[limited] > self._limits[1] + near_limit, 1.0, over)
+            over = np.where(new[limited] < self._limits[0] - near_limit, -1.0, over)
             if np.array_equal(weight, before[0]) and np.array_equal(over, before[1]):
                 break  # another pass is the same
         return z

@@ -71,6 +71,8 @@ FIRST = 0.2
 _DEAR = 1000.0  # times the price of a soft limit, of a hard one
 #: Square of a move beside the move, in the price of travel: the program's penalties may not be flat.
 CURVED = 0.01
+#: Of its unit, by which an output breaks its limit: it is reported, and the target cannot be had.
+BREAKS, BREAKS_FAR = 0.1, 0.5
 BARELY = 1.02  # a plan that is hardly better than the QP's is not worth a jump
 
 
@@ -99,7 +101,7 @@ class Outcome:
     plan: Array  # (n_b, n_u) drives by block; NaN where the solve failed
     y: Array  # (N, n_y) the outputs predicted under that plan, before any output bias
     status: str  # the solver's, ``"solved"`` where all is well
-    # by how much a limit of an output will be broken [degC], where it is by more than 0.1
+    # by how much a limit of an output will be broken [degC], where it is by more than BREAKS of its unit
     broken: dict[str, float]
     iterations: int
     # (n_u,) response of the controlled outputs to each drive's next block, over that at rest: below 0 the
@@ -496,7 +498,7 @@ class Optimiser:
         for at, (name, row) in enumerate(zip(self.design.limits, self._limited)):
             low, high = self._limits[at].tolist()
             over = float(max(low - y[:, row].min(), y[:, row].max() - high))
-            if over > 0.1:
+            if over > BREAKS * self.model.unit[row]:
                 found[name] = over
         return found
 

@@ -2,8 +2,8 @@ r"""The plant at the controller's sample time: prediction, linearisation along a
 
 A plant is x+ = f(x, u, d; p) at its native step.  A controller moves every dt = n native steps with u
 held, so one sample is f composed n times, or fewer times at a longer step where that changes the prediction
-by less than 0.01 degC.  Delay needs no special case: it is in the model's states (the water in the
-tubes), and so in the prediction.
+by less than a hundredth of an output's unit (:func:`unit_of`).  Delay needs no special case: it is in the
+model's states (the water in the tubes), and so in the prediction.
 
 The optimiser needs the predicted outputs and how they answer to the plan.  With the plan held over blocks,
 u_k = v_b for k in block b, the outputs are linearised **along the predicted trajectory** [1]_:
@@ -94,7 +94,7 @@ def drive_range(plant: Plant, name: str) -> tuple[float, float]:
     return float(low), float(high)
 
 
-_STEP_ERROR = 0.01  # degC, of the prediction by a coarser step
+_STEP_ERROR = 0.01  # of an output's unit, of the prediction by a coarser step
 #: The room's temperature where nothing is known of it [degC].
 ROOM = 25.0
 #: Readings outside, and beyond twice what the logs showed, are a broken wire [degC].
@@ -104,7 +104,7 @@ SPIKE = 6.0
 # of a disturbance that is no temperature, in ranges of the logs: how far outside none is, what is no change
 _FAR, _CLOSE = 10.0, 0.02
 _ANY = 1e30
-_NEAR = 5.0  # degC from what the logs showed, where a black box still knows what it does
+_NEAR = 5.0  # units from what the logs showed, where a black box still knows what it does
 
 
 #: A state and the drives that hold it, of a model by controlled outputs, start and disturbances.
@@ -177,9 +177,9 @@ class PredictionModel:
         self.sub = self._fewest_steps()
 
     def _fewest_steps(self) -> int:
-        """Return into how few steps a sample may be cut with a full swing of the drives within 0.01 degC: an
-        implicit network is as good for control at four times its own step, and a controller's time goes into
-        these."""
+        """Return into how few steps a sample may be cut with a full swing of the drives within a hundredth of
+        the outputs' units: an implicit network is as good for control at four times its own step, and a
+        controller's time goes into these."""
         own = self.sub
         d = self.undisturbed(ROOM)
         x = self.rest(self.usual(ROOM), d)[None, :]
@@ -188,7 +188,7 @@ class PredictionModel:
         for steps in range(1, own):
             if own % steps == 0:
                 self.sub = steps
-                if np.max(np.abs(self.run(x, plan, d)[0] - exact)) < _STEP_ERROR:
+                if np.max(np.abs(self.run(x, plan, d)[0] - exact) / self.unit) < _STEP_ERROR:
                     return steps
         self.sub = own
         return own
@@ -224,7 +224,8 @@ class PredictionModel:
         """Return outputs (n_y,) that are as warm as the room [degC], or the middle of what the logs showed of
         those that never were."""
         low, high = self._seen.T
-        away = (ambient < low - _NEAR) | (ambient > high + _NEAR)
+        far = _NEAR * self.unit
+        away = (ambient < low - far) | (ambient > high + far)
         return np.asarray(np.mean(np.where(away, self._seen.T, ambient), axis=0), dtype=np.float64)
 
     def output(self, x: ArrayLike) -> Array:
@@ -659,7 +660,7 @@ def holding_drive(
     return Holding(u, y, float(np.max(np.abs(miss(found.x)))))
 
 
-_HELD = 0.25  # degC: a start that drives miss by less is held
+_HELD = 0.25  # of an output's unit: a start that drives miss by less is held
 
 
 def held_start(
@@ -683,7 +684,8 @@ def _held_start(
     if not np.isfinite(x).all():  # an integrator
         x, u = _balance(model, [model.outputs.index(name) for name in controlled], wanted, np.array(d))
         held = replace(held, miss=held.miss if np.all((model.lowest <= u) & (u <= model.highest)) else np.inf)
-    if held.miss < _HELD and np.isfinite(x).all():
+    unit = model.unit[[model.outputs.index(name) for name in controlled]].min()
+    if held.miss < _HELD * unit and np.isfinite(x).all():
         return np.asarray(x), u
     return model.rest(np.full(model.n_y, start), d), None
 

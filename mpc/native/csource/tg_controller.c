@@ -546,7 +546,7 @@ static void aim(tg_controller *c, double *kept)
 static double missed_by(tg_controller *c)
 {
     const tg_design *s = c->design;
-    double limit, held[TG_NC] = {0.0}, by_w[TG_NC * TG_SOME(TG_NW)] = {0.0};
+    double limit, unit, held[TG_NC] = {0.0}, by_w[TG_NC * TG_SOME(TG_NW)] = {0.0};
     double d[TG_SOME(TG_ND)] = {0.0}, on_u[TG_NU], on_y[TG_NY], scaled = -1.0, worst = 0.0, inflation = 1.0;
     double kept[TG_NC];
     int away = 0, out = 0, alarm = 0, lost = 0;
@@ -555,10 +555,11 @@ static double missed_by(tg_controller *c)
         memcpy(c->target, kept, sizeof kept);
         return 0.0;
     }
-    limit = c->unreachable ? TG_CAN : TG_CANNOT;
+    limit = c->unreachable ? TG_CAN : TG_CANNOT; /* of an output's unit */
     for (int r = 0; r < s->n_c; r++)
         away = away || (!(c->unread_s[r] > 0.0) &&
-                        fabs(c->target[r] - c->y_best[(s->N - 1) * TG_NY + s->controlled[r]]) > limit);
+                        fabs(c->target[r] - c->y_best[(s->N - 1) * TG_NY + s->controlled[r]]) >
+                            limit * s->unit[s->controlled[r]]);
     if (away) {
         tg_biases(c, on_u, d, on_y);
         for (int i = 0; i < TG_ND; i++)
@@ -573,18 +574,20 @@ static double missed_by(tg_controller *c)
     for (int r = 0; r < s->n_c; r++) {
         const double *J = by_w + r * TG_SOME(TG_NW);
         double sd = 0.0, miss, beyond = fabs(c->target[r] - own_limit(c, r));
-        int is_barred = beyond > TG_CANNOT;
+        int is_barred;
+        unit = s->unit[s->controlled[r]];
+        is_barred = beyond > TG_CANNOT * unit;
         if (c->unread_s[r] > 0.0)
             continue;
         for (int i = 0; i < TG_NW; i++)
             for (int j = 0; j < TG_NW; j++)
                 sd += J[i] * J[j] * c->P[(TG_NX + i) * TG_Z + TG_NX + j];
-        sd = fmax(sqrt(fmax(sd, 0.0)), TG_LEAST_SD);
+        sd = fmax(sqrt(fmax(sd, 0.0)), TG_LEAST_SD * unit);
         miss = away ? fabs(c->target[r] - held[r]) : 0.0;
-        scaled = fmax(scaled, (miss - TG_CANNOT) / (sd * inflation));
-        out = out || miss > limit || is_barred;
+        scaled = fmax(scaled, (miss - TG_CANNOT * unit) / (sd * inflation));
+        out = out || miss > limit * unit || is_barred;
         alarm = alarm || is_barred;
-        miss = miss > limit ? miss : 0.0;
+        miss = miss > limit * unit ? miss : 0.0;
         beyond = is_barred ? beyond : 0.0;
         if (fmax(miss, beyond) > worst) {
             worst = fmax(miss, beyond);
@@ -688,8 +691,8 @@ static void decide(tg_controller *c, tg_move *move)
         move->advice = TG_OUT_OF_REACH;
         move->which = c->missing;
         move->over = missed;
-    } else if (c->broken > 0.1) {
-        move->status = c->broken > 0.5 ? TG_INFEASIBLE : TG_OK;
+    } else if (c->broken > TG_BREAKS * s->unit[c->breaks]) {
+        move->status = c->broken > TG_BREAKS_FAR * s->unit[c->breaks] ? TG_INFEASIBLE : TG_OK;
         move->advice = TG_LIMIT_BREAKS;
         move->which = c->breaks;
         move->over = c->broken;

@@ -437,18 +437,18 @@ static void nearest(const tg_controller *c, const double *G, const double *y, co
         changed = 0;
         for (int r = 0; r < rows; r++) {
             int i = r < s->n_c ? s->controlled[r] : s->limited[r - s->n_c];
-            double value = y[i], before = r < s->n_c ? weight[r] : over[r];
+            double value = y[i], before = r < s->n_c ? weight[r] : over[r], near = TG_CAN * s->unit[i];
             for (int j = 0; j < TG_NU; j++)
                 value += G[i * TG_NU + j] * z[j];
             if (r < s->n_c) {
-                if (weight[r] > 0.0 && c->side[r] * (value - c->target[r]) > TG_CAN)
+                if (weight[r] > 0.0 && c->side[r] * (value - c->target[r]) > near)
                     weight[r] = sqrt(s->price * (TG_FIRST + 1.0) / s->track); /* what 1 degC costs the optimiser */
                 changed = changed || weight[r] != before;
                 continue;
             }
-            if (value > s->limit_high[r - s->n_c] + TG_CAN)
+            if (value > s->limit_high[r - s->n_c] + near)
                 over[r] = 1.0;
-            if (value < s->limit_low[r - s->n_c] - TG_CAN)
+            if (value < s->limit_low[r - s->n_c] - near)
                 over[r] = -1.0;
             weight[r] = over[r] != 0.0 ? TG_BEYOND_LIMIT : 0.0;
             changed = changed || over[r] != before;
@@ -512,7 +512,10 @@ int tg_find_steady(tg_controller *c, const double *d, const double *on_u, const 
     const tg_design *s = c->design;
     double x[TG_NX], u[TG_NU], X[TG_NX * SIDES] = {0.0};
     double G[TG_NY * TG_NU] = {0.0}, y[TG_NY] = {0.0}, low[TG_NU] = {0.0}, high[TG_NU] = {0.0}, z[TG_NU] = {0.0};
+    double largest = 0.0;
     int found = 0;
+    for (int i = 0; i < TG_NY; i++)
+        largest = fmax(largest, s->unit[i]);
     memcpy(x, c->has_steady ? c->steady_x : tg_now(c), sizeof x);
     memcpy(u, c->has_steady ? c->steady_u : c->u, sizeof u);
     c->has_steady = 0;
@@ -530,7 +533,7 @@ int tg_find_steady(tg_controller *c, const double *d, const double *on_u, const 
         range_of(s, G, u, on_u, low, high);
         nearest(c, G, y, low, high, z);
         for (int i = 0; i < TG_NX && !s->settles; i++) {
-            moved = fmax(moved, fabs(X[i * SIDES]));
+            moved = fmax(moved, fabs(X[i * SIDES]) / largest);
             x[i] += X[i * SIDES];
             for (int j = 0; j < TG_NU; j++)
                 x[i] += X[i * SIDES + 1 + j] * z[j];

@@ -597,17 +597,16 @@ static void try_others(tg_controller *c, const double *x, const double *guess, c
 static void find_broken(tg_controller *c)
 {
     const tg_design *s = c->design;
-    double most = 0.0;
+    c->broken = 0.0;
     for (int r = 0; r < s->n_l; r++)
         for (int k = 0; k < s->N; k++) {
-            double value = c->y_best[k * TG_NY + s->limited[r]];
+            double value = c->y_best[k * TG_NY + s->limited[r]], unit = s->unit[s->limited[r]];
             double over = fmax(s->limit_low[r] - value, value - s->limit_high[r]);
-            if (over > most) {
-                most = over;
+            if (over / unit > c->broken / s->unit[c->breaks]) {
+                c->broken = over;
                 c->breaks = s->limited[r];
             }
         }
-    c->broken = most;
 }
 
 static void set_prices(const tg_design *s, tg_qp *q)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.optimize import lsq_linear
 
-from tests.mpc.makers import crossed
+from tests.mpc.makers import WAYS, crossed
 from thermogrip.mpc.closed_loop.simulate import simulate_closed_loop
 from thermogrip.mpc.closed_loop.simulate_native import compiled_loop
 from thermogrip.mpc.controllers.mpc import Controller
@@ -21,6 +21,8 @@ from thermogrip.mpc.native.runtime import wanted
 from thermogrip.mpc.optimiser.reach import Reach, _least_squares_in_box
 from thermogrip.mpc.optimiser.rti import Optimiser
 from thermogrip.mpc.plant.prediction import PredictionModel
+from thermogrip.sysid.models.state_space import StateSpaceModel
+from thermogrip.sysid.plant.plant import Plant
 
 LIMIT = {"t_tank": (8.0, 50.0)}
 OWN = {"t_surface": (20.0, 48.0)}  # of what is controlled
@@ -90,6 +92,26 @@ def test_a_target_out_of_reach_is_reported_soon_and_kept_and_no_other_is(row, ta
         compiled = compiled_loop(Controller(plant, design), truth, schedule)
         assert compiled.status == loop.status
         np.testing.assert_allclose(compiled.drive["drive"], loop.drive["drive"], atol=1e-5)
+
+
+@pytest.mark.parametrize("make", WAYS)
+@pytest.mark.parametrize(
+    ("gain", "beyond", "status"),
+    [(2.0, 0.06, "infeasible"), (2.0, 0.003, "ok"), (300.0, 0.4, "ok"), (300.0, 2.0, "infeasible")],
+)
+def test_what_is_out_of_reach_counts_in_the_unit_of_its_output(make, gain, beyond, status):
+    """A mount whose logs span 2 K, unit 0.05, and a kiln of 300 K, unit 5: a tenth of it is near enough."""
+    a = float(np.exp(-0.05))
+    model = StateSpaceModel(("q",), (), ("t",), A=[[a]], B=[[gain * (1 - a)]], C=[[1.0]], dt=5.0, y0=[25.0])
+    valid = {"q": (0.0, 1.0), "t": (25.0, 25.0 + gain)}
+    plant = Plant(model, {}, dt=5.0, units={"q": "1", "t": "degC"}, valid=valid, noise={"t": 1e-4 * gain})
+    controller = make(plant, default_design(plant, dt=5.0, deadline_s=1e9))
+    x, target = np.zeros(1), 25.0 + gain + beyond
+    controller.reset({"t": 25.0})
+    for _ in range(120):
+        move = controller.step({"t": 25.0 + x[0]}, target)
+        x = a * x + gain * (1 - a) * move.drive
+    assert move.status == status
 
 
 # ---- its parts, by hand ----
