@@ -1,17 +1,16 @@
-r"""What somebody beside a loop may say of it: it swings, does not arrive, or its plant is another.
+r"""What somebody beside a loop may say of it: it swings, a sensor has stopped, or its plant is another.
 
 A controller controls; a monitor is fed what was read, asked and moved, outside of the step and its deadline,
 whatever the law, and has a filter of its own.  Its words name a load where one would look the same, and are
 taken back when their evidence goes.
 
-**Arrival.**  Of the first-order plant with gain K, lag T and apparent delay L that its step response is, the
+**Settling.**  Of the first-order plant with gain K, lag T and apparent delay L that its step response is, the
 loop of a PI has the poles of
 
     T s^2 + (1 + K Kc) s + K Kc / Ti = 0,
 
 and with the slowest of them, 1 / t, it is there in L + 4 t (2 % are left); a predictive controller is held to
-the PI by Skogestad's rule.  While a drive is at its limit no time counts; else
-:mod:`thermogrip.mpc.estimator.arrival` has the rule.
+the PI by Skogestad's rule.
 
 **Limits.**  Where a drive is within 1 % of its range of its limit, on the side to which the error drives it,
 the plant has nothing but its own lag.  On the way to a rest at or beyond the target the distance falls by
@@ -22,7 +21,8 @@ driven by another plant or a load.
 **Another plant.**  A drive whose estimated bias is beyond 30 % of its range, or an output's beyond a third of
 a jump (:mod:`thermogrip.mpc.estimator.reading_checks`), for as long as the loop takes to arrive: a draw is
 over by then.  Where the plant has a posterior, :mod:`thermogrip.mpc.estimator.structure_monitor` says what
-its model lacks.
+its model lacks.  What a drive does from target to target, and which reading should have moved,
+:mod:`thermogrip.mpc.estimator.fault_monitors` says of any plant.
 
 **Swings.**  :mod:`thermogrip.mpc.estimator.oscillation`.
 """
@@ -37,8 +37,8 @@ import numpy as np
 
 from thermogrip.datasets.arrays import Array, Mask
 from thermogrip.mpc.design.design import Design, PILoop
-from thermogrip.mpc.estimator.arrival import ArrivalMonitor
 from thermogrip.mpc.estimator.call_times import RESTART_S, SAME
+from thermogrip.mpc.estimator.fault_monitors import GainMonitor, StuckMonitor
 from thermogrip.mpc.estimator.oscillation import OscillationMonitor
 from thermogrip.mpc.estimator.reading_checks import follows
 from thermogrip.mpc.estimator.structure_monitor import StructureMonitor
@@ -118,10 +118,11 @@ class LoopMonitor:
         self._side = np.sign([p.Kc for p in self.loops])
         self._delay, self._lag = np.array([[a.delay, a.lag] for a in answers]).reshape(n, 2).T
         self._zone = np.array([design.zones.get(p.output, 0.0) for p in self.loops])
-        outputs = [p.output for p in self.loops]
+        self.names = tuple(p.output for p in self.loops)
         allowed = 2.0 * design.overshoot
-        self.swings = OscillationMonitor(outputs, model.dt, self._delay.tolist(), [allowed] * n)
-        self.arrival = ArrivalMonitor(outputs, model.dt, np.full(n, allowed))
+        self.swings = OscillationMonitor(self.names, model.dt, self._delay.tolist(), [allowed] * n)
+        self.gain = GainMonitor(model.drives, float(np.max(self._promised, initial=0.0)))
+        self.stuck = StuckMonitor(model.outputs)
         self.observer = design.observer(model)
         self.structure = StructureMonitor(plant, model, self.controlled)
         self.forget()
@@ -133,12 +134,13 @@ class LoopMonitor:
         self._u: Array | None = None
         self.swings.forget()
         self.structure.forget()
+        self.gain.forget()
+        self.stuck.forget()
         self._restart()
 
     def _restart(self) -> None:
         """Begin anew, as towards a new target."""
         n = len(self.loops)
-        self.arrival.restart()
         self._target = np.full(n, np.nan)
         self._error = np.full(n, np.nan)  # mean of the last errors
         self._limited_s, self._away_s, self._strange_s = np.zeros(n), np.zeros(n), 0.0
@@ -180,6 +182,8 @@ class LoopMonitor:
         if self._u is None or seconds > RESTART_S + self.model.dt:
             observer.reset(y, d)
             self.structure.restart()
+            self.gain.forget()
+            self.stuck.forget()
         else:
             observer.advance(seconds, applied, d)
             observer.look(d)
@@ -187,24 +191,28 @@ class LoopMonitor:
         if self._u is not None and abs(seconds - self.model.dt) > _EVEN * self.model.dt:
             self.structure.restart()
         self.structure.note(observer, y, applied, d)
+        self.gain.note(observer, applied, seconds)
+        self.stuck.note(observer, y, applied, d)
         return follows(observer, self.controlled)
 
     def _judge(self, y: Array, target: Array, u: Array, seconds: float, strange: str) -> str:
         """Return what is to be said after readings y and targets of the loops (n,) and drives u (n,)."""
         if np.any(target != self._target):
+            self.gain.new_target()
             self._restart()
             self._target = target.copy()
         swings = self.swings.note(y, target, seconds, self._zone.tolist())
-        self.arrival.near = near = self.swings.least
+        near = self.swings.least
         error = target - y
         begun = np.where(np.isfinite(self._error), self._error, error)
         self._error = np.where(np.isfinite(error), begun + _REMEMBER * (error - begun), begun)
         limited = self._limits(u, seconds, near)
-        overdue = self.arrival.expect(y, target, self._promised, np.where(limited, 0.0, seconds), self._zone)
-        off, names = np.abs(self._error), self.arrival.names
+        off, names = np.abs(self._error), self.names
         away = limited & (off > self._begun + near)
         self._away_s = np.where(away, self._away_s + seconds, 0.0)
         self._strange_s = self._strange_s + seconds if strange else 0.0
+        if self.stuck.said:
+            return self.stuck.said
         for which in (self._away_s > self._promised, limited & self._stalled):
             if which.any():
                 k = int(np.argmax(np.where(which, off / near, 0.0)))
@@ -212,10 +220,11 @@ class LoopMonitor:
                 does = "goes away from its target" if away[k] and not self._stalled[k] else does
                 why = "a load, or another plant than the model"
                 return f"{names[k]} {does} while {self.loops[k].drive} is at its limit: {why}"
-        if swings or overdue:
-            return "; ".join(filter(None, (swings or overdue, strange)))
+        if swings:
+            return "; ".join(filter(None, (swings, strange)))
         lasts = self._strange_s > np.max(self._promised, initial=0.0)
-        return self.structure.said or (f"{strange} or is it a load?" if strange and lasts else "")
+        other = self.structure.said or self.gain.said
+        return other or (f"{strange} or is it a load?" if strange and lasts else "")
 
     def _limits(self, u: Array, seconds: float, near: Array) -> Mask:
         """Note for how long drives have been at the limits to which errors drive them; return which are."""

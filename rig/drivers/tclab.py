@@ -246,9 +246,7 @@ class TCLabRig(NoticeBook):
             raise PortError("lost", problem, file=self.port.url, hint="start anew")
         self._known_at = self.port.opened
 
-    def _ask(
-        self, command: bytes, count: int, form: re.Pattern[bytes], *, known: bool = True
-    ) -> list[bytes]:
+    def _ask(self, command: bytes, count: int, form: re.Pattern[bytes], *, known: bool = True) -> list[bytes]:
         """Return the lines that answer a command, each of the form; three attempts, of a board that is
         ``known`` or, for what switches off, of any."""
         if self.closed:

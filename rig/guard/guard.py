@@ -25,7 +25,8 @@ and when it was there.  The rig's clock is wrong where no moments between these 
 late the program is with a reading, it is not wrong for that.  The program itself was late (*frozen*) where a
 drive stood for longer than ``expiry_s`` without being renewed (:meth:`Guard.late`); while nothing is driven
 it may take its time.  A device that ends its drives itself knows better whether that one has held: the loop
-asks it then.
+asks it then.  The model is told when a drive was applied: on a computer that is late that is long after the
+reading that it answers.
 
 **How far beyond a limit.**  A limit trips on the second accepted reading beyond it.  The loop looks at least
 every :data:`~thermogrip.rig.session.loop.LOOK_S`, whatever the sample time is, so a rig that changes by at
@@ -64,8 +65,13 @@ from math import isfinite
 from thermogrip.datasets.errors import UserError, known_names
 from thermogrip.datasets.limits import keyed
 from thermogrip.rig.guard.model_checks import ModelMonitor, ModelSettings, Residual, by_danger
-from thermogrip.rig.guard.plant_mismatch import PlantDrift
-from thermogrip.rig.guard.sensor_checks import SensorMonitor, SensorSettings, room_disturbances, room_sensors
+from thermogrip.rig.guard.sensor_checks import (
+    HOTTEST,
+    SensorMonitor,
+    SensorSettings,
+    room_disturbances,
+    room_sensors,
+)
 from thermogrip.rig.guard.trip import KINDS, Trip
 from thermogrip.rig.interface import Reading, range_of
 from thermogrip.sysid.plant.plant import Plant
@@ -73,6 +79,9 @@ from thermogrip.sysid.plant.plant import Plant
 #: A limit is not exceeded by more than this before power is off [K].
 LIMIT_MARGIN = 2.0
 
+# a reading is believed so far beyond the highest limit [K], as 75 is beyond the usual 70 degC
+_BELIEVED_BEYOND = 5.0
+_BEYOND_LOGS = 0.1  # of the logs' range: by so much a loop by SIMC overshoots a step
 _KEPT_S = 300.0
 _ROOMS = (10.0, 35.0)  # degC, where people work: an output outside was heated or cooled before the session
 _OPTIMUM_EVERY_S, _OPTIMUM_FOR_S = 10.0, 60.0
@@ -203,7 +212,7 @@ class GuardSettings:
     # of the skin's sensors, where ``limits`` does not name them [degC]
     skin_limits: tuple[float, float] = keyed((3.0, 55.0), "skin_degC", -50, 150)
     # of every other one [degC]: water that neither freezes nor scalds
-    other_limits: tuple[float, float] = keyed((-1.0, 70.0), "others_degC", -50, 150)
+    other_limits: tuple[float, float] = keyed((-1.0, 70.0), "others_degC", -50, HOTTEST)
     # the device's own time to live of a drive [s]: a longer silence of ours and it is off
     expiry_s: float = keyed(2.0, "expiry_s", 0.5, 2)
     stale_s: float = keyed(2.0, "stale_s", 0.5, 60)  # longest time without a new reading [s]
@@ -220,8 +229,34 @@ class GuardSettings:
     rules: RuleSettings = field(default_factory=RuleSettings)
     file: str = field(default="", compare=False)  # where it was read from, for messages
 
+    @classmethod
+    def of(cls, plant: Plant | None, skin: str = "t_surface") -> GuardSettings:
+        """Return what is allowed where no file says it: an output of a plant whose logs went beyond the usual
+        limits may go there again."""
+        usual = cls()
+        coldest, hottest = usual.other_limits
+        logged = {} if plant is None else {name: plant.valid.get(name) for name in plant.outputs}
+        limits = {
+            name: (coldest, ends[1] + _BEYOND_LOGS * (ends[1] - ends[0]))
+            for name, ends in logged.items()
+            if ends is not None and ends[1] > hottest and name not in (skin, f"{skin}_2")
+        }
+        return replace(usual, limits=limits)._believing()
+
+    def _believing(self) -> GuardSettings:
+        """Return these with readings believed until beyond every limit."""
+        low, high = self.sensors.plausible
+        highest = max(most for _, most in (self.other_limits, *self.limits.values()))
+        return replace(
+            self, sensors=replace(self.sensors, plausible=(low, max(high, highest + _BELIEVED_BEYOND)))
+        )
+
     def below(self, limit: float) -> GuardSettings:
-        """Return these with no sensor above a limit [degC]."""
+        """Return these with no sensor above a limit [degC] that somebody states; where no file states others,
+        it holds for all but the skin also where it is higher than usual."""
+        if not self.file and limit > self.other_limits[1]:
+            limit = min(limit, HOTTEST)
+            return replace(self, limits={}, other_limits=(self.other_limits[0], limit))._believing()
 
         def cut(ends: tuple[float, float]) -> tuple[float, float]:
             if limit <= ends[0]:
@@ -267,8 +302,6 @@ class Guard:
     settings : GuardSettings, optional
     skin : str, optional
         The output that touches objects.
-    drift : PlantDrift, optional
-        What is known of how far the rig is from its plant.
 
     Attributes
     ----------
@@ -297,11 +330,10 @@ class Guard:
         settings: GuardSettings | None = None,
         *,
         skin: str = "t_surface",
-        drift: PlantDrift | None = None,
     ) -> None:
-        self.settings = GuardSettings() if settings is None else settings
+        self.settings = GuardSettings.of(plant, skin) if settings is None else settings
         self.skin, self._ranges = skin, {} if plant is None else plant.valid
-        self.model = None if plant is None else ModelMonitor(plant, self.settings.model, drift)
+        self.model = None if plant is None else ModelMonitor(plant, self.settings.model)
         self.sensors = SensorMonitor(self.settings.sensors)
         self.rules = RuleMonitor(self.settings.rules)
         self.target: dict[str, float] = {}
@@ -322,7 +354,8 @@ class Guard:
         self._fresh = (now if asked is None else asked, now)
         self._seen = float("nan")
         self._drive, self._pump = dict.fromkeys(units, 0.0), reading.pump
-        self._acted = self._drive
+        self._acted = self._before = self._drive
+        self._pump_before, self._changed_s = self._pump, 0.0
         self._differs, self._beyond = 0, dict.fromkeys(reading.values, 0)
         if not known:
             self._released = float("-inf")
@@ -334,26 +367,18 @@ class Guard:
         self.trips = []
         self.sensors.start(reading.time_s, reading.values)
         self.rules.start()
-        if self.model is not None:
-            self.model.evidence.clear()  # of a session that did not end well
         if self.model is not None and known:
             self.model.predict(reading.time_s, dict.fromkeys(units, 0.0), 0, self._plausible(reading.values))
         elif self.model is not None:
             self.model.reset(reading.time_s, self._plausible(reading.values))
 
-    def learn(self) -> PlantDrift | None:
-        """Learn from the session that ended well; None where nothing is (any more)."""
-        if self.model is None or self.model.drift is None or not self.model.drift.learns:
-            return None
-        if self.trips or not self.model.evidence:
-            return None
-        self.model.adopt(self.model.drift.learnt(self.model.evidence))
-        return self.model.drift
-
     def applied(self, drive: Mapping[str, float], pump: int, now: float) -> None:
         """Note what was applied at the host's time ``now`` [s]."""
-        self._drive, self._pump = {name: float(value) for name, value in drive.items()}, int(pump)
-        self._renewed = now
+        applied = {name: float(value) for name, value in drive.items()}
+        if (applied, int(pump)) != (self._drive, self._pump):
+            self._before, self._pump_before = self._drive, self._pump
+            self._changed_s = now - self._fresh[1]  # since the reading
+        self._drive, self._pump, self._renewed = applied, int(pump), now
 
     def late(self, now: float) -> Trip | None:
         """Return the trip of a drive that has stood without being renewed until the host's time ``now`` [s],
@@ -513,6 +538,14 @@ class Guard:
         s, skin = self.settings, name in (self.skin, f"{self.skin}_2")
         return s.limits.get(name, s.skin_limits if skin else s.other_limits)
 
+    def check_target(self, name: str, value: float) -> None:
+        """Raise UserError where a target [degC] of a sensor is beyond its limits."""
+        low, high = self.limits_of(name)
+        if not low <= value <= high:
+            problem = f"target {value:g} degC is unsafe"
+            hint = f"choose one from {low:g} to {high:g} degC, or state the limits of {name} in a guard file"
+            raise UserError(problem, file=self.settings.file or None, hint=hint)
+
     def _masked(self, time: float) -> frozenset[str]:
         """Return the outputs that an object determines, now or lately."""
         recent = self._touched or time - self._released < self.settings.forget_s
@@ -523,7 +556,12 @@ class Guard:
         """Predict with the model and return the sensors whose innovation is too large."""
         if self.model is None:
             return frozenset()
-        self.model.predict(reading.time_s, self._acted, self._pump, self._plausible(reading.values))
+        values = self._plausible(reading.values)
+        if reading.mean_drive is None and self._changed_s > 0:
+            changed = min(self._time + self._changed_s, reading.time_s)
+            self.model.predict(changed, self._before, self._pump_before, values)
+        self._changed_s = 0.0
+        self.model.predict(reading.time_s, self._acted, self._pump, values)
         jumps = [n for n, v in reading.values.items() if isfinite(v) and self.model.is_jump(n, v)]
         return frozenset(jumps)
 

@@ -154,7 +154,7 @@ class RigModel:
         self.ranges = np.array([self._range(name) for name in self.drives]).reshape(-1, 2)
         self.half = 0.5 * (self.ranges[:, 1] - self.ranges[:, 0])
         self.offsets = np.array([plant.offsets.get(name, 0.0) for name in plant.outputs])
-        self.p = plant.p  # or better ones
+        self.p = plant.p
 
     def _range(self, name: str) -> tuple[float, float]:
         return range_of(self.plant.units.get(name, "1"), self.plant.valid.get(name)) or (-1.0, 1.0)

@@ -28,9 +28,17 @@ the effect of inputs is that from run to run it differs by 5 % of itself
 
 Of the model alone: would more cooling drive still cool?
 
-Where the user states that the rig may have drifted from its plant, windows and drive biases are evaluated
-with the uncertainty of the plant's parameters as well (:mod:`~thermogrip.rig.guard.plant_mismatch`), and the
-longest windows of a session are evidence of these parameters.
+**A rig that has drifted.**  A plant is identified on one day; a room, its water and its thermal paste are
+others on the next.  Where the user states a drift s (a share, 0.05 say), each parameter may be theta_i (1 + s
+delta_i) with delta_i uniform between -1 and 1, of variance 1/3 (of a parameter on a linear scale, whose value
+may be next to 0, s is a share of at least 0.2).  A window then ends elsewhere by G delta, G its slopes, and a
+residual is no fault where it is below
+
+    allowed + min(3 sqrt(G G' / 3), allowed),
+
+so no window ever is more than twice as wide as without.  The bias of a drive beyond its limit is no fault
+where all that it does in a longest window is below min(3 sqrt(G G' / 3), allowed): near its optimum a Peltier
+element hardly answers to its current, and a few percent of heat look like a quarter of the drive.
 
 Which fault explains a window whose residual is too large?
 ----------------------------------------------------------
@@ -56,9 +64,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from thermogrip.datasets.arrays import Array
+from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.limits import keyed
 from thermogrip.rig.guard.kalman_filter import Estimate, FilterSettings, History, RigFilter, RigModel
-from thermogrip.rig.guard.plant_mismatch import MOST_DRIFT, Evidence, PlantDrift
 from thermogrip.sysid.plant.plant import Plant
 
 
@@ -174,6 +182,8 @@ def _late(path: Array, k: int, steps: float) -> Array:
     return out
 
 
+_MOST_DRIFT, _LEAST_LINEAR = 0.2, 0.2  # shares of a parameter
+_DRIFT_SIGMAS = 3.0
 _COMPARED_EVERY_S = 1.0  # a tenth of the shortest window; it costs half of a look
 _BIAS_AFTER_S = 60.0  # a bias is not evaluated before the filter has seen something
 
@@ -192,7 +202,7 @@ class ModelSettings(FilterSettings):
     # of a drive's bias, a share of what was asked for lately: three of the 5 % from run to run
     drive_limit: float = keyed(0.15, "drive_limit", 0.01, 0.45)
     warm_up: float = keyed(60.0, "warm_up_s", 0, 3600)  # nothing is compared where it starts not at rest [s]
-    drift: float = keyed(0.0, "drift", 0, MOST_DRIFT)  # share by which each plant parameter may have drifted
+    drift: float = keyed(0.0, "drift", 0, _MOST_DRIFT)  # share by which each plant parameter may have drifted
 
 
 @dataclass(frozen=True)
@@ -215,6 +225,23 @@ class Residual:
     def off(self) -> float:
         """How far measured is from expected."""
         return abs(self.measured - self.expected)
+
+
+def drift_steps(plant: Plant, drift: float) -> Array:
+    """Return by how much each parameter (n_p,) of a plant may be off that has drifted by a share; a plant
+    without parameters is a :class:`UserError`."""
+    names = plant.model.parameters
+    if not names:
+        problem = "the plant has no parameters that could drift"
+        raise UserError(problem, hint="identify a network, or leave the drift out of the guard file")
+    least = [_LEAST_LINEAR if plant.scales.get(name) == "linear" else 0.0 for name in names]
+    return np.asarray(drift * np.maximum(np.abs(plant.p), least), dtype=float)
+
+
+def drift_spread(slopes: Array) -> Array:
+    """Return three standard deviations (n_y,) of where a window ends [K], slopes (n_y, n_p) to what each
+    parameter may be off."""
+    return np.asarray(_DRIFT_SIGMAS * np.sqrt(np.sum(slopes**2, axis=1) / 3))
 
 
 def _window_slopes(
@@ -247,31 +274,18 @@ class ModelMonitor:
     """Follow a rig with its plant; pure: times are passed in.
 
     ``compared_from`` is when windows may begin [s]; ``compared_now`` says whether the last reading was
-    compared: it completed a native step of the model, and a second had passed since the last one that was;
-    ``evidence`` is of the longest windows since the start, where the drift is learnt.
+    compared: it completed a native step of the model, and a second had passed since the last one that was.
     """
 
-    def __init__(
-        self, plant: Plant, settings: ModelSettings | None = None, drift: PlantDrift | None = None
-    ) -> None:
+    def __init__(self, plant: Plant, settings: ModelSettings | None = None) -> None:
         self.plant = plant
         self.settings = ModelSettings() if settings is None else settings
         self._model = RigModel(plant)
         self.drives = self._model.drives
-        self.drift: PlantDrift | None = None
-        self.evidence: list[Evidence] = []
-        self._weighed = float("-inf")
-        if drift is None and self.settings.drift > 0:
-            drift = PlantDrift.unknown(plant, self.settings.drift)
-        if drift is not None:
-            self.adopt(drift)
+        drift = self.settings.drift
+        self._drift_steps = drift_steps(plant, drift) if drift > 0 else None
         keep = int(np.ceil(max(self.settings.windows) / plant.dt)) + 8
         self._filter, self._seconds = RigFilter(self._model, self.settings, keep), keep * plant.dt
-
-    def adopt(self, drift: PlantDrift) -> None:
-        """Use what is known of the rig's parameters from now on, and forget the evidence."""
-        self.drift, self.evidence = drift, []
-        self._model.p = drift.parameters(self.plant)
 
     def reset(self, time: float, values: Mapping[str, float]) -> None:
         """Start at rest at these readings."""
@@ -284,7 +298,6 @@ class ModelMonitor:
         self._since = np.full(len(self.plant.outputs), self.compared_from)
         self._time, self._compared, self.compared_now, self.share = time, 0, False, 0.0
         self._compared_at = float("-inf")
-        self._weighed = float("-inf")
 
     def predict(
         self, time: float, drive: Mapping[str, float], pump: int, values: Mapping[str, float]
@@ -317,7 +330,6 @@ class ModelMonitor:
         self._compared, self._compared_at = done, time
         compared = self.compare()
         self.share = max((one.excess for one in compared), default=0.0)
-        self._weigh(time, compared)
         found = [self._with_drift(one) for one in compared if one.off > one.allowed]
         return [one for one in found if one.off > one.allowed] + self._biases(time, compared)
 
@@ -380,51 +392,36 @@ class ModelMonitor:
         self._masked = masked
 
     def _slopes(self, window: float) -> tuple[Array, Array] | None:
-        if self.drift is None:
+        if self._drift_steps is None:
             return None
-        steps = self.drift.steps(self.plant)
-        return _window_slopes(self._model, self._past, self.settings.smooth, window, steps)
+        return _window_slopes(self._model, self._past, self.settings.smooth, window, self._drift_steps)
 
     def _with_drift(self, one: Residual) -> Residual:
         """Return a residual with the uncertainty of the plant's parameters; a drive's bias that was such a
         parameter is wrong once the rig does something else: the path without it counts where that is nearer,
         and no further away than the parameters explain."""
         found = self._slopes(one.window)
-        if found is None or self.drift is None:
+        if found is None:
             return one
+        change, slopes = found
         k = self.plant.outputs.index(one.subject)
-        more, unbiased = float(self.drift.spread(found[1])[k]), float(found[0][k])
+        more, unbiased = float(drift_spread(slopes)[k]), float(change[k])
         may = [one.expected] + [unbiased] * (abs(unbiased - one.expected) <= more)
-        near = min(may, key=lambda change: abs(one.measured - change))
+        near = min(may, key=lambda expected: abs(one.measured - expected))
         return replace(one, expected=near, allowed=one.allowed + min(more, one.allowed))
-
-    def _longest(self, compared: list[Residual]) -> tuple[list[Residual], list[int], Array, Array] | None:
-        """Return the residuals of the longest windows, their outputs, and how far the path goes without the
-        drives' biases, with its slopes; None where there is none of them, or no drift."""
-        longest = max(self.settings.windows)
-        of_all = [one for one in compared if one.window == longest]
-        found = self._slopes(longest) if of_all else None
-        return found and (of_all, [self.plant.outputs.index(one.subject) for one in of_all], *found)
-
-    def _weigh(self, time: float, compared: list[Residual]) -> None:
-        """Keep the evidence of the longest windows, one after another."""
-        early = time - self._weighed < max(self.settings.windows)
-        if self.drift is None or not self.drift.learns or early or not (found := self._longest(compared)):
-            return
-        self._weighed = time
-        of_all, at, goes, slopes = found
-        for one, k in zip(of_all, at):
-            self.evidence.append(Evidence(one.measured - float(goes[k]), slopes[k], one.allowed / 3))
 
     def _drifted(self, compared: list[Residual]) -> bool:
         """Say whether the effect of the drives' biases in a longest window may be the plant's parameters."""
-        found = self._longest(compared)
-        if found is None or self.drift is None:
+        longest = max(self.settings.windows)
+        windows = [one for one in compared if one.window == longest]
+        found = self._slopes(longest) if windows else None
+        if found is None:
             return False
-        of_all, at, goes, slopes = found
-        does = np.abs(np.array([one.expected for one in of_all]) - goes[at])
-        may = np.minimum(self.drift.spread(slopes)[at], [one.allowed for one in of_all])
-        return bool((does <= may).all())
+        change, slopes = found
+        rows = [self.plant.outputs.index(one.subject) for one in windows]
+        effect = np.abs(np.array([one.expected for one in windows]) - change[rows])
+        tolerated = np.minimum(drift_spread(slopes)[rows], [one.allowed for one in windows])
+        return bool((effect <= tolerated).all())
 
     def _biases(self, time: float, compared: list[Residual]) -> list[Residual]:
         if time < self.compared_from + _BIAS_AFTER_S:

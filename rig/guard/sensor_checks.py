@@ -39,6 +39,8 @@ from thermogrip.datasets.roles import guess_role
 from thermogrip.rig.guard.trip import Trip
 from thermogrip.sysid.plant.plant import Plant
 
+#: The hottest limit that may be stated [degC]: above the thermocouples of a kiln (type S ends at 1768 degC).
+HOTTEST = 1800.0
 _LOST_SHARE, _LOST_S = 0.25, 60.0
 
 
@@ -47,7 +49,7 @@ class SensorSettings:
     """What a sensor may do."""
 
     # a reading outside is suspect [degC]
-    plausible: tuple[float, float] = keyed((-5.0, 75.0), "believable_degC", -50, 150)
+    plausible: tuple[float, float] = keyed((-5.0, 75.0), "believable_degC", -50, HOTTEST + 50)
     rate: float = keyed(5.0, "rate_K_per_s", 0.05, 100)  # fastest change of water [K/s]
     slack: float = keyed(0.5, "slack_K", 0, 10)  # noise allowance of a change [K]
     bad_in_a_row: int = keyed(3, "bad_in_a_row", 1, 20)  # so many suspect readings trip

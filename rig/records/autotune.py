@@ -177,6 +177,8 @@ class Autotune:
                 goals = {name: self.target[name] for name in begin if name in self.target}
             else:
                 goals = dict.fromkeys(begin, self.target)
+            for name, goal in goals.items():
+                guard.check_target(name, goal)
             goals = {name: self._highest(guard, name, begin[name], goal) for name, goal in goals.items()}
             if not goals:
                 names = ", ".join(begin)

@@ -1,14 +1,12 @@
 """The rig on a robot's network without ROS: a bridge in rosbridge's JSON over a websocket.
 
-A ``rosbridge_server`` (or roslibpy's peer, or Foxglove) understands four kinds of message that are used
+A ``rosbridge_server`` (or roslibpy's peer, or Foxglove) understands two kinds of message that are used
 here::
 
     {"op": "advertise", "topic": "/thermogrip/t_surface", "type": "sensor_msgs/Temperature"}
     {"op": "publish",   "topic": "/thermogrip/t_surface", "msg": {"header": {..}, "temperature": 38.0, ..}}
-    {"op": "subscribe", "topic": "/thermogrip/target",    "type": "std_msgs/Float64"}
-    {"op": "publish",   "topic": "/thermogrip/target",    "msg": {"data": 38.0}}        (from the server)
 
-:class:`Messages` is the protocol alone: rows and events in, JSON out, and back; no socket, no clock.
+:class:`Messages` is the protocol alone: rows and events in, JSON out; no socket, no clock.
 :class:`Bridge` sends them from a thread of its own: a slow or dead network never delays the loop.  What
 cannot be sent is dropped, oldest first; the run folder is the record, the bridge is a view.
 
@@ -16,9 +14,8 @@ A lost connection is opened again after 0.1 s, then after twice as long each tim
 lost, that it is back and how much was dropped between is in the record behind the bridge and on
 ``/thermogrip/status``.
 
-A target that comes in is a request: it must be a finite number inside ``limits``, else it is refused, which
-``/thermogrip/status`` reports.  Nothing but a target is accepted.  Nothing is encrypted: use it on a network
-of your own.
+Nothing is accepted: what comes in is read, so that the end of a connection shows, and forgotten.  Nothing is
+encrypted: use it on a network of your own.
 """
 
 from __future__ import annotations
@@ -31,7 +28,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from functools import partial
-from math import inf, isfinite, nan
+from math import isfinite
 from typing import Any
 
 from thermogrip.datasets.errors import as_user_error
@@ -42,27 +39,26 @@ from thermogrip.rig.interface import Event
 from thermogrip.rig.session.loop import Recorder
 
 PREFIX = "/thermogrip"
-MAX_BYTES = 1 << 16  # of a message from the server that is read
-_MOST_BYTES = 1 << 20  # of one that is received at all: a longer one ends the connection
+_MOST_BYTES = 1 << 20  # of a message from the server: a longer one ends the connection
 _KEEP = 1000  # rows and events that wait for a slow network
 _FIRST_WAIT_S, _LONGEST_WAIT_S = 0.1, 5.0  # of the back-off
 _LOOK_S = 0.02  # how often a thread without a connection asks whether the next try is due
 
 
 class Messages:
-    """The protocol: rows and events to JSON texts, JSON texts to targets inside ``limits`` [degC], or to none
-    where ``limits`` is None: then nothing is asked for."""
+    """The protocol: rows and events to JSON texts.
 
-    def __init__(self, prefix: str = PREFIX, limits: tuple[float, float] | None = (10.0, 50.0)) -> None:
-        self.prefix, self.limits = prefix, limits
+    >>> [json.loads(text)["op"] for text in Messages().row({"time_s": 0.0, "drive": 0.5}, stamp=0.0)]
+    ['advertise', 'publish']
+    """
+
+    def __init__(self, prefix: str = PREFIX) -> None:
+        self.prefix = prefix
         self._advertised: set[str] = set()
 
-    def hello(self) -> list[str]:
-        """Return the first messages of a new connection; earlier advertisements are forgotten."""
+    def forget(self) -> None:
+        """Begin a new connection: what was advertised on the last one is advertised again."""
         self._advertised.clear()
-        if self.limits is None:
-            return []
-        return [_text(op="subscribe", topic=f"{self.prefix}/target", type="std_msgs/Float64")]
 
     def row(self, row: Mapping[str, float], *, stamp: float) -> list[str]:
         """Return the messages of one row of this date [s since 1970]; JSON has no number that is lost."""
@@ -86,33 +82,6 @@ class Messages:
     def status(self, text: str) -> list[str]:
         """Return the messages of a status line."""
         return self._publish("status", "std_msgs/String", {"data": text})
-
-    def hear(self, text: str | bytes) -> tuple[float | None, str]:
-        """Return the target that a message is, or None and why not ("" where it is not for us)."""
-        if self.limits is None:
-            return None, ""
-        if len(text) > MAX_BYTES:
-            return None, "a message was too long"
-        try:
-            message = json.loads(text)
-        except (ValueError, RecursionError):
-            return None, "a message was not JSON"
-        if not isinstance(message, dict) or message.get("op") != "publish":
-            return None, ""
-        if message.get("topic") != f"{self.prefix}/target":
-            return None, ""
-        content = message.get("msg")
-        value = content.get("data") if isinstance(content, dict) else None
-        try:
-            target = float(value) if isinstance(value, int | float) and not isinstance(value, bool) else nan
-        except OverflowError:  # a whole number of JSON has no end
-            target = inf
-        if not isfinite(target):
-            return None, "target is not a number"
-        low, high = self.limits
-        if not low <= target <= high:
-            return None, f"target {target:g} is not between {low:g} and {high:g} degC"
-        return target, ""
 
     def _publish(self, name: str, kind: str, content: Mapping[str, Any]) -> list[str]:
         topic, found = f"{self.prefix}/{name}", []
@@ -149,8 +118,6 @@ class Bridge:
 
     Attributes
     ----------
-    target : float or None
-        The newest target that came in [degC].
     sent : int
         Messages.
     dropped : int
@@ -162,13 +129,6 @@ class Bridge:
     ------
     UserError
         If the package is missing or nothing answers at the start.
-
-    Examples
-    --------
-    What it sends first:
-
-    >>> Messages().hello()
-    ['{"op": "subscribe", "topic": "/thermogrip/target", "type": "std_msgs/Float64"}']
     """
 
     def __init__(
@@ -183,7 +143,6 @@ class Bridge:
     ) -> None:
         self.url, self._shown = url, without_password(url)
         self.messages, self.behind = Messages() if messages is None else messages, behind
-        self.target: float | None = None
         self.sent, self.dropped = 0, 0
         self.reports: tuple[str, ...] = ()
         self._clock, self._timeout, self._monotonic = clock, timeout, monotonic
@@ -256,12 +215,12 @@ class Bridge:
         with refused, ExitStack() as undo:
             opening = connect(self.url, open_timeout=wait, close_timeout=wait, max_size=_MOST_BYTES)
             link = undo.enter_context(opening)
-            for text in self.messages.hello():
-                link.send(text)
+            link.ping()  # one that hangs up at once is no rosbridge
             undo.pop_all()  # from now on it is for _hang_up
         return link
 
     def _take(self, link: Any) -> None:
+        self.messages.forget()
         self._link, self._since = link, self._monotonic()
         self._hearer = threading.Thread(target=self._hear_all, args=(link,), daemon=True)
         self._hearer.start()
@@ -322,12 +281,8 @@ class Bridge:
     def _hear_all(self, link: Any) -> None:
         why = "the server closed it"
         try:
-            for text in link:
-                target, refused = self.messages.hear(text)
-                if target is not None:
-                    self.target = target
-                if refused:
-                    self._put(partial(self.messages.status, refused))
+            for _ in link:
+                pass
         except Exception as error:  # the end of the connection comes as one of many errors
             why = _reason(error)
         self._lose(link, why)

@@ -686,9 +686,7 @@ def _rooms(header: list[str], events: tuple[Event, ...]) -> frozenset[str]:
     readings = {h.removesuffix("_degC") for h in header if h.endswith("_degC")}
     kept = next((e.data["rooms"] for e in events if e.kind == "phase" and "rooms" in e.data), None)
     return (
-        frozenset(readings.intersection(map(str, kept)))
-        if isinstance(kept, list)
-        else room_sensors(readings)
+        frozenset(readings.intersection(map(str, kept))) if isinstance(kept, list) else room_sensors(readings)
     )
 
 

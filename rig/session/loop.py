@@ -122,8 +122,6 @@ class Loop:
         self.operator.take_bad()  # of what was before
         self.open_gripper()  # a session that lost its rig in contact has left it closed on the object
         self.guard.start(self.reading, self.heard, self.rig.units, asked=self.asked)
-        if self.guard.model is not None and (drift := self.guard.model.drift) is not None:
-            self.note("drift", drift.line(), drift.shares())
         if guessed := self.guard.guessed_rooms(self.reading.values):
             text = f"{', '.join(guessed)} by name taken for the room's; state room_sensors in the guard file"
             self.note("room", text)
@@ -139,11 +137,8 @@ class Loop:
         if name not in self.reading.values:
             hint = known_names(name, self.reading.values, "set a target for one of {}")
             raise UserError(f"the rig has no sensor {name!r}", hint=hint)
-        lo, hi = self.guard.limits_of(name)
         for value in values:
-            if not lo <= value <= hi:
-                problem, hint = f"target {value:g} degC is unsafe", f"choose one from {lo:g} to {hi:g} degC"
-                raise UserError(problem, file=self.guard.settings.file or None, hint=hint)
+            self.guard.check_target(name, value)
 
     def regulate(self, phase: str, seconds: float, profile: Profile | None = None) -> Iterator[float]:
         """Run the controller for so long, its targets those of a profile where there is one; yield the time

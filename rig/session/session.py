@@ -276,24 +276,9 @@ def run_session(
     if trip is not None:
         run.record_last()
         run.note("tripped", trip.line(), trip.as_dict())
-    if verdict in ("settled", "followed"):
-        _learn(run)
     run.note("verdict", verdict)
     run.show(run.no_drive(), verdict=verdict, trip=trip)
     return _result(run, verdict, touched, band, trip)
-
-
-def _learn(run: Loop) -> None:
-    """Let the guard learn from a healthy session, and keep and note what it learnt."""
-    learnt = run.guard.learn()
-    if learnt is None or learnt.file is None:
-        return
-    text = learnt.line()
-    try:
-        learnt.save(learnt.file)
-    except UserError as error:
-        text += f"; not kept ({error})"
-    run.note("learnt", text, learnt.shares())
 
 
 def _check_object(thing: Object | None, run: Loop) -> None:

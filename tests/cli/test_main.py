@@ -92,14 +92,14 @@ autotune: --target --out --port --protocol --speed>0.01 --twin --relays --limit 
   --spec --guard --live>0<65535 --foxglove>1<65535 --on-trip --workers=1>1 --seed=0>0 --json=False
 run: CONTROLLER --out --target --profile --port --protocol --speed>0.01 --twin --draw=0>0 --relays
   --from --hold=0.0>0 --object --material --grasp-time=10.0>0.5 --stop-early
-  --settle-timeout=900.0>1 --guard --learn
+  --settle-timeout=900.0>1 --guard
   --live>0<65535 --foxglove>1<65535 --bridge --on-trip --report --network --seed=0>0 --json=False
 record: SCHEDULE --port --out --protocol --sample=1.0>0.05 --guard --speed=1.0>0.01 --live>0<65535
   --foxglove>1<65535 --bridge --on-trip --seed=0>0 --json=False
 virtual: --protocol=thermogrip --plant --pty=False --socket>0<65535 --speed=1.0>0.01 --from --ambient=23.0
   --object --material --fault --seconds>0 --seed=0>0 --json=False
 batch: CONTROLLER PLAN.csv --out --port --protocol --speed>0.01 --twin --draw=0>0 --grasp-time=10.0>0.5
-  --stop-early --settle-timeout=900.0>1 --guard --learn --ask/--no-ask=True --live>0<65535
+  --stop-early --settle-timeout=900.0>1 --guard --ask/--no-ask=True --live>0<65535
   --foxglove>1<65535 --bridge --on-trip --network --seed=0>0 --json=False
 recover: DIR --out --bad --json=False
 effusivity: GRASPS... --out --calibrate --object-range --report --seed=0>0 --workers=1>1 --cluster

@@ -72,7 +72,6 @@ KINDS = {
         for name in MODELS
     },
     "guard.toml": Kind(("guard.toml",), f"run controller.json {RUN} plant.json --guard guard.toml"),
-    "drift.json": Kind(("drift.json",), f"run netcontrol.json {RUN} net.json --learn drift.json"),
     "spec.toml": Kind(("spec.toml",), lambda: read_spec("spec.toml").design(small_plant())),
     "network.toml": Kind(
         ("network.toml",), "excite --kind prbs --minutes 60 --network network.toml --out s.csv"
@@ -156,7 +155,6 @@ def whole_files(folder: Path) -> None:
     from thermogrip.datasets.grasp_files import read_grasps, write_grasps
     from thermogrip.datasets.log_files import read_log, write_log
     from thermogrip.mpc.controllers.mpc import design_controller
-    from thermogrip.rig.guard.plant_mismatch import PlantDrift
     from thermogrip.sysid import Plant, load_network
 
     rows = [HEADER, *small_log_rows(240)]
@@ -196,7 +194,6 @@ def whole_files(folder: Path) -> None:
     )  # fmt: skip
     net.save(folder / "net.json")
     design_controller(net, dt=5.0, controlled=("t1",)).save(folder / "netcontrol.json")
-    PlantDrift.unknown(net, 0.1, file=folder / "drift.json").save(folder / "drift.json")
     header = ",".join(("time_s", *kit.inputs, *(f"{n}_degC" for n in (*kit.outputs, *kit.disturbances))))
     n_signals = len(kit.outputs) + len(kit.disturbances)
     lines = [f"{k},{50 * (k % 40 > 20)},0" + ",25" * n_signals for k in range(120)]

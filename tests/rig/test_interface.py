@@ -117,7 +117,6 @@ CHANGING = {"Loop", "InputSteps", "DeviceCore", "_BadCount", "_Memory", "_Contac
     "module",
     ["thermogrip.rig.interface", "thermogrip.rig.records.batch", "thermogrip.rig.records.run_folder",
      "thermogrip.rig.session.loop", "thermogrip.rig.session.session", "thermogrip.rig.firmware.reference",
-     "thermogrip.rig.guard.plant_mismatch",
      "thermogrip.rig.guard.trip", "thermogrip.rig.guard.guard",
      "thermogrip.rig.guard.model_checks", "thermogrip.rig.guard.kalman_filter",
      "thermogrip.rig.guard.sensor_checks", "thermogrip.rig.simulation.virtual_device",

@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import replace
+from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -25,7 +26,6 @@ if TYPE_CHECKING:
     from thermogrip.mpc.controllers.pi import PIController
     from thermogrip.rig.clock import ScaledClock
     from thermogrip.rig.guard.guard import Guard
-    from thermogrip.rig.guard.plant_mismatch import PlantDrift
     from thermogrip.rig.guard.trip import Trip
     from thermogrip.rig.interface import Rig
     from thermogrip.rig.records.batch import Trial
@@ -37,7 +37,6 @@ if TYPE_CHECKING:
 
 WATCHED_SPEED = 10.0  # of a twin [times real time]: settling, minutes long, in a few tens of seconds
 PROTOCOLS = ("thermogrip", "tclab")
-LOWEST_TARGET, HIGHEST_TARGET = 10.0, 50.0  # degC, of the skin
 
 OutOption = Annotated[Path, cli.opt("--out", "DIR", "Folder of the run.")]
 TwinOption = Annotated[Path | None, cli.opt("--twin", "PLANT", "Simulate this plant; no hardware is opened.")]
@@ -130,14 +129,6 @@ OnTripOption = Annotated[
     str | None,
     cli.opt("--on-trip", "CMD", "Run this on a trip, which it gets as JSON on stdin."),
 ]
-LearnOption = Annotated[
-    Path | None,
-    cli.opt(
-        "--learn",
-        "RIG.json",
-        "Let the guard learn from this rig's first healthy sessions how far it is from the plant.",
-    ),
-]
 
 
 @stop_signals()
@@ -149,7 +140,7 @@ def run(
         cli.opt(
             "--target",
             "DEGC",
-            "Skin temperature at contact, 10 to 50; of several outputs t1=40,t2=35.",
+            "Where to, inside the guard's limits; of several outputs t1=40,t2=35.",
             lambda value: value and (targets_of(value), value)[1],
         ),
     ] = None,
@@ -176,7 +167,6 @@ def run(
     stop_early: StopEarlyOption = None,
     settle_timeout: SettleTimeoutOption = 900.0,
     guard: GuardOption = None,
-    learn: LearnOption = None,
     live: LiveOption = None,
     foxglove: FoxgloveOption = None,
     bridge: BridgeOption = None,
@@ -218,14 +208,17 @@ def run(
         path = read_profile(profile, loaded.controlled, preview_s=loaded.dt * sum(loaded.design.blocks))
         wanted = path.at(0.0)
     wanted = _for_outputs(wanted, loaded.controlled)
-    checks = guard_of(guard, loaded.plant, learn, speed=speed or 1.0)
+    checks = guard_of(guard, loaded.plant, speed=speed or 1.0)
+    by_name = wanted if isinstance(wanted, dict) else {loaded.controlled[0]: wanted}
+    for output, value in by_name.items():
+        checks.check_target(output, value)
     clock = ScaledClock(pace or speed or 1.0)
     name = f"{twin.name}, draw {draw}" if twin is not None else str(port)
     about: dict[str, Any] = {"controller": controller.name, "target_degC": wanted}
     about |= {"port": port} if twin is None else {"twin": twin.name, "draw": draw}
     about |= {} if profile is None else {"profile": profile.name}
     about |= {"from_degC": start, "hold_s": hold, "object_degC": obj, "material": material, "seed": seed}
-    files = files_of(learn, controller=controller, plant=twin, guard=guard, profile=profile, relays=relays)
+    files = files_of(controller=controller, plant=twin, guard=guard, profile=profile, relays=relays)
     paced = pace is not None
     rig = rig_of(
         port, protocol, clock, twin, network, draw, loaded, seed=seed, t_start=start, paced=paced,
@@ -299,7 +292,6 @@ def batch(
     stop_early: StopEarlyOption = None,
     settle_timeout: SettleTimeoutOption = 900.0,
     guard: GuardOption = None,
-    learn: LearnOption = None,
     ask: Annotated[bool, cli.flag("--ask/--no-ask", "With --port: ask before and after each grasp.")] = True,
     live: LiveOption = None,
     foxglove: FoxgloveOption = None,
@@ -321,7 +313,7 @@ def batch(
     from thermogrip.rig.records.batch import read_plan, run_batch
 
     trials, loaded = read_plan(plan), load_controller(controller, network)
-    checks = guard_of(guard, loaded.plant, learn, speed=speed or 1.0)
+    checks = guard_of(guard, loaded.plant, speed=speed or 1.0)
     pace, console = pace_of(speed, twin, live, foxglove), Console(as_json)
     clock, paced = ScaledClock(pace or speed or 1.0), pace is not None
     watch = watch_of("batch", console, out, live, foxglove, on_trip, pace)
@@ -332,7 +324,7 @@ def batch(
             port, protocol, clock, twin, network, draw, loaded, seed=seed, t_start=None, paced=paced
         )
 
-    files = files_of(learn, controller=controller, plan=plan, plant=twin, guard=guard)
+    files = files_of(controller=controller, plan=plan, plant=twin, guard=guard)
     with _bridge(bridge) as through, watch:
         done = run_batch(
             opened,
@@ -546,10 +538,9 @@ def one_rig(port: str | None, twin: Path | None) -> None:
         raise UserError(given, hint="give --port DEV, or --twin PLANT to simulate")
 
 
-def files_of(learn: Path | None, **named: Path | None) -> dict[str, Path]:
-    """Return the files that a run is made from, those that are named; what is learnt may not be there yet."""
-    known = learn if learn is not None and learn.exists() else None
-    return {name: path for name, path in {**named, "learn": known}.items() if path is not None}
+def files_of(**named: Path | None) -> dict[str, Path]:
+    """Return the files that a run is made from, those that are named."""
+    return {name: path for name, path in named.items() if path is not None}
 
 
 def rig_of(
@@ -613,48 +604,31 @@ def _twin(
 
 
 def guard_of(
-    path: Path | None, plant: Plant | None, learn: Path | None = None, *, speed: float = 1.0,
-    limit: float | None = None,
-) -> Guard:  # fmt: skip
+    path: Path | None, plant: Plant | None, *, speed: float = 1.0, limit: float | None = None
+) -> Guard:
     """Return the guard of a rig; what no file says is as by default, and nothing may be beyond a ``limit``.
     Of a virtual device that runs ``speed`` times as fast this program may be as late as of others, in seconds
     of the computer."""
     from thermogrip.rig.guard.guard import Guard, GuardSettings
     from thermogrip.rig.guard.settings import read_guard
 
-    settings = GuardSettings() if path is None else read_guard(path)
+    settings = GuardSettings.of(plant) if path is None else read_guard(path)
     if speed > 1.0:
         settings = replace(settings, expiry_s=speed * settings.expiry_s)
     if limit is not None:
         settings = settings.below(limit)
-    drift = None if learn is None or plant is None else _drift_of(learn, plant, settings.model.drift)
-    return Guard(plant, settings, drift=drift)
-
-
-def _drift_of(path: Path, plant: Plant, stated: float) -> PlantDrift:
-    """Return what a file knows of the rig, nothing yet where it is to be made."""
-    from thermogrip.rig.guard.plant_mismatch import USUAL_DRIFT, PlantDrift
-
-    cli.new_file(path, (".json",))
-    if not path.exists():
-        return PlantDrift.unknown(plant, stated or USUAL_DRIFT, file=path)
-    found = PlantDrift.load(path, plant)
-    if stated and stated != found.drift:
-        problem = f"was learnt with a drift of {found.drift:g}, the guard file says {stated:g}"
-        raise UserError(problem, file=path, hint="make them agree, or learn into another file")
-    return found
+    return Guard(plant, settings)
 
 
 def targets_of(target: str) -> float | dict[str, float]:
-    """Return one target or targets by output ("38", "t1=40,t2=35"), inside what a skin may be brought to."""
+    """Return one target or targets by output ("38", "t1=40,t2=35")."""
     bare = target.rstrip("degC° ") or "one"
     hint = f"write {bare} [degC], or t1=40,t2=35 for several outputs"
     with as_user_error(ValueError, f"'--target' {target!r} is no temperature", hint=hint):
         values = cli.numbers("--target", target) if "=" in target else float(target)
     for value in values.values() if isinstance(values, dict) else (values,):
-        if not LOWEST_TARGET <= value <= HIGHEST_TARGET:
-            hint = f"choose one from {LOWEST_TARGET:g} to {HIGHEST_TARGET:g} degC"
-            raise UserError(f"--target {value:g} degC is outside the rig's range", hint=hint)
+        if not isfinite(value):
+            raise UserError(f"'--target' {target!r} is no temperature", hint=hint)
     return values
 
 
@@ -710,13 +684,13 @@ def watch_of(
 
 @contextmanager
 def _bridge(url: str | None) -> Iterator[Callable[[Recorder], AbstractContextManager[Recorder]]]:
-    """Yield what publishes whatever a recorder gets while a run lasts; it takes no target."""
+    """Yield what publishes whatever a recorder gets while a run lasts."""
     if url is None:
         yield nullcontext
         return
-    from thermogrip.rig.records.rosbridge import Bridge, Messages
+    from thermogrip.rig.records.rosbridge import Bridge
 
-    with Bridge(url, clock=time.time, messages=Messages(limits=None)) as bridge:
+    with Bridge(url, clock=time.time) as bridge:
         yield bridge.before
 
 

@@ -17,9 +17,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.rig.makers import PATIENCE_S, Bench, Constant, DirectPort, SteppedClock, make_lab
+from tests.rig.makers import Bench, Constant, DirectPort, SteppedClock, make_lab
 from thermogrip.datasets.errors import UserError
-from thermogrip.rig.drivers.background_sampler import Sampler
 from thermogrip.rig.drivers.connect import open_rig, recognise
 from thermogrip.rig.drivers.thermogrip import TTL_S, DeviceClock, DeviceRig, Gathering
 from thermogrip.rig.firmware.reference import DeviceCore
@@ -438,9 +437,6 @@ def test_an_older_firmware_is_to_be_polled(plant: Plant, monkeypatch: pytest.Mon
     monkeypatch.setattr("thermogrip.rig.serial.protocol.parse_request", of_old)
     old = Sampling(plant)
     assert not old.rig.sample_every(DT)
-    with Sampler(old.rig, DT, clock=old.clock, sleep=old.clock.sleep) as sampler:
-        assert not sampler.by_device
-    assert sampler.take()
     old.rig.close()
 
 
@@ -478,21 +474,3 @@ def test_times_never_go_back_though_the_offset_does() -> None:
         kept = (Kept(k, 0, (0,), (1,)),)
         times += [t for t, _ in gathering.take(Taken(50 + k, k, k + 1, kept), clock)]
     assert all(b > a for a, b in pairwise(times))
-
-
-def test_the_sampler_lets_the_device_measure_and_misses_nothing_when_it_is_held_up(plant: Plant) -> None:
-    sampling = Sampling(plant)
-    clock = sampling.clock
-    with Sampler(sampling.rig, DT, clock=clock, sleep=clock.sleep) as sampler:
-        assert sampler.by_device
-        for _ in range(3):
-            sampler.ask(lambda: clock.sleep(0.12))  # nobody can ask for a reading meanwhile
-            asked, end = len(sampler.late), time.monotonic() + PATIENCE_S
-            while len(sampler.late) < asked + 3 and time.monotonic() < end:
-                time.sleep(0.001)
-    times = [reading.time_s for reading in sampler.take()]
-    sampling.rig.close()
-    assert len(times) >= 36
-    assert [b - a for a, b in pairwise(times)] == pytest.approx([DT] * (len(times) - 1), abs=1e-9)
-    assert sampler.missed == 0
-    assert max(sampler.late) > 0.1  # it was late, and yet it has them

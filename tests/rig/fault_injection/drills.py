@@ -33,7 +33,6 @@ from tests.rig.makers import SteppedClock
 from thermogrip.mpc.interface import Controller
 from thermogrip.rig.drivers.thermogrip import DeviceRig
 from thermogrip.rig.guard.guard import Guard, GuardSettings
-from thermogrip.rig.guard.plant_mismatch import PlantDrift
 from thermogrip.rig.interface import Reading
 from thermogrip.rig.records.run_folder import RunFolder, read_run
 from thermogrip.rig.serial.port import Port
@@ -145,7 +144,6 @@ def run_drill(
     hold: float = 600.0,
     link: str = "pty",
     settings: GuardSettings | None = None,
-    drift: PlantDrift | None = None,
 ) -> Outcome:
     """Run one drill (none: the session without a fault) into a run folder and return what it showed."""
     clock, (known, real) = SteppedClock(), drill_plants()
@@ -155,7 +153,7 @@ def run_drill(
         rig = _Rig(device, clock, at, drill, jump)
         try:
             with RunFolder(folder) as recorder:  # forced to disk by real seconds, of which there are few
-                guard = Guard(known, settings, drift=drift)
+                guard = Guard(known, settings)
                 session = run_session(
                     rig, controller, _TARGET, hold=hold, guard=guard, clock=clock, recorder=recorder
                 )

@@ -23,6 +23,8 @@ from thermogrip.rig.guard.model_checks import (
     _window_slopes,
     _wrong_drives,
     by_danger,
+    drift_spread,
+    drift_steps,
     explain_window,
 )
 from thermogrip.rig.simulation.twin import Twin
@@ -452,10 +454,11 @@ def test_a_bias_beyond_its_limit_is_an_alarm_after_a_minute(
 
 
 def drifted(unbiased: float, spread: float) -> ModelMonitor:
-    """Return a monitor whose windows end ``unbiased`` without biases, and ``spread`` to either side."""
+    """Return a monitor whose windows end ``unbiased`` without biases, and ``spread`` to either side: three
+    standard deviations of one parameter that may be anywhere within -1 and 1, sqrt(3) times its slope."""
     made = ModelMonitor(integrator(("a", "b")))
-    made.drift = SimpleNamespace(spread=lambda slopes: slopes @ [1.0], learns=True)
-    made._slopes = lambda window: (np.array([9.0, unbiased]), np.array([[99.0], [spread]]))
+    slopes = np.array([[99.0], [spread]]) / np.sqrt(3.0)
+    made._slopes = lambda window: (np.array([9.0, unbiased]), slopes)
     return made
 
 
@@ -487,18 +490,18 @@ def test_a_drives_bias_is_no_fault_where_its_effect_may_be_the_plants(
     assert not ModelMonitor(integrator())._drifted(two)
 
 
-def test_the_longest_windows_are_evidence_one_after_another() -> None:
-    made = drifted(0.75, 0.25)
-    made.reset(0.0, {"a": 0.0, "b": 0.0})
-    two = [Residual("window", "b", 30.0, 1.0, 0.5, 0.3), Residual("window", "b", 90.0, 1.0, 0.5, 0.6)]
-    counts = []
-    for time in (95.0, 184.9, 185.0):
-        made._weigh(time, two)
-        made._weigh(time + 200.0, two[:1])
-        counts.append(len(made.evidence))
-    assert counts == [1, 1, 2]
-    one = made.evidence[0]
-    assert (one.residual, one.slopes.tolist(), one.sd) == (-0.25, [0.25], pytest.approx(0.2))
+def test_a_share_is_of_the_parameter_and_on_a_linear_scale_of_a_fifth_at_least() -> None:
+    names = ("drive_offset", "cooling_gain", "C_water")
+    plant = SimpleNamespace(
+        model=SimpleNamespace(parameters=names),
+        p=np.array([-0.5, 0.1, 400.0]),
+        scales={"drive_offset": "linear", "cooling_gain": "linear"},
+    )
+    assert drift_steps(plant, 0.05).tolist() == pytest.approx([0.025, 0.01, 20.0])
+
+
+def test_a_window_may_end_three_standard_deviations_of_its_parameters_elsewhere() -> None:
+    assert drift_spread(np.array([[3.0, 4.0], [0.0, -3.0]])) == pytest.approx([5 * 3**0.5, 3 * 3**0.5])
 
 
 def test_slopes_are_of_each_parameters_own_step() -> None:

@@ -150,6 +150,7 @@ def test_a_power_cut_loses_the_rows_of_a_second_and_no_event(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     now, forced, path = [0.0], {}, tmp_path / "run"
+
     def fsync(file: int) -> None:
         forced[os.fstat(file).st_ino] = os.fstat(file).st_size
 
