@@ -115,7 +115,5 @@ class StuckMonitor:
             moved = float(model.output(x)[i]) - begin
             by_drive = float((model.output(x) - model.output(still))[i])
             if min(abs(moved), abs(by_drive)) > SHARE * float(model.spike[i]):
-                self.said = (
-                    f"{name} is stuck at {y[i]:.4g}: by its drives the model moves by {moved:+.2g}"
-                )
+                self.said = f"{name} is stuck at {y[i]:.4g}: by its drives the model moves by {moved:+.2g}"
         self._y = np.where(np.isfinite(y), y, self._y)
