@@ -732,7 +732,7 @@ def _judged(
     doubts = (*data.doubts, *doubts_of(plant), *not_scored)
     good, verdict = verdict_of(kind, plant, rows, data.checked, doubts)
     covered = evidence(plant, [log_rows(log, plant.inputs, plant.outputs, ()) for log in data.logs])
-    verdict += "; " + covered.sentence(plant.units)
+    verdict += f" {covered.sentence(plant.units)}."
     notes = (*data.notes, *boxes.refused, *held_out.refused, *lost, *_plant_notes(kind, plant))
     return Identification(
         plant=replace(plant, verdict=verdict),

@@ -265,10 +265,12 @@ def choose_disturbances(
         if found > least:
             chosen, margin = [*chosen, entry], found
     if len(chosen) < min(wanted, len(controlled)):
+        from thermogrip.sysid.plant.plant import said_not_good
+
         raise UserError(
             f"no disturbance model of {wanted} states is detectable from {', '.join(model.outputs)}",
             hint="control an output that a drive can move"
-            + (": identify does not call this plant good" if "; not good: " in model.plant.verdict else ""),
+            + (": identify does not call this plant good" if said_not_good(model.plant.verdict) else ""),
         )
     on_drive, on_disturbance, on_output = _matrices(model, chosen)
     names = {"input": model.drives, "output": model.outputs, "disturbance": model.disturbances}

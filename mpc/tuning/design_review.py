@@ -41,6 +41,7 @@ from thermogrip.mpc.tuning.objective import (
     trial,
 )
 from thermogrip.sysid.models.model import BlackBox
+from thermogrip.sysid.plant.plant import said_not_good
 
 #: A controller of any kind.
 Reviewed: TypeAlias = Controller | PIController
@@ -426,12 +427,11 @@ def valid_range(controller: Reviewed, span: tuple[float, float]) -> Check:
 def called_good(controller: Reviewed) -> Check:
     """What rests on a plant that its own logs contradict looks as sound as what rests on a good one."""
     name, verdict = "identify calls the plant good", controller.plant.verdict
-    head, bad, why = verdict.partition("; not good: ")
     fix = "identify on longer logs, or on logs that excite it more, and tune again"
-    if bad:
-        return Check(name, "warn", f"{head}; not good: {why.split(';')[0]}", fix)
-    head, good, _ = verdict.partition("; good for ")
-    return Check(name, "pass", head if good else f"no verdict, of {len(controller.plant.logs)} logs")
+    answer = verdict.partition(". ")[0] or f"no verdict, of {len(controller.plant.logs)} logs"
+    if said_not_good(verdict):
+        return Check(name, "warn", answer, fix)
+    return Check(name, "pass", answer)
 
 
 def beyond_logs(

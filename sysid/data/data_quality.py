@@ -505,7 +505,7 @@ class Evidence:
             f"{name} between {low:.3g} and {high:.3g} {units.get(name, '1')}".removesuffix(" 1")
             for name, (low, high) in self.ranges.items()
         )
-        said = [f"the logs cover {seen} (98 % of the readings)"]
+        said = [f"The logs cover {seen} (98 % of the readings)"]
         for kind in self.thin:
             minutes = self.minutes[kind]
             said.append(

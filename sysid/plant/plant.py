@@ -40,6 +40,11 @@ _MODELS = {
 }
 
 
+def said_not_good(verdict: str) -> bool:
+    """Return whether ``identify`` called a plant not good: its verdict, a string, is all that files keep."""
+    return "not good" in verdict.lower()
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class Plant(Shown, plant_data.PlantData):
     """A model with its numbers.

@@ -26,33 +26,35 @@ FAR_FROM_PRIOR = 3.3  # sd: beyond it lies one parameter of a right network in a
 def verdict_of(
     model: str, plant: Plant, rows: Sequence[Row], checked: DataCheck, doubts: Sequence[str] = ()
 ) -> tuple[bool, str]:
-    """Return whether the kept candidate may be called good, and why, in a sentence; a doubt forbids it."""
+    """Return whether the kept candidate may be called good, and in sentences why, and how much another run
+    should err; a doubt forbids it."""
     expected, named = plant.scores.expected, network_name(plant)
+    label = f"network {named}" if named else model
     errors = ", ".join(f"{name} {each.words(plant.units.get(name, '1'))}" for name, each in expected.items())
-    head = f"{f'network {named}' if named else model}: on another run like these about {errors}"
+    another = f"Expected error of another run like these: {errors}."
     if 0 < len(plant.logs) < SEVERAL:
-        head += f" (its gain off by {100 * RUN_GAIN_SD:.0f} %, assumed: it takes {SEVERAL} logs to show how "
-        head += "runs differ)"
+        another += f" That gains vary by {100 * RUN_GAIN_SD:.0f} % from run to run is assumed; {SEVERAL} "
+        another += "logs would show it."
     kept = [row for row in rows if row.model == model]
     for name, error in expected.items():
         parts, parts_idle = _pooled([row for row in kept if row.output == name and row.held_out])
         whole, whole_idle = _pooled([row for row in kept if row.output == name and not row.held_out])
         if not parts < USEFUL * parts_idle:
             errs = f"on parts held out {name} errs by {parts:.2g}, without input by {parts_idle:.2g}"
-            return False, f"{head}; not good: {errs}; it needs more excitation, or another model"
+            return False, f"Not good ({label}): {errs}; it needs more excitation, or another model. {another}"
         if not whole < USEFUL * whole_idle:
             errs = f"on the logs of its own fit {name} errs by {whole:.2g}, without input by {whole_idle:.2g}"
-            return False, f"{head}; not good: {errs}; try other models, or longer logs"
+            return False, f"Not good ({label}): {errs}; try other models, or longer logs. {another}"
         if not error.rmse < USEFUL * whole_idle:
             errs = f"without input {name} errs by {whole_idle:.2g}, so on another run it may be hardly better"
-            return False, f"{head}; not good: {errs}; it needs more excitation, or more logs"
+            return False, f"Not good ({label}): {errs}; it needs more excitation, or more logs. {another}"
     failed = [finding.says for finding in checked.findings if finding.verdict == "fail"]
     if failed:
-        return False, f"{head}; not good: {failed[0]}"
+        return False, f"Not good ({label}): {failed[0]}. {another}"
     if doubts:
         more = f" (and {len(doubts) - 1} more)" if len(doubts) > 1 else ""
-        return False, f"{head}; not good as long as this is in doubt: {doubts[0]}{more}"
-    return True, f"{head}; good for simulation and control on runs like these"
+        return False, f"Not good ({label}) as long as this is in doubt: {doubts[0]}{more}. {another}"
+    return True, f"Good for simulation and control on runs like these ({label}). {another}"
 
 
 def _pooled(rows: Sequence[Row]) -> tuple[float, float]:

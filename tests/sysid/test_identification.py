@@ -259,9 +259,9 @@ def test_one_error_is_stated_of_another_run_everywhere():
     differs = np.sqrt(np.mean(between_runs(found.plant, [log])["t"] ** 2))
     (stated,) = found.expected.values()
     assert stated == expected_error(parts, float(differs))
-    said = f"oe: on another run like these about t {stated.words('degC')} (its gain off by 5 %"
+    said = f"(oe). Expected error of another run like these: t {stated.words('degC')}. That gains vary by 5 %"
     assert said in found.verdict
-    assert "good for simulation and control on runs like these" in found.verdict
+    assert "Good for simulation and control on runs like these" in found.verdict
     assert Plant.from_dict(found.plant.to_dict()).scores.expected == found.expected
     again = free_run(found.plant, plant_log(seed=7))  # of the same kind, so its band is as stated
     assert again.band().expected["t"] == pytest.approx(stated.rmse, rel=0.2)
@@ -289,7 +289,7 @@ def test_an_output_that_ignores_the_input_is_never_called_good():
     log["t"].values[:] = 25 + lfilter([0.1], [1, -0.99], rng.standard_normal(900))
     found = identify(log, models=["arx"], average=2.0)
     assert not found.good
-    assert "not good" in found.verdict
+    assert found.verdict.startswith("Not good")
     assert found.plant.verdict == found.verdict
 
 
@@ -318,7 +318,7 @@ def test_what_subspace_models_say_is_known_before_others_are_fitted_at_their_ste
     found = identify(plant_log(), models=["oe", "subspace"], draws=0, early=early)
     ((count, first),) = known
     assert (count, first.model, first.good) == (1, "subspace", True)
-    assert "on another run like these about t" in first.plant.verdict
+    assert "Expected error of another run like these: t" in first.plant.verdict
     assert fitted == [("subspace", None), ("oe", first.plant.dt)]
     assert {row.model for row in found.rows} == {"oe", "subspace"}
     identify(plant_log(), models=["arx"], average=2.0, draws=0, early=early)
@@ -501,13 +501,13 @@ def test_an_input_that_never_moves_has_no_gain(kind):
 @pytest.mark.parametrize(
     ("rmse", "high", "held", "own", "checked", "doubts", "said"),  # errors [K] beside 2 K without input
     [
-        (0.99, 1.9, 0.9, 0.9, "ok", (), "good for simulation"),
-        (1.01, 1.9, 0.9, 0.9, "ok", (), "not good: without input t errs by 2, so on another run it may"),
-        (0.5, 2.01, 0.9, 0.9, "ok", (), "good for simulation"),  # one part of moves that no other has
-        (0.5, 1.9, 1.01, 0.9, "ok", (), "not good: on parts held out t errs by 0.71, without input by 1.4"),
-        (0.5, 1.9, 0.9, 1.01, "ok", (), "not good: on the logs of its own fit t errs by 1"),
-        (0.5, 1.9, 0.9, 0.9, "fail", (), "not good: q never moves"),
-        (0.5, 1.9, 0.9, 0.9, "ok", ("a guess", "b"), "not good as long as this is in doubt: a guess (and 1"),
+        (0.99, 1.9, 0.9, 0.9, "ok", (), "Good for simulation"),
+        (1.01, 1.9, 0.9, 0.9, "ok", (), "Not good (arx): without input t errs by 2"),
+        (0.5, 2.01, 0.9, 0.9, "ok", (), "Good for simulation"),  # one part of moves that no other has
+        (0.5, 1.9, 1.01, 0.9, "ok", (), "Not good (arx): on parts held out t errs by 0.71"),
+        (0.5, 1.9, 0.9, 1.01, "ok", (), "Not good (arx): on the logs of its own fit t errs by 1"),
+        (0.5, 1.9, 0.9, 0.9, "fail", (), "Not good (arx): q never moves"),
+        (0.5, 1.9, 0.9, 0.9, "ok", ("a guess", "b"), "Not good (arx) as long as this is in doubt: a guess"),
     ],
 )
 def test_a_plant_is_good_where_it_errs_by_less_than_half_of_no_input_on_parts_in_the_fit_and_on_another_run(
@@ -521,9 +521,9 @@ def test_a_plant_is_good_where_it_errs_by_less_than_half_of_no_input_on_parts_in
     scores = SimpleNamespace(expected={"t": ExpectedError(rmse, 0.1, high)})
     plant: Any = SimpleNamespace(scores=scores, units={"t": "K"}, logs=("a", "b", "c"), model=None)
     found, words = goodness.verdict_of("arx", plant, rows, quality, doubts)
-    assert found == said.startswith("good")
-    assert words.startswith(f"arx: on another run like these about t {rmse:.2g} K (0.1 to {high:.2g}); ")
-    assert said in words
+    assert found == said.startswith("Good")
+    assert words.startswith(said)
+    assert words.endswith(f" Expected error of another run like these: t {rmse:.2g} K (0.1 to {high:.2g}).")
 
 
 def table(shares, held=True):

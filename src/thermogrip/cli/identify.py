@@ -360,6 +360,7 @@ def validate(
 
     It sees the inputs and disturbances of the whole log, and measured outputs of the warm-up only."""
     from thermogrip.sysid.plant.log_grid import moved_beside, roles_of
+    from thermogrip.sysid.plant.plant import said_not_good
 
     loaded = cli.load_plant(plant, network)
     console = Console(as_json)
@@ -393,7 +394,7 @@ def validate(
     answers = [run_answer(log.attrs["name"], run, band) for log, run, band in zip(logs, runs, bands)]
     console.answer({"logs": answers, "repairs": repairs})
     found = [_urgency(run.verdict) for run in runs if run.verdict is not None]
-    if "; not good" in loaded.verdict and set(found) & {"as stated", "better", "seen"}:
+    if said_not_good(loaded.verdict) and set(found) & {"as stated", "better", "seen"}:
         console.say(
             f"{plant.name}: identify did not call it good, and a run as was stated does not change that"
         )

@@ -344,8 +344,9 @@ def test_a_pi_is_reviewed_by_its_loops_and_by_what_it_does(tank):
 @pytest.mark.parametrize(
     ("said", "verdict", "finding"),
     [
-        ("oe: expected RMSE 0.1; good for simulation; on another", "pass", "oe: expected RMSE 0.1"),
-        ("oe: RMSE 9; not good: no better on a; on another", "warn", "oe: RMSE 9; not good: no better on a"),
+        ("Good for simulation (oe). Expected error: 1 K.", "pass", "Good for simulation (oe)"),
+        ("Not good (oe): no better on a. Expected error: 1 K.", "warn", "Not good (oe): no better on a"),
+        ("oe: RMSE 9; not good: no better on a", "warn", "oe: RMSE 9; not good: no better on a"),
         ("", "pass", "no verdict, of 2 logs"),
     ],
 )
