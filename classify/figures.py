@@ -113,27 +113,17 @@ def reliability_figure(comparison: Comparison, condition: str = POOLED) -> Figur
     return figure
 
 
-def effusivity_figure(
-    rows: Sequence[EffusivityRow], library: Mapping[str, float], *, materials: Sequence[str] | None = None
-) -> Figure:
-    """Draw the posterior of each grasp as a strip on a logarithmic effusivity axis [W s^0.5 m^-2 K^-1],
-    coloured by its true material, with lines for the library."""
+def effusivity_figure(rows: Sequence[EffusivityRow], library: Mapping[str, float]) -> Figure:
+    """Draw the posterior of each grasp as a strip on a logarithmic effusivity axis [W s^0.5 m^-2 K^-1], with
+    lines for the library."""
     if not rows:
         raise UserError("there is no posterior to draw", hint="give at least one grasp")
-    truth = list(materials) if materials is not None else [""] * len(rows)
-    kinds = list(dict.fromkeys(truth))
     figure, [[axis]] = panels(1, 1, size=(9.6, 1.2 + 0.16 * len(rows)), ticks=7)
-    for i, (row, name) in enumerate(zip(rows, truth)):
-        colour = PALETTE[kinds.index(name) % 8]
-        axis.plot([row.effusivity_p05, row.effusivity_p95], [i, i], color=colour, lw=4, alpha=0.45)
-        axis.plot(row.effusivity, i, MARKERS[kinds.index(name) % 8], ms=4.5, color=colour)
+    for i, row in enumerate(rows):
+        axis.plot([row.effusivity_p05, row.effusivity_p95], [i, i], color=PALETTE[0], lw=4, alpha=0.45)
+        axis.plot(row.effusivity, i, MARKERS[0], ms=4.5, color=PALETTE[0])
     axis.set_xscale("log")
     axis.tick_params(axis="x", which="minor", labelsize=7)
-    for k, name in enumerate(kinds):
-        if name:
-            axis.plot([], [], MARKERS[k % 8], color=PALETTE[k % 8], ms=4.5, label=name)
-    if any(kinds):
-        axis.legend(frameon=False, fontsize=7, loc="center left", bbox_to_anchor=(1.0, 0.5))
     _library_lines(axis, library)
     axis.set_yticks(range(len(rows)), [row.grasp_id for row in rows], fontsize=6)
     axis.set_ylim(len(rows) - 0.3, -0.7)

@@ -147,8 +147,7 @@ def choose_next_touch(
         Temperatures to weigh [degC].
     seconds : callable, optional
         Time to bring the gripper to a temperature [s], of
-        :func:`~thermogrip.classify.decisions.next_touch.by_plant` or
-        :func:`at_rates`; by default it is done within the rest.
+        :func:`~thermogrip.classify.decisions.next_touch.by_plant`; by default it is done within the rest.
     price : float, optional
         Of a second, in units of a right answer.
     rest, end : float, optional
@@ -228,17 +227,6 @@ def advise_touches(
             best, accuracy = choice.best, float(choice.accuracy[choice.t_gripper == choice.best][0])
         found[name] = {"next_touch_degC": best, "next_touch_accuracy": accuracy}
     return [found[name] for name in units.tolist()]
-
-
-def at_rates(now: float, *, heating: float, cooling: float) -> Callable[[float], float]:
-    """Return the time [s] from temperature ``now`` [degC] to another at constant rates [K/s]."""
-    if not (heating > 0 and cooling > 0):
-        raise UserError("a rate is not positive", hint="give K/s, both as positive numbers")
-
-    def seconds(there: float) -> float:
-        return round(abs(there - now) / (heating if there > now else cooling), 9)
-
-    return seconds
 
 
 def with_model(classifier: GraspClassifier) -> PosteriorClassifier:

@@ -66,7 +66,6 @@ from thermogrip.classify.estimators.base import (
     Floats,
     GraspClassifier,
     Labels,
-    check_shapes,
     level,
     named_arrays,
     normalised,
@@ -375,16 +374,12 @@ class BayesClassifier(GraspClassifier):
         return numbers, named_arrays(self, ("center_", "scale_", "means_", "covariance_", "mean_covariance_"))
 
     def set_state(self, numbers: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> None:
-        """Take up what :meth:`get_state` returned; 0.1.0 had no error of the object temperature."""
+        """Take up what :meth:`get_state` returned."""
         self.reader_ = FeatureReader.from_dict(numbers)
         self.feature_names_ = self.reader_.names
         self.dof_, self.shrinkage_ = float(numbers["dof"]), float(numbers["shrinkage"])
         self.mean_shrinkage_ = float(numbers["mean_shrinkage"])
-        self.t_object_sd_ = number_within({"t_object_sd": 0.0, **numbers}, "t_object_sd", 0.0, 1e3)
-        if "widening_" in arrays:
-            check_shapes(arrays, widening_=(self.classes_.size,))
-            spread = (arrays["widening_"] - 1)[:, None, None] * arrays["covariance_"]
-            arrays = arrays | {"mean_covariance_": spread}
+        self.t_object_sd_ = number_within(numbers, "t_object_sd", 0.0, 1e3)
         n, k = len(self.feature_names_), self.classes_.size
         square = {"covariance_": (n, n), "mean_covariance_": (k, n, n)}
         set_arrays(self, arrays, center_=(n,), scale_=(n,), means_=(k, n), **square)

@@ -90,8 +90,8 @@ class FeaturesLda(_Lda):
     class, not noise; grasps within 1 K teach nothing and speak for no class.
     """
 
-    spread_: float = np.inf
-    """Variance of the discriminants within a class, summed; infinite in files of 0.1.0, which lack it."""
+    spread_: float
+    """Variance of the discriminants within a class, summed."""
 
     def _fit(self, grasps: Grasps, labels: Labels) -> None:
         self.reader_, read, usable, self.notes_ = FeatureReader.learn([grasps], labels)
@@ -124,15 +124,13 @@ class FeaturesLda(_Lda):
         return np.asarray(share[:, None] * self._discriminants(x))
 
     def get_state(self) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
-        spread = self.spread_ if np.isfinite(self.spread_) else None
         arrays = named_arrays(self, ("center_", "scale_", "coef_", "intercept_"))
-        return self.reader_.to_dict() | {"spread": spread}, arrays
+        return self.reader_.to_dict() | {"spread": self.spread_}, arrays
 
     def set_state(self, numbers: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> None:
         self.reader_ = FeatureReader.from_dict(numbers)
         self.feature_names_ = self.reader_.names
-        spread = numbers.get("spread")
-        self.spread_ = np.inf if spread is None else float(spread)
+        self.spread_ = float(numbers["spread"])
         self._take_up(arrays, len(self.feature_names_))
 
 

@@ -121,12 +121,13 @@ class LstmClassifier(JoinedClassifier):
         real = as_array(grasps, times=self.times_)
         target = np.searchsorted(self.classes_, labels).astype(np.int64)
         epochs = self.epochs
-        if self.patience is not None and self.epochs > self.patience:
-            for fitted, held in inner_folds(grasps, labels, seed=self.random_state)[:1]:
-                self.mean_, self.sd_ = self._standard(real[fitted])
-                seen = self._series(real[held]), target[held]
-                series, classes = self._copies(real[fitted], target[fitted])
-                epochs = _train(self, series, classes, epochs=epochs, held_out=seen).best
+        split = _held_out(grasps, labels, seed=self.random_state)
+        if split is not None and self.patience is not None and self.epochs > self.patience:
+            fitted, held = split
+            self.mean_, self.sd_ = self._standard(real[fitted])
+            seen = self._series(real[held]), target[held]
+            series, classes = self._copies(real[fitted], target[fitted])
+            epochs = _train(self, series, classes, epochs=epochs, held_out=seen).best
         self.mean_, self.sd_ = self._standard(real)
         series, classes = self._copies(real, target)
         self.weights_, self.loss_curve_, _ = _train(self, series, classes, epochs=epochs)
@@ -191,27 +192,22 @@ class PaperLstm(LstmClassifier):
     patience: int | None = None
 
 
-def inner_folds(
-    grasps: Grasps, labels: Labels, *, count: int = 5, seed: int = 0
-) -> list[tuple[NDArray[np.int64], NDArray[np.int64]]]:
-    """Return (fitted, held out) rows of training grasps, whole sessions apart, or whole grasps where a
-    session has all of a class; a fold without a class to train on is left out."""
-    groups = unit_names(grasps)
-    session = grasps["session"].values.astype(str) if "session" in grasps else groups
+def _held_out(
+    grasps: Grasps, labels: Labels, *, seed: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64]] | None:
+    """Return rows to train on and a fifth that is held out, whole sessions apart, or whole grasps where a
+    session has all of a class; None where a class has too few of either."""
     from sklearn.model_selection import StratifiedGroupKFold
 
-    kept: list[tuple[NDArray[np.int64], NDArray[np.int64]]] = []
-    for tried in (session, groups):
-        fewest = min(np.unique(tried[labels == c]).size for c in np.unique(labels))
+    units = unit_names(grasps)
+    for groups in (grasps["session"].values.astype(str) if "session" in grasps else units, units):
+        fewest = min(np.unique(groups[labels == name]).size for name in np.unique(labels))
         if fewest > 1:
-            split = StratifiedGroupKFold(min(count, fewest), shuffle=True, random_state=seed)
-            found = [(np.asarray(a), np.asarray(b)) for a, b in split.split(labels, labels, tried)]
-            whole = np.unique(labels).size
-            sound = [(a, b) for a, b in found if b.size and np.unique(labels[a]).size == whole]
-            if len(sound) == len(found):
-                return sound
-            kept = kept or sound
-    return kept
+            folds = StratifiedGroupKFold(min(5, fewest), shuffle=True, random_state=seed)
+            fitted, held = next(folds.split(labels, labels, groups))
+            if held.size and np.unique(labels[fitted]).size == np.unique(labels).size:
+                return fitted, held
+    return None
 
 
 Weights = dict[str, NDArray[Any]]

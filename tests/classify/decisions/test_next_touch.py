@@ -18,7 +18,6 @@ from thermogrip.classify.decisions import next_touch
 from thermogrip.classify.decisions.next_touch import (
     NextTouch,
     advise_touches,
-    at_rates,
     by_plant,
     entropy,
     expected_information,
@@ -119,15 +118,11 @@ def test_the_second_touch_is_asked_far_from_the_first(known: PosteriorClassifier
 
 def test_a_slow_gripper_asks_nearer(known: PosteriorClassifier, touched: Grasps) -> None:
     """Reaching 15 degC takes long at 0.02 K/s; a dearer second moves the choice to where it is already."""
-    slow = at_rates(22.0, heating=0.02, cooling=0.02)
+    slow = lambda there: abs(there - 22.0) / 0.02  # noqa: E731
     fast = choose_next_touch(known, touched, t_gripper=[15.0, 22.0], price=0.0)
     dear = choose_next_touch(known, touched, t_gripper=[15.0, 22.0], price=0.002, seconds=slow)
     assert (fast.best, dear.best) == (15.0, 22.0)
     assert not choose_next_touch(known, touched, t_gripper=[15.0, 25.0], price=0.1).worth_it
-    assert [at_rates(20.0, heating=2.0, cooling=0.5)(t) for t in (25.0, 15.0, 20.0)] == [2.5, 10.0, 0.0]
-    for rates in ((0.0, 1.0), (1.0, 0.0)):
-        with pytest.raises(UserError, match="rate is not positive"):
-            at_rates(20.0, heating=rates[0], cooling=rates[1])
 
 
 def test_values_that_tie_go_to_the_most_information() -> None:

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 import pytest
 import xarray as xr
 from scipy.stats import multivariate_t
 
-from thermogrip.classify import load_classifier, make_classifier, save_classifier
+from thermogrip.classify import make_classifier
 from thermogrip.classify.estimators.base import GraspClassifier, join_grasps, pick
 from thermogrip.classify.estimators.bayes import (
     BayesClassifier,
@@ -22,7 +21,6 @@ from thermogrip.classify.estimators.bayes import (
     _weighted_mean,
     _within_class_sd,
 )
-from thermogrip.datasets.atomic_files import read_json, write_json
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.datasets.schema import Grasps
@@ -363,24 +361,6 @@ def test_what_cannot_be_learnt_from_is_reported(name: str, make_touches: Maker) 
     ]
     assert "features stay in kelvin" in make_classifier(name).fit(unknown).notes_[0]
     assert make_classifier(name).fit(warm).notes_ == []
-
-
-def test_bayes_files_of_0_1_0_still_load(three: Grasps, tmp_path: Path) -> None:
-    model = make_classifier("bayes").fit(three)
-    model.mean_covariance_ = model.covariance_ / (8 + model.mean_shrinkage_) * np.ones((3, 1, 1))
-    model.t_object_sd_ = 0.0
-    folder = save_classifier(model, tmp_path / "m")
-    content = read_json(folder / "classifier.json", "thermogrip.classifier", 1)
-    del content["arrays"]["mean_covariance_"], content["numbers"]["t_object_sd"]
-    content["arrays"]["widening_"] = [1 + 1 / (8 + model.mean_shrinkage_)] * 3
-    write_json(folder / "classifier.json", content, schema="thermogrip.classifier", version=1)
-    np.testing.assert_allclose(
-        load_classifier(folder).predict_proba(three), model.predict_proba(three), atol=1e-9
-    )
-    content["arrays"]["widening_"] = [2.0]
-    write_json(folder / "classifier.json", content, schema="thermogrip.classifier", version=1)
-    with pytest.raises(UserError, match="is damaged"):
-        load_classifier(folder)
 
 
 def test_conditions_of_other_rates_and_lengths_are_learnt_from_together(make_touches: Maker) -> None:
