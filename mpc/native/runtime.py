@@ -17,11 +17,11 @@ import os
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from functools import cache
 from importlib import resources
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -129,21 +129,6 @@ def _written(model: _ByStructure, drives: tuple[int, ...], h: float) -> ModelCod
     return _codes[key]
 
 
-#: Structure, drives and step of a model, and its C.
-KnownCode: TypeAlias = tuple[str, tuple[int, ...], float, ModelCode]
-
-
-def known_codes() -> list[KnownCode]:
-    """Return the C of models that this process has written, for :func:`remember_codes` of another one."""
-    return [(model.text, drives, h, code) for (model, drives, h), code in _codes.items() if model.complete]
-
-
-def remember_codes(codes: Sequence[KnownCode]) -> None:
-    """Take over what another process has written."""
-    for text, drives, h, code in codes:
-        _codes.setdefault((_ByStructure.named(text), drives, h), code)
-
-
 def _code_of(model: PredictionModel) -> ModelCode:
     return _written(_ByStructure(model.model), tuple(model.drive_index), model.dt / model.sub)
 
@@ -153,16 +138,9 @@ class _ByStructure:
 
     def __init__(self, model: Model) -> None:
         # equations in a file of the user's own are not in what a model saves: only itself is the same
-        self.complete = model.kind in ("network", "statespace", "sindy")
+        complete = model.kind in ("network", "statespace", "sindy")
         self.model = model
-        self.text = repr(model.to_dict()) if self.complete else f"{model.kind} {id(model)}"
-
-    @classmethod
-    def named(cls, text: str) -> _ByStructure:
-        """Return what counts as a model of these equations, without the model."""
-        made = object.__new__(cls)
-        made.text, made.complete = text, True
-        return made
+        self.text = repr(model.to_dict()) if complete else f"{model.kind} {id(model)}"
 
     def __hash__(self) -> int:
         return hash(self.text)

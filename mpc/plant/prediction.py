@@ -35,7 +35,7 @@ import operator
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -107,11 +107,6 @@ _ANY = 1e30
 _NEAR = 5.0  # units from what the logs showed, where a black box still knows what it does
 
 
-#: A state and the drives that hold it, of a model by controlled outputs, start and disturbances.
-HeldStart: TypeAlias = tuple[Array, Array | None]
-HeldStarts: TypeAlias = dict[tuple[tuple[str, ...], float, tuple[float, ...]], HeldStart]
-
-
 class Response(NamedTuple):
     """Outputs after 1...N samples of a linear plant, by what they come from."""
 
@@ -173,7 +168,6 @@ class PredictionModel:
         self.sub = max(1, round(wanted / plant.dt))
         self.dt = self.sub * plant.dt
         self._responses: dict[tuple[int, ...], Response] = {}
-        self.held_starts: HeldStarts = {}
         self.sub = self._fewest_steps()
 
     def _fewest_steps(self) -> int:
@@ -663,30 +657,22 @@ def holding_drive(
 _HELD = 0.25  # of an output's unit: a start that drives miss by less is held
 
 
+@lru_cache(maxsize=256)  # trials of many designs begin there
 def held_start(
     model: PredictionModel, controlled: tuple[str, ...], start: float, d: tuple[float, ...]
-) -> HeldStart:
+) -> tuple[Array, Array | None]:
     """Return the state (n_x,) in which drives inside their range hold the controlled outputs at ``start``
     [degC] for good, and these drives (n_u,); where none do, that of a plant which is as warm all over, and
-    None.  The model keeps it."""
-    key = (controlled, start, d)
-    if key not in model.held_starts:
-        model.held_starts[key] = _held_start(model, controlled, start, d)
-    return model.held_starts[key]
-
-
-def _held_start(
-    model: PredictionModel, controlled: tuple[str, ...], start: float, d: tuple[float, ...]
-) -> HeldStart:
+    None. Shared: read it."""
     wanted = np.full(len(controlled), start)
     held = holding_drive(model, controlled, wanted, d)
-    x, u = model.steady_state(held.u, d), held.u
+    x, u, miss = model.steady_state(held.u, d), held.u, held.miss
     if not np.isfinite(x).all():  # an integrator
         x, u = _balance(model, [model.outputs.index(name) for name in controlled], wanted, np.array(d))
-        held = replace(held, miss=held.miss if np.all((model.lowest <= u) & (u <= model.highest)) else np.inf)
+        miss = miss if np.all((model.lowest <= u) & (u <= model.highest)) else np.inf
     unit = model.unit[[model.outputs.index(name) for name in controlled]].min()
-    if held.miss < _HELD * unit and np.isfinite(x).all():
-        return np.asarray(x), u
+    if miss < _HELD * unit and np.isfinite(x).all():
+        return x, u
     return model.rest(np.full(model.n_y, start), d), None
 
 
