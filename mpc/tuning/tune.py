@@ -1,15 +1,15 @@
 r"""Find the best controller of all kinds for what is wanted, and say whether weights were the limit.
 
-**Search.**  An MPC is varied by five factors of its default design, a PI by three of SIMC's settings, by a
-compass search [1]_: along one parameter after the other by a factor of 4, as long as the score falls, then by
-2, then by 1.4.  Each design is scored in closed loop on draws of the plant's posterior, never on the model
-itself, on steps and on loads, and on draws that lack structure (:mod:`thermogrip.mpc.tuning.objective`).  An
-MPC that is worse than the default design by more than 3 % on steps or on loads is not taken, whatever it wins
-on the other: trials are the model's word, and on two of eight plants the truth denied it.  The default
-design, the best MPC and the best PI are then compared on draws that the search has not seen, and the one of
-the least score is what is saved, whatever its kind; a tuned MPC where it wins more than 3 %.  A PI does not
-know zones, prices of energy, limits of outputs, ramps or what is switched: where the spec asks for one of
-these the MPC is taken.
+**Search.** An MPC is varied by five factors of its default design, a PI by three of SIMC's settings, each
+by its logarithm, by NLopt's simplex search [1]_ from a factor of 2 on.
+Each design is scored in closed loop on draws of the plant's posterior, never on the model itself, on
+steps and on loads, and on draws that lack structure (:mod:`thermogrip.mpc.tuning.objective`). An MPC that
+is worse than the default design by more than 3 % on steps or on loads is not taken, whatever it wins on
+the other: trials are the model's word, and on two of eight plants the truth denied it. The default
+design, the best MPC and the best PI are then compared on draws that the search has not seen, and the one
+of the least score is what is saved, whatever its kind; a tuned MPC where it wins more than 3 %. A PI does
+not know zones, prices of energy, limits of outputs, ramps or what is switched: where the spec asks for
+one of these the MPC is taken.
 
 **Interrupted** by Ctrl-C, once the default design and the PI by SIMC are scored, it returns the best so far.
 
@@ -24,7 +24,7 @@ these the MPC is taken.
 
 References
 ----------
-.. [1] T. G. Kolda, R. M. Lewis, V. Torczon, "Optimization by direct search", SIAM Review 45(3), 2003.
+.. [1] J. A. Nelder, R. Mead, "A simplex method for function minimization", Computer Journal 7(4), 1965.
 """
 
 from __future__ import annotations
@@ -37,6 +37,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.parallel import Progress
 from thermogrip.mpc.closed_loop.simulate import ClosedLoop
 from thermogrip.mpc.controllers.mpc import Controller
@@ -78,7 +79,10 @@ _WON = 0.03  # relative fall of the score that counts
 _NEAR = 1.25  # settling over bound that counts as the actuator's limit
 _CHECK_FROM = 100  # draws of the comparison, apart from those of the search
 _NOISES = 2  # in which each trial of a search is run: one noise alone moves a score by a tenth
-_FACTORS = (4.0, 2.0, 1.4)  # of the compass search, see the module's text
+#: By which a search first varies each parameter.  Score over the default's on unseen draws of four plants
+#: (geometric mean): .971; subplex .982 from 2 and from 4 on; a compass search .970.
+_FIRST_FACTOR = 2.0
+_LAST_FACTOR = 1.1  # and below which it stops: a tenth more or less moves a score by less than noise does
 #: What a search varies, as a factor of the default design or of SIMC: name, smallest, largest.
 MPC_PARAMETERS = {
     "move": (0.01, 1000.0),
@@ -425,32 +429,36 @@ def _search(bench: Bench, tried: list[Trial], show: Progress) -> None:
 
     first = {kind: evaluate(kind, dict.fromkeys(limits, 1.0)) for kind, limits in ranges.items()}
     for kind, limits in ranges.items():
-        compass(partial(evaluate, kind), first[kind], limits, most - 1)
+        minimise(partial(evaluate, kind), first[kind], limits, most - 1)
 
 
-def compass(
+def minimise(
     evaluate: Callable[[Mapping[str, float]], Trial],
     first: Trial,
     limits: Mapping[str, tuple[float, float]],
     most: int,
-) -> Trial:
-    """Return the best of at most so many trials, from a first one along one parameter after the other."""
-    best = first
-    for factor in _FACTORS:
-        for name, (low, high) in limits.items():
-            for along in (factor, 1 / factor):
-                before = best
-                while most > 0:
-                    value = float(np.clip(along * best.parameters[name], low, high))
-                    if value == best.parameters[name]:
-                        break
-                    found, most = evaluate({**best.parameters, name: value}), most - 1
-                    if not found.score < best.score:
-                        break
-                    best = found
-                if best is not before:
-                    break  # the other way leads back
-    return best
+) -> None:
+    """Evaluate at most so many designs on the way down from a first one."""
+    import nlopt
+
+    names, (low, high) = list(limits), np.log(list(limits.values())).T
+    start = np.log([first.parameters[name] for name in names])
+
+    def cost(z: Array, gradient: Array) -> float:
+        if np.array_equal(z, start):
+            return first.score
+        return evaluate(dict(zip(names, np.exp(z).tolist(), strict=True))).score
+
+    if most < 1:
+        return
+    search = nlopt.opt(nlopt.LN_NELDERMEAD, len(names))
+    search.set_min_objective(cost)
+    search.set_lower_bounds(low)
+    search.set_upper_bounds(high)
+    search.set_initial_step(np.full(len(names), np.log(_FIRST_FACTOR)))
+    search.set_xtol_abs(np.log(_LAST_FACTOR))
+    search.set_maxeval(most + 1)
+    search.optimize(start)
 
 
 def _candidates(bench: Bench, tried: Sequence[Trial]) -> dict[str, Trial]:

@@ -129,6 +129,14 @@ class Bridge:
     ------
     UserError
         If the package is missing or nothing answers at the start.
+
+    Examples
+    --------
+    What it sends of a row, after the topic is advertised:
+
+    >>> messages = Messages()
+    >>> messages.row({"drive": 0.5}, stamp=0.0)[-1]
+    '{"op": "publish", "topic": "/thermogrip/drive", "msg": {"data": 0.5}}'
     """
 
     def __init__(

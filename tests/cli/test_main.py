@@ -82,7 +82,7 @@ simulate: PLANT LOG --out --warmup=5.0>0 --bands=False --network --columns --dt>
 linearise: PLANT --at --dt>1e-09 --out --report --network --seed=0>0 --json=False
 excite: --kind --minutes>0.1 --out --plant --network --lowest=5.0 --highest=60.0 --hold --slew>1e-09
   --seed=0>0 --json=False
-tune: PLANT --out --spec --report --network --seed=0>0 --workers=1>1 --cluster --json=False
+tune: PLANT --out --spec --report --network --seed=0>0 --json=False
 retune: DIR LOG... --out=retuned.json --controller --spec --report --network --seed=0>0 --workers=1>1
   --json=False
 review: CONTROLLER --report --network --seed=0>0 --json=False

@@ -30,7 +30,6 @@ MISTAKES = {
     "export controller.json --out fw --chekc": "did you mean '--check'?",
     "identify log.csv -o plant.json": "options are whole words: --out, ",
     "identify log.csv --seed one": "Invalid value for '--seed'",
-    "run controller.json --target 380 --twin plant.json --out r": "choose one from 3 to 55 degC",
     # networks, models, classifiers
     "identify log.csv --network griper": "did you mean 'gripper'?",
     "excite --kind prbs --minutes 5 --network tclb --out s.csv": "did you mean 'tclab'?",

@@ -50,19 +50,6 @@ def test_files_that_share_no_material_are_one_line(
     assert said.endswith("nothing to score; test on grasps of the materials that were trained")
 
 
-def test_curves_that_need_more_grasps_cost_no_score(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    grasps = load_example_grasps()["exp2_dT20"]
-    few = grasps.isel(grasp=np.r_[np.flatnonzero(grasps["split"].values == "train"), 5])
-    file = write_grasps(few.assign_attrs(name="few"), tmp_path / "few.csv")
-    options = ["--classifiers", "pca-lda", "--repeats", "0", "--curves", "--out", str(tmp_path / "c")]
-    assert main(["compare", str(file), *options]) == 0
-    said = " ".join(capsys.readouterr().err.split())
-    assert "no contact time: no condition can be split" in said
-    assert (tmp_path / "c" / "report.html").exists()
-
-
 def test_grasps_without_a_contact_neither_train_nor_count(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -46,7 +46,6 @@ REFUSED = {
     "compare x.csv --by sesion --out o": "--by 'sesion' is unknown; use session, block",
     "compare x.csv --test nofile.csv --out o": "nofile.csv: no such file or folder",
     "compare x.csv --classifiers bayes,bays --out o": "no classifier is called 'bays'",
-    "compare x.csv --classifiers bayes+bays --out o": "no classifier is called 'bays'",
     "train x.csv --classifier bays --out o": "no classifier is called 'bays'",
     "train x.csv --classifier bayes --split trian --out o": "--split 'trian' is unknown",
     "effusivity nofile.csv --out o.csv": "nofile.csv: no such file or folder",

@@ -31,7 +31,7 @@ def no_torch(monkeypatch: pytest.MonkeyPatch) -> None:
     [
         ["train", "grasps.csv", "--classifier", "lstm", "--out", "made"],
         ["train", "grasps.csv", "--classifier", "lstm-paper", "--out", "made"],
-        ["compare", "grasps.csv", "--classifiers", "pca-lda+lstm", "--out", "made"],
+        ["compare", "grasps.csv", "--classifiers", "lstm", "--out", "made"],
         ["paper", "--out", "made"],
     ],
     ids=lambda words: " ".join(words[:4]),

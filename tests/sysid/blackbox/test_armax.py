@@ -68,7 +68,7 @@ def test_the_family_has_the_structures_of_output_error_with_c_beside():
     records = records_of([1.0, 0.7, 0.1], n=500)
     part = Segment(np.arange(500.0), records.y[0][:, None], records.w[0], np.zeros((500, 0)), "a")
     grid = Grid(("q",), (), ("t",), (), 1.0, (part,), 1.0, {})
-    how = {"poles": (1, 2), "zeros": (1,), "delays": (1, 2)}
+    how = {"poles": (1, 2), "zeros": (1,), "delays": (1, 2), "terms": ((),)}
     found, plain = armax_family(grid, **how), oe_family(grid, **how)
     assert [s.label for s in found] == [s.label for s in plain]
     assert [s.size - p.size for s, p in zip(found, plain)] == [1, 1, 2, 2]

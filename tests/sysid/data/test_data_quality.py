@@ -547,7 +547,7 @@ def test_an_input_of_one_sign_is_described_by_its_halves():
     assert seen.thin == ("q1 above 50",)
     assert seen.ranges["t2"] == pytest.approx((0.72, 71.26), abs=0.01)
     assert seen.ranges["t1"] == pytest.approx((0.36, 35.63), abs=0.01)
-    words = "the logs cover q1 between 20 and 80, q2 between 20 and 80, t1 between 0.36 and 35.6 degC, t2"
+    words = "The logs cover q1 between 20 and 80, q2 between 20 and 80, t1 between 0.36 and 35.6 degC, t2"
     assert words in seen.sentence({"t1": "degC", "t2": "1"})
     # no unit, no "1"
     assert seen.sentence({"t1": "degC", "t2": "1"}).split(";")[0].endswith("71.3 (98 % of the readings)")

@@ -97,15 +97,6 @@ def test_bins_are_whole_steps_and_hold_the_means_of_their_rows():
     np.testing.assert_allclose(cells.operators[0] @ line, at)
 
 
-def test_bins_of_a_model_with_short_steps_are_as_long_as_those_of_one_with_long_ones():
-    log = made(0, seconds=100.0)
-    fine, coarse = (problem_of(heater(), log, average=6.0, dt=dt) for dt in (0.5, 2.0))
-    assert (fine.plant.dt, coarse.plant.dt) == (0.5, 2.0)
-    assert fine.average == coarse.average == 6.0
-    assert fine.tau.tolist() == coarse.tau.tolist() == [10.0]
-    np.testing.assert_allclose(fine.logs[0][1][0].means[0], coarse.logs[0][1][0].means[0])
-
-
 def test_a_stretch_without_a_reading_is_no_reason_to_refuse_a_log():
     log = made(0, seconds=300.0)
     t = log["time"].values

@@ -283,7 +283,7 @@ def test_a_fifth_of_the_readings_lost_costs_little(fit_one):
 def test_the_neural_fit_chooses_by_free_run_and_its_plant_comes_back_from_its_file(tmp_path):
     found = fit_black_box("neural", [tank_log(400)], average=2.0)
     assert found.plant.model.kind == "neural"
-    assert found.choice.structure.label in {f"{n} states, {h} units" for n in (2, 3, 4) for h in (3, 8)}
+    assert found.choice.structure.label == "members of all sizes"
     again = Plant.load(found.plant.save(tmp_path / "plant.json"))
     fresh = tank_log(seed=4)
     one, other = (free_run(plant, fresh, warmup=50.0, score_from=50.0) for plant in (found.plant, again))
