@@ -1,10 +1,10 @@
 import typing
 
 from thermogrip.mpc.closed_loop.simulate import simulate_closed_loop as simulate_closed_loop
-from thermogrip.mpc.controllers.controller_file import load_controller as load_controller
 from thermogrip.mpc.controllers.loop_monitor import LoopMonitor as LoopMonitor
 from thermogrip.mpc.controllers.mpc import Controller as Controller
 from thermogrip.mpc.controllers.mpc import design_controller as design_controller
+from thermogrip.mpc.controllers.mpc import load_controller as load_controller
 from thermogrip.mpc.controllers.pi import PIController as PIController
 from thermogrip.mpc.design.design import default_design as default_design
 from thermogrip.mpc.design.spec import SPEC_TEMPLATE as SPEC_TEMPLATE

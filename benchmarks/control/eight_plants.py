@@ -34,8 +34,7 @@ from opponents import DoMPC, FirstOrder, SimcPI
 from ten_plants import Ours, Player, as_log
 from truths import Array, Plant, record
 
-from thermogrip.mpc.controllers.controller_file import load_controller
-from thermogrip.mpc.controllers.mpc import Controller
+from thermogrip.mpc.controllers.mpc import Controller, load_controller
 from thermogrip.mpc.controllers.pi import PIController
 from thermogrip.mpc.design.design import default_design
 from thermogrip.mpc.design.spec import Spec

@@ -16,8 +16,6 @@ from thermogrip.mpc.design.design import SCHEMA, Design
 from thermogrip.mpc.interface import FILE_VERSIONS
 
 if TYPE_CHECKING:
-    from thermogrip.mpc.controllers.mpc import Controller
-    from thermogrip.mpc.controllers.pi import PIController
     from thermogrip.sysid.models.model import Model
     from thermogrip.sysid.plant.plant import Plant
 
@@ -43,47 +41,6 @@ class Parts(NamedTuple):
     def save(self, path: str | Path) -> Path:
         """Write the file and return its path."""
         return write_json(path, self.to_dict(), schema=SCHEMA, version=FILE_VERSIONS[self.kind])
-
-    def controller(self) -> Controller | PIController:
-        """Return the controller."""
-        from thermogrip.mpc.controllers.mpc import Controller
-        from thermogrip.mpc.controllers.pi import PIController
-
-        if self.kind == "PI":
-            return PIController.of(self.plant, self.design, notes=self.notes)
-        return Controller(self.plant, self.design, notes=self.notes)
-
-
-def load_controller(path: str | Path, *, model: Model | None = None) -> Controller | PIController:
-    """Return the controller of a file, of whatever kind.
-
-    Parameters
-    ----------
-    path : str or Path
-    model : Model, optional
-        The equations of its plant, where they are a class of the user's own; ignored otherwise.
-
-    Raises
-    ------
-    UserError
-        If the file is absent, is no controller, or its numbers make none.
-
-    Examples
-    --------
-    >>> from thermogrip.sysid import Plant, load_network
-    >>> from thermogrip.mpc import PIController, load_controller
-    >>> kit = load_network("tclab")
-    >>> p, heaters = dict(zip(kit.parameters, kit.prior)), dict.fromkeys(kit.inputs, (0.0, 100.0))
-    >>> plant = Plant(kit, p, dt=kit.dt, units=kit.units, valid=heaters)
-    >>> from tempfile import TemporaryDirectory
-    >>> with TemporaryDirectory() as folder:
-    ...     path = PIController(plant, dt=5.0).save(f"{folder}/controller.json")
-    ...     type(load_controller(path)).__name__
-    'PIController'
-    """
-    # numbers each of which may be can leave no gain or no estimate together
-    with reading("its numbers make no controller", file=path, hint="tune the controller again"):
-        return read_parts(path, model=model).controller()
 
 
 def read_parts(path: str | Path, *, model: Model | None = None) -> Parts:

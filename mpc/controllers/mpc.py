@@ -18,6 +18,7 @@ from thermogrip.datasets.media import Shown
 from thermogrip.mpc.controllers.compiled import CompiledStep
 from thermogrip.mpc.controllers.controller_file import Parts, read_parts
 from thermogrip.mpc.controllers.linear_equivalent import to_control
+from thermogrip.mpc.controllers.pi import PIController
 from thermogrip.mpc.controllers.reference import ReferenceController
 from thermogrip.mpc.design.design import Design, check_design, default_design
 from thermogrip.mpc.estimator.observer import DisturbanceModel, Observer
@@ -267,3 +268,37 @@ def design_controller(plant: Plant, **changes: Any) -> Controller:
     (2.0, 2.0)
     """
     return Controller(plant, default_design(plant, **changes))
+
+
+def load_controller(path: str | Path, *, model: Model | None = None) -> Controller | PIController:
+    """Return the controller of a file, of whatever kind.
+
+    Parameters
+    ----------
+    path : str or Path
+    model : Model, optional
+        The equations of its plant, where they are a class of the user's own; ignored otherwise.
+
+    Raises
+    ------
+    UserError
+        If the file is absent, is no controller, or its numbers make none.
+
+    Examples
+    --------
+    >>> from thermogrip.sysid import Plant, load_network
+    >>> from thermogrip.mpc import PIController, load_controller
+    >>> kit = load_network("tclab")
+    >>> p, heaters = dict(zip(kit.parameters, kit.prior)), dict.fromkeys(kit.inputs, (0.0, 100.0))
+    >>> plant = Plant(kit, p, dt=kit.dt, units=kit.units, valid=heaters)
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     path = PIController(plant, dt=5.0).save(f"{folder}/controller.json")
+    ...     type(load_controller(path)).__name__
+    'PIController'
+    """
+    # numbers each of which may be can leave no gain or no estimate together
+    with reading("its numbers make no controller", file=path, hint="tune the controller again"):
+        parts = read_parts(path, model=model)
+        kind = PIController.of if parts.kind == "PI" else Controller
+        return kind(parts.plant, parts.design, notes=parts.notes)

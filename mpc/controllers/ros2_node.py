@@ -27,8 +27,7 @@ from thermogrip.datasets.rosbag import (
     read_topic_map,
     write_bag,
 )
-from thermogrip.mpc.controllers.controller_file import load_controller
-from thermogrip.mpc.controllers.mpc import Controller
+from thermogrip.mpc.controllers.mpc import Controller, load_controller
 from thermogrip.mpc.controllers.pi import PIController
 from thermogrip.mpc.interface import STATUSES
 

@@ -231,7 +231,7 @@ def test_a_review_is_an_answer_of_no_where_a_check_fails(
 def test_the_class_of_a_plant_of_one_s_own_is_handed_in(controller: Bench, stand_in: StandIn) -> None:
     controller.write("own.py", "")
     stand_in("thermogrip.cli.options.find_network", lambda text: f"model of {text}")
-    loaded = stand_in("thermogrip.mpc.controllers.controller_file.load_controller", "a controller")
+    loaded = stand_in("thermogrip.mpc.controllers.mpc.load_controller", "a controller")
     stand_in("thermogrip.mpc.tuning.design_review.review", [])
     for network in ((), ("--network", "own.py:Own")):
         assert controller.run("review", "c.json", *network).code == 0

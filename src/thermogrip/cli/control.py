@@ -255,6 +255,6 @@ def export(
 
 def load_controller(path: Path, network: str | None) -> Controller | PIController:
     """Return a controller; ``network`` is the class of its plant, where that is the user's own."""
-    from thermogrip.mpc.controllers.controller_file import load_controller as load
+    from thermogrip.mpc.controllers.mpc import load_controller as load
 
     return load(path, model=None if network is None else cli.find_network(network))

@@ -133,7 +133,7 @@ def _tune(
     out: Path, plant: Plant, seed: int, workers: Workers, progress: Progress | None
 ) -> tuple[Tuning, Sequence[Check]]:
     """Tune on few whole draws with few evaluations, and review the controller as its file has it."""
-    from thermogrip.mpc.controllers.controller_file import load_controller
+    from thermogrip.mpc.controllers.mpc import load_controller
     from thermogrip.mpc.design.spec import Spec
     from thermogrip.mpc.tuning.design_review import review
     from thermogrip.mpc.tuning.tune import tune

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from thermogrip.datasets.errors import UserError
-from thermogrip.mpc.controllers.controller_file import load_controller
-from thermogrip.mpc.controllers.mpc import Controller
+from thermogrip.mpc.controllers.mpc import Controller, load_controller
 from thermogrip.mpc.controllers.pi import PIController
 from thermogrip.mpc.design.spec import Spec
 from thermogrip.mpc.tuning.figures import closed_loop_figure
