@@ -48,7 +48,7 @@ shown = ["controller", "settle_mean_s", "settle_worst_s", "overshoot_worst", "bi
 pd.DataFrame(found.rows)[shown].round(3)
 
 # %% [markdown]
-# `baseline` is the default design; PI and LQR got no fewer trials on the same draws. Where the
+# `baseline` is the default design; the PI got as many trials on the same draws. Where the
 # drive is the limit, the verdict says so: then no weight improves the loop.
 
 # %%
