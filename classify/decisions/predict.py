@@ -156,7 +156,7 @@ def answer(
     >>> grasps = load_example_grasps()["exp2_dT20"]
     >>> first = answer(make_classifier("features-lda").fit(grasps), grasps)[0]
     >>> first.material, round(first.probabilities["copper"], 2), first.decided_at, first.notes
-    ('copper', 0.94, 10.0, ())
+    ('copper', 0.85, 10.0, ())
     """
     names = [str(c) for c in (classifier.classes_ if candidates is None else candidates)]
     if len(set(names)) < len(names):

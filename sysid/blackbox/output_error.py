@@ -299,7 +299,7 @@ def oe_family(
     grid: Grid,
     *,
     poles: Sequence[int] = (1, 2, 3),
-    zeros: Sequence[int] = (2,),
+    zeros: Sequence[int] = (1, 2),
     delays: Sequence[int] = (1, 2, 3),
     terms: Sequence[tuple[str, ...]] | None = None,
     only: order_selection.Structure | None = None,
@@ -307,8 +307,8 @@ def oe_family(
     search: type[Search] | None = None,
 ) -> Mapping[order_selection.Structure, StateSpaceModel]:
     """Return a model for each structure that has a stable one, by ``search`` of output error where absent;
-    ``searches``, one an output, remember the denominators of fits before.  With numerators of one row besides
-    nothing else was chosen on 14 public logs."""
+    ``searches``, one an output, remember the denominators of fits before.  Numerators of two rows alone err
+    alike on 14 public logs, and on the rig's four, left out in turn, by up to 41 % more."""
     out, kind = {}, search or Search
     searches = searches or [kind() for _ in grid.outputs]
     for products in order_selection.default_terms(grid) if terms is None else terms:
