@@ -174,12 +174,11 @@ class Controller(Shown):
         ...     Controller.load(path).dt
         5.0
         """
-        parts = read_parts(path, model=model)
-        if parts.kind != "MPC":
-            problem = f"holds a {parts.kind}, not an MPC"
-            raise UserError(problem, file=path, hint="thermogrip.mpc.load_controller reads every kind")
-        with reading("its numbers make no controller", file=path, hint="tune the controller again"):
-            return cls(parts.plant, parts.design, notes=parts.notes)
+        found = load_controller(path, model=model)
+        if not isinstance(found, Controller):
+            hint = "thermogrip.mpc.load_controller reads every kind"
+            raise UserError("holds a PI, not an MPC", file=path, hint=hint)
+        return found
 
     def to_control(self) -> Any:
         """Return the controller without its limits as a python-control ``StateSpace`` from readings,

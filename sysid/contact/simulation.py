@@ -45,10 +45,8 @@ from thermogrip.datasets.schema import make_grasps
 if TYPE_CHECKING:
     from thermogrip.datasets.schema import Grasps
 
-LAYER_NAMES = ("e_outer", "z_outer", "e_inner", "z_inner", "g_back", "g_side", "c_side")  # what shapes modes
 
 _N_OUTER, _N_INNER = 5, 26
-_SEEN = np.array([0, _N_OUTER - 1, _N_OUTER])  # cells at the face and about the sensor
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,7 +82,7 @@ class StackModes(NamedTuple):
     lam: Array
     face: Array
     sensor: Array
-    resistance: Any  # a float, or (n,) of n grippers
+    resistance: float
 
 
 class TimeNodes(NamedTuple):
@@ -108,66 +106,38 @@ def time_nodes(end: float, *, first: float = 0.01, per_group: int = 10) -> TimeN
 @lru_cache(maxsize=64)
 def stack_modes(stack: Stack) -> StackModes:
     """Return the gripper's modes: rise at face and sensor per unit flux into the face."""
-    matrix, root, half = _assembled(np.array([[getattr(stack, name) for name in LAYER_NAMES]]))
-    lam, vectors = np.linalg.eigh(matrix[0])
-    return StackModes(*(part[0] for part in _modes(lam[None], vectors[None], root, half)))
+    matrix, root, half = _assembled(stack)
+    lam, vectors = np.linalg.eigh(matrix)
+    shape = vectors / root[:, None]
+    left, right = half[_N_OUTER - 1], half[_N_OUTER]
+    sensor = (left * shape[_N_OUTER - 1] + right * shape[_N_OUTER]) / (left + right)
+    # the time stepping needs the sensor per unit of modal rise at the face; a mode that leaves the face still
+    # is never excited
+    still = np.abs(shape[0]) <= 1e-9 * np.abs(shape[0]).max()
+    face = np.where(still, np.inf, shape[0])
+    return StackModes(np.maximum(lam, 0.0), shape[0] ** 2, sensor / face, float(1 / half[0]))
 
 
-def nearby_modes(layers: Array, moved: Array) -> tuple[StackModes, StackModes]:
-    """Return modes of n grippers, whose LAYER_NAMES are ``layers`` (n, 7), and of k about each, ``moved`` (n,
-    k, 7), to first order: arrays (n, ...) and (n k, ...)."""
-    n, k, n_layer = moved.shape
-    here, root, half = _assembled(layers)
-    lam, vectors = np.linalg.eigh(here)
-    base = _modes(lam, vectors, root, half)
-    matrix, root, half = _assembled(moved.reshape(n * k, n_layer))
-    apart = matrix.reshape(n, k, *here.shape[1:]) - here[:, None]
-    change = vectors.transpose(0, 2, 1)[:, None] @ (apart @ vectors[:, None])
-    gap = lam[:, None, :] - lam[:, :, None]
-    at = np.arange(lam.shape[1])
-    gap[:, at, at] = np.inf
-    shifted = lam[:, None] + np.diagonal(change, axis1=2, axis2=3)
-    # of the vectors those nodes that count
-    turned = np.zeros(change.shape)
-    near = vectors[:, _SEEN]
-    turned[:, :, _SEEN] = near[:, None] + near[:, None] @ (change / gap[:, None])
-    size = n * k, lam.shape[1]
-    return base, _modes(shifted.reshape(size), turned.reshape(*size, size[1]), root, half)
-
-
-def _assembled(layers: Array) -> tuple[Array, Array, Array]:
-    """Return symmetric matrices (n, 32, 32), roots of capacities (n, 32) and cells' conductances (n, 31)."""
-    e_outer, z_outer, e_inner, z_inner, g_back, g_side, c_side = layers.T[:, :, None]
+def _assembled(stack: Stack) -> tuple[Array, Array, Array]:
+    """Return a symmetric matrix (32, 32), roots of capacities (32,) and cells' conductances (31,)."""
     # cells grow inwards: fast changes live near the face
     growth = 1.22 ** np.arange(_N_INNER)
     outer = np.ones(_N_OUTER)
-    dz = np.concatenate([z_outer / _N_OUTER * outer, growth / growth.sum() * z_inner], axis=1)
-    e = np.concatenate([e_outer * outer, e_inner * np.ones(_N_INNER)], axis=1)
+    dz = np.concatenate([stack.z_outer / _N_OUTER * outer, growth / growth.sum() * stack.z_inner])
+    e = np.concatenate([stack.e_outer * outer, stack.e_inner * np.ones(_N_INNER)])
     half = 2 * e / dz
-    link = half[:, :-1] * half[:, 1:] / (half[:, :-1] + half[:, 1:])
-    matrix = np.zeros((layers.shape[0], dz.shape[1] + 1, dz.shape[1] + 1))
-    at = np.arange(dz.shape[1])
-    matrix[:, at[:-1], at[:-1]] += link
-    matrix[:, at[1:], at[1:]] += link
-    matrix[:, at[-1], at[-1]] += (g_back * half[:, -1:] / (g_back + half[:, -1:]))[:, 0]
-    matrix[:, at[:-1], at[1:]] = matrix[:, at[1:], at[:-1]] = -link
-    matrix[:, _N_OUTER, _N_OUTER] += g_side[:, 0]
-    matrix[:, -1, -1] = g_side[:, 0]
-    matrix[:, _N_OUTER, -1] = matrix[:, -1, _N_OUTER] = -g_side[:, 0]
-    root = np.sqrt(np.concatenate([e * dz, c_side], axis=1))
-    return matrix / root[:, :, None] / root[:, None, :], root, half
-
-
-def _modes(lam: Array, vectors: Array, root: Array, half: Array) -> StackModes:
-    """Return the modes of n matrices from their eigenvalues (n, 32) and vectors (n, 32, 32)."""
-    shape = vectors / root[:, :, None]
-    left, right = half[:, _N_OUTER - 1, None], half[:, _N_OUTER, None]
-    sensor = (left * shape[:, _N_OUTER - 1] + right * shape[:, _N_OUTER]) / (left + right)
-    # the time stepping needs the sensor per unit of modal rise at the face; a mode that leaves the face still
-    # is never excited
-    still = np.abs(shape[:, 0]) <= 1e-9 * np.abs(shape[:, 0]).max(axis=1, keepdims=True)
-    face = np.where(still, np.inf, shape[:, 0])
-    return StackModes(np.maximum(lam, 0.0), shape[:, 0] ** 2, sensor / face, 1 / half[:, 0])
+    link = half[:-1] * half[1:] / (half[:-1] + half[1:])
+    matrix = np.zeros((dz.size + 1, dz.size + 1))
+    cell = np.arange(dz.size)
+    matrix[cell[:-1], cell[:-1]] += link
+    matrix[cell[1:], cell[1:]] += link
+    matrix[cell[-1], cell[-1]] += stack.g_back * half[-1] / (stack.g_back + half[-1])
+    matrix[cell[:-1], cell[1:]] = matrix[cell[1:], cell[:-1]] = -link
+    matrix[_N_OUTER, _N_OUTER] += stack.g_side
+    matrix[-1, -1] = stack.g_side
+    matrix[_N_OUTER, -1] = matrix[-1, _N_OUTER] = -stack.g_side
+    root = np.sqrt(np.concatenate([e * dz, [stack.c_side]]))
+    return matrix / root[:, None] / root[None, :], root, half
 
 
 @lru_cache(maxsize=64)
@@ -219,7 +189,7 @@ def far_response(
 def contact_numbers(stack: Stack, modes: StackModes) -> Array:
     """Return resistance, lag, first, creep, settle, far loss and leak, which are beside the modes, (7,)."""
     own = (stack.lag, stack.first, stack.creep, stack.settle, stack.g_far, stack.leak)
-    return np.array([float(modes.resistance), *own])
+    return np.array([modes.resistance, *own])
 
 
 #: A foam finger with a graphite sheet on a copper-filled silicone pipe, of the size of the example rig's.
