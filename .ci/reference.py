@@ -8,6 +8,7 @@ import inspect
 import io
 import os
 import re
+import textwrap
 from collections import Counter
 from pathlib import Path
 from typing import Any
@@ -26,7 +27,7 @@ Every verb has `--seed N`, `--json` (one JSON object on stdout and nothing else)
 Exit codes: 0 done; 1 a bug; 2 your input is at fault; 3 done, but the answer is no; 130 Ctrl-C.
 Written by `python .ci/reference.py`. Each verb's `--help` has two examples and what comes next.
 
-## Options of several verbs
+## Options and arguments of several verbs
 
 ```text
 {shared}
@@ -34,13 +35,13 @@ Written by `python .ci/reference.py`. Each verb's `--help` has two examples and 
 """
 ROOM_HEAD = """# thermogrip.{room}
 
-{subject}: what `from thermogrip.{room} import ...` offers. `help(name)` says the rest.
+{subject}: what `from thermogrip.{room} import ...` offers. `help(name)` has types, units and examples.
 Written by `python .ci/reference.py`.
 """
 _WIDTH = 100
-_SEVERAL = 3  # verbs that share an option, from which on it is described once
-#: An option of a help, with what stands behind it.
-_OPTION = r"\n  (--[^\n]*?\S)(?: {2,}|\n {15,})([^\n]*(?:\n {15,}[^\n]*)*)"
+_SEVERAL = 2  # verbs that share an option or an argument, from which on it is described once
+#: An option or an argument of a help, with what stands behind it.
+_OPTION = r"\n  ((?:--|[A-Z])[^\n]*?\S)(?: {2,}|\n {15,})([^\n]*(?:\n {10,}[^\n]*)*)"
 
 
 def pages() -> dict[Path, str]:
@@ -56,14 +57,14 @@ def page_of_verbs() -> str:
     helps = {verb: help_of(verb) for verb in VERBS}
     options = {verb: dict(re.findall(_OPTION, text)) for verb, text in helps.items()}
     often = Counter((name, " ".join(about.split())) for by in options.values() for name, about in by.items())
-    shared = {name: about for (name, about), n in often.items() if n >= _SEVERAL}
+    shared = {name: about for (name, about), n in often.items() if n >= _SEVERAL and name != "--out DIR"}
     sections = []
     for verb, text in helps.items():
         besides = [
             name for name, about in options[verb].items() if shared.get(name) == " ".join(about.split())
         ]
         for name in besides:
-            text = re.sub(rf"\n  {re.escape(name)}(?: {{2,}}.*| *)(?:\n {{15,}}.*)*", "", text)
+            text = re.sub(rf"\n  {re.escape(name)}(?: {{2,}}.*| *)(?:\n {{10,}}.*)*", "", text)
         text = re.sub(r"\n\n(?:Options|Arguments):(?=\n\n|$)", "", text)
         more = f"\nBesides: {', '.join(f'`{name.split()[0]}`' for name in besides)}.\n" if besides else ""
         sections.append(f"## {verb}\n\n```text\n{text}\n```\n{more}")
@@ -85,7 +86,7 @@ def help_of(verb: str) -> str:
 
 
 def page_of_room(room: str) -> str:
-    """Return signature and first sentence of every name that a room exports."""
+    """Return the call and the first sentence of every name that a room exports."""
     module = importlib.import_module(f"thermogrip.{room}")
     sections = [section(name, getattr(module, name)) for name in module.__all__]
     return "\n".join([ROOM_HEAD.format(room=room, subject=ROOMS[room]), *sections])
@@ -125,28 +126,11 @@ def first_sentence(value: Any) -> str:
 
 
 def signature(name: str, value: Any) -> str:
-    """Return how a function or class is called, a parameter a line where one line is too short."""
-    made = inspect.signature(value)
-    if inspect.isclass(value):
-        made = made.replace(return_annotation=inspect.Signature.empty)
-    line = plain_annotations(f"{name}{made}")
-    if len(line) <= _WIDTH:
-        return line
-    parts, named_only = [], False
-    for parameter in made.parameters.values():
-        if parameter.kind is parameter.KEYWORD_ONLY and not named_only:
-            parts.append("*")
-        named_only = named_only or parameter.kind in (parameter.KEYWORD_ONLY, parameter.VAR_POSITIONAL)
-        parts.append(plain_annotations(str(parameter)))
-    begin, end = f"{name}(\n", plain_annotations(str(made.replace(parameters=()))).removeprefix("(")
-    return begin + "".join(f"    {part},\n" for part in parts) + end
-
-
-def plain_annotations(text: str) -> str:
-    """Return a signature without the quotes of its annotations, and with dots for defaults that are no
-    literals."""
-    text = re.sub(r"(: |-> )'([^']*)'", r"\1\2", text)
-    return re.sub(r"= <[^<>]*>", "= ...", text)
+    """Return how a function or class is called: names and defaults; ``help(name)`` has the types."""
+    parameters = inspect.signature(value).parameters.values()
+    bare = [parameter.replace(annotation=inspect.Parameter.empty) for parameter in parameters]
+    line = re.sub(r"=<[^<>]*>", "=...", f"{name}{inspect.Signature(bare)}")
+    return "\n".join(textwrap.wrap(line, _WIDTH, subsequent_indent="    ", break_long_words=False))
 
 
 def main() -> None:
