@@ -35,7 +35,7 @@ def main() -> None:
     controller = PIController(drill_plants()[0], dt=1.0)
     page = with_rows(out.read_text(encoding="utf-8"), "| fault |", drilled(controller))
     page = with_rows(page, "| held at [degC] |", unseen(controller))
-    kinds = [f"| `{kind}` | {check} | {clear} |" for kind, (check, clear) in KINDS.items()]
+    kinds = [f"| `{kind}` | {check} |" for kind, (check, _) in KINDS.items()]
     out.write_text(with_rows(page, "| kind |", kinds), encoding="utf-8")
 
 

@@ -25,19 +25,17 @@ TEXT = """\
 {begin}
 
 **The guard's guarantee**: power is off before a limit is exceeded by {margin:g} K. The rig is looked at, and its drive
-renewed, every {look:g} s or sooner; `--sample` and the controller's own sample time only say how often a row is
-written and the controller asked. A limit takes two readings beyond it, so that one bad reading ends no session.
+renewed, every {look:g} s or sooner, whatever `--sample` and the controller's own sample time are. A limit takes two readings beyond it, so that one
+bad reading ends no session.
 
 Full drive of everything from {room:g} degC into the limit, all sensors honest; in K beyond the limit, of the warmest
-true temperature: when power went off / the highest afterwards, and for how long it was driven beyond the limit
-(`python benchmarks/rig/limits.py --out docs/reference/faults.md`):
+true temperature (the most over samples of {samples} s; `python benchmarks/rig/limits.py --out docs/reference/faults.md`):
 
-| device, limit of all sensors | {heads} |
-|---|{rules}
+| device, limit of all sensors | when power went off | the highest afterwards | driven beyond the limit for |
+|---|---|---|---|
 {rows}
 
-What is in a heater when power goes off still comes, and no check of readings takes that back. It is the more, the
-faster the rig warms: on the last line, 5 K above the room at full power, it is most of what is seen. Keep such a
+What is in a heater when power goes off still comes: on the last line, 5 K above the room at full power, it is most of what is seen. Keep such a
 distance from what must not be exceeded, or drive more gently.
 
 """
@@ -55,16 +53,16 @@ def with_limits(page: str) -> str:
     """Return the page with its section on limits measured anew."""
     rows = []
     for device, limit in (*LIMITS, NEAR_ROOM):
-        cells = [f"{device}, {limit:g} degC"]
-        for dt in SAMPLES_S:
-            beyond = drive_into(device, limit, dt)
-            cells.append(f"{beyond.at_off:.1f} / {beyond.highest:.1f}, {beyond.driven:.1f} s")
-        rows.append(f"| {' | '.join(cells)} |")
+        beyond = [drive_into(device, limit, dt) for dt in SAMPLES_S]
+        at_off, highest, driven_s = (
+            max(getattr(one, name) for one in beyond) for name in ("at_off", "highest", "driven")
+        )
+        rows.append(f"| {device}, {limit:g} degC | {at_off:.1f} | {highest:.1f} | {driven_s:.1f} s |")
         print(rows[-1], flush=True)
+    samples = ", ".join(f"{dt:g}" for dt in SAMPLES_S)
     text = TEXT.format(
-        begin=BEGIN, margin=LIMIT_MARGIN, look=LOOK_S, room=ROOM, rows="\n".join(rows),
-        heads=" | ".join(f"sample {dt:g} s" for dt in SAMPLES_S), rules="---|" * len(SAMPLES_S),
-    )  # fmt: skip
+        begin=BEGIN, margin=LIMIT_MARGIN, look=LOOK_S, room=ROOM, samples=samples, rows="\n".join(rows)
+    )
     before, _, rest = page.partition(BEGIN)
     return before + text + rest[rest.index(END) :]
 
