@@ -135,7 +135,7 @@ def test_who_wins_has_the_least_log_loss_and_is_set_apart_only_where_n_can(p_val
     found = SimpleNamespace(scores=lambda: scores, differences=lambda condition: pairs)
     assert classification._who_wins(found, "pooled") == (
         "a has the lowest log loss (0.25; chance 1.10) and 90 % right of n = 20 grasps (68 to 99 %).",
-        f"b: 85 %, log loss 0.50.{more}"
+        f"b: 85 %, log loss 0.50.{more}",
     )
 
 

@@ -29,7 +29,6 @@ from thermogrip.report.plots import (
     grasps_chart,
     loops_chart,
     models_figure,
-    pole_figure,
     residual_figure,
     steps_chart,
 )
@@ -218,12 +217,6 @@ def steps_of() -> Figure:
     return draw_chart(steps_chart(runs))
 
 
-def poles_of_two() -> Figure:
-    near = SimpleNamespace(A=np.diag([0.9, 0.5]), dt=2.0)
-    draws = [SimpleNamespace(A=np.diag([0.9 + k / 100, 0.5]), dt=2.0) for k in (-1, 1)]
-    return pole_figure(SimpleNamespace(poles=np.array([-0.05, -0.3 + 0.4j]), near=near, draws=draws))
-
-
 def grasps_of(*labels: str) -> Any:
     traces = [[23.0 + k, 24.0 + 2 * k, 26.0] for k in range(2)]
     known = {"material": list(labels)} if labels else {}
@@ -238,7 +231,6 @@ FIGURES = {
     "corner": corner_of,
     "loops": loops_of,
     "steps": steps_of,
-    "poles": poles_of_two,
     "grasps": lambda: draw_chart(grasps_chart({"two": [grasps_of("copper", "wood"), grasps_of()]})),
     "responses": lambda: draw_chart(
         grasps_chart(

@@ -89,8 +89,8 @@ def template_text(kind: str) -> str:
 
 def template_keys(kind: str) -> set[str]:
     """Return the keys and tables that a template shows, those that are commented out among them."""
-    found = re.findall(r"(?m)^(?:# )?(?:\[+(\w+)[\].]|(\w+) += )", template_text(kind))
-    return {table or key for table, key in found}
+    shown = re.findall(r"(?m)^(?:# )?(?:\[+(\w+)[\].]|(\w+) += )", template_text(kind))
+    return {table or key for table, key in shown}
 
 
 def _keys(content: dict[str, Any]) -> Iterator[str]:
@@ -103,11 +103,11 @@ def _keys(content: dict[str, Any]) -> Iterator[str]:
 
 def check_keys(path: str, kind: str) -> None:
     """Refuse a key that the template of this kind has not."""
-    known = template_keys(kind).union(KINDS[kind].get("former", ()))
+    allowed = template_keys(kind).union(KINDS[kind].get("former", ()))
     shows = f"'thermogrip init {kind}' shows every key"
     for key in _keys(read_toml(path, hint=shows)):
-        if key not in known:
-            raise UserError(f"{key}: no such key", file=path, hint=known_names(key, sorted(known), shows))
+        if key not in allowed:
+            raise UserError(f"{key}: no such key", file=path, hint=known_names(key, sorted(allowed), shows))
 
 
 check_spec, check_guard = partial(check_keys, kind="spec"), partial(check_keys, kind="guard")
@@ -131,22 +131,22 @@ def check_exists(text: str, meant: str = "") -> None:
 
 def check_kind(ctx: Any, path: str, wanted: str) -> None:
     """Refuse what is known to be another kind of file, with what to type instead."""
-    found, verb = kind_of(path if os.path.exists(path) else path.rpartition("@")[0]), ctx.command.name
-    if found in ("", wanted) or {found, wanted} in BOTH:
+    actual, verb = kind_of(path if os.path.exists(path) else path.rpartition("@")[0]), ctx.command.name
+    if actual in ("", wanted) or {actual, wanted} in BOTH:
         return
     verbs_of, above = ctx.parent.command, ctx.parent
-    fits = {v: _places(verbs_of.get_command(above, v), found) for v in verbs_of.list_commands(above)}
+    fits = {v: _places(verbs_of.get_command(above, v), actual) for v in verbs_of.list_commands(above)}
     verbs = [name for name, (_, takes) in fits.items() if takes]
-    hint = KINDS[found].get("hint", f"it is for {', '.join(verbs)}")
-    if wanted in _PARTS and os.path.isfile(part := Path(path, _PARTS[wanted])):
-        hint = f"give {part}"
+    hint = KINDS[actual].get("hint", f"it is for {', '.join(verbs)}")
+    if wanted in _PARTS and os.path.isfile(file_inside := Path(path, _PARTS[wanted])):
+        hint = f"give {file_inside}"
     elif kind_of(folder := Path(path).parent) == wanted:
         hint = f"give {folder}"
     elif verb in verbs:
         hint = f"write {' '.join([verb, *fits[verb][0]])}"
     if needs := KINDS[wanted].get("needs"):
         hint = f"{hint}; {KINDS[wanted]['words']} has {needs}"
-    raise UserError(f"is {KINDS[found]['words']}, not {KINDS[wanted]['words']}", file=path, hint=hint)
+    raise UserError(f"is {KINDS[actual]['words']}, not {KINDS[wanted]['words']}", file=path, hint=hint)
 
 
 def _places(command: Any, kind: str) -> tuple[list[str], bool]:
@@ -173,20 +173,24 @@ def _meant(path: str, kind: str) -> list[str]:
 
 def check_files(ctx: Any) -> None:
     """Refuse what is not there, of another kind, or not whole among what a verb was given."""
-    given = []
+    named_files = []
     for param in ctx.command.params:
         kind, value = TAKES.get(param.metavar, ""), ctx.params.get(param.name)
         if kind and value and param.name != "out":
-            given += [(str(path), kind) for path in (value if isinstance(value, list | tuple) else [value])]
-    given.sort(key=lambda each: each[1] != "network")  # a misspelt name is refused before files are read
+            named_files += [
+                (str(path), kind) for path in (value if isinstance(value, list | tuple) else [value])
+            ]
+    named_files.sort(
+        key=lambda each: each[1] != "network"
+    )  # a misspelt name is refused before files are read
     named = ("network", "page", "port")  # which need no file
-    there = [(path, kind) for path, kind in given if kind not in named or os.path.isfile(path)]
-    there = [(each, kind) for path, kind in there for each in _meant(path, kind)]
-    for path, _ in there:
+    files = [(path, kind) for path, kind in named_files if kind not in named or os.path.isfile(path)]
+    files = [(each, kind) for path, kind in files for each in _meant(path, kind)]
+    for path, _ in files:
         check_exists(path, _joined(ctx, path))
-    for path, kind in there:
+    for path, kind in files:
         check_kind(ctx, path, kind)
-    for path, kind in given:
+    for path, kind in named_files:
         if where := KINDS[kind].get("check"):
             module, name = where.split(":")
             getattr(import_module(module), name)(path)

@@ -28,7 +28,10 @@ from thermogrip.datasets.errors import UserError, known_names, os_fault
 from thermogrip.datasets.media import printable, without_password
 from thermogrip.datasets.provenance import work
 
-OK, BUG, USER, INTERRUPTED = 0, 1, 2, 130
+OK = 0
+BUG = 1
+USER = 2
+INTERRUPTED = 130
 
 app = typer.Typer(
     name="thermogrip",
@@ -102,11 +105,11 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _without_passwords(words: Sequence[str]) -> list[str]:
     """Return the words of a command line as records keep them: of ``--on-trip`` no more than the program."""
-    kept: list[str] = []
+    recorded: list[str] = []
     for before, word in zip(["", *words], words):
         command = before == "--on-trip" or word.startswith("--on-trip=")
-        kept.append(without_password(re.sub(r"(?s)\s.*", " ...", word) if command else word))
-    return kept
+        recorded.append(without_password(re.sub(r"(?s)\s.*", " ...", word) if command else word))
+    return recorded
 
 
 def _ignore_settings_of_folder() -> None:
@@ -139,13 +142,13 @@ def _option_line(error: typer.TyperException) -> str:
         words = f"{words}; options are whole words: {', '.join(long)}" if long else words
     elif "param_type" in about and isinstance(command := getattr(context, "command", None), Verb):
         words = f"{words}; for example thermogrip {command.examples[0]}"
-    elif number := re.match(r"[-+]?\d+(\.\d+)?(?=[^\d.])", given := _given(error)):
+    elif number := re.match(r"[-+]?\d+(\.\d+)?(?=[^\d.])", typed := _given(error)):
         option, begin = about["param"].opts[0], words.partition(": ")[0]
-        words = f"{begin}: {given!r} is no number; write {option} {number[0]}"
+        words = f"{begin}: {typed!r} is no number; write {option} {number[0]}"
     return f"{words}; see {path} --help"
 
 
 def _given(error: Exception) -> str:
     """Return what an option was given that its type cannot take, "" where that is not known."""
-    found: list[dict[str, object]] = getattr(error.__cause__, "errors", list)()
-    return str(found[0]["input"]) if found else ""
+    faults: list[dict[str, object]] = getattr(error.__cause__, "errors", list)()
+    return str(faults[0]["input"]) if faults else ""

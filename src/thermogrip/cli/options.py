@@ -86,9 +86,9 @@ def check_port(value: str) -> None:
     """Refuse a device that is not there, with those that are."""
     if "://" not in value and sys.platform != "win32" and not os.path.exists(value):
         patterns = ("ttyACM*", "ttyUSB*", "cu.*")
-        there = sorted(str(path) for pattern in patterns for path in Path("/dev").glob(pattern))
-        words = "use {}" if there else "none is here"
-        hint = known_names(value, there, f"{words}; check name, cable and power")
+        devices = sorted(str(path) for pattern in patterns for path in Path("/dev").glob(pattern))
+        words = "use {}" if devices else "none is here"
+        hint = known_names(value, devices, f"{words}; check name, cable and power")
         raise UserError("no such port", file=value, hint=hint)
 
 
@@ -161,8 +161,8 @@ OwnNetwork = Annotated[
 
 def without_meta_files(paths: list[str] | None) -> list[str] | None:
     """Leave out the meta files that a pattern of the shell gives beside the grasps they belong to."""
-    given = {*(paths or ())}
-    return paths and [path for path in paths if path.replace("_meta.", ".") not in given - {path}]
+    all_paths = {*(paths or ())}
+    return paths and [path for path in paths if path.replace("_meta.", ".") not in all_paths - {path}]
 
 
 GraspFiles = Annotated[
@@ -222,8 +222,8 @@ def listed(path: Path, *keys: str) -> list[str]:
     at fault, which the reader explains."""
     try:
         content = json.loads(path.read_bytes())
-        for part in ("plant", "model", "network"):
-            content = content.get(part, content)
+        for level in ("plant", "model", "network"):
+            content = content.get(level, content)
         return [str(name) for key in keys for name in content[key]]
     except Exception:  # whatever is wrong with it, its reader says so
         return []
@@ -231,9 +231,9 @@ def listed(path: Path, *keys: str) -> list[str]:
 
 def choices(option: str, names: Iterable[str], path: Path, *keys: str) -> None:
     """Refuse names that a JSON file of ours does not list under these keys."""
-    if known := listed(path, *keys):
+    if allowed := listed(path, *keys):
         for name in names:
-            choice(option, name, known)
+            choice(option, name, allowed)
 
 
 def new_file(path: Path, suffixes: Sequence[str] = ()) -> Path:
@@ -335,10 +335,10 @@ def find_network(text: str) -> GreyModel:
     file, name = _split_class(text)
     if not name:
         return load_network(text)
-    found = load_object(file, name)
-    if isinstance(found, type) and not issubclass(found, NetworkModel):
-        return own_model(found)
-    made = _made(found, file, name)
+    own_object = load_object(file, name)
+    if isinstance(own_object, type) and not issubclass(own_object, NetworkModel):
+        return own_model(own_object)
+    made = _made(own_object, file, name)
     return made if isinstance(made, NetworkModel) else own_model(made)
 
 

@@ -63,23 +63,29 @@ def paper(
 
     console = Console(as_json)
     with console.progress("paper") as progress:
-        found = repeat_paper(quick=quick, seed=seed, workers=pool, progress=progress)
-    found.bundled.save(out / "bundled")
-    found.twin.save(out / "simulated")
+        repeated = repeat_paper(quick=quick, seed=seed, workers=pool, progress=progress)
+    repeated.bundled.save(out / "bundled")
+    repeated.twin.save(out / "simulated")
     lead = "The experiments of Osawa et al. (arXiv 2111.15344) on simulated grasps, table beside table."
-    write_report(out / "report.html", "The paper, repeated", lead, found.sections())
-    head, rows = found.table()
+    write_report(out / "report.html", "The paper, repeated", lead, repeated.sections())
+    head, rows = repeated.table()
     for row in rows:
         console.say(f"{row[0]}: object {row[1]:g}, gripper {row[2]:g} degC, {row[3]} materials")
         console.say(f"    paper: {row[4]} ({row[5]})")
         for k, name in enumerate(head[6:], start=6):
             console.say(f"    {name}: {row[k]}")
-    console.say(found.verdict)
-    console.say(found.copies_verdict)
+    console.say(repeated.verdict)
+    console.say(repeated.copies_verdict)
     console.say(f"wrote {out}/report.html")
     cases = [dict(zip(head, row)) for row in rows]
     console.answer(
-        {"cases": cases, "copies": found.copies, "epochs": found.epochs, "verdict": found.verdict, "out": out}
+        {
+            "cases": cases,
+            "copies": repeated.copies,
+            "epochs": repeated.epochs,
+            "verdict": repeated.verdict,
+            "out": out,
+        }
     )
     return 0
 

@@ -47,7 +47,9 @@ def jobs() -> dict[str, dict[str, list[Any]]]:
 
 def _whole_words(formatter: Any) -> Any:
     """Return a help formatter that ends no line within a word: at no hyphen, and in a list behind a comma."""
-    write, write_text, write_dl = formatter.write, formatter.write_text, formatter.write_dl
+    write = formatter.write
+    write_text = formatter.write_text
+    write_dl = formatter.write_dl
 
     def marked(text: str) -> str:
         return re.sub(r"(?<=\w)-(?=\w)", "\u2011", re.sub(r",(?=\S)", ",\ue000 ", text))
@@ -81,11 +83,11 @@ class Verb(TyperCommand):
         note_seed(ctx.params.get("seed"))
         check_files(ctx)
         code = super().invoke(ctx)
-        found = getattr(code, "what", None)  # also where the work is done and the answer is no
-        if (not code or found is not None) and not ctx.params.get("as_json"):
+        outcome = getattr(code, "what", None)  # also where the work is done and the answer is no
+        if (not code or outcome is not None) and not ctx.params.get("as_json"):
             sys.stdout.flush()
-            given = {name: value for name, value in ctx.params.items() if value}
-            command = getattr(code, "command", "") or self.next(given, ctx.meta[TYPED], found or "")
+            stated = {name: value for name, value in ctx.params.items() if value}
+            command = getattr(code, "command", "") or self.next(stated, ctx.meta[TYPED], outcome or "")
             sys.stderr.write(f"next: thermogrip {command}\n")
         return code
 
@@ -93,12 +95,16 @@ class Verb(TyperCommand):
         """Return the command that comes next after what the verb ``found``, with what was given in place of
         its names: what was typed once more where that wrote no file for it."""
         words = {str(param.name): str(param.metavar).split("|")[0].rstrip(".") for param in self.params}
-        what = given.get("what", "")
-        then = self.then if isinstance(self.then, str) else self.then[found or what or next(iter(self.then))]
-        if what == "examples":
+        kind_of_work = given.get("what", "")
+        then = (
+            self.then
+            if isinstance(self.then, str)
+            else self.then[found or kind_of_work or next(iter(self.then))]
+        )
+        if kind_of_work == "examples":
             words["out"] = "."
         elif typed and "{out}" in then and "out" not in given:
-            file = f"{what}.toml" if what else self.examples[0].rpartition("--out ")[2]
+            file = f"{kind_of_work}.toml" if kind_of_work else self.examples[0].rpartition("--out ")[2]
             return printable(shlex.join([str(self.name), *typed, "--out", file]))
         for name, value in given.items():
             words[name] = printable(shlex.join(map(str, value if isinstance(value, list) else [value])))
@@ -107,10 +113,12 @@ class Verb(TyperCommand):
         rig = "port" if "port" in given else "twin"
         words["rig"] = f"--{rig} {words.get(rig, 'PLANT')}"
         line = str(then).format(**words)
-        own = str(given.get("network", ""))  # a class of the user's own, which no file of a plant holds
-        if ".py:" in own and "--network" not in line:
+        own_network = str(
+            given.get("network", "")
+        )  # a class of the user's own, which no file of a plant holds
+        if ".py:" in own_network and "--network" not in line:
             takes_it = "network" in signature(function_of(line.split()[0])).parameters
-            line += f" --network {printable(shlex.quote(own))}" if takes_it else ""
+            line += f" --network {printable(shlex.quote(own_network))}" if takes_it else ""
         return line
 
     def get_short_help_str(self, limit: int = 200) -> str:
@@ -158,8 +166,10 @@ def _fit_of(plant: Any) -> str:
             return "LOG_OF_FIT"
         if all(Path(word.rpartition("@")[0] or word).exists() for word in logs):
             words = iter(typed)
-            kept = [word for word in words if not (word in _BESIDE and next(words, "")) and word != "--json"]
-            return printable(shlex.join(kept))
+            repeated = [
+                word for word in words if not (word in _BESIDE and next(words, "")) and word != "--json"
+            ]
+            return printable(shlex.join(repeated))
     return "LOG_OF_FIT"
 
 

@@ -21,7 +21,8 @@ class Mirror:
     def __init__(self, port: int, title: str, layout: str | None) -> None:
         import foxglove
 
-        self._foxglove, self._layout, self._title = foxglove, layout, title
+        self._foxglove = foxglove
+        self._layout = layout
         self._server = foxglove.start_server(name=title, host="127.0.0.1", port=port)
         self._channels: dict[str, Any] = {}
         self._events = self._channel("events", {"kind": "string", "text": "string"}, {})

@@ -96,7 +96,7 @@ function tiles(now) {
   for (const [name, value] of Object.entries(now.drive)) found.push([name, gone ? "0" : kept ? "not known" : value.toFixed(2) + unit(name), gone ? "expired" : ""]);
   if (now.pump !== null) found.push(["pump", gone ? "off" : kept ? "not known" : now.pump ? "on" : "off"]);
   if (now.margin !== null) found.push(["guard margin", now.margin.toFixed(1) + " K", "to the limit of " + now.nearest]);
-  if (now.model_share !== null) found.push(["off the plant", (100 * now.model_share).toFixed(0) + " %", "of what is allowed"]);
+  if (now.model_share !== null) found.push(["beside the model", (100 * now.model_share).toFixed(0) + " %", "of what is allowed"]);
   $("tiles").replaceChildren(...found.map(([name, value, more]) => {
     const box = document.createElement("div"), dt = document.createElement("dt"), dd = document.createElement("dd");
     dt.textContent = name; dd.textContent = value;

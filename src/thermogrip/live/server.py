@@ -109,7 +109,9 @@ class Requests:
     def __init__(
         self, state: State, ask: Callable[[dict[str, Any]], None], clock: Callable[[], float] = time.monotonic
     ) -> None:
-        self._state, self._ask, self._clock = state, ask, clock
+        self._state = state
+        self._ask = ask
+        self._clock = clock
         self._marked, self._done = -float("inf"), set[str]()
 
     def take(self, do: str, words: dict[str, str]) -> tuple[int, str]:
@@ -136,7 +138,9 @@ class Gate:
     """Lets in who calls this computer by its own name, comes from its own page, and has the token."""
 
     def __init__(self, app: ASGIApp, *, port: int, token: str) -> None:
-        self.app, self._token, self.cookie = app, token, f"thermogrip_{port}"
+        self.app = app
+        self._token = token
+        self.cookie = f"thermogrip_{port}"
         self._hosts = tuple(f"{name}:{port}" for name in (HOST, "localhost"))
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -157,29 +161,29 @@ class Gate:
             return "refused: this address is not the page's own"
         if origin != f"http://{host}" and (origin is not None or request.method == "POST"):
             return "refused: this comes from another page"
-        given = request.cookies.get(self.cookie, "")
+        shown_token = request.cookies.get(self.cookie, "")
         if request.url.path == "/":
-            given = request.query_params.get("token", given)
-        if not secrets.compare_digest(given.encode(), self._token.encode()):
+            shown_token = request.query_params.get("token", shown_token)
+        if not secrets.compare_digest(shown_token.encode(), self._token.encode()):
             return "refused: open the address that the terminal shows, with its token"
         return ""
 
 
 def page_text() -> tuple[str, str]:
     """Return the page and the policy under which a browser shows it."""
-    parts = {
+    sources = {
         name: (files(__package__) / f"page.{name}").read_text(encoding="utf-8")
         for name in ("html", "css", "js")
     }
     hashes = {
-        name: base64.b64encode(hashlib.sha256(parts[name].encode()).digest()).decode()
+        name: base64.b64encode(hashlib.sha256(sources[name].encode()).digest()).decode()
         for name in ("css", "js")
     }
     policy = (
         f"default-src 'none'; script-src 'sha256-{hashes['js']}'; style-src 'sha256-{hashes['css']}'; "
         "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
     )
-    return parts["html"].replace("{{css}}", parts["css"]).replace("{{js}}", parts["js"]), policy
+    return sources["html"].replace("{{css}}", sources["css"]).replace("{{js}}", sources["js"]), policy
 
 
 def application(state: State, ask: Callable[[dict[str, Any]], None], *, port: int, token: str) -> ASGIApp:
@@ -214,8 +218,8 @@ def application(state: State, ask: Callable[[dict[str, Any]], None], *, port: in
 
     async def act(request: Request) -> Response:
         body = b""
-        async for part in request.stream():
-            body += part
+        async for chunk in request.stream():
+            body += chunk
             if len(body) > MOST_BYTES:
                 return JSONResponse({"refused": "too long"}, 413)
         try:
@@ -240,10 +244,11 @@ def _words(body: bytes) -> dict[str, str]:
 
 async def _events(state: State) -> AsyncIterator[str]:
     """Yield what a viewer is sent, until the session is over."""
-    count, messages, content, said = state.count, state.messages, state.whole(), 0.0
+    count, messages = state.count, state.messages
+    content, last_sent_s = state.whole(), 0.0
     while True:
         if content:
-            said = time.monotonic()
+            last_sent_s = time.monotonic()
             yield f"data: {json.dumps(content)}\n\n"
         if state.over:
             return
@@ -252,13 +257,14 @@ async def _events(state: State) -> AsyncIterator[str]:
         if messages != state.messages:
             content = state.since(count)
             count, messages = state.count, state.messages
-        elif time.monotonic() - said > ALIVE_S:
+        elif time.monotonic() - last_sent_s > ALIVE_S:
             content = {"rows": [], "posterior": state.posterior, **state._present()}
 
 
 async def _serve(settings: dict[str, Any], lines: Iterator[bytes], listener: socket.socket | None) -> None:
     """Serve until the session is over."""
-    state, loop, ended = State(), asyncio.get_running_loop(), asyncio.Event()
+    state, ended = State(), asyncio.Event()
+    loop = asyncio.get_running_loop()
     mirror: Callable[[dict[str, Any]], None] | None = None
     if settings["foxglove"] is not None:
         from thermogrip.live.foxglove import Mirror
@@ -315,9 +321,9 @@ def _answer(content: dict[str, Any]) -> None:
 
 def _lines() -> Iterator[bytes]:
     """Yield the lines of standard input; unbuffered, for a thread that waits in a buffer holds up the end."""
-    rest = b""
+    unfinished = b""
     while data := os.read(0, 1 << 16):
-        *whole, rest = (rest + data).split(b"\n")
+        *whole, unfinished = (unfinished + data).split(b"\n")
         yield from whole
 
 

@@ -31,7 +31,7 @@ import typer
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.media import printable
 from thermogrip.live.server import LINGER_S
-from thermogrip.live.terminal import History, line, panel
+from thermogrip.live.terminal import line, panel
 from thermogrip.live.trip_command import TripCommand
 from thermogrip.report.console import Console, plain
 from thermogrip.rig.session.loop import PHASES
@@ -84,7 +84,9 @@ class Watch:
     """
 
     def __init__(self, title: str, console: Console, show: Show | None = None) -> None:
-        self.title, self._console, self._show = title, console, show or Show()
+        self.title = title
+        self._console = console
+        self._show = show or Show()
         self.operator = Operator()
         self._show.check()
         self._command = None if self._show.on_trip is None else TripCommand(self._show.on_trip, console.warn)
@@ -92,7 +94,8 @@ class Watch:
         self._posterior: deque[list[Any]] = deque(maxlen=_KEEP)
         self._now: Snapshot | None = None
         self._heard = time.monotonic()
-        self._fraction, self._what, self._verdict = 0.0, "", ""
+        self._fraction, self._what = 0.0, ""
+        self._verdict = ""
         self._question: Question | None = None
         self._asked = 0
         self._answers: queue.Queue[tuple[int, str]] = queue.Queue()
@@ -160,19 +163,19 @@ class Watch:
                 if not self._reached and not self._typing.is_alive():
                     raise UserError("nobody can answer any more", hint="run the same command again to go on")
                 with suppress(queue.Empty):
-                    number, said = self._answers.get(timeout=0.2)
+                    number, reply = self._answers.get(timeout=0.2)
                     if number in (0, self._asked):
-                        return said.strip()
+                        return reply.strip()
         finally:
             self._question = None
             sys.stderr.write("\n")
 
     def _read_typed(self) -> None:
         """Read lines from the terminal; not through Python's buffer, which a waiting thread would hold."""
-        rest = b""
+        unfinished = b""
         with suppress(OSError, ValueError):
             while data := os.read(sys.stdin.fileno(), 4096):
-                *whole, rest = (rest + data).split(b"\n")
+                *whole, unfinished = (unfinished + data).split(b"\n")
                 for typed in whole:
                     self._answers.put((0, typed.decode("utf-8", "replace")))
 
@@ -280,21 +283,21 @@ class Watch:
         page.stdin.write(json.dumps(settings).encode() + b"\n")
         page.stdin.flush()
         begin = time.monotonic()
-        said: dict[str, Any] = {}
+        opening: dict[str, Any] = {}
         for text in page.stdout:
-            said |= json.loads(text)
-            if said.keys() & {"ready", "error"} or time.monotonic() - begin > _PATIENCE_S:
+            opening |= json.loads(text)
+            if opening.keys() & {"ready", "error"} or time.monotonic() - begin > _PATIENCE_S:
                 break
         self._reader = threading.Thread(target=self._read_page, args=(page,), daemon=True)
         self._reader.start()
-        self._reached = "ready" in said
+        self._reached = "ready" in opening
         if not self._reached:
             page.kill()
             self._close_page()
-            why = said.get("error", "its process did not start")
+            why = opening.get("error", "its process did not start")
             raise UserError(f"the live page cannot be served ({why})", hint="choose another port")
         if show.live is not None:
-            self.address = f"http://127.0.0.1:{said['port']}/?token={token}"
+            self.address = f"http://127.0.0.1:{opening['port']}/?token={token}"
             sys.stderr.write(f"live: {self.address}\n")
         if show.pace is not None:
             sys.stderr.write(f"the twin runs {show.pace:g} times as fast as real time (--speed)\n")
@@ -306,19 +309,20 @@ class Watch:
         """Take what viewers ask."""
         assert page.stdout is not None
         for text in page.stdout:
-            asked = json.loads(text)
-            do = asked.get("do")  # it may also say why it ends
+            request = json.loads(text)
+            do = request.get("do")  # it may also say why it ends
             if do == "viewers":
-                self._viewers = asked["count"]
+                self._viewers = request["count"]
             elif do == "stop":
                 self.operator.stop("the page")
             elif do == "bad":
-                self.operator.mark_bad(asked.get("text") or "marked on the page")
-            elif do == "answer" and asked.get("question", "").isdecimal():
-                self._answers.put((int(asked["question"]), asked.get("text", "")))
+                self.operator.mark_bad(request.get("text") or "marked on the page")
+            elif do == "answer" and request.get("question", "").isdecimal():
+                self._answers.put((int(request["question"]), request.get("text", "")))
 
     def _close_page(self) -> None:
-        page, self._page, self._reached = self._page, None, False
+        page, self._page = self._page, None
+        self._reached = False
         if page is None or page.stdin is None or page.stdout is None:
             return
         with suppress(OSError):
@@ -336,7 +340,9 @@ class _Lines:
     """What is no terminal: one line a second at most."""
 
     def __init__(self, title: str) -> None:
-        self._title, self._said, self._last = title, -float("inf"), ""
+        self._title = title
+        self._said_at_s = -float("inf")
+        self._last_text = ""
         self._now: Snapshot | None = None
         self._paused = False
         self.progress: tuple[float, str] = 0.0, ""
@@ -345,13 +351,17 @@ class _Lines:
         self._now = snapshot
 
     def show(self, *, last: bool) -> None:
-        fraction, what = self.progress
-        begin = f"{printable(self._title)} {100 * fraction:3.0f} % {printable(what)}"
+        fraction, stage = self.progress
+        begin = f"{printable(self._title)} {100 * fraction:3.0f} % {printable(stage)}"
         text = begin if self._now is None else f"{begin}; {line(self._now)}"
         if self._paused:
             return
-        if (last or time.monotonic() - self._said >= 1.0) and text != self._last and (what or self._now):
-            self._said, self._last = time.monotonic(), text
+        if (
+            (last or time.monotonic() - self._said_at_s >= 1.0)
+            and text != self._last_text
+            and (stage or self._now)
+        ):
+            self._said_at_s, self._last_text = time.monotonic(), text
             sys.stderr.write(text + "\n")
             sys.stderr.flush()
 
@@ -368,7 +378,7 @@ class _Panel:
     def __init__(self, title: str) -> None:
         from rich.console import Console as RichConsole
 
-        self._title, self._history = title, History()
+        self._title = title
         self._now: Snapshot | None = None
         self.progress: tuple[float, str] = 0.0, ""
         self._console, self._lock = RichConsole(stderr=True, highlight=False), threading.Lock()
@@ -376,7 +386,6 @@ class _Panel:
 
     def add(self, snapshot: Snapshot) -> None:
         self._now = snapshot
-        self._history.add(snapshot.time_s, snapshot.values.get(snapshot.skin, float("nan")))
 
     def show(self, *, last: bool) -> None:
         with self._lock:
@@ -397,13 +406,10 @@ class _Panel:
             self._live.start()
 
     def _drawn(self) -> Any:
-        fraction, what = self.progress
-        note = f"{100 * fraction:3.0f} %  {what}" if what else ""
-        plain_text = not (self._console.encoding or "").lower().startswith("utf")
+        fraction, stage = self.progress
+        note = f"{100 * fraction:3.0f} %  {stage}" if stage else ""
         width = get_terminal_size().columns
-        return panel(
-            f"thermogrip {self._title}", self._now, self._history, note=note, width=width, plain=plain_text
-        )
+        return panel(f"thermogrip {self._title}", self._now, note=note, width=width)
 
 
 def _drain(waiting: deque[Any]) -> list[Any]:

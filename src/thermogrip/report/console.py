@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from thermogrip.datasets.parallel import Progress
 
 _AT_ONCE = 0.5  # s
-_TELLING = 0.05  # share of the work that must be done before its time tells how long the rest will take
+_FORESEEABLE = 0.05  # share of the work that must be done before its time tells how long the rest will take
 _WIDTH = 100  # columns of what is written to no terminal
 #: Head and rows of a table.
 Cells: TypeAlias = tuple[tuple[str, ...], tuple[tuple[Any, ...], ...]]
@@ -153,16 +153,18 @@ def _table(title: str, head: Sequence[str], rows: Sequence[Sequence[Any]], width
     while sum(wide) > room and (open_ := [k for k in columns if wide[k] > least[k]]):
         wide[max(open_, key=lambda k: wide[k])] -= 1
     lines = [printable(title), ""]
-    for at, row in enumerate(cells):
+    for row_number, row in enumerate(cells):
         if sum(wide) > room:
-            lines += [f"{name}: {cell}" for name, cell in zip(cells[0], row)] + [""] if at else []
+            lines += [f"{name}: {cell}" for name, cell in zip(cells[0], row)] + [""] if row_number else []
             continue
-        for parts in zip_longest(
+        for line_cells in zip_longest(
             *(wrap(row[k], wide[k], break_on_hyphens=False) or [""] for k in columns), fillvalue=""
         ):
-            aligned = (part.rjust(w) if n else part.ljust(w) for part, w, n in zip(parts, wide, numeric))
+            aligned = (
+                words.rjust(w) if n else words.ljust(w) for words, w, n in zip(line_cells, wide, numeric)
+            )
             lines.append("  ".join(aligned).rstrip())
-        lines += ["  ".join("-" * w for w in wide)] if at == 0 else []
+        lines += ["  ".join("-" * w for w in wide)] if row_number == 0 else []
     return "\n".join([*lines, "", ""])
 
 
@@ -178,12 +180,15 @@ def _lines(title: str) -> Progress:
 
     def show(fraction: float, what: str) -> None:
         fraction = min(max(fraction, last[2]), 1.0)
-        stage, step, spent, clear = what.split(":")[0], int(20 * fraction), time.monotonic() - begin, _anew()
+        stage = what.split(":")[0]
+        step = int(20 * fraction)
+        spent = time.monotonic() - begin
+        clear = _anew()
         first[:] = first or [fraction if spent < _AT_ONCE else 0.0]
         left_s = spent * (1 - fraction) / max(fraction - first[0], 1e-3)
-        known = fraction - first[0] > _TELLING and spent > 1 and spent + left_s > 10
-        left = f", {left_s:.0f} s left" if known else ""
-        line = f"{title} {100 * fraction:3.0f} % {spent:4.0f} s{left} {printable(what)}"
+        is_foreseeable = fraction - first[0] > _FORESEEABLE and spent > 1 and spent + left_s > 10
+        remaining = f", {left_s:.0f} s left" if is_foreseeable else ""
+        line = f"{title} {100 * fraction:3.0f} % {spent:4.0f} s{remaining} {printable(what)}"
         if clear:
             sys.stderr.write(clear + f"[{'#' * step:.<20}] {line}"[: get_terminal_size().columns - 1])
         elif stage != last[1] or step != last[0]:

@@ -3,8 +3,8 @@
 A report is a list of :class:`Section`; each says its verdict in words first and shows the evidence under it.
 The page is one file which opens without a network: styles, figures and the script are in it, and its content
 security policy names the hashes of that script and style alone.  A :class:`Plot` can be zoomed and read point
-by point; on paper and without scripts it is the same figure at rest, as all others are: inline SVG, or PNG
-where the SVG would be large.  Every text is escaped by the template.
+by point; on paper and without scripts it is the same figure at rest, as all others are: inline SVG.
+Every text is escaped by the template.
 
 The script draws with uPlot [1]_, whose licence stands in ``templates/uPlot.LICENSE`` and in every page.
 
@@ -56,12 +56,10 @@ VERDICTS = {
     "changing": "bad",
 }
 #: Numbers in all charts of a page, and points in one of their curves, at most.
-MOST_NUMBERS, MOST_POINTS = 200_000, 2400
+MOST_NUMBERS = 200_000
+MOST_POINTS = 2400
 _SUPERSCRIPT = re.compile(r"(\$\^\{-?[0-9.]+\}\$)")
 _DOLLAR = re.compile(r"(?<!\\)\$")
-#: An SVG larger than this goes in as PNG [bytes].
-SVG_LIMIT = 130_000
-_COLOURS = 128  # of a PNG
 
 
 @dataclass(frozen=True)
@@ -119,7 +117,7 @@ class Picture:
 
     @cached_property
     def data_uri(self) -> str:
-        """Return the figure as a ``data:`` address, SVG or PNG."""
+        """Return the figure as a ``data:`` address."""
         return _data_uri(self.figure)
 
 
@@ -202,9 +200,9 @@ class Section:
 def draw(sections: Sequence[Section]) -> None:
     """Draw the figures of sections now: else they are drawn as the page is written."""
     for section in sections:
-        for part in section.parts:
-            if isinstance(part, Picture):
-                _ = part.data_uri
+        for evidence in section.parts:
+            if isinstance(evidence, Picture):
+                _ = evidence.data_uri
 
 
 def html_page(title: str, lead: str, sections: Sequence[Section]) -> str:
@@ -223,7 +221,7 @@ def html_page(title: str, lead: str, sections: Sequence[Section]) -> str:
     )
     env.filters["breakable"] = lambda name: escape(printable(name)).replace("_", Markup("_<wbr>"))
     template = env.get_template("report.html.j2")
-    plots = [part for section in sections for part in section.parts if isinstance(part, Plot)]
+    plots = [evidence for section in sections for evidence in section.parts if isinstance(evidence, Plot)]
     script, style = _script(drawing=bool(plots)), _asset("uPlot.min.css") + _asset("report.css")
     return template.render(
         title=title, lead=lead, sections=sections, points=_points(plots), provenance=provenance(),
@@ -238,7 +236,7 @@ def write_report(path: Path, title: str, lead: str, sections: Sequence[Section])
 
 
 def _points(plots: Sequence[Plot]) -> int:
-    """Return how many points a curve may have, so that the page stays small."""
+    """Return the points that a curve may have, so that the page stays small."""
     sizes = [size for plot in plots for size in plot.size]
     most = MOST_POINTS
     while most > 200 and sum(per * min(n, most) for n, per in sizes) > MOST_NUMBERS:
@@ -264,8 +262,8 @@ def _source(text: str) -> str:
 
 def _packed(values: Array) -> str:
     """Return numbers as base64 of little-endian float32, gaps and what is no number as NaN."""
-    known = np.where(np.isfinite(values), values, np.nan)
-    return base64.b64encode(np.asarray(known, dtype="<f4").tobytes()).decode()
+    with_gaps = np.where(np.isfinite(values), values, np.nan)
+    return base64.b64encode(np.asarray(with_gaps, dtype="<f4").tobytes()).decode()
 
 
 def _number(cell: Any) -> bool:
@@ -301,8 +299,8 @@ def literal(figure: Figure) -> Figure:
 
 
 def _literal(text: str) -> str:
-    parts = _SUPERSCRIPT.split(printable(text))  # own superscripts are every second part
-    return "".join(part if at % 2 else _DOLLAR.sub(r"\\$", part) for at, part in enumerate(parts))
+    pieces = _SUPERSCRIPT.split(printable(text))  # own superscripts are every second part
+    return "".join(piece if place % 2 else _DOLLAR.sub(r"\\$", piece) for place, piece in enumerate(pieces))
 
 
 @contextmanager
@@ -322,14 +320,5 @@ def _data_uri(figure: Figure) -> str:
     for axes in figure.axes:
         axes.set_facecolor("none")
     with rc_context({"svg.hashsalt": "thermogrip"}), _letters():  # its ids are no random ones
-        figure.savefig(svg, format="svg", metadata={"Date": None, "Creator": None}, **look)
-    if svg.tell() <= SVG_LIMIT:
-        return "data:image/svg+xml;base64," + base64.b64encode(svg.getvalue()).decode()
-    from PIL import Image
-
-    whole, png = io.BytesIO(), io.BytesIO()
-    with _letters():
-        figure.savefig(whole, format="png", dpi=130, **look)
-    few = Image.open(whole).quantize(_COLOURS, method=Image.Quantize.FASTOCTREE)  # keeps what is transparent
-    few.save(png, format="png", optimize=True)
-    return "data:image/png;base64," + base64.b64encode(png.getvalue()).decode()
+        figure.savefig(svg, format="svg", dpi=130, metadata={"Date": None, "Creator": None}, **look)
+    return "data:image/svg+xml;base64," + base64.b64encode(svg.getvalue()).decode()

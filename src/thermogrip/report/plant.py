@@ -30,10 +30,6 @@ _BASELINES = (
     "Beside the free run: the best decay without input, the log's mean, and one step from each last "
     "reading (RMSE)"
 )
-_POLES = (
-    "Poles of the plant, and of the draws of its parameters: their scatter shows how well the time constants "
-    "are known. Below the line a plant does not settle."
-)
 _TIME_CONSTANTS = 6  # the slowest, in a sentence
 _STRUCTURES = 5  # of each kind, in the table of those searched
 
@@ -222,7 +218,6 @@ def dynamics_section(found: Dynamics) -> Section:
         ),
         Table(*gain_table(found), "Gains in steady state, with intervals"),
         Plot(plots.bode_chart(found), "Frequency response from each input; shaded: the interval."),
-        Picture(plots.pole_figure(found), _POLES),
     )
     words = time_constant_words(found)
     return Section("How does the plant respond?", parts, _sentence(words[0].upper() + words[1:]))

@@ -53,7 +53,8 @@ def free_run_chart(run: FreeRun, outputs: Sequence[str], band: Band | None = Non
     )
     columns = []
     for name in outputs:
-        measured, model, unit = column(log, name), column(simulated, name), log[name].attrs["units"]
+        measured, model = column(log, name), column(simulated, name)
+        unit = log[name].attrs["units"]
         read = Curve("measured", t, measured, MEASURED, width=5.0)
         freely = Curve("free run", t, model, PREDICTED, width=1.6, dash="--")
         error = Curve("measured - free run", t, measured - model, MODEL, width=0.9)
@@ -83,10 +84,10 @@ def residual_figure(run: FreeRun) -> Figure:
     figure, axes = panels(len(outputs), 1 + len(inputs), size=size, sharex="col")
     for row, name in zip(axes, outputs):
         shown = {f"{name}, own": run.whiteness[name]}
-        shown |= {f"{name} after {u}": found for u, found in run.input_correlation[name].items()}
-        for axis, (title, found) in zip(row, shown.items()):
-            axis.axhspan(-found.band, found.band, color=MODEL, alpha=0.15, lw=0)
-            axis.vlines(found.lags * row_s, 0.0, found.values, color=PALETTE[1], lw=1.2)
+        shown |= {f"{name} after {u}": correlation for u, correlation in run.input_correlation[name].items()}
+        for axis, (title, correlation) in zip(row, shown.items()):
+            axis.axhspan(-correlation.band, correlation.band, color=MODEL, alpha=0.15, lw=0)
+            axis.vlines(correlation.lags * row_s, 0.0, correlation.values, color=PALETTE[1], lw=1.2)
             axis.axhline(0, color=TARGET, lw=0.6)
             axis.set_ylim(-1.05, 1.05)
             axis.set_title(title, fontsize=8)
@@ -98,20 +99,20 @@ def residual_figure(run: FreeRun) -> Figure:
 
 def models_figure(rows: Sequence[Row]) -> Figure:
     """Draw the held-out free-run error of every model, a panel an output, on a logarithmic scale."""
-    held = [row for row in rows if row.held_out]
-    outputs = list(dict.fromkeys(row.output for row in held))
-    models = list(dict.fromkeys(row.model for row in held))
-    logs = list(dict.fromkeys(row.log for row in held))
+    held_out = [row for row in rows if row.held_out]
+    outputs = list(dict.fromkeys(row.output for row in held_out))
+    models = list(dict.fromkeys(row.model for row in held_out))
+    logs = list(dict.fromkeys(row.log for row in held_out))
     figure, axes = panels(1, len(outputs), size=(max(9.6, 4.6 * len(outputs)), 0.9 + 0.42 * len(models)))
     for axis, output in zip(axes[0], outputs):
         for k, log in enumerate(logs):
-            mine = {row.model: row.rmse for row in held if row.output == output and row.log == log}
-            at = [models.index(name) for name in mine]
-            axis.plot(list(mine.values()), at, MARKERS[k % 8], ms=6, color=PALETTE[k % 8], label=log)
-        _log_scale(axis, [row.rmse for row in held if row.output == output])
+            mine = {row.model: row.rmse for row in held_out if row.output == output and row.log == log}
+            heights = [models.index(name) for name in mine]
+            axis.plot(list(mine.values()), heights, MARKERS[k % 8], ms=6, color=PALETTE[k % 8], label=log)
+        _log_scale(axis, [row.rmse for row in held_out if row.output == output])
         axis.set_yticks(range(len(models)), models, fontsize=9)
         axis.set_ylim(len(models) - 0.5, -0.5)
-        unit = next(row.unit for row in held if row.output == output)
+        unit = next(row.unit for row in held_out if row.output == output)
         axis.set_xlabel(f"{output}: free-run RMSE [{unit}]")
     figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper center", fontsize=7, ncols=2)
     return figure
@@ -124,7 +125,7 @@ def step_response_chart(found: Dynamics) -> Chart:
     units = {name: found.units.get(name, "1") for name in (*outputs, *inputs)}
 
     def panel(i: int, j: int) -> Panel:
-        value, low, high = (np.asarray(part)[:, i, j] for part in step)
+        value, low, high = (np.asarray(values)[:, i, j] for values in step)
         ends = (low, high) if np.isfinite(low).all() else (None, None)
         curve = Curve(outputs[i], time, value, PALETTE[i % 8], low=ends[0], high=ends[1])
         by = units[inputs[j]]
@@ -145,14 +146,14 @@ def bode_chart(found: Dynamics) -> Chart:
     turned = type(phase)(*(np.where(magnitude.value < least, np.nan, part) for part in phase))
 
     def curve(part: Estimate, i: int, j: int, floor: float) -> Curve:
-        value, low, high = (each[:, i, j] for each in part)
+        value, low, high = (ends[:, i, j] for ends in part)
         line = Curve(
             outputs[i], omega, np.where(value < floor, np.nan, value), PALETTE[i % 8], dash=DASHES[i % 4]
         )
         if not np.isfinite(high).any():
             return line
-        seen = high >= floor
-        low, high = np.where(seen, np.maximum(low, floor), np.nan), np.where(seen, high, np.nan)
+        visible = high >= floor
+        low, high = np.where(visible, np.maximum(low, floor), np.nan), np.where(visible, high, np.nan)
         return replace(line, low=low, high=high)
 
     rows = range(len(outputs))
@@ -163,27 +164,6 @@ def bode_chart(found: Dynamics) -> Chart:
         above = Panel("magnitude", sizes, name, 1.5, log=True)
         columns.append((above, Panel("phase [deg]", turns, height=1.3)))
     return Chart(tuple(columns), "frequency [rad/s]", log=True, wide=max(3.2, 6.4 / len(inputs)))
-
-
-def pole_figure(found: Dynamics) -> Figure:
-    """Draw the poles s of the plant, crosses, over those of the draws, dots: 1 / abs(s) [s], of a real pole
-    the time constant, and the damping ratio -Re(s) / abs(s)."""
-    from thermogrip.sysid.export.dynamics import poles_of
-
-    figure, [[axis]] = panels(1, 1, size=(9.6, 2.8))
-    drawn = np.concatenate([np.empty(0, complex), *(poles_of(other) for other in found.draws)])
-    for label, poles, mark, size, colour in (
-        (f"{len(found.draws)} draws", drawn, ".", 4, PREDICTED),
-        ("plant", found.poles, "x", 7, MODEL),
-    ):
-        s = poles[np.abs(poles) > 0]  # an integrator has no time
-        axis.plot(1 / np.abs(s), -s.real / np.abs(s), mark, ms=size, color=colour, label=label)
-    axis.axhline(0, color=TARGET, lw=0.8)
-    axis.set(xscale="log", ylim=(min(-0.1, axis.get_ylim()[0]), 1.1))
-    axis.set_xlabel("1 / |pole| [s]; of a real pole, on top, the time constant")
-    axis.set_ylabel("damping ratio")
-    axis.legend(frameon=False, fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))
-    return figure
 
 
 def loops_chart(runs: Mapping[str, Log], targets: Mapping[str, float], output: str = "t_surface") -> Chart:
@@ -202,8 +182,8 @@ def loops_chart(runs: Mapping[str, Log], targets: Mapping[str, float], output: s
             Curve(_with_unit(u, log[u].attrs["units"]), t, column(log, u), PALETTE[(1 + j) % 8], step=True)
             for j, u in enumerate(names(log, "input"))
         )
-        own = Curve(output, t, column(log, output), MODEL, 1.6)
-        top = Panel("temperature [degC]", (*others, goal, own), title, 2.2)
+        regulated = Curve(output, t, column(log, output), MODEL, 1.6)
+        top = Panel("temperature [degC]", (*others, goal, regulated), title, 2.2)
         columns.append((top, Panel("inputs", drives)))
     return Chart(tuple(columns), wide=3.6)
 
@@ -254,8 +234,8 @@ def _log_scale(axis: Axes, values: Sequence[float]) -> None:
     """Give the axis a logarithmic scale of at least a decade, with plain numbers at 1, 2 and 5."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-    known = [value for value in values if np.isfinite(value) and value > 0] or [1.0]
-    low, high = 0.7 * min(known), 1.4 * max(known)
+    positive = [value for value in values if np.isfinite(value) and value > 0] or [1.0]
+    low, high = 0.7 * min(positive), 1.4 * max(positive)
     widen = max(1.0, np.sqrt(10 * low / high))
     axis.set_xscale("log")
     axis.set_xlim(low / widen, high * widen)
@@ -309,7 +289,7 @@ def _corner_panel(
             ax.axvline(edge, color="tab:blue", lw=0.8, ls="--")
         ax.set_yticks([])
     else:
-        ax.plot(columns[:, j], columns[:, i], ".", ms=1.5, alpha=0.4)
+        ax.plot(columns[:, j], columns[:, i], ".", ms=1.5, alpha=0.4, rasterized=True)  # of thousands
         ax.axhline(posterior.fitted[names[i]], color="0.6", lw=0.8)
         ax.tick_params(labelleft=j == 0)  # a row shares its scale
     if i == len(names) - 1:

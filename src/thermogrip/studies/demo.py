@@ -70,7 +70,9 @@ def run_demo(
     with ThreadPoolExecutor(1) as beside:
         compare = partial(_compare, out, seed, workers)
         compared = None if workers == 1 else beside.submit(copy_context().run, compare, None)
-        found, plant, record, held_out = _identify(out, seed, sub_progress(progress, 0.0, 0.6, "identify"))
+        identification, plant, record, held_out = _identify(
+            out, seed, sub_progress(progress, 0.0, 0.6, "identify")
+        )
         tuning, checks = _tune(out, plant, seed, workers, sub_progress(progress, 0.6, 0.73, "tune"))
         sessions = _run(out, tuning, plant, seed, sub_progress(progress, 0.73, 0.76, "run"))
         share = sub_progress(progress, 0.76, 0.98, "compare")
@@ -79,7 +81,7 @@ def run_demo(
         comparison, classifier = compare(share) if compared is None else compared.result()
     touched = [session.grasps for _, session in sessions if session.grasps is not None]
     sections = [
-        identification_section(found),
+        identification_section(identification),
         free_run_section(held_out, title="Does it predict the half of a log that was held out?"),
         parameters_section(plant, record),
         replace(tuning_section(tuning), shown=1),
@@ -121,12 +123,12 @@ def _identify(
     cuts = {name: f"@:{SPLIT_S}" if name == "pump_on_off" else "" for name in EXAMPLE_LOGS}
     logs = [read_log(f"{example_path(name)}{cut}") for name, cut in cuts.items()]
     share = sub_progress(progress, 0.0, 0.6)
-    found = identify(logs, network="gripper", models=MODELS, draws=0, seed=seed, progress=share)
+    identification = identify(logs, network="gripper", models=MODELS, draws=0, seed=seed, progress=share)
     share = sub_progress(progress, 0.6, 1.0, "posterior")
-    plant, record = sample_posterior(found.plant, logs, seed=seed, progress=share)
+    plant, record = sample_posterior(identification.plant, logs, seed=seed, progress=share)
     plant.save(out / "plant.json")
     whole = read_log(example_path("pump_on_off"))
-    return found, plant, record, free_run(plant, whole, score_from=SPLIT_S)
+    return identification, plant, record, free_run(plant, whole, score_from=SPLIT_S)
 
 
 def _tune(
@@ -203,7 +205,7 @@ def _compare(
 def _touch(out: Path, classifier: GraspClassifier, touched: Sequence[Grasps]) -> Section:
     from thermogrip.classify.decisions.predict import answer, write_predictions
 
-    rows = [found.row() for found in answer(classifier, list(touched), CANDIDATES)]
+    rows = [one_answer.row() for one_answer in answer(classifier, list(touched), CANDIDATES)]
     if rows:
         write_predictions(rows, out / "predictions.csv")
     truth = [str(name) for grasps in touched for name in grasps["material"].values]
