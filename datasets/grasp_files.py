@@ -1,8 +1,9 @@
 """Grasps to and from disk.
 
 As CSV a condition is two files, ``NAME.csv``, long, one row a sample, and ``NAME_meta.csv``, one row a grasp:
-``docs/reference/files.md`` has their columns.  A missing ``session`` is the file, a missing ``block`` the
-material: so blocks are never split between training and test by accident of a missing column.
+``docs/reference/files.md`` has their columns.  In a Parquet file or a DataFrame each row repeats what is
+known of its grasp.  A missing ``session`` is the file, a missing ``block`` the material: so blocks are never
+split between training and test by accident of a missing column.
 
 The grasps of one file share one time axis.  Where their stamps agree they are taken as they are; where they
 jitter each grasp is interpolated linearly onto the common step, which is noted in ``attrs["repairs"]``, and
@@ -13,10 +14,8 @@ from __future__ import annotations
 
 import os
 import re
-from collections import Counter
 from collections.abc import Sequence
-from dataclasses import replace
-from itertools import pairwise
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -37,11 +36,7 @@ from thermogrip.datasets.schema import (
     make_grasps,
     with_lead_in,
 )
-from thermogrip.datasets.tables import (
-    Table,
-    read_csv_table,
-    read_parquet_frame,
-)
+from thermogrip.datasets.tables import Table, frame_table, read_csv_table, read_parquet_table
 from thermogrip.datasets.units import rename_hint, split_header, to_record_unit
 
 if TYPE_CHECKING:
@@ -51,16 +46,26 @@ if TYPE_CHECKING:
     from thermogrip.datasets.schema import Grasps
 
 Floats = NDArray[np.float64]
+Rows = NDArray[np.int64]
 #: What is taken for grasps: themselves, long DataFrames, paths of files; one or several.
 Records: TypeAlias = "Grasps | DataFrame | str | Path | Sequence[Grasps | DataFrame | str | Path]"
-_OF_SAMPLES = ("grasp_id", "time", "t_surface", "pump")  # how the columns begin that change in a grasp
 
 # name in the meta file (without unit) -> name in the record
 _FROM_META = {"t_object_nominal": "t_object", "t_gripper_set": "t_gripper"}
 #: Names in the meta file of what a record calls otherwise.
 META_NAMES = {ours: theirs for theirs, ours in _FROM_META.items()}
 _ENDINGS = (".csv", ".csv.gz", ".csv.xz")
-_NEEDED = ("time", "t_surface")  # how the columns begin that are read as numbers
+_CHANNELS = ("time", "t_surface")  # how the columns of a sample begin that are numbers
+
+
+@dataclass(frozen=True)
+class _Samples:
+    """The rows of a table of samples, in its units of records."""
+
+    grasp_ids: list[str]  # (n_row,)
+    time: Floats  # (n_row,) [s]
+    channels: dict[str, Floats]  # (n_row,) [degC]
+    repairs: list[str]
 
 
 def read_grasps(path: str | Path, *, name: str | None = None) -> Grasps:
@@ -92,18 +97,16 @@ def read_grasps(path: str | Path, *, name: str | None = None) -> Grasps:
     >>> dict(grasps.sizes), str(grasps["material"].values[0]), float(grasps["t_object"][0])
     ({'grasp': 40, 'time': 121}, 'copper', 43.0)
     """
-    if file_format(path) not in ("csv", "netcdf", "parquet"):
-        raise UserError("grasps are CSV, NetCDF or Parquet", file=path, hint="use one of them")
-    if file_format(path) == "parquet":
-        frame = read_parquet_frame(path)
-        if "grasp_id" not in frame:
-            problem = "no column grasp_id"
-            raise UserError(problem, file=path, hint="a grasp file has grasp_id,time_s,t_surface_degC")
-        return from_frame(frame, name or file_stem(path), file=path)
-    if file_format(path) == "netcdf":
+    kind = file_format(path)
+    if kind == "netcdf":
         return _whole(_of_dataset(open_netcdf(path), path, name), path)
-    samples, meta = _sample_table(path), _meta_path(path)
-    return _of_tables(samples, _meta_table(meta), name or file_stem(path))
+    if kind == "parquet":
+        samples = read_parquet_table(path, text=_is_text, tolerated=0.0)
+        return _of_tables(samples, None, name or file_stem(path))
+    if kind != "csv":
+        raise UserError("grasps are CSV, NetCDF or Parquet", file=path, hint="use one of them")
+    samples = read_csv_table(path, text=_is_text)
+    return _of_tables(samples, read_csv_table(_meta_path(path), text=_is_text), name or file_stem(path))
 
 
 def _whole(grasps: Grasps, path: str | Path) -> Grasps:
@@ -123,54 +126,19 @@ def _whole(grasps: Grasps, path: str | Path) -> Grasps:
 
 def as_grasps(grasps: Records) -> list[Grasps]:
     """Return records as they are, those of files and DataFrames as they are read."""
-    given = list(grasps) if isinstance(grasps, Sequence) and not isinstance(grasps, str) else [grasps]
-    files: list[Any] = [read_grasps(each) if isinstance(each, str | Path) else each for each in given]
-    import pandas as pd
+    from pandas import DataFrame
 
-    return [from_frame(each) if isinstance(each, pd.DataFrame) else each for each in files]
+    records = list(grasps) if isinstance(grasps, Sequence) and not isinstance(grasps, str) else [grasps]
+    read: list[Any] = [read_grasps(each) if isinstance(each, str | Path) else each for each in records]
+    return [from_frame(each) if isinstance(each, DataFrame) else each for each in read]
 
 
-def from_frame(frame: DataFrame, name: str = "DataFrame", *, file: str | Path | None = None) -> Grasps:
+def from_frame(frame: DataFrame) -> Grasps:
     """Return the grasps of a table with a row a sample, in which each row repeats what is known of its grasp;
-    columns as in the two files of :func:`read_grasps`.  What is refused is named by ``file`` and its row,
-    the first one 1."""
-    where = str(file or name)
-    frame = frame.rename(columns=str).reset_index(drop=True)
-    samples = [column for column in frame.columns if column.startswith(_OF_SAMPLES)]
-    rest = frame.drop(columns=[column for column in samples if column != "grasp_id"])
-    if "grasp_id" in rest:
-        _check_cells(frame, where)
-        rest = rest.drop_duplicates("grasp_id")
-    long = _sample_table(where, frame[samples].to_csv(index=False).encode())
-    meta = _meta_table(where, rest.to_csv(index=False).encode())
-    return _of_tables(replace(long, lines=long.lines - 1), meta, name)
-
-
-def _check_cells(frame: DataFrame, file: str) -> None:
-    """Refuse a text where a number should be, and rows that say different things of one grasp."""
-    import pandas as pd
-
-    known = [name for name in frame.columns if _meta_name(name, file)[0] in (*GRASP_NUMBERS, *GRASP_LABELS)]
-    for name in frame.columns:
-        if not name.startswith(_NEEDED) and _meta_name(name, file)[0] not in GRASP_NUMBERS:
-            continue
-        cells = frame[name].astype(object)
-        text = cells.map(lambda cell: isinstance(cell, str) and cell.strip().lower() not in ("", "nan"))
-        wrong = text & pd.to_numeric(cells, errors="coerce").isna()
-        if wrong.any():
-            at = int(wrong.argmax())
-            hint = "write a number, or leave the cell empty"
-            raise UserError(f"{cells[at][:40]!r} is no number", file=file, row=at + 1, column=name, hint=hint)
-    differ = frame[["grasp_id", *known]].drop_duplicates().duplicated("grasp_id")
-    if not differ.any():
-        return
-    at = int(differ.index[differ][0])
-    grasp = frame["grasp_id"][at]
-    first = int((frame["grasp_id"] == grasp).argmax())
-    name = next(each for each in known if frame[each].iloc[[first, at]].nunique(dropna=False) > 1)
-    problem = f"{frame[name][at]!s} of grasp {grasp!r} was {frame[name][first]!s} in row {first + 1}"
-    hint = "repeat in each row what is known of its grasp"
-    raise UserError(problem, file=file, row=at + 1, column=name, hint=hint)
+    columns as in the two files of :func:`read_grasps`.  What is refused is named by its row, the first one
+    1."""
+    table = frame_table(frame.reset_index(drop=True), "DataFrame", text=_is_text, tolerated=0.0)
+    return _of_tables(table, None, "DataFrame")
 
 
 def write_grasps(grasps: Grasps, path: str | Path) -> Path:
@@ -228,27 +196,21 @@ def list_grasp_files(paths: Sequence[str | Path]) -> list[Path]:
 
 
 def distinct_names(files: Sequence[Path]) -> list[str | None]:
-    """Return for each file None, or where another one has its stem a name with as many of the folders above
-    it as tell them apart; UserError where a file is given twice."""
+    """Return for each file None, or where another one has its stem its path below the folder that all of this
+    stem have in common; UserError where a file is given twice."""
     places = [os.path.abspath(file) for file in files]
-    seen: set[str] = set()
     for file, place in zip(files, places):
-        if place in seen:
+        if places.count(place) > 1:
             raise UserError("is given twice", file=file, hint="give each file once")
-        seen.add(place)
-    names = [file_stem(file) for file in files]
-    alike = {name for name, n in Counter(names).items() if n > 1}
-    found: list[str | None] = [None] * len(files)
-    depth = 1
-    while alike:
-        found = [
-            "/".join(Path(place).parts[-depth:]) if name in alike else longer
-            for name, place, longer in zip(names, places, found)
-        ]
-        names = [longer or name for name, longer in zip(names, found)]
-        alike = {name for name, n in Counter(names).items() if n > 1}
-        depth += 1
-    return found
+    of_stem: dict[str, list[str]] = {}
+    for file, place in zip(files, places):
+        of_stem.setdefault(file_stem(file), []).append(place)
+    return [
+        os.path.relpath(place, os.path.commonpath(alike))
+        if len(alike := of_stem[file_stem(file)]) > 1
+        else None
+        for file, place in zip(files, places)
+    ]
 
 
 def grasp_file_parts(path: Path) -> list[Path]:
@@ -284,22 +246,22 @@ def _in_folder(folder: Path) -> list[Path]:
     return files
 
 
-def _sample_table(path: str | Path, data: bytes | None = None) -> Table:
-    return read_csv_table(path, text=lambda header: not header.startswith(_NEEDED), data=data)
+def _is_text(header: str) -> bool:
+    """Tell whether a column of grasps is left as text: its name is that of no number."""
+    return not header.startswith(_CHANNELS) and _name_of_fact(header)[0] not in GRASP_NUMBERS
 
 
-def _samples_of(table: Table) -> tuple[list[str], Floats, dict[str, Floats], list[str]]:
-    """Return grasp_id of each row, its time [s], the temperature channels [degC], and what was repaired."""
+def _samples_of(table: Table, facts: Table | None) -> _Samples:
+    """Return the samples of a table, in which the facts of a grasp may stand too, where they have no table of
+    their own."""
     path = table.file
     if "grasp_id" not in table.text:
         problem = "no column grasp_id"
         raise UserError(problem, file=path, hint="a grasp file has grasp_id,time_s,t_surface_degC")
     channels, repairs = {}, list(table.notes)
-    unused = [header for header in table.text if header not in ("grasp_id", "pump")]
-    repairs += [f"not used: {', '.join(unused)}"] if unused else []
-    for header, values in table.numbers.items():
+    for header in (header for header in table.numbers if header.startswith(_CHANNELS)):
         name, unit = split_header(header, file=str(path))
-        channels[name], after = to_record_unit(values, unit)
+        channels[name], after = to_record_unit(table.numbers[header], unit)
         if name.startswith("t_surface") and after != "degC":
             raise UserError("is not a temperature", file=path, column=header, hint=f"write {name}_degC")
         if name == "time" and after != "s":
@@ -310,48 +272,51 @@ def _samples_of(table: Table) -> tuple[list[str], Floats, dict[str, Floats], lis
         if need not in channels:
             problem = f"no column {wanted}"
             raise UserError(problem, file=path, hint=rename_hint(need, [*table.text, *table.numbers]))
-    time = channels["time"]
+    time, ids = channels["time"], table.text["grasp_id"]
     if not np.isfinite(time).all():
         row = int(table.lines[np.argmin(np.isfinite(time))])
         raise UserError("has no time", file=path, row=row, hint="remove the row")
-    if "" in table.text["grasp_id"]:
-        row = int(table.lines[table.text["grasp_id"].index("")])
+    if "" in ids:
+        row = int(table.lines[ids.index("")])
         raise UserError("is empty", file=path, row=row, column="grasp_id", hint="name the grasp")
+    others = [h for h in (*table.text, *table.numbers) if not h.startswith((*_CHANNELS, "grasp_id", "pump"))]
+    if others and facts is not None:
+        repairs.append(f"not used: {', '.join(others)}")
     kept = {name: values for name, values in channels.items() if name in ("t_surface", "t_surface_2")}
-    return table.text["grasp_id"], time, kept, repairs
+    return _Samples(ids, np.round(time, 6), kept, repairs)
 
 
-def _in_order(ids: list[str]) -> tuple[list[str], NDArray[np.int64]]:
-    """Return the names in order of first appearance and each row's index into them."""
-    order = {name: at for at, name in enumerate(dict.fromkeys(ids))}
-    return list(order), np.fromiter((order[name] for name in ids), dtype=np.int64, count=len(ids))
+def _onto_one_axis(samples: _Samples, order: Sequence[str], file: str) -> tuple[Floats, dict[str, Floats]]:
+    """Return the common time axis (n_time,) and the channels (n_grasp, n_time); what is repaired is added to
+    the samples' repairs."""
+    time, rows_of = samples.time, []
+    ids = np.asarray(samples.grasp_ids)
+    for grasp, rows in zip(order, _rows_of(ids, order)):
+        steps = np.diff(time[rows])
+        if (back := np.flatnonzero(steps < 0)).size:
+            begin, end = time[rows[back[0] : back[0] + 2]]
+            problem = f"grasp {grasp!r}: time runs back from {begin:g} s to {end:g} s"
+            raise UserError(problem, file=file, hint="sort its rows, or give each grasp its own grasp_id")
+        if repeated := int((steps == 0).sum()):
+            samples.repairs.append(f"grasp {grasp}: {repeated} repeated time stamp(s) dropped")
+        rows_of.append(rows[np.append(True, steps > 0)])
+    step = _common_step([time[rows] for rows in rows_of], order, file)
+    axis = np.unique(time)
+    if not _is_even(axis, step):
+        first, last = np.ceil(time.min() / step - 1e-6), np.floor(time.max() / step + 1e-6)
+        axis = np.round(step * np.arange(first, last + 1), 9)
+        samples.repairs.append(f"time stamps jitter: interpolated onto a step of {step:g} s")
+    return axis, {
+        name: np.stack([_on_axis(axis, time[rows], values[rows], step) for rows in rows_of])
+        for name, values in samples.channels.items()
+    }
 
 
-def _onto_one_axis(
-    order: list[str], index: NDArray[np.int64], time: Floats, channels: dict[str, Floats], file: str
-) -> tuple[Floats, dict[str, Floats], list[str]]:
-    """Return the common time axis (n_time,), the channels (n_grasp, n_time), and what was repaired."""
-    by_grasp = np.argsort(index, kind="stable")
-    bounds = np.searchsorted(index[by_grasp], np.arange(len(order) + 1))
-    parts = [by_grasp[a:b] for a, b in pairwise(bounds)]
-    repairs, steps = [], []
-    for at, rows in enumerate(parts):
-        parts[at], repeated = _increasing(time[rows], rows, order[at], file)
-        steps.append(_step_of(time[parts[at]]))
-        repairs += [f"grasp {order[at]}: {repeated} repeated time stamp(s) dropped"] if repeated else []
-    step = _common_step(np.asarray(steps), order, file)
-    axis = np.unique(np.round(time, 6))
-    if _is_even(axis, step):
-        return axis, {name: _placed(axis, time, values, parts) for name, values in channels.items()}, repairs
-    axis = np.round(
-        step * np.arange(np.ceil(time.min() / step - 1e-6), np.floor(time.max() / step + 1e-6) + 1), 9
-    )
-    repairs.append(f"time stamps jitter: interpolated onto a step of {step:g} s")
-    return (
-        axis,
-        {name: _interpolated(axis, time, values, parts, step) for name, values in channels.items()},
-        repairs,
-    )
+def _rows_of(ids: NDArray[np.str_], order: Sequence[str]) -> list[Rows]:
+    """Return the rows of each grasp, in the order of the file."""
+    names, index = np.unique(ids, return_inverse=True)
+    by_name = np.split(np.argsort(index, kind="stable"), np.cumsum(np.bincount(index))[:-1])
+    return [by_name[at] for at in np.searchsorted(names, order)]
 
 
 def _is_even(axis: Floats, step: float) -> bool:
@@ -364,23 +329,17 @@ def _is_even(axis: Floats, step: float) -> bool:
     return bool(np.abs(axis - axis[0] - exact * count).max() <= 0.02 * step)
 
 
-def _increasing(
-    time: Floats, rows: NDArray[np.int64], grasp: str, file: str
-) -> tuple[NDArray[np.int64], int]:
-    step = np.diff(time)
-    if np.any(step < 0):
-        at = int(np.argmax(step < 0))
-        problem = f"grasp {grasp!r}: time runs back from {time[at]:g} s to {time[at + 1]:g} s"
-        raise UserError(problem, file=file, hint="sort its rows, or give each grasp its own grasp_id")
-    keep = np.concatenate([[True], step > 0])
-    return rows[keep], int((~keep).sum())
-
-
-def _common_step(steps: Floats, order: list[str], file: str) -> float:
-    if not np.isfinite(steps).any():
+def _common_step(times: Sequence[Floats], order: Sequence[str], file: str) -> float:
+    """Return the median over grasps of the mean step, in which a hole counts as the steps that it is long."""
+    steps = np.full(len(times), np.nan)
+    for at, time in enumerate(times):
+        if time.size > 1:
+            moves = np.diff(time)
+            steps[at] = np.ptp(time) / np.maximum(np.round(moves / np.median(moves)), 1).sum()
+    if np.isnan(steps).all():
         raise UserError("no grasp has two samples", file=file, hint="give the whole recording of each grasp")
     step = float(np.nanmedian(steps))
-    odd = np.isfinite(steps) & (np.abs(steps / step - 1) > 0.2)
+    odd = np.abs(steps / step - 1) > 0.2  # NaN compares false
     if odd.any():
         at = int(odd.argmax())
         problem = f"grasp {order[at]!r} has a step of {steps[at]:g} s, the others {step:g} s"
@@ -389,37 +348,17 @@ def _common_step(steps: Floats, order: list[str], file: str) -> float:
     return plain if abs(plain / step - 1) < 0.01 else float(f"{step:.4g}")
 
 
-def _step_of(time: Floats) -> float:
-    """Return the mean step, a hole counted as the steps that it is long; NaN for a single sample."""
-    if time.size < 2:
-        return np.nan
-    step = np.diff(time)
-    return float((time[-1] - time[0]) / np.maximum(np.round(step / np.median(step)), 1).sum())
-
-
-def _placed(axis: Floats, time: Floats, values: Floats, parts: list[NDArray[np.int64]]) -> Floats:
-    grid = np.full((len(parts), axis.size), np.nan)
-    for at, rows in enumerate(parts):
-        grid[at, np.searchsorted(axis, np.round(time[rows], 6))] = values[rows]
-    return grid
-
-
-def _interpolated(
-    axis: Floats, time: Floats, values: Floats, parts: list[NDArray[np.int64]], step: float
-) -> Floats:
-    grid = np.full((len(parts), axis.size), np.nan)
-    for at, rows in enumerate(parts):
-        good = rows[np.isfinite(values[rows])]
-        if not good.size:
-            continue
-        t = time[good]
-        after = np.clip(np.searchsorted(t, axis), 0, t.size - 1)
-        before = np.clip(np.searchsorted(t, axis, side="right") - 1, 0, t.size - 1)
-        inside = (
-            (axis >= t[0] - 0.5 * step) & (axis <= t[-1] + 0.5 * step) & (t[after] - t[before] <= 1.5 * step)
-        )
-        grid[at, inside] = np.interp(axis[inside], t, values[good])
-    return grid
+def _on_axis(axis: Floats, time: Floats, values: Floats, step: float) -> Floats:
+    """Return a grasp on the axis: as it is where it has a sample, NaN where none is near."""
+    out, known = np.full(axis.size, np.nan), np.isfinite(values)
+    if not known.any():
+        return out
+    t = time[known]
+    after = np.clip(np.searchsorted(t, axis), 0, t.size - 1)
+    before = np.clip(np.searchsorted(t, axis, side="right") - 1, 0, t.size - 1)
+    near = (axis >= t[0] - 0.5 * step) & (axis <= t[-1] + 0.5 * step) & (t[after] - t[before] <= 1.5 * step)
+    out[near] = np.interp(axis[near], t, values[known])
+    return out
 
 
 def _meta_path(path: str | Path) -> Path:
@@ -432,92 +371,102 @@ def _meta_path(path: str | Path) -> Path:
     return found
 
 
-def _meta_table(path: str | Path, data: bytes | None = None) -> Table:
-    def is_text(header: str) -> bool:
-        return _meta_name(header, str(path))[0] not in GRASP_NUMBERS
-
-    return read_csv_table(path, text=is_text, data=data)
-
-
-def _meta_name(header: str, file: str | None = None) -> tuple[str, str]:
+def _name_of_fact(header: str, file: str | None = None) -> tuple[str, str]:
     """Return what a record calls a column of the meta file, and its unit; no name where it means nothing."""
-    if not re.fullmatch(r"\S+", header) or not header.lower().startswith(
-        ("grasp_id", *GRASP_LABELS, *GRASP_NUMBERS)
-    ):
+    known = ("grasp_id", *GRASP_LABELS, *GRASP_NUMBERS)
+    if not re.fullmatch(r"\S+", header) or not header.lower().startswith(known):
         return "", ""
     name, unit = split_header(header, file=file)
     return name.lower() if name.lower() in GRASP_LABELS else _FROM_META.get(name, name), unit  # "Material"
 
 
-def _meta_of(table: Table, order: list[str], file: str) -> tuple[dict[str, Any], list[str]]:
-    """Return the per-grasp columns in the order of the sample file, and a line on those that are left out."""
-    path = Path(table.file)
-    if "grasp_id" not in table.text:
-        raise UserError("no column grasp_id", file=path, hint="give each grasp's name as in the sample file")
-    rows = _matched(table, order, path, file)
-    found: dict[str, Any] = {}
-    strange = []
+def _facts_of(table: Table, rows: Sequence[int]) -> tuple[dict[str, Any], list[str]]:
+    """Return what is known of each grasp, from a row of each, and the columns that mean nothing."""
+    facts: dict[str, Any] = {}
+    unknown = []
     for header in (*table.text, *table.numbers):
-        name, unit = _meta_name(header, str(path))
-        if name in found:
-            raise UserError(f"gives {name} a second time", file=path, column=header, hint="keep one")
+        name, unit = _name_of_fact(header, table.file)
+        if name in facts:
+            raise UserError(f"gives {name} a second time", file=table.file, column=header, hint="keep one")
         if name in GRASP_NUMBERS:
-            numbers, got = to_record_unit(table.numbers[header], unit)
-            if got != GRASP_NUMBERS[name]:
+            numbers, unit = to_record_unit(table.numbers[header], unit)
+            if unit != GRASP_NUMBERS[name]:
                 hint = f"it is in {GRASP_NUMBERS[name]}: write {name}_{GRASP_NUMBERS[name]}"
-                raise UserError(f"unit {got!r} does not fit", file=path, column=header, hint=hint)
-            found[name] = numbers[rows]
+                raise UserError(f"unit {unit!r} does not fit", file=table.file, column=header, hint=hint)
+            facts[name] = numbers[[*rows]]
         elif name in GRASP_LABELS:
-            found[name] = [table.text[header][at] for at in rows]
-        elif name != "grasp_id":
-            strange.append(header)
-    known = [*(f"{META_NAMES.get(name, name)}_{unit}" for name, unit in GRASP_NUMBERS.items()), *GRASP_LABELS]
-    line = f"{path.name}: not used: {', '.join(strange)}; known are {', '.join(known)}"
-    return found, [line] if strange else []
+            facts[name] = [table.text[header][at] for at in rows]
+        elif name != "grasp_id" and not header.startswith((*_CHANNELS, "pump")):
+            unknown.append(header)
+    return facts, unknown
 
 
-def _matched(table: Table, order: list[str], path: Path, file: str) -> list[int]:
+def _rows_of_meta(table: Table, order: Sequence[str], file: str) -> list[int]:
     """Return for each grasp its row in the meta file; both files must name the same grasps, each once."""
+    if "grasp_id" not in table.text:
+        hint = "give each grasp's name as in the sample file"
+        raise UserError("no column grasp_id", file=table.file, hint=hint)
     rows: dict[str, int] = {}
     for at, grasp in enumerate(table.text["grasp_id"]):
-        if grasp in rows:
-            line = int(table.lines[at])
-            raise UserError(f"grasp_id {grasp!r} occurs twice", file=path, row=line, hint="give each its own")
+        if grasp in rows or grasp not in order:
+            problem = f"grasp {grasp!r} has no samples in {Path(file).name}"
+            hint, row = "remove the row or add the samples", int(table.lines[at])
+            if grasp in rows:
+                problem, hint = f"grasp_id {grasp!r} occurs twice", "give each its own"
+            raise UserError(problem, file=table.file, row=row, hint=hint)
         rows[grasp] = at
-    missing = next((g for g in order if g not in rows), None)
-    if missing is not None:
-        raise UserError(f"no row for grasp {missing!r} of {Path(file).name}", file=path, hint="add it")
-    extra = next((g for g in rows if g not in set(order)), None)
-    if extra is not None:
-        line = int(table.lines[rows[extra]])
-        problem = f"grasp {extra!r} has no samples in {Path(file).name}"
-        raise UserError(problem, file=path, row=line, hint="remove the row or add the samples")
-    return [rows[g] for g in order]
+    for grasp in order:
+        if grasp not in rows:
+            problem = f"no row for grasp {grasp!r} of {Path(file).name}"
+            raise UserError(problem, file=table.file, hint="add it")
+    return [rows[grasp] for grasp in order]
 
 
-def _with_defaults(per_grasp: dict[str, Any], n: int, stem: str) -> dict[str, Any]:
+def _first_rows(table: Table, order: Sequence[str]) -> list[int]:
+    """Return the first row of each grasp in a table that repeats its facts; UserError where they differ."""
+    rows_of = _rows_of(np.asarray(table.text["grasp_id"]), order)
+    for header, column in {**table.text, **table.numbers}.items():
+        if _name_of_fact(header)[0] not in (*GRASP_LABELS, *GRASP_NUMBERS):
+            continue
+        cells = np.asarray(column)
+        for grasp, rows in zip(order, rows_of):
+            first = cells[rows[0]]
+            other = rows[(cells[rows] != first) & ~((cells[rows] != cells[rows]) & (first != first))]
+            if other.size:
+                problem = (
+                    f"{cells[other[0]]!s} of grasp {grasp!r} was {first!s} in row {table.lines[rows[0]]}"
+                )
+                hint, row = "repeat in each row what is known of its grasp", int(table.lines[other[0]])
+                raise UserError(problem, file=table.file, row=row, column=header, hint=hint)
+    return [int(rows[0]) for rows in rows_of]
+
+
+def _with_defaults(facts: dict[str, Any], n: int, stem: str) -> dict[str, Any]:
     """Fill in the material, session and block where they are missing."""
-    filled = dict(per_grasp)
-    filled.setdefault("material", [""] * n)
-    filled["session"] = [s or stem for s in filled.get("session", [""] * n)]
-    filled["block"] = [b or m for b, m in zip(filled.get("block", [""] * n), filled["material"])]
-    return filled
+    material = facts.get("material", [""] * n)
+    session = [label or stem for label in facts.get("session", [""] * n)]
+    block = [label or its_material for label, its_material in zip(facts.get("block", [""] * n), material)]
+    return facts | {"material": material, "session": session, "block": block}
 
 
-def _of_tables(samples: Table, meta: Table, name: str) -> Grasps:
-    """Return the grasps of a table with a row a sample and one with a row a grasp."""
-    ids, time, channels, repairs = _samples_of(samples)
-    order, index = _in_order(ids)
-    axis, gridded, more = _onto_one_axis(order, index, time, channels, samples.file)
-    about, left_out = _meta_of(meta, order, samples.file)
-    per_grasp = _with_defaults(about, len(order), name)
-    per_grasp |= {"name": name, "t_surface_2": gridded.get("t_surface_2")}
+def _of_tables(table: Table, meta: Table | None, name: str) -> Grasps:
+    """Return the grasps of a table with a row a sample, and of one with a row a grasp, if there is one."""
+    samples = _samples_of(table, meta)
+    order = list(dict.fromkeys(samples.grasp_ids))
+    rows = _first_rows(table, order) if meta is None else _rows_of_meta(meta, order, table.file)
+    axis, channels = _onto_one_axis(samples, order, table.file)
+    facts, unknown = _facts_of(table if meta is None else meta, rows)
+    if unknown:
+        numbers = (f"{META_NAMES.get(name, name)}_{unit}" for name, unit in GRASP_NUMBERS.items())
+        line = f"{Path((meta or table).file).name}: not used: {', '.join(unknown)}"
+        samples.repairs.append(f"{line}; known are {', '.join([*numbers, *GRASP_LABELS])}")
+    facts = _with_defaults(facts, len(order), name)
     try:
-        grasps = make_grasps(axis, gridded["t_surface"], order, **per_grasp)
+        grasps = make_grasps(axis, grasp_id=order, name=name, **channels, **facts)
     except UserError as error:  # which knows the record's name alone
-        raise UserError(error.problem, file=samples.file, column=error.column, hint=error.hint) from error
-    grasps.attrs["repairs"] = "\n".join(repairs + more + left_out)
-    return _whole(grasps, samples.file)
+        raise UserError(error.problem, file=table.file, column=error.column, hint=error.hint) from error
+    grasps.attrs["repairs"] = "\n".join(samples.repairs)
+    return _whole(grasps, table.file)
 
 
 def _of_dataset(data: xr.Dataset, path: str | Path, called: str | None = None) -> Grasps:

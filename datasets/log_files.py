@@ -21,7 +21,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,6 +38,7 @@ from thermogrip.datasets.schema import ROLES, check_log, hash_columns, make_log
 from thermogrip.datasets.tables import (
     Table,
     check_header,
+    frame_table,
     read_excel_table,
     read_matlab_table,
     read_parquet_table,
@@ -126,7 +127,9 @@ def read_log(
     """
     if not isinstance(path, str | Path):
         file, start, stop = Path("DataFrame"), -np.inf, np.inf
-        table = _frame_table(path, columns)
+        if columns is not None:
+            raise UserError("has names of its own", file=file, hint="rename its columns")
+        table = frame_table(path, str(file))
     else:
         file, start, stop = split_cut(path)
         table = _one_column_a_signal(_read_table(file, columns))
@@ -274,15 +277,15 @@ def _read_netcdf_table(path: str | Path) -> Table:
     return Table(str(path), numbers, {}, np.arange(1, data.sizes["time"] + 1), attrs, meta, notes)
 
 
-_WITHOUT_NAMES = {
+_OF_TEXT = {
     "csv": read_text_table, "text": read_text_table, "matlab": read_matlab_table, "excel": read_excel_table
 }  # fmt: skip
 
 
 def _read_table(file: Path, columns: Sequence[str] | None) -> Table:
     kind = _format(file)
-    if kind in _WITHOUT_NAMES:
-        return _WITHOUT_NAMES[kind](file, columns)
+    if kind in _OF_TEXT:
+        return _OF_TEXT[kind](file, columns)
     if columns is not None:
         raise UserError("has names of its own", file=file, hint="leave --columns out")
     if kind == "rosbag":
@@ -290,33 +293,6 @@ def _read_table(file: Path, columns: Sequence[str] | None) -> Table:
 
         return read_rosbag_table(file)
     return _read_netcdf_table(file) if kind == "netcdf" else read_parquet_table(file)
-
-
-def _frame_table(frame: Any, columns: Sequence[str] | None) -> Table:
-    """Return the columns of a DataFrame, its index among them unless that only counts rows."""
-    import pandas as pd
-
-    if not isinstance(frame.index, pd.RangeIndex):
-        frame = frame.rename_axis(frame.index.name or "time").reset_index()
-    if columns is not None and len(columns) != frame.shape[1]:
-        raise UserError(f"has {frame.shape[1]} columns, columns= names {len(columns)}", file="DataFrame")
-    if len(frame) < 2:
-        raise UserError(f"{len(frame)} row(s) are not a log", file="DataFrame", hint="give at least two rows")
-    numbers: dict[str, Floats] = {}
-    text: dict[str, list[str]] = {}
-    for at, header in enumerate(map(str, frame.columns if columns is None else columns)):
-        values = frame.iloc[:, at]
-        if header == "-":
-            continue
-        if isinstance(values.dtype, pd.DatetimeTZDtype) or values.dtype.kind == "M":
-            text[header] = [str(stamp) for stamp in values]
-        elif values.dtype.kind == "m":
-            numbers[f"{header}_s"] = values.dt.total_seconds().to_numpy(dtype=float)
-        elif values.dtype.kind in "fiub":
-            numbers[header] = values.to_numpy(dtype=float, na_value=np.nan)
-        else:
-            text[header] = values.astype(str).to_list()
-    return Table("DataFrame", numbers, text, np.arange(1, len(frame) + 1))
 
 
 def _convert(table: Table, dt: float | None) -> _Columns:

@@ -1,13 +1,11 @@
 """Tables of numbers on disk: text (plain, gzip or xz), Parquet, MATLAB, Excel, read without running code.
 
-The whole file is parsed at once; only where a row or a cell does not fit is it read line by line, to name
-them.  A last line that was cut off (a logger that lost power) is dropped and noted; any other ragged line is
-refused.
-
 :func:`read_csv_table` reads what thermogrip writes.  :func:`read_text_table` reads what any logger writes:
 the separator is the one of comma, semicolon, tab, bar and blanks that makes the first lines rows of equal
 length whose cells are numbers; the header is the last line of words before them.  What it passes over or
-takes for something is noted; a row or a cell that is broken is left out as long as they are few.
+takes for something is noted; a row or a cell that is broken is left out as long as they are few.  A last line
+that was cut off (a logger that lost power) is dropped and noted.  What is in a column is decided in one place
+(:func:`read_column`), for text as for the columns of text in a DataFrame or a Parquet file.
 """
 
 from __future__ import annotations
@@ -23,7 +21,6 @@ import zipfile
 import zlib
 from collections import Counter
 from collections.abc import Callable, Container, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
 from itertools import chain, count, islice
 from pathlib import Path
@@ -42,33 +39,35 @@ from thermogrip.datasets.units import read_header
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-MOST_COLUMNS = 4096  # of a table
-_MOST_EMPTY = 1_000_000  # lines without a cell that are passed over
+MOST_COLUMNS = 4096  # of a table; one of thermogrip has twelve
 
-_NULLS = ["", "nan", "NaN", "NAN", "NA", "na", "N/A", "null", "NULL", "None", "-nan", "#N/A"]
-_LOST = [*_NULLS, "-", "--", "---", "?", "*", "NaT", "unknown", "unavailable"]
+_NULLS = frozenset(
+    ["", "nan", "NaN", "NAN", "NA", "na", "N/A", "null", "NULL", "None", "-nan", "#N/A", "<NA>"]
+)
+_LOST = _NULLS | {"-", "--", "---", "?", "*", "NaT", "unknown", "unavailable"}
 _COMMENT = ("#", "%", "//")  # how a line begins that is no row
 _LEFT_OUT = "\x1f"  # how the name of a column begins that is not kept
 _NAMELESS = "columns named c1 to c{} by position; --columns a,b,... names them"
-_HEAD_LINES = 200  # of a file, that show how it is a table
+_HEAD_LINES = 200  # of a file, that show how it is a table: the longest preamble seen has 40
 #: A date, a time of day, or both, as a whole cell.
 STAMP = re.compile(
     r"()(?:(\d{1,4})[-/.](\d{1,2}|[A-Za-z]{3})[-/.](\d{1,4})(?:,?\s+|T|$))?"
     r"(?:(\d{1,2}):(\d{2})(?::(\d{2}(?:[.,]\d+)?))?)?\s*([AaPp][Mm])?\s*(Z|UTC|[+-]\d{2}:?\d{2})?$"
 )
+_TIME_OF_DAY = r"((?:\d{1,4}[-/.]\d{1,2}[-/.]\d{1,4}[ T]+)?\d{1,2}:\d{2}:\d{2}(?:[.,]\d+)?)"
 _LINE_STAMP = re.compile(
-    r"\W{0,2}((?:\d{1,4}[-/.]\d{1,2}[-/.]\d{1,4}[ T]+)?\d{1,2}:\d{2}:\d{2}(?:[.,]\d+)?)|Stats (\d+\.\d+):"
+    r"\W{0,2}" + _TIME_OF_DAY + r"|Stats (\d+\.\d+):"
 )  # how a line of a program's log begins: a stamp, or Klipper's seconds
 _TERMINAL = re.compile(
-    rb"(?m)^\[?((?:\d{1,4}[-/.]\d{1,2}[-/.]\d{1,4}[ T]+)?\d{1,2}:\d{2}:\d{2}(?:[.,]\d+)?)(?:\]|\s+->)[ \t]*"
+    rb"(?m)^\[?" + _TIME_OF_DAY.encode() + rb"(?:\]|\s+->)[ \t]*"
 )  # of PuTTY and others, and of Arduino's serial monitor
 _ESPHOME = re.compile(r"\[(\d{2}:\d{2}:\d{2}[.\d]*)\].*?: '([^',]+)': Sending state ([-+.\d]+|ON|OFF)\b")
 _OF_HEATERS = ("target", "temp", "pwm")  # of a section of Klipper's statistics; what follows is the host's
 _NAME = re.compile(r"[A-Za-z_@][^:=,;]{0,63}")
 _LABELLED = re.compile(r"[A-Za-z_@][^:=,;]{0,63}?[:=]([-+.\deE]{1,30}|nan|NaN)")  # a cell, name and number
 _LABELLED_LINES = 10  # with the same names, that are no chance
-_MANY = 0.9  # share of a column's cells, or of a table's lines, that decide what the others should be
-_MOST_BROKEN = 0.05  # share of rows with too few or too many cells that are left out
+_MOST = 0.9  # share of a column's cells, or of a table's lines, that decide what the others should be
+_TOLERATED = 0.05  # share of rows with too few or too many cells that are left out, as a bad serial line has
 _SWITCH = {
     "on": 1.0, "off": 0.0, "true": 1.0, "false": 0.0, "yes": 1.0, "no": 0.0, "open": 1.0, "closed": 0.0,
     "heating": 1.0, "cooling": 1.0, "active": 1.0, "running": 1.0, "idle": 0.0, "inactive": 0.0,
@@ -77,6 +76,7 @@ _SWITCH = {
 _NUMBER = re.compile(
     r"[+-]?(\d+\.?\d*([eE][+-]?\d+)?|\.\d+([eE][+-]?\d+)?|inf|infinity)", re.ASCII | re.IGNORECASE
 )
+_WITH_UNIT = re.compile(r"([+-]?[\d.,]+(?:[eE][+-]?\d+)?)\s*([^\W\d_]{1,4}|%|[°º]\s?[CFK])")
 
 
 @dataclass(frozen=True)
@@ -92,26 +92,6 @@ class Table:
     notes: tuple[str, ...] = ()  # what the reader repaired
 
 
-def read_csv_table(
-    path: str | Path,
-    *,
-    text: Callable[[str], bool] | frozenset[str] | None = frozenset(),
-    data: bytes | None = None,
-) -> Table:
-    """Return the columns of a CSV file, plain, ``.gz`` or ``.xz``.
-
-    Lines that start with ``#`` before the header are skipped. The separator is a comma, or a semicolon or tab
-    if the header has no comma; then numbers may have a decimal comma, which is noted. ``text`` names the
-    columns to leave as text, or states that of a header; None is all of them; ``data`` is what the file
-    holds, where that is known.
-    """
-    data = _text_of(path) if data is None else data
-    layout = Layout(*_header(data, str(path)), ())
-    is_text = text if callable(text) else lambda name: text is None or name in text
-    words = frozenset(name for name in layout.names if is_text(name))
-    return _parse_table(data, layout, str(path), words, broken=0.0)
-
-
 @dataclass(frozen=True)
 class Layout:
     """How a text file is a table."""
@@ -119,7 +99,35 @@ class Layout:
     names: list[str]  # of the columns, by position where the file has none
     skip: int  # lines before the first row
     separator: str
-    notes: tuple[str, ...]
+    notes: tuple[str, ...] = ()
+    header: Sequence[str] = ()  # the cells of the line of names, where it may stand again
+
+
+@dataclass
+class Column:
+    """What the cells of a column are: numbers, or text."""
+
+    name: str
+    numbers: NDArray[np.float64] | None = None
+    text: list[str] | None = None
+    notes: tuple[str, ...] = ()
+
+
+def read_csv_table(path: str | Path, *, text: Callable[[str], bool] | None = None) -> Table:
+    """Return the columns of a CSV file, plain, ``.gz`` or ``.xz``.
+
+    Lines that start with ``#`` before the header are skipped. The separator is a comma, or a semicolon or tab
+    if the header has no comma; then numbers may have a decimal comma, which is noted. ``text`` tells which
+    headers are those of text.  Nothing that is broken is passed over.
+    """
+    data, file = _text_of(path), str(path)
+    with as_user_error(csv.Error, "the header is no line of names", file=file, hint="correct it"):
+        layout = _first_line_as_names(data, file)
+    for at, name in enumerate(layout.names):
+        if not name or name in layout.names[:at]:
+            problem = f"column {at + 1} has no name" if not name else f"column {name!r} occurs twice"
+            raise UserError(problem, file=file, row=layout.skip, hint="name each column once")
+    return _parse_table(data, layout, file, text or (lambda name: False), tolerated=0.0)
 
 
 def read_text_table(path: str | Path, columns: Sequence[str] | None = None) -> Table:
@@ -138,21 +146,27 @@ def parse_text(data: bytes, file: str, columns: Sequence[str] | None = None) -> 
     if not labelled:
         data = _stamps_as_column(data)
     layout = find_layout(data, file)
-    names, notes = layout.names, (*coded, *labelled, *layout.notes)
+    notes = (*coded, *labelled, *layout.notes)
     if columns is not None:
-        have = len([name for name in names if not name.startswith(_LEFT_OUT)])
-        if len(columns) != have:
-            raise _other_count(file, have, len(columns))
-        given: list[str] = []
-        for name in columns:
-            given.append(unused(_LEFT_OUT if name == "-" else name, given))
-        names = [*given, *names[have:]]
+        own = [name for name in layout.names if not name.startswith(_LEFT_OUT)]
+        layout = replace(layout, names=[*_new_names(columns, len(own), file), *layout.names[len(own) :]])
         notes = tuple(note for note in notes if "--columns" not in note)
     if layout.separator == " ":  # one run at a time: [ ]+$ would look at each of its blanks again
         data = re.sub(rb"(?m)^ | ?\r?$", b"", re.sub(rb"[ \t]+", b" ", data))
-    table = _parse_table(data, replace(layout, names=names, notes=notes), file)
+    table = _parse_table(data, replace(layout, notes=notes), file, lambda name: False, _TOLERATED)
     kept = {name: values for name, values in table.numbers.items() if not name.startswith(_LEFT_OUT)}
     return replace(table, numbers=kept)
+
+
+def _new_names(columns: Sequence[str], n: int, file: str | Path) -> list[str]:
+    """Return the names that a user gives to n columns, each once; those left out begin with a sign."""
+    if len(columns) != n:
+        hint = "write a name for each, - to leave one out"
+        raise UserError(f"has {n} columns, --columns names {len(columns)}", file=file, hint=hint)
+    names: list[str] = []
+    for name in columns:
+        names.append(unused(_LEFT_OUT if name == "-" else name, names))
+    return names
 
 
 def check_header(headers: Sequence[str], names: Sequence[str], file: str) -> None:
@@ -173,30 +187,16 @@ def find_layout(data: bytes, file: str) -> Layout:
     for at, raw in enumerate(_lines(data[: 1 << 20]), start=1):
         if len(head) < _HEAD_LINES and raw.strip():
             head.append((at, raw.decode("utf-8", errors="replace").strip("\r\n")))
-    best: tuple[float, int, str, list[list[str]]] | None = None  # share of rows that fit, the first of them
-    for separator in "\t;|, ":
-        rows = [_split(line, separator) for _, line in head]
-        starts = [k for k in range(len(rows)) if _is_row(rows, k, separator)]
-        if not starts:
-            continue
-        # a preamble may have a line like a row, of another length than the rows of the table
-        others = (k for k in starts if len(rows[k]) not in (1, len(rows[starts[0]])))
-        first = starts[0]
-        if _like_first(rows[first:], separator) < _MANY:
-            first = next((k for k in others if _like_first(rows[k:], separator) >= _MANY), first)
-        n, below = len(rows[first]), rows[first:]
-        fit = float(np.mean([len(r) == n and _values(r, separator) for r in below])) if n > 1 else 0.0
-        if best is None or fit > best[0] + 1e-9:
-            best = fit, first, separator, below
-    if best is None:
-        return Layout(*_header(data, file), ())
-    _, first, separator, rows = best
+    separator, first = _best_separator(head)
+    if first is None:
+        return _first_line_as_names(data, file)
+    rows = [_split(line, separator) for _, line in head[first:]]
     n = len(rows[0])
     if n > MOST_COLUMNS:
         raise UserError(f"has {n} columns, more than {MOST_COLUMNS}", file=file, hint="leave some out")
-    names, used = _names_above(head[:first], n, separator)
-    hollow = not names[-1] and all(row[-1] == "" for row in rows)  # every line ends with a separator
-    nameless = [f"c{at}" for at, name in enumerate(names[: n - hollow], 1) if not name]
+    header, used = _names_above(head[:first], n, separator)
+    hollow = not header[-1] and all(row[-1] == "" for row in rows)  # every line ends with a separator
+    nameless = [f"c{at}" for at, name in enumerate(header[: n - hollow], 1) if not name]
     notes = []
     if len(nameless) == n - hollow:
         above = len(_split(head[first - 1][1].lstrip("#%/ "), separator)) if first else 0
@@ -204,8 +204,9 @@ def find_layout(data: bytes, file: str) -> Layout:
         notes = [f"{why}: {_NAMELESS.format(n - hollow)}"]
     if nameless and not notes:
         notes.append(f"without a name: {', '.join(nameless)}")
-    for at, name in enumerate(names):
-        names[at] = unused(name or f"c{at + 1}", names[:at], "{1}_{0}")  # the unit at the end stays there
+    names: list[str] = []
+    for at, name in enumerate(header):
+        names.append(unused(name or f"c{at + 1}", names, "{1}_{0}"))  # the unit at the end stays there
         if name and names[at] != name:
             notes.append(f"{name} occurs again: named {names[at]}")
     if hollow:
@@ -213,7 +214,29 @@ def find_layout(data: bytes, file: str) -> Layout:
     passed = sum(not line.startswith(_COMMENT) for _, line in head[:first]) - used
     if passed:
         notes.append(f"{passed} line(s) before the table passed over")
-    return Layout(names, head[first][0] - 1, separator, tuple(notes))
+    return Layout(names, head[first][0] - 1, separator, tuple(notes), header)
+
+
+def _best_separator(head: Sequence[tuple[int, str]]) -> tuple[str, int | None]:
+    """Return the separator that makes most of the lines rows of numbers, and which is the first row, None
+    where no line is one."""
+    best_share, best, best_first = -1.0, ",", None
+    for separator in "\t;|, ":
+        rows = [[] if line.startswith(_COMMENT) else _split(line, separator) for _, line in head]
+        starts = [k for k in range(len(rows)) if _is_row(rows, k, separator)]
+        if not starts:
+            continue
+        # a preamble may have a line like a row, of another length than the rows of the table
+        others = (k for k in starts if len(rows[k]) not in (1, len(rows[starts[0]])))
+        first = starts[0]
+        if _like_first(rows[first:], separator) < _MOST:
+            first = next((k for k in others if _like_first(rows[k:], separator) >= _MOST), first)
+        n = len(rows[first])
+        fits = [len(row) == n and _values(row, separator) for row in rows[first:]]
+        share = float(np.mean(fits)) if n > 1 else 0.0
+        if share > best_share + 1e-9:
+            best_share, best, best_first = share, separator, first
+    return best, best_first
 
 
 def unused(name: str, others: Container[str], numbered: str = "{0}_{1}") -> str:
@@ -232,7 +255,9 @@ def _split(line: str, separator: str) -> list[str]:
 
 def _is_value(cell: str, separator: str) -> bool:
     plain = cell if separator == "," else cell.replace(",", ".")
-    return bool(_NUMBER.fullmatch(plain) or STAMP.fullmatch(cell)) or cell in _LOST or cell.lower() in _SWITCH
+    if _NUMBER.fullmatch(plain) or STAMP.fullmatch(cell) or cell in _LOST or cell.lower() in _SWITCH:
+        return True
+    return (match := _WITH_UNIT.fullmatch(cell)) is not None and _is_unit(match[2])
 
 
 def _values(row: Sequence[str], separator: str) -> float:
@@ -255,29 +280,49 @@ def _is_row(rows: Sequence[Sequence[str]], k: int, separator: str) -> bool:
 
 def _names_above(lines: Sequence[tuple[int, str]], n: int, separator: str) -> tuple[list[str], int]:
     """Return the names of n columns, empty where the file has none, and how many lines gave them."""
-    found: list[list[str]] = []
+    headers: list[list[str]] = []  # the nearest first: units may stand under the names
     for _, line in reversed(lines):
         comment = line.startswith(_COMMENT)
         cells = _split(line.lstrip("#%/ ") if comment else line, separator)
         if separator == " " and len(cells) != n:
             cells = [cell.strip() for cell in re.split(r"\s{2,}|\t|,|;", line.strip("#%/ "))]
-        if len(cells) in (n, n - 1) and any(cells) and len(found) < 2 and not (comment and found):
-            found.append([*cells, ""][:n])
-        if found and not _are_units(found[0]):
+        if len(cells) in (n, n - 1) and any(cells) and len(headers) < 2 and not (comment and headers):
+            headers.append([*cells, ""][:n])
+        if headers and not _are_units(headers[0]):
             break
-    if not found:
+    if not headers:
         return [""] * n, 0
-    names = found[-1] if len(found) == 2 else found[0]
-    if len(found) == 2:
-        names = [f"{a} [{b.strip('[]()')}]" if b else a for a, b in zip(names, found[0])]
-    used = sum(not line.startswith(_COMMENT) for _, line in lines[-len(found) :])
+    names = headers[-1]
+    if len(headers) == 2:
+        names = [f"{name} [{unit.strip('[]()')}]" if unit else name for name, unit in zip(names, headers[0])]
+    used = sum(not line.startswith(_COMMENT) for _, line in lines[-len(headers) :])
     return [from_csv(name) for name in names], used
+
+
+def _is_unit(word: str) -> bool:
+    return read_header(f"x [{word.strip('[]()')}]")[1] != "1"
 
 
 def _are_units(cells: Sequence[str]) -> bool:
     """Tell whether a line under the names has their units."""
     words = [cell for cell in cells if cell]
-    return bool(words) and all(read_header(f"x [{word.strip('[]()')}]")[1] != "1" for word in words)
+    return bool(words) and all(map(_is_unit, words))
+
+
+def _first_line_as_names(data: bytes, file: str) -> Layout:
+    """Return the layout of a table whose first line, comments aside, is its header."""
+    lines = enumerate(io.BytesIO(data), start=1)
+    first = next(((at, raw) for at, raw in lines if raw.strip() and not raw.startswith(b"#")), None)
+    if first is None:
+        raise UserError("has only comments", file=file, hint="give a header and at least two rows")
+    skip, raw = first
+    line = raw.decode("utf-8", "replace").strip()
+    separator = next((sign for sign in ",;\t" if sign in line), ",")
+    names = [from_csv(cell.strip()) for cell in next(csv.reader([line], delimiter=separator))]
+    if len(names) > MOST_COLUMNS:
+        problem = f"the header has {len(names)} names, more than {MOST_COLUMNS}"
+        raise UserError(problem, file=file, row=skip, hint="leave out what is not needed")
+    return Layout(names, skip, separator)
 
 
 def _any_coding(data: bytes) -> tuple[bytes, tuple[str, ...]]:
@@ -298,25 +343,25 @@ def _without_labels(data: bytes) -> tuple[bytes, tuple[str, ...]]:
     its reading) and Klipper (``extruder: target=200 temp=22.1 pwm=0.9``); lines without them are passed over.
     """
     head = [line.decode("utf-8", "replace") for line in islice(_lines(data[: 1 << 20]), 5 * _HEAD_LINES)]
-    known = Counter(tuple(_labelled(line)) for line in head)
-    del known[()]
     if any(_ESPHOME.match(line) for line in head):
-        found = (_ESPHOME.match(line.decode("utf-8", "replace")) for line in _lines(data))
-        rows = (line.expand(r"\1,\2,\3") if line else "" for line in found)
-        return "\n".join(["time,name,state", *rows]).encode(), ("lines of an ESPHome log",)
-    names, count = max(known.items(), key=lambda item: (item[1], len(item[0])), default=((), 0))
-    if not names or count < min(_LABELLED_LINES, max(2, _MANY * sum(map(bool, head)))):
+        matches = (_ESPHOME.match(line.decode("utf-8", "replace")) for line in _lines(data))
+        readings = (match.expand(r"\1,\2,\3") if match else "" for match in matches)
+        return "\n".join(["time,name,state", *readings]).encode(), ("lines of an ESPHome log",)
+    labels = Counter(tuple(_labelled(line)) for line in head)
+    del labels[()]
+    names, lines_of_names = max(labels.items(), key=lambda item: (item[1], len(item[0])), default=((), 0))
+    if not names or lines_of_names < min(_LABELLED_LINES, max(2, _MOST * sum(map(bool, head)))):
         return data, ()
-    out: list[str] = []
+    rows: list[str] = []
     for raw in _lines(data):
         cells = _labelled(raw.decode("utf-8", "replace"))
-        out.append(",".join(cells[name] for name in names) if cells.keys() >= {*names} else "")
-    passed = sum(not line and bool(raw.strip()) for line, raw in zip(out, _lines(data)))
-    head_row = next((at for at, line in enumerate(out) if line), 0)
-    out[max(head_row - 1, 0) : head_row] = [",".join(names)]  # in place of a line before, if there is one
+        rows.append(",".join(cells[name] for name in names) if cells.keys() >= {*names} else "")
+    passed = sum(not row and bool(raw.strip()) for row, raw in zip(rows, _lines(data)))
+    first = next((at for at, row in enumerate(rows) if row), 0)
+    rows[max(first - 1, 0) : first] = [",".join(names)]  # in place of a line before, if there is one
     notes = [f"lines have readings beside their names: {', '.join(names)}"]
     notes += [f"{passed} line(s) without them passed over"] if passed else []
-    return "\n".join(out).encode() + b"\n", tuple(notes)
+    return "\n".join(rows).encode() + b"\n", tuple(notes)
 
 
 def _stamps_as_column(data: bytes) -> bytes:
@@ -324,13 +369,13 @@ def _stamps_as_column(data: bytes) -> bytes:
     the stamps as its first column."""
     head = [line for line in islice(_lines(data[: 1 << 20]), _HEAD_LINES) if line.strip()]
     stamped = [match for line in head if (match := _TERMINAL.match(line))]
-    if not head or len(stamped) < _MANY * len(head):
+    if not head or len(stamped) < _MOST * len(head):
         return data
-    rest = stamped[-1].string[stamped[-1].end() :]
-    separator = next((sign for sign in (b"\t", b";", b"|", b",") if sign in rest), b" ")
+    cells = stamped[-1].string[stamped[-1].end() :]
+    separator = next((sign for sign in (b"\t", b";", b"|", b",") if sign in cells), b" ")
     before, _, after = data.partition(stamped[0][0])
     names = before.rstrip().rpartition(b"\n")[2]
-    if len(names.split(separator)) == len(rest.split(separator)):
+    if len(names.split(separator)) == len(cells.split(separator)):
         before = before.replace(names, b"time" + separator + names)
     return before + _TERMINAL.sub(
         lambda match: match[1].replace(b" ", b"T") + separator, stamped[0][0] + after
@@ -363,119 +408,179 @@ def _labelled(line: str) -> dict[str, str]:
 
 
 def _parse_table(
-    data: bytes, layout: Layout, file: str, words: frozenset[str] = frozenset(), broken: float = _MOST_BROKEN
+    data: bytes, layout: Layout, file: str, is_text: Callable[[str], bool], tolerated: float
 ) -> Table:
-    """Return the table in a text: columns of numbers as they are, others cell by cell.
+    """Return the table in a text; all that is wrong beyond what is tolerated is named in one error.
 
-    ``words`` are columns to leave as text; up to a share ``broken`` of the rows, and twice as many cells of a
-    column, may be left out.  All that is wrong beyond that is named in one error.
+    Up to a share ``tolerated`` of the rows, and twice as many cells of a column, may be left out.
     """
-    names, separator, skip = layout.names, layout.separator, layout.skip
-    body, notes = _drop_cut_line(data, len(names), separator)
-    faults: list[UserError] = []
-    odd: list[int] = []
+    names, n = layout.names, len(layout.names)
     try:
-        body.decode("utf-8")
-    except UnicodeDecodeError as error:  # Arrow writes a traceback for a row that it cannot hand over
-        row = body.count(b"\n", 0, error.start) + 1
+        text = data.decode("utf-8")
+    except UnicodeDecodeError as error:
+        row = data.count(b"\n", 0, error.start) + 1
         raise UserError("is not UTF-8 text", file=file, row=row, hint="save the file as UTF-8") from error
-    table, counts = _parse(body, skip, separator, names)
-    if counts or table is None:
-        odd = [at for at, cells in _rows(body, skip, separator, file) if len(cells) != len(names)]
-    if odd and len(odd) > broken * (len(odd) + (table.num_rows if table is not None else 0)):
-        more = f"; {len(odd) - 1} more rows do not fit" if len(odd) > 1 else ""
-        problem = f"has {counts[0] if counts else 0} cell(s), the header has {len(names)}{more}"
-        faults.append(UserError(problem, file=file, row=odd[0], hint="complete or remove the row"))
-    elif odd:
-        notes += (f"{len(odd)} row(s) with too few or too many cells left out ({name_rows(odd, 5)})",)
-    if table is None:
-        # Arrow refuses a header whose line has no end as well
-        bare = next(_rows(body, skip, separator, file), None) is None
-        problem = "has a header but no rows" if bare else "is not a table"
-        hint = "give at least two rows" if bare else "open it in an editor and compare its rows"
-        raise faults[0] if faults else UserError(problem, file=file, hint=hint)
-    _check_empty(body, table.num_rows + len(odd), file)
-    lines = _line_numbers(body, skip, table.num_rows + len(odd))
-    lines = lines[~np.isin(lines, odd)]
-    if len(lines) != table.num_rows:  # a quoted cell may have line ends
-        lines = np.arange(skip + 1, skip + 1 + table.num_rows)
-    if not lines.size and not faults:
+    rows, notes = list(_rows(text, layout, file)), list(layout.notes)
+    if rows and len(rows[-1][1]) < n and not text.endswith(("\n", "\r")):
+        line, cells = rows.pop()
+        notes.append(f"row {line} is the last and was cut off ({len(cells)} of {n} cells): dropped")
+    again = [line for line, cells in rows if any(layout.header) and cells == layout.header]
+    if again and tolerated:  # the logger was started again
+        notes.append(f"the header stands again in {name_rows(again, 5)}")
+        rows = [(line, cells) for line, cells in rows if cells != layout.header]
+    ragged = {line: len(cells) for line, cells in rows if len(cells) != n}
+    faults: list[UserError] = []
+    if len(ragged) > tolerated * len(rows):
+        more = f"; {len(ragged) - 1} more rows do not fit" if len(ragged) > 1 else ""
+        line, cell_count = next(iter(ragged.items()))
+        problem = f"has {cell_count} cell(s), the header has {n}{more}"
+        faults.append(UserError(problem, file=file, row=line, hint="complete or remove the row"))
+    elif ragged:
+        left_out = f"{len(ragged)} row(s) with too few or too many cells left out"
+        notes.append(f"{left_out} ({name_rows([*ragged], 5)})")
+    rows = [(line, cells) for line, cells in rows if len(cells) == n]
+    if not rows and not faults:
         raise UserError("has a header but no rows", file=file, hint="give at least two rows")
-    numbers: dict[str, NDArray[np.float64]] = {}
-    text: dict[str, list[str]] = {}
-    for name in names:
-        column = table.column(name)
-        if name in words:
-            text[name] = [from_csv(cell.strip()) for cell in column.to_pylist()]
-        elif (values := _plain_numbers(column)) is not None:
-            numbers[name] = values
-        elif not name.startswith(_LEFT_OUT):
-            notes += _read_cells(name, column, (numbers, text, faults), lines, separator, broken, file)
+    lines = np.array([line for line, _ in rows], dtype=np.int64)
+    columns: list[Column] = []
+    for name, cells in zip(names, zip(*(cells for _, cells in rows)) if rows else ()):
+        if is_text(name):
+            columns.append(Column(name, text=[from_csv(cell.strip()) for cell in cells]))
+            continue
+        try:
+            columns.append(read_column(name, cells, lines, file, layout.separator, tolerated))
+        except UserError as fault:
+            faults += [] if name.startswith(_LEFT_OUT) else [fault]
     if faults:
-        raise _joined(faults, names if broken else ())  # what may be broken is a log
-    notes = tuple(dict.fromkeys([*layout.notes, *notes]))
-    return Table(file, numbers, text, lines, notes=notes)
+        raise _joined(faults, names if tolerated else ())  # what may be broken is a log
+    return _table_of(columns, file, lines, notes)
 
 
-def _read_cells(
+def _table_of(columns: Sequence[Column], file: str, lines: NDArray[np.int64], notes: Sequence[str]) -> Table:
+    numbers = {column.name: column.numbers for column in columns if column.numbers is not None}
+    text = {column.name: column.text for column in columns if column.text is not None}
+    lasting = {name: cells for name, cells in text.items() if not name.startswith(_LEFT_OUT)}
+    all_notes = dict.fromkeys([*notes, *(note for column in columns for note in column.notes)])
+    return Table(file, numbers, lasting, lines, notes=tuple(all_notes))
+
+
+def _rows(text: str, layout: Layout, file: str) -> Iterator[tuple[int, list[str]]]:
+    """Yield the first line and the cells of each row that is not empty."""
+    stream = io.StringIO(text, newline="")
+    for _ in range(layout.skip):
+        next(stream, "")
+    reader = csv.reader(stream, delimiter=layout.separator)
+    line = layout.skip + 1
+    try:
+        for cells in reader:
+            if cells:
+                yield line, cells
+            line = layout.skip + reader.line_num + 1
+    except csv.Error as error:
+        raise UserError(f"cannot be split ({error})", file=file, row=line, hint="correct the row") from error
+
+
+def read_column(
     name: str,
-    column: Any,
-    found: tuple[dict[str, NDArray[np.float64]], dict[str, list[str]], list[UserError]],
+    cells: Sequence[str],
     lines: NDArray[np.int64],
-    separator: str,
-    broken: float,
     file: str,
-) -> tuple[str, ...]:
-    """Put a column of text among the numbers, the words or the faults that were found; return the notes."""
-    numbers, text, faults = found
-    cells, values, comma = _cell_numbers(column, separator)
-    lost = cells.isin(_LOST if broken else _NULLS)
-    wrong = np.flatnonzero(np.isnan(values) & ~lost)
-    first = cells.iloc[wrong[0]] if wrong.size else ""
-    states = switched(cells) if broken and cells.iloc[wrong].str.lower().nunique() > 1 else None
+    separator: str = ",",
+    tolerated: float = _TOLERATED,
+) -> Column:
+    """Return what the cells of a column are: numbers, a switch, or words; UserError for a cell that is no
+    number among more numbers than are tolerated."""
+    if (plain := _plain_numbers(cells)) is not None:
+        return Column(name, plain)
+    cells, lost = [cell.strip() for cell in cells], _LOST if tolerated else _NULLS
+    values = _to_numbers(cells, lost)
+    notes: list[str] = []
+    wrong = _not_numbers(cells, values, lost)
+    if wrong.size and separator != "," and _has_decimal_comma(cells):
+        values, notes = _to_numbers([cell.replace(",", ".") for cell in cells], lost), [_COMMAS]
+        wrong = _not_numbers(cells, values, lost)
+    known = len(cells) - sum(cell in lost for cell in cells)
+    if tolerated and wrong.size and (united := _without_unit(name, cells, lost)) is not None:
+        return read_column(*united, lines, file, separator, tolerated)
+    first = cells[wrong[0]] if wrong.size else ""
+    states = switched(cells) if tolerated and len({cells[at].lower() for at in wrong}) > 1 else None
     if states is not None and np.isfinite(values).any():
-        text[name] = cells.to_list()  # numbers and both states of a switch: the readings of several signals
-        return ()
-    if wrong.size <= 2 * broken * int((~lost).sum()):
-        numbers[name] = values
-        where = f"{name_rows(lines[wrong], 5)}: {_shown(first)}"
-        words = (
-            (f"{name}: {wrong.size} cell(s) that are no numbers left empty ({where})",) if wrong.size else ()
-        )
-        return (*words, *(["numbers have a decimal comma"] if comma else []))
-    if broken and (states := switched(cells)) is not None:
-        numbers[name] = states
-        return (f"{name}: words as {_shown(first)} read as 0 and 1",)
-    if broken and (wrong.size >= _MANY * int((~lost).sum()) or (first and STAMP.fullmatch(first))):
-        text[name] = cells.to_list()
-    else:
-        faults.append(_cell_fault(first, file, int(lines[wrong[0]]), name))
-    return ()
+        return Column(name, text=[*cells])  # numbers and both states of a switch: readings of several signals
+    if wrong.size <= 2 * tolerated * known:
+        if wrong.size:
+            where = f"{name_rows(lines[wrong], 5)}: {_shown(first)}"
+            notes = [f"{name}: {wrong.size} cell(s) that are no numbers left empty ({where})", *notes]
+        return Column(name, values, notes=tuple(notes))
+    if tolerated and (states := switched(cells)) is not None:
+        return Column(name, states, notes=(f"{name}: words as {_shown(first)} read as 0 and 1",))
+    if tolerated and (wrong.size >= _MOST * known or STAMP.fullmatch(first)):
+        return Column(name, text=[*cells])
+    hint = "write a number, leave the cell empty, or drop the column"
+    if re.fullmatch(r"[+-]?\d+,\d+", first):
+        hint = "write a decimal point"
+    elif STAMP.fullmatch(first):
+        hint = "write seconds since the first row"
+    problem = f"{_shown(first)} is not a number"
+    raise UserError(problem, file=file, row=int(lines[wrong[0]]), column=name, hint=hint)
 
 
-def _cell_numbers(column: Any, separator: str) -> tuple[Any, NDArray[np.float64], bool]:
-    """Return the stripped cells, their numbers (NaN where they are none), and if decimals have a comma."""
-    import pandas as pd
+_COMMAS = "numbers have a decimal comma"
 
-    cells = plain = column.to_pandas().astype(str).str.strip()
-    comma = separator != "," and bool(cells.str.fullmatch(r"[+-]?\d*,\d+([eE][+-]?\d+)?").any())
-    comma = comma and not cells.str.contains(".", regex=False).any()
-    if comma:
-        plain = cells.str.replace(",", ".")
-    return cells, np.asarray(pd.to_numeric(plain, errors="coerce"), dtype=float), comma
+
+def _to_numbers(cells: Sequence[str], lost: Container[str]) -> NDArray[np.float64]:
+    """Return the numbers of cells, NaN where one is none."""
+    known = ["nan" if cell in lost else cell for cell in cells]
+    if (plain := _plain_numbers(known)) is not None:
+        return plain
+    return np.array([float(cell) if _NUMBER.fullmatch(cell) else np.nan for cell in known], dtype=float)
+
+
+def _plain_numbers(cells: Sequence[str]) -> NDArray[np.float64] | None:
+    """Return the numbers of cells that are nothing else, None where one is."""
+    joined = "".join(cells)
+    if not joined.isascii() or "_" in joined:  # which Python takes in numbers, and no file means so
+        return None
+    try:
+        return np.fromiter(map(float, cells), dtype=float, count=len(cells))
+    except ValueError:
+        return None
+
+
+def _not_numbers(
+    cells: Sequence[str], values: NDArray[np.float64], lost: Container[str]
+) -> NDArray[np.int64]:
+    """Return which cells are neither numbers nor lost."""
+    at_nan = np.flatnonzero(np.isnan(values)).tolist()
+    return np.array([at for at in at_nan if cells[at] not in lost], dtype=np.int64)
+
+
+def _has_decimal_comma(cells: Sequence[str]) -> bool:
+    comma = re.compile(r"[+-]?\d*,\d+([eE][+-]?\d+)?")
+    return any(map(comma.fullmatch, cells)) and not any("." in cell for cell in cells)
+
+
+def _without_unit(name: str, cells: Sequence[str], lost: Container[str]) -> tuple[str, list[str]] | None:
+    """Return a column's name and cells where one unit stands behind each of its numbers (``23.4 °C``)."""
+    matches = [None if cell in lost else _WITH_UNIT.fullmatch(cell) for cell in cells]
+    units = {match[2] for match in matches if match is not None}
+    if len(units) != 1 or any(m is None and cell not in lost for m, cell in zip(matches, cells)):
+        return None
+    unit = units.pop()
+    if not _is_unit(unit):
+        return None
+    named = name if read_header(name)[1] != "1" else f"{name} [{unit}]"
+    return named, ["" if match is None else match[1] for match in matches]
 
 
 def switched(cells: Sequence[str]) -> NDArray[np.float64] | None:
     """Return the numbers of cells that are numbers or the two states of a switch, NaN where one is lost; None
     where there are other words, or two of one meaning."""
-    import pandas as pd
-
-    words = pd.Series(cells, dtype=object).astype(str).str.strip().str.lower()
-    values = pd.to_numeric(words, errors="coerce")
-    states = {*words[values.isna()]} - {lost.lower() for lost in _LOST}
+    words, lost = [cell.strip().lower() for cell in cells], {word.lower() for word in _LOST}
+    values = _to_numbers(words, lost)
+    states = {words[at] for at in _not_numbers(words, values, lost)}
     if not states <= {*_SWITCH} or len({_SWITCH[state] for state in states}) < len(states):
         return None
-    return np.asarray(values.fillna(words.map(_SWITCH)), dtype=float)
+    return np.array([_SWITCH.get(word, value) for word, value in zip(words, values.tolist())], dtype=float)
 
 
 def _shown(cell: str) -> str:
@@ -496,6 +601,34 @@ def _joined(faults: Sequence[UserError], names: Sequence[str]) -> UserError:
     return UserError(f"{len(faults)} faults: " + "; ".join(each), file=first.file, hint=hint)
 
 
+def frame_table(
+    frame: DataFrame, file: str, *, text: Callable[[str], bool] | None = None, tolerated: float = _TOLERATED
+) -> Table:
+    """Return the columns of a DataFrame, its index among them unless that only counts rows; what is in a
+    column of words is decided as in a file of text."""
+    import pandas as pd
+
+    if not isinstance(frame.index, pd.RangeIndex):
+        frame = frame.rename_axis(frame.index.name or "time").reset_index()
+    lines = np.arange(1, len(frame) + 1)
+    columns: list[Column] = []
+    for at, name in enumerate(map(str, frame.columns)):
+        values = frame.iloc[:, at]
+        if text is not None and text(name):
+            columns.append(
+                Column(name, text=values.astype(object).where(values.notna(), "").astype(str).tolist())
+            )
+        elif values.dtype.kind == "m":
+            columns.append(Column(f"{name}_s", values.dt.total_seconds().to_numpy(dtype=float)))
+        elif values.dtype.kind in "fiub":
+            columns.append(Column(name, values.to_numpy(dtype=float, na_value=np.nan)))
+        else:
+            columns.append(
+                read_column(name, [str(cell) for cell in values], lines, file, tolerated=tolerated)
+            )
+    return _table_of(columns, file, lines, ())
+
+
 def read_matlab_table(path: str | Path, columns: Sequence[str] | None = None) -> Table:
     """Return the columns of a MATLAB file (up to version 7): vectors and columns of matrices of one length (a
     matrix alone without names); a scalar ``Ts``, ``dt`` or ``fs`` is the step (``meta["dt"]``)."""
@@ -509,30 +642,29 @@ def read_matlab_table(path: str | Path, columns: Sequence[str] | None = None) ->
         source: Any = io.BytesIO(_unpacked_matlab(raw, path))  # the stubs know names only
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", MatReadWarning)  # of objects without names
-            found = loadmat(source, simplify_cells=True)
-    arrays = dict(_matlab_arrays({k: v for k, v in found.items() if not k.startswith("__")}))
+            content = loadmat(source, simplify_cells=True)
+    arrays = dict(_matlab_arrays({k: v for k, v in content.items() if not k.startswith("__")}))
     lengths = [values.shape[0] for values in arrays.values() for _ in range(values.shape[1])]
     if not lengths:
         hint = "save the signals as vectors or a matrix (timeseries and tables are objects of MATLAB's own)"
         raise UserError("has no columns of numbers", file=path, hint=hint)
     n = max(set(lengths), key=lambda length: (length * lengths.count(length), length))
-    parts = {name: values for name, values in arrays.items() if values.shape[0] == n}
+    kept = {name: values for name, values in arrays.items() if values.shape[0] == n}
     numbers = {
         name if values.shape[1] == 1 else f"{name}_{at + 1}": values[:, at]
-        for name, values in parts.items()
+        for name, values in kept.items()
         for at in range(values.shape[1])
     }
-    left = [name for name in arrays if name not in parts]
-    notes = [f"left out, of another length: {', '.join(left)}"] if left else []
-    if len(parts) == 1 and len(numbers) > 1:
+    other_lengths = [name for name in arrays if name not in kept]
+    notes = [f"left out, of another length: {', '.join(other_lengths)}"] if other_lengths else []
+    if len(kept) == 1 and len(numbers) > 1:
         numbers = {f"c{at}": values for at, values in enumerate(numbers.values(), 1)}
         if columns is None:
             notes.append(f"no header: {_NAMELESS.format(len(numbers))}")
     if columns is not None:
-        if len(columns) != len(numbers):
-            raise _other_count(path, len(numbers), len(columns))
-        numbers = {name: v for name, v in zip(columns, numbers.values()) if name != "-"}
-    scalars = dict(_matlab_scalars(found))
+        names = _new_names(columns, len(numbers), path)
+        numbers = {k: v for k, v in zip(names, numbers.values()) if not k.startswith(_LEFT_OUT)}
+    scalars = dict(_matlab_scalars(content))
     step = scalars.get("ts") or scalars.get("dt") or 1 / scalars.get("fs", 1.0)
     meta = {"dt": repr(float(step))}
     return Table(str(path), numbers, {}, np.arange(1, n + 1), meta=meta, notes=tuple(notes))
@@ -591,64 +723,34 @@ def read_excel_table(path: str | Path, columns: Sequence[str] | None = None) -> 
     return parse_text(frame.to_csv(index=False, header=False).encode(), str(path), columns)
 
 
-def _other_count(file: str | Path, have: int, named: int) -> UserError:
-    hint = "write a name for each, - to leave one out"
-    return UserError(f"has {have} columns, --columns names {named}", file=file, hint=hint)
-
-
-def read_parquet_table(path: str | Path) -> Table:
-    """Return the numeric columns of a Parquet file, with the units and roles of its columns."""
-    import pyarrow as pa
-
-    numbers, attrs = {}, {}
+def read_parquet_table(
+    path: str | Path, *, text: Callable[[str], bool] | None = None, tolerated: float = _TOLERATED
+) -> Table:
+    """Return the columns of a Parquet file, with the units and roles of its columns; see
+    :func:`frame_table`."""
     raw = read_bytes(path)
-    with _sound_parquet(path):
-        with _open_parquet(path, io.BytesIO(raw), len(raw)) as opened:
-            table = opened.read()
-        for entry in table.schema:
-            numbers[entry.name] = _to_float(table.column(entry.name).cast(pa.float64()))
-            attrs[entry.name] = _decode(entry.metadata)
-        meta = _decode(table.schema.metadata)
-    return Table(str(path), numbers, {}, np.arange(1, table.num_rows + 1), attrs, meta)
-
-
-def read_parquet_frame(path: str | Path) -> DataFrame:
-    """Return a Parquet file with columns of numbers and text."""
-    raw = read_bytes(path)
-    with (
-        _sound_parquet(path),
-        _open_parquet(path, io.BytesIO(raw), len(raw), text=True) as opened,
-    ):
-        frame: DataFrame = opened.read().to_pandas()
-        return frame
-
-
-def _open_parquet(path: str | Path, source: Any, packed: int, *, text: bool = False) -> Any:
-    """Return the open file, its columns and sizes checked; ``text`` may be in some."""
     import pyarrow.parquet as parquet
 
-    limits.check_size(packed, file=path)
-    with _sound_parquet(path):
-        opened = parquet.ParquetFile(source, page_checksum_verification=True)
-        _check_parquet(opened, packed, path, text)
-    return opened
+    with (
+        reading("is not Parquet, or is damaged", file=path, hint="write or copy it again"),
+        parquet.ParquetFile(io.BytesIO(raw), page_checksum_verification=True) as opened,
+    ):
+        _check_parquet(opened, len(raw), path)
+        content = opened.read()
+        frame = content.to_pandas(ignore_metadata=True)
+        table = frame_table(frame, str(path), text=text, tolerated=tolerated)
+        attrs = {entry.name: _decode(entry.metadata) for entry in content.schema}
+        return replace(table, attrs=attrs, meta=_decode(content.schema.metadata))
 
 
-def _sound_parquet(path: str | Path) -> AbstractContextManager[None]:
-    return reading("is not Parquet, or is damaged", file=path, hint="write or copy it again")
-
-
-def _check_parquet(opened: Any, packed: int, path: str | Path, text: bool) -> None:
-    """Refuse columns that are no numbers, nor ``text`` where it may be, and a table that would be too large,
-    before any of it is read."""
+def _check_parquet(opened: Any, packed: int, path: str | Path) -> None:
+    """Refuse columns that are no column of a table, and a table that would be too large, before any of it is
+    read."""
     import pyarrow.types as kinds
 
-    known: list[Any] = [kinds.is_floating, kinds.is_integer, kinds.is_boolean]
-    known += [kinds.is_string, kinds.is_large_string, kinds.is_dictionary, kinds.is_null] if text else []
     for entry in opened.schema_arrow:
-        if not any(is_one(entry.type) for is_one in known):
-            problem = f"holds {entry.type}, not numbers"
-            raise UserError(problem, file=path, column=entry.name, hint="leave it out")
+        if kinds.is_nested(entry.type):
+            raise UserError(f"holds {entry.type}", file=path, column=entry.name, hint="leave it out")
     about, columns = opened.metadata, len(opened.schema_arrow)
     if columns > MOST_COLUMNS:
         raise UserError(f"has {columns} columns, more than {MOST_COLUMNS}", file=path, hint="leave some out")
@@ -660,11 +762,6 @@ def _check_parquet(opened: Any, packed: int, path: str | Path, text: bool) -> No
 
 def _decode(metadata: dict[bytes, bytes] | None) -> dict[str, str]:
     return {k.decode(errors="replace"): v.decode(errors="replace") for k, v in (metadata or {}).items()}
-
-
-def _to_float(column: Any) -> NDArray[np.float64]:
-    """Return a column of float, NaN where it is null."""
-    return np.array(column.fill_null(np.nan).to_numpy(), dtype=float)
 
 
 def _text_of(path: str | Path) -> bytes:
@@ -704,125 +801,7 @@ def _as_utf8(data: bytes, path: str | Path) -> bytes:
         return data.decode("utf-16").encode("utf-8")
 
 
-def _header(data: bytes, file: str) -> tuple[list[str], int, str]:
-    """Return column names, the number of lines before the first row, and the separator."""
-    lines = enumerate(io.BytesIO(data), start=1)
-    first = next(((at, raw) for at, raw in lines if raw.strip() and not raw.startswith(b"#")), None)
-    if first is None:
-        raise UserError("has only comments", file=file, hint="give a header and at least two rows")
-    skip, raw = first
-    at: dict[str, Any] = {"file": file, "row": skip}
-    with as_user_error(UnicodeDecodeError, "the header is not UTF-8 text", **at, hint="save it as UTF-8"):
-        line = raw.decode("utf-8").strip()
-    separator = next((s for s in ",;\t" if s in line), ",")
-    # such as a carriage return alone between two names
-    hint = "end every line with a line feed"
-    with as_user_error(csv.Error, "the header is no line of names", **at, hint=hint):
-        header = [from_csv(cell.strip()) for cell in next(csv.reader([line], delimiter=separator))]
-    if len(header) > MOST_COLUMNS:
-        problem = f"the header has {len(header)} names, more than {MOST_COLUMNS}"
-        raise UserError(problem, **at, hint="leave out what is not needed")
-    for k, name in enumerate(header):
-        if not name:
-            raise UserError(f"column {k + 1} has no name", **at, hint="name it or remove it")
-        if name in header[:k]:
-            raise UserError("occurs twice", **at, column=name, hint="rename one of them")
-    if all(_NUMBER.fullmatch(name) for name in header):
-        hint = "write a first line such as time_s,drive,t_tank_degC"
-        raise UserError("has no header, only numbers", **at, hint=hint)
-    return header, skip, separator
-
-
-def _parse(data: bytes, skip: int, separator: str, names: Sequence[str]) -> tuple[Any, list[int]]:
-    """Return the columns of text as a pyarrow table, None where they are none, and the number of cells of
-    each row that has too few or too many."""
-    import pyarrow as pa
-    import pyarrow.csv as arrow_csv
-
-    counts: list[int] = []
-
-    def leave_out(row: Any) -> str:
-        counts.append(row.actual_columns)
-        return "skip"
-
-    block = min(len(data) + 1, 1 << 30)
-    try:
-        table = arrow_csv.read_csv(
-            pa.BufferReader(data),
-            read_options=arrow_csv.ReadOptions(
-                use_threads=False, skip_rows=skip, column_names=list(names), block_size=block
-            ),
-            parse_options=arrow_csv.ParseOptions(delimiter=separator, invalid_row_handler=leave_out),
-            convert_options=arrow_csv.ConvertOptions(
-                column_types=dict.fromkeys(names, pa.string()), strings_can_be_null=False
-            ),
-        )
-    except pa.ArrowInvalid:
-        return None, counts
-    return table, counts
-
-
-def _plain_numbers(column: Any) -> NDArray[np.float64] | None:
-    """Return the numbers of a column of text that has nothing else, NaN where a cell is empty, or None."""
-    import pyarrow as pa
-    import pyarrow.compute as compute
-
-    cells = compute.utf8_trim_whitespace(column)
-    empty = compute.is_in(cells, value_set=pa.array(_NULLS))
-    try:
-        return _to_float(compute.if_else(empty, pa.scalar(None, pa.string()), cells).cast(pa.float64()))
-    except pa.ArrowInvalid:
-        return None
-
-
-def _drop_cut_line(data: bytes, n_columns: int, separator: str) -> tuple[bytes, tuple[str, ...]]:
-    """Drop an unfinished last line: no line end and too few cells."""
-    body, _, last = data.rpartition(b"\n")
-    cells = last.count(separator.encode()) + 1
-    if not last.strip() or cells >= n_columns:
-        return data, ()
-    row = body.count(b"\n") + 2
-    return body + b"\n", (f"row {row} is the last and was cut off ({cells} of {n_columns} cells): dropped",)
-
-
-def _rows(data: bytes, skip: int, separator: str, file: str) -> Iterator[tuple[int, list[str]]]:
-    """Yield line number and cells of each non-empty row."""
-    for line, raw in enumerate(_lines(data), start=1):
-        if raw and line > skip:
-            try:
-                yield line, next(csv.reader([raw.decode("utf-8")], delimiter=separator))
-            except UnicodeDecodeError as error:
-                hint = "save the file as UTF-8"
-                raise UserError("is not UTF-8 text", file=file, row=line, hint=hint) from error
-            except csv.Error as error:
-                problem = f"cannot be split ({error})"
-                raise UserError(problem, file=file, row=line, hint="correct the row") from error
-
-
-def _cell_fault(cell: str, file: str, line: int, name: str) -> UserError:
-    comma = re.fullmatch(r"\s*[+-]?\d+,\d+\s*", cell)
-    hint = "write a decimal point" if comma else "write a number, leave the cell empty, or drop the column"
-    if cell.strip() and STAMP.fullmatch(cell.strip()):
-        hint = "write seconds since the first row"
-    return UserError(f"{_shown(cell)} is not a number", file=file, row=line, column=name, hint=hint)
-
-
-def _line_numbers(data: bytes, skip: int, n_rows: int) -> NDArray[np.int64]:
-    """Return the file's line of each row; only in a file with empty lines they are counted."""
-    if data.count(b"\n") - skip + (not data.endswith(b"\n")) == n_rows:
-        return np.arange(skip + 1, skip + 1 + n_rows)
-    lines = (at for at, raw in enumerate(_lines(data), start=1) if at > skip and raw)
-    return np.fromiter(islice(lines, n_rows), dtype=np.int64)
-
-
 def _lines(data: bytes) -> Iterator[bytes]:
     """Yield the lines without their ends; a list of all of them would be larger than the table."""
     for raw in io.BytesIO(data):
         yield from raw.splitlines()
-
-
-def _check_empty(data: bytes, n_rows: int, file: str) -> None:
-    """Refuse millions of empty lines: they are no table, and walking them takes minutes."""
-    empty = data.count(b"\n") - n_rows
-    if empty > max(n_rows, _MOST_EMPTY):
-        raise UserError(f"has {empty} empty lines", file=file, hint="remove them")

@@ -94,7 +94,7 @@ def read_plan(path: str | Path) -> list[Trial]:
     >>> read_plan(path)
     [Trial(material='copper', target=38.0, t_object=18.0, t_object_sd=None, labels={'block': 'c1'})]
     """
-    table = read_csv_table(path, text=None)
+    table = read_csv_table(path, text=lambda header: True)
     unknown = sorted(set(table.text) - _KNOWN)
     if unknown or "target_degC" not in table.text or "material" not in table.text:
         problem = f"has the unknown column {unknown[0]!r}" if unknown else "lacks material or target_degC"

@@ -12,7 +12,6 @@ import xarray as xr
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from thermogrip.datasets import grasp_files
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.examples import example_path
 from thermogrip.datasets.grasp_files import (
@@ -151,19 +150,23 @@ def test_jittering_stamps_are_interpolated_onto_one_axis(pair, seed, size):
 
 @pytest.mark.parametrize(
     ("steps", "common"),
-    [([0.1, np.nan, 0.1009, 0.1009], 0.1), ([0.1015] * 3, 0.1015), ([0.1, 0.1, 0.11999], 0.1),
-     ([1.23456, np.nan], 1.235), ([0.1, 0.121, 0.1], "grasp 'b' has a step of 0.121 s, the others 0.1 s")],
+    [([0.1, 0.1009, 0.1009], 0.1), ([0.1015] * 3, 0.1015), ([0.1, 0.1, 0.11999], 0.1), ([1.23456], 1.235),
+     ([0.1, 0.121, 0.1], "grasp 'g1' has a step of 0.121 s, the others 0.1 s")],
 )  # fmt: skip
-def test_the_step_is_the_median_in_two_digits_if_that_is_within_one_per_cent(steps, common):
+def test_the_step_is_the_median_in_two_digits_if_that_is_within_one_per_cent(pair, steps, common):
+    rng = np.random.default_rng(0)
+    lines, meta = ["grasp_id,time_s,t_surface_degC"], [META.strip()]
+    for at, step in enumerate(steps):
+        time = step * np.arange(-20, 41) + 0.2 * step * rng.uniform(-1, 1, 61)
+        time[[0, -1]] = -20 * step, 40 * step  # the mean step is that of the ends
+        time = np.delete(time, [30, 31])  # a hole counts as the steps that it is long
+        lines += [f"g{at},{t!r},23" for t in time.tolist()]
+        meta.append(f"g{at},copper,43,23")
+    path = pair("\n".join(lines) + "\n", "\n".join(meta) + "\n")
     if isinstance(common, str):
-        with pytest.raises(UserError, match=common):
-            grasp_files._common_step(np.array(steps), list("abcd"), "g.csv")
+        assert common in refused(path)
     else:
-        assert grasp_files._common_step(np.array(steps), list("abcd"), "g.csv") == common
-    assert grasp_files._step_of(np.array([0.0, 0.25, 0.5, 1.25])) == 0.25  # with a hole of two samples
-    assert np.isnan(grasp_files._step_of(np.array([1.0])))
-    axes = [[0, 1, 2, 4], [0, 1, 2.03], [0, 1, 2.05], [0, 0.4, 1.4]]
-    assert [grasp_files._is_even(np.array(axis, float), 1.0) for axis in axes] == [True, True, False, False]
+        assert read_grasps(path).attrs["repairs"].endswith(f"interpolated onto a step of {common:g} s")
 
 
 def test_a_hole_in_a_jittering_grasp_stays_a_hole(pair):
@@ -344,8 +347,8 @@ def frame():
 @pytest.mark.parametrize(
     ("column", "row", "value", "expected"),
     [
-        ("t_surface_degC", 5, "warm", "row 5, column t_surface_degC: 'warm' is no number"),
-        ("t_object_nominal_degC", 6, "hot", "row 6, column t_object_nominal_degC: 'hot' is no number"),
+        ("t_surface_degC", 5, "warm", "row 5, column t_surface_degC: 'warm' is not a number"),
+        ("t_object_nominal_degC", 6, "hot", "row 6, column t_object_nominal_degC: 'hot' is not a number"),
         ("t_object_nominal_degC", 5, 20.0, "row 5, column t_object_nominal_degC: 20.0 of grasp 'g1' was"),
         ("material", 3, "wood", "row 3, column material: wood of grasp 'g0' was iron in row 1"),
         ("t_object_nominal_degC", 2, None, "of grasp 'g0' was 43.0 in row 1"),

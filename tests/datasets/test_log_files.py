@@ -20,7 +20,6 @@ from hypothesis.extra.numpy import arrays
 from scipy.io import savemat
 from scipy.signal import lfilter
 
-from thermogrip.datasets import tables
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.examples import example_path
 from thermogrip.datasets.file_names import split_cut
@@ -720,14 +719,12 @@ def test_a_data_frame_is_a_log():
     assert (log.attrs["name"], log["time"].values.tolist()) == ("DataFrame", [0.0, 2.0, 4.0])
     np.testing.assert_allclose(column(log, "T1"), [0.0, np.nan, 10.0])
     assert "left out, no numbers: note" in log.attrs["repairs"]
-    log = read_log(frame.reset_index(drop=True), columns=["u", "y", "-"], dt=3)
-    assert (list(log), log["time"].values.tolist()) == (["u", "y"], [0.0, 3.0, 6.0])
     lapse = pd.DataFrame({"time": stamps - stamps[0], "y": [1, 2, 3]})
     assert read_log(lapse)["time"].values.tolist() == [0.0, 2.0, 4.0]
     bare = pd.DataFrame({"y": [1.0, 2.0]}, index=[0.5, 2.0])
     assert read_log(bare)["time"].values.tolist() == [0.5, 2.0]
     assert "DataFrame: 1 row(s) are not a log; give at least two" in refused(bare[:1].reset_index())
-    assert "DataFrame: has 2 columns, columns= names 1" in refused(bare.reset_index(), columns=["t"])
+    assert "DataFrame: has names of its own; rename its columns" in refused(bare, columns=["t"])
 
 
 STYLES = [
@@ -842,18 +839,6 @@ def test_what_is_neither_a_log_nor_a_line_is_noticed(tmp_path, monkeypatch):
 
     monkeypatch.setitem(globals(), "read_log", refuse)
     assert what_is_wrong(path) != ""
-
-
-def test_empty_lines_are_counted_beside_the_short_rows_too(tmp_path, monkeypatch):
-    monkeypatch.setattr(tables, "_MOST_EMPTY", 3)
-    rows = [f"{k},.5,20\n" for k in range(40)]
-    rows.insert(7, "7.5,.5\n")  # a row that is left out is no empty line
-    text = "time_s,drive,t_tank_degC\n" + "".join(rows)
-    (tmp_path / "a.csv").write_text(text + 40 * "\n")
-    assert read_log(tmp_path / "a.csv").sizes["time"] == 40
-    (tmp_path / "a.csv").write_text(text + 41 * "\n")
-    with pytest.raises(UserError, match="empty lines"):
-        read_log(tmp_path / "a.csv")
 
 
 def test_a_table_with_a_reading_of_one_signal_in_a_row_has_a_column_for_each_signal(tmp_path):

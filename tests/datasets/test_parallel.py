@@ -386,8 +386,6 @@ def test_a_cluster_unpacks_an_item_where_it_computes_and_not_at_its_scheduler(cl
     assert ["Dask-" in name for name in parallel._unpacked] == [True] * 3
 
 
-
-
 @pytest.mark.skipif((os.cpu_count() or 1) < 2, reason="needs two processors")
 def test_processes_begin_with_our_modules_and_not_with_files_of_the_folder(tmp_path):
     for name in ("colorsys", "joblib", "numpy"):
