@@ -153,14 +153,3 @@ class LatchingRig(Rig, Protocol):
 
     def clear(self) -> None:
         """Clear the latch; DeviceRefusedError where the cause is still there."""
-
-
-@runtime_checkable
-class SamplingRig(Rig, Protocol):
-    """A rig that may take readings by its own clock and keep them until they are taken."""
-
-    def sample_every(self, seconds: float) -> bool:
-        """Take a reading every so many seconds from now on, 0 for none; False where it cannot."""
-
-    def take(self) -> tuple[list[Reading], int]:
-        """Return the readings since the last call, oldest first, and how many were lost since."""

@@ -30,7 +30,7 @@ DOORS = {
     "emcee": {"sysid.greybox.posterior"},
     "foxglove": {"live.foxglove"},
     "llvmlite": {"sysid.models.jit_rollout"},
-    "mcap": {"rig.records.run_folder", "datasets.rosbag"},
+    "mcap": {"datasets.rosbag"},
     "nlopt": {"mpc.tuning.tune"},
     "numba": {"datasets.compiled"},
     "pysindy": {"sysid.blackbox.sindy"},

@@ -272,27 +272,16 @@ def check_damage(chip: Chip, rig: DeviceRig, check: Check) -> None:
     check(chip.status().pins == (1, 127, 0, 1), "damage: the drive goes on")
 
 
-def check_sampling(chip: Chip, rig: DeviceRig, check: Check, seconds: float = 10.0) -> None:
-    """100 Hz by the chip's clock, beside renewed drives, with a host that is held up."""
+def check_load(chip: Chip, rig: DeviceRig, check: Check, seconds: float = 10.0) -> None:
+    """A host that asks as fast as it can: the loop turns, and every answer begins in time."""
     chip.say("forget")
-    assert rig.sample_every(0.01)
-    begin = last = chip.status().ms
-    readings, lost, excused, k = 0, 0, 0, 0
-    while last < begin + 1000 * seconds:
-        time.sleep(0.1 if k % 10 == 5 else 0.03)
-        if k % 10 == 0:
-            rig.apply({"drive": 0.2}, 1)
-        got, gone = rig.take()
-        now = chip.status().ms
-        late = now - last > 230  # this computer stood still for longer than the device keeps
-        readings, lost, excused = readings + len(got), lost + (not late) * gone, excused + late * gone
-        last, k = now, k + 1
-    rig.sample_every(0.0)
+    begin = chip.status().ms
+    while chip.status().ms < begin + 1000 * seconds:
+        rig.apply({"drive": 0.2}, 1)
+        rig.read()
     worst = chip.status()
-    text = f"{readings} readings, {lost} lost" + (f" ({excused} more by this computer)" if excused else "")
-    check(lost == 0 and readings + excused >= 99 * seconds, f"100 Hz for {seconds:g} s: {text}")
-    check(worst.turn_us < 10_000, f"100 Hz: the loop's longest turn took {worst.turn_us / 1000:.1f} ms")
-    check(worst.answer_us < 50_000, f"100 Hz: every answer began within {worst.answer_us / 1000:.1f} ms")
+    check(worst.turn_us < 10_000, f"under load: the loop's longest turn took {worst.turn_us / 1000:.1f} ms")
+    check(worst.answer_us < 50_000, f"under load: answers began within {worst.answer_us / 1000:.1f} ms")
 
 
 def check_wrap(chip: Chip, rig: DeviceRig, check: Check, elf: Path) -> None:
@@ -300,16 +289,9 @@ def check_wrap(chip: Chip, rig: DeviceRig, check: Check, elf: Path) -> None:
     symbols = run("avr-nm", elf).splitlines()
     address = next(line.split()[0] for line in symbols if line.endswith(" timer0_millis"))
     rig.apply({"drive": 0.0}, 0)  # the leap itself is no time without flow
-    rig.sample_every(0.01)
     chip.say(f"poke {int(address, 16) - 0x800000:x} {2**32 - 1000}")
     rig.read()
-    rig.sample_every(0.01)
     check_expiry(chip, rig, check, "across the end of the clock")
-    rig.take()
-    chip.wait(50)
-    readings, _ = rig.take()
-    check(bool(readings), f"across the end of the clock: {len(readings)} readings more")
-    rig.sample_every(0.0)
 
 
 def check_watchdog(chip: Chip, rig: DeviceRig, check: Check) -> None:
@@ -335,7 +317,7 @@ def check_board(chip: Chip, elf: Path, check: Check) -> int:
     check_latch(chip, rig, check)
     check_damage(chip, rig, check)
     deepest = chip.status().stack
-    check_sampling(chip, rig, check)
+    check_load(chip, rig, check)
     check_wrap(chip, rig, check, elf)
     check_watchdog(chip, rig, check)
     rig.close()

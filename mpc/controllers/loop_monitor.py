@@ -21,7 +21,7 @@ driven by another plant or a load.
 **Another plant.**  A drive whose estimated bias is beyond 30 % of its range, or an output's beyond a third of
 a jump (:mod:`thermogrip.mpc.estimator.reading_checks`), for as long as the loop takes to arrive: a draw is
 over by then.  Where the plant has a posterior, :mod:`thermogrip.mpc.estimator.structure_monitor` says what
-its model lacks.  What a drive does from target to target, and which reading should have moved,
+its model lacks.  Which drive does another share than before, and which reading should have moved,
 :mod:`thermogrip.mpc.estimator.fault_monitors` says of any plant.
 
 **Swings.**  :mod:`thermogrip.mpc.estimator.oscillation`.
@@ -121,7 +121,8 @@ class LoopMonitor:
         self.names = tuple(p.output for p in self.loops)
         allowed = 2.0 * design.overshoot
         self.swings = OscillationMonitor(self.names, model.dt, self._delay.tolist(), [allowed] * n)
-        self.gain = GainMonitor(model.drives, float(np.max(self._promised, initial=0.0)))
+        filters = {name: design.observer(model) for name in model.drives}
+        self.gain = GainMonitor(filters, float(np.max(self._promised, initial=0.0)))
         self.stuck = StuckMonitor(model.outputs)
         self.observer = design.observer(model)
         self.structure = StructureMonitor(plant, model, self.controlled)
@@ -132,6 +133,7 @@ class LoopMonitor:
         self.said = ""  # of the newest sample
         self._time_s = np.nan
         self._u: Array | None = None
+        self._goals: list[float] = []
         self.swings.forget()
         self.structure.forget()
         self.gain.forget()
@@ -164,11 +166,12 @@ class LoopMonitor:
         applied = u if self._u is None else self._u
         told = np.array([number(reading, name) for name in self.model.drives])
         applied = np.where(np.isfinite(told), told, applied)
-        strange = self._follow(y, d, applied, seconds)
         wanted = target_now(target)
         by_name = wanted if isinstance(wanted, Mapping) else dict.fromkeys(self.controlled, wanted)
         goals = [number(by_name, p.output) for p in self.loops]
-        self._u = u
+        new = bool(self._goals) and goals != self._goals
+        strange = self._follow(y, d, applied, seconds, new=new)
+        self._u, self._goals = u, goals
         if move.status not in ("ok", "late", "infeasible"):
             self._restart()  # no law is followed
             self.said = ""
@@ -176,29 +179,29 @@ class LoopMonitor:
             self.said = self._judge(y[self._rows], np.array(goals), applied[self._drives], seconds, strange)
         return self.said
 
-    def _follow(self, y: Array, d: Array, applied: Array, seconds: float) -> str:
-        """Let the filter follow; return in what the plant is another than its model."""
+    def _follow(self, y: Array, d: Array, applied: Array, seconds: float, *, new: bool) -> str:
+        """Let the filters follow, also towards a new target; return in what the plant is another than its
+        model."""
         observer = self.observer
         if self._u is None or seconds > RESTART_S + self.model.dt:
             observer.reset(y, d)
+            observer.update(y)
             self.structure.restart()
-            self.gain.forget()
+            self.gain.restart(y, d)
             self.stuck.forget()
         else:
             observer.advance(seconds, applied, d)
             observer.look(d)
-        observer.update(y)
+            self.gain.note(observer.update(y), observer.R, y, applied, d, seconds, new=new)
         if self._u is not None and abs(seconds - self.model.dt) > _EVEN * self.model.dt:
             self.structure.restart()
         self.structure.note(observer, y, applied, d)
-        self.gain.note(observer, applied, seconds)
         self.stuck.note(observer, y, applied, d)
         return follows(observer, self.controlled)
 
     def _judge(self, y: Array, target: Array, u: Array, seconds: float, strange: str) -> str:
         """Return what is to be said after readings y and targets of the loops (n,) and drives u (n,)."""
         if np.any(target != self._target):
-            self.gain.new_target()
             self._restart()
             self._target = target.copy()
         swings = self.swings.note(y, target, seconds, self._zone.tolist())

@@ -16,9 +16,8 @@ here:
   as our own firmware does; the latch is cleared with :meth:`TCLabRig.clear`.  Where the board could not be
   reached then, its heaters go off at the first scan that shows them on.
 * **Which board it is.**  The firmware knows no number of its own.  After a silence or on a new connection it
-  is the same board where its USB interface has the same serial number or, where that has none, where a heater
-  that was on still is, to the last digit.  With the heaters off nothing tells one such board from another: it
-  is not driven any more.
+  is the same board where a heater that was on still is, to the last digit.  With the heaters off nothing
+  tells one board from another: it is not driven any more.
 
 What cannot be done: **nothing ends the heaters when the program is dead or the cable out**; they stay as they
 were until the board loses its power.  They are small (about 1.5 W at most at the ceilings that the firmware
@@ -77,7 +76,7 @@ class TCLabRig(NoticeBook):
         self._known_at, self._heard = 0, 0  # the connection whose board is known; bytes so far
         self.faults: tuple[str, ...] = ()
         port.open()
-        self.version, self._usb = self._greet(greeting), port.usb
+        self.version = self._greet(greeting)
 
     @property
     def units(self) -> dict[str, str]:
@@ -239,8 +238,6 @@ class TCLabRig(NoticeBook):
             raise PortError("lost", "does not answer", file=self.port.url, hint="check cable and power")
         heaters_as_set = all(abs(float(now) - then) <= 0.002 for now, then in zip(scan[2:], self._set))
         same = any(self._set) and heaters_as_set
-        if self._usb is not None or self.port.usb is not None:
-            same = self.port.usb == self._usb
         if not same or version[0].decode("ascii").strip() != self.version:
             problem = "may be another board now, or was reset: no serial number and no heater tells"
             raise PortError("lost", problem, file=self.port.url, hint="start anew")

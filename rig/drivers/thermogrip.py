@@ -9,83 +9,22 @@ decide.  A drive that was not confirmed raises, because it must not count as app
 **The conversation.**  A question that is met with silence, or whose answer came damaged, is repeated with the
 same number, and the device does nothing twice.  A lost port is tried again (with back-off) at each question;
 a device that answers again after it was lost or reset is greeted anew, which switches everything off.  It
-must be the same board: by its own serial number; of firmware that has none by that of its USB interface, or,
-where that has none either, by its count of resets.  Another one is never driven.
-
-**Readings by the device's clock.**  An answer at device time u was made between the moment its question was
-sent and the moment it was received, so the host's time less the device's, the offset o, is bounded by each
-exchange:
-
-    t_sent - u <= o <= t_received - u.
-
-The offset stays while it agrees with that, else it moves to the nearer bound.  A slow exchange has wide
-bounds and moves nothing; a resonator that runs 0.5 % fast is followed; a reset, or the wrap of the device's
-clock, moves it at once.  A time is off by no more than the quickest recent exchange took; the interval
-between two readings is the device's own measure.
+must be the same board: by its own serial number or, of firmware that has none, by its count of resets.
+Another one is never driven.
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
-from contextlib import suppress
 
 from thermogrip.rig.clock import Metronome
-from thermogrip.rig.firmware.reference import MAX_PERIOD_MS, MIN_PERIOD_MS
 from thermogrip.rig.interface import DeviceRefusedError, NoticeBook, Reading, check_order
 from thermogrip.rig.serial import protocol
 from thermogrip.rig.serial.port import Port, PortError
 
 TTL_S = protocol.MAX_TTL_MS / 1000
 MOST_TRIES = 12  # of one question on a line that spoils half of it
-
-
-class DeviceClock:
-    """The device's clock in the host's time."""
-
-    def __init__(self) -> None:
-        self._offset = float("inf")
-
-    def see(self, sent_s: float, heard_s: float, uptime_ms: int) -> None:
-        """Update the offset: when an exchange was sent and answered [s], and the device's time [ms]."""
-        low, high = sent_s - (uptime_ms + 1) / 1000, heard_s - uptime_ms / 1000
-        self._offset = min(max(self._offset, low), high)
-
-    def time(self, uptime_ms: int, age_ms: int = 0) -> float:
-        """Return the host's time [s] of a reading that was ``age_ms`` old at an answer."""
-        return self._offset + (uptime_ms - age_ms) / 1000
-
-
-class Gathering:
-    """Fetches the readings that a device takes by its own clock, each once: ``number`` is that of the next
-    to ask for, ``lost`` counts ticks of which no reading will ever come."""
-
-    def __init__(self, period_ms: int) -> None:
-        self.period_ms, self.number, self.lost = period_ms, 0, 0
-        self._last: float | None = None
-        self._was_reset = False
-
-    def device_was_reset(self) -> None:
-        """Count from 0 again."""
-        self.number, self._was_reset = 0, True
-
-    def take(self, taken: protocol.Taken, clock: DeviceClock) -> list[tuple[float, protocol.Kept]]:
-        """Return the readings of an answer with their time [s], which never goes back."""
-        lost = (taken.first - self.number) % 2**32 + sum(kept is None for kept in taken.readings)
-        there = []
-        for kept in taken.readings:
-            if kept is None:
-                continue
-            time = clock.time(taken.uptime_ms, kept.age_ms)
-            if self._was_reset and self._last is not None:
-                lost = max(lost, round(1000 * (time - self._last) / self.period_ms) - 1)
-            if self._last is not None:
-                time = max(time, self._last + 1e-6)  # a quicker exchange may have moved the offset back
-            self._was_reset, self._last = False, time
-            there.append((time, kept))
-        self.lost += lost
-        self.number = (taken.first + len(taken.readings)) % 2**32
-        return there
 
 
 class DeviceRig(NoticeBook):
@@ -109,14 +48,12 @@ class DeviceRig(NoticeBook):
         super().__init__(clock)
         self.port, self.timeout, self.tries = port, timeout, tries
         self._beat = Metronome(clock, sleep)
-        self._gathering: Gathering | None = None
-        self._host, self._device_clock = protocol.HostEnd(), DeviceClock()
+        self._host = protocol.HostEnd()
         self._known: protocol.State | None = None
         self._heard, self._silent = 0, False  # bytes so far; whether the last question was met with none
         self._greeted_at, self._lost, self.closed = 0, False, False
         port.open()
         self.identity = self._first_hello(greeting)
-        self._usb = port.usb
 
     @property
     def units(self) -> dict[str, str]:
@@ -167,37 +104,6 @@ class DeviceRig(NoticeBook):
         """Let time pass; waits that follow each other end on a grid."""
         self._beat.wait(seconds)
 
-    def sample_every(self, seconds: float) -> bool:
-        """Let the device take a reading every so many seconds by its own clock, 0 for none; False where its
-        firmware is older, or it cannot keep this time."""
-        period = round(1000 * seconds)
-        possible = MIN_PERIOD_MS <= period <= MAX_PERIOD_MS and abs(period - 1000 * seconds) < 1e-6
-        self._gathering = None
-        if seconds and not possible:
-            return False
-        try:
-            self._ask(protocol.Sample(period))
-        except DeviceRefusedError as refused:
-            if refused.code == "unknown":
-                return False
-            raise
-        self._gathering = Gathering(period) if period else None
-        return period > 0
-
-    def take(self) -> tuple[list[Reading], int]:
-        """Return the device's own readings since the last call, oldest first, and how many were lost; none
-        come while it cannot be reached, and it goes on taking them."""
-        gathering = self._gathering
-        if gathering is None:
-            raise RuntimeError("the device takes no readings of its own; see sample_every")
-        before, readings = gathering.lost, []
-        while taken := self._next_taken(gathering):
-            there = gathering.take(taken, self._device_clock)
-            readings += [self._reading(time, kept) for time, kept in there]
-            if not taken.waiting:
-                break
-        return readings, gathering.lost - before
-
     def grasp(self, material: str, t_object: float) -> None:
         """Close the gripper."""
         self._ask(protocol.Grip(1))
@@ -225,27 +131,13 @@ class DeviceRig(NoticeBook):
     def _counts(self, drive: Mapping[str, float]) -> tuple[int, ...]:
         return tuple(round(1e4 * drive[channel.name]) for channel in self.identity.drives)
 
-    def _reading(self, time_s: float, content: protocol.State | protocol.Kept) -> Reading:
+    def _reading(self, time_s: float, content: protocol.State) -> Reading:
         values = {
             name: float("nan") if isinstance(value, str) else value / 1000
             for name, value in zip(self.identity.sensors, content.temperatures)
         }
         applied = {channel.name: value / 1e4 for channel, value in zip(self.identity.drives, content.drive)}
         return Reading(time_s, values, applied, content.pump)
-
-    def _next_taken(self, gathering: Gathering) -> protocol.Taken | None:
-        """Return the device's next readings, None where it cannot be reached or was reset."""
-        try:
-            content = self._content(protocol.Take(gathering.number))
-        except PortError:
-            return None
-        except DeviceRefusedError:  # it was reset: it takes none any more, or counts from 0
-            gathering.device_was_reset()
-            with suppress(PortError):  # then the next call begins
-                self._ask(protocol.Sample(gathering.period_ms))
-            return None
-        assert isinstance(content, protocol.Taken)
-        return content
 
     def _first_hello(self, seconds: float) -> protocol.Identity:
         """Ask for the device's identity until it answers; an Arduino takes seconds to start."""
@@ -265,7 +157,7 @@ class DeviceRig(NoticeBook):
         self._compare(state)
         return state
 
-    def _content(self, request: protocol.Request) -> protocol.Identity | protocol.State | protocol.Taken:
+    def _content(self, request: protocol.Request) -> protocol.Identity | protocol.State:
         """Return what answers a question, greeting the device first where it is a new one."""
         if self.closed:
             raise PortError("lost", "is closed", file=self.port.url, hint="open the rig again")
@@ -305,12 +197,10 @@ class DeviceRig(NoticeBook):
             raise PortError("lost", "is another device now", file=self.port.url, hint="start anew")
         self._greeted_at = self.port.opened
 
-    def _is_same(self, identity: protocol.Identity | protocol.State | protocol.Taken) -> bool:
+    def _is_same(self, identity: protocol.Identity | protocol.State) -> bool:
         """Say whether what has answered to hello is the board of the first hello."""
         if self.identity.serial or identity != self.identity:
             return identity == self.identity
-        if self._usb is not None or self.port.usb is not None:
-            return self.port.usb == self._usb
         if self._known is None:  # a reset was announced, which ends the session
             return True
         answer = self._exchange(protocol.Read())
@@ -319,16 +209,12 @@ class DeviceRig(NoticeBook):
 
     def _exchange(self, request: protocol.Request) -> protocol.Answer | protocol.Refused:
         """Repeat a question until it is answered."""
-        data, sent = self._host.ask(request), self._now()
+        data = self._host.ask(request)
         silent, most = 0, 1 if self._silent else self.tries  # one that was silent holds up the loop no longer
         for _ in range(MOST_TRIES):
             before = self._heard
             answer = self._once(data)
             self._silent = self._heard == before
-            if isinstance(answer, protocol.Answer) and isinstance(
-                answer.content, protocol.State | protocol.Taken
-            ):
-                self._device_clock.see(sent, self._now(), answer.content.uptime_ms)
             if answer is not None:
                 return answer
             silent += self._silent

@@ -27,7 +27,6 @@ void Core::begin(const Board &board, const char *cause, uint16_t boot, uint32_t 
   n_in_ = 0;
   last_ = 0;
   said_ = "";
-  ring_.start(0, 0, now_ms);
   for (uint8_t k = 0; k < MAX_DRIVES; ++k) drive_[k] = 0;
   for (uint8_t k = 0; k < MAX_SENSORS; ++k) {
     values_[k] = OPEN;
@@ -81,8 +80,6 @@ void Core::line(uint32_t now_ms) {
     writer_.put(refusal);
   } else if (bare_hello) {
     write_identity();
-  } else if (same(words[1], "take")) {
-    write_taken(now_ms);
   } else {
     write_state(now_ms);
   }
@@ -95,7 +92,6 @@ void Core::line(uint32_t now_ms) {
 const char *Core::obey(char **words, size_t n, uint32_t now_ms) {
   const char *word = words[0];
   if (same(word, "drive")) return set_drive(words, n, now_ms);
-  if (same(word, "sample") || same(word, "take")) return set_sampling(words, n, now_ms);
   if (same(word, "grip")) {
     if (n != 2 || !(same(words[1], "0") || same(words[1], "1"))) return "syntax";
     grip_ = words[1][0] == '1';
@@ -117,18 +113,6 @@ const char *Core::clear() {
   pump_latched_ = false;
   for (uint8_t k = 0; k < board_->n_sensors; ++k) bad_counts_[k].latched = GOOD;
   switch_off(OFF);
-  return nullptr;
-}
-
-const char *Core::set_sampling(char **words, size_t n, uint32_t now_ms) {
-  int64_t number;
-  if (n != 2 || !integer(words[1], &number)) return "syntax";
-  if (same(words[0], "take")) {
-    if (!ring_.running()) return "idle";
-    return ring_.forget(static_cast<uint32_t>(number)) ? nullptr : "range";
-  }
-  if (number != 0 && (number < MIN_PERIOD_MS || number > MAX_PERIOD_MS)) return "range";
-  ring_.start(static_cast<uint32_t>(number), static_cast<uint8_t>(board_->n_drives + board_->n_sensors), now_ms);
   return nullptr;
 }
 
@@ -200,13 +184,6 @@ void Core::sample(const int32_t *values, bool flow, uint32_t now_ms) {
     latch(MAX_SENSORS);
   }
   if (n_latched_ > before) switch_off(LATCHED);
-}
-
-void Core::keep(const int32_t *values, uint32_t now_ms) {
-  expire(now_ms);
-  int32_t *numbers = ring_.keep(pump_, now_ms);
-  for (uint8_t k = 0; k < board_->n_drives; ++k) *numbers++ = drive_[k];
-  for (uint8_t k = 0; k < board_->n_sensors; ++k) *numbers++ = values_[k] = values[k];
 }
 
 void Core::latch(uint8_t which) {
@@ -295,42 +272,6 @@ void Core::write_temperature(int32_t value) {
     writer_.put("short");
   } else {
     writer_.put_number(value);
-  }
-}
-
-// Write as many of the readings as fit on the line.
-void Core::write_taken(uint32_t now_ms) {
-  writer_.put(" ok ");
-  writer_.put_unsigned(now_ms - started_ms_);
-  writer_.put(' ');
-  writer_.put_unsigned(ring_.first());
-  writer_.put(' ');
-  writer_.put_unsigned(ring_.next());
-  for (uint8_t place = 0; place < ring_.count(); ++place) {
-    size_t before = writer_.length();
-    write_kept(ring_.at(place, now_ms));
-    if (writer_.full()) {
-      writer_.go_back(before);
-      return;
-    }
-  }
-}
-
-void Core::write_kept(const Kept &kept) {
-  writer_.put(' ');
-  if (kept.numbers == nullptr) {
-    writer_.put('-');
-    return;
-  }
-  writer_.put_unsigned(kept.age_ms);
-  writer_.put(kept.pump ? ",1" : ",0");
-  for (uint8_t k = 0; k < board_->n_drives + board_->n_sensors; ++k) {
-    writer_.put(',');
-    if (k < board_->n_drives) {
-      writer_.put_number(kept.numbers[k]);
-    } else {
-      write_temperature(kept.numbers[k]);
-    }
   }
 }
 

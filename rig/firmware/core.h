@@ -1,8 +1,8 @@
 // The rig's firmware without pins: what it answers, and when it switches off.
 //
 // Plain C++11, no Arduino header, no heap, no floating point in what the host compares, and an int may have 16
-// bits.  The sketch calls receive() with each byte, sample() ten times a second, keep() whenever due(), and
-// applies outputs() after each of them.
+// bits.  The sketch calls receive() with each byte, sample() ten times a second, and applies
+// outputs() after each of them.
 // docs/reference/protocol.md is the specification; rig/firmware/reference.py does the same in Python, and tests feed both
 // the same bytes.
 
@@ -13,7 +13,6 @@
 #include <stdint.h>
 
 #include "line.h"
-#include "ring.h"
 
 namespace thermogrip {
 
@@ -89,7 +88,6 @@ struct Outputs {
   bool pump, grip;
 };
 
-static_assert(CELLS >= 2 * (1 + MAX_DRIVES + MAX_SENSORS), "the ring keeps two readings at least");
 static_assert(MAX_BODY <= 0xFF, "a line's length has two hexadecimal digits");
 
 class Core {
@@ -107,10 +105,6 @@ class Core {
 
   // Take one sample of every sensor, and whether the pump turns.
   void sample(const int32_t *values, bool flow, uint32_t now_ms);
-
-  // Whether the host wants a reading now; then take it: every sensor, by the device's own clock.
-  bool due(uint32_t now_ms) const { return ring_.due(now_ms); }
-  void keep(const int32_t *values, uint32_t now_ms);
 
   // End a drive whose time is over; call it in every turn of the loop.
   void expire(uint32_t now_ms);
@@ -130,13 +124,10 @@ class Core {
   const char *obey(char **words, size_t n, uint32_t now_ms);
   const char *clear();
   const char *set_drive(char **words, size_t n, uint32_t now_ms);
-  const char *set_sampling(char **words, size_t n, uint32_t now_ms);
   void write_version();
   void write_identity();
   void write_state(uint32_t now_ms);
   void write_faults();
-  void write_taken(uint32_t now_ms);
-  void write_kept(const Kept &kept);
   void write_temperature(int32_t value);
   void switch_off(Mode mode);
   bool latched() const { return n_latched_ > 0; }
@@ -162,7 +153,6 @@ class Core {
   LineWriter writer_;
   bool have_last_;
   uint32_t last_;
-  Ring ring_;
 };
 
 // Thermistor on a divider against a fixed resistor, the sum of n readings (at most 64) of a 10-bit converter:

@@ -90,17 +90,13 @@ static void sample(const int32_t *values, uint32_t now_ms) {
   core.sample(values, flow, now_ms);
 }
 
-// Measure what is due (for the guards ten times a second, and for the host as often as it asked); whether it was.
+// Measure ten times a second; whether it was time to.
 static bool measure_due(uint32_t now_ms) {
-  bool guards = now_ms - sampled_ms >= 100, kept = core.due(now_ms);
-  if (!guards && !kept) return false;
+  if (now_ms - sampled_ms < 100) return false;
   int32_t values[thermogrip::MAX_SENSORS];
   measure(values);
-  if (kept) core.keep(values, now_ms);
-  if (guards) {
-    sampled_ms = now_ms;
-    sample(values, now_ms);
-  }
+  sampled_ms = now_ms;
+  sample(values, now_ms);
   return true;
 }
 
@@ -133,9 +129,8 @@ void loop() {
   bool measured = measure_due(now_ms);
   apply();
   send();
-  // either takes 4 or 5 ms, both in one turn would come too late for the next reading at 100 Hz
-  if (measured) return;
-  // one line at most a turn, and none before the last answer is out; readings go on however much comes in
+  if (measured) return;  // it takes 4 ms
+  // one line at most a turn, and none before the last answer is out; samples go on however much comes in
   for (uint8_t k = 0; k < 64 && *unsent == '\0' && Serial.available() > 0; ++k) {
     core.receive(static_cast<char>(Serial.read()), now_ms);
     unsent = core.answer();

@@ -71,16 +71,11 @@ void LineWriter::start(char *line, size_t size, uint32_t seq) {
   line_ = line;
   room_ = size - (CHECK + ENDS);
   length_ = 0;
-  full_ = false;
   put_unsigned(seq);
 }
 
 void LineWriter::put(char c) {
-  if (length_ < room_ && length_ < MAX_BODY) {
-    line_[length_++] = c;
-  } else {
-    full_ = true;
-  }
+  if (length_ < room_ && length_ < MAX_BODY) line_[length_++] = c;
 }
 
 void LineWriter::put(const char *text) {

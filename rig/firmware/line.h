@@ -33,18 +33,13 @@ class LineWriter {
   void put_number(int32_t value);
   void put_unsigned(uint32_t value);
 
-  // What does not fit is left out: see whether it did, and go back to where it does.
-  size_t length() const { return length_; }
-  bool full() const { return full_; }
-  void go_back(size_t length) { length_ = length; }
-
+  // What does not fit is left out.
   // Close the line (star, length, both CRCs, end) and return it.
   const char *finish();
 
  private:
   char *line_;
   size_t length_, room_;
-  bool full_;
 };
 
 }  // namespace thermogrip

@@ -1,100 +1,20 @@
 """The firmware in Python: the reference that the virtual device runs and the sketch is tested against.
 
 The core owns no pin, no clock and no sensor.  Whoever runs it calls :meth:`DeviceCore.receive` with what came
-over the line, :meth:`DeviceCore.sample` with the sensors' values ten times a second, :meth:`DeviceCore.keep`
-with them whenever :attr:`DeviceCore.ring` says that a reading is due, and applies :attr:`DeviceCore.outputs`
-after each call.
+over the line, :meth:`DeviceCore.sample` with the sensors' values ten times a second, and applies
+:attr:`DeviceCore.outputs` after each call.
 
 What protects the rig when nobody is there (expiry, latch, interlock, the supply of the drivers, the hello
-after a reset) and the ring of readings that the device takes by its own clock are specified in
-``docs/reference/protocol.md``.  A ring has what an Arduino Uno has room for: 120 numbers, of which a reading
-takes one for its time and one for each drive and sensor.
+after a reset) is specified in ``docs/reference/protocol.md``.
 """
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import TypeAlias
 
 from thermogrip.rig.serial import protocol
-
-CELLS = 120
-MIN_PERIOD_MS, MAX_PERIOD_MS = 10, 1000
-_WRAP = 2**32
-
-
-class Ring:
-    """Readings by number; not running before :meth:`start`."""
-
-    def __init__(self, n_numbers: int) -> None:
-        self._slots: deque[tuple[int, protocol.Kept] | None] = deque(maxlen=CELLS // (1 + n_numbers))
-        self.period_ms, self.first, self._due_ms = 0, 0, 0
-
-    @property
-    def next(self) -> int:
-        """Number of the tick that is still to come."""
-        return (self.first + len(self._slots)) % _WRAP
-
-    @property
-    def due_ms(self) -> int | None:
-        """When the next tick is, None where none comes."""
-        return self._due_ms if self.period_ms else None
-
-    def start(self, period_ms: int, now_ms: int) -> None:
-        """Forget everything and take a reading every so many ms from now on; 0 takes none."""
-        self._slots.clear()
-        self.period_ms, self.first, self._due_ms = period_ms, 0, now_ms
-
-    def due(self, now_ms: int) -> bool:
-        """Say whether a reading is to be taken now."""
-        return self.period_ms > 0 and (now_ms - self._due_ms) % _WRAP < _WRAP // 2
-
-    def keep(
-        self, now_ms: int, pump: int, drive: tuple[int, ...], temperatures: tuple[int | str, ...]
-    ) -> None:
-        """Keep the reading of the newest tick that is due; those before it have none."""
-        late = (now_ms - self._due_ms) % _WRAP // self.period_ms
-        for _ in range(self._skip(late)):
-            self._push(None)
-        self._push((now_ms, protocol.Kept(0, pump, drive, temperatures)))
-
-    def forget(self, number: int) -> bool:
-        """Forget everything before this number; False if that has not come yet."""
-        ahead = (self.next - number) % _WRAP
-        if ahead >= _WRAP // 2:
-            return False
-        while len(self._slots) > ahead:
-            self._slots.popleft()
-            self.first = (self.first + 1) % _WRAP
-        return True
-
-    def at(self, place: int, now_ms: int) -> protocol.Kept | None:
-        """Return the reading at a place from the first, with its age; None where the tick has none."""
-        slot = self._slots[place]
-        if slot is None:
-            return None
-        return replace(slot[1], age_ms=(now_ms - slot[0]) % 2**16)  # of the clock only so much is kept
-
-    def __len__(self) -> int:
-        return len(self._slots)
-
-    def _skip(self, late: int) -> int:
-        """Return how many ticks without a reading are worth keeping; the rest only count."""
-        most = CELLS  # more than fit
-        if late > most:
-            self.first = (self.next + late - most) % _WRAP
-            self._due_ms += (late - most) * self.period_ms
-            self._slots.clear()
-        return min(late, most)
-
-    def _push(self, slot: tuple[int, protocol.Kept] | None) -> None:
-        full = len(self._slots) == self._slots.maxlen
-        self.first = (self.first + full) % _WRAP
-        self._slots.append(slot)
-        self._due_ms += self.period_ms
-
 
 VERSION = "0.2.0"
 SERIALS = 100_000_000  # a board's number is below
@@ -176,7 +96,6 @@ class DeviceCore:
         self._values: tuple[Value, ...] = ("open",) * len(self.board.sensors)
         self._greeted = False
         self._last: tuple[int, bytes] | None = None  # number of the last question, and its answer
-        self.ring = Ring(len(self.board.drives) + len(self.board.sensors))
 
     @property
     def outputs(self) -> Outputs:
@@ -238,12 +157,6 @@ class DeviceCore:
             self.faults += tuple(latched)
             self._switch_off("latched")
 
-    def keep(self, values: Sequence[Value], now_ms: int) -> None:
-        """Keep the reading that is due, which is not guarded."""
-        self._expire(now_ms)
-        self._values = tuple(values)
-        self.ring.keep(now_ms, self._pump, self._drive, self._values)
-
     def _answer(self, line: protocol.Line | protocol.Damaged, now_ms: int) -> bytes:
         """Return the answer to one line; a question that is repeated gets its answer repeated."""
         if isinstance(line, protocol.Damaged):
@@ -258,8 +171,6 @@ class DeviceCore:
             answer = protocol.encode_line(line.seq, "err", refusal)
         elif isinstance(request, protocol.Hello):
             answer = protocol.encode_line(line.seq, "ok", *self.identity.words())
-        elif isinstance(request, protocol.Take):
-            answer = protocol.encode_line(line.seq, "ok", *self._taken(line.seq, now_ms).words())
         else:
             answer = protocol.encode_line(line.seq, "ok", *self.state(now_ms).words())
         self._last = (line.seq, answer)
@@ -282,27 +193,7 @@ class DeviceCore:
                 self._switch_off("off")
             case protocol.Drive():
                 return self._set_drive(request, now_ms)
-            case protocol.Sample(period_ms=period):
-                if period and not MIN_PERIOD_MS <= period <= MAX_PERIOD_MS:
-                    return "range"
-                self.ring.start(period, now_ms)
-            case protocol.Take(number=number):
-                known = self.ring.due_ms is not None
-                return "idle" if not known else "" if self.ring.forget(number) else "range"
         return ""
-
-    def _taken(self, seq: int, now_ms: int) -> protocol.Taken:
-        """Return as many of the readings as fit on a line."""
-        head = (now_ms - self.started_ms) % 2**32, self.ring.first, self.ring.next
-        readings: list[protocol.Kept | None] = []
-        room = protocol.MAX_BODY - len(" ".join([str(seq), "ok", *protocol.Taken(*head, ()).words()]))
-        for place in range(len(self.ring)):
-            reading = self.ring.at(place, now_ms)
-            room -= 1 + (1 if reading is None else len(reading.word()))
-            if room < 0:
-                break
-            readings.append(reading)
-        return protocol.Taken(*head, tuple(readings))
 
     def _set_drive(self, request: protocol.Drive, now_ms: int) -> str:
         if not self._greeted:

@@ -10,7 +10,6 @@ It asks, in this order:
     limits    is everything inside its limits?  (limit)
     model     does the rig follow its identified model?  (model, pump, driver, reversed, drift;
               :mod:`~thermogrip.rig.guard.model_checks`), or, without a model, the rules below
-    optimum   does more cooling drive still cool?  (optimum)
     operator  has somebody asked to stop?  (operator)
 
 and of a move, before it goes out: is it finite, and does it pump heat into standing water?  (drive,
@@ -84,7 +83,6 @@ _BELIEVED_BEYOND = 5.0
 _BEYOND_LOGS = 0.1  # of the logs' range: by so much a loop by SIMC overshoots a step
 _KEPT_S = 300.0
 _ROOMS = (10.0, 35.0)  # degC, where people work: an output outside was heated or cooled before the session
-_OPTIMUM_EVERY_S, _OPTIMUM_FOR_S = 10.0, 60.0
 
 
 @dataclass(frozen=True)
@@ -363,7 +361,6 @@ class Guard:
             self._released = self._time
         self._touched = False
         self._repeated: dict[str, int] = {}
-        self._turned_since, self._turn_asked = float("nan"), float("-inf")
         self.trips = []
         self.sensors.start(reading.time_s, reading.values)
         self.rules.start()
@@ -455,7 +452,7 @@ class Guard:
         room = next((v for n, v in reading.values.items() if n in rooms), float("nan"))
         outputs = {name: value for name, value in accepted.items() if name not in rooms}
         trip = self._driver(reading) or trip or self._limits(reading.time_s, outputs)
-        trip = trip or self._behaviour(reading.time_s, outputs, masked, room) or self._optimum(reading.time_s)
+        trip = trip or self._behaviour(reading.time_s, outputs, masked, room)
         self._time = reading.time_s
         return self._findings(reading, accepted, suspect, trip)
 
@@ -607,23 +604,6 @@ class Guard:
         measured = f"{alarm.measured:+.2f} K" + (f" ({because})" if because else "")
         check = "; or ".join(KINDS[each][0] for each in dict.fromkeys(k for k, _ in kinds))
         return Trip(kind, time, subject, expected, measured, check=check, figures=figures)
-
-    def _optimum(self, time: float) -> Trip | None:
-        if self.model is None or time - self._turn_asked < _OPTIMUM_EVERY_S:
-            return None
-        self._turn_asked = time
-        turned = self.model.past_optimum()
-        if not turned:
-            self._turned_since = float("nan")
-            return None
-        if not time - self._turned_since >= 0:
-            self._turned_since = time
-        if time - self._turned_since < _OPTIMUM_FOR_S:
-            return None
-        drive = self._drive[turned]
-        expected = "a drive with which more of it cools more"
-        measured = f"{drive:+.2f} for {time - self._turned_since:.0f} s, beyond the Peltier element's optimum"
-        return Trip("optimum", time, turned, expected, measured, figures={"drive": drive})
 
     def _share(self, name: str, value: float) -> float:
         low, high = self._span.get(name, (-1.0, 1.0))

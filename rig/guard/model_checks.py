@@ -26,8 +26,6 @@ drive, but more of it where more drive hardly does more, near a Peltier element'
 the effect of inputs is that from run to run it differs by 5 % of itself
 (:data:`~thermogrip.sysid.plant.fit_record.RUN_GAIN_SD`), so ``drive_limit`` is three of that.
 
-Of the model alone: would more cooling drive still cool?
-
 **A rig that has drifted.**  A plant is identified on one day; a room, its water and its thermal paste are
 others on the next.  Where the user states a drift s (a share, 0.05 say), each parameter may be theta_i (1 + s
 delta_i) with delta_i uniform between -1 and 1, of variance 1/3 (of a parameter on a linear scale, whose value
@@ -359,26 +357,6 @@ class ModelMonitor:
     def explain(self, alarm: Residual) -> list[Cause]:
         """Return what explains the readings of an alarm's window best; nothing where nothing does."""
         return explain_window(self._model, self._past, alarm.window) if alarm.kind == "window" else []
-
-    def past_optimum(self, seconds: float = 120.0) -> str:
-        """Return the drive with which more cooling would cool less, "" where there is none.
-
-        A Peltier element pumps heat in proportion to its current and makes heat with its square.  Beyond the
-        optimum a controller that wants it colder drives harder and gets it warmer: a runaway with the wrong
-        sign in it.  Asked of the model: from now on, does a tenth less drive end colder?
-        """
-        model, now = self._model, self._filter
-        n = max(1, round(seconds / self.plant.dt))
-        for j, at in enumerate(model.drive_at):
-            if now.u[at] >= -0.3 * model.half[j]:
-                continue
-            u = np.repeat(now.driven(now.u)[None, None], 2, axis=0).repeat(n, axis=1)
-            u[1, :, at] += 0.1 * model.half[j]
-            d = np.repeat(np.repeat(now.d[None, None], 2, axis=0), n, axis=1)
-            end = model.run(np.repeat(now.x[None], 2, axis=0), u, d)[:, -1]
-            if np.isfinite(end).all() and float((end[1] - end[0]).min()) < -0.02:
-                return self.drives[j]
-        return ""
 
     def _mask(self, time: float, masked: frozenset[str]) -> None:
         """Where an output is unmasked, its states are less certain, and its windows start afresh."""

@@ -14,14 +14,13 @@ A lost connection is opened again after 0.1 s, then after twice as long each tim
 lost, that it is back and how much was dropped between is in the record behind the bridge and on
 ``/thermogrip/status``.
 
-Nothing is accepted: what comes in is read, so that the end of a connection shows, and forgotten.  Nothing is
-encrypted: use it on a network of your own.
+Nothing is subscribed to, and nothing that comes in is taken.  Nothing is encrypted: use it on a network of
+your own.
 """
 
 from __future__ import annotations
 
 import json
-import socket
 import threading
 import time
 from collections import deque
@@ -31,18 +30,17 @@ from functools import partial
 from math import isfinite
 from typing import Any
 
-from thermogrip.datasets.errors import as_user_error
+from thermogrip.datasets.errors import UserError, as_user_error
 from thermogrip.datasets.media import without_password
 from thermogrip.datasets.units import split_header
 from thermogrip.rig.clock import BackOff
 from thermogrip.rig.interface import Event
+from thermogrip.rig.serial.port import FIRST_WAIT_S, LONGEST_WAIT_S
 from thermogrip.rig.session.loop import Recorder
 
 PREFIX = "/thermogrip"
-_MOST_BYTES = 1 << 20  # of a message from the server: a longer one ends the connection
-_KEEP = 1000  # rows and events that wait for a slow network
-_FIRST_WAIT_S, _LONGEST_WAIT_S = 0.1, 5.0  # of the back-off
-_LOOK_S = 0.02  # how often a thread without a connection asks whether the next try is due
+_KEEP = 1000  # rows and events that wait for a slow network: a quarter of an hour of a session, MBs at most
+_LOOK_S = 0.1  # how often the sender looks whether a try is due, or the server is gone: a row of a grasp
 
 
 class Messages:
@@ -62,17 +60,17 @@ class Messages:
 
     def row(self, row: Mapping[str, float], *, stamp: float) -> list[str]:
         """Return the messages of one row of this date [s since 1970]; JSON has no number that is lost."""
-        found = []
+        texts = []
         for header, value in row.items():
             name, unit = split_header(header)
             if header == "time_s" or not isfinite(value):
                 continue
             if unit == "degC":
                 content: dict[str, Any] = {"header": _header(stamp), "temperature": value, "variance": 0.0}
-                found += self._publish(name, "sensor_msgs/Temperature", content)
+                texts += self._publish(name, "sensor_msgs/Temperature", content)
             else:
-                found += self._publish(name, "std_msgs/Float64", {"data": value})
-        return found
+                texts += self._publish(name, "std_msgs/Float64", {"data": value})
+        return texts
 
     def event(self, event: Event) -> list[str]:
         """Return the messages of one event."""
@@ -84,19 +82,11 @@ class Messages:
         return self._publish("status", "std_msgs/String", {"data": text})
 
     def _publish(self, name: str, kind: str, content: Mapping[str, Any]) -> list[str]:
-        topic, found = f"{self.prefix}/{name}", []
+        topic, texts = f"{self.prefix}/{name}", []
         if topic not in self._advertised:
             self._advertised.add(topic)
-            found.append(_text(op="advertise", topic=topic, type=kind))
-        return [*found, _text(op="publish", topic=topic, msg=content)]
-
-
-def _hang_up(link: Any, *, at_once: bool = False) -> None:
-    """Close a connection; a network that is gone cannot be closed better than this."""
-    with suppress(Exception):
-        if at_once:  # a thread hangs in it
-            link.socket.shutdown(socket.SHUT_RDWR)
-        link.close()
+            texts.append(_text(op="advertise", topic=topic, type=kind))
+        return [*texts, _text(op="publish", topic=topic, msg=content)]
 
 
 class Bridge:
@@ -108,7 +98,6 @@ class Bridge:
         ``ws://HOST:9090`` of a rosbridge server.
     clock : callable
         The date [s since 1970], for the messages' stamps.
-    messages : Messages, optional
     behind : Recorder, optional
         A recorder that gets everything too, first (the run folder), and what happens to the connection.
     timeout : float, optional
@@ -118,8 +107,6 @@ class Bridge:
 
     Attributes
     ----------
-    sent : int
-        Messages.
     dropped : int
         Rows and events that were not sent.
     reports : tuple of str
@@ -144,28 +131,28 @@ class Bridge:
         url: str,
         *,
         clock: Callable[[], float],
-        messages: Messages | None = None,
         behind: Recorder | None = None,
         timeout: float = 5.0,
         monotonic: Callable[[], float] = time.monotonic,
     ) -> None:
         self.url, self._shown = url, without_password(url)
-        self.messages, self.behind = Messages() if messages is None else messages, behind
-        self.sent, self.dropped = 0, 0
+        self.messages = Messages()
+        self.behind = behind
+        self.dropped = 0
         self.reports: tuple[str, ...] = ()
-        self._clock, self._timeout, self._monotonic = clock, timeout, monotonic
-        self._back_off = BackOff(monotonic, first=_FIRST_WAIT_S, longest=_LONGEST_WAIT_S)
+        self._clock, self._timeout = clock, timeout
+        self._back_off = BackOff(monotonic, first=FIRST_WAIT_S, longest=LONGEST_WAIT_S)
         self._waiting: deque[Callable[[], list[str]]] = deque()
-        self._changed = threading.Condition()  # of all that the threads share
-        self._recorded, self._reported, self._time, self._ending = 0, 0, 0.0, False
-        self._link: Any | None = None
-        self._take(self._connect())
+        self._changed = threading.Condition()  # of all that the two threads share
+        self._n_recorded, self._n_reported = 0, 0  # of the reports, and of what was dropped
+        self._time_s, self._ending = 0.0, False
+        self._link: Any = self._connect()
         self._sender = threading.Thread(target=self._work, daemon=True)
         self._sender.start()
 
     def sample(self, row: Mapping[str, float]) -> None:
         """Publish one row."""
-        self._time = row.get("time_s", self._time)
+        self._time_s = row.get("time_s", self._time_s)
         if self.behind is not None:
             self.behind.sample(row)
         self._record()
@@ -180,7 +167,7 @@ class Bridge:
     @contextmanager
     def before(self, recorder: Recorder) -> Iterator[Bridge]:
         """Publish what this recorder gets, while the block runs; the connection outlasts it."""
-        self.behind, self._time = recorder, 0.0
+        self.behind, self._time_s = recorder, 0.0
         try:
             yield self
         finally:
@@ -195,14 +182,11 @@ class Bridge:
             self._changed.notify_all()
         self._sender.join(self._timeout)
         with self._changed:
-            link, self._link = self._link, None
             self.dropped += len(self._waiting)
             self._waiting.clear()
-            if self.dropped > self._reported:
+            if self.dropped > self._n_reported:
                 self._report(f"{self._not_sent()} were not sent")
-        if link is not None:
-            _hang_up(link, at_once=self._sender.is_alive())
-            self._hearer.join(self._timeout)
+        self._hang_up()
         with suppress(OSError):  # it is closed already, or its disk is full, which the run itself records
             self._record()
 
@@ -217,83 +201,68 @@ class Bridge:
         with as_user_error(ImportError, "a bridge needs websockets", hint=hint):
             from websockets.exceptions import WebSocketException
             from websockets.sync.client import connect
-        wait, hint = self._timeout, "start rosbridge_server, or check host and port"
+        hint = "start rosbridge_server, or check host and port"
         wrong = (OSError, TimeoutError, WebSocketException, ValueError)
         refused = as_user_error(wrong, "no rosbridge answers ({error})", file=self._shown, hint=hint)
         with refused, ExitStack() as undo:
-            opening = connect(self.url, open_timeout=wait, close_timeout=wait, max_size=_MOST_BYTES)
+            opening = connect(self.url, open_timeout=self._timeout, close_timeout=self._timeout)
             link = undo.enter_context(opening)
             link.ping()  # one that hangs up at once is no rosbridge
             undo.pop_all()  # from now on it is for _hang_up
         return link
 
-    def _take(self, link: Any) -> None:
-        self.messages.forget()
-        self._link, self._since = link, self._monotonic()
-        self._hearer = threading.Thread(target=self._hear_all, args=(link,), daemon=True)
-        self._hearer.start()
-
-    def _connect_again(self) -> None:
-        try:
-            link = self._connect()
-        except Exception:  # whatever it is: it is tried again, and the loss is reported already
-            self._back_off.failed()
-            return
-        with self._changed:
-            if not self._ending:
-                text = f"connected to {self._shown} again; {self._not_sent()} were dropped"
-                self._report(text)
-                self._waiting.appendleft(partial(self.messages.status, text))
-                self._take(link)
-                return
-        _hang_up(link)
-
-    def _lose(self, link: Any, why: str) -> None:
-        """Drop a connection that was lost; whichever thread notices first reports it."""
-        with self._changed:
-            if self._link is not link:
-                return
-            self._link = None
-            if self._monotonic() - self._since >= _LONGEST_WAIT_S:  # one that ends at once is no success
-                self._back_off.succeeded()
-            self._back_off.failed()
-            self._report(f"the connection to {self._shown} was lost ({why})")
-            self._changed.notify_all()
-        _hang_up(link)
+    def _hang_up(self) -> None:
+        """Close the connection; a network that is gone cannot be closed better than this."""
+        link, self._link = self._link, None
+        if link is not None:
+            with suppress(Exception):
+                link.close()
 
     def _work(self) -> None:
         """Send what waits; connect again where there is no connection."""
         while True:
             with self._changed:
-                if not self._ending and not (self._waiting if self._link else self._back_off.due()):
-                    self._changed.wait(None if self._link else _LOOK_S)
-                link = self._link
-                if self._ending and not (link and self._waiting):
+                if not self._waiting and not self._ending:
+                    self._changed.wait(_LOOK_S)
+                if self._ending and not (self._link and self._waiting):
                     return
-                item = self._waiting.popleft() if link and self._waiting else None
-            if link is not None and item is not None:
-                self._send(link, item)
-            elif link is None and self._back_off.due():
+                item = self._waiting.popleft() if self._link and self._waiting else None
+            if self._link is None:
                 self._connect_again()
+            else:
+                self._send(item)
 
-    def _send(self, link: Any, item: Callable[[], list[str]]) -> None:
+    def _connect_again(self) -> None:
+        """Try to connect, if that is due."""
+        if not self._back_off.due():
+            time.sleep(_LOOK_S)
+            return
         try:
-            for text in item():
-                link.send(text)
-                self.sent += 1
+            self._link = self._connect()
+        except UserError:  # it is tried again, and the loss is reported already
+            self._back_off.failed()
+            return
+        self._back_off.succeeded()
+        self.messages.forget()
+        with self._changed:
+            text = f"connected to {self._shown} again; {self._not_sent()} were dropped"
+            self._report(text)
+            self._waiting.appendleft(partial(self.messages.status, text))
+
+    def _send(self, item: Callable[[], list[str]] | None) -> None:
+        """Send what an item makes, and take what came in, whose end is that of the connection."""
+        try:
+            for text in () if item is None else item():
+                self._link.send(text)
+            with suppress(TimeoutError):
+                self._link.recv(timeout=0)
         except Exception as error:  # of whatever kind: the view is gone, the session goes on
+            reason = " ".join(str(error).split())[:200] or type(error).__name__
             with self._changed:
-                self.dropped += 1
-            self._lose(link, _reason(error))
-
-    def _hear_all(self, link: Any) -> None:
-        why = "the server closed it"
-        try:
-            for _ in link:
-                pass
-        except Exception as error:  # the end of the connection comes as one of many errors
-            why = _reason(error)
-        self._lose(link, why)
+                self.dropped += item is not None
+                self._report(f"the connection to {self._shown} was lost ({reason})")
+            self._back_off.failed()
+            self._hang_up()
 
     def _put(self, item: Callable[[], list[str]]) -> None:
         """Queue what makes messages; where the network is too slow the oldest goes."""
@@ -308,18 +277,14 @@ class Bridge:
         self.reports = (*self.reports, text)
 
     def _not_sent(self) -> str:
-        more, self._reported = self.dropped - self._reported, self.dropped
+        more, self._n_reported = self.dropped - self._n_reported, self.dropped
         return f"{more} rows and events"
 
     def _record(self) -> None:
         if self.behind is not None:
-            for text in self.reports[self._recorded :]:
-                self._recorded += 1
-                self.behind.event(Event(self._time, "bridge", text))
-
-
-def _reason(error: Exception) -> str:
-    return " ".join(str(error).split())[:200] or type(error).__name__
+            for text in self.reports[self._n_recorded :]:
+                self._n_recorded += 1
+                self.behind.event(Event(self._time_s, "bridge", text))
 
 
 def _header(stamp: float) -> dict[str, Any]:

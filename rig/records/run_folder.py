@@ -4,19 +4,13 @@ Its files, and which folders are refused, are described in ``docs/reference/file
 
 **Writing.**  Lines of text are the one format that a killed process leaves whole; everything else is exported
 from it later.  A session waits for no disk: one thread writes the lines, each at once and in one ``write``,
-another forces them to disk, once a second and after each event.  ``kill -9`` loses only lines that a disk
-which hangs has not taken yet, a power cut only those of the last second and of the time that the disk needs
-to force them.
-
-**A full disk.**  A part of a line that still fitted is cut off again.  The folder keeps ``RESERVE`` bytes in
-a file of their own from the start; they are given back then, so that the line at hand, the reason and the
-verdict still find room.  The caller gets the ``OSError`` at that row or the next one, and the loop switches
-off.  A disk that has not taken the last ``MOST_WAITING`` lines counts as gone.
+another forces them to disk, once a second and after each event.  A part of a line that still fitted on a full
+disk is cut off again; the caller gets the ``OSError`` at that row or the next one, and the loop switches off.
+A disk that has not taken the last ``MOST_WAITING`` lines counts as gone.
 
 **Reading.**  A line counts if it is whole: ended, of the header's width, every cell a number or empty.  After
 a power cut a file system may leave half a line, or zeros, at the end; lines after the last whole one are the
-tail.  A bad line with whole ones after it is damage of another kind; it is skipped and reported.  The log and
-the grasps are made of the whole rows, never of anything else; no measured number is ever touched.
+tail.  A bad line with whole ones after it is damage of another kind; it is skipped and reported.
 """
 
 from __future__ import annotations
@@ -32,17 +26,14 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import ExitStack, suppress
-from dataclasses import asdict, dataclass
-from datetime import datetime
+from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from math import isfinite
 from pathlib import Path
-from struct import error as StructError
 from types import TracebackType
 from typing import Any
 
 from thermogrip.datasets.atomic_files import (
-    atomic_path,
     file_hash,
     make_folder,
     open_new,
@@ -52,11 +43,11 @@ from thermogrip.datasets.atomic_files import (
     write_atomic,
     write_json,
 )
-from thermogrip.datasets.errors import UserError, as_user_error, os_fault, os_faults
+from thermogrip.datasets.errors import UserError, os_faults
 from thermogrip.datasets.grasp_files import read_grasps, write_grasps
 from thermogrip.datasets.log_files import write_log
 from thermogrip.datasets.media import csv_text, from_csv
-from thermogrip.datasets.schema import Grasps, Log, column
+from thermogrip.datasets.schema import Grasps, Log
 from thermogrip.rig.guard.sensor_checks import room_sensors
 from thermogrip.rig.interface import Event
 from thermogrip.rig.session.loop import PHASES, log_of_rows
@@ -64,15 +55,14 @@ from thermogrip.rig.session.session import Session, grasp_of_rows
 from thermogrip.rig.session.signals import hold_signals
 
 SCHEMA, VERSION = "thermogrip.run", 1
-RESERVE = 1 << 18  # bytes, for the last words of a run on a full disk
 MOST_WAITING = 6000  # lines for a disk that hangs: ten minutes of the fastest rows (of a grasp, 10 a second)
 # for which a row holds up its caller: less than half of the shortest sample (0.05 s), more than Python needs
 # to change threads (5 ms), so that a disk that is well has the row when the call returns
 _AT_ONCE_S = 0.02
 FILES = ("run.json", "samples.csv", "events.jsonl", "grasps.csv", "grasps_meta.csv")
 _GRASPS = ("grasps.csv", "grasps_meta.csv")
-_RESERVE, _SUMS = ".reserve", "SHA256SUMS"
-NAMES = (*FILES, _RESERVE, _SUMS)  # of everything that a run may leave
+_SUMS = "SHA256SUMS"
+NAMES = (*FILES, _SUMS)  # of everything that a run may leave
 _PACKAGES = ("thermogrip", "numpy", "scipy", "xarray", "casadi", "daqp", "pyserial")
 
 
@@ -100,11 +90,9 @@ class RunFolder:
         with ExitStack() as undo, os_faults(self.path):
             make_folder(self.path)
             refuse_used(self.path)
-            self._reserve = _Reserve(self.path / _RESERVE)
-            undo.callback(self._reserve.give_back)
-            self._samples = _Lines(self.path / "samples.csv", self._reserve)
+            self._samples = _Lines(self.path / "samples.csv")
             undo.callback(self._samples.remove)
-            self._events = _Lines(self.path / "events.jsonl", self._reserve)
+            self._events = _Lines(self.path / "events.jsonl")
             undo.callback(self._events.remove)
             self._write_about({"verdict": "running"})  # at last, for it forces the names of all to disk
             undo.pop_all()
@@ -115,7 +103,7 @@ class RunFolder:
 
     def sample(self, row: Mapping[str, float]) -> None:
         """Take one row; the first one sets the columns, and others are a ValueError.  OSError where the disk
-        is full or gone, or was at an earlier line; the row is on disk if the reserve had room for it."""
+        is full or gone, or was at an earlier line."""
         if not self._header:
             self._header = tuple(row)
             self._write(self._samples, csv_text([self._header]).encode())
@@ -144,31 +132,29 @@ class RunFolder:
 
     def finish(self, session: Session) -> None:
         """Write the verdict, and the grasp where there is one; call it before :meth:`close`."""
-        self._take_all()
         if session.grasps is not None:
             write_grasps(session.grasps, self.path / "grasps.csv")
         figures = {
-            "settle_time": session.settle_time, "overshoot": session.overshoot, "bias": session.bias,
+            "settle_time": session.settle_time,
+            "overshoot": session.overshoot,
+            "bias": session.bias,
             "contact_s": session.contact,
-        }  # fmt: skip
+        }
         finite = {key: value if value == value else None for key, value in figures.items()}  # JSON has no NaN
         trip = {} if session.trip is None else {"trip": session.trip.as_dict()}
-        self._write_about({"verdict": session.verdict, "advice": session.advice, **finite, **trip})
+        self._end({"verdict": session.verdict, "advice": session.advice, **finite, **trip})
 
     def played(self, ended: str) -> None:
         """Write that a schedule was played, or what ended it; call it before :meth:`close`."""
-        self._take_all()
-        self._write_about({"verdict": "tripped" if ended else "played", "advice": ended})
+        self._end({"verdict": "tripped" if ended else "played", "advice": ended})
 
-    def _take_all(self) -> None:
-        """Wait for the disk; UserError where it refuses a line, and no row or event has said so before."""
-        self._reserve.give_back()
-        known = self._disk.refused
-        try:
+    def _end(self, result: Mapping[str, Any]) -> None:
+        """Wait for the disk and write the result; UserError where it refuses, if no row has said so."""
+        known = (UserError,) if self._disk.refused else ()
+        with suppress(*known), os_faults(self.path):
             self.sync()
-        except OSError as error:
-            if not known:
-                raise os_fault(error, self.path) from error
+        with suppress(*known):
+            self._write_about(result)
 
     def close(self) -> None:
         """Close the files and write their sums, which no signal interrupts; may be called twice."""
@@ -176,7 +162,6 @@ class RunFolder:
             return
         with hold_signals():
             self._closed = True
-            self._reserve.give_back()
             with suppress(OSError):  # a disk that is gone cannot be forced
                 self.sync()
             self._disk.close()
@@ -192,7 +177,6 @@ class RunFolder:
         with hold_signals():
             if kind is not None and not self._closed:
                 ended = "interrupted" if issubclass(kind, KeyboardInterrupt) else "failed"
-                self._reserve.give_back()
                 with suppress(UserError):  # what ends it is more important than what can be written of it
                     self._write_about({"verdict": ended, "advice": f"{kind.__name__}: {error}"})
             self.close()
@@ -318,35 +302,22 @@ class _Disk:
 class _Lines:
     """A file to which whole lines are appended, or nothing."""
 
-    def __init__(self, path: Path, reserve: _Reserve) -> None:
-        self._path, self._reserve = path, reserve
+    def __init__(self, path: Path) -> None:
+        self._path = path
         self._file = open_new(path)
         self._size = 0
 
     def write(self, line: bytes) -> None:
+        rest = memoryview(line)
         try:
-            self._append(line)
-        except OSError as first:
-            self._cut()
-            if not self._reserve.give_back():
-                raise
-            try:
-                self._append(line)
-            except OSError:
-                self._cut()
-                raise
-            raise first  # the line is on disk, and the caller knows that it was the last but a few
-
-    def _append(self, data: bytes) -> None:
-        left = memoryview(data)
-        while left:
-            left = left[_write(self._file, left) :]
-        self._size += len(data)
-
-    def _cut(self) -> None:
-        with suppress(OSError):  # the reader drops half a line, too
-            os.ftruncate(self._file, self._size)
-            os.lseek(self._file, self._size, os.SEEK_SET)
+            while rest:
+                rest = rest[_write(self._file, rest) :]
+        except OSError:
+            with suppress(OSError):  # the reader drops half a line, too
+                os.ftruncate(self._file, self._size)
+                os.lseek(self._file, self._size, os.SEEK_SET)
+            raise
+        self._size += len(line)
 
     def sync(self) -> None:
         os.fsync(self._file)
@@ -357,28 +328,6 @@ class _Lines:
     def remove(self) -> None:
         self.close()
         self._path.unlink()
-
-
-class _Reserve:
-    """Disk space that is kept so that it can be given back."""
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        file = open_new(path)
-        try:
-            with open(file, "wb") as reserve:
-                reserve.write(os.urandom(RESERVE))  # not zeros, which some disks store as nothing
-        except OSError:
-            self.give_back()
-            raise
-
-    def give_back(self) -> bool:
-        """Free the space; say whether there was some."""
-        try:
-            self._path.unlink()
-        except OSError:
-            return False
-        return True
 
 
 def _write(file: int, data: memoryview) -> int:
@@ -506,7 +455,7 @@ def recover(folder: str | Path) -> Recovery:
         findings.append("the run did not end by itself: its verdict is now interrupted")
         content = {key: value for key, value in run.about.items() if key not in ("schema", "version")}
         write_json(path / "run.json", {**content, "verdict": "interrupted"}, schema=SCHEMA, version=VERSION)
-    (path / ".reserve").unlink(missing_ok=True)
+    (path / ".reserve").unlink(missing_ok=True)  # which version 0.2.0 kept
     write_sums(path)
     rows = 0 if run.log is None else run.log.sizes["time"]
     findings.append(f"{rows} rows and {len(run.events)} events are whole")
@@ -526,70 +475,11 @@ def mark_bad(folder: str | Path, why: str) -> None:
 
 
 def export_run(folder: str | Path, out: str | Path) -> Path:
-    """Write the log of a run folder as ``.nc``, ``.parquet``, ``.csv`` or ``.mcap`` and return the path."""
-    run, path = read_run(folder), Path(out)
+    """Write the log of a run folder as ``.nc``, ``.parquet`` or ``.csv`` and return the path."""
+    run = read_run(folder)
     if run.log is None:
         raise UserError("has fewer than two rows", file=folder, hint="give a run that recorded something")
-    if path.suffix.lower() != ".mcap":
-        return write_log(run.log, path)
-    odd = (OverflowError, StructError)
-    no_date = as_user_error(odd, "has a time that MCAP cannot have", file=folder, hint="write .nc or .csv")
-    with atomic_path(path) as temporary, no_date:
-        _write_mcap(run, temporary)
-    return path
-
-
-def _write_mcap(run: Run, path: Path) -> None:
-    """Write one channel a variable of the log, as JSON messages (``{"time_s": .., "value": ..}``) with a JSON
-    schema that carries unit and role, so that any MCAP reader shows it without our types, and one of events.
-
-    Times are nanoseconds since 1970, counted from the run's date in ``run.json``.
-    """
-    hint = "pip install thermogrip[ros]"
-    with as_user_error(ImportError, "needs the package mcap", file=path, hint=hint):
-        from mcap.writer import Writer
-    log, began = run.log, _nanoseconds(run)
-    assert log is not None
-    columns = {str(name): column(log, str(name)) for name in log.data_vars}
-    with path.open("wb") as file:
-        writer = Writer(file)
-        writer.start(profile="", library="thermogrip")
-        writer.add_metadata("run", {"run.json": json.dumps(run.about)})
-        channels = {}
-        for name in columns:
-            attrs = {key: str(log[name].attrs[key]) for key in ("units", "role")}
-            channels[name] = _channel(writer, f"/{name}", f"sample_{name}", {"value": "number"}, attrs)
-        events = _channel(writer, "/events", "event", {"kind": "string", "text": "string"}, {})
-        for k, time_s in enumerate(log["time"].values.tolist()):
-            for name, values in columns.items():
-                if values[k] == values[k]:  # a lost reading is no message
-                    content = {"time_s": time_s, "value": float(values[k])}
-                    _message(writer, channels[name], began, k, content)
-        for k, event in enumerate(run.events):
-            _message(writer, events, began, k, asdict(event))
-        writer.finish()  # type: ignore[no-untyped-call]
-
-
-def _channel(writer: Any, topic: str, title: str, fields: dict[str, str], attrs: dict[str, str]) -> int:
-    """Register a channel of JSON messages, whose schema has the time besides these fields."""
-    properties = {key: {"type": kind} for key, kind in {"time_s": "number", **fields}.items()}
-    schema = json.dumps({"title": title, "type": "object", "properties": properties}).encode()
-    number = writer.register_schema(name=f"thermogrip.{title}", encoding="jsonschema", data=schema)
-    channel = writer.register_channel(topic=topic, message_encoding="json", schema_id=number, metadata=attrs)
-    return int(channel)
-
-
-def _message(writer: Any, channel: int, began: int, k: int, content: dict[str, Any]) -> None:
-    stamp, data = began + round(1e9 * content["time_s"]), json.dumps(content).encode()
-    writer.add_message(channel_id=channel, log_time=stamp, publish_time=stamp, sequence=k, data=data)
-
-
-def _nanoseconds(run: Run) -> int:
-    """Return when the run began [ns since 1970], 0 where not known."""
-    try:
-        return round(datetime.fromisoformat(str(run.about.get("began", ""))).timestamp()) * 1_000_000_000
-    except ValueError:
-        return 0
+    return write_log(run.log, out)
 
 
 def sums_agree(folder: Path) -> list[str] | None:

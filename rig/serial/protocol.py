@@ -5,10 +5,9 @@ firmware.  The host asks and the device answers once, with the number of the que
 
     7 drive 2000 1 2500            ->   7 ok armed 81204 power 17 - 1 0 2500 31250,30812,25000
     8 drive 2000 0 2500            ->   8 err interlock
-    9 take 118                     ->   9 ok 82310 118 120 24,1,2500,31250,30812,25000 -
                                         0 boot watchdog 18 0.2.0+5309
 
-Every answer but those of hello and take is the whole state, so one exchange a sample both drives and reads.
+Every answer but that of hello is the whole state, so one exchange a sample both drives and reads.
 A question that got no answer is asked again with the same number; the device repeats its answer and does
 nothing twice.  An answer to anything but the question that is open is reported and never used.
 
@@ -157,61 +156,6 @@ def _words(message: Request | State) -> tuple[str, ...]:
 
 
 LOST = ("open", "short")
-_HOLE = "-"
-
-
-@dataclass(frozen=True)
-class Kept:
-    """One reading of the device's own."""
-
-    age_ms: int  # how long before the answer it was taken
-    pump: int
-    drive: tuple[int, ...]  # applied then [1e-4 of the unit]
-    temperatures: tuple[int | str, ...]  # thousandths of a degC, ``open`` or ``short``
-
-    def word(self) -> str:
-        """Return it as a word of a line."""
-        return join((self.age_ms, self.pump, *self.drive, *self.temperatures))
-
-
-@dataclass(frozen=True)
-class Taken:
-    """Readings of consecutive ticks."""
-
-    uptime_ms: int  # the device's clock at the answer, modulo 2**32
-    first: int  # number of the first tick here, modulo 2**32
-    next: int  # number of the tick that is still to come; more wait where this answer does not reach it
-    readings: tuple[Kept | None, ...]  # none where the device came too late for a tick
-
-    @property
-    def waiting(self) -> int:
-        """How many ticks wait on the device after these."""
-        return (self.next - self.first - len(self.readings)) % 2**32
-
-    def words(self) -> tuple[str, ...]:
-        """Return the words after ``ok``."""
-        kept = (_HOLE if reading is None else reading.word() for reading in self.readings)
-        return (str(self.uptime_ms), str(self.first), str(self.next), *kept)
-
-
-def parse_taken(words: Sequence[str], n_drives: int) -> Taken:
-    """Return the readings of the words after ``ok``, ValueError where they are malformed."""
-    uptime_ms, first, to_come = map(integer, words[:3])
-    readings = tuple(None if word == _HOLE else _kept(word, n_drives) for word in words[3:])
-    ticks = (to_come - first) % 2**32
-    stuck = ticks > 0 and not readings  # would be requested for ever
-    _check(min(uptime_ms, first, to_come) >= 0 and len(readings) <= ticks < 2**31 and not stuck)
-    return Taken(uptime_ms, first, to_come, readings)
-
-
-def _kept(word: str, n_drives: int) -> Kept:
-    age, pump, *rest = word.split(",")
-    drive = tuple(map(integer, rest[:n_drives]))
-    kept = Kept(integer(age), _switch(pump), drive, _temperatures(rest[n_drives:]))
-    _check(kept.age_ms >= 0 and bool(kept.temperatures))
-    return kept
-
-
 MAX_TTL_MS = 2000
 PROTOCOL = "thermogrip/1"
 MODES = ("off", "armed", "expired", "latched")
@@ -224,7 +168,6 @@ REFUSALS = {
     "interlock": "no drive while the pump is off",
     "range": "a number is out of its range",
     "ttl": "the time to live is not 1 to 2000 ms",
-    "idle": "the device takes no readings of its own; it was reset, or never asked to",
     "active": "the fault is still there, so it cannot be cleared",
     "syntax": "the question has the wrong words",
     "unknown": "the device does not know this question",
@@ -272,24 +215,11 @@ class Clear:
     """Clear the fault latch, if what tripped it is over."""
 
 
-@dataclass(frozen=True)
-class Sample:
-    """Take a reading every ``period_ms`` (10 to 1000) from now on, numbered from 0; 0 takes none."""
-
-    period_ms: int
-
-
-@dataclass(frozen=True)
-class Take:
-    """Ask for those readings from this number on; all before it have arrived."""
-
-    number: int
-
-
-Request: TypeAlias = Hello | Read | Drive | Grip | Off | Clear | Sample | Take
+Request: TypeAlias = Hello | Read | Drive | Grip | Off | Clear
 _FORMS: dict[str, tuple[Callable[[str], Any], ...]] = {
-    "drive": (integer, _switch, integers), "grip": (_switch,), "sample": (integer,), "take": (integer,),
-}  # fmt: skip
+    "drive": (integer, _switch, integers),
+    "grip": (_switch,),
+}
 _KINDS: dict[str, type[Request]] = {kind.__name__.lower(): kind for kind in get_args(Request)}
 
 
@@ -348,7 +278,7 @@ class Answer:
     """The device answered the open question."""
 
     request: Request
-    content: Identity | State | Taken
+    content: Identity | State
 
 
 @dataclass(frozen=True)
@@ -434,20 +364,15 @@ class HostEnd:
         self._open = None
         return answered
 
-    def _content(self, words: Sequence[str]) -> Identity | State | Taken:
+    def _content(self, words: Sequence[str]) -> Identity | State:
         if isinstance(self._open, Hello):
             self.identity = parse_identity(words)
             return self.identity
-        if isinstance(self._open, Take):
-            _check(self.identity is not None)
-            taken = parse_taken(words, len(self.identity.drives) if self.identity else 0)
-            _check(all(self._fits(kept) for kept in taken.readings if kept))
-            return taken
         state = parse_state(words)
         _check(self._fits(state))
         return state
 
-    def _fits(self, heard: State | Kept) -> bool:
+    def _fits(self, heard: State) -> bool:
         """Say whether it has as many numbers as the device has drives and sensors, where known."""
         known = self.identity
         shape = (len(heard.drive), len(heard.temperatures))

@@ -30,7 +30,7 @@ from thermogrip.datasets.units import join_header, split_header
 from thermogrip.mpc.interface import Controller, Move
 from thermogrip.rig.guard.guard import Guard
 from thermogrip.rig.guard.trip import ENDLESS, Trip, TripError
-from thermogrip.rig.interface import DeviceRefusedError, Event, Reading, Rig, SamplingRig
+from thermogrip.rig.interface import DeviceRefusedError, Event, Reading, Rig
 from thermogrip.rig.serial.port import PortError
 from thermogrip.rig.session.profile import Profile
 from thermogrip.rig.session.signals import check_stopped, hold_signals
@@ -76,7 +76,6 @@ class Loop:
     events: list[Event] = field(default_factory=list)
     target: dict[str, float] = field(default_factory=dict)
     touching: bool = False
-    by_device: bool = False
     fresh: bool = False  # whether the newest reading may be handed to the controller
     disk_fault: str = ""
     status: str = "ok"
@@ -169,27 +168,6 @@ class Loop:
         for _ in range(n):
             self.record(phase)
             self.wait(dt)
-            if self.by_device:
-                self._fill(dt)
-
-    def let_device_sample(self, dt: float) -> None:
-        """Let the rig measure by its own clock too, where it can: :meth:`sample` may come too late."""
-        rig = self.rig
-        self.by_device = isinstance(rig, SamplingRig) and self.ask(lambda: rig.sample_every(dt))
-
-    def _fill(self, dt: float) -> None:
-        """Add the rows that this program was too late for: the device has measured all the same."""
-        rig, last, newest = self.rig, self.rows[-1], self.reading.time_s
-        assert isinstance(rig, SamplingRig)
-        readings, lost = self.ask(rig.take)
-        if lost:
-            self.note("lost", f"{lost} samples of the device's own came too late to be kept")
-        if newest - last["time_s"] < 1.5 * dt:
-            return
-        for reading in readings:
-            if last["time_s"] + 0.5 * dt < reading.time_s < newest - 0.5 * dt:
-                self.rows.append({**last, **_measured(reading)})
-                self._write(self.rows[-1])
 
     def check(self) -> None:
         """Have the guard check the newest reading."""

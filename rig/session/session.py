@@ -11,9 +11,6 @@ the rig pass one sample time.
     contact   the gripper closes (time 0 of the grasp) and ``grasp_time`` seconds are recorded, fewer where
               ``stop`` ends it; then it opens
 
-From the lead-in on a rig that can (our firmware) measures by its own clock too, so that a row which this
-program is too late for is filled in.
-
 Whatever ends it (done, time-out, a trip, an exception, Ctrl-C, ``kill``), drive and pump are off afterwards.
 A session that does not settle is an answer (a verdict), not an error, and so is one that the guard ended: its
 ``trip`` has what was expected and what was measured.
@@ -321,7 +318,6 @@ def _touch(
     """Stop the pump, close the gripper, record and open it; return the one grasp."""
     first, n_lead = len(run.rows), max(1, round(LEAD_S / dt))
     run.report(0.9, "grasping")
-    run.let_device_sample(dt)
     run.ends = run.reading.time_s + n_lead * dt
     run.sample("lead_in", n_lead, dt)
     run.move = Move(drive=run.no_drive(), pump=0)
@@ -354,7 +350,6 @@ def _touch(
                 break
     finally:
         run.open_gripper()
-    run.let_device_sample(0.0)
     return grasp_so_far()
 
 

@@ -457,8 +457,6 @@ class VirtualDevice:
         now = self._now_ms()
         while (due := self._due()) <= now:
             self.bench.advance(due / 1000)
-            if isinstance(self.core, DeviceCore) and self.core.ring.due(due):
-                self.core.keep(self.bench.readings(), due)
             if due == self._next_ms:
                 self._next_ms += SAMPLE_MS
                 self._sample(due)
@@ -468,10 +466,9 @@ class VirtualDevice:
         self.bench.advance(now / 1000)
 
     def _due(self) -> int:
-        """Return when something is to happen next: a sample, the end of a drive, a reading to keep."""
-        kept = self.core.ring.due_ms if isinstance(self.core, DeviceCore) else None
-        dues = (self._next_ms, self.core.expires_ms, kept)
-        return min(due for due in dues if due is not None)
+        """Return when something is to happen next: a sample, or the end of a drive."""
+        expires_ms = self.core.expires_ms
+        return self._next_ms if expires_ms is None else min(self._next_ms, expires_ms)
 
     def _sample(self, now_ms: int) -> None:
         self.core.sample(self.bench.sample(), flow=self.bench.flow, now_ms=now_ms)

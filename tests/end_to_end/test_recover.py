@@ -24,10 +24,8 @@ def killed(path: Path, n: int = 30) -> Path:
     return path
 
 
-@pytest.mark.parametrize("name", ["log.nc", "log.parquet", "log.csv", "log.mcap"])
+@pytest.mark.parametrize("name", ["log.nc", "log.parquet", "log.csv"])
 def test_a_run_is_written_in_other_formats_and_reads_back(tmp_path: Path, name: str) -> None:
-    if name.endswith("mcap"):
-        pytest.importorskip("mcap")
     folder = killed(tmp_path / "run")
     assert main(["recover", str(folder), "--out", str(tmp_path / name)]) == 0
     log = read_log(tmp_path / name)

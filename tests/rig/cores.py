@@ -36,8 +36,6 @@ def reference(script: list[str]) -> str:
         elif word == "sample":
             values: list[Value] = [text if text.isalpha() else int(text) for text in rest[2:]]
             core.sample(values, flow=rest[0] == "1", now_ms=int(rest[1]))
-        elif word == "keep" and core.ring.due(int(rest[0])):
-            core.keep([text if text.isalpha() else int(text) for text in rest[1:]], int(rest[0]))
         elif word == "pins":
             pins = core.outputs
             numbers = [pins.enable, *pins.drive, pins.pump, pins.grip]
@@ -147,47 +145,6 @@ SCRIPTS = {
         "pins",
         say(3, "read", now=1000),
     ],
-    "readings by the device's own clock": [
-        *START,
-        say(2, "take", "0", now=6),
-        say(3, "sample", "9", now=7),
-        say(4, "sample", "1001", now=8),
-        say(5, "sample", "x", now=9),
-        say(6, "sample", "10", now=10),
-        "keep 9 1 1 1",
-        "keep 10 25000 -25000 open",
-        "keep 11 1 1 1",
-        say(7, "drive", "2000", "1", "-2500", now=12),
-        "keep 20 25001 short 273150",
-        "keep 47 25002 25000 25000",  # two ticks too late
-        say(8, "take", "0", now=48),
-        say(8, "take", "0", now=49),
-        say(9, "take", "1", now=50),
-        say(10, "take", "5", now=51),
-        say(11, "take", "4294967295", now=52),
-        say(12, "take", "4", now=53),
-        say(13, "take", now=54),
-        say(14, "sample", "0", now=55),
-        say(15, "take", "0", now=56),
-    ],
-    "a ring that nobody empties keeps the newest": [
-        *START,
-        say(2, "sample", "10", now=0),
-        *[f"keep {10 * k} {25000 + k} 25000 25000" for k in range(60)],
-        say(3, "take", "0", now=600),
-        say(4, "take", "36", now=601),
-        say(5, "take", "59", now=602),
-    ],
-    "readings across the end of the clock, and a device that stood still": [
-        "begin power 1 4294967200",
-        say(1, "sample", "1000", now=4294967200),
-        "keep 4294967200 25000 25000 25000",
-        "keep 904 25001 25000 25000",
-        say(2, "take", "0", now=905),
-        "keep 500000 25002 25000 25000",
-        say(3, "take", "0", now=500001),
-        say(4, "take", "500", now=500002),
-    ],
     "two drives and no pump": [
         "board lab",
         "begin power 1 0",
@@ -197,8 +154,5 @@ SCRIPTS = {
         "pins",
         "sample 0 5000 25000 25000",
         "pins",
-        say(3, "sample", "20", now=5001),
-        *[f"keep {5001 + 20 * k} -1{k:02d}000 25000" for k in range(30)],
-        say(4, "take", "0", now=5600),
     ],
 }

@@ -4,7 +4,6 @@
 //   begin CAUSE BOOT NOW         a reset; prints the announcement
 //   bytes HEX NOW                received bytes; prints each answer
 //   sample FLOW NOW V V V        1e-3 degC, open or short
-//   keep NOW V V V               the same, by the device's own clock, where a reading is due
 //   pins                         prints enable, drives, pump, grip
 //   ntc SUM N                    prints the thermistor's temperature
 #include <cstdio>
@@ -62,18 +61,15 @@ int main() {
         core.receive(static_cast<char>(std::stoi(hex.substr(k, 2), nullptr, 16)), now);
         std::fputs(core.answer(), stdout);
       }
-    } else if (word == "sample" || word == "keep") {
-      bool guards = word == "sample";
+    } else if (word == "sample") {
       int flow = 0;
       int32_t values[MAX_SENSORS] = {};
-      if (guards) in >> flow;
-      in >> now;
+      in >> flow >> now;
       for (uint8_t k = 0; k < board.n_sensors; ++k) {
         in >> word;
         values[k] = value_of(word);
       }
-      if (guards) core.sample(values, flow != 0, now);
-      if (!guards && core.due(now)) core.keep(values, now);
+      core.sample(values, flow != 0, now);
     } else if (word == "pins") {
       Outputs pins = core.outputs();
       std::printf("pins %d", pins.enable);

@@ -1,4 +1,4 @@
-"""The session in Foxglove: a channel a column, as in the MCAP of ``recover --out run.mcap``, and a layout.
+"""The session in Foxglove: a channel a column, and a layout.
 
     /NAME    {"time_s": .., "value": ..}            each temperature, drive, the pump, the target
     /events  {"time_s": .., "kind": .., "text": ..}

@@ -1,36 +1,28 @@
-"""Our firmware behind its driver: every failure is noted, none is hidden, and drives end by themselves.
-
-Readings that the device takes by its own clock arrive whole, in order, with their times.
-"""
+"""Our firmware behind its driver: every failure is noted, none is hidden, and drives end by themselves."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import nullcontext
-from dataclasses import replace
-from itertools import pairwise
 from unittest.mock import Mock
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from tests.rig.makers import Bench, Constant, DirectPort, SteppedClock, make_lab
 from thermogrip.datasets.errors import UserError
 from thermogrip.rig.drivers.connect import open_rig, recognise
-from thermogrip.rig.drivers.thermogrip import TTL_S, DeviceClock, DeviceRig, Gathering
+from thermogrip.rig.drivers.thermogrip import TTL_S, DeviceRig
 from thermogrip.rig.firmware.reference import DeviceCore
 from thermogrip.rig.guard.guard import Guard
-from thermogrip.rig.interface import DeviceRefusedError, Reading
+from thermogrip.rig.interface import DeviceRefusedError
 from thermogrip.rig.serial.port import PortError
-from thermogrip.rig.serial.protocol import Hello, HostEnd, Kept, Request, Taken, parse_request
+from thermogrip.rig.serial.protocol import Hello, HostEnd
 from thermogrip.rig.session.session import run_session
 from thermogrip.rig.simulation.virtual_device import VirtualDevice
 from thermogrip.sysid.plant.plant import Plant
 
-DT = 0.01
 DRIVE = {"drive": 0.5}
 
 
@@ -216,22 +208,18 @@ def test_a_board_that_comes_back_is_driven_on_where_its_number_says_so(direct: B
     assert direct.device.applied_drive == DRIVE
 
 
-@pytest.mark.parametrize(
-    ("boot", "usb", "driven"),
-    [(7, "A", True), (8, "A", True), (7, "B", False), (7, None, True), (8, None, False)],
-)
-def test_older_firmware_is_known_by_its_usb_interface_or_its_resets(
-    boot: int, usb: str | None, driven: bool, plant: Plant, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(("boot", "driven"), [(7, True), (8, False)])
+def test_older_firmware_is_known_by_its_resets(
+    boot: int, driven: bool, plant: Plant, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(DeviceCore, "version", "0.1.0")
     bench = Bench(plant, options={"timeout": 0.05})
-    port, bench.device.core.boot = bench.rig.port, 7
-    port.usb = bench.rig._usb = usb and (0x2341, 0x43, "A")
+    bench.device.core.boot = 7
     bench.rig.read()
     bench.device.fault("cable_pulled")
     bench.rig.read()
     bench.device.clear()
-    bench.device.core.boot, port.usb = boot, usb and (0x2341, 0x43, usb)
+    bench.device.core.boot = boot
     with nullcontext() if driven else pytest.raises(PortError, match="another device"):
         bench.rig.apply(DRIVE, 1)
     assert (bench.device.applied_drive == DRIVE) == driven
@@ -261,34 +249,6 @@ def test_a_question_is_asked_so_often_and_once_where_nothing_was_heard(
     assert notes.count(("damaged", "a line came damaged (check)")) == (24 if heard else 0)
     links = [text for kind, text in notes if kind == "link"]
     assert (len(links), links[-1]) == (2, "answers again")
-
-
-@pytest.mark.parametrize(
-    ("seconds", "takes"), [(0.01, True), (1.0, True), (0.009, False), (1.001, False), (0.0, False)]
-)
-def test_a_device_keeps_whole_milliseconds_from_10_to_1000(
-    sampling: Sampling, seconds: float, takes: bool
-) -> None:
-    assert sampling.rig.sample_every(seconds) == takes
-    assert (sampling.rig._gathering is not None) == takes
-
-
-def test_ticks_that_were_overwritten_or_missed_are_lost_and_the_next_is_asked_for() -> None:
-    clock, gathering = DeviceClock(), Gathering(10)
-    clock.see(0.0, 0.0, 0)
-    kept = Kept(20, 1, (0,), (1,))
-    assert gathering.take(Taken(1000, 3, 6, (kept, None, replace(kept, age_ms=0))), clock) == [
-        (pytest.approx(0.98), kept), (pytest.approx(1.0), replace(kept, age_ms=0)),
-    ]  # fmt: skip
-    assert (gathering.lost, gathering.number) == (3 + 1, 6)
-    gathering.take(Taken(1010, 2**32 - 1, 3, (replace(kept, age_ms=0),)), clock)
-    assert gathering.number == 0
-    gathering.device_was_reset()
-    gathering.lost = 0
-    gathering.take(Taken(1050, 0, 1, (replace(kept, age_ms=0),)), clock)
-    assert gathering.lost == 3  # 10 ms apart, from 1.01 s to 1.05 s
-    gathering.take(Taken(1200, 1, 2, (replace(kept, age_ms=0),)), clock)
-    assert gathering.lost == 3  # a tick that was late is not lost
 
 
 class Flood(DirectPort):
@@ -327,150 +287,3 @@ def test_a_port_that_vanishes_between_opening_and_reading_is_one_line(plant: Pla
         run_session(rig, Constant(), 30.0, clock=clock)
     assert "\n" not in str(refused.value)
     rig.close()
-
-
-# ---- readings by the device's own clock ----
-
-
-class Sampling(Bench):
-    """A bench whose device measures by itself."""
-
-    def __init__(self, plant: Plant) -> None:
-        super().__init__(plant, options={"timeout": 0.002, "greeting": 0.1})
-        self.got: list[Reading] = []
-        self.lost = 0
-
-    def take(self) -> None:
-        readings, lost = self.rig.take()
-        self.got += readings
-        self.lost += lost
-
-    def ticks(self) -> list[int]:
-        """Return which ticks there are readings of."""
-        return [round((reading.time_s - self.got[0].time_s) / DT) for reading in self.got]
-
-
-@pytest.fixture
-def sampling(plant: Plant) -> Iterator[Sampling]:
-    made = Sampling(plant)
-    assert made.rig.sample_every(DT)
-    yield made
-    made.close()
-
-
-def test_a_host_that_was_held_up_loses_nothing_and_each_reading_has_its_time_and_drive(
-    sampling: Sampling,
-) -> None:
-    sampling.clock.sleep(0.015)
-    sampling.rig.apply({"drive": 0.5}, 1)
-    for held_up in (0.015, 0.05, 0.2, 0.01, 0.13):
-        sampling.clock.sleep(held_up)
-        sampling.take()
-    assert sampling.lost == 0
-    assert [reading.time_s for reading in sampling.got] == pytest.approx(
-        [DT * k for k in range(43)], abs=1e-9
-    )
-    assert [(r.drive["drive"], r.pump) for r in sampling.got[:3]] == [(0.0, 0), (0.0, 0), (0.5, 1)]
-
-
-def test_what_the_device_could_not_keep_is_counted(sampling: Sampling) -> None:
-    sampling.clock.sleep(1.0)
-    sampling.take()
-    made = round(1.0 / DT) + 1
-    assert len(sampling.got) + sampling.lost == made
-    assert sampling.lost > made // 2
-    sampling.clock.sleep(0.1)
-    sampling.take()
-    assert len(sampling.got) + sampling.lost == made + 10
-    assert sampling.ticks() == list(range(len(sampling.got)))
-
-
-def test_over_a_bad_line_every_reading_comes_once(sampling: Sampling) -> None:
-    sampling.device.fault("garbage", rate=0.3)
-    for _ in range(100):
-        sampling.clock.sleep(0.05)
-        sampling.take()
-    sampling.device.clear()
-    sampling.take()
-    assert sampling.lost == 0
-    assert sampling.ticks() == list(range(501))
-
-
-def test_a_cable_that_is_out_for_less_than_the_device_keeps_costs_nothing(sampling: Sampling) -> None:
-    sampling.clock.sleep(0.05)
-    sampling.take()
-    sampling.device.fault("cable_pulled")
-    sampling.take()
-    sampling.clock.sleep(0.12)
-    sampling.device.clear("cable_pulled")
-    sampling.take()
-    sampling.take()
-    assert sampling.lost == 0
-    assert sampling.ticks() == list(range(18))
-
-
-def test_a_reset_costs_what_was_not_fetched_and_it_is_counted(sampling: Sampling) -> None:
-    sampling.clock.sleep(0.1)
-    sampling.take()
-    sampling.clock.sleep(0.06)
-    sampling.device.fault("reset")
-    sampling.clock.sleep(0.04)
-    sampling.take()  # begins anew
-    sampling.clock.sleep(0.1)
-    sampling.take()
-    assert len(sampling.got) + sampling.lost == round(0.3 / DT) + 1
-    assert sampling.lost == 9  # those of 0.11 s to 0.19 s
-    assert any(notice.kind == "reset" for notice in sampling.rig.notices())
-
-
-def test_a_device_that_cannot_keep_the_time_is_to_be_polled(sampling: Sampling) -> None:
-    assert not sampling.rig.sample_every(1 / 3)
-    assert not sampling.rig.sample_every(0.005)
-    with pytest.raises(RuntimeError, match="sample_every"):
-        sampling.rig.take()
-
-
-def test_an_older_firmware_is_to_be_polled(plant: Plant, monkeypatch: pytest.MonkeyPatch) -> None:
-    def of_old(words: Sequence[str]) -> Request | str:
-        return "unknown" if words[0] in ("sample", "take") else parse_request(words)
-
-    monkeypatch.setattr("thermogrip.rig.serial.protocol.parse_request", of_old)
-    old = Sampling(plant)
-    assert not old.rig.sample_every(DT)
-    old.rig.close()
-
-
-@given(
-    st.lists(st.tuples(st.floats(0.0005, 0.1), st.floats(0, 1), st.floats(0, 0.05)), min_size=1, max_size=60),
-    st.floats(-5e-3, 5e-3),
-    st.integers(0, 2**32 - 1),
-)
-def test_times_are_off_by_no_more_than_the_last_exchange_took(
-    exchanges: list[tuple[float, float, float]], drift: float, start: int
-) -> None:
-    clock, now = DeviceClock(), 0.0
-    for took, share, pause in exchanges:
-        now += pause
-        answered = now + share * took
-        uptime = (start + int(1000 * answered * (1 + drift))) % 2**32
-        clock.see(now, now + took, uptime)
-        now += took
-        assert abs(clock.time(uptime) - answered) <= took + 0.001
-
-
-def test_a_slow_exchange_moves_nothing() -> None:
-    clock = DeviceClock()
-    clock.see(1.0, 1.001, 1000)
-    before = clock.time(5000)
-    clock.see(2.0, 2.5, 2100)
-    assert clock.time(5000) == before
-
-
-def test_times_never_go_back_though_the_offset_does() -> None:
-    clock, gathering, times = DeviceClock(), Gathering(10), []
-    clock.see(0.0, 0.050, 0)  # the answer was held up
-    for k, sent in enumerate((0.050, 0.051)):
-        clock.see(sent, sent + 0.0001, 50 + k)
-        kept = (Kept(k, 0, (0,), (1,)),)
-        times += [t for t, _ in gathering.take(Taken(50 + k, k, k + 1, kept), clock)]
-    assert all(b > a for a, b in pairwise(times))

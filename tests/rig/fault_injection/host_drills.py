@@ -53,10 +53,9 @@ rig = DeviceRig(Port(sys.argv[1], clock=clock), clock=clock, sleep=clock.sleep)
 if sys.argv[4] == "fill":
     write, left = run_folder._write, [700]
     def full(file, data):
-        if (Path(sys.argv[2]) / ".reserve").exists():
-            left[0] -= len(data)
-            if left[0] < 0:
-                raise OSError(28, "No space left on device")
+        left[0] -= len(data)
+        if left[0] < 0:
+            raise OSError(28, "No space left on device")
         return write(file, data)
     run_folder._write = full
 try:

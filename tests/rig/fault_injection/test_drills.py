@@ -62,7 +62,7 @@ def test_whatever_happens_to_the_host_the_drive_ends(drill: HostDrill, tmp_path:
         assert outcome.run.about["verdict"] in ("tripped", "interrupted", "failed")
         assert outcome.said
     if "second program" in drill.name:
-        assert "is used by process" in outcome.said
+        assert "is used by another program" in outcome.said
         assert outcome.run.about["verdict"] == "interrupted"  # the first one did not notice: no drive ran out
 
 

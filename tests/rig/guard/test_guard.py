@@ -340,7 +340,7 @@ def told(plant: Plant) -> tuple[Guard, Mock]:
     """Return a guard that has started, and the model monitor that is told what to find."""
     guard = Guard(plant)
     guard.model = model = Mock(plant=plant, compared_from=0.0, compared_now=True)
-    model.update.return_value, model.explain.return_value, model.past_optimum.return_value = [], [], ""
+    model.update.return_value, model.explain.return_value = [], []
     model.is_jump.return_value = False
     guard.start(reading(0.0, 25.0, tank=nan), 0.0, UNITS)
     return guard, model
@@ -464,19 +464,6 @@ def test_causes_are_named_by_danger_unless_the_sensor_repeats_itself(
         subject, checks, because = "t_tank", KINDS["stuck"][0], "bit for bit the same for 4 s"
     assert (trip.kind, trip.subject, trip.check) == (want, subject, checks)
     assert trip.measured == f"{measured:+.2f} K ({because})"
-
-
-def test_a_drive_beyond_the_optimum_for_a_minute_trips(plant: Plant) -> None:
-    guard, model = told(plant)
-    guard.applied({"drive": -0.8}, 1, 0.0)
-    # asked at 1, 11, 21 ...; true from 21 to 61, false at 71, true from 81 on: a minute later is 141
-    for k in range(1, 142):
-        model.past_optimum.return_value = "" if k <= 20 or k == 71 else "drive"
-        trip = check(guard, reading(float(k), 25.0 + 0.01 * k, drive=-0.8)).trip
-        assert (trip is None) == (k < 141)
-    measured = "-0.80 for 60 s, beyond the Peltier element's optimum"
-    assert said(trip) == ("optimum", "drive", "a drive with which more of it cools more", measured)
-    assert trip.figures == {"drive": -0.8}
 
 
 def test_without_a_model_the_drive_of_the_rules_is_the_largest_share_of_a_range() -> None:

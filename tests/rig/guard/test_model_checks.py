@@ -135,18 +135,6 @@ def test_a_sensor_that_the_rig_has_not_makes_nothing_less_known(plant: Plant) ->
     assert never[1] < 0.5 * touched[1]
 
 
-def test_a_peltier_past_its_optimum_is_noticed_by_the_model() -> None:
-    """Q = S T I - R I^2 / 2 - K dT turns over at I = S T / R; the bundled network, 5 R."""
-    known = drill_plants()[0]
-    for resistance, drive, past in ((5.0, -1.0, False), (12.0, -0.4, False), (12.0, -0.5, True),
-                                    (40.0, -0.3, False), (40.0, -0.301, True)):  # fmt: skip
-        monitor = ModelMonitor(replace(known, values={**known.values, "resistance": resistance}))
-        monitor.reset(0.0, {"t_tank": 25.0, "t_surface": 25.0, "t_ambient": 25.0})
-        for k in range(1, 30):
-            monitor.predict(float(k), {"drive": drive}, 1, {"t_ambient": 25.0})
-        assert monitor.past_optimum() == ("drive" if past else "")
-
-
 def test_a_rig_that_stood_with_a_warm_tank_is_not_taken_for_one_at_rest() -> None:
     known, real = drill_plants()
     followed = Followed(known, real=real, t_start=25.0)

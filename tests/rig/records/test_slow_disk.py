@@ -135,7 +135,6 @@ def test_rows_that_the_disk_refuses_after_the_last_sample_are_no_silent_loss(
 
     monkeypatch.setattr(run_folder, "_AT_ONCE_S", 0.0)
     folder = RunFolder(tmp_path / "run")
-    (tmp_path / "run" / ".reserve").unlink()
     stuck = Stuck(bench.clock, full)
     monkeypatch.setattr(run_folder, "_write", stuck)
     _, ended = play(bench.rig, steps(5.0), clock=bench.clock, recorder=folder)

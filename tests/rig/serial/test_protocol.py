@@ -167,8 +167,7 @@ def test_words_that_make_no_line_are_refused(seq: int, parts: tuple[str, ...]) -
 @pytest.mark.parametrize(
     "request_",
     [protocol.Hello(), protocol.Read(), protocol.Off(), protocol.Clear(), protocol.Grip(1),
-     protocol.Drive(2000, 1, (1, -2)), protocol.Drive(1, 0, (0,)), protocol.Sample(10), protocol.Sample(0),
-     protocol.Take(0), protocol.Take(2**32 - 1)],
+     protocol.Drive(2000, 1, (1, -2)), protocol.Drive(1, 0, (0,))],
 )  # fmt: skip
 def test_a_question_reads_back(request_: protocol.Hello) -> None:
     assert protocol.parse_request(protocol.request_words(request_)) == request_
@@ -176,21 +175,15 @@ def test_a_question_reads_back(request_: protocol.Hello) -> None:
 
 @pytest.mark.parametrize(
     "text",
-    ["sample", "sample x", "sample 1 2", "take", "take -", "take 4294967296", "hello 1", "grip", "grip 2",
-     "grip 0 1", "drive 1 1", "drive x 1 1", "drive 1 1 x", "drive 1 2 1", "drive 1 1 1 1"],
+    ["hello 1", "grip", "grip 2", "grip 0 1", "drive 1 1", "drive x 1 1", "drive 1 1 x", "drive 1 2 1",
+     "drive 1 1 1 1"],
 )  # fmt: skip
 def test_a_question_with_the_wrong_words_is_refused(text: str) -> None:
     assert protocol.parse_request(text.split()) == "syntax"
     assert protocol.parse_request(["fly", *text.split()[1:]]) == "unknown"
 
 
-def test_numbers_of_readings_go_round_and_the_longest_line_is_whole() -> None:
-    kept = protocol.Kept(24, 1, (2500,), (31250, "open"))
-    taken = protocol.Taken(9, 2**32 - 2, 3, (kept, None))
-    assert (taken.waiting, protocol.parse_taken(taken.words(), 1)) == (3, taken)
-    assert protocol.parse_taken(["9", "0", str(2**31 - 1), "-"], 1).waiting == 2**31 - 2
-    with pytest.raises(ValueError, match="malformed"):
-        protocol.parse_taken(["9", "0", str(2**31), "-"], 1)
+def test_the_longest_line_is_whole() -> None:
     longest = protocol.encode_line(65535, "x" * 154)
     assert protocol.decode_line(longest[:-1]) == protocol.Line(65535, ("x" * 154,))
     with pytest.raises(ValueError, match="line"):

@@ -31,8 +31,7 @@ def rig_of(**values: float) -> Mock:
         rig.time, dict(rig.values), (rig.apply.call_args or NONE).args[0], 1
     )
     rig.wait.side_effect = lambda seconds: setattr(rig, "time", round(rig.time + seconds, 9))
-    rig.sample_every.side_effect = lambda seconds: seconds < 1.0
-    rig.notices.return_value, rig.take.return_value = [], ([], 0)
+    rig.notices.return_value = []
     return rig
 
 
@@ -293,27 +292,6 @@ def test_power_goes_off_or_the_rig_is_let_go(
     assert run.rig.close.called == (error is not None)
     assert len(told(run, "power")) == bool(said)
     assert (said or "") in run.events[-1].text
-
-
-def test_what_the_device_measured_fills_the_gap_between_two_rows() -> None:
-    run = started()
-    run.let_device_sample(1.0)
-    assert not run.by_device
-    run.let_device_sample(0.1)
-    assert run.by_device
-    at = (10.14, 10.16, 10.3, 10.39, 10.41, 10.5)
-    taken = [Reading(t, {"t_tank": t, "t_surface": 1.0, "t_ambient": 2.0}, {}, 0) for t in at]
-    run.rig.take.side_effect = [(taken, 3), (taken, 0)]
-    run.move = Move(drive=40.0)
-    run.sample("contact", 1, 0.1)  # in time: nothing is missing
-    assert run.column("time_s").tolist() == [10.0]
-    assert told(run, "lost") == [(10.1, "3 samples of the device's own came too late to be kept")]
-    run.rig.wait.side_effect = lambda seconds: setattr(run.rig, "time", 10.45)
-    run.sample("contact", 1, 0.1)
-    assert run.column("time_s").tolist() == [10.0, 10.1, 10.16, 10.3, 10.39]
-    row = run.rows[-1]
-    assert (row["t_tank_degC"], row["q_percent"], row["phase"]) == (10.39, 40.0, 4.0)
-    assert run.recorder.sample.call_args == call(row)
 
 
 def test_progress_is_at_most_whole() -> None:

@@ -110,7 +110,7 @@ def test_what_is_ignored_stays_ignored(number: signal.Signals) -> None:
         signal.signal(number, before)
 
 
-TRACED = ("recorder.py", "signals.py", "contextlib.py", "atomic_files.py")
+TRACED = ("run_folder.py", "signals.py", "contextlib.py", "atomic_files.py")
 
 
 def at_line(n: int, act: Callable[[], None]) -> Callable[..., Any]:
@@ -138,7 +138,6 @@ def test_wherever_a_second_ctrl_c_comes_the_run_is_closed_as_with_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     came: list[int] = []
-    monkeypatch.setattr(recorder, "RESERVE", 64)
     monkeypatch.setattr(recorder, "made_with", lambda files: {})  # this and the disk take the time here
     monkeypatch.setattr(os, "fsync", lambda file: None)
 
