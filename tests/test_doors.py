@@ -151,43 +151,6 @@ def test_a_door_is_documented_in_full(name: str) -> None:
     assert lacks(_door(name)) == set()
 
 
-NUMBER = "Parameters\n----------\nt : float\n    Time [s].\n"
-
-
-@pytest.mark.parametrize(
-    ("docstring", "missing"),
-    [
-        (f"Return a sum.\n\n{NUMBER}\n>>> 1\n1", set()),
-        (f"Return a sum.\n\n{NUMBER.replace(' [s]', '')}\n>>> 1\n1", {"unit of t"}),
-        ("Return a sum.\n\n>>> 1\n1", {"argument t"}),
-        (f"Add up.\n\n{NUMBER}", {"Returns", "Examples"}),
-    ],
-)
-def test_what_a_docstring_lacks_is_found(docstring: str, missing: set[str]) -> None:
-    def add(t: float) -> float:
-        return t
-
-    add.__doc__ = docstring
-    assert lacks(add) == missing
-
-
-def test_an_error_that_is_not_documented_is_found() -> None:
-    def add(t: float) -> float:
-        """Return a sum.
-
-        Parameters
-        ----------
-        t : float
-            Time [s].
-
-        >>> 1
-        1
-        """
-        raise ValueError(t)
-
-    assert lacks(add) == {"Raises"}
-
-
 BENCHMARKS = sorted((Path(__file__).parents[1] / "benchmarks").glob("*/*.py"))
 
 

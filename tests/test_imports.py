@@ -12,8 +12,6 @@ from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 
-import pytest
-
 ROOT = Path(__file__).parents[1]
 FOLDERS = {"thermogrip": ROOT / "src" / "thermogrip"}
 FOLDERS |= {f"thermogrip.{room}": ROOT / room for room in ("datasets", "sysid", "mpc", "rig", "classify")}
@@ -110,22 +108,6 @@ def test_nothing_imports_upwards():
     assert not found
 
 
-@pytest.mark.parametrize(
-    "source",
-    [
-        "def late():\n    from thermogrip.sysid.validation.free_run import free_run",
-        "if TYPE_CHECKING:\n    from thermogrip.sysid import identification",
-        "import_module('thermogrip.sysid.validation.free_run')",
-        "KINDS = {'fit': 'thermogrip.sysid.greybox.fit:fit_network'}\nimport_module(KINDS[kind])",
-        "import_module(f'thermogrip.mpc.{name}')",
-    ],
-)
-def test_an_import_that_goes_up_is_found(source):
-    known = modules()
-    assert any(goes_up("thermogrip.sysid.plant.plant", there) for there, _ in named(source, known))
-    assert not any(goes_up("thermogrip.report.plant", there) for there, _ in named(source, known))
-
-
 def external(text: str) -> set[str]:
     """Return the packages outside of the project that a source imports."""
     found: set[str] = set()
@@ -152,12 +134,3 @@ def test_a_heavy_package_is_imported_by_its_doors_alone():
         if past_its_doors(name, package)
     }
     assert not wrong
-
-
-@pytest.mark.parametrize(
-    "source", ["import pickle", "def late():\n    from joblib import load", "import casadi.tools as ca"]
-)
-def test_an_import_past_a_door_is_found(source):
-    (package,) = external(source)
-    assert past_its_doors("thermogrip.datasets.log_files", package)
-    assert not past_its_doors("thermogrip.datasets.log_files", "numpy")

@@ -9,16 +9,15 @@ import re
 import shlex
 import subprocess
 import sys
-from inspect import signature
 from pathlib import Path
-from typing import Any, get_args, get_type_hints
+from typing import Any
 
 import pytest
 import typer
 
 from thermogrip.cli.main import main
 from thermogrip.cli.rig import one_rig
-from thermogrip.cli.verbs import VERBS, Verb, Verbs, function_of
+from thermogrip.cli.verbs import VERBS, Verb, Verbs
 from thermogrip.datasets.errors import UserError
 
 HEAVY = ["numpy", "scipy", "xarray", "pandas", "casadi", "numba", "llvmlite", "nlopt", "emcee", "arviz"]
@@ -60,79 +59,6 @@ def test_python_dash_m_is_the_command() -> None:
         check=False,
     )
     assert (done.returncode, done.stdout[:10]) == (0, "thermogrip"), done.stderr
-
-
-def test_the_verbs_are_those_of_the_contract() -> None:
-    verbs = "demo identify validate simulate excite tune review export run effusivity train classify compare"
-    more = "warm-up retune linearise paper materials init record recover virtual batch autotune"
-    assert set(VERBS) == {*verbs.split(), *more.split()}
-
-
-#: Each verb's arguments and options as scripts use them: =default, >least, <most.
-OPTIONS = """
-demo: --out=thermogrip-demo --seed=0>0 --workers=2>1 --cluster --json=False
-identify: LOG... --out --network --inputs --outputs --disturbances --columns --dt>1e-09
-  --models=arx,oe,subspace,neural,network --average>0 --order>1<20 --delay>1<20
-  --leave-one-out=False --posterior/--no-posterior=False --report --seed=0>0 --workers=1>1
-  --cluster --json=False
-validate: PLANT LOG... --warmup>0 --score-from>0 --average>0 --network --columns --dt>1e-09
-  --report --seed=0>0 --json=False
-simulate: PLANT LOG --out --warmup=5.0>0 --bands=False --network --columns --dt>1e-09 --seed=0>0
-  --json=False
-linearise: PLANT --at --dt>1e-09 --out --report --network --seed=0>0 --json=False
-excite: --kind --minutes>0.1 --out --plant --network --lowest=5.0 --highest=60.0 --hold --slew>1e-09
-  --seed=0>0 --json=False
-tune: PLANT --out --spec --report --network --seed=0>0 --json=False
-retune: DIR LOG... --out=retuned.json --controller --spec --report --network --seed=0>0 --workers=1>1
-  --json=False
-review: CONTROLLER --report --network --seed=0>0 --json=False
-export: CONTROLLER --out --check=False --states=3000>1 --arduino=False --ros2=False
-  --network --seed=0>0 --json=False
-autotune: --target --out --port --protocol --speed>0.01 --twin --relays --limit --minutes=30.0>1<1440
-  --spec --guard --live>0<65535 --foxglove>1<65535 --on-trip --workers=1>1 --seed=0>0 --json=False
-run: CONTROLLER --out --target --profile --port --protocol --speed>0.01 --twin --draw=0>0 --relays
-  --from --hold=0.0>0 --object --material --grasp-time=10.0>0.5 --stop-early
-  --settle-timeout=900.0>1 --guard
-  --live>0<65535 --foxglove>1<65535 --bridge --on-trip --report --network --seed=0>0 --json=False
-record: SCHEDULE --port --out --protocol --sample=1.0>0.05 --guard --speed=1.0>0.01 --live>0<65535
-  --foxglove>1<65535 --bridge --on-trip --seed=0>0 --json=False
-virtual: --protocol=thermogrip --plant --pty=False --socket>0<65535 --speed=1.0>0.01 --from --ambient=23.0
-  --object --material --fault --seconds>0 --seed=0>0 --json=False
-batch: CONTROLLER PLAN.csv --out --port --protocol --speed>0.01 --twin --draw=0>0 --grasp-time=10.0>0.5
-  --stop-early --settle-timeout=900.0>1 --guard --ask/--no-ask=True --live>0<65535
-  --foxglove>1<65535 --bridge --on-trip --network --seed=0>0 --json=False
-recover: DIR --out --bad --json=False
-effusivity: GRASPS... --out --calibrate --object-range --report --seed=0>0 --workers=1>1 --cluster
-  --json=False
-train: GRASPS... --classifier --out --split --stop-error>0.001<0.5 --quick=False --seed=0>0 --json=False
-classify: MODEL_DIR GRASPS... --out --materials --early=False --next-touch=False --nearest=False
-  --known --object-range --serve=False --port>0<65535
-  --seed=0>0 --workers=1>1 --cluster --json=False
-compare: GRASPS... --out --test --classifiers --repeats=20>0 --train-per-class=5>1 --by
-  --quick=False --seed=0>0 --workers=1>1 --cluster --json=False
-paper: --out --quick=False --seed=0>0 --workers=1>1 --cluster --json=False
-materials: [NAME] --json=False
-init: spec|network|topics|guard|examples --like --out --json=False
-warm-up: --json=False
-"""
-
-
-def options_of(verb: str) -> str:
-    """Return a verb's arguments and options with defaults and limits."""
-    words, function = [f"{verb}:"], function_of(verb)
-    hints = get_type_hints(function, include_extras=True)
-    for name, parameter in signature(function).parameters.items():
-        info = get_args(hints[name])[1]
-        default = "" if parameter.default in (parameter.empty, None) else f"={parameter.default}"
-        limits = [f"{sign}{end:g}" for sign, end in ((">", info.min), ("<", info.max)) if end is not None]
-        names = [text for text in (info.default, *(info.param_decls or ())) if str(text).startswith("--")]
-        words.append("".join([names[0] if names else info.metavar, default, *limits]))
-    return " ".join(words)
-
-
-def test_the_options_of_every_verb_are_those_that_scripts_use() -> None:
-    wanted = [" ".join(lines.split()) for lines in OPTIONS.strip().replace("\n  ", " ").splitlines()]
-    assert [options_of(verb) for verb in VERBS] == wanted
 
 
 @pytest.mark.parametrize("verb", VERBS)

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import re
-import subprocess
-import sys
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -15,7 +13,6 @@ from tests.cli.conftest import Bench, StandIn
 from thermogrip.cli import options
 from thermogrip.cli.options import choice, comma, new_file, new_folder, workers_of
 from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.schema import make_log
 from thermogrip.report.console import Console
 from thermogrip.sysid.models.network import NetworkModel
 
@@ -43,34 +40,6 @@ def test_work_is_done_by_processes_or_by_the_cluster_that_is_named(stand_in: Sta
     assert [call.args for call in begun] == [(3, ("a", "b")), ("tcp://10.0.0.1:8786", ("a", "b"))]
     with pytest.raises(UserError, match="write tcp://HOST:PORT"):
         workers_of(3, "localhost")
-
-
-@pytest.mark.parametrize(
-    "words",
-    [
-        "effusivity grasps.csv --out e.csv",
-        *(
-            pytest.param(words, marks=pytest.mark.slow)
-            for words in ("compare grasps.csv --out c", "identify log.csv --out p.json")
-        ),
-    ],
-)
-def test_processes_begin_to_import_before_this_one_does(tmp_path: Path, words: str) -> None:
-    (tmp_path / "grasps.csv").write_text("grasp_id,time_s,t_surface_degC\n")
-    (tmp_path / "grasps_meta.csv").write_text("grasp_id,material,t_object_nominal_degC\n")
-    (tmp_path / "log.csv").write_text("t,q,y\n")
-    program = f"""if __name__ == "__main__":
-        import os, sys
-        from thermogrip.cli.main import main
-        from thermogrip.datasets import parallel
-        def begin(workers, modules):
-            os.write(1, f"{{workers}} {{'scipy' in sys.modules}} {{all(map(__import__, modules))}}".encode())
-            os._exit(0)
-        parallel.begin_processes = begin
-        main({[*words.split(), "--workers", "2"]!r})
-    """
-    done = subprocess.run([sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True)
-    assert done.stdout == "2 False True", done.stderr
 
 
 def test_a_file_and_a_folder_to_write_are_not_each_other_and_are_made_room_for(tmp_path: Path) -> None:
@@ -143,29 +112,6 @@ def test_a_network_is_a_name_or_a_file_or_what_a_file_of_the_user_makes(
         options.find_network("own.py:wrong")
     with pytest.raises(UserError, match=r"^not today$"):
         options.find_network("own.py:refuses")
-    for text, file, name in (
-        ("own.py:Tank", "own.py", "Tank"),
-        ("C:/a.py:B", "C:/a.py", "B"),
-        ("a:b", "a:b", ""),
-    ):
-        assert options._split_class(text) == (file, name)
-
-
-def test_a_plant_of_one_s_own_is_loaded_with_its_class(stand_in: StandIn) -> None:
-    stand_in("thermogrip.cli.options.find_network", lambda text: f"model of {text}")
-    loaded = stand_in("thermogrip.sysid.plant.plant.Plant.load", "a plant")
-    assert options.load_plant(Path("p.json")) == options.load_plant(Path("p.json"), "a.py:A") == "a plant"
-    assert [(call.args, call.model) for call in loaded] == [
-        ((Path("p.json"),), None), ((Path("p.json"),), "model of a.py:A"),
-    ]  # fmt: skip
-
-
-def test_logs_and_grasps_are_read_as_they_were_named(stand_in: StandIn) -> None:
-    log = make_log([0.0, 1.0], {"u": ([0, 1], "1", "input")})
-    logs = stand_in("thermogrip.datasets.log_files.read_log", log)
-    assert options.load_logs(["a", "b"], ["u"], ["y"], ["d"], known={"u": "output"}, dt=2.0) == [log] * 2
-    assert (logs[1].args, logs[1].known) == (("b", ["u"], ["y"], ["d"]), {"u": "output"})
-    assert (logs[0].columns, logs[0].dt) == (None, 2.0)
 
 
 def test_the_first_log_settles_the_roles_and_what_never_moves_is_no_signal(tmp_path: Path) -> None:

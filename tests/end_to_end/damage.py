@@ -1,14 +1,10 @@
 """Whole files of every kind that a verb opens, and ways to damage them.
 
-    python -m tests.end_to_end.damage [--each 300] [--kind WORD] [--first SEED]
-
-Runs each damaged file through the verb that reads it, in a child process with 20 s of CPU for it, and prints
-how many ended as a bug, never, or by a crash of a library.  ``test_damaged_files.py`` runs a few.
+Each damaged file goes through the verb that reads it, in a child process with 20 s of CPU for it.
 """
 
 from __future__ import annotations
 
-import argparse
 import ast
 import io
 import json
@@ -18,10 +14,8 @@ import re
 import resource
 import shutil
 import signal
-import sys
 import tempfile
 import warnings
-from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass
@@ -307,32 +301,3 @@ def read_many(kind: str, whole: Path, seeds: Sequence[int]) -> dict[int, str]:
             number = os.WTERMSIG(status)
             ends[dead[0]] = "endless" if number == signal.SIGXCPU else f"crash by signal {number}"
     return ends
-
-
-def show(each: int, only: str, first: int) -> None:
-    """Print the table of all kinds."""
-    out = sys.stdout
-    with tempfile.TemporaryDirectory() as made:
-        whole = Path(made)
-        with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):
-            whole_files(whole)
-        columns = ("0", "2", "3", "bug", "endless", "crash", "stray line")
-        out.write(f"| kind | exit {' | exit '.join(columns[:3])} | {' | '.join(columns[3:])} |\n")
-        out.write("|---" * (len(columns) + 1) + "|\n")
-        for kind in [kind for kind in KINDS if only in kind]:
-            ends = read_many(kind, whole, range(first, first + each))
-            for seed, end in ends.items():
-                if end not in ("0", "2", "3"):
-                    sys.stderr.write(f"  {kind} {seed}: {end}"[:250] + "\n")
-            kinds = Counter(end.split(":")[0].split(" by")[0] for end in ends.values())
-            out.write(f"| {kind} | {' | '.join(str(kinds[name]) for name in columns)} |\n")
-            out.flush()
-
-
-if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--each", type=int, default=300)
-    parser.add_argument("--first", type=int, default=0)
-    parser.add_argument("--kind", default="")
-    given = parser.parse_args()
-    show(given.each, given.kind, given.first)

@@ -59,26 +59,25 @@ def folder(bench: Bench, tmp_path_factory: pytest.TempPathFactory) -> Folder:
     return Folder(bench.path, tmp_path_factory.mktemp("programs"))
 
 
-def test_neither_modules_nor_settings_of_the_working_folder_are_obeyed(folder: Folder) -> None:
+@pytest.mark.parametrize(
+    "words",
+    [
+        "validate plant.json good.csv --report new.html",
+        pytest.param(
+            "identify good.csv --models arx --workers 2 --out new.json --report new.html",
+            marks=pytest.mark.slow,  # three processes import everything
+        ),
+    ],
+)
+def test_neither_modules_nor_settings_of_the_working_folder_are_obeyed(words: str, folder: Folder) -> None:
     for name in ("json", "multiprocessing", "numpy", "sitecustomize", "thermogrip", "usercustomize"):
         code = f"with open({str(folder.programs / 'ran')!r}, 'a') as stream:\n    stream.write({name!r})\n"
         (folder.path / f"{name}.py").write_text(code)
     for name in ("latex", "dvipng"):
         folder.trap(folder.programs / name)
     (folder.path / "matplotlibrc").write_text("text.usetex: True\n")
-    words = [
-        "identify",
-        "good.csv",
-        "--models",
-        "arx",
-        "--workers",
-        2,
-        "--out",
-        "new.json",
-        "--report",
-        "new.html",
-    ]
-    done = folder.python("import sys; from thermogrip.__main__ import main; sys.exit(main())", *words)
+    program = "import sys; from thermogrip.__main__ import main; sys.exit(main())"
+    done = folder.python(program, *words.split())
     assert (folder.ran, done.returncode) == ("", 0), done.stderr
     assert (folder.path / "new.html").stat().st_size > 10_000
 

@@ -109,15 +109,6 @@ def test_sessions_that_did_not_settle_are_counted_and_their_advice_shown() -> No
 
 
 @pytest.mark.parametrize(
-    ("ends", "said"),
-    [((0.25, 0.75), "0.500 (.25\N{EN DASH}.75)"), ((0.5, 1.0), "0.500 (.50\N{EN DASH}1.00)")],
-)
-def test_a_score_stands_with_both_ends_or_alone(ends: tuple[float, float], said: str) -> None:
-    assert classification._between(0.5, *ends) == said
-    assert classification._between(0.5, None, None) == "0.500"
-
-
-@pytest.mark.parametrize(
     ("p_value", "more"), [(0.2, " In accuracy n does not separate a from b."), (0.01, "")]
 )
 def test_who_wins_has_the_least_log_loss_and_is_set_apart_only_where_n_can(p_value: float, more: str) -> None:

@@ -297,18 +297,6 @@ def test_speed_is_traded_for_energy_along_the_front(front: list[tuple[str, float
 
 
 @pytest.mark.parametrize(
-    ("seconds", "shown"), [(12.34, 12.3), (None, "does not settle"), (NAN, "does not settle"), (INF, "never")]
-)
-def test_a_missing_time_is_reported_in_words(seconds: float | None, shown: object) -> None:
-    assert control._shown(seconds) == shown
-
-
-@pytest.mark.parametrize(("value", "shown"), [(0.12345, 0.123), (None, None), (NAN, None), (INF, None)])
-def test_a_number_that_is_none_is_left_out(value: float | None, shown: float | None) -> None:
-    assert control._rounded(value) == shown
-
-
-@pytest.mark.parametrize(
     ("settle", "tone", "said"),
     [
         (41.6, "good", "t from 25.0 to 38 degC settles in 42 s, overshoot 0.25 K, bias -0.010 K."),

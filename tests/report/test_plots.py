@@ -22,7 +22,6 @@ from thermogrip.mpc.interface import Move
 from thermogrip.report.control import session_sections
 from thermogrip.report.plant import _per_log
 from thermogrip.report.plots import (
-    _log_scale,
     bode_chart,
     corner_figure,
     free_run_chart,
@@ -125,19 +124,6 @@ def test_what_a_log_has_of_its_own_has_a_unit():
     (table,) = _per_log(plant)
     assert [row[-1] for row in table.rows] == ["K", "K", "1", "V"]
     assert not _per_log(SimpleNamespace(scores=PlantScores()))
-
-
-@pytest.mark.parametrize(
-    "values", [[0.02, 0.5, 40.0], [3.0, 3.1], [np.nan, -1.0, 0.3], [0.0, 7.0], [], [float("nan")]]
-)
-def test_a_logarithmic_axis_shows_every_positive_value_and_at_least_a_decade(values: list[float]) -> None:
-    axis = Figure().subplots()
-    _log_scale(axis, values)
-    low, high = axis.get_xlim()
-    known = [value for value in values if value > 0]
-    assert all(low < value < high for value in known)
-    assert high / low >= 10 * (1 - 1e-9)
-    assert high / low == pytest.approx(max([10.0, *(2 * max(known) / min(known) for _ in known[:1])]))
 
 
 def waves(n: int, shift: float = 0.0) -> Any:
