@@ -28,7 +28,7 @@ DOORS = {
     "emcee": {"sysid.greybox.posterior"},
     "foxglove": {"live.foxglove"},
     "llvmlite": {"sysid.models.jit_rollout"},
-    "mcap": {"datasets.rosbag"},
+    "mcap": {"datasets.rosbag", "rig.records.mcap_export"},
     "nlopt": {"mpc.tuning.tune"},
     "numba": {"datasets.compiled"},
     "pysindy": {"sysid.blackbox.sindy"},

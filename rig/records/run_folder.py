@@ -50,6 +50,7 @@ from thermogrip.datasets.media import csv_text, from_csv
 from thermogrip.datasets.schema import Grasps, Log
 from thermogrip.rig.guard.sensor_checks import room_sensors
 from thermogrip.rig.interface import Event
+from thermogrip.rig.records.mcap_export import write_mcap
 from thermogrip.rig.session.loop import PHASES, log_of_rows
 from thermogrip.rig.session.session import Session, grasp_of_rows
 from thermogrip.rig.session.signals import hold_signals
@@ -475,11 +476,14 @@ def mark_bad(folder: str | Path, why: str) -> None:
 
 
 def export_run(folder: str | Path, out: str | Path) -> Path:
-    """Write the log of a run folder as ``.nc``, ``.parquet`` or ``.csv`` and return the path."""
-    run = read_run(folder)
+    """Write the log of a run folder as ``.nc``, ``.parquet``, ``.csv`` or ``.mcap`` and return the path."""
+    run, path = read_run(folder), Path(out)
     if run.log is None:
         raise UserError("has fewer than two rows", file=folder, hint="give a run that recorded something")
-    return write_log(run.log, out)
+    if path.suffix.lower() != ".mcap":
+        return write_log(run.log, path)
+    write_mcap(path, run.log, run.events, run.about)
+    return path
 
 
 def sums_agree(folder: Path) -> list[str] | None:

@@ -24,7 +24,7 @@ def killed(path: Path, n: int = 30) -> Path:
     return path
 
 
-@pytest.mark.parametrize("name", ["log.nc", "log.parquet", "log.csv"])
+@pytest.mark.parametrize("name", ["log.nc", "log.parquet", "log.csv", "log.mcap"])
 def test_a_run_is_written_in_other_formats_and_reads_back(tmp_path: Path, name: str) -> None:
     folder = killed(tmp_path / "run")
     assert main(["recover", str(folder), "--out", str(tmp_path / name)]) == 0

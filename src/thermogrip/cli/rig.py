@@ -429,7 +429,7 @@ def recover(
     folder: Annotated[Path, cli.arg("DIR", "Folder of a run, or of a batch of runs.")],
     out: Annotated[
         Path | None,
-        cli.opt("--out", "FILE", "Also write the run's log: .nc, .parquet or .csv."),
+        cli.opt("--out", "FILE", "Also write the run's log: .nc, .parquet, .csv, or .mcap (with ros)."),
     ] = None,
     bad: Annotated[str | None, cli.opt("--bad", "WHY", "Mark the trial as bad; nothing is removed.")] = None,
     as_json: cli.AsJson = False,
@@ -443,7 +443,7 @@ def recover(
     if len(folders) > 1 and (out is not None or bad is not None):
         raise UserError("holds several runs", file=folder, hint="give the folder of one of them")
     if out is not None:
-        cli.new_file(out, (".nc", ".parquet", ".csv"))
+        cli.new_file(out, (".nc", ".parquet", ".csv", ".mcap"))
     from thermogrip.rig.records.run_folder import export_run, mark_bad, recover
 
     console = Console(as_json)
