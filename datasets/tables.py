@@ -443,12 +443,12 @@ def _parse_table(
         raise UserError("has a header but no rows", file=file, hint="give at least two rows")
     lines = np.array([line for line, _ in rows], dtype=np.int64)
     columns: list[Column] = []
-    for name, cells in zip(names, zip(*(cells for _, cells in rows)) if rows else ()):
+    for name, column in zip(names, zip(*(cells for _, cells in rows)) if rows else ()):
         if is_text(name):
-            columns.append(Column(name, text=[from_csv(cell.strip()) for cell in cells]))
+            columns.append(Column(name, text=[from_csv(cell.strip()) for cell in column]))
             continue
         try:
-            columns.append(read_column(name, cells, lines, file, layout.separator, tolerated))
+            columns.append(read_column(name, column, lines, file, layout.separator, tolerated))
         except UserError as fault:
             faults += [] if name.startswith(_LEFT_OUT) else [fault]
     if faults:
@@ -609,7 +609,7 @@ def frame_table(
     import pandas as pd
 
     if not isinstance(frame.index, pd.RangeIndex):
-        frame = frame.rename_axis(frame.index.name or "time").reset_index()
+        frame = frame.rename_axis(str(frame.index.name or "time")).reset_index()
     lines = np.arange(1, len(frame) + 1)
     columns: list[Column] = []
     for at, name in enumerate(map(str, frame.columns)):

@@ -17,7 +17,7 @@ from thermogrip.rig.interface import Event
 
 
 def write_mcap(path: Path, log: xr.Dataset, events: Sequence[Event], about: dict[str, Any]) -> None:
-    """Write one channel a variable of the log (``{"time_s": .., "value": ..}``, its unit and role as metadata)
+    """Write one channel a variable of the log (``{"time_s": .., "value": ..}``, unit and role as metadata)
     and one of events. Times are nanoseconds since 1970 by the run's date, since 0 where it is lost."""
     try:
         began_ns = round(datetime.fromisoformat(str(about.get("began", ""))).timestamp()) * 1_000_000_000
