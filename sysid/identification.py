@@ -122,9 +122,9 @@ class Identification(Shown):
         return self.plant.scores.expected
 
     def _facts(self) -> dict[str, object]:
-        """Return the verdict, the chosen model, and the held-out error of each candidate."""
+        """Return the chosen model, the held-out error of each candidate, and the verdict."""
         errors = {f"error of {m}": f"{e:.3g} of that without an input" for m, e in self.errors().items()}
-        return {"verdict": self.verdict, "model": self.model, **errors, "notes": "; ".join(self.notes)}
+        return {"model": self.model, **errors, "notes": "; ".join(self.notes), "verdict": self.verdict}
 
     def errors(self) -> dict[str, float]:
         """Return the mean held-out error of each candidate, relative to the no-input baseline."""

@@ -27,6 +27,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from thermogrip.datasets.arrays import Array, Mask
+from thermogrip.datasets.media import Shown
 from thermogrip.datasets.schema import Log, column, names
 from thermogrip.mpc.interface import Controller, Move, Readings, Regulator, Target
 from thermogrip.mpc.plant.prediction import held_start, prediction_model
@@ -87,8 +88,8 @@ class Segment:
     full_share: float  # share of the time until settling at the limit of the drive, 0 to 1
 
 
-@dataclass(frozen=True)
-class ClosedLoop:
+@dataclass(frozen=True, repr=False)
+class ClosedLoop(Shown):
     """The record of one run: n of the plant's own steps, k calls of the controller."""
 
     time: Array  # (n,), the plant's own steps [s]
@@ -103,6 +104,16 @@ class ClosedLoop:
     band: float | Mapping[str, float]  # for settling [degC], by output where they differ
     drive_range: dict[str, tuple[float, float]]
     segments: tuple[Segment, ...]
+
+    def _facts(self) -> dict[str, object]:
+        """Return how well each target was reached, and whether all were."""
+        facts: dict[str, object] = {
+            f"{s.output} to {s.target:.4g}": f"from {s.start:.4g}: settles in {s.settle_s:.4g} s (nan: not), "
+            f"overshoot {s.overshoot:.3g}, bias {s.bias:.3g}, {s.energy_s:.4g} s at full drive"
+            for s in self.segments
+        }
+        answered = f"{self.status.count('ok')} of {len(self.status)} are ok"
+        return facts | {"steps": answered, "verdict": "settled" if self.settled else "not settled"}
 
     @property
     def settled(self) -> bool:

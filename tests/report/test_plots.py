@@ -11,14 +11,19 @@ from typing import Any
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
+from matplotlib.text import Text as MplText
 from numpy.typing import NDArray
 
+from tests.end_to_end.conftest import HEADER, small_log_rows, small_plant
 from tests.report.conftest import described
 from thermogrip.classify import figures as of_classifiers
 from thermogrip.datasets.charts import PALETTE, draw_chart
 from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.log_files import read_log
 from thermogrip.datasets.schema import make_grasps, make_log
+from thermogrip.mpc import PIController, simulate_closed_loop
 from thermogrip.mpc.interface import Move
+from thermogrip.report import plot
 from thermogrip.report.control import session_sections
 from thermogrip.report.plant import _per_log
 from thermogrip.report.plots import (
@@ -32,6 +37,7 @@ from thermogrip.report.plots import (
     steps_chart,
 )
 from thermogrip.rig import Session
+from thermogrip.sysid import free_run, identify
 from thermogrip.sysid.export.dynamics import Estimate
 from thermogrip.sysid.plant.fit_record import PlantScores
 from thermogrip.sysid.validation.held_out import Row
@@ -263,3 +269,20 @@ def test_a_parameter_that_was_not_sampled_has_no_corner() -> None:
     posterior = SimpleNamespace(free=("a", "b"))
     with pytest.raises(UserError, match="'c' was not sampled; use a, b"):
         corner_figure(posterior, ("a", "c"))
+
+
+def test_a_result_is_drawn_as_its_page_shows_it(tmp_path: Path) -> None:
+    plant = small_plant()
+    (tmp_path / "good.csv").write_text("\n".join([HEADER, *small_log_rows()]) + "\n")
+    log = read_log(tmp_path / "good.csv")
+    run = simulate_closed_loop(PIController(plant), plant, [(26.0, 20.0)])
+    identified = identify([log], models=["arx"])
+    drawn = {
+        "free-run RMSE": plot(identified), "t_tank": plot(free_run(plant, log)), "t_surface": plot(plant),
+        "magnitude": plot(plant, bode=True), "drive": plot(run),
+    }  # fmt: skip
+    for words, figure in drawn.items():
+        texts = [text.get_text() for text in figure.findobj(MplText)]
+        assert any(words in text for text in texts), words
+    with pytest.raises(TypeError, match="there is no picture of a str"):
+        plot("plant.json")  # type: ignore[arg-type]
