@@ -30,7 +30,7 @@ References
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -70,7 +70,6 @@ from thermogrip.mpc.tuning.objective import (
     steps_on,
     trial,
 )
-from thermogrip.mpc.tuning.trade_offs import Pareto, Trial, front_of
 
 if TYPE_CHECKING:
     from thermogrip.sysid.plant.plant import Plant
@@ -161,6 +160,16 @@ def _row(name: str, part: Sequence[StepResult], bounds: Bounds) -> Row:
 
 
 @dataclass(frozen=True)
+class Trial:
+    """One design that was tried, over all trials."""
+
+    controller: str  # ``"MPC"`` or ``"PI"``
+    parameters: dict[str, float]  # factors of the default design, or of SIMC
+    score: float  # lower is better, see :mod:`thermogrip.mpc.tuning.objective`
+    results: tuple[StepResult, ...] = field(default=(), repr=False)
+
+
+@dataclass(frozen=True)
 class Tuning:
     """What the tuner found.
 
@@ -176,8 +185,6 @@ class Tuning:
         Baseline, tuned and PI side by side, step by step and load by load, on the same draws.
     scores : dict of str to float
         By controller, on those draws; lower is better.
-    pareto : Pareto
-        Settling, overshoot and energy of all designs that were tried, and which of them nothing beats.
     history : tuple of Trial
         Every design that was tried.
     meets_spec : bool
@@ -195,7 +202,6 @@ class Tuning:
     finding: str
     rows: tuple[Row, ...]
     scores: dict[str, float]
-    pareto: Pareto
     history: tuple[Trial, ...]
     meets_spec: bool
     runs: dict[str, ClosedLoop]
@@ -394,7 +400,7 @@ class Bench:
         design, results = self.design(kind, parameters), []
         for noise in range(_NOISES):
             results += self.run(kind, design, self.draws, self.seed + noise, loads=not noise)
-        steps, found = self.counting(results), self.score(results)
+        found = self.score(results)
         cost = found.total
         if kind == "MPC":
             self.default = self.default or found  # which comes first
@@ -404,10 +410,6 @@ class Bench:
             controller=kind,
             parameters=dict(parameters),
             score=float(cost),
-            settle_s=float(np.mean([result.settle_s for result in steps])),
-            overshoot=max(result.overshoot for result in steps),
-            energy_s=float(np.mean([result.energy_s for result in steps])),
-            travel=float(np.mean([result.travel for result in steps])),
             results=tuple(results),
         )
 
@@ -504,13 +506,11 @@ def _tuning(
     if interrupted:
         finding = f"Interrupted after {len(tried)} designs; this is the best of them. {finding}"
     meets = all(meets_spec(result, spec) for result in bench.counting(results[kept]))
-    pareto = front_of(tried, {id(candidates[name]): name for name in reversed(list(candidates))})
     notes = {
         "verdict": verdict,
         "finding": finding,
         "meets_spec": meets,
         "scores": scores,
-        "pareto": pareto.rows(),
         "spec": spec.model_dump(mode="json"),
         "seed": bench.seed,
         "rows": [row.to_dict() for row in rows],
@@ -523,7 +523,6 @@ def _tuning(
         finding=finding,
         rows=rows,
         scores=scores,
-        pareto=pareto,
         history=tuple(tried),
         meets_spec=meets,
         runs={} if interrupted else _runs(bench, candidates, controller),

@@ -17,8 +17,6 @@ from thermogrip.mpc.controllers.export import Agreement, Export
 from thermogrip.mpc.controllers.mpc import Controller
 from thermogrip.mpc.design.spec import Spec
 from thermogrip.mpc.tuning.design_review import Check
-from thermogrip.mpc.tuning.objective import StepResult
-from thermogrip.mpc.tuning.retune import RunError
 from thermogrip.mpc.tuning.tune import Row
 
 ROW = Row("tuned", 28.0, 38.0, 90.0, 95.0, 0.1, 0.2, 0.01, 0.01, 7.0, 7.0, 2.0, 0.5, 80.0)
@@ -36,7 +34,6 @@ def tuned(stand_in: StandIn) -> SimpleNamespace:
     found = SimpleNamespace(
         save=lambda out: out.write_text("{}"), verdict="tuned", finding="faster", meets_spec=True,
         scores={"tuned": 1.5}, rows=(ROW,), interrupted=False, controller=None,
-        pareto=SimpleNamespace(rows=lambda: [{"a": 1}]),
     )  # fmt: skip
     found.asked = stand_in("thermogrip.mpc.tuning.tune.tune", tune)
     stand_in("thermogrip.report.control.tuning_table", (tuple("abcdefghi"), ROWS))
@@ -64,13 +61,13 @@ def test_a_tuning_is_an_answer_of_yes_where_it_meets_the_spec(
     assert shares(done.err, "tune") == [50]
     [page] = tuned.pages
     assert page.args == (
-        Path("t.html"), "Tuning", "A controller for plant.json, tuned in simulation on draws of the plant.",
-        ["a section"],
+        Path("t.html"), "Tuning",
+        "The best controller for plant.json is an MPC, by simulations on its draws.", ["a section"],
     )  # fmt: skip
     assert json.loads(bench.run("tune", "plant.json", "--out", "c.json", "--json").out) == {
         "kind": "MPC", "verdict": "tuned", "finding": "faster", "meets_spec": meets, "interrupted": False,
         "scores": {"tuned": 1.5}, "rows": [asdict(ROW)],
-        "pareto": [{"a": 1}], "out": "c.json", "report": None,
+        "out": "c.json", "report": None,
     }  # fmt: skip
     assert (tuned.asked[1].args[1], len(tuned.pages)) == (Spec(), 1)
 
@@ -80,60 +77,6 @@ def test_an_interrupted_tuning_is_written_and_ends_with_130(bench: Bench, tuned:
     done = bench.run("tune", "plant.json", "--out", "c.json")
     assert (done.code, Path("c.json").exists()) == (130, True)
     assert "wrote c.json" in words_of(done.out)
-
-
-def a_run(bench: Bench, *, controller: str = "controller.json", phases: str = "000114") -> None:
-    """Write a run folder: a drive, a pump, two outputs."""
-    head = "time_s,drive,pump,t_tank_degC,t_surface_degC,t_ambient_degC,target_t_surface_degC,phase"
-    rows = [f"{2 * k},0.5,1,{25 + k},{25 + k / 2},25,38,{phase}" for k, phase in enumerate(phases)]
-    (bench.path / "run").mkdir(exist_ok=True)
-    bench.write("run/samples.csv", "\n".join([head, *rows, ""]))
-    content = {"schema": "thermogrip.run", "version": 1, "about": {}, "verdict": "settled"}
-    content["files"] = {"controller": {"path": controller, "sha256": "0"}}
-    bench.write("run/run.json", json.dumps(content))
-
-
-@pytest.mark.parametrize("better", [True, False])
-def test_retune_takes_the_run_up_to_the_contact_and_keeps_a_controller_that_is_no_worse(
-    better: bool, bench: Bench, tuned: SimpleNamespace, stand_in: StandIn
-) -> None:
-    a_run(bench)
-    Controller(small_plant()).save("controller.json")
-    step = StepResult(25.0, 29.0, 1, 90.0, 0.25, 0.01, 0.0, 5.0, 2.0, 0.5, 300.0)
-    found = SimpleNamespace(
-        better=better, errors=(RunError("t_surface", "degC", 1.25, 0.5),),
-        tuning=tuned if better else None, old=(step,) if better else (), new=(replace(step, settle_s=60.0),),
-    )  # fmt: skip
-    asked = stand_in("thermogrip.mpc.tuning.retune.retune", found)
-    tuned.save = lambda out: out.write_text("{}")
-    bench.write("spec.toml", "steps = [[25, 29]]\nhold_s = 77\n")
-    options = ["--out", "new.json", "--spec", "spec.toml", "--seed", "3"]
-    done = bench.run("retune", "run", *options, "--report", "new.html")
-    assert done.code == (0 if better else 3), done
-    [call] = asked
-    assert call.args[1]["time"].values.tolist() == [0.0, 2.0, 4.0, 6.0, 8.0]  # not the contact
-    assert (call.args[0].controlled, call.args[2], call.spec.hold_s) == (("t_surface",), [], 77.0)
-    said = words_of(done.out)
-    assert said.startswith("t_surface: old plant 1.25, new 0.5 degC, rms over the end of run")
-    assert Path("new.json").exists() == better
-    told = "25 to 29, draw 1: old controller 90 s, overshoot 0.25; new 60 s, overshoot 0.25"
-    assert said.endswith(told if better else "The run shows no better plant: keep the controller.")
-    asked.clear()
-    answer = json.loads(bench.run("retune", "run", "good.csv", "--out", "new.json", "--json").out)
-    assert answer["errors"] == [{"output": "t_surface", "unit": "degC", "old": 1.25, "new": 0.5}]
-    assert len(asked[0].args[2]) == 1
-    assert asked[0].spec == Spec()
-
-
-def test_a_run_that_names_no_controller_that_is_there_is_refused(bench: Bench) -> None:
-    a_run(bench, controller="gone.json")
-    done = bench.run("retune", "run")
-    assert done.code == 2
-    assert "gone.json" in done.err
-    a_run(bench, phases="0")
-    done = bench.run("retune", "run")
-    assert done.code == 2
-    assert "run: holds no samples; give the folder of a run that began" in done.err
 
 
 @pytest.mark.parametrize(

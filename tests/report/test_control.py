@@ -1,4 +1,4 @@
-"""What the pages of a tuning and of a session say: numbers, units, trade-offs and tones."""
+"""What the pages of a tuning and of a session say: numbers, units and tones."""
 
 from __future__ import annotations
 
@@ -8,14 +8,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from matplotlib.figure import Figure
 
+from tests.mpc.makers import make_tank
 from thermogrip.datasets.charts import Chart
 from thermogrip.mpc.closed_loop.simulate import ClosedLoop, Segment
 from thermogrip.mpc.controllers.mpc import Controller
 from thermogrip.mpc.controllers.pi import PIController
-from thermogrip.mpc.design.design import PILoop
-from thermogrip.mpc.design.spec import OnOff, Settling, Spec
+from thermogrip.mpc.design.spec import Settling, Spec
 from thermogrip.mpc.tuning.tune import Row
 from thermogrip.report import control
 from thermogrip.report.html import Plot, Table, Text
@@ -29,13 +28,11 @@ STEPS = [(28.0, 38.0), (28.0, 18.0)]
 def drawn(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
     """Return what each figure was drawn from; figures have tests of their own."""
     seen: dict[str, Any] = {}
-    made = dict.fromkeys(("pareto_figure", "step_time_figure"), Figure)
-    made |= dict.fromkeys(("closed_loop_chart", "steps_chart", "grasps_chart"), lambda: Chart(()))
-    for name, make in made.items():
+    for name in ("closed_loop_chart", "steps_chart", "grasps_chart"):
 
-        def draw(*args: Any, name: str = name, make: Any = make, **options: Any) -> Any:
+        def draw(*args: Any, name: str = name, **options: Any) -> Any:
             seen.setdefault(name.rpartition("_")[0], []).append((args, options))
-            return make()
+            return Chart(())
 
         monkeypatch.setattr(control, name, draw)
     return seen
@@ -52,36 +49,26 @@ class Stub(Controller):
 
 
 def tuning_of(**changes: Any) -> Any:
-    spec = SimpleNamespace(
-        steps=STEPS, settle_within_s=180.0, band_degC=0.25, overshoot_degC=0.5, bias_degC=0.1, hold_s=200.0,
-        energy_weight=2.0, ambient_degC=25.0, noise_degC=0.04, sensor_offset_degC=0.3, search_draws=2,
-        check_draws=5, evaluations=30, moves_weight=0.03, moves_limit=1.4, extra_lag=0.4, extra_delay=0.6,
-        lost_gain=0.1,
-        zones={"t1": 1.0}, hard=["t1", "t2"], energy_price=None, tariff=[(0.0, 1.0), (600.0, 3.0)],
-        ramp_per_s=None, safe_drive={}, limits={"t1": (-1e12, 60.0), "t2": (5.0, 70.0)}, weights=None,
-        settling=None, ramps=False, on_off=None, disturbances=None,
-    )  # fmt: skip
+    spec = Spec(
+        steps=STEPS,
+        settle_within_s=180.0,
+        hold_s=200.0,
+        search_draws=2,
+        check_draws=5,
+        evaluations=30,
+        sensor_offset_degC=0.3,
+    )
     design = SimpleNamespace(
-        controlled=("t1", "t2"), dt=2.0, horizon_s=60.0, blocks=(1, 2, 4), drive_range={"q": (0.0, 100.0)},
-        slew_per_s={"q": 5.0}, move=0.125, travel=1.5, terminal=3.0, overshoot=0.75, deadline_s=0.5,
-        limits={}, noise=SimpleNamespace(drive={"q": 0.01}, output=0.02),
-        loops=(PILoop("q", "t1", 2.0, 30.0),),
+        controlled=("t1", "t2"), dt=2.0, deadline_s=0.5, limits={}, slew_per_s={"q": 5.0},
+        drive_range={"q": (0.0, 100.0)}, to_dict=dict,
     )  # fmt: skip
     plant = SimpleNamespace(samples=None, covariance=np.eye(1), valid={}, units={})
-    rows = [
-        {"controller": of, "name": name, "settle_s": settle, "overshoot_degC": 0.12345, "energy_s": 20.04,
-         "best": best}
-        for of, name, settle, best in (
-            ("PI", "c", None, False), ("MPC", "b", 80.0, True), ("MPC", "a", 50.0, True),
-        )
-    ]  # fmt: skip
     run = SimpleNamespace(
         segments=(), status=("ok",), advice=("", "wait"), band=0.25, seconds=(0.01, 0.02), settle=0.0
     )
     made = {
         "spec": spec, "scores": {"tuned": 1.23456, "PI": 2.0}, "verdict": "tuned", "finding": "Faster.",
         "meets_spec": True, "rows": [], "seed": 7,
-        "pareto": SimpleNamespace(rows=lambda: rows),
         "runs": {"28 to 38, MPC": run, "28 to 38, PI": run, "28 to 18, MPC": run, "q by 10, MPC": run},
         "controller": Stub(design, plant),
     }  # fmt: skip
@@ -107,8 +94,8 @@ def test_a_step_is_good_where_each_output_is_as_the_spec_asks(figures: dict, ton
 @pytest.mark.parametrize(
     ("meets", "known", "tone", "says", "of"),
     [
-        (True, True, "good", "The controller meets the spec on every draw.", "5 draws of the plant"),
-        (False, False, "warn", "The controller does not meet the spec on every draw.", "the plant"),
+        (True, True, "good", "The MPC meets the spec on every draw.", "5 draws of the plant"),
+        (False, False, "warn", "The MPC does not meet the spec on every draw.", "the plant"),
     ],
 )
 def test_a_tuned_controller_stands_with_its_scores_and_what_it_did_not_know(
@@ -136,7 +123,6 @@ def test_outputs_that_are_judged_apart_have_their_own_rows_and_bands():
     spec = Spec(
         steps=STEPS,
         settling={"t2": Settling(within_s=600.0, band_degC=0.5)},
-        on_off={"valve": OnOff(min_on_s=60.0, price=0.2)},
     )
     start, target = STEPS[0]
     row = Row("tuned", start, target, 80.0, 85.0, 0.1, 0.2, 0.0, 0.0, 20.0, 21.0, 2.0, 0.5, 60.0, "t1")
@@ -146,58 +132,30 @@ def test_outputs_that_are_judged_apart_have_their_own_rows_and_bands():
     *_, about, _ = control.tuning_section(tuning).parts
     assert about.text.startswith("Band 0.25 degC of t1, 0.5 degC of t2. ")
     assert "or the ramp" in about.text
-    asked = dict(control.spec_section(tuning).parts[0].rows)
-    switched = "valve at least 60 s on, 0 s off, a sample on costs 0.2"
-    assert asked["switched by the controller"] == switched
-    assert asked["of single outputs"] == "t2 settle within [s] 600, band, half width [degC] 0.5"
 
 
-@pytest.mark.parametrize(("known", "draws"), [(True, 2), (False, 1)])
-def test_designs_stand_from_the_fastest_to_those_that_never_settle(
-    known: bool, draws: int, drawn: dict[str, Any]
-) -> None:
-    tuning = tuning_of()
-    tuning.controller.plant.covariance = np.eye(1) if known else None
-    section = control.pareto_section(tuning)
-    _, table = section.parts
-    assert table.rows == (
-        ("MPC", "a", 50.0, 0.123, 20.0, "yes"), ("MPC", "b", 80.0, 0.123, 20.0, "yes"),
-        ("PI", "c", "does not settle", 0.123, 20.0, ""),
-    )  # fmt: skip
-    assert table.caption == f"Means over steps and the draws of the search ({draws}), 200 s each"
-    assert section.verdict == "Nothing: the fastest design (50 s) is as frugal as any."
-    assert drawn["pareto"] == [((tuning.pareto,), {})]
-
-
-def test_what_was_asked_stands_beside_the_design() -> None:
-    section = control.spec_section(tuning_of())
-    asked, found = section.parts
+def test_what_was_asked_stands_beside_the_design_by_the_names_of_their_files() -> None:
+    tank = make_tank()
+    spec = Spec(steps=STEPS, settling={"t_surface": Settling(within_s=60.0)}, zones={"t_surface": 0.05})
+    controller = Controller(tank, spec.design(tank, move=0.125))
+    section = control.spec_section(tuning_of(spec=spec, controller=controller))
+    asked, found = (dict(part.rows) for part in section.parts)
     assert section.verdict == "Seed 7; the same seed gives the same design."
-    assert (asked.head, asked.caption, found.head, found.caption) == (
-        ("requested", "value"), "The spec", ("design", "value"), "The design",
-    )  # fmt: skip
-    assert [value for _, value in asked.rows] == [
-        "28 to 38, 28 to 18", "180", "0.25", "0.5", "0.1", "200", "2", "0.03", "1.4", "25", "0.04", "0.3",
-        "2", "5", "30", "0.4", "0.6", "0.1", "t1 at most 60, t2 5 to 70", "t1 1", "t1, t2", "0: 1, 600: 3",
-    ]  # fmt: skip
-    assert asked.rows[1] == ("settle within [s]", "180")
-    assert dict(found.rows) == {
-        "regulated": "t1, t2", "controller": "MPC", "sample time [s]": "2", "range of q": "0 to 100",
-        "slew of q [1/s]": "5", "Kc, Ti [s] of t1 by q": "2, 30", "horizon [s]": "60",
-        "blocks [samples]": "1 2 4", "move weight": "0.125", "terminal weight": "3",
-        "overshoot band [degC]": "0.75", "process noise of q's disturbance": "0.01",
-        "process noise of an output's disturbance": "0.02", "disturbances estimated": "q, t1",
-    }  # fmt: skip
+    assert (asked["steps"], asked["settle_within_s"]) == ("[[28, 38], [28, 18]]", "450")
+    assert asked["settling"].startswith("t_surface = within_s = 60; ")
+    assert "limits" not in asked
+    assert (found["move"], found["controlled"]) == ("0.125", "[t_surface]")
+    assert found["drive_range"] == "drive = [-1, 1]"
 
 
 def test_the_page_of_a_pi_has_its_loops_and_no_weights() -> None:
-    tuning = tuning_of()
-    design = tuning.controller.design
-    tuning.controller = object.__new__(PIController)
-    vars(tuning.controller).update(_design=design)
+    tank = make_tank()
+    pi = PIController.of(tank, Spec(steps=STEPS).design(tank))
+    tuning = tuning_of(spec=Spec(steps=STEPS), controller=pi)
     found = dict(control.spec_section(tuning).parts[1].rows)
-    assert (found["controller"], found["Kc, Ti [s] of t1 by q"]) == ("PI", "2, 30")
-    assert not {"move weight", "horizon [s]"} & set(found)
+    assert list(found) == ["dt", "controlled", "drive_range", "slew_per_s", "loops"]
+    assert found["loops"].startswith("[drive = drive; output = t_surface; Kc = ")
+    assert control.tuning_section(tuning).verdict == "The PI meets the spec on every draw."
 
 
 def test_a_tuning_has_a_section_for_each_step_and_load_of_its_controller_and_its_step_times(
@@ -206,12 +164,10 @@ def test_a_tuning_has_a_section_for_each_step_and_load_of_its_controller_and_its
     tuning = tuning_of()
     titles = [section.title for section in control.tuning_sections(tuning)]
     assert titles == [
-        "Does the controller meet the spec?", "What can be traded?", "The step from 28 to 38 degC",
+        "Does the controller meet the spec?", "The step from 28 to 38 degC",
         "The step from 28 to 18 degC", "A load on q by 10", "Is it fast enough?",
         "What was requested, and the design",
     ]  # fmt: skip
-    [((times, deadline, dt), _)] = drawn["step_time"]
-    assert (times["controller"].tolist(), deadline, dt) == ([0.01, 0.02] * 3, 0.5, 2.0)
     design = tuning.controller.design
     options = {"limits": design.limits, "slew_per_s": design.slew_per_s}
     assert drawn["closed_loop"][0] == ((tuning.runs["28 to 38, MPC"],), options)
@@ -270,30 +226,6 @@ def test_a_session_stands_with_its_events_its_grasp_and_its_loop(
 def test_steps_are_late_only_beyond_their_deadline(seconds: list[float], said: str, tone: str) -> None:
     section = control.timing_section(seconds, SimpleNamespace(deadline_s=0.5, dt=2.0))
     assert (section.verdict, section.tone) == (said, tone)
-
-
-@pytest.mark.parametrize(
-    ("front", "said"),
-    [
-        (
-            [("A", 50.0, 20.0), ("B", 80.0, 15.0), ("C", 60.0, 18.0)],
-            "B takes 80 s instead of 50 s and 25 % less",
-        ),
-        ([("A", 50.0, 20.0), ("B", 80.0, 19.6)], "Nothing: the fastest design (50 s) is as frugal as any."),
-        ([("A", 50.0, 20.0)], "Nothing: the fastest design (50 s) is as frugal as any."),
-        ([], "No design settled on all draws."),
-    ],
-)
-def test_speed_is_traded_for_energy_along_the_front(front: list[tuple[str, float, float]], said: str) -> None:
-    rows = [
-        {"name": name, "settle_s": settle, "energy_s": energy, "best": True, "controller": "MPC"}
-        for name, settle, energy in front
-    ]
-    others = [
-        {"name": "x", "settle_s": 1.0, "energy_s": 1.0, "best": best, "controller": of}
-        for best, of in ((False, "MPC"), (False, "PI"))
-    ]
-    assert said in control._trade([*others, *rows])
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""tune, retune, review, export: from a plant to a controller, its design looked through, and into C."""
+"""tune, review, export: from a plant to a controller, its design looked through, and into C."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def tune(
     """Find the best controller for what you want, MPC or PI.
 
     You say settling time, overshoot, energy. Runs closed loops on posterior draws of the plant, steps and
-    loads; shows baseline, tuned and PI side by side, and what can be traded. Ctrl-C keeps the best so far.
+    loads; shows baseline, tuned and PI side by side. Ctrl-C keeps the best so far.
     """
     cli.new_file(out, (".json",))
     from thermogrip.mpc.design.spec import Spec, read_spec
@@ -61,90 +61,28 @@ def tune(
         )
     with console.progress("tune") as progress, _naming(spec, tuple(Spec.model_fields)):
         found = search(loaded, wanted, progress=progress, seed=seed)
-    result = _written(console, found, f"A controller for {plant.name}", out, report)
-    console.answer(result)
+    console.answer(_written(console, found, plant.name, out, report))
     if found.interrupted:
         raise KeyboardInterrupt
     return 0 if found.meets_spec else cli.ANSWER_IS_NO
 
 
-def _written(console: Console, found: Tuning, lead: str, out: Path, report: Path | None) -> dict[str, Any]:
+def _written(console: Console, found: Tuning, plant: str, out: Path, report: Path | None) -> dict[str, Any]:
     """Write and show what a search found; return the answer."""
     from thermogrip.report.control import kind_of, tuning_caption, tuning_sections, tuning_table
     from thermogrip.report.html import write_report
 
     found.save(out)
+    kind, meets = kind_of(found.controller), "meets" if found.meets_spec else "does not meet"
     if report is not None:
-        lead = f"{lead}, tuned in simulation on draws of the plant."
+        best = "a PI" if kind == "PI" else "an MPC"
+        lead = f"The best controller for {plant} is {best}, by simulations on its draws."
         write_report(report, "Tuning", lead, tuning_sections(found))
     console.table(tuning_caption(found), *tuning_table(found))
     console.say(f"{found.verdict}: {found.finding}")
-    kind, meets = kind_of(found.controller), "meets" if found.meets_spec else "does not meet"
     console.say(f"The {kind} {meets} the spec on every draw; wrote {out}")
     keys = ("verdict", "finding", "meets_spec", "interrupted", "scores", "rows")
-    result = {"kind": kind} | {key: getattr(found, key) for key in keys}
-    return result | {"pareto": found.pareto.rows(), "out": out, "report": report}
-
-
-def retune(
-    run: Annotated[Path, cli.arg("DIR", "Folder of the run in which the plant was not the model.")],
-    logs: Annotated[list[str] | None, cli.arg("LOG...", "The logs that the plant came from.")] = None,
-    out: Annotated[Path, cli.opt("--out", "FILE.json", "Where the new controller goes.")] = Path(
-        "retuned.json"
-    ),
-    controller: Annotated[
-        Path | None, cli.opt("--controller", "CONTROLLER", "The run's controller; where absent, as it says.")
-    ] = None,
-    spec: Annotated[
-        Path | None, cli.opt("--spec", "SPEC.toml", "What is wanted; where absent, what was wanted before.")
-    ] = None,
-    report: cli.Report = None,
-    network: cli.OwnNetwork = None,
-    seed: cli.Seed = 0,
-    workers: cli.Workers = 1,
-    as_json: cli.AsJson = False,
-) -> int:
-    """Identify and tune again, with a run whose plant was not the model.
-
-    Says how far the old and the new plant are from the end of the run, and what the old and the new
-    controller do on draws of the new plant.
-    """
-    cli.new_file(out, (".json",))
-    from thermogrip.mpc.design.spec import Spec, read_spec, spec_from_dict
-    from thermogrip.mpc.tuning.retune import retune as search
-    from thermogrip.rig.records.run_folder import read_run
-    from thermogrip.sysid.plant.log_grid import roles_of
-
-    done = read_run(run)
-    if done.log is None:
-        raise UserError("holds no samples", file=run, hint="give the folder of a run that began")
-    file = Path(done.about.get("files", {}).get("controller", {}).get("path", "controller.json"))
-    old = load_controller(controller or file, network)
-    noted = old.notes.get("spec")
-    was = spec_from_dict(noted) if isinstance(noted, dict) else Spec()
-    wanted = was if spec is None else read_spec(spec)
-    more = cli.load_logs(logs, known=roles_of(old.plant)) if logs else []
-    phases = str(done.log["phase"].attrs["flag_meanings"]).split()
-    loop = done.log.isel(time=done.log["phase"].values < phases.index("contact"))
-    console = Console(as_json)
-    with console.progress("retune") as progress:
-        found = search(old, loop, more, spec=wanted, progress=progress, workers=workers, seed=seed)
-    for error in found.errors:
-        said = f"old plant {error.old:.3g}, new {error.new:.3g} {error.unit}, rms over the end of {run}"
-        console.say(f"{error.output}: {said}")
-    result: dict[str, Any] = {"better": found.better, "errors": found.errors}
-    if found.tuning is None:
-        console.say("The run shows no better plant: keep the controller.")
-        console.answer(result)
-        return cli.ANSWER_IS_NO
-    result |= _written(console, found.tuning, f"A controller for {run.name}", out, report)
-    for old_step, new_step in zip(found.old, found.new, strict=True):
-        pair = [f"{step.settle_s:.0f} s, overshoot {step.overshoot:.2f}" for step in (old_step, new_step)]
-        step = f"{old_step.start:g} to {old_step.target:g}, draw {old_step.draw}"
-        console.say(f"{step}: old controller {pair[0]}; new {pair[1]}")
-    result |= {key: [step.to_dict() for step in getattr(found, key)] for key in ("old", "new")}
-    console.answer(result)
-    return 0 if found.tuning.meets_spec else cli.ANSWER_IS_NO
+    return {"kind": kind} | {key: getattr(found, key) for key in keys} | {"out": out, "report": report}
 
 
 @contextmanager

@@ -32,7 +32,7 @@ ALONE = {"--live": "0", "--foxglove": "8765"}
 VERBS = {
     "demo": "project", "identify": "identify", "validate": "identify",
     "simulate": "identify", "linearise": "identify", "excite": "excite",
-    "tune": "control", "retune": "control", "review": "control", "export": "control",
+    "tune": "control", "review": "control", "export": "control",
     "autotune": "autotune", "run": "rig", "record": "rig", "virtual": "rig", "batch": "rig", "recover": "rig",
     "effusivity": "classify", "train": "classify", "classify": "classify", "compare": "compare",
     "paper": "project", "materials": "classify", "init": "project", "warm-up": "project",

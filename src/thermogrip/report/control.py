@@ -1,4 +1,4 @@
-"""Sections of the page of a controller: its tuning, trade-offs and closed loops.
+"""Sections of the page of a controller: its tuning and its closed loops.
 
 As in :mod:`thermogrip.report.classification`, each function returns sections whose verdict is a sentence.
 """
@@ -13,16 +13,10 @@ import numpy as np
 from thermogrip.mpc.closed_loop.simulate import session_loop
 from thermogrip.mpc.controllers.mpc import Controller
 from thermogrip.mpc.controllers.pi import PIController
-from thermogrip.mpc.design.spec import OnOff, Settling
-from thermogrip.mpc.tuning.design_review import range_text
-from thermogrip.mpc.tuning.figures import (
-    closed_loop_chart,
-    pareto_figure,
-    step_time_figure,
-)
+from thermogrip.mpc.tuning.figures import closed_loop_chart
 from thermogrip.mpc.tuning.objective import bands_of, meets_spec
 from thermogrip.report.console import Cells, Columns, cells, short
-from thermogrip.report.html import Picture, Plot, Section, Table, Text
+from thermogrip.report.html import Plot, Section, Table, Text
 from thermogrip.report.plots import grasps_chart, steps_chart
 
 if TYPE_CHECKING:
@@ -41,39 +35,8 @@ _STEPS_CAPTION = (
     "broad and PI dashed, so that both show where they do the same."
 )
 
-_SPEC_WORDS = {
-    "settle_within_s": "settle within [s]",
-    "band_degC": "band, half width [degC]",
-    "overshoot_degC": "overshoot, at most [degC]",
-    "bias_degC": "bias at the end, at most [degC]",
-    "hold_s": "each step is simulated for [s]",
-    "energy_weight": "seconds of settling given for one at full drive",
-    "moves_weight": "share of the minimum time given for one move of full drive less",
-    "moves_limit": "moves charged beyond so many times those of the default design",
-    "ambient_degC": "room of the simulations [degC]",
-    "noise_degC": "noise of one reading [degC]",
-    "sensor_offset_degC": "sensors are off by [degC]",
-    "search_draws": "draws of the plant in the search",
-    "check_draws": "draws in the comparison",
-    "evaluations": "designs that each search may try",
-    "extra_lag": "sensors slower than the model, tried [apparent delays]",
-    "extra_delay": "delay longer than the model's, tried [apparent delays]",
-    "lost_gain": "share of the drives that does nothing, tried",
-}
-
-_WISHES = {
-    "disturbances": "measured, in the simulations and where nobody reads them",
-    "settling": "of single outputs",
-    "limits": "limits of outputs, soft [degC]",
-    "weights": "how many times the errors of an output count",
-    "zones": "anywhere within, about the target",
-    "hard": "limits that give way last",
-    "energy_price": "price of a sample at full drive",
-    "tariff": "second of the day, times the price",
-    "ramp_per_s": "fastest change of a target [per s]",
-    "safe_drive": "drive without its loop",
-    "on_off": "switched by the controller",
-}
+#: What of a design counts for a PI.
+_OF_A_PI = ("dt", "controlled", "drive_range", "slew_per_s", "loops")
 
 
 def tuning_table(tuning: Tuning) -> Cells:
@@ -114,7 +77,7 @@ def tuning_sections(tuning: Tuning) -> list[Section]:
     design, kind = tuning.controller.design, kind_of(tuning.controller)
     runs = {title.rpartition(", ")[0]: run for title, run in tuning.runs.items() if title.endswith(kind)}
     steps = {f"{a:g} to {b:g}": f"The step from {a:g} to {b:g} degC" for a, b in tuning.spec.steps}
-    sections = [tuning_section(tuning), pareto_section(tuning)]
+    sections = [tuning_section(tuning)]
     for title, run in runs.items():
         tone = _tone(tuning.spec, run) if title in steps else ""
         sections.append(loop_section(run, design, steps.get(title, f"A load on {title}"), tone=tone))
@@ -136,11 +99,8 @@ def _tone(spec: Spec, run: ClosedLoop) -> str:
 
 def tuning_section(tuning: Tuning) -> Section:
     """Return the section of a tuned controller: verdict, table, closed loops."""
-    meets = (
-        "The controller meets the spec on every draw."
-        if tuning.meets_spec
-        else "The controller does not meet the spec on every draw."
-    )
+    meets = "meets" if tuning.meets_spec else "does not meet"
+    answer = f"The {kind_of(tuning.controller)} {meets} the spec on every draw."
     scores = ", ".join(f"{name} {value:.3f}" for name, value in tuning.scores.items())
     parts: list[Any] = [
         *([Plot(steps_chart(tuning.runs), _STEPS_CAPTION)] if tuning.runs else []),
@@ -158,33 +118,7 @@ def tuning_section(tuning: Tuning) -> Section:
         ),
     ]
     tone = "good" if tuning.meets_spec else "warn"
-    return Section("Does the controller meet the spec?", tuple(parts), meets, tone, shown=2)
-
-
-def pareto_section(tuning: Tuning) -> Section:
-    """Return the section of what may be traded: settling, overshoot and energy of many designs."""
-    draws = tuning.spec.search_draws if _uncertain(tuning) else 1
-    rows = sorted(tuning.pareto.rows(), key=lambda row: (row["settle_s"] is None, row["settle_s"]))
-    columns: Columns = (
-        ("controller", lambda row: row["controller"]),
-        ("design", lambda row: row["name"]),
-        ("settling [s]", lambda row: _shown(row["settle_s"])),
-        ("overshoot, worst [K]", lambda row: _rounded(row["overshoot_degC"])),
-        ("energy [s at full drive]", lambda row: _shown(row["energy_s"])),
-        ("non-dominated", lambda row: "yes" if row["best"] else ""),
-    )
-    parts = (
-        Picture(
-            pareto_figure(tuning.pareto),
-            "Each mark is a design; ringed: no other is as good in settling, overshoot and energy and "
-            "better in one. Differences of a second, 0.05 K or half a per cent of energy do not count.",
-        ),
-        Table(
-            *cells(columns, rows),
-            f"Means over steps and the draws of the search ({draws}), {tuning.spec.hold_s:g} s each",
-        ),
-    )
-    return Section("What can be traded?", parts, _trade(rows))
+    return Section("Does the controller meet the spec?", tuple(parts), answer, tone, shown=2)
 
 
 def loop_section(run: ClosedLoop, design: Design, title: str, *, tone: str = "") -> Section:
@@ -220,47 +154,28 @@ def timing_section(seconds: Sequence[float], design: Design) -> Section:
         if late
         else f"The slowest of {times.size} steps took {slowest:.2g} ms of the {design.deadline_s:g} s it had."
     )
-    figure = step_time_figure({"controller": times}, design.deadline_s, design.dt)
-    caption = (
-        "Wall time of a step in Python on this machine, whatever else it did; what is later than the "
-        "deadline does not count, and the last plan goes on."
+    words = (
+        f"Median {1e3 * float(np.median(times)):.2g} ms on this machine, whatever else it did; an answer "
+        "after the deadline does not count, and the last plan goes on."
     )
-    return Section("Is it fast enough?", (Picture(figure, caption),), verdict, "warn" if late else "good")
+    return Section("Is it fast enough?", (Text(words),), verdict, "warn" if late else "good")
 
 
 def spec_section(tuning: Tuning) -> Section:
-    """Return the section of what was requested, and of the design that was found."""
-    spec, design = tuning.spec, tuning.controller.design
-    requested = [("steps [degC]", ", ".join(f"{a:g} to {b:g}" for a, b in spec.steps))]
-    requested += [(words, getattr(spec, key)) for key, words in _SPEC_WORDS.items()]
-    requested += [
-        (words, _listed(getattr(spec, key))) for key, words in _WISHES.items() if getattr(spec, key)
-    ]
-    design_rows: list[tuple[str, Any]] = [
-        ("regulated", ", ".join(design.controlled)),
-        ("controller", kind_of(tuning.controller)),
-        ("sample time [s]", design.dt),
-        *((f"range of {name}", f"{low:g} to {high:g}") for name, (low, high) in design.drive_range.items()),
-        *((f"slew of {name} [1/s]", value) for name, value in design.slew_per_s.items()),
-        *((f"Kc, Ti [s] of {p.output} by {p.drive}", f"{p.Kc:.4g}, {p.Ti:.4g}") for p in design.loops),
-    ]
-    if isinstance(tuning.controller, Controller):
-        design_rows += [
-            ("horizon [s]", design.horizon_s),
-            ("blocks [samples]", " ".join(map(str, design.blocks))),
-            ("move weight", design.move),
-            ("terminal weight", design.terminal),
-            ("overshoot band [degC]", design.overshoot),
-            *((f"process noise of {name}'s disturbance", sd) for name, sd in design.noise.drive.items()),
-            ("process noise of an output's disturbance", design.noise.output),
-            ("disturbances estimated", ", ".join(tuning.controller.disturbance.names)),
-        ]
+    """Return the section of what was requested, and of the design that was found, by the names that their
+    files have."""
+    kind, design = kind_of(tuning.controller), tuning.controller.design.to_dict()
+    requested = tuning.spec.model_dump(mode="json")
+    chosen = {name: design[name] for name in _OF_A_PI} if kind == "PI" else design
     parts = tuple(
-        Table(head, tuple((words, short(value)) for words, value in rows), caption)
-        for head, rows, caption in (
-            (("requested", "value"), requested, "The spec"),
-            (("design", "value"), design_rows, "The design"),
+        Table(
+            (head, "value"),
+            tuple(
+                (name, _as_written(value)) for name, value in values.items() if value not in (None, [], {})
+            ),
+            caption,
         )
+        for head, values, caption in (("key", requested, "The spec"), ("field", chosen, f"The {kind}"))
     )
     words = f"Seed {tuning.seed}; the same seed gives the same design."
     return Section("What was requested, and the design", parts, words, shown=0)
@@ -273,19 +188,13 @@ def _bands(band: float | Mapping[str, float]) -> str:
     return ", ".join(f"{half:g} degC of {name}" for name, half in band.items())
 
 
-def _listed(value: Any) -> str:
-    """Return a value of the spec as text: by output or drive, and of a tariff by its times."""
-    if isinstance(value, OnOff):
-        least = f"at least {value.min_on_s:g} s on, {value.min_off_s:g} s off"
-        return f"{least}, a sample on costs {value.price:g}"
-    if isinstance(value, Settling):
-        own = {_SPEC_WORDS[f"settle_{key}" if key == "within_s" else key]: each for key, each in value}
-        return ", ".join(f"{words} {each:g}" for words, each in own.items() if each is not None)
-    if isinstance(value, dict):
-        return ", ".join(f"{name} {_listed(each)}" for name, each in value.items())
+def _as_written(value: Any) -> str:
+    """Return a value much as TOML has it, numbers with four digits."""
+    if isinstance(value, Mapping):
+        return "; ".join(f"{name} = {_as_written(each)}" for name, each in value.items())
     if isinstance(value, list):
-        return ", ".join(each if isinstance(each, str) else f"{each[0]:g}: {each[1]:g}" for each in value)
-    return range_text(*value) if isinstance(value, tuple) else f"{value:g}"
+        return f"[{', '.join(_as_written(each) for each in value)}]"
+    return short(value)
 
 
 def session_sections(
@@ -330,22 +239,6 @@ def _contact_section(grasps: Grasps, contact: float) -> Section:
     caption = "The grasp as recorded; dotted: the message."
     parts = (Plot(grasps_chart({"": [grasps]}), caption),)
     return Section("What did the skin feel?", parts, felt, "good" if np.isfinite(contact) else "warn")
-
-
-def _trade(rows: list[dict[str, Any]]) -> str:
-    """Return the sentence of the two ends of the front."""
-    front = [row for row in rows if row["best"]]
-    if not front:
-        return "No design settled on all draws."
-    fast = min(front, key=lambda row: row["settle_s"])
-    frugal = min(front, key=lambda row: row["energy_s"])
-    if fast is frugal or frugal["energy_s"] > 0.97 * fast["energy_s"]:
-        return f"Nothing: the fastest design ({fast['settle_s']:.0f} s) is as frugal as any."
-    saved = 100 * (1 - frugal["energy_s"] / fast["energy_s"])
-    return (
-        f"Speed for energy: {frugal['name']} takes {frugal['settle_s']:.0f} s instead of "
-        f"{fast['settle_s']:.0f} s and {saved:.0f} % less energy."
-    )
 
 
 def _uncertain(tuning: Tuning) -> bool:

@@ -1,4 +1,4 @@
-"""Closed loops, step times and tunings on a sheet: every artist is as its record has it."""
+"""Closed loops on a sheet: every artist is as its record has it."""
 
 from __future__ import annotations
 
@@ -12,24 +12,9 @@ from matplotlib.figure import Figure
 
 from tests.report.conftest import described
 from thermogrip.datasets.limits import LARGEST
-from thermogrip.mpc.tuning.figures import (
-    closed_loop_chart,
-    closed_loop_figure,
-    pareto_figure,
-    step_time_figure,
-)
+from thermogrip.mpc.tuning.figures import closed_loop_chart, closed_loop_figure
 
 DRAWN = Path(__file__).with_name("figures.txt")
-
-
-def designs() -> Any:
-    row = {"settle_s": 100.0, "energy_s": 200.0, "overshoot_degC": 0.2, "best": True}
-    return SimpleNamespace(rows=lambda: [
-        row | {"name": "tuned", "controller": "MPC"},
-        row | {"name": "move x 4", "controller": "MPC", "settle_s": 160.0, "energy_s": 90.0},
-        row | {"name": "PI", "controller": "PI", "settle_s": 130.0, "best": False},
-        row | {"name": "lost", "controller": "PI", "settle_s": None},
-    ])  # fmt: skip
 
 
 def run() -> Any:
@@ -47,8 +32,6 @@ def test_each_figure_shows_what_it_should_in_the_colours_widths_and_units_of_the
     """``figures.txt`` has every artist; THERMOGRIP_FIGURES=write writes it anew: read the difference."""
     alone: Any = SimpleNamespace(**{**vars(run()), "outputs": {"skin": run().outputs["skin"]}})
     figures: dict[str, Figure] = {
-        "designs": pareto_figure(designs()),
-        "step times": step_time_figure({"MPC": [0.001, 0.002, 0.0], "PI": [1e-4]}, 0.5, 1.0),
         "closed loop": closed_loop_figure(
             run(), "a run", limits={"tank": (20.0, 45.0)}, slew_per_s={"q": 0.01}
         ),

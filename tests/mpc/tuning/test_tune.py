@@ -15,8 +15,17 @@ from thermogrip.mpc.controllers.pi import PIController
 from thermogrip.mpc.design.spec import Spec
 from thermogrip.mpc.tuning.figures import closed_loop_figure
 from thermogrip.mpc.tuning.objective import Score, StepResult, meets_spec
-from thermogrip.mpc.tuning.trade_offs import Trial
-from thermogrip.mpc.tuning.tune import Row, Tuning, best_of, kept_of, minimise, rows_of, tune, verdict_of
+from thermogrip.mpc.tuning.tune import (
+    Row,
+    Trial,
+    Tuning,
+    best_of,
+    kept_of,
+    minimise,
+    rows_of,
+    tune,
+    verdict_of,
+)
 from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.plant import Plant
 
@@ -156,7 +165,7 @@ VALLEY = {"a": 6.0, "b": 0.3, "c": 1.0}
 def valley(parameters: Any) -> Trial:
     """A trial whose score is a valley about known factors."""
     cost = sum(float(np.log(parameters[name] / value)) ** 2 for name, value in VALLEY.items())
-    return Trial("MPC", dict(parameters), 1.0 + cost, 1.0, 0.0, 1.0)
+    return Trial("MPC", dict(parameters), 1.0 + cost)
 
 
 def test_a_search_goes_down_its_valley_inside_its_limits_and_stops_in_time():
