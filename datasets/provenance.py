@@ -8,7 +8,7 @@ writer asks :func:`provenance`.  Two runs of one command with one seed differ in
 References
 ----------
 .. [1] https://reproducible-builds.org/specs/source-date-epoch/
-.. [2] https://git-scm.com/docs/gitrepository-layout
+.. [2] https://git-scm.com/docs/git-rev-parse
 """
 
 from __future__ import annotations
@@ -17,7 +17,8 @@ import hashlib
 import os
 import re
 import shlex
-import stat
+import shutil
+import subprocess
 import sys
 import time
 from collections.abc import Iterator, Sequence
@@ -34,8 +35,7 @@ _ROOMS = tuple(
     str(Path(__file__).resolve().parent.parent / room) + os.sep
     for room in ("datasets", "sysid", "mpc", "rig", "classify")
 )  # what they bring belongs to the version
-_LONGEST_GIT_FILE = 1 << 20  # bytes; packed-refs of a repository with ten thousand branches and tags
-_COMMIT = re.compile("[0-9a-f]{40}(?:[0-9a-f]{24})?")  # SHA-1 or SHA-256
+_GIT_S = 5  # it takes milliseconds; a disk of the network may hang
 _EPOCH = re.compile("[0-9]{1,11}")
 
 
@@ -128,37 +128,15 @@ def _hash(name: str) -> str:
 def _commit_of(folder: str) -> str | None:
     """Return the commit that is checked out in the repository around a folder, None where there is none.
 
-    Git itself is not asked: its configuration, which an unpacked archive may bring, can name programs that it
-    would start.  Its files are read as text [2]_.
+    Of Git's commands this one reads names and their commits alone [2]_: it starts none of the programs that a
+    repository's configuration, which an unpacked archive may bring, can name.
     """
-    place = Path(folder)
-    root = next((p for p in (place, *place.parents) if os.path.lexists(p / ".git")), None)
-    if root is None:
+    git = shutil.which("git")
+    if git is None or Path(git).parent == Path(folder):  # on Windows the working folder is searched first
         return None
-    git = root / ".git"
-    if git.is_file():  # of a worktree or a submodule
-        git = root / _git_text(git).removeprefix("gitdir:").strip()
-    head = _git_text(git / "HEAD").strip()
-    if not head.startswith("ref: refs/"):
-        return head if _COMMIT.fullmatch(head) else None
-    ref = head.removeprefix("ref: ")
-    if ".." in ref:
-        return None
-    packed_ref = re.compile(rf"^({_COMMIT.pattern}) {re.escape(ref)}$", re.MULTILINE)
-    for common in (git, git / _git_text(git / "commondir").strip()):  # a worktree has its branches elsewhere
-        if _COMMIT.fullmatch(commit := _git_text(common / ref).strip()):
-            return commit
-        if packed := packed_ref.search(_git_text(common / "packed-refs")):
-            return packed[1]
+    command = [git, "-C", folder, "rev-parse", "--verify", "--quiet", "HEAD"]
+    alone: dict[str, Any] = {"stdin": subprocess.DEVNULL, "env": os.environ | {"GIT_NO_LAZY_FETCH": "1"}}
+    with suppress(OSError, subprocess.SubprocessError):
+        ran = subprocess.run(command, capture_output=True, text=True, check=True, timeout=_GIT_S, **alone)
+        return str(ran.stdout).strip()
     return None
-
-
-def _git_text(path: Path) -> str:
-    """Return a small file of a repository, "" where it is no regular file, is a link, or is too large."""
-    with suppress(OSError, ValueError):
-        place = os.open(path, os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0))
-        with open(place, "rb") as stream:
-            about = os.fstat(place)
-            if stat.S_ISREG(about.st_mode) and about.st_size <= _LONGEST_GIT_FILE:
-                return stream.read(_LONGEST_GIT_FILE).decode("utf-8", "replace")
-    return ""

@@ -443,7 +443,7 @@ def _parse_table(
         raise UserError("has a header but no rows", file=file, hint="give at least two rows")
     lines = np.array([line for line, _ in rows], dtype=np.int64)
     columns: list[Column] = []
-    for name, column in zip(names, zip(*(cells for _, cells in rows)) if rows else ()):
+    for name, column in zip(names, zip(*(cells for _, cells in rows))):
         if is_text(name):
             columns.append(Column(name, text=[from_csv(cell.strip()) for cell in column]))
             continue

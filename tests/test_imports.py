@@ -43,7 +43,8 @@ DOORS = {
     "sklearn": {"classify", "cli.compare"},
     # what runs code from a file
     **{name: set() for name in ("pickle", "shelve", "dill", "marshal")},
-    "joblib": {"datasets.parallel"},  # its processes; no file is opened by it
+    "joblib": set(),
+    "loky": {"datasets.parallel"},  # its processes; no file is opened by it
 }  # fmt: skip
 
 

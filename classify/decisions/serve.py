@@ -18,6 +18,7 @@ import math
 import re
 import socket
 from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any, BinaryIO, TypeAlias
 
 from thermogrip.datasets.errors import UserError, known_names
@@ -97,9 +98,9 @@ def serve_lines(answer: Rows, requests: BinaryIO, answers: BinaryIO) -> int:
     return n
 
 
-def application(replies: Callable[[bytes], dict[str, Any]], port: int, workers: int = 1) -> ASGIApp:
+def application(replies: Callable[[bytes], dict[str, Any]], port: int) -> ASGIApp:
     """Return the server of answers for uvicorn; it is called by the loopback's names and this port.
-    ``replies`` returns what :func:`reply` does; several ``workers`` import it."""
+    ``replies`` returns what :func:`reply` does, one after the other in a thread."""
     import asyncio
 
     from starlette.applications import Starlette
@@ -107,9 +108,7 @@ def application(replies: Callable[[bytes], dict[str, Any]], port: int, workers: 
     from starlette.responses import JSONResponse, Response
     from starlette.routing import Route
 
-    from thermogrip.datasets.parallel import Replaced
-
-    pool = Replaced(workers)
+    thread = ThreadPoolExecutor(1)
     hosts = {f"{name}:{port}" for name in (HOST, "localhost")}
 
     async def ask(request: Request) -> Response:
@@ -132,10 +131,7 @@ def application(replies: Callable[[bytes], dict[str, Any]], port: int, workers: 
             return JSONResponse({"error": f"the request did not come within {BODY_S:g} s"}, 408, end)
         except ClientDisconnect:  # nobody is there to read an answer
             return Response(status_code=400)
-        try:
-            found = await pool.call(replies, bytes(body))
-        except UserError as error:
-            return JSONResponse({"error": str(error)}, 503)
+        found = await asyncio.get_running_loop().run_in_executor(thread, replies, bytes(body))
         return JSONResponse(found, 400 if "error" in found else 200)
 
     return Starlette(routes=[Route("/", ask, methods=["POST"])])
@@ -149,14 +145,12 @@ def listen(port: int) -> socket.socket:
         raise UserError(f"port {port} cannot be used ({error.strerror})", hint="choose another") from error
 
 
-def server(
-    replies: Callable[[bytes], dict[str, Any]], listening: socket.socket, workers: int = 1
-) -> Server:  # fmt: skip
+def server(replies: Callable[[bytes], dict[str, Any]], listening: socket.socket) -> Server:
     """Return what answers over HTTP once its ``run(sockets=[listening])`` is called, as
     :func:`application`."""
     import uvicorn
 
-    app = application(replies, listening.getsockname()[1], workers)
+    app = application(replies, listening.getsockname()[1])
     config = uvicorn.Config(app, log_level="warning", access_log=False, lifespan="off")
     return uvicorn.Server(config)
 

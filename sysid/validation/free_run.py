@@ -227,9 +227,7 @@ def free_run(
     )  # fmt: skip
 
 
-def _causes(
-    miss: Array, outputs: Sequence[str], start: Mapping[str, float]
-) -> dict[str, dict[Cause, float]]:
+def _causes(miss: Array, outputs: Sequence[str], start: Mapping[str, float]) -> dict[str, dict[Cause, float]]:
     """Return by output which share of the squared error is the start, and which a constant offset."""
     with np.errstate(over="ignore", invalid="ignore"):
         offsets = np.nanmean(miss, axis=0) ** 2 / np.maximum(np.nanmean(miss**2, axis=0), 1e-300)

@@ -13,7 +13,6 @@ import pytest
 
 from tests.cli.conftest import Bench, StandIn, shares, words_of
 from thermogrip.classify.evaluation.comparison import POOLED, Caution
-from thermogrip.cli import compare as verb
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Grasps, make_grasps
 
@@ -75,15 +74,11 @@ def scored(bench: Bench, stand_in: StandIn) -> SimpleNamespace:
     )
     made.planned = stand_in("thermogrip.classify.evaluation.splits.plan_folds")
     made.scored = stand_in("thermogrip.classify.evaluation.harness.evaluate", evaluate)
-    made.threads = stand_in(  # in turn
-        "thermogrip.datasets.parallel.run_threads", lambda function, items, _: [function(i) for i in items]
-    )
     stand_in("thermogrip.report.classification.comparison_sections", lambda name, found: [f"of {name}"])
     stand_in(
         "thermogrip.report.classification.score_table",
         lambda found: (HEAD, tuple(("bayes", name, "0.9", "0.1", "3") for name in found.conditions)),
     )
-    made.drawn = stand_in("thermogrip.report.html.draw")
     made.pages = stand_in("thermogrip.report.html.write_report")
     return made
 
@@ -128,9 +123,6 @@ def test_what_is_split_how_and_by_whom_it_is_scored(
     assert [call.args[1] for call in scored.touched] == [[first], *([tests] if tests else [])]
     assert [call.quick for call in scored.asked] == [False, True]
     assert {call.seed for call in scored.asked} == {4}
-    [call] = scored.threads
-    assert ([*call.args[1]], call.args[2]) == (splits, 3)
-    assert [call.args[0] for call in scored.drawn] == [[f"of {name}"] for name in splits]
     [page] = scored.pages
     assert page.args[0] == Path("c/report.html")
     assert page.args[3] == [f"of {name}" for name in splits]
@@ -205,14 +197,3 @@ def test_of_many_conditions_the_pooled_scores_are_printed(n: int, cut: bool, sco
     assert [name in said for name in names] == [not cut or name in (POOLED, "c2") for name in names]
     assert "Brier" not in said
     assert "fit [s]" not in said
-
-
-def test_the_bar_goes_to_each_part_by_its_work() -> None:
-    def shares_of(*parts: bool) -> dict[str, float]:
-        return {name: share for name, (share, _) in verb._shares(*parts).items()}
-
-    widths = {"given": 3 / 15, "random": 7 / 15, "by": 5 / 15}
-    assert shares_of(True, True, True) == pytest.approx(widths)
-    assert shares_of(False, True, False) == pytest.approx({"random": 1.0})
-    titles = [title for _, title in verb._shares(True, True, True).values()]
-    assert titles == ["given split", "random splits", "held out in turn"]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import math
 import os
 import pickle
@@ -22,15 +21,7 @@ import pytest
 from thermogrip import __version__
 from thermogrip.datasets import parallel
 from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.parallel import (
-    Replaced,
-    begin_processes,
-    in_order,
-    joint_progress,
-    run_parallel,
-    run_threads,
-    sub_progress,
-)
+from thermogrip.datasets.parallel import in_order, run_parallel, sub_progress
 
 OWN = ["__import__('os').getpid()"] * 4  # a process may not find this module, the builtin eval it does
 
@@ -63,56 +54,6 @@ def test_the_same_processes_do_the_work_of_every_call_also_after_a_fault() -> No
     again = set(run_parallel(eval, OWN, workers=2))
     assert len(first | again) <= 2
     assert os.getpid() not in first | again
-
-
-@pytest.mark.skipif((os.cpu_count() or 1) < 2, reason="needs two processors")
-def test_a_single_item_is_done_here_unless_it_is_to_run_elsewhere() -> None:
-    assert run_parallel(eval, OWN[:1], 2) == [os.getpid()]
-    assert run_parallel(eval, OWN[:1], 2, elsewhere=True) != [os.getpid()]
-    assert run_parallel(eval, OWN[:1], 1, elsewhere=True) == [os.getpid()]
-
-
-@pytest.mark.skipif((os.cpu_count() or 1) < 2, reason="needs two processors")
-def test_threads_share_processes_and_give_results_in_order() -> None:
-    meet, seen = threading.Barrier(3, timeout=60), []
-
-    def work(n: int) -> list[int]:
-        meet.wait()  # all three at once
-        return run_parallel(math.factorial, [n, n + 1], 2)
-
-    got = run_threads(work, [3, 1, 2], 2, lambda *a: seen.append(a), what="factorials")
-    assert got == [[6, 24], [1, 2], [2, 6]]
-    assert seen == [(pytest.approx(n / 3), "factorials") for n in (1, 2, 3)]
-    order: list[int] = []
-    assert run_threads(lambda n: order.append(n) or n, [3, 1, 2], 1) == order == [3, 1, 2]
-
-
-def test_a_fault_in_a_thread_ends_the_others_when_they_ask_for_work(pools) -> None:
-    asked, failed = [], threading.Event()
-
-    def work(n: int) -> int:
-        if n == 1:
-            failed.set()
-            raise ValueError("no")
-        failed.wait(10)
-        for _ in range(400):
-            time.sleep(0.005)
-            asked.append(run_parallel(abs, [-n], 2))
-        return n
-
-    with pytest.raises(ValueError, match="no"):
-        run_threads(work, [0, 1, 2], 2)
-    assert len(asked) < 400
-
-
-def test_progress_of_parts_side_by_side_adds_up() -> None:
-    seen: list[tuple[float, str]] = []
-    first, second = joint_progress(lambda share, what: seen.append((share, what)), [0.25, 0.75])
-    for part, share in ((second, 0.5), (first, 1.0), (second, 2.0)):
-        assert part is not None
-        part(share, "x")
-    assert seen == [(0.375, "x"), (0.625, "x"), (1.0, "x")]
-    assert joint_progress(None, [1.0]) == [None]
 
 
 @pytest.mark.skipif(os.name == "nt" or (os.cpu_count() or 1) < 2, reason="needs POSIX and two processors")
@@ -263,7 +204,6 @@ def test_a_cluster_does_again_what_a_killed_worker_had_in_hand_and_takes_in_a_la
         n_workers=1, threads_per_worker=1, processes=True, host="127.0.0.1", dashboard_address=":0"
     ) as made:
         address = made.scheduler_address
-        begin_processes(address, ["thermogrip.datasets.schema"])
         items = [(kill if n == 3 else pid).format(n=n) for n in range(40)]
         seen = []
         for n, found in enumerate(in_order(eval, items, address)):
@@ -331,46 +271,6 @@ def test_results_come_in_order_as_soon_as_they_can(pools):
     assert list(in_order(abs, [-2, -1])) == [2, 1]
 
 
-@pytest.mark.skipif(os.name == "nt" or (os.cpu_count() or 1) < 2, reason="needs POSIX and two processors")
-def test_calls_as_they_come_are_answered_by_processes_that_are_replaced() -> None:
-    async def asked() -> None:
-        pool = Replaced(2)
-        four = {await pool.call(eval, OWN[0]) for _ in range(4)}
-        assert os.getpid() not in four
-        os.kill(next(iter(four)), signal.SIGKILL)
-        found = await asyncio.gather(*(pool.call(math.factorial, n) for n in range(6)))
-        assert found == [math.factorial(n) for n in range(6)]
-        with pytest.raises(UserError, match="killed again and again"):
-            await pool.call(signal.raise_signal, signal.SIGKILL)
-        with pytest.raises(ValueError, match="factorial"):
-            await pool.call(math.factorial, -1)
-
-    asyncio.run(asked())
-
-
-@pytest.mark.skipif(os.name == "nt" or (os.cpu_count() or 1) < 2, reason="needs POSIX and two processors")
-def test_every_call_is_answered_while_processes_are_killed_at_random() -> None:
-    async def asked() -> None:
-        pool, killed = Replaced(2), []
-
-        async def kill() -> None:
-            for _ in range(10):
-                pid = await pool.call(eval, OWN[0])
-                os.kill(pid, signal.SIGKILL)
-                killed.append(pid)
-
-        calls = [pool.call(math.factorial, n % 6) for n in range(400)]
-        found, _ = await asyncio.gather(asyncio.gather(*calls), kill())
-        assert found == [math.factorial(n % 6) for n in range(400)]
-        assert len({*killed}) > 1
-
-    asyncio.run(asked())
-
-
-def test_one_worker_is_a_thread_here() -> None:
-    assert asyncio.run(Replaced(1).call(eval, OWN[0])) == os.getpid()
-
-
 class Unpacked:
     """Notes in which thread it is unpacked."""
 
@@ -388,13 +288,12 @@ def test_a_cluster_unpacks_an_item_where_it_computes_and_not_at_its_scheduler(cl
 
 @pytest.mark.skipif((os.cpu_count() or 1) < 2, reason="needs two processors")
 def test_processes_begin_with_our_modules_and_not_with_files_of_the_folder(tmp_path):
-    for name in ("colorsys", "joblib", "numpy"):
+    for name in ("colorsys", "loky", "numpy"):
         (tmp_path / f"{name}.py").write_text("raise SystemExit('of the folder')")
     program = """
 import os, sys
 sys.path.remove("")
-from thermogrip.datasets.parallel import begin_processes, run_parallel
-begin_processes(2, ["no_such_module", "colorsys"])
+from thermogrip.datasets.parallel import run_parallel
 found = run_parallel(eval, ["hasattr(__import__('colorsys'), 'hsv_to_rgb')"] * 2, 2)
 threads = run_parallel(os.getenv, ["OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"], 2)
 print(found, threads, "PYTHONSAFEPATH" in os.environ, "OPENBLAS_NUM_THREADS" in os.environ)
@@ -427,10 +326,7 @@ def test_the_client_of_a_scheduler_is_the_same_one_for_every_call(cluster, monke
     made, connected = [], parallel._connected
     monkeypatch.setattr(parallel, "_clients", {})
     monkeypatch.setattr(parallel, "_connected", lambda *given: made.append(connected(*given)) or made[-1])
-    begin_processes(cluster, ["colorsys"])
     for _ in range(2):
         assert run_parallel(math.factorial, [3, 4], cluster) == [6, 24]
     [client] = made
     client.close()
-    with pytest.raises(UserError, match="no address of a scheduler"):
-        begin_processes("localhost", ["colorsys"])

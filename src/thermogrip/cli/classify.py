@@ -144,7 +144,7 @@ def effusivity(
     """
     stated = _range(between)
     check_place(out, [*grasps, *(calibrate or ())])
-    pool = cli.workers_of(workers, cluster, *NEEDED)
+    pool = cli.workers_of(workers, cluster)
     console = Console(as_json)
     device, coupling, longest = calibrated_device(console, calibrate or [], seed)
     ask = _Effusivity(device, coupling, longest, stated)
@@ -320,14 +320,14 @@ def classify(
     Files are read one by one, workers share them out. Where --out is a folder each file's table is written
     there when it is done. --serve takes one object a line,
     {"time_s": [...], "t_surface_degC": [...], "t_object_nominal_degC": 28}, and writes its answer; with
-    --port and --workers so many are answered at once.
+    --port it answers over HTTP.
     """
     stated = _range(between)
     if serve == bool(paths) or serve == (out is not None) or (port is not None and not serve):
         raise UserError("give GRASPS and --out, or --serve alone", hint="--port belongs to --serve")
     if out is not None:
         check_place(out, [*(paths or ()), *(known or ())])
-    pool = cli.workers_of(workers, cluster, *NEEDED)
+    pool = cli.workers_of(workers, cluster)
     from thermogrip.datasets.materials import load_materials
 
     own = [name for name in cli.comma(candidates) or () if name not in load_materials()]
@@ -340,8 +340,10 @@ def classify(
         known=tuple(str(anywhere(Path(path))) for path in known or ()),
         changed_at=_changed_at([model_dir, *(known or ())]),
     )  # fmt: skip
+    if serve and pool != 1:
+        raise UserError("--serve answers one after the other", hint="leave --workers and --cluster out")
     if serve:
-        return _serve(console, ask, port, pool)
+        return _serve(console, ask, port)
     assert out is not None
     _answerer(ask)
     found = answer_files(console, "classify", paths or [], ask.answer, out, pool)
@@ -378,13 +380,10 @@ def classify(
     return 0
 
 
-def _serve(console: Console, ask: _Question, port: int | None, workers: int | str) -> int:
+def _serve(console: Console, ask: _Question, port: int | None) -> int:
     """Answer single grasps: from stdin, or over HTTP at a port."""
     from thermogrip.classify.decisions.serve import HOST, listen, reply, serve_lines, server
 
-    if isinstance(workers, str) or (workers > 1 and port is None):
-        problem = "--serve --workers is for HTTP on this computer"
-        raise UserError(problem, hint="give --port, and no --cluster")
     answer = _answerer(ask)
     if port is None:
         serve_lines(answer, sys.stdin.buffer, sys.stdout.buffer)
@@ -395,8 +394,7 @@ def _serve(console: Console, ask: _Question, port: int | None, workers: int | st
         )
     listening = listen(port)
     sys.stderr.write(f"answers at http://{HOST}:{listening.getsockname()[1]}/\n")
-    replies = partial(reply, answer) if workers == 1 else ask.reply
-    server(replies, listening, workers).run(sockets=[listening])
+    server(partial(reply, answer), listening).run(sockets=[listening])
     return 0
 
 
@@ -418,12 +416,6 @@ class _Question:
         said = Said()
         cli.warn_of_contacts(said, [record])
         return {"rows": _answerer(self)(record), "warnings": said.words}
-
-    def reply(self, request: bytes) -> dict[str, Any]:
-        """Return the answer to one request of a server."""
-        from thermogrip.classify.decisions.serve import reply
-
-        return reply(_answerer(self), request)
 
     def load(self) -> Callable[[Grasps], list[dict[str, Any]]]:
         """Return what answers a record with a row a grasp."""

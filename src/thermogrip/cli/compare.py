@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
+from itertools import accumulate, pairwise
 from pathlib import Path
-from threading import Lock
 from typing import TYPE_CHECKING, Annotated, Any
 
 from thermogrip.classify.estimators import classifier_names
@@ -17,8 +17,8 @@ from thermogrip.report.console import Console
 
 if TYPE_CHECKING:
     from thermogrip.classify.evaluation.comparison import Comparison
+    from thermogrip.datasets.parallel import Progress
     from thermogrip.datasets.schema import Grasps
-    from thermogrip.report.html import Section
 
 BY_DEFAULT = ("lstm", "posterior", "bayes", "features-lda", "pca-lda")
 MOST_CONDITIONS = 4  # that are printed one by one
@@ -74,11 +74,10 @@ def compare(
         hint = "give others to --test, or leave it out: a part of each material is then held back"
         raise UserError("is to be trained and tested on", file=min(both), hint=hint)
 
-    pool = cli.workers_of(workers, cluster, *NEEDED)
+    pool = cli.workers_of(workers, cluster)
     from thermogrip.classify.estimators.registry import trainable
     from thermogrip.classify.evaluation.harness import evaluate
     from thermogrip.datasets.grasp_files import read_grasp_files
-    from thermogrip.datasets.parallel import joint_progress, run_threads, sub_progress
 
     names = cli.comma(classifiers)
     models, missing = trainable(names or BY_DEFAULT, quick=quick, seed=seed)
@@ -103,36 +102,26 @@ def compare(
         if given and anew and (why := _unsplittable(records, repeats, train_per_class, seed)):
             console.warn(f"no random splits: {why}")
             anew = False
-        parts = _shares(given, anew, by is not None)
-        widths = joint_progress(progress, [share for share, _ in parts.values()])
-        shares = {
-            name: sub_progress(width, 0.0, 1.0, title)
-            for width, (name, (_, title)) in zip(widths, parts.items())
-        }
+        shares = _shares(progress, given, anew, by is not None)
         again: dict[str, Any] = {"seed": seed, "workers": pool}
         asked: dict[str, Callable[[], Comparison]] = {}
         if given:
             asked["files" if tests is not None else "shipped"] = partial(
                 evaluate, models, records, test=tests, progress=shares["given"], **again
             )
-        if "random" in shares:
+        if anew:
             some: dict[str, Any] = {"repeats": repeats, "train_per_class": train_per_class}
             asked["random"] = partial(
                 evaluate, fast, records, split="random", progress=shares["random"], **some, **again
             )
         if by is not None:
             asked[by] = partial(evaluate, fast, records, split=by, progress=shares["by"], **again)
-        page = _Page(left_out)
-
-        def work(name: str) -> Comparison:
-            return page.compared(name, asked[name]())
-
-        # side by side: processes that one of them leaves idle work for another, the page is drawn meanwhile
-        done = dict(zip(asked, run_threads(work, list(asked), pool), strict=True))
-        found = {name: each for name, each in done.items() if each and _scored(console, name, each, left_out)}
+        made = {name: compared() for name, compared in asked.items()}
+        done = {name: replace(each, notes=(*left_out, *each.notes)) for name, each in made.items()}
+        found = {name: each for name, each in done.items() if _scored(console, name, each, left_out)}
         if not found:
             raise UserError("nothing to score", hint="test on grasps of the materials that were trained")
-    _write_comparisons(console, found, out, page.sections(*found))
+    _write_comparisons(console, found, out)
     return 0
 
 
@@ -147,52 +136,14 @@ def _unsplittable(records: Sequence[Grasps], repeats: int, train_per_class: int,
     return ""
 
 
-def _shares(given: bool, random: bool, by: bool) -> dict[str, tuple[float, str]]:
-    """Return the share of the bar of each part of the work, and the part's name."""
-    weights = {
-        "given": (3.0 * given, "given split"),
-        "random": (7.0 * random, "random splits"),
-        "by": (5.0 * by, "held out in turn"),
-    }
-    total = sum(weight for weight, _ in weights.values())
-    return {name: (weight / total, title) for name, (weight, title) in weights.items() if weight}
+def _shares(progress: Progress | None, given: bool, random: bool, by: bool) -> dict[str, Progress | None]:
+    """Return the progress of each part of the work, by its share of the whole."""
+    from thermogrip.datasets.parallel import sub_progress
 
-
-class _Page:
-    """Sections of the report, which are made and drawn as soon as they can be, one after the other:
-    matplotlib is not for several threads."""
-
-    def __init__(self, notes: Sequence[str]) -> None:
-        self._notes, self._lock = tuple(notes), Lock()
-        self._sections: dict[str, list[Section]] = {}
-        self._faults: dict[str, UserError] = {}
-
-    def add(self, name: str, make: Callable[[], list[Section]]) -> None:
-        """Make the sections of a name, and draw them."""
-        from thermogrip.report.html import draw
-
-        with self._lock:
-            try:
-                self._sections[name] = made = make()
-                draw(made)
-            except UserError as error:  # said where they are asked for
-                self._faults[name] = error
-
-    def compared(self, name: str, comparison: Comparison) -> Comparison:
-        """Return a comparison with the notes of all of them, its section made."""
-        from thermogrip.report.classification import comparison_sections
-
-        comparison = replace(comparison, notes=(*self._notes, *comparison.notes))
-        if comparison.scores():
-            self.add(name, partial(comparison_sections, name, comparison))
-        return comparison
-
-    def sections(self, *names: str) -> list[Section]:
-        """Return the sections of these names."""
-        for name in names:
-            if name in self._faults:
-                raise self._faults[name]
-        return [section for name in names for section in self._sections[name]]
+    weights = {"given split": 3.0 * given, "random splits": 7.0 * random, "held out in turn": 5.0 * by}
+    ends = [0.0, *accumulate(weight / sum(weights.values()) for weight in weights.values())]
+    titles = zip(("given", "random", "by"), weights, pairwise(ends))
+    return {key: sub_progress(progress, start, stop, title) for key, title, (start, stop) in titles}
 
 
 def _scored(console: Console, name: str, comparison: Comparison, known: Sequence[str]) -> bool:
@@ -204,12 +155,12 @@ def _scored(console: Console, name: str, comparison: Comparison, known: Sequence
     return False
 
 
-def _write_comparisons(
-    console: Console, found: dict[str, Comparison], out: Path, sections: Sequence[Section]
-) -> None:
+def _write_comparisons(console: Console, found: dict[str, Comparison], out: Path) -> None:
     """Print and write the scores of each kind of split, and the report."""
+    from thermogrip.report.classification import comparison_sections
     from thermogrip.report.html import write_report
 
+    sections = [part for name, comparison in found.items() for part in comparison_sections(name, comparison)]
     for name, comparison in found.items():
         comparison.save(out / name)
         _show(console, name, comparison)

@@ -113,7 +113,7 @@ def identify(
     Checks the data, fits candidate models, scores each by free run on held-out data, keeps the best one.
     """
     wanted = cli.comma(models) or ()
-    pool = cli.workers_of(workers, cluster, "thermogrip.sysid.identification")
+    pool = cli.workers_of(workers, cluster)
     assert out is not None  # its callback names one
     cli.new_file(out, (".json",))
     roles = cli.comma(inputs), cli.comma(outputs), cli.comma(disturbances)

@@ -199,15 +199,11 @@ def numbers(option: str, text: str | None) -> dict[str, float]:
     return out
 
 
-def workers_of(workers: int, cluster: str | None, *modules: str) -> int | str:
-    """Return who does the work: so many local processes, or the cluster where one is named; they begin to
-    import ``modules``."""
-    from thermogrip.datasets.parallel import begin_processes, check_workers
+def workers_of(workers: int, cluster: str | None) -> int | str:
+    """Return who does the work: so many local processes, or the cluster where one is named."""
+    from thermogrip.datasets.parallel import check_workers
 
-    pool = workers if cluster is None else check_workers(cluster)
-    if modules:
-        begin_processes(pool, modules)
-    return pool
+    return workers if cluster is None else check_workers(cluster)
 
 
 def choice(option: str, value: str, allowed: Sequence[str]) -> str:

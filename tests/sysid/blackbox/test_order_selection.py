@@ -137,9 +137,7 @@ def test_errors_of_a_free_run_are_those_of_the_rows_after_the_warm_up_for_each_p
     want = [[np.sqrt(46.5 / 3), np.sqrt(14 / 3)], [np.sqrt((4 + 16 + 4) / 3), np.sqrt(14 / 3)]]
     np.testing.assert_allclose(found, want)
     fading = [StartPrior(noise=1.0, nuisance=1.0, memory=5.0)]  # by exp(-2 s/5 s) a row
-    (found,) = selection.free_run_errors(
-        Stands(), [Run(long), Run(short)], **how | {"priors": fading}
-    )
+    (found,) = selection.free_run_errors(Stands(), [Run(long), Run(short)], **how | {"priors": fading})
     left = 1.5 * np.exp(-0.4 * (np.arange(3) + 1.5))
     misses = [3.5 - left[0], 5.5 - left[2], 2.0]  # nothing of the short one's is offset
     np.testing.assert_allclose(found[0], np.sqrt(np.mean(np.square(misses))))

@@ -85,9 +85,7 @@ def test_where_no_output_can_beat_no_input_the_log_is_no_test_unless_it_did_far_
 
 def test_an_error_that_the_start_explains_does_not_clear_a_plant_that_is_far_worse_than_no_input():
     # 11.7 degC beside 3.99 without input was taken for a log that is no test
-    found = judge(
-        band(a=3.0), {"a": 11.7}, {"a": 3.99}, causes={"a": {"start": 0.95}}, gain=None, seen=False
-    )
+    found = judge(band(a=3.0), {"a": 11.7}, {"a": 3.99}, causes={"a": {"start": 0.95}}, gain=None, seen=False)
     assert (found.standing, found.cause) == ("worse", "start")
 
 
