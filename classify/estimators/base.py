@@ -19,7 +19,6 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
-from inspect import signature
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Self, TypeAlias
 
@@ -27,6 +26,8 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import logsumexp
+from sklearn.base import BaseEstimator, ClassifierMixin
+from sklearn.exceptions import NotFittedError
 
 from thermogrip.classify.estimators.arrays import coded, grasps_of
 from thermogrip.datasets.errors import UserError, known_names
@@ -90,55 +91,7 @@ class _Sampled:
     times: Sequence[float] | None = None  # of an array's samples [s], 0 at contact; None: 0, 0.1, 0.2 ...
 
 
-class _Estimator:
-    """What makes an estimator of a classifier, by scikit-learn's own functions: these are imported when it
-    asks, for an answer needs none of them."""
-
-    _estimator_type = "classifier"
-
-    @classmethod
-    def _get_param_names(cls) -> list[str]:
-        from sklearn.base import BaseEstimator
-
-        return list(BaseEstimator._get_param_names.__func__(cls))
-
-    def get_params(self, deep: bool = True) -> dict[str, Any]:
-        """Return the parameters by name, with ``deep`` also those of parameters that are estimators."""
-        from sklearn.base import BaseEstimator
-
-        return dict(BaseEstimator.get_params(self, deep))
-
-    def set_params(self, **params: Any) -> Self:
-        """Set parameters by name and return the estimator."""
-        from sklearn.base import BaseEstimator
-
-        BaseEstimator.set_params(self, **params)
-        return self
-
-    def score(self, X: Any, y: ArrayLike, sample_weight: ArrayLike | None = None) -> float:
-        """Return the share of right answers."""
-        from sklearn.base import ClassifierMixin
-
-        return float(ClassifierMixin.score(self, X, y, sample_weight))
-
-    def __repr__(self) -> str:
-        usual = {name: each.default for name, each in signature(type(self)).parameters.items()}
-        own = self.get_params(deep=False).items()
-        changed = [f"{name}={value!r}" for name, value in own if repr(value) != repr(usual[name])]
-        return f"{type(self).__name__}({', '.join(changed)})"
-
-    def __sklearn_tags__(self) -> Any:
-        from sklearn.utils import ClassifierTags, InputTags, Tags, TargetTags
-
-        return Tags(
-            estimator_type="classifier",
-            target_tags=TargetTags(required=True),
-            classifier_tags=ClassifierTags(),
-            input_tags=InputTags(allow_nan=True, three_d_array=True),
-        )
-
-
-class GraspClassifier(_Sampled, _Estimator, ABC):
+class GraspClassifier(_Sampled, ClassifierMixin, BaseEstimator, ABC):  # type: ignore[misc]
     """Base of the classifiers: checks what comes in, derives what scikit-learn expects.
 
     Parameters
@@ -186,17 +139,22 @@ class GraspClassifier(_Sampled, _Estimator, ABC):
     def _taught(self, X: Any, y: Any, learn: Callable[[list[Grasps], list[Labels]], None]) -> Self:
         self.check_installed()
         if _are_records(X):
-            records = record_list(X)
+            records = despiked(record_list(X))
             learn(records, record_labels(records, y))
             if not self.reads_both_sensors and any("t_surface_2" in part for part in records):
                 self.notes_ = [*self.notes_, "the second sensor is not read"]
             return self
         words, values = (None, None) if y is None else coded(y)
         record = grasps_of(self, X, reset=True, y=words)
-        learn(record_list(record), [grasp_labels(record, words)])
+        learn(despiked(record_list(record)), [grasp_labels(record, words)])
         if values is not None:
             self.classes_ = values[self.classes_.astype(int)]
         return self
+
+    def __sklearn_tags__(self) -> Any:
+        tags = super().__sklearn_tags__()
+        tags.input_tags.allow_nan = tags.input_tags.three_d_array = True
+        return tags
 
     @abstractmethod
     def _learn(self, records: list[Grasps], labels: list[Labels]) -> None:
@@ -205,7 +163,7 @@ class GraspClassifier(_Sampled, _Estimator, ABC):
     def _records(self, X: Any) -> list[Grasps]:
         """Return what is to be classified as records."""
         self._check_fitted()
-        return record_list(X if _are_records(X) else grasps_of(self, X, reset=False))
+        return despiked(record_list(X if _are_records(X) else grasps_of(self, X, reset=False)))
 
     def check_installed(self) -> None:
         """Raise :class:`UserError` where training needs a package that is not installed."""
@@ -274,8 +232,6 @@ class GraspClassifier(_Sampled, _Estimator, ABC):
 
     def _check_fitted(self) -> None:
         if not hasattr(self, "classes_"):
-            from sklearn.exceptions import NotFittedError
-
             raise NotFittedError(f"this {type(self).__name__} is not fitted yet: call fit(grasps)")
 
     def _as_trained(self, grasps: Grasps) -> Grasps:
@@ -330,7 +286,7 @@ def _are_records(X: Any) -> bool:
 
 
 def record_list(X: Any) -> list[Grasps]:
-    """Return one record as a list of one, several as a list; checked, and their spikes lost samples."""
+    """Return one record as a list of one, several as a list, checked."""
     records = as_grasps(X)
     if not records:
         raise UserError("no grasps were given", hint="give at least one record")
@@ -340,11 +296,16 @@ def record_list(X: Any) -> list[Grasps]:
                 f"expected Grasps, got {type(grasps).__name__}", hint="use make_grasps or read_grasps"
             )
         check_grasps(grasps)
-        records[at] = grasps = as_record(grasps)
-        spiked = check_quality(grasps).spiked
-        if spiked.any():
-            records[at] = grasps.assign(t_surface=grasps["t_surface"].where(~spiked))
+        records[at] = as_record(grasps)
     return records
+
+
+def despiked(records: Sequence[Grasps]) -> list[Grasps]:
+    """Return records whose spikes are lost samples."""
+    return [
+        record.assign(t_surface=record["t_surface"].where(~spiked)) if spiked.any() else record
+        for record, spiked in ((record, check_quality(record).spiked) for record in records)
+    ]
 
 
 def grasp_labels(grasps: Grasps, y: ArrayLike | None = None) -> Labels:

@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from thermogrip.classify.estimators.base import grasp_labels, pick, record_list
+from thermogrip.classify.estimators.base import despiked, grasp_labels, pick, record_list
 from thermogrip.classify.evaluation.comparison import Caution
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.grasp_files import Records
@@ -64,10 +64,10 @@ def plan_folds(
     seed: int = 0,
 ) -> Plan:
     """Return who trains and who is tested; the arguments are those of ``evaluate``."""
-    records = record_list(conditions)
+    records = despiked(record_list(conditions))
     _refuse_repeated(records)
     if test is not None:
-        plan = _from_files(records, record_list(test))
+        plan = _from_files(records, despiked(record_list(test)))
     elif split == "shipped":
         plan = _shipped(records)
     elif split == "random":

@@ -6,7 +6,5 @@ from thermogrip.sysid.effusivity.multi_touch import Coupling as Coupling
 from thermogrip.sysid.effusivity.posterior import EffusivityRow as EffusivityRow
 from thermogrip.sysid.effusivity.posterior import MaterialFit as MaterialFit
 from thermogrip.sysid.effusivity.posterior import effusivity_posterior as effusivity_posterior
-from thermogrip.sysid.effusivity.posterior import material_evidence as material_evidence
 from thermogrip.sysid.effusivity.posterior import material_fit as material_fit
-from thermogrip.sysid.effusivity.posterior import material_posterior as material_posterior
 from thermogrip.sysid.effusivity.quality import check_grasps as check_grasps

@@ -236,7 +236,7 @@ class Problem:
         if not values.size:
             return self.fixed
         curves = values[:-n].reshape(-1, KNOTS.size)
-        return Discrepancy(curves[0], curves[1:], values[-n:], np.zeros(0))
+        return Discrepancy(curves[0], curves[1:], values[-n:])
 
     @property
     def known(self) -> Mask:
@@ -543,10 +543,6 @@ def _calibrated(
     if rounds > 1:
         problem, last, w, spread, noise = _discrepant(problem, last, w, spread, noise, report)
     found = _gripper_model(problem, last, spread, noise, length, names, prior)
-    if found.discrepancy is not None and not problem.known.all():
-        u = problem.centre(last.theta) + problem.scales(spread) * w
-        temperatures = replace(found.discrepancy, from_room=u[:, T_OBJECT] - problem.room)
-        found = replace(found, discrepancy=temperatures)
     if data.second is None:
         return found
     # unknown object temperatures are those that the first sensor found for the blocks that they are of
@@ -571,23 +567,19 @@ def _discrepant(
 ) -> _Fitted:
     """Return the fit with a discrepancy in a smooth noise where its evidence is greater, else as it was; a
     first look at twice three steps decides whether a search is worth it.  The evidence has a maximum for
-    contacts that build up fast and one for slow ones, so the search starts at both, and the greater one is
-    the answer."""
+    contacts that build up fast, near the fit without one, and a greater one for slow ones, where the search
+    begins."""
     bare = problem, last, w, spread, noise
     least = _log_evidence(problem, last, noise)
     problem, theta = _with_discrepancy(problem, last.theta)
     begin = replace(_SMOOTH, white=noise.white)  # from elsewhere a search may end without misfit
-    looks = (3, 3, _STEPS, _STEPS)
-    found = _search(problem, theta, w, spread, (noise, begin), looks, least, progress)
-    if found is None:
+    if _search(problem, theta, w, spread, (noise, begin), (3, 3), least, progress) is None:
         return bare
     theta = problem.prior.mean.copy()
     theta[SHARED_NAMES.index("ln_build_up")] = _SLOW
     begin = replace(_SMOOTH, white=max(noise.white, _WHITE))
     start = theta, np.zeros(w.shape), dict(problem.prior.spread), (begin, begin)
-    slow = _search(problem, *start, looks[2:], least, progress)
-    each = [fit for fit in (found, slow) if fit is not None]
-    return max(each, key=lambda fit: _log_evidence(fit[0], fit[1], fit[4]))
+    return _search(problem, *start, (_STEPS, _STEPS, _STEPS), least, progress) or bare
 
 
 def _search(
@@ -595,7 +587,7 @@ def _search(
     looks: Sequence[int], least: float, progress: Progress,
 ) -> _Fitted | None:  # fmt: skip
     """Return a fit with the problem's discrepancy, after ``looks`` of so many steps, the noise found anew
-    after each; None where the evidence is below ``least`` once the noise is fitted.  ``noises``: to begin
+    between them; None where the evidence is below ``least`` once the noise is fitted.  ``noises``: to begin
     with, and from where it is searched."""
     noise, begin = noises
     for i, steps in enumerate(looks):
@@ -603,9 +595,10 @@ def _search(
         theta = last.theta
         if i > 0 and _log_evidence(problem, last, noise) < least:
             return None
-        slope = _NOISE_ROUGHLY if steps < _STEPS else _NOISE_SLOPE
-        noise = _fit_noise(problem, linearise(problem, theta, w, spread), w, begin, slope)
-    return problem, *_fit(problem, theta, w, spread, noise, progress), noise
+        if i < len(looks) - 1:
+            slope = _NOISE_ROUGHLY if steps < _STEPS else _NOISE_SLOPE
+            noise = _fit_noise(problem, linearise(problem, theta, w, spread), w, begin, slope)
+    return problem, last, w, spread, noise
 
 
 def _log_evidence(problem: Problem, step: Step, noise: Noise) -> float:

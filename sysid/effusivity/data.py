@@ -47,8 +47,8 @@ from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import check_grasps, label_values, log_name
 from thermogrip.sysid.contact.simulation import PUMP_OFF
+from thermogrip.sysid.effusivity.quality import CHECKED, number_values
 from thermogrip.sysid.effusivity.quality import check_grasps as check_quality
-from thermogrip.sysid.effusivity.quality import number_values
 
 if TYPE_CHECKING:
     from thermogrip.datasets.schema import Grasps
@@ -155,8 +155,12 @@ def touches(
     second = None
     if "t_surface_2" in grasps:
         beside = grasps.drop_vars("t_surface_2").assign(t_surface=grasps["t_surface_2"])
+        beside.attrs.pop(CHECKED, None)  # of the first sensor's samples
         second = touches(beside, until=until, at=at)
-    check_grasps(grasps)
+    masked = np.zeros(grasps["t_surface"].shape, dtype=bool)
+    if CHECKED not in grasps.attrs:
+        check_grasps(grasps)
+        masked = check_quality(grasps).masked
     where = log_name(grasps)
     found = grasps.variables  # a DataArray made of one costs more than to bin it
     ids = np.asarray(found["grasp"].values).astype(str)[at]
@@ -168,7 +172,7 @@ def touches(
     time = np.asarray(found["time"].values, dtype=float)
     keep = (time > _EDGES[0]) & (time < min(_EDGES[-1], np.inf if until is None else until + 1e-9))
     time, data = time[keep], np.asarray(found["t_surface"].values, dtype=float)[at][:, keep]
-    good = np.isfinite(data) & ~check_quality(grasps).masked[at][:, keep]
+    good = np.isfinite(data) & ~masked[at][:, keep]
     for i in np.flatnonzero((good & (time > 0.15)).sum(axis=1) < 1):
         raise UserError(f"grasp {str(ids[i])!r} has no sample after contact", file=where, hint="remove it")
     for i in np.flatnonzero((good & (time < -0.25)).sum(axis=1) < 1):

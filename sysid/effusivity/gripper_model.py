@@ -257,13 +257,12 @@ class Discrepancy:
     # effusivity of others: an approach before contact, a smoothed record
     share: Array = field(compare=False)
     onset: Array = field(compare=False)  # (n_block,) [s], of contact with each block about the mean
-    from_room: Array = field(compare=False)  # (n,) [K], objects less room in a training with unknown ones
 
     @classmethod
     def from_dict(cls, content: Mapping[str, Any], n_block: int) -> Discrepancy:
         """Return what a file holds; ValueError where a shape or a number is wrong."""
         parts = [np.asarray(content[f.name], dtype=float) for f in fields(cls)]
-        shapes = [(KNOTS.size,), (n_block, KNOTS.size), (n_block,), parts[3].shape]
+        shapes = [(KNOTS.size,), (n_block, KNOTS.size), (n_block,)]
         if [p.shape for p in parts] != shapes or not all(np.isfinite(p).all() for p in parts):
             raise ValueError("discrepancy is of another shape, or not finite")
         return cls(*parts)

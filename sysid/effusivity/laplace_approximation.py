@@ -60,7 +60,6 @@ N_NUISANCE = 7
 _EARLIEST_ONSET = 1.5  # s before the closed message
 SENSORS_APART = 0.3  # K: two thermistors of 1 %
 _DOF, _COUNTS, _GAIN_SD = 20.0, 2.0, 0.1
-_ALIKE_SD = 1.0  # K
 UNEXPLAINED = 4.0  # standard deviations of the misfit; the example rig's grasps have 2.3 at most
 _STATED_SD = 1.5  # K: an object that is less well known is one of a range of temperatures, 5 K or more
 # Tukey's contaminated normal: one stated temperature of an object in twenty is three times as far off
@@ -265,9 +264,6 @@ def fit_pairs(
         n = n + (data.second.count[row] > 0).sum(axis=1)
     if gripper.discrepancy is not None:
         mode = widened(mode, prior, n, gripper.bias)
-        if gripper.discrepancy.from_room.size:
-            unknown = ~np.isfinite(data.t_object[row])
-            mode = as_in_training(mode, prior, gripper.discrepancy.from_room, unknown)
     return mode
 
 
@@ -362,30 +358,6 @@ def widened(mode: Mode, prior: Prior, n: NDArray[np.int64], bias: float) -> Mode
     covariance[:, T_OBJECT, T_OBJECT] = v0 * width / (v0 + width)
     u[:, T_OBJECT] = (x0 * width + seen * v0) / (v0 + width)
     return mode._replace(u=u, covariance=covariance, log_evidence=evidence / _COUNTS)
-
-
-def as_in_training(mode: Mode, prior: Prior, from_room: Array, unknown: Mask) -> Mode:
-    """Return the modes under even odds that an object of unknown temperature is as far from its room as some
-    object of the training was, within 1 K, or anywhere in its range."""
-    seen, width = _seen_temperature(mode, prior)
-    room, v0 = prior.mean[:, T_OBJECT], prior.sd[:, T_OBJECT] ** 2
-    off, variance = room[:, None] + from_room - seen[:, None], (width + _ALIKE_SD**2)[:, None]
-    ratio = _log_normal(off, variance) - _log_normal(seen - room, v0 + width)[:, None]
-    each = np.exp(np.clip(ratio, -700.0, 300.0)) / (2 * from_room.size)
-    # where it lies: the range's own answer, or that of an object of the training
-    weight = np.column_stack([np.full(seen.size, 0.5), each])
-    means = seen[:, None] + (width[:, None] / variance) * off
-    means = np.column_stack([mode.u[:, T_OBJECT], means])
-    within = (width * _ALIKE_SD**2 / (width + _ALIKE_SD**2))[:, None] * np.ones(each.shape)
-    within = np.column_stack([mode.covariance[:, T_OBJECT, T_OBJECT], within])
-    total = weight.sum(axis=1)
-    mean = (weight * means).sum(axis=1) / total
-    spread = (weight * (within + (means - mean[:, None]) ** 2)).sum(axis=1) / total
-    u, covariance = mode.u.copy(), mode.covariance.copy()
-    u[unknown, T_OBJECT] = mean[unknown]
-    covariance[unknown, T_OBJECT, T_OBJECT] = spread[unknown]
-    evidence = mode.log_evidence + np.where(unknown, np.log(total), 0.0)
-    return mode._replace(u=u, covariance=covariance, log_evidence=evidence)
 
 
 def slip_of(sd: ArrayLike) -> Array:

@@ -16,13 +16,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.special import softmax
 
-from thermogrip.datasets.arrays import Array, Mask
+from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.grasp_files import Records, as_grasps
 from thermogrip.datasets.materials import Material
 from thermogrip.datasets.schema import has_touch_groups
 from thermogrip.sysid.effusivity.data import touches
 from thermogrip.sysid.effusivity.gripper_model import INSULATOR, GripperModel
-from thermogrip.sysid.effusivity.laplace_approximation import T_OBJECT, H, fit_candidates
+from thermogrip.sysid.effusivity.laplace_approximation import T_OBJECT, fit_candidates
 from thermogrip.sysid.effusivity.multi_touch import Coupling, free_touch_fit, touch_groups
 from thermogrip.sysid.effusivity.posterior_grid import GridPosterior, grid_posteriors, mixture_quantiles
 
@@ -52,11 +52,12 @@ class MaterialFit:
     log_evidence: Array
     t_object: Array  # the object's temperature under the candidate [degC]
     t_object_sd: Array  # [K]
-    prior_t_object: Array  # its prior mean, which a caller may replace (two touches of one block) [degC]
-    prior_t_object_sd: Array  # [K]
-    h_c: Array  # [W m^-2 K^-1]
-    converged: Mask
     u: Array  # (n_grasp, n_candidate, 7), the modes of the nuisances
+
+    @property
+    def probabilities(self) -> Array:
+        """Probabilities of the candidates at equal prior odds, (n_grasp, n_candidate)."""
+        return np.asarray(softmax(self.log_evidence, 1))
 
 
 def material_fit(
@@ -72,33 +73,13 @@ def material_fit(
     the spread of the training grasps.
     """
     data = touches(grasps, until=until)
-    mode, prior, *_ = fit_candidates(gripper, data, candidates, start=start)
+    mode = fit_candidates(gripper, data, candidates, start=start).mode
     n, m = data.level.size, len(candidates)
     return MaterialFit(
         log_evidence=mode.log_evidence.reshape(n, m), t_object=mode.u[:, T_OBJECT].reshape(n, m),
         t_object_sd=np.sqrt(mode.covariance[:, T_OBJECT, T_OBJECT]).reshape(n, m),
-        prior_t_object=prior.mean[:, T_OBJECT].reshape(n, m),
-        prior_t_object_sd=prior.sd[:, T_OBJECT].reshape(n, m), h_c=np.exp(mode.u[:, H]).reshape(n, m),
-        converged=mode.converged.reshape(n, m), u=mode.u.reshape(n, m, -1),
+        u=mode.u.reshape(n, m, -1),
     )  # fmt: skip
-
-
-def material_evidence(
-    gripper: GripperModel, grasps: Grasps, candidates: Sequence[str | Material], *,
-    until: float | None = None,
-) -> Array:  # fmt: skip
-    """Return the log evidence of each candidate for each grasp, shape (n_grasp, n_candidate), with the
-    arguments of :func:`material_fit`."""
-    return material_fit(gripper, grasps, candidates, until=until).log_evidence
-
-
-def material_posterior(
-    gripper: GripperModel, grasps: Grasps, candidates: Sequence[str | Material], *,
-    until: float | None = None,
-) -> Array:  # fmt: skip
-    """Return probabilities of the candidates, (n_grasp, n_candidate), at equal prior odds; rows sum to 1."""
-    evidence = material_evidence(gripper, grasps, candidates, until=until)
-    return np.asarray(softmax(evidence, 1))
 
 
 def effusivity_posterior(

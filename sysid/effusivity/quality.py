@@ -35,20 +35,6 @@ A **spike** (a bus that answered 85 or -127 degC, or 0 for a lost reading) is ma
 that a trace leaves for and comes back from, by the rule of :mod:`thermogrip.datasets.repair`, or with which
 it begins or ends, a leap of 10 K away from the rest.
 
-Drift of the skin before contact
---------------------------------
-
-A skin that was not settled goes on moving for a while, and an object that answers to it is found too warm or
-too cold: a skin that moves by s [K/s] and keeps to it puts the temperature of a metal off by 12 to 17 s times
-s (simulated copper and iron at 20 K, 10 s of contact), half of that where it settles within 10 s; of an
-insulator it is the effusivity that moves, 0.13 in log10 e for 0.05 K/s.
-
-That drift is no unknown of the model: readings before contact leave it so open that every metal's temperature
-would be known to 0.3 K instead of 0.1, and the 195 training grasps of the example rig want 0.002 K/s, which
-moves nothing.  So it is reported: a line through the last five seconds before contact whose slope noise would
-make once in 100 000 grasps.  Of the second and a half that the example rig records that is 0.17 K/s, of five
-seconds 0.03 K/s; only a session that has settled rules out a slower drift.
-
 **Contacts longer than those of the calibration** show what that could not identify, such as water behind a
 cast layer.  Their beginning alone is read, and the answer reports it.  Touches of one block are read whole:
 each leaves in the block what it took as long as it lasted.
@@ -75,8 +61,8 @@ Flags = NDArray[np.bool_]
 
 #: No skin moves by so much from one reading to the next [K].
 LEAP = 10.0
-#: A metal's temperature is off by so many seconds of a drift that lasts [s].
-BIAS_S = 15.0
+#: Attribute of a record whose samples are all usable: nobody need check them again.
+CHECKED = "checked_samples"
 #: Why a grasp is unusable.
 NO_CONTACT, OUT_OF_RANGE = "no contact", "no reading within the sensor's range"
 CONTRARY = "the skin moves away from t_object: is that right, and in degC?"
@@ -95,10 +81,6 @@ _CONTRARY_MOVE = 0.05  # of the difference
 _LEAST_TIME = 3.0  # s of contact
 _JUST_NOW = 0.25  # s
 _REST = 60.0  # s between two touches, where the record does not say
-_FROM, _UNTIL = -5.0, -0.4  # s: some contacts are made before the message
-_LEAST = 6  # readings
-_CHANCE = 1e-5
-_CERTAIN = 4.4  # sd: a smaller slope is more likely than that with any number of readings
 _READ_WHOLE = 1.2  # a contact up to so many times as long as the longest known one is not worth a word
 _LATEST = 0.7  # s
 _MOVES_BEFORE = 0.04  # of the difference, within the record before contact: the pump's stop moves 0.005
@@ -134,23 +116,6 @@ class GraspQuality:
         unread = ~np.isfinite(trace.clean[:, trace.time > _CONTACT]).any(axis=1)
         return np.asarray(unread | trace.unmoved() | trace.begins_to_saturate())
 
-    @cached_property
-    def drift(self) -> tuple[Floats, Floats]:
-        """Slope of each skin just before contact and its standard error, (n,) [K/s]; NaN where unknown."""
-        return self._trace.drift()
-
-    @property
-    def unsettled(self) -> Flags:
-        """Return which grasps touched while their skin was surely still moving, (n,)."""
-        slope, sd = self.drift
-        off = np.abs(slope) / np.maximum(sd, 1e-9)
-        if not (off > _CERTAIN).any():  # NaN compares false
-            return np.zeros(off.shape, dtype=bool)
-        from scipy.special import stdtr
-
-        n = np.isfinite(self._trace.clean[:, self._trace.near]).sum(axis=1)
-        return np.asarray(2 * stdtr(np.maximum(n - 2, 1), -off) < _CHANCE)
-
     def usable_grasps(self, grasps: Grasps) -> Grasps | None:
         """Return the usable grasps with all their samples (None where there are none), a block's ``rest``
         before a touch longer by the touches left out before it."""
@@ -167,7 +132,8 @@ class GraspQuality:
         """Return the usable grasps as an answer reads them: masked samples lost (NaN), and cut."""
         if self.masked.any():
             grasps = grasps.assign(t_surface=grasps["t_surface"].where(~self.masked))
-        return self.usable_grasps(grasps.sel(time=slice(None, self.until + 1e-9)))
+        cut = grasps.sel(time=slice(None, self.until + 1e-9)).assign_attrs({CHECKED: True})
+        return self.usable_grasps(cut)
 
 
 def check_grasps(grasps: Grasps, *, longest: float = np.inf, whole_traces: bool = False) -> GraspQuality:
@@ -268,33 +234,6 @@ class _Trace:
                     still[i] |= _saturates(self.time, sign * row, float(sign * seen[-1]), _BEGINS)
         return still
 
-    @property
-    def near(self) -> Flags:
-        """Which times are just before contact, (n_time,)."""
-        return np.asarray((self.time >= _FROM) & (self.time < _UNTIL))
-
-    def drift(self) -> tuple[Floats, Floats]:
-        """Return slope and standard error of a line through the readings just before contact, (n,) [K/s]."""
-        t, y = self.time[self.near], self.clean[:, self.near]
-        there = np.isfinite(y)
-        n = there.sum(axis=1)
-        least = np.maximum(n, 1)
-
-        def centred(values: Floats) -> Floats:
-            kept = np.where(there, values, 0.0)
-            return np.where(there, kept - (kept.sum(axis=1) / least)[:, None], 0.0)
-
-        x, off = centred(np.broadcast_to(t, y.shape)), centred(y)
-        spread = np.maximum((x**2).sum(axis=1), 1e-12)
-        slope = (x * off).sum(axis=1) / spread
-        left = ((off - slope[:, None] * x) ** 2).sum(axis=1) / np.maximum(n - 2, 1)
-        # readings that all round to one step know no better than that step
-        apart = np.diff(np.unique(y[there]))
-        step = float(apart[apart > 1e-6].min(initial=np.inf))
-        sd = np.sqrt(np.maximum(left, (step if np.isfinite(step) else 0.0) ** 2 / 12) / spread)
-        known = n >= _LEAST
-        return np.where(known, slope, np.nan), np.where(known, sd, np.nan)
-
 
 def find_contact(
     time: ArrayLike, skin: ArrayLike, *, k: float = 6.0, quantum: float = 1 / 16, since: float = -1.0
@@ -343,7 +282,7 @@ def longest_contact(records: Sequence[Grasps]) -> float:
 def contact_faults(grasps: Grasps) -> list[str]:
     """Return in words what is wrong with the contacts of a record; nothing where all is well."""
     quality = check_grasps(grasps)
-    trace, spiked, drift, unsettled = quality._trace, quality.spiked, quality.drift[0], quality.unsettled
+    trace, spiked = quality._trace, quality.spiked
     clipped, difference = np.isfinite(quality.clipped_at), trace.difference
     still, wrong = trace.stays(_ODD_MOVE), trace.contradicts()
     faults = []
@@ -371,12 +310,6 @@ def contact_faults(grasps: Grasps) -> list[str]:
     mistimed = _mistimed(trace.time, trace.clean[far], np.abs(difference[far]))
     if mistimed:  # a contact before time 0 moves the skin too
         faults.append(mistimed)
-    elif unsettled.any():
-        most = float(np.abs(drift[unsettled]).max())
-        faults.append(
-            f"{named(unsettled)} touched while the skin still moved, by up to {most:.2f} K/s: a metal may be "
-            f"found {BIAS_S * most:.1f} K too warm or too cold; let the gripper settle"
-        )
     return faults
 
 

@@ -24,7 +24,7 @@ from thermogrip.sysid.effusivity.gripper_model import (
 )
 from thermogrip.sysid.effusivity.laplace_approximation import fit_candidates, whitened
 from thermogrip.sysid.effusivity.multi_touch import two_touch_fit
-from thermogrip.sysid.effusivity.posterior import effusivity_posterior, material_evidence
+from thermogrip.sysid.effusivity.posterior import effusivity_posterior, material_fit
 from thermogrip.sysid.effusivity.posterior_grid import free_evidence
 
 
@@ -58,7 +58,7 @@ def test_fifteen_grasps_teach_it_to_identify_the_other_nine(
 
 
 def test_probabilities_are_the_evidence_times_the_prior(fitted: PosteriorClassifier, fresh: Grasps) -> None:
-    evidence = material_evidence(fitted.device_, fresh, ["copper", "iron", "wood"])
+    evidence = material_fit(fitted.device_, fresh, ["copper", "iron", "wood"]).log_evidence
     biased = clone(fitted).set_params(priors={"iron": 20.0})
     biased.device_, biased.classes_ = fitted.device_, fitted.classes_
     expected = evidence + np.log([1.0, 20.0, 1.0])
@@ -142,7 +142,7 @@ def test_odds_of_an_unknown_are_prior_odds_times_the_bayes_factor() -> None:
         load_default_gripper(),
         load_example_grasps()["exp1A_obj43_grip23"].isel(grasp=[0, 9, 18]),
     )
-    known = material_evidence(device, record, FIVE)
+    known = material_fit(device, record, FIVE).log_evidence
     data = touches(record)
     fits = fit_candidates(device, data, FIVE).mode
     best = fits.log_evidence.reshape(3, 5).argmax(axis=1)

@@ -12,7 +12,6 @@ import pytest
 
 from thermogrip.datasets.materials import load_materials
 from thermogrip.sysid.contact.closed_forms import (
-    block_contact_flux,
     half_space,
     layer_on,
     sensor_temperature,
@@ -179,9 +178,8 @@ def test_flux_from_a_finite_block_is_the_closed_forms():
     nodes = time_nodes(40.0)
     flux = step_response(PLAIN, nodes, effusivity=[3.64e4], capacity=[68600.0], h_c=[800.0])[2][0]
     late = (nodes.t > 0.05) & (nodes.t < 40)
-    want = block_contact_flux(
-        nodes.t[late], T_dev0=0, T_obj0=1, e_dev=1600.0, e_obj=3.64e4, capacity=68600.0, h_c=800.0
-    )
+    bodies = {"dev": half_space(1600.0), "obj": slab(3.64e4, 68600.0)}
+    want = two_body_flux(nodes.t[late], T_dev0=0, T_obj0=1, h_c=800.0, **bodies)
     np.testing.assert_allclose(flux[late], want, rtol=4e-3)
 
 

@@ -39,7 +39,7 @@ def test_a_gripper_survives_its_file_and_those_of_before_are_read(device, tmp_pa
 
 def test_discrepancy_and_second_sensor_survive_the_file(device, tmp_path):
     rng = np.random.default_rng(0)
-    parts = rng.normal(size=16), rng.normal(size=(5, 16)), rng.normal(size=5), rng.normal(size=3)
+    parts = rng.normal(size=16), rng.normal(size=(5, 16)), rng.normal(size=5)
     second = replace(device, bias=1.5, noise=replace(device.noise, smooth=True))
     whole = replace(device, second=second, discrepancy=Discrepancy(*parts))
     back = GripperModel.load(whole.save(tmp_path / "device.json"))
@@ -48,6 +48,8 @@ def test_discrepancy_and_second_sensor_survive_the_file(device, tmp_path):
     for ours, theirs in zip(vars(back.discrepancy).values(), parts):
         np.testing.assert_array_equal(ours, theirs)
     content = whole.to_dict()
+    content["discrepancy"]["from_room"] = [1.0]  # of version 0.2.0
+    assert GripperModel.from_dict(content) == whole
     content["discrepancy"]["always"] = [0.0]
     with pytest.raises(UserError, match="discrepancy is of another shape"):
         GripperModel.from_dict(content)
@@ -60,7 +62,7 @@ def test_what_blocks_of_the_calibration_have_others_have_in_between(device):
     share, names = np.zeros((5, 16)), list(device.blocks)
     share[names.index("wood"), 6], share[names.index("copper"), 6] = 0.1, 0.3
     onset = np.where(np.array(names) == "wood", -0.2, 0.0)
-    found = replace(device, discrepancy=Discrepancy(np.eye(16)[0], share, onset, np.zeros(0)))
+    found = replace(device, discrepancy=Discrepancy(np.eye(16)[0], share, onset))
     ln_e = np.array([device.blocks["wood"].ln_effusivity, 3.0, device.blocks["copper"].ln_effusivity])
     beyond = found.beyond(np.array([[-2.0, -1.0, 1.0]]), ln_e)
     np.testing.assert_allclose(beyond[:, 0], [[0.0, 1.0, 0.0]] * 3)
@@ -223,7 +225,7 @@ def test_the_scale_of_one_block_is_that_of_a_normal_process():
     np.testing.assert_allclose(mean, [[0.2 * 0.09 / 0.1025, 0.2 * far / 0.1025]])
     np.testing.assert_allclose(sd, np.sqrt([[0.09 - 0.0081 / 0.1025, 0.09 - far**2 / 0.1025]]))
     # of a gripper with a discrepancy less is expected: 0.36
-    nothing = Discrepancy(np.zeros(16), np.zeros((1, 16)), np.zeros(1), np.zeros(0))
+    nothing = Discrepancy(np.zeros(16), np.zeros((1, 16)), np.zeros(1))
     mean, sd = replace(GRIPPER, discrepancy=nothing).effusivity_scale(np.array([8.2]))
     assert mean[0] == pytest.approx(0.2 * 0.36 / 0.3725)
     assert sd[0] == pytest.approx(np.sqrt(0.36 - 0.1296 / 0.3725))

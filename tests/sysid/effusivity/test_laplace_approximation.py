@@ -23,7 +23,6 @@ from thermogrip.sysid.effusivity.laplace_approximation import (
     T_OBJECT,
     Mode,
     Prior,
-    as_in_training,
     find_modes,
     fit_pairs,
     free_hypotheses,
@@ -58,7 +57,7 @@ def test_readings_are_bin_means_of_the_curve_later_by_the_onset(device, data, u)
     rise, slope, _ = step_response(
         device.stack, nodes, effusivity=np.exp(u[:, 5]), capacity=np.exp(u[:, 6]), h_c=np.exp(u[:, 0]),
         build_up=np.exp(u[:, 1]),
-    )  # fmt: skip
+ )  # fmt: skip
     f = np.zeros(data.y.shape)
     for p in range(3):
         t, bins = data.sample_t[p] - u[p, 2], data.sample_bin[p]
@@ -130,7 +129,7 @@ def test_the_search_ends_where_a_general_optimiser_does(device, data, dof):
             ]
             for b in eye
         ]
-    ) / (8 * h**2)  # fmt: skip
+ ) / (8 * h**2)  # fmt: skip
     nu = law[free][np.isfinite(law[free])]
     peak = (gammaln(0.5 * (nu + 1)) - gammaln(0.5 * nu) - 0.5 * np.log(0.5 * nu)).sum()
     want = -0.5 * (cost(start) + np.linalg.slogdet(curvature)[1] + log_det[0]) + peak
@@ -314,7 +313,7 @@ def test_two_sensors_on_one_object_are_the_joint_normal():
     found = joined_modes(
         alone(r[0], x0, v0, noise[0]), normal_prior(x0, v0**0.5), alone(r[1], own0, own_v, noise[1]),
         normal_prior(own0, own_v**0.5), apart,
-    )  # fmt: skip
+ )  # fmt: skip
     covariance = v0 + np.diag([noise[0], noise[1] + 0.3**2])
     off = np.array([r[0] - x0, r[1] - x0 - apart])
     want = -0.5 * (off @ np.linalg.solve(covariance, off) + np.linalg.slogdet(2 * np.pi * covariance)[1])
@@ -347,29 +346,6 @@ def test_the_more_a_grasp_misfits_the_less_it_says():
     assert small.covariance[0, 4, 4] < large.covariance[0, 4, 4]
     # a tenth of the distance from the skin, here of 0 degC, and the bias
     assert small.covariance[0, 4, 4] == pytest.approx(1 / (1 / 1.2903 + 1 / 11.5**2), rel=1e-3)
-
-
-def test_objects_are_as_warm_as_those_of_the_training_or_anything():
-    """The evidence and the moments of a mixture, integrated on a grid."""
-    prior, from_room = normal_prior(20.0, 11.5), np.array([0.0, 0.5, -14.0])
-    mode, x = normal_mode(19.0, 2.0, evidence=1.0), np.linspace(-60, 100, 160_001)
-
-    def density(x, mean, variance):
-        return np.exp(-0.5 * (x - mean) ** 2 / variance) / np.sqrt(2 * np.pi * variance)
-
-    wide = density(x, 20.0, 11.5**2)
-    seen = density(x, 19.0, 2.0) / wide  # times the evidence
-    mixed = 0.5 * wide + 0.5 * np.mean([density(x, 20.0 + d, 1.0) for d in from_room], axis=0)
-    total = np.trapezoid(seen * mixed, x)
-    mean = np.trapezoid(x * seen * mixed, x) / total
-    variance = np.trapezoid((x - mean) ** 2 * seen * mixed, x) / total
-    found = as_in_training(mode, prior, from_room, np.array([True]))
-    assert found.log_evidence[0] == pytest.approx(1.0 + np.log(total), abs=1e-6)
-    assert found.u[0, 4] == pytest.approx(mean, abs=1e-6)
-    assert found.covariance[0, 4, 4] == pytest.approx(variance, abs=1e-6)
-    known = as_in_training(mode, prior, from_room, np.array([False]))
-    np.testing.assert_array_equal(known.u, mode.u)
-    assert known.log_evidence[0] == 1.0
 
 
 def test_the_second_sensor_is_asked_about_the_same_material(device):

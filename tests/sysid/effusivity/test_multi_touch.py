@@ -35,7 +35,7 @@ from thermogrip.sysid.effusivity.multi_touch import (
     traces_of,
     two_touch_fit,
 )
-from thermogrip.sysid.effusivity.posterior import effusivity_posterior, material_evidence, material_fit
+from thermogrip.sysid.effusivity.posterior import effusivity_posterior, material_fit
 
 from .makers import FIVE
 
@@ -60,7 +60,7 @@ def test_two_touches_name_blocks_that_one_cannot(device, record, fit):
     truth = _truth(record, fit)
     first = [at[0] for at in fit.rows]
     two = np.array(FIVE)[fit.log_evidence.argmax(axis=1)]
-    one = np.array(FIVE)[material_evidence(device, record.isel(grasp=first), FIVE).argmax(axis=1)]
+    one = np.array(FIVE)[material_fit(device, record.isel(grasp=first), FIVE).log_evidence.argmax(axis=1)]
     assert (two == truth).mean() > (one == truth).mean() + 0.1
     # metal from wood is certain with two touches
     assert np.array_equal(two == "wood", truth == "wood")
