@@ -41,13 +41,7 @@ that discrepancy resembles.
 
 Sizes are scaled anew with every fit: s = 1 means a given rms of the response over all of its logs. An
 experiment that moves the plant more than the n stretches of the fit, to a mean square m instead of m_0,
-changes that scale by
-
-    c = sqrt((n + 1) / (n + m / m_0)),
-
-with s as it was; what s will be cannot be known. Without a trace of discrepancy in the new log G = 0 and c
-= 1; with discrepancy as large as in the fit c is at least 1, with all of G. These are the ends of the range
-of a forecast.
+changes that scale by c = sqrt((n + 1) / (n + m / m_0)), with s as it was; what s will be cannot be known.
 
 With the fit's Hessian P and covariance S (:mod:`thermogrip.sysid.greybox.sandwich`; the covariance of its
 score is P S P, with U U' in it), a fit to all logs would have
@@ -70,7 +64,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Literal
 
 import numpy as np
 
@@ -83,8 +76,6 @@ from thermogrip.sysid.models.lti import symmetric_root
 from thermogrip.sysid.models.model import GreyModel
 from thermogrip.sysid.models.network import NetworkModel
 from thermogrip.sysid.plant.plant import Plant
-
-Discrepancy = Literal["rescaled", "absent", "as learnt"]
 
 _TINY = 1e-9  # keeps the score's covariance invertible in directions without information
 
@@ -119,23 +110,20 @@ class ReadingError:
     pull: Array  # U, (n_free, n_term), contribution of each term to the score of the fit
     stretches: int  # of the logs of the fit
 
-    def gain(self, root: Array, new: Experiment, discrepancy: Discrepancy = "rescaled") -> Array:
+    def gain(self, root: Array, new: Experiment) -> Array:
         """Return the inverse (n, n) of the covariance of the whitened parameters after an experiment."""
         hessian, spread, pull = self._added(new)
         before = root.T @ self.hessian @ root
         after, shared = before + hessian, self._shared(before, root)
         alone = np.eye(len(root)) - shared @ shared.T
-        both = before @ shared
-        if discrepancy != "absent":
-            both = (both + pull) * self._resized(new.lagged, discrepancy)
+        both = (before @ shared + pull) * self._resized(new.lagged)
         score = before @ alone @ before + both @ both.T + spread + _TINY * np.eye(len(root))
         return np.asarray(after @ np.linalg.solve(score, after))
 
-    def _resized(self, lagged: Array, discrepancy: Discrepancy) -> Array:
+    def _resized(self, lagged: Array) -> Array:
         """Return c (n_term,)."""
         louder = np.mean(lagged**2, axis=1) / np.square([term.rms for term in self.terms])
-        anew = np.sqrt((self.stretches + 1) / (self.stretches + louder))
-        return np.asarray(np.maximum(anew, 1.0) if discrepancy == "as learnt" else anew)
+        return np.asarray(np.sqrt((self.stretches + 1) / (self.stretches + louder)))
 
     def _shared(self, before: Array, root: Array) -> Array:
         """Return W (n, n_term), of singular values up to 1."""
@@ -243,18 +231,10 @@ class ExperimentForecast:
         """Return the expected gain of information of an experiment u (N, n_u) [bits]."""
         return _bits(self._gain(u, self._run(u, *self._moved)))
 
-    def covariance(self, u: Array, discrepancy: Discrepancy = "rescaled") -> Array:
-        """Return the covariance (n_free, n_free) of theta expected after an experiment u (N, n_u) in which
-        the model ``discrepancy`` is so large (see the module)."""
-        after = self._root @ np.linalg.solve(
-            self._gain(u, self._run(u, *self._moved), discrepancy), self._root.T
-        )
+    def covariance(self, u: Array) -> Array:
+        """Return the covariance (n_free, n_free) of theta expected after an experiment u (N, n_u)."""
+        after = self._root @ np.linalg.solve(self._gain(u, self._run(u, *self._moved)), self._root.T)
         return np.asarray(0.5 * (after + after.T))
-
-    @property
-    def has_range(self) -> bool:
-        """Whether the fit has learnt a model discrepancy, so that the forecast has a range."""
-        return self._error is not None and bool(self._error.terms)
 
     def evaluate(self, u: Array, *, margin: float = 0.0) -> float:
         """Return the bits of u (N, n_u), minus infinity where it leaves the limits; one batch for both."""
@@ -266,7 +246,7 @@ class ExperimentForecast:
             return -np.inf
         return _bits(self._gain(u, y[: len(rows)]))
 
-    def _gain(self, u: Array, y: Array, discrepancy: Discrepancy = "rescaled") -> Array:
+    def _gain(self, u: Array, y: Array) -> Array:
         """Return the inverse (n_free, n_free) of the covariance after an experiment, where it is 1 now, from
         the outputs ``y`` of the plant and of what was moved."""
         n = len(self.plant.free)
@@ -277,9 +257,7 @@ class ExperimentForecast:
             effects, starts = self._effects(self._error, change)
             lagged = self._lagged(self._error, u, y[0])
             warm_up = self._warm_up(len(u))
-            return self._error.gain(
-                self._root, Experiment(rise, effects, starts, lagged, self.dt, warm_up), discrepancy
-            )
+            return self._error.gain(self._root, Experiment(rise, effects, starts, lagged, self.dt, warm_up))
         sd, seconds = reading_noise(self.plant)
         flat = (rise * np.sqrt(self.dt / seconds) / sd).reshape(n, -1)
         return np.asarray(np.eye(n) + flat @ flat.T)

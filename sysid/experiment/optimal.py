@@ -34,12 +34,11 @@ from thermogrip.datasets.arrays import Array, Mask
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.parallel import Progress
 from thermogrip.datasets.schema import Log, column, make_log
-from thermogrip.sysid.experiment.information import ROOM, Discrepancy, ExperimentForecast, interval_widths
+from thermogrip.sysid.experiment.information import ROOM, ExperimentForecast, interval_widths
 from thermogrip.sysid.experiment.schedules import REST
 from thermogrip.sysid.plant.plant import Plant
 
 EVALUATIONS = 1500
-OTHER_DISCREPANCY: tuple[Discrepancy, ...] = ("absent", "as learnt")  # the model discrepancy may be instead
 _CELLS = 240  # at most, of the search
 _STEPS = 800  # of a simulation in the search, about
 _MARGIN = 0.2  # [K] inside the limits while the step is coarse
@@ -52,9 +51,6 @@ class Expectation:
 
     bits: dict[str, float]  # gain of information by schedule; 0 for ``now``
     widths: dict[str, dict[str, float]]  # of each parameter's 90 % interval in natural units, by schedule
-    # of each width, by how large the model discrepancy is in the experiment; empty where the plant's fit has
-    # learnt none
-    ranges: dict[str, dict[str, tuple[float, float]]]
 
     def determinant_ratio(self, kind: str, than: str) -> float:
         """Return how many times smaller det(covariance) is expected after ``kind`` than after ``than``."""
@@ -76,18 +72,7 @@ def expect(plant: Plant, schedules: Mapping[str, Log], *, room: float = ROOM) ->
     covariance = np.asarray(plant.covariance)
     widths = {"now": interval_widths(plant, covariance)}
     widths |= {name: interval_widths(plant, forecast.covariance(u)) for name, u in inputs.items()}
-    with_range = inputs if forecast.has_range else {}
-    return Expectation(
-        bits, widths, {name: _range(forecast, u, widths[name]) for name, u in with_range.items()}
-    )
-
-
-def _range(
-    forecast: ExperimentForecast, u: Array, widths: Mapping[str, float]
-) -> dict[str, tuple[float, float]]:
-    ends = [interval_widths(forecast.plant, forecast.covariance(u, how)) for how in OTHER_DISCREPANCY]
-    found = {name: [width, *(end[name] for end in ends)] for name, width in widths.items()}
-    return {name: (min(values), max(values)) for name, values in found.items()}
+    return Expectation(bits, widths)
 
 
 def inputs_of(plant: Plant, log: Log) -> Array:

@@ -11,7 +11,7 @@ about pi tau_fast to 2 pi tau_slow.
 * **staircase**: levels up and down over the whole range, each held for three tau_slow where time allows; it
   shows the curvature that two-level signals cannot.
 
-A slew limit is kept by ramps.  The first 6 s rest at the middle, so that the start is known.
+The first 6 s rest at the middle, so that the start is known.
 """
 
 from __future__ import annotations
@@ -37,13 +37,11 @@ def excite(
     dt: float = 0.5,
     low: float = -1.0,
     high: float = 1.0,
-    slew: float = np.inf,
     tau_fast: float = 10.0,
     tau_slow: float = 200.0,
-    pump: bool = True,
     seed: int = 0,
 ) -> Log:
-    """Return a schedule as a Log with ``drive`` and ``pump``, a row every dt.
+    """Return a schedule as a Log with ``drive`` and a ``pump`` that runs, a row every dt.
 
     Parameters
     ----------
@@ -54,12 +52,8 @@ def excite(
         Time between rows [s].
     low, high : float, optional
         Limits of the drive, as a share of full scale.
-    slew : float, optional
-        Greatest change of the drive per second.
     tau_fast, tau_slow : float, optional
         Time constants of the plant to excite [s].
-    pump : bool, optional
-        Whether the pump runs.
     seed : int, optional
         Where the PRBS begins in its sequence, the phases of the multisine, the first way of the staircase.
 
@@ -78,8 +72,8 @@ def excite(
         raise UserError(f"no schedule of kind {kind!r}", hint=known_names(kind, KINDS))
     if not high > low:
         raise UserError(f"limits {low:g} to {high:g} are empty", hint="give low below high")
-    if not (0 < tau_fast < tau_slow and dt > 0 and slew > 0):
-        raise UserError("need 0 < tau_fast < tau_slow, dt > 0 and slew > 0")
+    if not (0 < tau_fast < tau_slow and dt > 0):
+        raise UserError("need 0 < tau_fast < tau_slow and dt > 0")
     seconds = 60.0 * minutes
     if seconds < max(REST + 20 * tau_fast, 40 * dt):
         raise UserError(
@@ -96,9 +90,7 @@ def excite(
     else:
         shape = staircase(n, hold=3 * tau_slow / dt, seed=seed)
     drive = (low + high) / 2 + (high - low) / 2 * np.concatenate([np.zeros(rest), shape])
-    drive = _slewed(np.clip(drive, low, high), slew * dt)
-    running = np.full(time.size, float(pump))
-    columns = {"drive": (drive, "1", "input"), "pump": (running, "1", "input")}
+    columns = {"drive": (drive, "1", "input"), "pump": (np.ones(time.size), "1", "input")}
     return make_log(time, columns, name=f"{kind} schedule")
 
 
@@ -138,14 +130,3 @@ def staircase(n: int, *, hold: float, seed: int = 0) -> Array:
     up = np.linspace(0.0, 1.0, half + 1)[1:]
     levels = np.concatenate([up, up[::-1][1:], [0.0], -up, -up[::-1][1:], [0.0]])
     return np.asarray((-1.0) ** (seed % 2) * levels[(np.arange(n) * levels.size) // n])
-
-
-def _slewed(wanted: Array, most: float) -> Array:
-    """Follow the wanted values with at most ``most`` change from row to row."""
-    if not np.isfinite(most) or np.abs(np.diff(wanted)).max() <= most:
-        return wanted
-    out = np.empty_like(wanted)
-    out[0] = wanted[0]
-    for k in range(1, wanted.size):
-        out[k] = out[k - 1] + float(np.clip(wanted[k] - out[k - 1], -most, most))
-    return out

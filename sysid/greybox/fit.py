@@ -357,7 +357,7 @@ def _of_intervals(problem: Problem, spread: ScoreCovariance) -> fit_record.Inter
         stretches=sum(len(stretches) for stretches, _ in problem.logs),
         pull=(spread.pull / problem.width[:, None]).tolist(),
         error=learnt.describe(outputs, spread.bin_s, units),
-        between_logs=round(spread.q, 3),
+        between_logs=round(spread.phi, 3),
         spread_over_logs={name: round(value, 4) for name, value in spread.spreads.items()},
     )
 

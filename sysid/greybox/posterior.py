@@ -12,9 +12,7 @@ covariance C, wider by s,
     x' ~ t_6(m, s^2 C),      accepted with min(1, p(x') t(x) / (p(x) t(x'))).
 
 A poor approximation costs acceptance, not correctness. **Converged** means that the chain is longer than 50
-integrated autocorrelation times of every parameter [1]_. A ``backend`` keeps the chain in an HDF5 file with a
-hash of everything that decides its density and its moves: a run goes on from there if the hash agrees.
-
+integrated autocorrelation times of every parameter [1]_.
 Randomised maximum a posteriori
 -------------------------------
 
@@ -54,13 +52,10 @@ References
 .. [2] J. W. Miller, D. B. Dunson, "Robust Bayesian inference via coarsening", JASA 114 (2019).
 .. [3] J. M. Bardsley, A. Solonen, H. Haario, M. Laine, "Randomize-then-optimize", SIAM J. Sci. Comput. 36
    (2014).
-.. [4] A. Gelman et al., "Bayesian Data Analysis", 3rd ed. (2013), section 11.4.
 """
 
 from __future__ import annotations
 
-import hashlib
-import json
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -75,7 +70,7 @@ from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.atomic_files import atomic_path
 from thermogrip.datasets.errors import UserError, known_names
 from thermogrip.datasets.log_files import Logs, as_logs
-from thermogrip.datasets.schema import Log, columns, log_name
+from thermogrip.datasets.schema import Log
 from thermogrip.sysid.greybox.noise_model import ErrorModel
 from thermogrip.sysid.greybox.problem import Problem, make_problem
 from thermogrip.sysid.greybox.sandwich import ScoreCovariance, score_covariance
@@ -239,6 +234,7 @@ class RandomizedMap:
 LENGTH = 50  # autocorrelation times that make a chain long enough
 _DOF, _WIDER = 6.0, 1.25  # of the proposals: a tail, and the factor s
 _CHECK_EVERY = 50
+_SAMPLED = 6  # parameters: a chain of emcee's walkers slows down with each more
 
 
 @dataclass(frozen=True, eq=False)
@@ -270,7 +266,6 @@ def run_chain(
     max_steps: int,
     normal: tuple[Array, Array] | None = None,
     seed: int = 0,
-    backend: Any | None = None,
     progress: Callable[[float, str], None] | None = None,
 ) -> Chain:
     """Run emcee until the chain is 50 autocorrelation times long, or ``max_steps`` are done."""
@@ -281,26 +276,19 @@ def run_chain(
     moves = [emcee.moves.DEMove()]
     if normal is not None:
         moves.append(emcee.moves.MHMove(_proposals(*normal), n_dim))
-    sampler = emcee.EnsembleSampler(
-        n_walkers, n_dim, log_posterior, moves=moves, vectorize=True, backend=backend
-    )
-    if sampler.iteration:  # a chain is there already
-        state = sampler.get_last_sample()
-    else:
-        state = emcee.State(start, random_state=np.random.RandomState(seed).get_state())
-    tau = _autocorrelation(sampler.get_chain()) if sampler.iteration else np.full(n_dim, np.nan)
-    left = max_steps - sampler.iteration
-    if left > 0 and not sampler.iteration > LENGTH * np.max(tau):
-        for _ in sampler.sample(state, iterations=left, skip_initial_state_check=True):
-            n = sampler.iteration
-            if n % _CHECK_EVERY == 0 or n == max_steps:
-                tau = _autocorrelation(sampler.get_chain())
-                worst = float(np.max(tau))
-                if progress is not None:
-                    share = max(n / max_steps, min(1.0, n / (LENGTH * worst)))
-                    progress(share, f"sampling, {n / worst:.0f} tau")
-                if n > LENGTH * worst:
-                    break
+    sampler = emcee.EnsembleSampler(n_walkers, n_dim, log_posterior, moves=moves, vectorize=True)
+    state = emcee.State(start, random_state=np.random.RandomState(seed).get_state())
+    tau = np.full(n_dim, np.nan)
+    for _ in sampler.sample(state, iterations=max_steps, skip_initial_state_check=True):
+        n_step = sampler.iteration
+        if n_step % _CHECK_EVERY == 0 or n_step == max_steps:
+            tau = _autocorrelation(sampler.get_chain())
+            slowest = float(np.max(tau))
+            if progress is not None:
+                share = max(n_step / max_steps, min(1.0, n_step / (LENGTH * slowest)))
+                progress(share, f"sampling, {n_step / slowest:.0f} tau")
+            if n_step > LENGTH * slowest:
+                break
     return Chain(
         steps=np.asarray(sampler.get_chain()),
         log_posterior=np.asarray(sampler.get_log_prob()),
@@ -335,55 +323,6 @@ def _autocorrelation(steps: Array) -> Array:
     with np.errstate(invalid="ignore"):
         found = np.asarray(integrated_time(steps, tol=0, quiet=True), dtype=float)
     return np.asarray(np.maximum(np.where(np.isfinite(found), found, len(steps)), 1.0))
-
-
-_MARK = "thermogrip_problem"
-_METHOD = 2  # counts up when density or moves change, so that no chain goes on with other ones
-
-
-def problem_hash(
-    plant: Plant, logs: Sequence[Log], sampled: Sequence[int], average: float, walkers: int, seed: int
-) -> str:
-    """Return a hash of all that decides a chain."""
-    settings = [
-        _METHOD,
-        list(plant.free),
-        list(sampled),
-        average,
-        walkers,
-        seed,
-        {k: f"{t:.4g}" for k, t in plant.scores.weight_s.items()},
-    ]
-    # a machine's last digits are its own
-    values = {name: f"{value:.6g}" for name, value in plant.values.items()}
-    content = {"model": plant.model.to_dict(), "values": values, "settings": settings}
-    digest = hashlib.sha256(json.dumps(content, sort_keys=True).encode())
-    for log in logs:
-        digest.update(log_name(log).encode())
-        names = (*plant.inputs, *plant.disturbances, *plant.outputs)
-        digest.update(np.ascontiguousarray(log["time"].values, dtype=float).tobytes())
-        digest.update(np.ascontiguousarray(columns(log, names), dtype=float).tobytes())
-    return digest.hexdigest()
-
-
-def open_backend(path: str | Path, mark: str, shape: tuple[int, ...]) -> Any:
-    """Return emcee's backend on a file, with its steps if they belong to ``mark``, else emptied."""
-    from emcee.backends import HDFBackend
-
-    backend = HDFBackend(str(path))
-    try:
-        if Path(path).exists() and backend.initialized:
-            with backend.open() as file:
-                if file[backend.name].attrs.get(_MARK, "") == mark:
-                    return backend
-        backend.reset(*shape)
-        with backend.open("a") as file:
-            file[backend.name].attrs[_MARK] = mark
-    except (OSError, KeyError) as error:
-        raise UserError(
-            "is not a chain of a posterior", file=path, hint="delete it, or name another"
-        ) from error
-    return backend
 
 
 @dataclass(frozen=True, eq=False)
@@ -433,13 +372,9 @@ def sample_posterior(
     logs: Logs,
     *,
     free: Sequence[str] | None = None,
-    n_sampled: int = 6,
-    average: float | None = None,
-    walkers: int | None = None,
     max_steps: int = 4000,
     n_samples: int = 200,
     seed: int = 0,
-    backend: str | Path | None = None,
     progress: Callable[[float, str], None] | None = None,
 ) -> tuple[Plant, Posterior]:
     """Sample the parameters of a fitted plant.
@@ -451,21 +386,13 @@ def sample_posterior(
     logs : Log, DataFrame, str, Path, or sequence of them
         The logs of the fit.
     free : sequence of str, optional
-        Parameters that emcee samples; default the ``n_sampled`` that the data know best relative to the
-        prior. All other free parameters of the plant are integrated out, and fitted to each sample.
-    n_sampled : int, optional
-        How many, where ``free`` is absent.
-    average : float, optional
-        Bin width [s]; default that of the fit.
-    walkers : int, optional
-        Default 2 n_dim + 4.
+        Parameters that emcee samples; default the six that the data know best relative to the prior. All
+        other free parameters of the plant are integrated out, and fitted to each sample.
     max_steps : int, optional
         Give up after so many steps of the ensemble; the record is then marked as not converged.
     n_samples : int, optional
         Samples kept.
     seed : int, optional
-    backend : str or Path, optional
-        HDF5 file of the chain: written as it grows, gone on from if it belongs to the same problem.
     progress : callable, optional
         Called with (fraction done, what is being done).
 
@@ -490,29 +417,27 @@ def sample_posterior(
     report = progress or (lambda fraction, what: None)
     report(0.0, "averaging the logs")
     logs = as_logs(logs, known=roles_of(plant))
-    problem = fit_problem(plant, logs, average)
+    problem = fit_problem(plant, logs)
     z = problem.standard(plant.values)
     report(0.02, "learning the model error")
     uncertainty = score_covariance(problem, z)
     target = RandomizedMap(problem, z, uncertainty)
     spread = target.covariance
-    sampled = _choose(plant, free, n_sampled, spread)
+    sampled = _choose(plant, free, spread)
     rng = np.random.default_rng(seed)
-    n_walkers = max(walkers or 0, 2 * len(sampled) + 4)
+    n_walkers = 2 * len(sampled) + 4
     draws = rng.multivariate_normal(z[sampled], spread[np.ix_(sampled, sampled)], size=8 * n_walkers)
 
     def log_posterior(points: Array) -> Array:
         return target.log_profile(points, sampled)
 
     start = _inside(draws, log_posterior, n_walkers)
-    mark = problem_hash(plant, logs, sampled, problem.average, n_walkers, seed)
     chain = run_chain(
         log_posterior,
         start,
         max_steps=max_steps,
         normal=(z[sampled], spread[np.ix_(sampled, sampled)]),
         seed=seed,
-        backend=None if backend is None else open_backend(backend, mark, start.shape),
         progress=lambda f, w: report(0.1 + 0.85 * f, w),
     )
     report(0.95, "completing the samples")
@@ -546,14 +471,14 @@ def with_draws(
     return replace(plant, samples=drawn)
 
 
-def fit_problem(plant: Plant, logs: Sequence[Log], average: float | None = None) -> Problem:
+def fit_problem(plant: Plant, logs: Sequence[Log]) -> Problem:
     """Return the least-squares problem of the fit, with its weights."""
     if not plant.free:
         raise UserError("the plant has no free parameter", hint="fit a network first")
     model = plant.model
     if not isinstance(model, GreyModel):
         raise UserError(f"a {model.kind} model has no priors", hint="fit a network, or a model with priors")
-    bin_s = average or plant.scores.average_s or model.average
+    bin_s = plant.scores.average_s or model.average
     logs, _ = match_logs(model, logs)
     problem = make_problem(model, logs, average=bin_s, independent=model.independent)
     weights, bin_s = plant.scores.weight_s, problem.average
@@ -561,10 +486,10 @@ def fit_problem(plant: Plant, logs: Sequence[Log], average: float | None = None)
     return problem.with_tau(np.maximum(tau, 1.0))
 
 
-def _choose(plant: Plant, free: Sequence[str] | None, n: int, spread: Array) -> list[int]:
+def _choose(plant: Plant, free: Sequence[str] | None, spread: Array) -> list[int]:
     """Return which free parameters are sampled."""
     if free is None:
-        return sorted(np.argsort(np.diag(spread))[:n].tolist())
+        return sorted(np.argsort(np.diag(spread))[:_SAMPLED].tolist())
     for name in free:
         if name not in plant.free:
             raise UserError(f"{name!r} is not a free parameter", hint=known_names(name, plant.free))
@@ -611,7 +536,7 @@ def _record(
     about = (
         f"bins of {problem.average:g} s; "
         f"{uncertainty.numbers.describe(plant.outputs, uncertainty.bin_s, units)}; "
-        f"logs differ {uncertainty.q:.1f} times as much as expected (variance); all in all a log has "
+        f"logs differ {uncertainty.phi:.1f} times as much as expected (variance); all in all a log has "
         f"{uncertainty.coarsening:.1f} times less information than the fit's weights assume; "
         "sensor offsets and start of each log allowed for"
     )
@@ -631,22 +556,11 @@ def _record(
         off_centre=float(np.max(np.abs(np.median(whole, axis=0) - z) / whole.std(axis=0))),
         verdict=verdict,
         ess={name: drawn.settled[..., 0].size / tau for name, tau in zip(names, chain.tau.tolist())},
-        r_hat={name: split_r_hat(drawn.settled[..., i]) for i, name in enumerate(names)},
+        r_hat={
+            name: float(_arviz().rhat(drawn.settled[..., i].T, method="split"))
+            for i, name in enumerate(names)
+        },
     )
-
-
-def split_r_hat(steps: Array) -> float:
-    """Return the R-hat [4]_ of one dimension (n_step, n_walker), each walker cut in two; NaN of few steps.
-
-    >>> split_r_hat(np.random.default_rng(0).standard_normal((1000, 8))) < 1.01
-    True
-    """
-    half = len(steps) // 2
-    if half < 2:
-        return float("nan")
-    parts = np.concatenate([steps[:half], steps[half : 2 * half]], axis=1)
-    within, between = parts.var(axis=0, ddof=1).mean(), parts.mean(axis=0).var(ddof=1)
-    return float(np.sqrt((half - 1) / half + between / within)) if within > 0 else float("nan")
 
 
 def _arviz() -> Any:

@@ -71,10 +71,9 @@ def test_without_a_plant_a_schedule_has_the_whole_range(bench: Bench) -> None:
     assert (schedule["drive"].min(), schedule["drive"].max()) == (-1.0, 1.0)
 
 
-def test_the_table_of_widths_ends_with_the_range_of_the_last_schedule() -> None:
+def test_the_table_of_widths_has_a_column_a_schedule() -> None:
     plant: Any = SimpleNamespace(free=("U", "C"), units={"C": "J/K"}, values={"U": 5.0, "C": 80.0})
-    widths = {"now": {"U": 4.0, "C": 40.0}, "prbs": {"U": 2.0, "C": 20.0}, "optimal": {"U": 1.0, "C": 10.0}}
-    expected = Expectation({}, widths, {"prbs": {"U": (1.5, 3.0)}, "optimal": {"U": (0.8, 1.6)}})
-    head, rows = expected_rows(plant, expected)
-    assert head == ["parameter", "unit", "value", "now", "prbs", "optimal", "from", "to"]
-    assert rows == [["U", "1", 5.0, 4.0, 2.0, 1.0, 0.8, 1.6], ["C", "J/K", 80.0, 40.0, 20.0, 10.0]]
+    widths = {"now": {"U": 4.0, "C": 40.0}, "optimal": {"U": 1.0, "C": 10.0}}
+    head, rows = expected_rows(plant, Expectation({}, widths))
+    assert head == ["parameter", "unit", "value", "now", "optimal"]
+    assert rows == [["U", "1", 5.0, 4.0, 1.0], ["C", "J/K", 80.0, 40.0, 10.0]]

@@ -287,7 +287,6 @@ def test_a_posterior_is_an_answer_of_yes_where_it_has_converged(
 
     sampled = stand_in("thermogrip.sysid.greybox.posterior.sample_posterior", outcome)
     room.found = found_of(model)
-    room.bench.write("p.chain.h5", "a chain")
     done = room.bench.run("identify", "good.csv", "--posterior", "--seed", "5", "--out", "p.json", "--json")
     assert done.code == code
     shown = room.bench.run("identify", "good.csv", "--posterior", "--report", "p.html", "--out", "p.json").out
@@ -296,9 +295,8 @@ def test_a_posterior_is_an_answer_of_yes_where_it_has_converged(
     used = model == "network" and converged is not None
     assert json.loads(done.out)["posterior"] == (vars(record) if used else None)
     assert room.sections[0].args[3] is (record if used else None)
-    assert (room.bench.path / "p.chain.h5").exists() == (not (used and converged))
     if model == "network":
-        assert (sampled[0].args[0], sampled[0].seed, sampled[0].backend) == (BOARD, 5, Path("p.chain.h5"))
+        assert (sampled[0].args[0], sampled[0].seed) == (BOARD, 5)
     if used:
         assert shares(done.err, "identify") == [0, 30, 80]
         assert "posterior: c" in done.err

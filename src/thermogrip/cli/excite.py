@@ -124,7 +124,7 @@ def _optimal(
     ratios = {
         kind: expected.determinant_ratio("optimal", kind) for kind in expected.bits if kind != "optimal"
     }
-    answer = {"bits": expected.bits, "widths_90": expected.widths, "ranges_90": expected.ranges}
+    answer = {"bits": expected.bits, "widths_90": expected.widths}
     return log, answer | {"determinant_ratio": ratios, "notes": notes}
 
 
@@ -205,15 +205,13 @@ def optimal_for(
 
 
 def expected_rows(plant: Plant, expected: Expectation) -> tuple[list[str], list[list[object]]]:
-    """Return head and rows of the table of interval widths now and after each schedule, and of the last the
-    range."""
+    """Return head and rows of the table of interval widths now and after each schedule."""
     kinds = list(expected.widths)
-    ranges = expected.ranges.get(kinds[-1], {})
-    head = ["parameter", "unit", "value", *kinds, *(["from", "to"] if ranges else [])]
+    head = ["parameter", "unit", "value", *kinds]
     rows: list[list[object]] = []
     for name in plant.free:
         widths = [expected.widths[kind][name] for kind in kinds]
-        rows.append([name, plant.units.get(name, "1"), plant.values[name], *widths, *ranges.get(name, ())])
+        rows.append([name, plant.units.get(name, "1"), plant.values[name], *widths])
     return head, rows
 
 

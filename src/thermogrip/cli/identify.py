@@ -229,13 +229,10 @@ def _sampled(
     from thermogrip.sysid.greybox.posterior import sample_posterior
     from thermogrip.sysid.identification import NO_DRAWS, no_draws
 
-    chain = out.with_suffix(".chain.h5")  # a run that was stopped goes on from it
     try:
-        plant, record = sample_posterior(plant, logs, seed=seed, backend=chain, progress=progress)
+        plant, record = sample_posterior(plant, logs, seed=seed, progress=progress)
     except NO_DRAWS as error:
         return plant, None, no_draws("network", "posterior", error)
-    if record.converged:
-        chain.unlink(missing_ok=True)
     return plant, record, ""
 
 

@@ -58,25 +58,20 @@ NOISE, OWN, OFFSET, START = 4 * 0.09 * 56, (2 * 28) ** 2, (2 * 2.4) ** 2, 16**2 
 
 
 @pytest.mark.parametrize(
-    ("rms", "pull", "discrepancy", "shared", "factor"),
+    ("rms", "pull", "shared", "factor"),
     [
-        (2.0, 80.0, "rescaled", 0.4, 4 / (3 + 11 / 4)),  # the mean square of the lagged signal is 11
-        (2.0, 80.0, "as learnt", 0.4, 1.0),
-        (2.0, 80.0, "absent", 0.4, None),
-        (4.0, 80.0, "rescaled", 0.4, 4 / (3 + 11 / 16)),
-        (4.0, 80.0, "as learnt", 0.4, 4 / (3 + 11 / 16)),
-        (2.0, 300.0, "rescaled", 1.0, 4 / (3 + 11 / 4)),  # 1.5, cut to 1
-        (2.0, -80.0, "rescaled", -0.4, 4 / (3 + 11 / 4)),
+        (2.0, 80.0, 0.4, 4 / (3 + 11 / 4)),  # the mean square of the lagged signal is 11
+        (4.0, 80.0, 0.4, 4 / (3 + 11 / 16)),
+        (2.0, 300.0, 1.0, 4 / (3 + 11 / 4)),  # 1.5, cut to 1
+        (2.0, -80.0, -0.4, 4 / (3 + 11 / 4)),
     ],
 )
-def test_the_gain_of_an_experiment_by_hand(
-    rms: float, pull: float, discrepancy: Any, shared: float, factor: float | None
-):
+def test_the_gain_of_an_experiment_by_hand(rms: float, pull: float, shared: float, factor: float):
     """With R = 0.5 the fit's Hessian is 100, the experiment's 2 * 56; the term's pull on it is 2 * 11."""
     error = learnt(terms=(Response("q", 20.0, np.array([0.25]), rms),), pull=np.array([[pull]]))
-    both = (100 * shared) ** 2 if factor is None else (100 * shared + 22) ** 2 * factor
+    both = (100 * shared + 22) ** 2 * factor
     score = 100**2 * (1 - shared**2) + both + 1.5 * (NOISE + OWN + OFFSET + START)
-    got = error.gain(np.array([[0.5]]), experiment(), discrepancy)
+    got = error.gain(np.array([[0.5]]), experiment())
     np.testing.assert_allclose(got, [[212**2 / score]])
 
 
@@ -141,7 +136,6 @@ def test_what_a_fit_has_learnt_is_taken_from_its_record(gripper: Plant):
     assert (found.pull.shape, found.hessian.shape) == ((n, 1), (n, n))
     (got,) = found.terms
     assert (got.signal, got.lag, got.size.tolist(), got.rms) == ("v |v|", 20.0, [0.1, 0.2], 0.05)
-    assert ExperimentForecast(plant).has_range
     wide = learnt_error(
         replace(plant, scores=PlantScores(intervals=replace(known, between_logs=2.5, terms=[], pull=[])))
     )
@@ -153,7 +147,6 @@ def test_what_a_fit_has_learnt_is_taken_from_its_record(gripper: Plant):
         {"scores": PlantScores(intervals=replace(known, numbers=None))},
     ):
         assert learnt_error(replace(plant, **less)) is None
-        assert not ExperimentForecast(replace(plant, **less)).has_range
 
 
 def lag() -> Plant:
