@@ -5,14 +5,12 @@ A relay keeps what it owes,
     debt(t) = int (requested - state) dt      [s of full power],
 
 and switches on once it owes half of its shortest pulse, off once it owes nothing, neither before its least
-time is over.  While it is on the debt falls by no more than 1 s a second, while it is off it rises by no
-more: whatever is requested,
+time is over.  So whatever is requested,
 
     -on_s / 2  <=  debt  <=  max(on_s / 2, off_s),
 
-so over a window of W seconds the mean of the relay is off by at most the width of that over W, and over
-a period of one requested share by nothing.  There is no period to choose: at a share d it is the shortest
-that the least times allow, but at the ends, where it takes on_s / d and off_s / (1 - d).
+and over a window of W seconds the mean of the relay is off by at most the width of that over W.  There is no
+period to choose: at a share d it is the shortest that the least times allow.
 
 A heater and a cooler are two such relays of one drive from -1 to 1, each asked for its own sign.  One comes
 on only when the other has been off for a dead time; what it owes by then beyond its bound is forgiven.  A

@@ -3,25 +3,21 @@
 The TCLab's protocol has no number, no checksum, no time to live and no trip, so what can be done is done
 here:
 
-* **Which answer is whose.**  Old input is thrown away before each question, and one question is open at a
-  time.  Whenever an answer did not come, or was not what it had to be, silence is waited for before anything
-  is asked again: a late answer would be taken for the next one.  ``SCAN`` gives both temperatures and both
-  heaters at once; heaters that are not what was set mean a reset, or an answer that slipped.
-* **What is a number.**  ``digits.three-digits``, ended by LF or CR LF, inside what the converter can give;
-  anything else, also the head of a number that a time-out cut, is asked again.
+* **Which answer is whose.**  Old input is thrown away before each question.  Whenever an answer did not come,
+  or was not what it had to be, silence is waited for before anything is asked again: a late answer would be
+  taken for the next one.  Heaters that are not what was set mean a reset, or an answer that slipped.
 * **What is plausible.**  A jump of more than ``jump`` since the last scan of less than 10 s ago is asked
   again, and the median of three counts: without a checksum a flipped digit is as good as any other.  A
   converter at its end is an open or shorted sensor: NaN.
 * **Trips.**  Four scans in a row above ``highest`` or with a lost sensor switch both heaters off and latch,
-  as our own firmware does; the latch is cleared with :meth:`TCLabRig.clear`.  Where the board could not be
-  reached then, its heaters go off at the first scan that shows them on.
-* **Which board it is.**  The firmware knows no number of its own.  After a silence or on a new connection it
-  is the same board where a heater that was on still is, to the last digit.  With the heaters off nothing
-  tells one board from another: it is not driven any more.
+  as our own firmware does.  Where the board could not be reached then, its heaters go off at the first scan
+  that shows them on.
+* **Which board it is.**  After a silence or on a new connection it is the same board where a heater that was
+  on still is, to the last digit.  With the heaters off nothing tells one board from another: it is not driven
+  any more.
 
 What cannot be done: **nothing ends the heaters when the program is dead or the cable out**; they stay as they
-were until the board loses its power.  They are small (about 1.5 W at most at the ceilings that the firmware
-starts with).  ``Q2B`` is never used: firmware 2.0.1 sets heater 1 with it.
+were until the board loses its power.  ``Q2B`` is never used: firmware 2.0.1 sets heater 1 with it.
 """
 
 from __future__ import annotations

@@ -20,30 +20,23 @@ guard keeps no clock and opens nothing: a reading, the host's time, and what was
 values and a :class:`~thermogrip.rig.guard.trip.Trip` come out.  The loop switches off.
 
 **The time of a reading** by the computer's clock lies between ``asked`` and ``now``, when it was asked for
-and when it was there.  The rig's clock is wrong where no moments between these allow what it says; however
-late the program is with a reading, it is not wrong for that.  The program itself was late (*frozen*) where a
-drive stood for longer than ``expiry_s`` without being renewed (:meth:`Guard.late`); while nothing is driven
-it may take its time.  A device that ends its drives itself knows better whether that one has held: the loop
-asks it then.  The model is told when a drive was applied: on a computer that is late that is long after the
-reading that it answers.
+and when it was there; the rig's clock is wrong where no moments between these allow what it says.  The
+program itself was late (*frozen*) where a drive stood for longer than ``expiry_s`` without being renewed.
+A device that ends its drives itself knows better whether that one has held: the loop asks it then.
 
-**How far beyond a limit.**  A limit trips on the second accepted reading beyond it.  The loop looks at least
-every :data:`~thermogrip.rig.session.loop.LOOK_S`, whatever the sample time is, so a rig that changes by at
-most r K/s is at most 2 r LOOK_S beyond it, and three times its noise, when power goes off: 0.35 K + 0.1 K for
-a TCLab at full power.  What is in a heater by then still comes, and no check of readings takes it back: the
-same TCLab goes on by 1.3 K from 40 degC.  :data:`LIMIT_MARGIN` holds for both together wherever the heat in
-transit is less than 1.5 K (docs/reference/faults.md has measured figures).
+**How far beyond a limit.**  A limit trips on the second accepted reading beyond it.  A rig that changes by at
+most r K/s is then at most 2 r :data:`~thermogrip.rig.session.loop.LOOK_S` beyond it, and three times its
+noise: 0.35 K + 0.1 K for a TCLab at full power.  What is in a heater by then still comes: the same TCLab goes
+on by 1.3 K from 40 degC.  :data:`LIMIT_MARGIN` holds for both together wherever the heat in transit is less
+than 1.5 K (docs/reference/faults.md has measured figures).
 
-Does it warm when it is heated and cool when it is cooled?  The rules that need no model
-----------------------------------------------------------------------------------------
-
-They are the rules of 3-D printers (Klipper's ``verify_heater``, Marlin's ``WATCH_TEMP``), with a sign,
-because a Peltier drive does both, and by energy, because what heats slowly burns as well:
+**The rules that need no model** are those of 3-D printers (Klipper's ``verify_heater``, Marlin's
+``WATCH_TEMP``), with a sign, because a Peltier drive does both, and by energy, because what heats slowly
+burns as well.
 
 *No answer.*  Each time the integral of the drive (a share of its range, positive heats) has come to
-``energy`` seconds of full drive, either way and without a change of sign, an output must have moved by
-``least`` kelvin with the drive at some time since the last time, or one must stand where such a drive holds
-it.  A change of sign begins anew, for what was stored before still acts:
+``energy`` seconds of full drive without a change of sign, an output must have moved by ``least`` kelvin with
+the drive, or one must stand where such a drive holds it:
 
     |T - T_room| >= far min(1, 2 |mean drive|) - least,    T on the drive's side of the room.
 

@@ -1,7 +1,7 @@
 r"""The state of a rig, estimated from its readings, and the minutes that led there.
 
-State x, a bias w on each drive (a fraction of half its range; a driver is never quite what its command says)
-and a bias b on each output but the reference (thermocouples are plugged anew) follow
+State x, a bias w on each drive (a fraction of half its range) and a bias b on each output but the reference
+(thermocouples are plugged anew) follow
 
     x+ = f(x, u + w, d),    w+ = w + noise,    b+ = b + noise,    y = h(x) + y0 + b + noise,
 
@@ -10,13 +10,9 @@ P, a native step predicts and a reading corrects by
 
     P = F P F' + Q,    S = H P H' + R,    K = P H' S^-1,    z += K (y - expected),
 
-and P by (I - K H) P (I - K H)' + K R K', which stays positive whatever rounding does to K.
-
-An innovation y - expected beyond ``jump_k`` of its own standard deviations sqrt(S) and ``jump_floor`` kelvin
-is not a temperature of this rig.
-
-It starts at rest at the first readings.  Where those agree neither with each other nor with the room nothing
-is known of what cannot be read (a hot heatsink), and P starts a hundred times larger.
+and P by (I - K H) P (I - K H)' + K R K', which stays positive whatever rounding does to K.  It starts at rest
+at the first readings; where those agree neither with each other nor with the room nothing is known of what
+cannot be read (a hot heatsink), and P starts a hundred times larger.
 
 **Inputs between readings.**  A model steps with its own dt, readings come when they come.  What was applied
 is averaged over each native step of the model, as the twin and the fits do: with u(t) held between calls,

@@ -11,10 +11,8 @@ residual r may be
     |r| <= floor(H) + share * swing,
 
 swing the largest change that either path makes in the window: a model is wrong by a share of what it
-predicts, and by a floor when it predicts nothing.  This is the "not heating at the expected rate" of 3-D
-printers, with a sign, for cooling too, and with the expected number at hand.  A pump that was switched
-meanwhile is another plant, and the floor is larger by ``switching``.  The cause of a larger residual is
-sought as below.
+predicts, and by a floor when it predicts nothing.  A pump that was switched meanwhile is another plant, and
+the floor is larger by ``switching``.  The cause of a larger residual is sought as below.
 
 *A bias.*  A sensor that drifts slowly, or a driver that weakens, is followed by the filter's biases b and w.
 b may not exceed ``bias_limit``, and w, of standard deviation sd in the filter, not
@@ -22,36 +20,30 @@ b may not exceed ``bias_limit``, and w, of standard deviation sd in the filter, 
     sqrt((drive_limit e / s)^2 + (5 sd)^2),
 
 e being what the largest drive of the longest window does in such a window, and s its slope: e / s is that
-drive, but more of it where more drive hardly does more, near a Peltier element's optimum.  What logs show of
-the effect of inputs is that from run to run it differs by 5 % of itself
-(:data:`~thermogrip.sysid.plant.fit_record.RUN_GAIN_SD`), so ``drive_limit`` is three of that.
+drive, but more of it where more drive hardly does more, near a Peltier element's optimum.  From run to run
+the effect of inputs differs by 5 % of itself (:data:`~thermogrip.sysid.plant.fit_record.RUN_GAIN_SD`), so
+``drive_limit`` is three of that.
 
-**A rig that has drifted.**  A plant is identified on one day; a room, its water and its thermal paste are
-others on the next.  Where the user states a drift s (a share, 0.05 say), each parameter may be theta_i (1 + s
-delta_i) with delta_i uniform between -1 and 1, of variance 1/3 (of a parameter on a linear scale, whose value
-may be next to 0, s is a share of at least 0.2).  A window then ends elsewhere by G delta, G its slopes, and a
-residual is no fault where it is below
+**A rig that has drifted.**  Where the user states a drift s (a share, 0.05 say), each parameter may be
+theta_i (1 + s delta_i) with delta_i uniform between -1 and 1, of variance 1/3 (of a parameter on a linear
+scale, whose value may be next to 0, s is a share of at least 0.2).  A window then ends elsewhere by G delta,
+G its slopes, and a residual is no fault where it is below
 
     allowed + min(3 sqrt(G G' / 3), allowed),
 
 so no window ever is more than twice as wide as without.  The bias of a drive beyond its limit is no fault
-where all that it does in a longest window is below min(3 sqrt(G G' / 3), allowed): near its optimum a Peltier
-element hardly answers to its current, and a few percent of heat look like a quarter of the drive.
+where all that it does in a longest window is below min(3 sqrt(G G' / 3), allowed).
 
-Which fault explains a window whose residual is too large?
-----------------------------------------------------------
-
-The window is simulated again under each fault that may have happened in it, from several onsets on: the
-driver gives nothing, gives everything, gives half, is wired the wrong way round, or the pump has stopped.
-With e = reading less path, summed over the readings of the window and the outputs,
+**Which fault explains a window** whose residual is too large?  The window is simulated again under each fault
+that may have happened in it, from several onsets on.  With e = reading less path, summed over the readings of
+the window and the outputs,
 
     cost = rarity * sum e^2,
 
 rarity more than 1 for what hardly happens (nobody rewires a rig that runs).  A sensor that is wrong alone
-leaves the other outputs on the model's path, and one that is late follows that path some seconds behind.
-
-The cheapest is the explanation if its cost is a small part of that without any fault, and the next best is
-named as well where the readings cannot distinguish the two.
+leaves the other outputs on the model's path, and one that is late follows that path some seconds behind.  The
+cheapest is the explanation if its cost is a small part of that without any fault, and the next best is named
+as well where the readings cannot distinguish the two.
 """
 
 from __future__ import annotations

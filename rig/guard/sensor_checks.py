@@ -1,31 +1,28 @@
 r"""Faults of a single sensor that show without any model: lost, jumping, stuck, or apart from its pair.
 
-*Lost.*  Open and shorted sensors read as not a number, or as the end of the converter's range.  A reading
-that is not finite, or outside what a water loop can be, is suspect; the third in a row trips, for one spike
-(a loose plug) must not end a night's work.  So does a quarter of the time without a good reading,
+*Lost.*  A reading that is not finite, or outside what a water loop can be, is suspect; the third in a row
+trips, for one spike (a loose plug) must not end a night's work.  So does a quarter of the time without a good
+reading (three in a row come every 84 readings then anyway),
 
     share += (1 - exp(-passed / 60 s)) (lost - share),    lost = 1 from a suspect reading to the next, else 0.
-
-Where a quarter of all readings is lost at random, three in a row come every 84 readings anyway.
 
 *Jump.*  Water cannot change faster than ``rate``; a reading that does is suspect.  A skin that touches an
 object may.
 
-*Stuck.*  A reading that repeats bit for bit has stopped.  How many repeats prove it depends on the noise:
-with white noise of standard deviation s about the middle of a quantum q, a healthy sensor repeats itself with
+*Stuck.*  How many bit-equal readings prove a fault depends on the noise: with white noise of standard
+deviation s about the middle of a quantum q, a healthy sensor repeats itself with
 
     p = erf(q / (2 sqrt(2) s)),
 
-so n = ln(alpha) / ln(p) repeats are a false alarm with probability alpha.  No test of repeats can be faster
-at that alpha; for q = 1/16 K and s = 0.04 K it takes 37 samples at 1e-9, and for a converter of 0.3 K with
-the same noise no number of repeats proves anything (the model has to).  q is the smallest step seen.
+so n = ln(alpha) / ln(p) repeats are a false alarm with probability alpha.  For q = 1/16 K and s = 0.04 K it
+takes 37 samples at 1e-9; for a converter of 0.3 K with the same noise no number proves anything (the model
+has to).  q is the smallest step seen.
 
 *Pairs.*  Two sensors of one temperature may differ by ``pair_limit`` for ``pair_s``, no longer.
 
-**The room's sensors.**  Losing one is no reason to stop, and no limit holds for it.  Which they are is a
-role: the plant's disturbances that are temperatures, and of the sensors that the plant does not know those
-that the guard file states.  Where it states none the name decides, as in a log
-(:func:`~thermogrip.datasets.roles.guess_role`), and the session reports the guess.
+**The room's sensors.**  Losing one is no reason to stop, and no limit holds for it.  They are the plant's
+disturbances that are temperatures, and of the sensors that the plant does not know those that the guard file
+states, or else those that are called so (:func:`~thermogrip.datasets.roles.guess_role`).
 """
 
 from __future__ import annotations

@@ -69,8 +69,6 @@ def guard_from_dict(content: Mapping[str, Any], *, file: str | Path | None = Non
     if "room_sensors" in content:
         values["rooms"] = _names(content["room_sensors"], file)
     values["limits"] = {name: _limit(name, pair, file) for name, pair in tables.get("limits", {}).items()}
-    if "no_model" in tables:
-        tables["no_model"] = _without_former(tables["no_model"], file)
     for name, kind in _TABLES.items():
         found = _values(tables.get(name, {}), kind, f"{name}.", file)
         if name == "sensors":
@@ -80,20 +78,6 @@ def guard_from_dict(content: Mapping[str, Any], *, file: str | Path | None = Non
     for problem, hint in _faults(settings):
         raise UserError(problem, file=file, hint=hint)
     return settings
-
-
-def _without_former(table: Mapping[str, Any], file: str | Path | None) -> dict[str, Any]:
-    """Return [no_model] of version 0.2.0 by today's keys: its window of full drive is an energy, and what
-    moves the wrong way is no answer."""
-    former = {"window_s": (60.0, (5, 3600)), "drive": (0.5, (0.01, 1)), "wrong_K": (2.0, (0.05, 50))}
-    values = {
-        name: _number(f"no_model.{name}", table.get(name, usual), span, "write full_drive_s", file)
-        for name, (usual, span) in former.items()
-    }
-    today = {name: value for name, value in table.items() if name not in former}
-    if "window_s" in table:
-        today.setdefault("full_drive_s", values["window_s"])
-    return today
 
 
 def _values(table: Mapping[str, Any], kind: type[Any], where: str, file: str | Path | None) -> dict[str, Any]:

@@ -8,17 +8,11 @@
     check          a session to the target under the controller that came of it
 
 Each session has a run folder of its own in the folder (``01-step``, ``02-loop``, ...), and what is known so
-far stands beside them: ``plant.json``, ``controller.json``.  Whatever ended it (Ctrl-C, a trip, a power cut),
-the same call goes on from the sessions that are there: their rows count, and so does their time.
+far stands beside them.  Whatever ended it, the same call goes on from the sessions that are there.
 
 **How long a loop's log is.**  SIMC's integral time is 8 delays of what it controls (or the lag, where that is
 shorter), and the loop settles within a few of them.  The step is held for ``HOLD`` of these; a bit of the
-PRBS lasts half of one, the time in which the loop answers a change of its target, and ``BITS`` of them are
-the period of a register of four bits, the shortest in which every pair of bits occurs.
-
-**How far the targets may go.**  A loop by SIMC overshoots a step by a tenth, and the guard's limit is kept by
-what is still under way when power goes off (``LIMIT_MARGIN``): the highest target stays below the limit by
-that, and ``OVERSHOOT`` of the way from where it began.
+PRBS lasts half of one, the time in which the loop answers a change of its target.
 """
 
 from __future__ import annotations

@@ -12,19 +12,12 @@ the rig pass one sample time.
               ``stop`` ends it; then it opens
 
 Whatever ends it (done, time-out, a trip, an exception, Ctrl-C, ``kill``), drive and pump are off afterwards.
-A session that does not settle is an answer (a verdict), not an error, and so is one that the guard ended: its
-``trip`` has what was expected and what was measured.
+A session that does not settle is an answer (a verdict), not an error, and so is one that the guard ended.
 
-The object's temperature is a number (what the warmer is set to), the name of a sensor that is read as the
-gripper closes, or unknown; from an earlier touch of the same block it is a number with its uncertainty.
-
-When has a temperature settled?  A test that allows for noise, and the three figures of a step
-----------------------------------------------------------------------------------------------
-
-Over the last ``window`` seconds the error e = y - target is fitted by a line, e = a + b (t - t_mean).  Its
-two coefficients are uncertain: readings are noisy, quantised, and correlated from sample to sample.
-With the residual standard deviation s, floored at the rounding error quantum / sqrt(12), and its lag-one
-correlation r, the n samples are worth n_eff = n (1 - r) / (1 + r) independent ones, so
+**When has a temperature settled?**  Over the last ``window`` seconds the error e = y - target is fitted by a
+line, e = a + b (t - t_mean).  With the residual standard deviation s, floored at the rounding error
+quantum / sqrt(12), and its lag-one correlation r, the n samples are worth n_eff = n (1 - r) / (1 + r)
+independent ones, so
 
     se(a) = s / sqrt(n_eff),        se(b) = sqrt(12) s / (window sqrt(n_eff)).
 
@@ -32,15 +25,10 @@ The temperature has settled if level and drift are inside the band even at two s
 
     |a| + 2 se(a) <= band    and    window (|b| + 2 se(b)) <= band.
 
-A single reading inside the band proves nothing (it may be passing through), and a fixed waiting time proves
-less.  The rule errs towards waiting: with noise that could hide a drift of the size of the band it is never
-met.
+The rule errs towards waiting: with noise that could hide a drift of the size of the band it is never met.
 
-Play a schedule on a rig and record what it does: the log that a plant is identified from
------------------------------------------------------------------------------------------
-
-It is a session without a controller: the same loop reads, guards, applies and writes down, and every way out
-switches off.  The drive is the schedule's row that is in force; the log is sampled every ``dt`` seconds.
+**A schedule** is played by a session without a controller: the drive is the schedule's row that is in force,
+and the log, sampled every ``dt`` seconds, is what a plant is identified from.
 """
 
 from __future__ import annotations

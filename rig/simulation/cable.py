@@ -2,8 +2,7 @@
 
 A pty's host side appears under a name that stays the same through pulling and plugging, a link in a folder of
 its own, as ``/dev/serial/by-id`` gives real ones.  A socket listens on the loopback address only.  Bad lines
-flip bits, lose, invent, repeat and splice bytes: the virtual device does so on demand, and the tests of the
-parsers.
+flip bits, lose bytes and change digits: the virtual device does so on demand, and the tests of the parsers.
 """
 
 from __future__ import annotations
@@ -143,31 +142,23 @@ def _no_ptys() -> UserError:
     return UserError("this system has no pseudo-terminals", hint=hint)
 
 
-def _flip(data: bytes, rng: Random) -> bytes:
+def flip(data: bytes, rng: Random) -> bytes:
+    """Return the bytes with one to eight bits turned over."""
     spoilt = bytearray(data)
     for _ in range(rng.randint(1, 8)):
         spoilt[rng.randrange(len(spoilt))] ^= 1 << rng.randrange(8)
     return bytes(spoilt)
 
 
-def _replace(data: bytes, rng: Random) -> bytes:
-    start, end = _stretch(data, rng)
-    return data[:start] + rng.randbytes(end - start) + data[end:]
+def lose(data: bytes, rng: Random) -> bytes:
+    """Return the bytes without up to twenty in a row, as an overrun does."""
+    start = rng.randrange(len(data))
+    return data[:start] + data[start + rng.randint(1, 20) :]
 
 
-def _lose(data: bytes, rng: Random) -> bytes:
-    """Lose a stretch, as an overrun does."""
-    start, end = _stretch(data, rng)
-    return data[:start] + data[end:]
-
-
-def _invent(data: bytes, rng: Random) -> bytes:
-    at = rng.randint(0, len(data))
-    return data[:at] + rng.randbytes(rng.randint(1, 40)) + data[at:]
-
-
-def _digit(data: bytes, rng: Random) -> bytes:
-    """Change one to four digits into others: the worst case, since the grammar stays right."""
+def digit(data: bytes, rng: Random) -> bytes:
+    """Return the bytes with up to four digits changed into others: the worst case, since the grammar stays
+    right."""
     places = [k for k, byte in enumerate(data) if 48 <= byte <= 57]
     spoilt = bytearray(data)
     for place in rng.sample(places, min(len(places), rng.randint(1, 4))):
@@ -175,24 +166,8 @@ def _digit(data: bytes, rng: Random) -> bytes:
     return bytes(spoilt)
 
 
-def _cut(data: bytes, rng: Random) -> bytes:
-    return data[: rng.randrange(len(data))]
-
-
-def _stretch(data: bytes, rng: Random) -> tuple[int, int]:
-    start = rng.randrange(len(data))
-    return start, min(len(data), start + rng.randint(1, 20))
-
-
 #: The ways to spoil, by name.
-SPOILS = {
-    "flip": _flip,
-    "replace": _replace,
-    "lose": _lose,
-    "invent": _invent,
-    "digit": _digit,
-    "cut": _cut,
-}
+SPOILS = {"flip": flip, "lose": lose, "digit": digit}
 
 
 def spoil(data: bytes, rng: Random) -> bytes:

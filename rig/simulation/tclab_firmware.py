@@ -1,8 +1,8 @@
 """The TCLab's firmware 2.0.1, its faults included.
 
 One line a command, ``WORD [ARG]`` ended by a carriage return or a line feed; one line back, ended by both
-(``SCAN`` gives four; words that end in ``B`` give four bytes, a little-endian float).  An empty command gives
-nothing, so the usual ``\\r\\n`` gives one answer.
+(``SCAN`` gives four).  An empty command gives nothing, so the usual ``\\r\\n`` gives one answer.  Words that
+end in ``B`` (four bytes, a little-endian float), which no client here uses, are left out.
 
 | word | does | answer |
 |---|---|---|
@@ -16,14 +16,12 @@ nothing, so the usual ``\\r\\n`` gives one answer.
 | ``VER`` | | name and version |
 | anything else | heaters off | the word |
 
-There is no checksum, no number, no time-out and no trip: heaters stay on for good when the host dies, and
-``Q2B`` sets heater 1.
+There is no checksum, no number, no time-out and no trip: heaters stay on for good when the host dies.
 """
 
 from __future__ import annotations
 
 import re
-import struct
 from collections.abc import Sequence
 
 from thermogrip.rig.firmware.reference import Board, Outputs, Value
@@ -72,11 +70,7 @@ class TCLabCore:
     def _answer(self, command: bytes) -> bytes:
         text = command.decode("ascii", errors="replace").strip().upper()
         word, _, argument = text.partition(" ")
-        value = _to_float(argument)
-        if word.endswith("B") and word[:-1] in ("T1", "T2", "Q1", "Q2"):
-            return self._binary(word[:-1], value)
-        lines = self._lines(word, value)
-        return b"".join(line.encode() + b"\r\n" for line in lines)
+        return b"".join(line.encode() + b"\r\n" for line in self._lines(word, _to_float(argument)))
 
     def _lines(self, word: str, value: float) -> list[str]:
         match word:
@@ -103,13 +97,6 @@ class TCLabCore:
             case _:
                 self._power = [0.0, 0.0]
                 return [word]
-
-    def _binary(self, word: str, value: float) -> bytes:
-        channel = int(word[1]) - 1
-        if word[0] == "T":
-            return struct.pack("<f", self._temperature(channel))
-        self._power[0] = _clip(value, 100.0)  # Q2B sets heater 1 too, and answers with heater 2
-        return struct.pack("<f", self._power[channel])
 
     def _temperature(self, channel: int) -> float:
         """Return what the converter makes of a sensor: an open one floats up, a short one is 0."""

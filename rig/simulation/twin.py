@@ -1,9 +1,8 @@
 """The twin: an identified plant behind the rig's interface, with sensors and a hand to grasp with.
 
 The plant is integrated with its own native step dt; the inputs of a step are the time averages of what was
-applied during it (exact for a linear plant, and what the fit did to its logs), a switch takes the value that
-it had for longer.  Between two steps the outputs are interpolated towards a provisional step, so the twin can
-be read at any time.
+applied during it (what the fit did to its logs), a switch takes the value that it had for longer.  Between
+two steps the outputs are interpolated towards a provisional step, so the twin can be read at any time.
 
 A reading is  truth + offset + slow noise + white noise, rounded to the quantum;  slow noise is an
 Ornstein-Uhlenbeck process (standard deviation ``slow_noise``, memory ``slow_time``).
@@ -16,12 +15,10 @@ done alone: with y(t) the plant's skin, t_c the true time of contact and F the s
                - int F(t - s) dy(s),   s from t_c to t,
 
 G being what the room does by the far face of the block.  The integral is Duhamel's: the object answers to the
-difference as it is, not as it was at contact.  Once the pump is off a bare skin drifts to the room, and one
-that is pressed on a metal cannot: where F comes to 1, T_dev stays at T_obj whatever y does.
+difference as it is, not as it was at contact.
 
 On release the addition dies out with the time constant ``recovery``; it is the heat that soaks into the
-finger and the water, which the plant's states do not know, and only matters to what is recorded between
-grasps.
+finger and the water, which the plant's states do not know.
 """
 
 from __future__ import annotations

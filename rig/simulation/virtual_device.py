@@ -1,13 +1,9 @@
 """A device without hardware: either protocol on a pty or a socket, a simulated plant, faults on demand.
 
 The device lives in a thread of its own and moves its plant and its firmware ten times a second of its own
-clock: the computer's, many times that, or one that the host steps.  What it does on a stepped clock depends
-on no scheduler.  On the computer's its time stands still while the computer has no time for it: no board is
-held up, and what a host sent meanwhile came in time.  :meth:`VirtualDevice.exchange` leaves out thread and
-cable: the quickest.
-
-``trace`` keeps the truth of the last hour (or as many samples as asked), so that a test knows when the
-drive went to zero and how warm it got, whatever the sensors showed.
+clock: the computer's, many times that, or one that the host steps.  On the computer's its time stands still
+while the computer has no time for it: no board is held up, and what a host sent meanwhile came in time.
+:meth:`VirtualDevice.exchange` leaves out thread and cable: the quickest.
 
 The plant is a :class:`~thermogrip.rig.simulation.twin.Twin`.  A fault sits where the real one would: a
 sensor's between the true temperature and the device, a stuck driver's between the device and the plant (only
@@ -265,7 +261,7 @@ class VirtualDevice:
         self._rng = Random(seed)
         self._link = _link(link, socket_port)
         self._lock = threading.RLock()
-        self._jobs: deque[tuple[bool, threading.Event]] = deque()  # pull or plug, and when it was done
+        self._cable = threading.Lock()  # of who reads, writes, pulls or plugs
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
         self._garbage = 0.0
@@ -318,7 +314,7 @@ class VirtualDevice:
         if name not in FAULTS:
             raise ValueError(f"no fault {name!r}; there are {', '.join(FAULTS)}")
         if name == "cable_pulled":
-            self._handle_cable(pull=True)
+            self._pull_or_plug(pull=True)
         with self._lock:
             self._advance()
             self._set_fault(name, sensor, options)
@@ -326,7 +322,7 @@ class VirtualDevice:
     def clear(self, name: str | None = None) -> None:
         """Clear one fault, or all of them; a latch of the device stays."""
         if name in (None, "cable_pulled") and self.is_pulled:
-            self._handle_cable(pull=False)
+            self._pull_or_plug(pull=False)
         with self._lock:
             self._advance()
             if name is None or name in SENSOR_FAULTS:
@@ -381,18 +377,19 @@ class VirtualDevice:
         self.stop()
 
     def _serve(self) -> None:
-        """Answer and let time pass until stopped; the only thread that touches the cable."""
+        """Answer and let time pass until stopped."""
         assert self._link is not None
         while not self._stop.is_set():
-            while self._jobs:
-                pull, done = self._jobs.popleft()
-                self._pull_or_plug(pull)
-                done.set()
             if self.is_pulled:
                 self._stop.wait(_POLL_S)
                 self.exchange(b"")
-            elif answer := self.exchange(self._link.read(self._patience())):
-                self._link.write(answer)
+                continue
+            with self._cable:
+                heard = b"" if self.is_pulled else self._link.read(self._patience())
+            answer = self.exchange(heard)
+            with self._cable:
+                if answer and not self.is_pulled:
+                    self._link.write(answer)
 
     def _patience(self) -> float:
         """Return how long to listen: not beyond the next sample, or its work would hold up an answer [s]."""
@@ -402,23 +399,15 @@ class VirtualDevice:
             left = self._due() / 1000 - self.time
         return min(_POLL_S, max(0.0, left / self._clock.speed))
 
-    def _handle_cable(self, *, pull: bool) -> None:
-        """Pull the cable or plug it in between two reads of the serving thread; return when it is done."""
-        if self._thread is None:
-            self._pull_or_plug(pull)
-            return
-        done = threading.Event()
-        self._jobs.append((pull, done))
-        while not done.wait(1.0) and self._thread.is_alive():
-            pass
-
-    def _pull_or_plug(self, pull: bool) -> None:
-        if pull:
-            self._lost.add("cable_pulled")
-        else:
-            self._lost.discard("cable_pulled")
-        if self._link is not None:
-            (self._link.pull if pull else self._link.plug)()
+    def _pull_or_plug(self, *, pull: bool) -> None:
+        """Pull the cable or plug it in, between two reads of the thread that serves."""
+        with self._cable:
+            if pull:
+                self._lost.add("cable_pulled")
+            else:
+                self._lost.discard("cable_pulled")
+            if self._link is not None:
+                (self._link.pull if pull else self._link.plug)()
 
     def _set_fault(self, name: str, sensor: str | None, options: Mapping[str, Any]) -> None:
         if name == "garbage":

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from thermogrip.classify import classify_grasps, load_classifier
-from thermogrip.cli.kinds import check_guard
 from thermogrip.cli.main import main
 from thermogrip.datasets import read_grasps
 from thermogrip.datasets.errors import UserError
@@ -85,13 +84,12 @@ def test_samples_of_0_1_0_belong_to_their_plant() -> None:
     assert (len(plant.samples), mean) == (100, pytest.approx(EXPECTED["samples"], rel=1e-12))
 
 
-def test_what_init_of_0_1_0_wrote_is_read() -> None:
+def test_what_init_of_0_1_0_wrote_is_read_but_for_the_guard() -> None:
     assert sorted(load_network(OLD / "network.toml").parameters) == EXPECTED["network"]
-    spec, guard = read_spec(OLD / "spec.toml"), read_guard(OLD / "guard.toml")
+    spec = read_spec(OLD / "spec.toml")
     assert {name: getattr(spec, name) for name in EXPECTED["spec"]} == EXPECTED["spec"]
-    check_guard(str(OLD / "guard.toml"))
-    assert guard.stale_s == EXPECTED["guard"]["stale_s"]
-    assert [*guard.skin_limits] == EXPECTED["guard"]["skin_limits"]
+    with pytest.raises(UserError, match=r"no_model\.window_s: no such key; `thermogrip init guard` shows"):
+        read_guard(OLD / "guard.toml")
     assert read_topic_map(OLD / "topics.toml").columns
 
 

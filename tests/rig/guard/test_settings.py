@@ -57,6 +57,7 @@ def test_every_line_of_the_template_may_be_changed() -> None:
 
 REFUSED: dict[str, tuple[str, tuple[str, ...]]] = {
     "not TOML": ("stale_s =", ("is not TOML",)),
+    "a key of version 0.2.0": ("[no_model]\nwindow_s = 60", ("no_model.window_s", "`thermogrip init guard`")),
     "an unknown key": ("happiness = 3", ("happiness", "no such key", "init guard")),
     "another unit of time": ("stale_ms = 500", ("stale_ms", "write stale_s")),
     "another unit of temperature": ("skin_degF = [37, 131]", ("skin_degF", "write skin_degC")),
@@ -128,19 +129,6 @@ def test_each_number_has_a_range_in_which_its_check_works() -> None:
         for value in (*ends, ends[0] - step, ends[1] + step):
             with nullcontext() if value in ends else pytest.raises(UserError, match=said):
                 guard_from_dict({table: {key: value}} if table else {key: value})
-
-
-@pytest.mark.parametrize(
-    ("content", "energy"),
-    [({"window_s": 60.0, "drive": 0.5, "wrong_K": 2.0}, 60.0), ({"drive": 0.25}, 60.0),
-     ({"window_s": 40}, 40.0), ({"window_s": 40, "full_drive_s": 9}, 9.0)],
-)  # fmt: skip
-def test_what_a_drive_gave_in_a_window_of_version_0_2_0_is_an_energy(
-    content: dict[str, float], energy: float
-) -> None:
-    assert guard_from_dict({"no_model": content}).rules == RuleSettings(energy=energy)
-    with pytest.raises(UserError, match=r"no_model.drive: 2 is not from 0.01 to 1; write full_drive_s"):
-        guard_from_dict({"no_model": {**content, "drive": 2}})
 
 
 WIDE = {"sensors": {"believable_degC": [-50, 150]}}

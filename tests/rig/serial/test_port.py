@@ -39,9 +39,7 @@ def use(port: Port) -> None:
         port.read(0.2)
 
 
-def test_bytes_go_both_ways_and_old_input_can_be_thrown_away(
-    link: PtyLink | SocketLink
-) -> None:
+def test_bytes_go_both_ways_and_old_input_can_be_thrown_away(link: PtyLink | SocketLink) -> None:
     with Port(link.url) as port:
         accept(link, port)
         assert port.read(0.01) == b""
@@ -56,7 +54,7 @@ def test_bytes_go_both_ways_and_old_input_can_be_thrown_away(
 
 
 def test_all_that_waits_is_read_at_once_where_only_sockets_can_be_waited_for(
-    monkeypatch: pytest.MonkeyPatch
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """On Windows a serial port is waited for by its own time-out."""
     link = PtyLink()
@@ -71,7 +69,7 @@ def test_all_that_waits_is_read_at_once_where_only_sockets_can_be_waited_for(
 
 
 def test_a_pulled_cable_is_one_error_and_the_port_comes_back_under_the_same_name(
-    link: PtyLink | SocketLink
+    link: PtyLink | SocketLink,
 ) -> None:
     port = Port(link.url)
     accept(link, port)

@@ -106,32 +106,6 @@ def test_every_kind_of_damage_is_noticed(seed: int, kind: str) -> None:
     assert heard(SPOILS[kind](line, rng)) in ([], [protocol.decode_line(line[:-1])])
 
 
-def changed(kind: str) -> list[tuple[bytes, bytes]]:
-    """Return a thousand spoilt lines, without what heads and tails have in common."""
-    line, found = bytes(range(48, 58)) * 6, []
-    for seed in range(1000):
-        old, new = line, SPOILS[kind](line, Random(seed))
-        while old and new and old[0] == new[0]:
-            old, new = old[1:], new[1:]
-        while old and new and old[-1] == new[-1]:
-            old, new = old[:-1], new[:-1]
-        found.append((old, new))
-    return found
-
-
-def test_damage_is_of_the_sizes_of_a_serial_line() -> None:
-    flips = [sum((a ^ b).bit_count() for a, b in zip(*pair, strict=True)) for pair in changed("flip")]
-    assert (min(flips), max(flips)) == (1, 8)
-    assert {len(old) - len(new) for old, new in changed("replace") + changed("digit")} == {0}
-    assert max(len(old) for old, _ in changed("replace")) == 20
-    digits = [sum(a != b for a, b in zip(*pair, strict=True)) for pair in changed("digit")]
-    assert (min(digits), max(digits)) == (0, 4)
-    assert all(new.isdigit() or not new for _, new in changed("digit"))
-    assert {len(old) - len(new) for old, new in changed("lose")} == set(range(1, 21))
-    assert {len(new) - len(old) for old, new in changed("invent")} == set(range(1, 41))
-    assert {len(old) - len(new) for old, new in changed("cut")} == set(range(1, 61))
-
-
 @given(st.binary(max_size=600))
 def test_noise_is_never_a_line(noise: bytes) -> None:
     assert not any(isinstance(event, protocol.Line) for event in protocol.LineParser().feed(noise + b"\n"))
