@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import threading
 import time
+from contextlib import suppress
 from dataclasses import replace
 from importlib import util
 from typing import Any
+from urllib.request import Request, urlopen
 
 import pytest
 
@@ -95,3 +98,16 @@ def test_a_question_on_the_page_may_be_answered_on_the_terminal(
         assert watch.ask("ready?") == "q"  # a stop that was asked for is an answer
         os.close(ends[1])
         watch._typing.join()
+
+
+@pytest.mark.parametrize(
+    ("error", "ended"), [(KeyboardInterrupt(), "stopped by Ctrl-C"), (RuntimeError("odd"), "failed: odd")]
+)
+def test_a_page_is_told_what_ended_a_session(error: BaseException, ended: str) -> None:
+    with suppress(type(error)), Watch("run", Console(), Show(live=0)) as watch:
+        address, _, token = watch.address.partition("/?token=")
+        cookie = f"thermogrip_{address.rpartition(':')[2]}={token}"
+        page = urlopen(Request(f"{address}/events", headers={"Cookie": cookie}), timeout=30.0)
+        raise error
+    events = [line.removeprefix(b"data: ") for line in page if line.strip()]
+    assert json.loads(events[-1])["ended"] == ended
