@@ -16,7 +16,7 @@ import pytest
 import typer
 
 from thermogrip.cli.main import main
-from thermogrip.cli.rig import one_rig
+from thermogrip.cli.rig import RigOptions
 from thermogrip.cli.verbs import VERBS, Verb, Verbs
 from thermogrip.datasets.errors import UserError
 
@@ -148,7 +148,7 @@ def test_what_is_next_has_the_options_and_arguments_of_its_verb(verb: str, given
         assert rest == [], line
         assert [p.name for p in command.params if p.required and not options.get(p.name)] == [], line
         if {"port", "twin"} <= {param.name for param in command.params}:
-            one_rig(options.get("port"), options.get("twin"))
+            RigOptions(port=options.get("port"), twin=options.get("twin")).check()
         if "network" in mine and "network" in {param.name for param in command.params}:
             assert options["network"] == mine["network"], line
 

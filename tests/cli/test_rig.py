@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -14,6 +15,7 @@ from tests.cli.conftest import Bench, StandIn, shares, words_of
 from tests.end_to_end.conftest import small_plant
 from thermogrip.cli import rig as verbs
 from thermogrip.cli.main import main
+from thermogrip.cli.rig import RigOptions, ShowOptions
 from thermogrip.datasets.errors import UserError
 from thermogrip.live.watch import Watch
 from thermogrip.mpc.controllers.mpc import Controller
@@ -78,54 +80,46 @@ def test_an_object_has_a_material_and_a_temperature_or_there_is_none() -> None:
 
 
 @pytest.mark.parametrize(
-    ("port", "twin", "words"),
-    [(None, None, "no rig is given; "), ("COM3", Path("plant.json"), "--port and --twin are both given; ")],
-)
-def test_either_a_port_or_a_twin_is_given(port: str | None, twin: Path | None, words: str) -> None:
-    with pytest.raises(UserError, match=f"{words}give --port DEV, or --twin PLANT"):
-        verbs.one_rig(port, twin)
-    verbs.one_rig("COM3", None)
-    verbs.one_rig(None, Path("plant.json"))
-
-
-def test_files_of_a_run_are_those_that_are_named() -> None:
-    assert verbs.files_of(plant=None, guard=Path("g.toml")) == {"guard": Path("g.toml")}
-    assert verbs.files_of() == {}
-
-
-def rig_of(port: str | None, twin: Path | None, inputs: tuple[str, ...] = ("q1",), **changes: Any) -> Any:
-    clock = SimpleNamespace(sleep="its sleep")
-    controller = SimpleNamespace(plant=SimpleNamespace(inputs=inputs))
-    options = {"seed": 3, "t_start": None, "draw": 0} | changes
-    draw = options.pop("draw")
-    return verbs.rig_of(port, "tclab", clock, twin, "own.py:Own", draw, controller, **options)
+    ("given", "said"),
+    [({}, "no rig is given; give --port DEV, or --twin PLANT"),
+     ({"port": "COM3", "twin": Path("p.json")}, "--port and --twin are both given; give --port DEV, or"),
+     ({"port": "COM3", "start": 25.0}, "--from and --draw are of the twin; leave them away with --port"),
+     ({"port": "COM3", "draw": 2}, "--from and --draw are of the twin; leave them away with --port")],
+)  # fmt: skip
+def test_either_a_port_or_a_twin_is_given(given: dict[str, Any], said: str) -> None:
+    with pytest.raises(UserError, match=said):
+        RigOptions(**given).check()
+    RigOptions(port="COM3").check()
+    RigOptions(twin=Path("p.json"), draw=2, start=25.0).check()
 
 
 def test_a_rig_on_a_port_drives_what_the_controller_moves(stand_in: StandIn) -> None:
     closed: list[bool] = []
-    rig = SimpleNamespace(units={"q1": "percent", "q2": "percent"}, close=lambda: closed.append(True))
-    opened = stand_in("thermogrip.rig.drivers.connect.open_rig", rig)
-    assert rig_of("COM3", None, ("q1", "pump")) is rig
+    board = SimpleNamespace(units={"q1": "percent", "q2": "percent"}, close=lambda: closed.append(True))
+    opened = stand_in("thermogrip.rig.drivers.connect.open_rig", board)
+    clock, options = SimpleNamespace(sleep="its sleep"), RigOptions(port="COM3", protocol="tclab")
+
+    def of(*inputs: str) -> Any:
+        return SimpleNamespace(plant=SimpleNamespace(inputs=inputs))
+
+    assert options.open(clock, of("q1", "pump"), pace=None, seed=3) is board
     assert (opened[0].args, opened[0].sleep) == (("COM3", "tclab"), "its sleep")
-    for option in ({"t_start": 25.0}, {"draw": 2}):
-        with pytest.raises(UserError, match="--from and --draw are of the twin; leave them away with --port"):
-            rig_of("COM3", None, **option)
     assert not closed
     with pytest.raises(UserError, match="the rig drives q1, q2, not heat; use its own controller"):
-        rig_of("COM3", None, ("q1", "heat"))
+        options.open(clock, of("q1", "heat"), pace=None, seed=3)
     assert closed == [True]
 
 
 @pytest.mark.parametrize(
-    ("given", "pace"),
-    [((None, "p", None, None), None), ((None, "p", 0, None), 10.0), ((None, "p", None, 8765), 10.0),
-     ((3.0, "p", 0, None), 3.0), ((3.0, "p", None, None), 3.0), ((3.0, None, 0, None), None)],
+    ("rig", "show", "pace"),
+    [({"twin": "p"}, {}, None), ({"twin": "p"}, {"live": 0}, 10.0), ({"twin": "p"}, {"foxglove": 8765}, 10.0),
+     ({"twin": "p", "speed": 3.0}, {"live": 0}, 3.0), ({"twin": "p", "speed": 3.0}, {}, 3.0),
+     ({"port": "p", "speed": 3.0}, {"live": 0}, None)],
 )  # fmt: skip
 def test_a_twin_that_is_watched_runs_ten_times_as_fast_as_real_time(
-    given: tuple[Any, ...], pace: float | None
+    rig: dict[str, Any], show: dict[str, Any], pace: float | None
 ) -> None:
-    """Given are --speed, --twin, --live and --foxglove."""
-    assert verbs.pace_of(*given) == pace
+    assert RigOptions(**rig).pace(ShowOptions(**show)) == pace
 
 
 @pytest.mark.parametrize("own", [False, True])
@@ -137,16 +131,16 @@ def test_a_twin_is_a_draw_of_its_plant_within_the_controller_s_ranges(own: bool,
     twins = stand_in("thermogrip.rig.simulation.twin.Twin", "a twin")
     ranges = dict.fromkeys("abcde", (0.0, 100.0)) | {"d": (0.0, 5.0)}  # d has no unit: 1
     controller = SimpleNamespace(design=SimpleNamespace(drive_range=ranges))
-    given = (None, "clock", Path("p.json"), "own.py:Own", 4, controller)
-    assert verbs.rig_of(None, *given, seed=3, t_start=28.0) == "a twin"
+    options = RigOptions(twin=Path("p.json"), draw=4, start=28.0, network="own.py:Own")
+    assert options.open("clock", controller, pace=None, seed=3) == "a twin"
     [twin] = twins
     assert (twin.args, twin.seed, twin.t_start, twin.pace) == ((("draw", 4),), 3, 28.0, None)
     assert twin.limits == {"e": (0.0, 100.0)}
     assert [call.args for call in again] == [(Path("p.json"), "own.py:Own")] * own
     if own:
         with pytest.raises(UserError, match="own"):  # no class was named
-            verbs.rig_of(None, *given[:3], None, *given[4:], seed=3, t_start=28.0)
-    assert loaded[0].args == (Path("p.json"),)
+            replace(options, network=None).open("clock", controller, pace=None, seed=3)
+    assert loaded[0].args[-1] == Path("p.json")
 
 
 @pytest.fixture
@@ -172,7 +166,7 @@ def ran(bench: Bench, stand_in: StandIn, monkeypatch: pytest.MonkeyPatch) -> Sim
     made = SimpleNamespace(bench=bench, folders=[], finished=[], closed=[])
     made.session = Session(None, None, (), "settled", "", 81.25, 0.125, -0.0625)
     made.rig = SimpleNamespace(close=lambda: made.closed.append(True))
-    made.rigs = stand_in("thermogrip.cli.rig.rig_of", made.rig)
+    made.rigs = stand_in("thermogrip.cli.rig.RigOptions.open", made.rig)
     made.guards = stand_in("thermogrip.cli.rig.guard_of", AnyGuard("a guard"))
     made.sessions = stand_in("thermogrip.rig.session.session.run_session", session)
     made.beyond = stand_in("thermogrip.mpc.tuning.design_review.beyond_logs", ["40 degC is beyond the logs"])
@@ -193,12 +187,7 @@ def test_words_reach_the_session_on_a_twin(ran: SimpleNamespace, stand_in: Stand
     done = ran.bench.run(*words.split(), "--out", "r", "--report", "r.html")
     assert (done.code, ran.closed, ran.finished) == (0, [True], [ran.session]), done
     [rig], [session], [folder] = ran.rigs, ran.sessions, ran.folders
-    assert (rig.args[0], rig.args[3:6], rig.seed, rig.t_start) == (
-        None,
-        (Path("plant.json"), None, 2),
-        5,
-        28.0,
-    )
+    assert (rig.args[0], rig.seed) == (RigOptions(twin=Path("plant.json"), draw=2, start=28.0), 5)
     assert (session.args[0], session.args[2]) == (ran.rig, 40.0)
     assert (session.output, session.hold, session.grasp) == ("t_surface", 30.0, ("copper", 18.0))
     assert (session.grasp_time, session.settle_timeout, session.stop) == (4.0, 600.0, "stop")
@@ -233,8 +222,8 @@ def test_words_reach_the_session_on_a_port(ran: SimpleNamespace) -> None:
     done = ran.bench.run(*words, "--protocol", "tclab")
     assert (done.code, ran.closed, ran.pages) == (3, [True], [])
     [rig], [session], [folder] = ran.rigs, ran.sessions, ran.folders
-    assert (rig.args[:2], rig.args[3:6], rig.t_start) == (("socket://rig", "tclab"), (None, None, 0), None)
-    assert (session.clock is rig.args[2], rig.args[2].speed) == (True, 5.0)
+    assert rig.args[0] == RigOptions(port="socket://rig", protocol="tclab", speed=5.0)
+    assert (session.clock is rig.args[1], rig.args[1].speed) == (True, 5.0)
     assert (session.args[2], session.grasp, session.stop) == ({"t_surface": 40.0}, None, None)
     assert (session.hold, session.grasp_time, session.settle_timeout) == (0.0, 10.0, 900.0)
     assert folder.args[1]["port"] == "socket://rig"
@@ -283,7 +272,7 @@ def test_a_batch_keeps_on_what_it_ran_and_fails_while_a_trial_is_left(
 
     rigs: list[Any] = []
     batches = stand_in("thermogrip.rig.records.batch.run_batch", ran)
-    opened = stand_in("thermogrip.cli.rig.rig_of", "a rig")
+    opened = stand_in("thermogrip.cli.rig.RigOptions.open", "a rig")
     guards = stand_in("thermogrip.cli.rig.guard_of", "a guard")
     stops = stand_in("thermogrip.classify.decisions.stopping_rule.session_stop", "stop")
     Controller(small_plant()).save(bench.path / "c.json")
@@ -305,10 +294,11 @@ def test_a_batch_keeps_on_what_it_ran_and_fails_while_a_trial_is_left(
     )
     assert call.files == {name: Path(file) for name, file in files.items()}
     [rig] = opened
-    twin = None if on_rig else Path("plant.json")
-    assert rig.args[:2] == (("socket://rig", "tclab") if on_rig else (None, None))
-    assert rig.args[3:] == (twin, None, 0 if on_rig else 3, call.args[1])
-    assert (rig.args[2].speed, rig.seed, rig.t_start) == (3.0 if on_rig else 1.0, 0 if on_rig else 5, None)
+    on_port = RigOptions(port="socket://rig", protocol="tclab", speed=3.0)
+    assert rig.args[0] == (on_port if on_rig else RigOptions(twin=Path("plant.json"), draw=3))
+    assert (rig.args[1].speed, rig.seed, rig.args[2]) == (
+        3.0 if on_rig else 1.0, 0 if on_rig else 5, call.args[1],
+    )  # fmt: skip
     assert done.out.splitlines() == [f"{2 - left} of 2 grasps are good: stopped", "go on"]
     assert shares(done.err, "batch") == [50]
     answer = json.loads(bench.run(*words, "--stop-early", "model", "--json", "--out", "out").out)
@@ -316,7 +306,7 @@ def test_a_batch_keeps_on_what_it_ran_and_fails_while_a_trial_is_left(
     assert (batches[1].ready, batches[1].judge, batches[1].stop) == (None, None, "stop")
     assert stops[0].args == (Path("model"),)
     bench.run("batch", "c.json", "plan.csv", "--twin", "plant.json", "--out", "out")
-    assert (batches[2].grasp_time, batches[2].settle_timeout, opened[2].args[5]) == (10.0, 900.0, 0)
+    assert (batches[2].grasp_time, batches[2].settle_timeout, opened[2].args[0].draw) == (10.0, 900.0, 0)
 
 
 def test_a_batch_that_is_done_has_no_advice(bench: Bench, stand_in: StandIn) -> None:
@@ -387,13 +377,13 @@ def test_after_a_trip_the_operator_is_asked_whether_it_is_cleared(
 
 @pytest.mark.parametrize(("words", "shown"), [([], "0"), (["8642"], "8642"), (["--seed", "3"], "0")])
 def test_live_may_stand_alone(words: list[str], shown: str, ran: SimpleNamespace, stand_in: StandIn) -> None:
-    made = stand_in("thermogrip.cli.rig.watch_of", UserError("seen"))
+    made = stand_in("thermogrip.cli.rig.ShowOptions.watch", UserError("seen"))
     given = ["run", "c.json", "--target", "40", "--twin", "plant.json", "--out", "r", "--on-trip", "mail me"]
     assert ran.bench.run(*given, "--live", *words).code == 2
-    assert made[0].args[0::2] == ("run", Path("r"), None, 10.0)
-    assert (str(made[0].args[3]), made[0].args[5]) == (shown, "mail me")
+    assert made[0].args[0] == ShowOptions(live=int(shown), on_trip="mail me")
+    assert (made[0].args[1], made[0].args[3:]) == ("run", (Path("r"), 10.0))
     ran.bench.run(*given, "--foxglove")
-    assert made[1].args[3:5] == (None, 8765)
+    assert made[1].args[0] == ShowOptions(foxglove=8765, on_trip="mail me")
 
 
 def test_what_is_published_goes_through_the_bridge(stand_in: StandIn) -> None:
@@ -427,7 +417,6 @@ def test_runs_are_repaired_one_by_one(rows: tuple[int | None, ...], bench: Bench
     }
     found = stand_in("thermogrip.cli.rig._run_folders", folders)
     stand_in("thermogrip.rig.records.run_folder.recover", lambda folder: done_of[folder])
-    marked = stand_in("thermogrip.rig.records.run_folder.mark_bad")
     written = stand_in("thermogrip.rig.records.run_folder.export_run")
     (bench.path / "runs").mkdir()
     done = bench.run("recover", "runs")
@@ -440,16 +429,15 @@ def test_runs_are_repaired_one_by_one(rows: tuple[int | None, ...], bench: Bench
             for folder, n in zip(folders, rows)
         ]
     }  # fmt: skip
-    for option in (("--out", "x.csv"), ("--bad", "why")):
-        refused = bench.run("recover", "runs", *option)
-        assert (refused.code, refused.said) == (
-            2, ["thermogrip: runs: holds several runs; give the folder of one of them"],
-        )  # fmt: skip
-    assert not marked + written
+    refused = bench.run("recover", "runs", "--out", "x.csv")
+    assert (refused.code, refused.said) == (
+        2, ["thermogrip: runs: holds several runs; give the folder of one of them"],
+    )  # fmt: skip
+    assert not written
     del folders[1]
-    done = bench.run("recover", "runs", "--out", "x.csv", "--bad", "it slipped")
-    assert done.out.splitlines() == ["0001: cut 0001", "0001: marked bad: it slipped", "wrote x.csv"]
-    assert (marked[0].args, written[0].args) == ((folders[0], "it slipped"), (folders[0], Path("x.csv")))
+    done = bench.run("recover", "runs", "--out", "x.csv")
+    assert done.out.splitlines() == ["0001: cut 0001", "wrote x.csv"]
+    assert written[0].args == (folders[0], Path("x.csv"))
     assert bench.run("recover", "runs", "--out", "x.txt").code == 2
 
 

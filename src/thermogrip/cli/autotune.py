@@ -6,23 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from thermogrip.cli import options as cli
-from thermogrip.cli.rig import (
-    FoxgloveOption,
-    GuardOption,
-    LiveOption,
-    OnTripOption,
-    PortOption,
-    ProtocolOption,
-    RelaysOption,
-    SpeedOption,
-    TwinOption,
-    guard_of,
-    one_rig,
-    pace_of,
-    rig_of,
-    targets_of,
-    watch_of,
-)
+from thermogrip.cli.rig import GuardOption, RigOptions, ShowOptions, targets_of
 from thermogrip.report.console import Console
 from thermogrip.rig.session.signals import stop_signals
 
@@ -32,14 +16,12 @@ if TYPE_CHECKING:
 
 
 @stop_signals()
+@cli.grouped
 def autotune(
     target: Annotated[str, cli.opt("--target", "DEGC", "Where to; of several outputs t1=40,t2=35.")],
     out: Annotated[Path, cli.opt("--out", "DIR", "Folder of everything; the same one again goes on.")],
-    port: PortOption = None,
-    protocol: ProtocolOption = None,
-    speed: SpeedOption = None,
-    twin: TwinOption = None,
-    relays: RelaysOption = None,
+    rig: RigOptions,
+    show: ShowOptions,
     limit: Annotated[
         float | None, cli.opt("--limit", "DEGC", "No sensor above this [default: as the guard has it].")
     ] = None,
@@ -51,9 +33,6 @@ def autotune(
         cli.opt("--spec", "SPEC.toml", "What is wanted [default: the step from here to the target]."),
     ] = None,
     guard: GuardOption = None,
-    live: LiveOption = None,
-    foxglove: FoxgloveOption = None,
-    on_trip: OnTripOption = None,
     workers: cli.Workers = 1,
     seed: cli.Seed = 0,
     as_json: cli.AsJson = False,
@@ -66,25 +45,21 @@ def autotune(
     far. Drive and pump are off between sessions and on every way out.
     """
     wanted = targets_of(target)
-    one_rig(port, twin)
+    rig.check()
     from thermogrip.mpc.design.spec import read_spec
-    from thermogrip.rig.clock import ScaledClock
     from thermogrip.rig.records.autotune import Autotune, Tripped
 
-    console, pace = Console(as_json), pace_of(speed, twin, live, foxglove)
-    clock, paced = ScaledClock(pace or speed or 1.0), pace is not None
-    watch = watch_of("autotune", console, out, live, foxglove, on_trip, pace)
+    console, pace = Console(as_json), rig.pace(show)
+    clock, watch = rig.clock(pace), show.watch("autotune", console, out, pace)
     work = Autotune(
         cli.new_folder(out),
         wanted,
-        lambda: rig_of(
-            port, protocol, clock, twin, None, 0, None, seed=seed, t_start=None, paced=paced, relays=relays
-        ),
-        lambda plant: guard_of(guard, plant, speed=speed or 1.0, limit=limit),
+        lambda: rig.open(clock, None, pace=pace, seed=seed),
+        lambda plant: rig.guard(guard, plant, limit=limit),
         minutes=minutes,
         spec=None if spec is None else read_spec(spec),
-        about={"limit": limit, "twin": None if twin is None else twin.name},  # a port may be called otherwise
-        clock=None if port is None else clock,
+        about={"limit": limit, "twin": rig.about().get("twin")},  # a port may be called otherwise
+        clock=None if rig.port is None else clock,
         progress=watch.progress,
         shown={"listener": watch.listen, "operator": watch.operator},
         say=console.say,
@@ -107,9 +82,9 @@ def autotune(
         raise
     page = out / "report.html"
     if work.session is not None:
-        _write_page(work, page, str(port or twin))
+        _write_page(work, page, str(rig.port or rig.twin))
     head, rows = _table(work)
-    console.table(f"{port or twin}, to {target} degC", head, rows)
+    console.table(f"{rig.port or rig.twin}, to {target} degC", head, rows)
     console.say(f"wrote {page if page.exists() else out}")
     console.answer({"verdict": verdict, **work.known, "out": out})
     good = verdict == "settled" and work.known["tuned"]["good"]

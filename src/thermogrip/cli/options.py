@@ -5,9 +5,14 @@ from __future__ import annotations
 import json
 import os
 import sys
+import tomllib
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import fields, is_dataclass
+from functools import cache, wraps
+from importlib import resources
+from inspect import Parameter, signature
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Protocol
+from typing import TYPE_CHECKING, Annotated, Any, Protocol, get_type_hints
 
 import typer
 
@@ -120,6 +125,17 @@ def opt(
     return typer.Option(name, metavar=metavar or "N", help=words, callback=check, min=min, max=max)
 
 
+@cache
+def _table() -> dict[str, dict[str, Any]]:
+    return tomllib.loads((resources.files(__package__) / "options.toml").read_text(encoding="utf-8"))
+
+
+def shared(name: str, check: Callable[..., Any] | None = None, **words: str) -> Any:
+    """Return the Typer option of ``options.toml``, with a ``callback=`` and words in place of {names}."""
+    about = _table()[name]
+    return typer.Option(name, callback=check, **(about | {"help": about["help"].format(**words)}))
+
+
 def flag(name: str, words: str) -> Any:
     """Return the Typer option that is there or not."""
     return typer.Option(name, help=words)
@@ -128,6 +144,31 @@ def flag(name: str, words: str) -> Any:
 def arg(metavar: str, words: str, check: Callable[..., Any] | None = None) -> Any:
     """Return the Typer argument of a place on the command line."""
     return typer.Argument(metavar=metavar, help=words, callback=check)
+
+
+def grouped(verb: Callable[..., int]) -> Callable[..., int]:
+    """Return a verb with the fields of its parameters that are dataclasses in their place, as options."""
+    whole = signature(verb, eval_str=True)
+    groups = {name: one.annotation for name, one in whole.parameters.items() if is_dataclass(one.annotation)}
+    parameters = []
+    for name, parameter in whole.parameters.items():
+        if name not in groups:
+            parameters.append(parameter.replace(kind=Parameter.KEYWORD_ONLY))
+            continue
+        hints = get_type_hints(groups[name], include_extras=True)
+        for one in fields(groups[name]):
+            option = Parameter(one.name, Parameter.KEYWORD_ONLY, default=one.default)
+            parameters.append(option.replace(annotation=hints[one.name]))
+
+    @wraps(verb)
+    def with_options(**given: Any) -> int:
+        for name, group in groups.items():
+            given[name] = group(**{one.name: given.pop(one.name) for one in fields(group)})
+        return verb(**given)
+
+    vars(with_options)["__signature__"] = whole.replace(parameters=parameters)
+    with_options.__annotations__ = {one.name: one.annotation for one in parameters}
+    return with_options
 
 
 AsJson = Annotated[bool, flag("--json", "Print one JSON object on stdout and nothing else there.")]

@@ -6,7 +6,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from thermogrip.rig.guard.trip import Trip
     from thermogrip.rig.interface import Rig
     from thermogrip.rig.records.batch import Trial
+    from thermogrip.rig.records.run_folder import RunFolder
     from thermogrip.rig.session.loop import Recorder
     from thermogrip.rig.session.session import Session
     from thermogrip.rig.simulation.twin import Twin
@@ -38,82 +39,6 @@ if TYPE_CHECKING:
 WATCHED_SPEED = 10.0  # of a twin [times real time]: settling, minutes long, in a few tens of seconds
 PROTOCOLS = ("thermogrip", "tclab")
 
-OutOption = Annotated[Path, cli.opt("--out", "DIR", "Folder of the run.")]
-TwinOption = Annotated[Path | None, cli.opt("--twin", "PLANT", "Simulate this plant; no hardware is opened.")]
-PortOption = Annotated[
-    str | None, cli.opt("--port", "DEV", "The rig: /dev/ttyACM0, COM3, socket://HOST:PORT.")
-]
-ProtocolOption = Annotated[
-    str | None,
-    cli.opt(
-        "--protocol",
-        "NAME",
-        "thermogrip or tclab [default: found out].",
-        cli.one_of("--protocol", PROTOCOLS),
-    ),
-]
-SpeedOption = Annotated[
-    float | None,
-    cli.opt(
-        "--speed",
-        "X",
-        "Times real time: of a virtual device behind --port [default: 1], of a twin [default: 10 where it is "
-        "watched with --live or --foxglove, else as fast as it goes].",
-        min=0.01,
-    ),
-]
-RelaysOption = Annotated[
-    Path | None,
-    cli.opt("--relays", "RELAYS.toml", "Drives that are relays, with their least times on and off."),
-]
-DrawOption = Annotated[
-    int, cli.opt("--draw", None, "Posterior draw of the twin's plant (0: the fit).", min=0)
-]
-StartOption = Annotated[
-    float | None, cli.opt("--from", "DEGC", "Temperature at the start [default: the room's].")
-]
-ObjOption = Annotated[float | None, cli.opt("--object", "DEGC", "Temperature of the object.")]
-MaterialOption = Annotated[
-    str | None,
-    cli.opt("--material", "NAME", "Material of the object.", lambda name: name and find_material(name).name),
-]
-GraspTimeOption = Annotated[float, cli.opt("--grasp-time", "S", "Recorded time of contact.", min=0.5)]
-StopEarlyOption = Annotated[
-    Path | None,
-    cli.opt(
-        "--stop-early",
-        "MODEL_DIR",
-        "End the contact once this classifier (train --stop-error) has seen enough.",
-    ),
-]
-SettleTimeoutOption = Annotated[
-    float, cli.opt("--settle-timeout", "S", "Give up settling after this long.", min=1)
-]
-GuardOption = Annotated[
-    Path | None,
-    cli.opt("--guard", "GUARD.toml", "What the guard allows; `thermogrip init guard` writes one to edit."),
-]
-LiveOption = Annotated[
-    int | None,
-    cli.opt(
-        "--live",
-        "[PORT]",
-        "Live page on this computer, any free port or this one.",
-        min=0,
-        max=65535,
-    ),
-]
-FoxgloveOption = Annotated[
-    int | None,
-    cli.opt(
-        "--foxglove",
-        "[PORT]",
-        "Foxglove on this computer, port 8765 or this one.",
-        min=1,
-        max=65535,
-    ),
-]
-
 
 def _check_bridge(url: str | None) -> str | None:
     """Refuse what is no address of a websocket."""
@@ -122,57 +47,170 @@ def _check_bridge(url: str | None) -> str | None:
     return url
 
 
-BridgeOption = Annotated[
-    str | None, cli.opt("--bridge", "ws://HOST:PORT", "Publish to a rosbridge server.", _check_bridge)
+OutOption = Annotated[Path, cli.opt("--out", "DIR", "Folder of the run.")]
+ProtocolOption = Annotated[str | None, cli.shared("--protocol", cli.one_of("--protocol", PROTOCOLS))]
+StartOption = Annotated[float | None, cli.shared("--from")]
+ObjOption = Annotated[float | None, cli.shared("--object")]
+MaterialOption = Annotated[
+    str | None, cli.shared("--material", lambda name: name and find_material(name).name)
 ]
-OnTripOption = Annotated[
-    str | None,
-    cli.opt("--on-trip", "CMD", "Run this on a trip, which it gets as JSON on stdin."),
-]
+GuardOption = Annotated[Path | None, cli.shared("--guard")]
+BridgeOption = Annotated[str | None, cli.shared("--bridge", _check_bridge)]
+
+
+@dataclass(frozen=True)
+class ShowOptions:
+    """Where a session is shown."""
+
+    live: Annotated[int | None, cli.shared("--live")] = None
+    foxglove: Annotated[int | None, cli.shared("--foxglove")] = None
+    on_trip: Annotated[str | None, cli.shared("--on-trip")] = None
+
+    def watch(self, title: str, console: Console, out: Path, pace: float | None = None) -> Watch:
+        """Return what shows a session, ``pace`` times as fast as real time where a twin is watched."""
+        from thermogrip.live.watch import Show, Watch
+
+        layout = out / "foxglove_layout.json"
+        show = Show(live=self.live, foxglove=self.foxglove, on_trip=self.on_trip, layout=layout, pace=pace)
+        return Watch(title, console, show)
+
+
+@dataclass(frozen=True)
+class RigOptions:
+    """A rig on a port, or the twin of a plant."""
+
+    port: Annotated[str | None, cli.shared("--port")] = None
+    protocol: ProtocolOption = None
+    speed: Annotated[float | None, cli.shared("--speed")] = None
+    twin: Annotated[Path | None, cli.shared("--twin")] = None
+    draw: Annotated[int, cli.shared("--draw")] = 0
+    relays: Annotated[Path | None, cli.shared("--relays")] = None
+    start: StartOption = None
+    network: cli.OwnNetwork = None
+
+    def check(self) -> None:
+        """Raise UserError unless either hardware or a plant to simulate is named."""
+        if (self.twin is None) == (self.port is None):
+            given = "no rig is given" if self.twin is None else "--port and --twin are both given"
+            raise UserError(given, hint="give --port DEV, or --twin PLANT to simulate")
+        if self.port is not None and (self.start is not None or self.draw):
+            raise UserError("--from and --draw are of the twin", hint="leave them away with --port")
+
+    @property
+    def name(self) -> str:
+        """What it is called in records."""
+        return str(self.port) if self.twin is None else f"{self.twin.name}, draw {self.draw}"
+
+    def about(self) -> dict[str, Any]:
+        """Return what a run keeps of it."""
+        return {"port": self.port} if self.twin is None else {"twin": self.twin.name, "draw": self.draw}
+
+    def pace(self, show: ShowOptions) -> float | None:
+        """Return how many times as fast as real time a twin runs, None where it runs as fast as it goes."""
+        if self.twin is None or self.speed is not None:
+            return None if self.twin is None else self.speed
+        return None if show.live is None and show.foxglove is None else WATCHED_SPEED
+
+    def clock(self, pace: float | None) -> ScaledClock:
+        """Return the clock of sessions on it."""
+        from thermogrip.rig.clock import ScaledClock
+
+        return ScaledClock(pace or self.speed or 1.0)
+
+    def guard(self, path: Path | None, plant: Plant | None, *, limit: float | None = None) -> Guard:
+        """Return its guard."""
+        return guard_of(path, plant, speed=self.speed or 1.0, limit=limit)
+
+    def open(
+        self,
+        clock: ScaledClock,
+        controller: Controller | PIController | None,
+        *,
+        pace: float | None,
+        seed: int,
+    ) -> Rig:
+        """Return the rig on a port, or the simulated one at a pace, with the relays of a file."""
+        from thermogrip.rig.clock import Metronome
+        from thermogrip.rig.drivers.connect import open_rig
+        from thermogrip.rig.drivers.relays import RelayRig, read_relays
+
+        switched = {} if self.relays is None else read_relays(self.relays)
+        if self.twin is not None:
+            wait = None if pace is None else Metronome(clock, clock.sleep).wait
+            simulated = self._twin(self.twin, controller, seed=seed, wait=wait)
+            return RelayRig(simulated, switched, lambda: simulated.time) if switched else simulated
+        rig: Rig = open_rig(str(self.port), self.protocol, clock=clock, sleep=clock.sleep)
+        try:
+            rig = RelayRig(rig, switched, clock) if switched else rig
+            inputs = () if controller is None else controller.plant.inputs
+            if lacking := set(inputs) - set(rig.units) - {"pump"}:
+                problem = f"the rig drives {', '.join(rig.units)}, not {', '.join(lacking)}"
+                raise UserError(problem, hint="use its own controller")
+        except UserError:
+            rig.close()
+            raise
+        return rig
+
+    def _twin(
+        self,
+        path: Path,
+        controller: Controller | PIController | None,
+        *,
+        seed: int,
+        wait: Callable[[float], None] | None,
+    ) -> Twin:
+        """Return the simulated rig; a drive whose unit does not say its range has the controller's."""
+        from thermogrip.rig.interface import UNIT_RANGES
+        from thermogrip.rig.simulation.twin import Twin
+        from thermogrip.sysid.plant.plant import Plant
+
+        try:
+            plant = Plant.load(path)
+        except UserError:
+            if self.network is None:
+                raise
+            plant = cli.load_plant(path, self.network)
+        ranges = {} if controller is None else controller.design.drive_range
+        limits = {
+            name: ends for name, ends in ranges.items() if plant.units.get(name, "1") not in UNIT_RANGES
+        }
+        return Twin(plant.draw(self.draw), seed=seed, t_start=self.start, limits=limits, pace=wait)
+
+
+@dataclass(frozen=True)
+class GraspOptions:
+    """How long a session settles, and touches."""
+
+    grasp_time: Annotated[float, cli.shared("--grasp-time")] = 10.0
+    stop_early: Annotated[Path | None, cli.shared("--stop-early")] = None
+    settle_timeout: Annotated[float, cli.shared("--settle-timeout")] = 900.0
+
+    def of_session(self, watch: Watch) -> dict[str, Any]:
+        """Return them as a session takes them."""
+        from thermogrip.classify.decisions.stopping_rule import session_stop
+
+        stop = None if self.stop_early is None else session_stop(self.stop_early, tell=watch.posterior)
+        return {"grasp_time": self.grasp_time, "settle_timeout": self.settle_timeout, "stop": stop}
 
 
 @stop_signals()
+@cli.grouped
 def run(
     controller: ControllerFile,
     out: OutOption,
+    rig: RigOptions,
+    grasps: GraspOptions,
+    show: ShowOptions,
     target: Annotated[
-        str | None,
-        cli.opt(
-            "--target",
-            "DEGC",
-            "Where to, inside the guard's limits; of several outputs t1=40,t2=35.",
-            lambda value: value and (targets_of(value), value)[1],
-        ),
+        str | None, cli.shared("--target", lambda value: value and (targets_of(value), value)[1])
     ] = None,
-    profile: Annotated[
-        Path | None,
-        cli.opt(
-            "--profile",
-            "PROFILE.csv",
-            "Follow targets over time in place of one: time_s,target_degC, or a column of each output; the "
-            "controller sees them coming.",
-        ),
-    ] = None,
-    port: PortOption = None,
-    protocol: ProtocolOption = None,
-    speed: SpeedOption = None,
-    twin: TwinOption = None,
-    draw: DrawOption = 0,
-    relays: RelaysOption = None,
-    start: StartOption = None,
-    hold: Annotated[float, cli.opt("--hold", "S", "Regulate this long after settling.", min=0)] = 0.0,
+    profile: Annotated[Path | None, cli.shared("--profile")] = None,
+    hold: Annotated[float, cli.shared("--hold")] = 0.0,
     obj: ObjOption = None,
     material: MaterialOption = None,
-    grasp_time: GraspTimeOption = 10.0,
-    stop_early: StopEarlyOption = None,
-    settle_timeout: SettleTimeoutOption = 900.0,
     guard: GuardOption = None,
-    live: LiveOption = None,
-    foxglove: FoxgloveOption = None,
     bridge: BridgeOption = None,
-    on_trip: OnTripOption = None,
     report: cli.Report = None,
-    network: cli.OwnNetwork = None,
     seed: cli.Seed = 0,
     as_json: cli.AsJson = False,
 ) -> int:
@@ -182,90 +220,73 @@ def run(
     after settling; without them it only regulates.
     """
     grasp = _what_to_grasp(obj, material)
-    one_rig(port, twin)
+    rig.check()
     wanted = _one_goal(target, profile, grasp is not None)
     cli.choices("--target", wanted if isinstance(wanted, dict) else (), controller, "outputs")
-    from thermogrip.classify.decisions.stopping_rule import session_stop
     from thermogrip.mpc.closed_loop.simulate import RecordedController
     from thermogrip.mpc.controllers.loop_monitor import LoopMonitor
     from thermogrip.mpc.tuning.design_review import beyond_logs
     from thermogrip.report.control import session_sections
     from thermogrip.report.html import write_report
-    from thermogrip.rig.clock import ScaledClock
-    from thermogrip.rig.records.run_folder import RunFolder
     from thermogrip.rig.session.profile import read_profile, tracking_error
     from thermogrip.rig.session.session import run_session
 
-    if stop_early is not None and grasp is None:
+    if grasps.stop_early is not None and grasp is None:
         raise UserError("--stop-early without a grasp", hint="give --object and --material too")
-    console = Console(as_json)
-    pace = pace_of(speed, twin, live, foxglove)
-    watch = watch_of("run", console, out, live, foxglove, on_trip, pace)
-    stop = None if stop_early is None else session_stop(stop_early, tell=watch.posterior)
-    loaded = load_controller(controller, network)
+    console, pace = Console(as_json), rig.pace(show)
+    watch = show.watch("run", console, out, pace)
+    of_grasp = grasps.of_session(watch)
+    loaded = load_controller(controller, rig.network)
     regulator, path = RecordedController(loaded, LoopMonitor(loaded.plant, loaded.design)), None
     if profile is not None:
         path = read_profile(profile, loaded.controlled, preview_s=loaded.dt * sum(loaded.design.blocks))
         wanted = path.at(0.0)
     wanted = _for_outputs(wanted, loaded.controlled)
-    checks = guard_of(guard, loaded.plant, speed=speed or 1.0)
+    checks = rig.guard(guard, loaded.plant)
     by_name = wanted if isinstance(wanted, dict) else {loaded.controlled[0]: wanted}
     for output, value in by_name.items():
         checks.check_target(output, value)
-    clock = ScaledClock(pace or speed or 1.0)
-    name = f"{twin.name}, draw {draw}" if twin is not None else str(port)
-    about: dict[str, Any] = {"controller": controller.name, "target_degC": wanted}
-    about |= {"port": port} if twin is None else {"twin": twin.name, "draw": draw}
+    about = {"controller": controller.name, "target_degC": wanted, **rig.about()}
     about |= {} if profile is None else {"profile": profile.name}
-    about |= {"from_degC": start, "hold_s": hold, "object_degC": obj, "material": material, "seed": seed}
-    files = files_of(controller=controller, plant=twin, guard=guard, profile=profile, relays=relays)
-    paced = pace is not None
-    rig = rig_of(
-        port, protocol, clock, twin, network, draw, loaded, seed=seed, t_start=start, paced=paced,
-        relays=relays,
-    )  # fmt: skip
+    about |= {"from_degC": rig.start, "hold_s": hold, "object_degC": obj, "material": material, "seed": seed}
+    files = files_of(controller=controller, plant=rig.twin, guard=guard, profile=profile, relays=rig.relays)
+    clock = rig.clock(pace)
+    opened = rig.open(clock, loaded, pace=pace, seed=seed)
     try:
         furthest = wanted if path is None else path.highest()
         for line in beyond_logs(loaded, furthest, grasps=grasp is not None):
             console.warn(line)
-        with (
-            _bridge(bridge) as through,
-            watch,
-            RunFolder(out, about, files=files) as folder,
-            through(folder) as recorder,
-        ):
+        with _recorded(out, about, files, bridge, watch) as (folder, recorder):
             session = run_session(
-                rig,
+                opened,
                 regulator,
                 wanted,
                 output=loaded.controlled[0],
                 hold=hold,
                 grasp=grasp,
-                grasp_time=grasp_time,
-                stop=stop,
-                settle_timeout=settle_timeout,
                 profile=path,
                 guard=checks,
-                clock=None if port is None else clock,
+                clock=None if rig.port is None else clock,
                 recorder=recorder,
                 progress=watch.progress,
                 listener=watch.listen,
                 operator=watch.operator,
+                **of_grasp,
             )
             folder.finish(session)
             watch.ended(session.verdict)
     finally:
-        rig.close()
+        opened.close()
     if report is not None:
-        lead = f"One session on {name}: what was read, asked and answered, sample by sample."
-        write_report(report, "A session", lead, session_sections(session, regulator.moves, loaded, name))
+        lead = f"One session on {rig.name}: what was read, asked and answered, sample by sample."
+        write_report(report, "A session", lead, session_sections(session, regulator.moves, loaded, rig.name))
     figures = {"settle_time": session.settle_time, "overshoot": session.overshoot, "bias": session.bias}
     head, goal = ["settled after [s]", "overshoot [K]", "bias [K]"], f"to {_said(wanted)} degC"
     if profile is not None:
         rms, largest = tracking_error(session.log, loaded.controlled)
         figures, goal = {"rms_error": rms, "largest_error": largest}, f"along {profile.name}"
         head = ["rms error [K]", "largest error [K]"]
-    console.table(f"{name}, {goal}", ["verdict", *head], [[session.verdict, *figures.values()]])
+    console.table(f"{rig.name}, {goal}", ["verdict", *head], [[session.verdict, *figures.values()]])
     if session.advice:
         console.say(session.advice)
     console.say(f"wrote {out}")
@@ -274,6 +295,7 @@ def run(
 
 
 @stop_signals()
+@cli.grouped
 def batch(
     controller: ControllerFile,
     plan: Annotated[
@@ -283,21 +305,12 @@ def batch(
         ),
     ],
     out: Annotated[Path, cli.opt("--out", "DIR", "Folder of the batch.")],
-    port: PortOption = None,
-    protocol: ProtocolOption = None,
-    speed: SpeedOption = None,
-    twin: TwinOption = None,
-    draw: DrawOption = 0,
-    grasp_time: GraspTimeOption = 10.0,
-    stop_early: StopEarlyOption = None,
-    settle_timeout: SettleTimeoutOption = 900.0,
+    rig: RigOptions,
+    grasps: GraspOptions,
+    show: ShowOptions,
     guard: GuardOption = None,
     ask: Annotated[bool, cli.flag("--ask/--no-ask", "With --port: ask before and after each grasp.")] = True,
-    live: LiveOption = None,
-    foxglove: FoxgloveOption = None,
     bridge: BridgeOption = None,
-    on_trip: OnTripOption = None,
-    network: cli.OwnNetwork = None,
     seed: cli.Seed = 0,
     as_json: cli.AsJson = False,
 ) -> int:
@@ -307,27 +320,17 @@ def batch(
     again. Drive and pump are off between grasps and on every way out. The good grasps are in DIR/grasps.csv,
     labelled for classify.
     """
-    one_rig(port, twin)
-    from thermogrip.classify.decisions.stopping_rule import session_stop
-    from thermogrip.rig.clock import ScaledClock
+    rig.check()
     from thermogrip.rig.records.batch import read_plan, run_batch
 
-    trials, loaded = read_plan(plan), load_controller(controller, network)
-    checks = guard_of(guard, loaded.plant, speed=speed or 1.0)
-    pace, console = pace_of(speed, twin, live, foxglove), Console(as_json)
-    clock, paced = ScaledClock(pace or speed or 1.0), pace is not None
-    watch = watch_of("batch", console, out, live, foxglove, on_trip, pace)
-    asks = ask and port is not None and not as_json
-
-    def opened() -> Rig:
-        return rig_of(
-            port, protocol, clock, twin, network, draw, loaded, seed=seed, t_start=None, paced=paced
-        )
-
-    files = files_of(controller=controller, plan=plan, plant=twin, guard=guard)
+    trials, loaded = read_plan(plan), load_controller(controller, rig.network)
+    pace, console = rig.pace(show), Console(as_json)
+    clock, watch = rig.clock(pace), show.watch("batch", console, out, pace)
+    checks = rig.guard(guard, loaded.plant)
+    asks = ask and rig.port is not None and not as_json
     with _bridge(bridge) as through, watch:
         done = run_batch(
-            opened,
+            lambda: rig.open(clock, loaded, pace=pace, seed=seed),
             loaded,
             trials,
             cli.new_folder(out),
@@ -335,18 +338,16 @@ def batch(
             judge=_verdict(console, watch) if asks else None,
             cleared=_cleared(watch) if asks else None,
             through=through,
-            stop=None if stop_early is None else session_stop(stop_early, tell=watch.posterior),
             guard=checks,
             first_touch=_first_touch,
-            about={"port": port} if twin is None else {"twin": twin.name, "draw": draw, "seed": seed},
-            files=files,
+            about=rig.about() | ({} if rig.twin is None else {"seed": seed}),
+            files=files_of(controller=controller, plan=plan, plant=rig.twin, guard=guard, relays=rig.relays),
             output=loaded.controlled[0],
-            grasp_time=grasp_time,
-            settle_timeout=settle_timeout,
-            clock=None if port is None else clock,
+            clock=None if rig.port is None else clock,
             progress=watch.progress,
             listener=watch.listen,
             operator=watch.operator,
+            **grasps.of_session(watch),
         )
         watch.ended(done.verdict)
     console.say(f"{len(done.done)} of {len(trials)} grasps are good: {done.verdict}")
@@ -359,18 +360,17 @@ def batch(
 
 
 @stop_signals()
+@cli.grouped
 def record(
     schedule: Annotated[str, cli.arg("SCHEDULE", "schedule.csv of excite.")],
     port: Annotated[str, cli.opt("--port", "DEV", "/dev/ttyACM0, COM3, socket://HOST:PORT.")],
     out: OutOption,
+    show: ShowOptions,
     protocol: ProtocolOption = None,
     dt: Annotated[float, cli.opt("--sample", "S", "Seconds a row.", min=0.05)] = 1.0,
     guard: GuardOption = None,
     speed: Annotated[float, cli.opt("--speed", "X", "That of a virtual device.", min=0.01)] = 1.0,
-    live: LiveOption = None,
-    foxglove: FoxgloveOption = None,
     bridge: BridgeOption = None,
-    on_trip: OnTripOption = None,
     seed: cli.Seed = 0,
     as_json: cli.AsJson = False,
 ) -> int:
@@ -381,13 +381,11 @@ def record(
     from thermogrip.datasets.log_files import read_log
     from thermogrip.rig.clock import ScaledClock
     from thermogrip.rig.drivers.connect import open_rig
-    from thermogrip.rig.records.run_folder import RunFolder
     from thermogrip.rig.session.session import Playback, play
 
-    plan = read_log(schedule)
-    checks = guard_of(guard, None, speed=speed)
+    plan, checks = read_log(schedule), guard_of(guard, None, speed=speed)
     console = Console(as_json)
-    watch = watch_of("record", console, out, live, foxglove, on_trip)
+    watch = show.watch("record", console, out)
     clock = ScaledClock(speed)
     rig = open_rig(port, protocol, clock=clock, sleep=clock.sleep)
     try:
@@ -396,14 +394,7 @@ def record(
         except UserError as error:
             raise UserError(error.problem, file=schedule, hint=error.hint) from error
         about = {"schedule": schedule, "port": port, "sample_s": dt, "seed": seed}
-        files = {} if guard is None else {"guard": guard}
-        with (
-            _bridge(bridge) as through,
-            watch,
-            RunFolder(out, about, files=files) as folder,
-            through(folder) as recorder,
-        ):
-            shown: dict[str, Any] = {"progress": watch.progress, "listener": watch.listen}
+        with _recorded(out, about, files_of(guard=guard), bridge, watch) as (folder, recorder):
             log, ended = play(
                 rig,
                 plan,
@@ -411,8 +402,9 @@ def record(
                 guard=checks,
                 clock=clock,
                 recorder=recorder,
+                progress=watch.progress,
+                listener=watch.listen,
                 operator=watch.operator,
-                **shown,
             )
             folder.played(ended)
             watch.ended("tripped" if ended else "played")
@@ -431,7 +423,6 @@ def recover(
         Path | None,
         cli.opt("--out", "FILE", "Also write the run's log: .nc, .parquet, .csv, or .mcap (with ros)."),
     ] = None,
-    bad: Annotated[str | None, cli.opt("--bad", "WHY", "Mark the trial as bad; nothing is removed.")] = None,
     as_json: cli.AsJson = False,
 ) -> int:
     """Repair a run that was killed or lost its power.
@@ -440,11 +431,11 @@ def recover(
     cut is kept beside it. A folder that is whole is left as it is.
     """
     folders = _run_folders(folder)
-    if len(folders) > 1 and (out is not None or bad is not None):
+    if len(folders) > 1 and out is not None:
         raise UserError("holds several runs", file=folder, hint="give the folder of one of them")
     if out is not None:
         cli.new_file(out, (".nc", ".parquet", ".csv", ".mcap"))
-    from thermogrip.rig.records.run_folder import export_run, mark_bad, recover
+    from thermogrip.rig.records.run_folder import export_run, recover
 
     console = Console(as_json)
     results = []
@@ -457,9 +448,6 @@ def recover(
         results.append(
             {"run": each, "changed": done.changed, "said": done.findings, "rows": rows, "verdict": verdict}
         )
-    if bad is not None:
-        mark_bad(folders[0], bad)
-        console.say(f"{folders[0].name}: marked bad: {bad}")
     if out is not None:
         export_run(folders[0], out)
         console.say(f"wrote {out}")
@@ -485,12 +473,7 @@ def virtual(
     ambient: Annotated[float, cli.opt("--ambient", "DEGC", "Temperature of the room.")] = 23.0,
     obj: ObjOption = None,
     material: MaterialOption = None,
-    fault: Annotated[
-        list[str] | None,
-        cli.opt(
-            "--fault", "S:NAME", f"After S seconds let one of {', '.join(FAULTS)} fail; may be repeated."
-        ),
-    ] = None,
+    fault: Annotated[list[str] | None, cli.shared("--fault", faults=", ".join(FAULTS))] = None,
     seconds: Annotated[float | None, cli.opt("--seconds", "S", "End after this long.", min=0)] = None,
     seed: cli.Seed = 0,
     as_json: cli.AsJson = False,
@@ -531,76 +514,9 @@ def virtual(
     return 0
 
 
-def one_rig(port: str | None, twin: Path | None) -> None:
-    """Raise UserError unless either hardware or a plant to simulate is named."""
-    if (twin is None) == (port is None):
-        given = "no rig is given" if twin is None else "--port and --twin are both given"
-        raise UserError(given, hint="give --port DEV, or --twin PLANT to simulate")
-
-
 def files_of(**named: Path | None) -> dict[str, Path]:
     """Return the files that a run is made from, those that are named."""
     return {name: path for name, path in named.items() if path is not None}
-
-
-def rig_of(
-    port: str | None, protocol: str | None, clock: ScaledClock, twin: Path | None, network: str | None,
-    draw: int, controller: Controller | PIController | None, *, seed: int, t_start: float | None,
-    paced: bool = False, relays: Path | None = None,
-) -> Rig:  # fmt: skip
-    """Return the rig on a port, or the simulated one, ``paced`` by the clock or as fast as it goes, with the
-    relays of a file."""
-    from thermogrip.rig.clock import Metronome
-    from thermogrip.rig.drivers.connect import open_rig
-    from thermogrip.rig.drivers.relays import RelayRig, read_relays
-
-    switched = {} if relays is None else read_relays(relays)
-    if twin is not None:
-        pace = Metronome(clock, clock.sleep).wait if paced else None
-        simulated = _twin(twin, network, draw, controller, seed=seed, t_start=t_start, pace=pace)
-        return RelayRig(simulated, switched, lambda: simulated.time) if switched else simulated
-    if t_start is not None or draw:
-        raise UserError("--from and --draw are of the twin", hint="leave them away with --port")
-    rig: Rig = open_rig(str(port), protocol, clock=clock, sleep=clock.sleep)
-    if switched:
-        try:
-            rig = RelayRig(rig, switched, clock)
-        except UserError:
-            rig.close()
-            raise
-    lacking = set(controller.plant.inputs) - set(rig.units) - {"pump"} if controller is not None else ()
-    if lacking:
-        rig.close()
-        have = ", ".join(rig.units)
-        raise UserError(f"the rig drives {have}, not {', '.join(lacking)}", hint="use its own controller")
-    return rig
-
-
-def pace_of(speed: float | None, twin: Path | None, live: int | None, foxglove: int | None) -> float | None:
-    """Return how many times as fast as real time a twin runs, None where it runs as fast as it goes."""
-    if twin is None or speed is not None:
-        return None if twin is None else speed
-    return None if live is None and foxglove is None else WATCHED_SPEED
-
-
-def _twin(
-    path: Path, network: str | None, draw: int, controller: Controller | PIController | None, *, seed: int,
-    t_start: float | None, pace: Callable[[float], None] | None = None,
-) -> Twin:  # fmt: skip
-    """Return the simulated rig; a drive whose unit does not say its range has the controller's."""
-    from thermogrip.rig.interface import UNIT_RANGES
-    from thermogrip.rig.simulation.twin import Twin
-    from thermogrip.sysid.plant.plant import Plant
-
-    try:
-        plant = Plant.load(path)
-    except UserError:
-        if network is None:
-            raise
-        plant = cli.load_plant(path, network)
-    ranges = {} if controller is None else controller.design.drive_range
-    limits = {name: ends for name, ends in ranges.items() if plant.units.get(name, "1") not in UNIT_RANGES}
-    return Twin(plant.draw(draw), seed=seed, t_start=t_start, limits=limits, pace=pace)
 
 
 def guard_of(
@@ -670,16 +586,20 @@ def _what_to_grasp(obj: float | None, material: str | None) -> tuple[str, float]
     return material, obj
 
 
-def watch_of(
-    title: str, console: Console, out: Path, live: int | None, foxglove: int | None, on_trip: str | None,
-    pace: float | None = None,
-) -> Watch:  # fmt: skip
-    """Return what shows a session, ``pace`` times as fast as real time where a twin is watched."""
-    from thermogrip.live.watch import Show, Watch
+@contextmanager
+def _recorded(
+    out: Path, about: dict[str, Any], files: dict[str, Path], bridge: str | None, watch: Watch
+) -> Iterator[tuple[RunFolder, Recorder]]:
+    """Yield the run folder of a session that is watched, and what records into it."""
+    from thermogrip.rig.records.run_folder import RunFolder
 
-    layout = out / "foxglove_layout.json"
-    show = Show(live=live, foxglove=foxglove, on_trip=on_trip, layout=layout, pace=pace)
-    return Watch(title, console, show)
+    with (
+        _bridge(bridge) as through,
+        watch,
+        RunFolder(out, about, files=files) as folder,
+        through(folder) as recorder,
+    ):
+        yield folder, recorder
 
 
 @contextmanager
