@@ -149,7 +149,9 @@ def arg(metavar: str, words: str, check: Callable[..., Any] | None = None) -> An
 def grouped(verb: Callable[..., int]) -> Callable[..., int]:
     """Return a verb with the fields of its parameters that are dataclasses in their place, as options."""
     whole = signature(verb, eval_str=True)
-    groups = {name: one.annotation for name, one in whole.parameters.items() if is_dataclass(one.annotation)}
+    groups: dict[str, Any] = {
+        name: one.annotation for name, one in whole.parameters.items() if is_dataclass(one.annotation)
+    }
     parameters = []
     for name, parameter in whole.parameters.items():
         if name not in groups:
