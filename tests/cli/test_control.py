@@ -169,14 +169,3 @@ def test_a_review_is_an_answer_of_no_where_a_check_fails(
         "passed": code == 0, "checks": [asdict(check) for check in found], "report": None,
     }  # fmt: skip
     assert len(pages) == 1
-
-
-def test_the_class_of_a_plant_of_one_s_own_is_handed_in(controller: Bench, stand_in: StandIn) -> None:
-    controller.write("own.py", "")
-    stand_in("thermogrip.cli.options.find_network", lambda text: f"model of {text}")
-    loaded = stand_in("thermogrip.mpc.controllers.mpc.load_controller", "a controller")
-    stand_in("thermogrip.mpc.tuning.design_review.review", [])
-    for network in ((), ("--network", "own.py:Own")):
-        assert controller.run("review", "c.json", *network).code == 0
-    assert [call.args for call in loaded] == [(Path("c.json"),)] * 2
-    assert [call.model for call in loaded] == [None, "model of own.py:Own"]

@@ -473,23 +473,6 @@ def test_a_warm_up_shorter_than_that_of_the_fit_is_told(bench: Bench, stand_in: 
     assert "set the state" not in done.err
 
 
-def test_a_simulation_is_written_and_counted(bench: Bench, stand_in: StandIn) -> None:
-    log = make_log(np.arange(3.0), {"t_tank": (np.full(3, 20.0), "degC", "output")})
-    simulated = stand_in("thermogrip.sysid.plant.plant.Plant.simulate", log)
-    words = ["simulate", "plant.json", "good.csv", "--warmup", "3", "--out", "s.csv"]
-    done = bench.run(*words)
-    assert (done.code, done.out) == (0, "wrote s.csv: t_tank, t_surface at 3 times\n")
-    assert simulated[0].warmup == 3.0
-    bench.run(*words[:3], "--out", "s.csv")
-    assert simulated[1].warmup == 5.0
-    assert len((bench.path / "s.csv").read_text().splitlines()) == 4
-    assert json.loads(bench.run(*words, "--json").out) == {
-        "log": "good", "rows": 3, "out": "s.csv", "repairs": []
-    }  # fmt: skip
-    stand_in("thermogrip.sysid.plant.log_grid.match_logs", ([log], ["drive: converted"]))
-    assert "drive: converted" in bench.run(*words).err
-
-
 def test_a_simulation_has_the_ends_of_its_bands(bench: Bench, stand_in: StandIn) -> None:
     log = make_log(np.arange(3.0), {"t_tank": ([20.0, 21.0, 22.0], "degC", "output")})
     stand_in("thermogrip.sysid.plant.plant.Plant.simulate", log)

@@ -37,43 +37,6 @@ def test_the_demo_prints_its_verdicts_and_where_its_report_is(bench: Bench, stan
     assert (ran[1].args, ran[1].seed, ran[1].workers) == ((Path("thermogrip-demo"),), 0, 2)
 
 
-def test_the_paper_prints_each_case_beside_ours(bench: Bench, stand_in: StandIn) -> None:
-    def repeat(*, progress: Any, **_: Any) -> Any:
-        progress(0.5, "bundled grasps")
-        return found
-
-    head = ("case", "object", "gripper", "materials", "paper", "k of n", "bayes, bundled", "lstm, bundled")
-    row = ("1-A", 43.0, 23.5, 5, "100 %", "5/5", "9/12", "10/12")
-    saved: list[tuple[str, Path]] = []
-    found = SimpleNamespace(
-        bundled=SimpleNamespace(save=lambda out: saved.append(("bundled", out))),
-        twin=SimpleNamespace(save=lambda out: saved.append(("twin", out))),
-        sections=lambda: ["a section"], table=lambda: (head, (row,)), verdict="few grasps",
-        copies_verdict="copies are of little worth", copies=({"case": "1-A"},), epochs=200,
-    )  # fmt: skip
-    ran = stand_in("thermogrip.studies.paper.repeat_paper", repeat)
-    pages = stand_in("thermogrip.report.html.write_report")
-    done = bench.run("paper", "--out", "p", "--quick", "--seed", "4", "--workers", "3")
-    assert done.code == 0, done
-    assert done.out.splitlines() == [
-        "1-A: object 43, gripper 23.5 degC, 5 materials", "    paper: 100 % (5/5)",
-        "    bayes, bundled: 9/12", "    lstm, bundled: 10/12", "few grasps",
-        "copies are of little worth", "wrote p/report.html",
-    ]  # fmt: skip
-    assert (ran[0].quick, ran[0].seed, ran[0].workers) == (True, 4, 3)
-    assert saved == [("bundled", Path("p/bundled")), ("twin", Path("p/simulated"))]
-    assert (pages[0].args[:2], pages[0].args[3]) == (
-        (Path("p/report.html"), "The paper, repeated"),
-        ["a section"],
-    )
-    assert shares(done.err, "paper") == [50]
-    assert json.loads(bench.run("paper", "--out", "p", "--json").out) == {
-        "cases": [dict(zip(head, row))], "copies": [{"case": "1-A"}], "epochs": 200, "verdict": "few grasps",
-        "out": "p",
-    }  # fmt: skip
-    assert (ran[1].quick, ran[1].seed, ran[1].workers) == (False, 0, 1)
-
-
 @pytest.mark.parametrize(
     ("what", "key"),
     [("spec", "settle_within_s"), ("network", "[nodes]"), ("topics", "topic"), ("guard", "stale_s")],

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import lzma
 from pathlib import Path
 
@@ -64,7 +63,7 @@ MISTAKES = {
     "run controller.json --target t_surfce=38 --twin plant.json --out r": "did you mean 't_surface'?",
     "excite --kind optimal --minutes 5 --plant plant.json --hold pmup --out s.csv": "did you mean 'pump'?",
     "tune plant.json --spec typo.toml --out c.json": "did you mean 'band_degC'?",
-    "run controller.json --target 38 --twin plant.json --guard loose.toml --out r": "did you mean 'stale_s'?",
+    "run controller.json --target 38 --twin plant.json --guard loose.toml --out r": "key; write stale_s",
     "validate plant.json bare.csv": "--columns time_s,drive,pump,t_tank,t_surface,t_ambient",
     # files
     "validate plnt.json log.csv": "did you mean 'plant.json'?",
@@ -132,13 +131,13 @@ MISTAKES = {
 def mistaken_folder(path: Path) -> None:
     """Write the files that the mistakes are about."""
     from thermogrip.cli.main import main
+    from thermogrip.mpc import design_controller
 
     log = "\n".join([HEADER, *small_log_rows()]) + "\n"
     (path / "log.csv").write_text(log)
     (path / "long.csv.xz").write_bytes(lzma.compress(log.encode()))
-    plant = json.loads(small_plant().save(path / "plant.json").read_text())
-    controller = {"schema": "thermogrip.controller", "version": 1, "plant": plant, "design": {"dt": 2.0}}
-    (path / "controller.json").write_text(json.dumps(controller))
+    small_plant().save(path / "plant.json")
+    design_controller(small_plant()).save(path / "controller.json")
     for name, text in zip(("grasps.csv", "grasps_meta.csv"), small_grasps()):
         (path / name).write_text(text)
     for folder, name, text in (

@@ -72,18 +72,6 @@ def test_the_twin_settles_and_grasps_each_material(ran: tuple[Path, Sessions, An
         assert session.log["t_surface"].values[0] == again.values["t_surface"]
 
 
-def test_each_grasp_fills_its_share_of_the_progress(
-    ran: tuple[Path, Sessions, list[tuple[float, str]]],
-) -> None:
-    seen = ran[2]
-    fractions = [fraction for fraction, _ in seen]
-    assert fractions == sorted(fractions)
-    for k, name in enumerate(demo.TOUCHED[:2]):
-        own = [at for at, what in seen if what.startswith(name) and at <= (k + 1) / 5 + 1e-9]
-        assert k / 5 <= own[0] < k / 5 + 0.05
-        assert own[-1] == pytest.approx((k + 1) / 5)
-
-
 def test_classifiers_are_scored_on_test_grasps_and_trained_for_the_twins_on_training_grasps(
     ran: tuple[Path, Sessions, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -18,14 +18,11 @@ from thermogrip.classify.estimators.base import GraspClassifier
 from thermogrip.cli.main import main
 from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.datasets.parallel import Progress
-from thermogrip.report.html import Table
 from thermogrip.studies.paper import (
     CASES,
     Case,
     PaperResult,
-    _copies,
     _published,
-    _shown,
     repeat_paper,
 )
 
@@ -52,33 +49,6 @@ def test_published_accuracies_are_those_of_the_paper() -> None:
     assert said["1-B"] == "40 %"
     assert [said[name] for name in said if name.startswith("2-")] == ["33.33 %", "66.66 %", *["100 %"] * 3]
     assert [said[f"3-{letter}"] for letter in "ABC"] == ["100 %"] * 3
-
-
-def test_right_answers_are_counted_on_copies_on_one_grasp_a_material_and_on_all_others(
-    examples: dict[str, Any], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    class SaysWood:
-        def fit(self, grasps: Any) -> SaysWood:
-            return self
-
-        def predict(self, grasps: Any) -> np.ndarray:
-            return np.full(grasps.sizes["grasp"], "wood")
-
-        def predict_proba(self, grasps: Any) -> np.ndarray:
-            return np.tile([0.1, 0.9], (grasps.sizes["grasp"], 1))
-
-    monkeypatch.setattr(
-        "thermogrip.classify.estimators.registry.make_classifier", lambda *args, **params: SaysWood()
-    )
-    row = _copies((CASES[0], examples[CASES[0].record], True, 0))  # 8 grasps of each of five materials
-    assert (row["copies_right"], row["one_right"], row["others_right"]) == (row["copies_n"] / 5, 1, 7)
-    assert row["confidence"] == pytest.approx(0.9)
-
-
-def test_a_printed_rate_has_both_ends_of_its_interval() -> None:
-    assert _shown({"accuracy": 0.75, "n": 12, "low": 0.428, "high": 0.947}) == "9/12 (43–95)"
-    assert _published(CASES[0])[1] == "5/5 (48–100)"
-    assert _published(CASES[1])[1] == "2/5 (5–85)"
 
 
 @dataclass(frozen=True)
@@ -148,18 +118,6 @@ def test_the_table_counts_what_was_named_right_beside_what_was_published(small: 
             assert f"/{3 * case.of} (" in cell  # three test grasps a material in either
 
 
-def test_the_page_shows_the_table_in_two_halves_each_with_the_case_and_its_own_classifiers(
-    small: Repeated, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("thermogrip.studies.paper.CASES", FEW)
-    bundled, simulated = (p for p in small.found._beside_the_paper().parts if isinstance(p, Table))
-    head, rows = small.table
-    for half, kind, first in ((bundled, "bundled", range(6)), (simulated, "simulated", (0, 4))):
-        columns = [*first, *(k for k, title in enumerate(head) if title.endswith(f", {kind}"))]
-        assert half.head == tuple(head[k].split(", ")[0] for k in columns)
-        assert half.rows == tuple(tuple(row[k] for k in columns) for row in rows)
-
-
 def test_every_case_and_every_rate_is_printed(small: Repeated) -> None:
     lines = small.said.splitlines()
     head, rows = small.table
@@ -180,14 +138,6 @@ def test_every_case_and_every_rate_is_printed(small: Repeated) -> None:
     assert drawn == [True, False]  # the paper has none of 2-C
     assert [case.name for case in CASES if not case.confusion] == [c.name for c in CASES if c.name[0] == "2"]
     assert small.found.bundled.leaks == small.found.twin.leaks == ()  # the paper has no such probe
-
-
-def test_each_stage_of_the_paper_fills_its_share_of_the_progress(small: Repeated) -> None:
-    fractions, words = zip(*small.progress)
-    assert list(fractions) == sorted(fractions)
-    ends = {word.split(":")[0]: fraction for fraction, word in small.progress}
-    assert ends == pytest.approx({"bundled grasps": 0.5, "simulated grasps": 0.8, "copies of one grasp": 1.0})
-    assert all("copies" in word for fraction, word in zip(fractions, words) if fraction > 0.8001)
 
 
 def test_copies_are_of_one_grasp_a_material_and_all_others_are_asked(small: Repeated) -> None:

@@ -11,13 +11,10 @@ import lzma
 import os
 import re
 import tomllib
-from collections.abc import Iterator
-from functools import partial
 from importlib import import_module, resources
 from pathlib import Path
 from typing import Any
 
-from thermogrip.datasets.atomic_files import read_toml
 from thermogrip.datasets.errors import UserError, known_names
 from thermogrip.datasets.file_names import matching_files
 
@@ -71,46 +68,23 @@ def _kind_of_table(head: bytes) -> str:
 
 def _kind_of_toml(head: bytes) -> str:
     """Return which template a TOML file has most keys of, "" where two have as many."""
-    try:
-        keys = {*_keys(tomllib.loads(head.decode()))}
-    except (ValueError, RecursionError):
-        return ""
-    shared = {kind: len(keys & template_keys(kind)) for kind in ("spec", "guard")}
+    keys = _keys(head.decode("utf-8", "replace"))
+    shared = {kind: len(keys & _keys(template_text(kind))) for kind in ("spec", "guard")}
     most = max(shared.values())
     alike = [kind for kind, n_keys in shared.items() if n_keys == most]
     return alike[0] if len(alike) == 1 and most > len(keys) / 2 else ""
+
+
+def _keys(text: str) -> set[str]:
+    """Return the keys and tables of a TOML file, those that are commented out among them."""
+    shown = re.findall(r"(?m)^(?:# )?(?:\[+(\w+)[\].]|(\w+) *= *)", text)
+    return {table or key for table, key in shown}
 
 
 def template_text(kind: str) -> str:
     """Return the template of a kind of file."""
     package, name = KINDS[kind]["template"]
     return resources.files(package).joinpath(name).read_text(encoding="utf-8")
-
-
-def template_keys(kind: str) -> set[str]:
-    """Return the keys and tables that a template shows, those that are commented out among them."""
-    shown = re.findall(r"(?m)^(?:# )?(?:\[+(\w+)[\].]|(\w+) += )", template_text(kind))
-    return {table or key for table, key in shown}
-
-
-def _keys(content: dict[str, Any]) -> Iterator[str]:
-    """Yield the keys of a TOML file and of its tables."""
-    for key, value in content.items():
-        yield key
-        if key in ("sensors", "model", "no_model") and isinstance(value, dict):
-            yield from value
-
-
-def check_keys(path: str, kind: str) -> None:
-    """Refuse a key that the template of this kind has not."""
-    allowed = template_keys(kind).union(KINDS[kind].get("former", ()))
-    shows = f"'thermogrip init {kind}' shows every key"
-    for key in _keys(read_toml(path, hint=shows)):
-        if key not in allowed:
-            raise UserError(f"{key}: no such key", file=path, hint=known_names(key, sorted(allowed), shows))
-
-
-check_spec, check_guard = partial(check_keys, kind="spec"), partial(check_keys, kind="guard")
 
 
 def check_exists(text: str, meant: str = "") -> None:

@@ -45,21 +45,6 @@ class Done(int):
         return made
 
 
-def check_controller(path: str) -> None:
-    """Look through a controller before what its model needs is loaded."""
-    from thermogrip.datasets.limits import STEP_RANGE, number_within
-    from thermogrip.mpc.interface import FILE_VERSIONS
-    from thermogrip.sysid.plant.plant_data import check_plant_file
-
-    newest = max(FILE_VERSIONS.values())
-    content = check_plant_file(path, inside="thermogrip.controller", version=newest)
-    try:
-        number_within(content["design"], "dt", *STEP_RANGE)
-    except (KeyError, TypeError, ValueError) as error:
-        problem = f"has no whole design ({type(error).__name__}: {error})"
-        raise UserError(problem, file=path, hint="tune the controller again") from error
-
-
 def check_network(text: str) -> None:
     """Refuse what is no network, or no file of one."""
     if text == "none":
