@@ -146,7 +146,7 @@ def test_files_and_modules_that_the_documents_name_are_there(page: Path) -> None
 
 #: What a module has that starts processes.
 STARTS = re.compile(
-    r"^\s*(?:import|from) (?:subprocess|pty)\b|ProcessPoolExecutor\(|LocalCluster\(|"
+    r"^\s*(?:import|from) (?:subprocess|pty)\b|ProcessPoolExecutor\(|get_reusable_executor\(|LocalCluster\(|"
     r"multiprocessing.*\b(?:Process|Pool)\b|"
     r"\bos\.(?:system|popen|fork|startfile|(?:exec|spawn|posix_spawn)\w*)\(|create_subprocess_",
     flags=re.MULTILINE,
