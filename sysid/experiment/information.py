@@ -1,59 +1,36 @@
 """Expected information of an experiment: temperatures that it may reach, intervals that it would leave.
 
 **Information.** A schedule u moves the outputs y(t). With the free parameters theta (logarithms where they
-are positive) of covariance P now, an experiment whose output j is read with standard deviation sigma_j, one
-independent reading every tau_j seconds, adds
+are positive) of covariance P = R R' now, an experiment whose output j is read with standard deviation
+sigma_j, one independent reading every tau_j seconds, adds
 
-    F = sum_j 1 / (sigma_j^2 tau_j) integral (dy_j/dtheta) (dy_j/dtheta)' dt,
+    F = sum_j 1 / (sigma_j^2 tau_j) integral (dy_j/dtheta) (dy_j/dtheta)' dt
 
-and leaves the covariance (P^-1 + F)^-1. With P = R R' this is R (1 + R'F R)^-1 R', which needs no inverse
-of P, and the volume of the posterior shrinks by
+and leaves (P^-1 + F)^-1 = R (1 + R'F R)^-1 R': a gain of 1/2 log2 det(1 + R'F R) bits [1]_. All is linear
+about the plant's values.  Every experiment begins at rest in the room.
 
-    bits = 1/2 log2 det(1 + R'F R),
-
-the expected gain of information [1]_. sigma_j and tau_j are those of the fit: the error about its own free
-run, at least the stated sd of the sensor, and the correlation time of its residuals. All is linear in theta
-about the plant's values, so the forecast holds for a plant near them.
-
-**Start.** Every experiment begins at rest in the room, which is how a fit knows the state best. A plant
-that measures its ambient knows its start; for any other the state at rest follows the parameters.
-
-**Limits** are kept by the plant itself and by a number of draws of its parameters.
-
-**A learnt error model.** A fit learns the covariance of the residuals of its free runs
-(:mod:`thermogrip.sysid.greybox.noise_model`): white noise, two slow errors of the model, random effects of
-each log, and model discrepancy. An experiment to come has the same. With the sensitivities J of its bins,
-in units of the fit's residuals, it adds to a least-squares fit the Hessian A = J'J and to the covariance of
-its score
+**A learnt error model.** A fit learns the covariance C of its residuals, random effects of each log and
+model discrepancy (:mod:`thermogrip.sysid.greybox.noise_model`). With the sensitivities J of an experiment's
+bins, in units of the fit's residuals, B the random effects at one sd and phi the factor by which logs
+disagree, the experiment adds to the fit's Hessian A = J'J and to the covariance of its score
 
     V = phi (J' C J + E E'),      E = J' B,
 
-C the learnt covariance, B the columns of the random effects times their sd, phi the factor by which the
-logs of the fit disagreed beyond that. A start that a fit would estimate from the warm-up is known better
-than by its prior (:mod:`thermogrip.sysid.greybox.random_effects`): E E' is then E H E', with H the
-covariance of its error.
+of a start E H E', with H the covariance of what its warm-up leaves unknown
+(:mod:`thermogrip.sysid.greybox.random_effects`). Discrepancy is the same in every log: its responses F of the
+learnt sizes s add G = J' F s where they added U to the score of the fit, before both are squared. Sizes are
+scaled anew with every fit: an experiment that moves the plant more than the n stretches of the fit, to a mean
+square m instead of m_0, changes them by c = sqrt((n + 1) / (n + m / m_0)).
 
-**Model discrepancy** is the same in every log. With F its responses to the experiment's inputs, of the
-learnt sizes s, it adds G = J' F s to the score of the new log where it added U to that of the fit. The two
-add up before they are squared: a fit to all logs is off by U + G of one and the same term, and repeating an
-experiment does not average it out. Without G the forecast would be too narrow for exactly those parameters
-that discrepancy resembles.
-
-Sizes are scaled anew with every fit: s = 1 means a given rms of the response over all of its logs. An
-experiment that moves the plant more than the n stretches of the fit, to a mean square m instead of m_0,
-changes that scale by c = sqrt((n + 1) / (n + m / m_0)), with s as it was; what s will be cannot be known.
-
-With the fit's Hessian P and covariance S (:mod:`thermogrip.sysid.greybox.sandwich`; the covariance of its
-score is P S P, with U U' in it), a fit to all logs would have
+With the fit's Hessian P and covariance S (:mod:`thermogrip.sysid.greybox.sandwich`), a fit to all logs has
 
     (P + A)^-1 Omega (P + A)^-1,      Omega = P S P - U U' + (U + G) c c' (U + G)' + V.
 
-In whitened parameters x with R x = theta and R R' = S the inverse of this is the gain of the experiment
+In whitened parameters, R R' = S, the inverse is the gain (P' + A') Omega'^-1 (P' + A'), P' = R' P R and so
+on. S may be less than U U' in some direction; singular values of P'^-1 R' U above 1 are cut to 1 there.
 
-    (P' + A') Omega'^-1 (P' + A'),      P' = R' P R and so on.
-
-S was widened by parameter for the disagreement of logs, so in some direction U U' may exceed P S P a
-little; singular values of W = P'^-1 R' U above 1 are cut to 1 there.
+Without this model the optimal schedule of the gripper gains 33.4 bits in place of 40.9, and a fit with a
+third log states intervals 2.2 times the predicted ones (median), not 1.5.
 
 References
 ----------

@@ -2,17 +2,10 @@
 
 Schedules are lists of cells of equal length, one level per input in each.  Starting from the best of the
 given schedules (PRBS, multisine, staircase), from constants and from slow square waves, a search exchanges
-one block of cells after the other and keeps what gains information
+one block of cells of random length after the other and keeps what gains information
 (:mod:`thermogrip.sysid.experiment.information`) without leaving the limits: coordinate exchange of D-optimal
-design [1]_, with blocks of random length, since a slow plant answers to long blocks and a delay is seen at
-edges.  The moves are
-
-* a block gets one level, or two in turn;
-* a block is copied from another of the given schedules;
-* a block shifts by some cells, so that its switch times move;
-* a block swings further out or less far.
-
-A switch keeps each position for ``switch_hold`` at least, since a pump is not made to stutter.
+design [1]_.  A block gets one level, or two in turn; is copied from another schedule; shifts, so that its
+switch times move; or swings further out or less far.
 
 Limits that are kept at the search's step are checked again at the plant's own; a schedule that violates them
 there is shrunk towards the start's level until it keeps them.
@@ -34,15 +27,16 @@ from thermogrip.datasets.arrays import Array, Mask
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.parallel import Progress
 from thermogrip.datasets.schema import Log, column, make_log
-from thermogrip.sysid.experiment.information import ROOM, ExperimentForecast, interval_widths
+from thermogrip.sysid.experiment.information import ExperimentForecast, interval_widths
 from thermogrip.sysid.experiment.schedules import REST
 from thermogrip.sysid.plant.plant import Plant
 
 EVALUATIONS = 1500
+SWITCH_HOLD = 30.0  # [s] in each position: a pump is not made to stutter
 _CELLS = 240  # at most, of the search
 _STEPS = 800  # of a simulation in the search, about
 _MARGIN = 0.2  # [K] inside the limits while the step is coarse
-_HALVINGS = 10
+_HALVINGS, _HALVINGS_OF_SEARCH = 10, 5  # of a schedule that leaves the limits: to 0.1 and 3 %
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,10 +46,6 @@ class Expectation:
     bits: dict[str, float]  # gain of information by schedule; 0 for ``now``
     widths: dict[str, dict[str, float]]  # of each parameter's 90 % interval in natural units, by schedule
 
-    def determinant_ratio(self, kind: str, than: str) -> float:
-        """Return how many times smaller det(covariance) is expected after ``kind`` than after ``than``."""
-        return float(2.0 ** min(2 * (self.bits[kind] - self.bits[than]), 1000.0))
-
     def narrower(self, kind: str, than: str) -> float:
         """Return how many times narrower intervals are expected, the geometric mean over independent
         directions."""
@@ -63,10 +53,10 @@ class Expectation:
         return float(2.0 ** ((self.bits[kind] - self.bits[than]) / n))
 
 
-def expect(plant: Plant, schedules: Mapping[str, Log], *, room: float = ROOM) -> Expectation:
-    """Return what each schedule is expected to leave of a plant's uncertainty, from rest at ``room`` degC; a
+def expect(plant: Plant, schedules: Mapping[str, Log]) -> Expectation:
+    """Return what each schedule is expected to leave of a plant's uncertainty, from rest at 25 degC; a
     UserError where the plant has no covariance, or a schedule, on the plant's step, lacks an input."""
-    forecast = ExperimentForecast(plant, room=room, draws=0)
+    forecast = ExperimentForecast(plant, draws=0)
     inputs = {name: inputs_of(plant, log) for name, log in schedules.items()}
     bits = {"now": 0.0} | {name: forecast.bits(u) for name, u in inputs.items()}
     covariance = np.asarray(plant.covariance)
@@ -96,9 +86,7 @@ def optimal_schedule(
     lowest: float = -np.inf,
     highest: float = np.inf,
     slew: float = np.inf,
-    switch_hold: float = 30.0,
     hold: Collection[str] = (),
-    room: float = ROOM,
     seed: int = 0,
     evaluations: int | None = None,
     progress: Progress | None = None,
@@ -107,11 +95,11 @@ def optimal_schedule(
 
     ``ranges`` (low, high) are hard, of each input that is not a switch. The result is at least as good as
     those schedules of ``begin`` that keep the limits: ``shortest`` seconds between two changes of an input,
-    ``slew`` shares of its range in a second at most, ``switch_hold`` seconds in each position of a switch,
-    and every output in degC between ``lowest`` and ``highest``, of the plant and of eight draws of it.
-    Inputs on ``hold`` stay as at the start, in a room of ``room`` [degC]: a switch on, any other at 0 or
-    what is nearest to it. ``evaluations`` schedules are tried, 1500 where absent. A UserError where the
-    plant has no covariance, or nothing that moves an input keeps the limits.
+    ``slew`` shares of its range in a second at most, 30 s in each position of a switch, and every output in
+    degC between ``lowest`` and ``highest``, of the plant and of eight draws of it. Inputs on ``hold`` stay
+    as at the start, in a room of 25 degC: a switch on, any other at 0 or what is nearest to it.
+    ``evaluations`` schedules are tried, 1500 where absent. A UserError where the plant has no covariance, or
+    nothing that moves an input keeps the limits.
     """
     if not set(plant.inputs) - set(plant.model.switches) <= set(ranges):
         raise ValueError("ranges must name every input that is not a switch")
@@ -119,10 +107,10 @@ def optimal_schedule(
         raise UserError(
             f"cannot hold {', '.join(hold)}", hint=f"leave one of {', '.join(plant.inputs)} to move"
         )
-    frame = _Frame(plant, minutes, ranges, shortest, switch_hold, slew, hold)
+    frame = _Frame(plant, minutes, ranges, shortest, slew, hold)
     report = progress or (lambda fraction, what: None)
-    fine = ExperimentForecast(plant, lowest=lowest, highest=highest, room=room)
-    coarse = ExperimentForecast(plant, lowest=lowest, highest=highest, room=room, dt=frame.dt, starts=False)
+    fine = ExperimentForecast(plant, lowest=lowest, highest=highest)
+    coarse = ExperimentForecast(plant, lowest=lowest, highest=highest, dt=frame.dt, starts=False)
     pool = [
         np.where(frame.low < frame.high, inputs_of(plant, log), frame.still) for log in (begin or {}).values()
     ]
@@ -130,8 +118,13 @@ def optimal_schedule(
         frame, coarse, [frame.to_cells(u) for u in pool], seed, evaluations or EVALUATIONS, report
     )
     report(0.97, "checking the limits")
-    found = _keep_limits(frame, fine, cells)
-    kept = [u for u in (*pool, found) if u is not None and len(u) == frame.n and fine.stays(u)]
+
+    def bits(cells: Array) -> float:
+        return fine.evaluate(frame.inputs(cells, coarse=False))
+
+    within, _ = _shrunk(frame, bits, cells, _HALVINGS)
+    best_found = frame.inputs(within, coarse=False)
+    kept = [u for u in (*pool, best_found) if len(u) == frame.n and fine.stays(u)]
     if not kept:
         raise UserError(
             f"no schedule keeps the plant and {fine.n_draws} draws of it from {lowest:g} to {highest:g} degC",
@@ -153,7 +146,6 @@ class _Frame:
         minutes: float,
         ranges: Mapping[str, tuple[float, float]],
         shortest: float,
-        switch_hold: float,
         slew: float,
         hold: Collection[str],
     ) -> None:
@@ -177,7 +169,7 @@ class _Frame:
         if not np.any(self.low < self.high):
             raise UserError("no input has a range to move in", hint="give limits that differ")
         # cells that change as one, by input
-        self.together = np.where(self.switch, max(1, int(np.ceil(switch_hold / (self.cell * self.dt)))), 1)
+        self.together = np.where(self.switch, max(1, int(np.ceil(SWITCH_HOLD / (self.cell * self.dt)))), 1)
 
     def inputs(self, cells: Array, *, coarse: bool) -> Array:
         """Return the inputs (N, n_u) of cells (n_cell, n_u), on the search's step or on the plant's."""
@@ -217,7 +209,7 @@ def _search(
     pool = [*pool, *_plain_shapes(frame)]
     best, gain = np.tile(frame.still, (frame.n_cell, 1)), -np.inf
     for cells in [best, *pool]:
-        shrunk, value = _shrunk(frame, evaluate, cells)
+        shrunk, value = _shrunk(frame, evaluate, cells, _HALVINGS_OF_SEARCH)
         if value > gain:
             best, gain = shrunk, value
     for k in range(evaluations):
@@ -243,18 +235,22 @@ def _plain_shapes(frame: _Frame) -> list[Array]:
     return out
 
 
-def _shrunk(frame: _Frame, evaluate: Callable[[Array], float], cells: Array) -> tuple[Array, float]:
-    """Return the cells, drawn towards rest as far as the limits ask, and their bits."""
+def _shrunk(
+    frame: _Frame, evaluate: Callable[[Array], float], cells: Array, halvings: int
+) -> tuple[Array, float]:
+    """Return the cells, drawn towards rest as far as the limits ask, and their value (-inf: none keeps
+    them)."""
     value, low, high, best = evaluate(cells), 0.0, 1.0, cells
     if np.isfinite(value):
         return cells, value
-    for _ in range(5):
+    for _ in range(halvings):
         share = 0.5 * (low + high)
         trial = _drawn(frame, cells, share)
-        bits = evaluate(trial)
-        low, high = (share, high) if np.isfinite(bits) else (low, share)
-        if np.isfinite(bits):
-            best, value = trial, bits
+        trial_value = evaluate(trial)
+        if np.isfinite(trial_value):
+            low, best, value = share, trial, trial_value
+        else:
+            high = share
     return best, value
 
 
@@ -299,20 +295,3 @@ def _level(frame: _Frame, i: int, rng: np.random.Generator) -> float:
         return float(rng.integers(2))
     share = rng.choice([0.0, 1.0, 0.5, rng.random()], p=[0.35, 0.35, 0.1, 0.2])
     return low + float(share) * (high - low)
-
-
-def _keep_limits(frame: _Frame, forecast: ExperimentForecast, cells: Array) -> Array | None:
-    """Return the inputs on the plant's step, drawn towards rest as far as the limits ask; None: none keeps
-    them."""
-    whole = frame.inputs(cells, coarse=False)
-    if forecast.stays(whole):
-        return whole
-    low, high, best = 0.0, 1.0, None
-    for _ in range(_HALVINGS):
-        share = 0.5 * (low + high)
-        trial = frame.inputs(_drawn(frame, cells, share), coarse=False)
-        if forecast.stays(trial):
-            low, best = share, trial
-        else:
-            high = share
-    return best

@@ -5,24 +5,18 @@
 2. The correlation of residuals (tau) is measured on the fit. The estimate gives the data at least the
    weight of one reading a minute, so that a slow error of the model does not leave the fit to the priors;
    where residuals are whiter than that the fit is repeated with more weight.
-3. Covariance, from the learnt model of the error, the random effects of each log and the disagreement
-   between logs (:mod:`thermogrip.sysid.greybox.sandwich`), and which parameters are practically
-   identifiable (:mod:`thermogrip.sysid.greybox.identifiability`).
+3. Covariance (:mod:`thermogrip.sysid.greybox.sandwich`), and which parameters are practically identifiable
+   (:mod:`thermogrip.sysid.greybox.identifiability`).
 
-Levenberg-Marquardt with geodesic acceleration, in a box
---------------------------------------------------------
-
-A thermal network has combinations of parameters that its logs hardly determine, so the cost |r(z)|^2 is a
-narrow curved valley and plain Gauss-Newton steps, which are straight, leave it at once. With J the Jacobian,
-the step
+**Levenberg-Marquardt with geodesic acceleration, in a box.** Combinations of parameters that the logs hardly
+determine make the cost |r(z)|^2 a narrow curved valley, which straight steps leave at once. The step
 
     v = -(J'J + lambda)^-1 J'r            is followed by half of
     a = -(J'J + lambda)^-1 J' r_vv,       r_vv = (2 / h^2) (r(z + h v) - r(z) - h J v),
 
-which bends with the valley (Transtrum and Sethna [1]_). Several lambda are tried at once, straight and
-bent, each set of trials in one batch: for a simulator that runs many parameter sets side by side they are
-cheaper than the Jacobian. A coordinate on its bound whose step would leave the box is held there.  SciPy's
-trust region, one straight trial at a time, stops in such valleys: at 303 for 51 on a printer's heater block.
+which bends with the valley [1]_. Several lambda are tried at once, straight and bent, in one batch. A
+coordinate on its bound whose step would leave the box is held there.  SciPy's trust region, one straight
+trial at a time, stops in such valleys: at 303 for 51 on a printer's heater block.
 
 References
 ----------
@@ -33,7 +27,7 @@ References
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -161,7 +155,6 @@ def fit_network(
     logs: Logs,
     *,
     average: float | None = None,
-    near: Mapping[str, float] | None = None,
     progress: Progress | None = None,
 ) -> Plant:
     """Fit a network, or a model of the user's own, to logs.
@@ -175,9 +168,6 @@ def fit_network(
     average : float, optional
         Length of the bins that are compared [s]; the model's own where absent: for a network 5 s, or five
         steps if that is longer.
-    near : mapping of str to float, optional
-        Values to start from in place of the prior medians, as of an earlier fit; what is not named or not
-        free keeps its prior median.
     progress : callable, optional
         Called with (fraction done, what).
 
@@ -224,8 +214,8 @@ def fit_network(
     model = model.prepared(runs, spread)
     average = model.average if average is None else average
     problem = make_problem(model, logs, average=average, independent=model.independent)
-    report(0.0, "fitting from the priors" if near is None else "fitting from an earlier fit")
-    solution = _descend(problem, problem.standard(near or {}), report, (0.0, 0.6))
+    report(0.0, "fitting from the priors")
+    solution = _descend(problem, np.zeros(len(problem.free)), report, (0.0, 0.6))
     tau = residual_tau(problem.errors(solution.z), problem.tau)
     whiter = (tau < 0.8 * problem.tau) & np.array([slow is None for slow in problem.drift])
     if whiter.any():

@@ -1,21 +1,19 @@
-"""Error model of free runs, learnt from residuals: noise, slow model error, random effects of the logs.
+"""Error model of simulations, learnt from residuals: noise, slow model error, random effects of the logs.
 
 The residuals of one stretch of log l, one row of bins per output, are linear near the optimum:
 
     r = J (z - z_ref) + F c + B b_l + e.
 
-z are the parameters in prior units, z ~ N(0, 1). c ~ N(0, s^2) is the model discrepancy, the same in every
-log, b_l ~ N(0, s^2) are the random effects of the log: offsets, the ambient's bias, its start. Columns of F
-and B come in kinds with one s each. e is white noise and two slow errors of the model with correlation
-times tau_m,
+z ~ N(0, 1) are the parameters in prior units, c ~ N(0, s^2) the model discrepancy, the same in every log,
+b_l ~ N(0, s^2) the random effects of the log. Columns of F and B come in kinds with one s each. e is white
+noise and two slow errors of the model with correlation times tau_m,
 
     cov(e_j(t), e_k(t')) = w_j^2 [t = t'] [j = k] + sum_m R_m,jk a_mj a_mk exp(-|t - t'| / tau_m).
 
-**Cosine coordinates.** A covariance that depends on |t - t'| alone and decays is nearly diagonal after a
-discrete cosine transform (exactly so for an AR(1) process whose correlation goes to one [1]_). Its diagonal
-is sum_k W_fk c(k) with the autocovariance c and weights W that depend on the number of bins only. It is
-smooth in f, so frequencies are taken in bands with one small matrix S_b each, and of the data only the sums
-of products over each band are needed: a likelihood costs the same for an hour as for a day.
+**Cosine coordinates.** Such a covariance is nearly diagonal after a discrete cosine transform [1]_, its
+diagonal sum_k W_fk c(k) with the autocovariance c and weights W of the number of bins. It is smooth in f, so
+frequencies are taken in bands with one small matrix S_b each, and of the data only the sums of products over
+each band are needed: a likelihood costs the same for an hour as for a day.
 
 **Learning.** The numbers maximise the likelihood with z, c and all b_l integrated out (restricted maximum
 likelihood), under weak log-normal priors. Its slope in a number v of S, and in ln s of a kind, is

@@ -3,55 +3,43 @@
 What the samples are for, and why they lie closer than the intervals of the fit, is in
 ``docs/explanation/uncertainty.md``.
 
-**Sampling.** The few parameters that the data determine best relative to the prior are sampled with emcee;
-all others are integrated out and drawn afterwards, each as a fit of its own, so every sample is a whole
-vector. Half of the walkers' moves are differential evolution, which with few walkers has few directions, half
-proposals independent of the walker's position: Student's t about the mean m of the normal approximation of
-covariance C, wider by s,
-
-    x' ~ t_6(m, s^2 C),      accepted with min(1, p(x') t(x) / (p(x) t(x'))).
-
-A poor approximation costs acceptance, not correctness. **Converged** means that the chain is longer than 50
-integrated autocorrelation times of every parameter [1]_.
-Randomised maximum a posteriori
--------------------------------
-
-**Density.** What a fit leaves open is how far its free runs may move, d(z) = r(z) - r(z_fit), all logs
+**Density.** What a fit leaves open is how far its simulations may move, d(z) = r(z) - r(z_fit), all logs
 together:
 
     ln p(z) = -1/2 |z - z_fit|^2 - 1/2 |K^(1/2) Q'd(z)|^2 - 1/(2 T) |d(z) - Q Q'd(z)|^2.
 
-Q spans the slopes J = Q S R' of the fit. With A = J'J the information by the weights of the fit, V the
-learnt covariance of the score (:mod:`~thermogrip.sysid.greybox.sandwich`) and K = S R' V^-1 R S, the second
-term is A V^-1 A near the fit, where least squares are off by A^-1 V A^-1. Directions that move no run (S
-below 1e-9 of its largest) are left out of Q; only the first term restricts them. Model discrepancy is not
-in V: the parameters have absorbed it, and a plant that is to predict readings keeps them so. The third term
-is 0 where the plant is linear. Further away it excludes runs that the slopes do not predict; it is weighed
-by T = tr(P^-1 V) / tr(P^-1 A), how much larger the errors are than the fit's weights expect [2]_. No
-direction is less certain than by the prior, whose width the first term has, about the fit.
+Q spans the slopes J = Q S R' of the fit; directions that move no run (S below 1e-9 of its largest) are left
+to the first term. With A = J'J, V the learnt covariance of the score
+(:mod:`~thermogrip.sysid.greybox.sandwich`; without model discrepancy, which the parameters have absorbed
+and a plant that is to predict readings keeps) and K = S R' V^-1 R S, the second term is A V^-1 A near the
+fit. The third, 0 where the plant is linear, excludes runs that the slopes do not predict; T = tr(P^-1 V) /
+tr(P^-1 A) is how much larger the errors are than the fit's weights expect [1]_.
 
-**Draws.** Each is a fit of its own, to perturbed readings from a perturbed prior [3]_:
+**Draws.** Each is a fit of its own, to perturbed readings from a perturbed prior [2]_:
 
-    minimise  |z - z_fit - xi|^2 + |K^(1/2) Q'd(z) - e|^2 + |d(z) - Q Q'd(z)|^2 / T,      xi, e ~ N(0, 1).
+    minimise  |z - z_fit - xi|^2 + |K^(1/2) Q'd(z) - e|^2 + |d(z) - Q Q'd(z)|^2 / T,      xi, e ~ N(0, 1),
 
-Where the model is linear that is a draw from p; elsewhere it bends as the plant does. All go through
-Levenberg-Marquardt side by side, for the simulator runs many parameter sets at once. A few steps settle
-what the free runs see; along a valley that they hardly see a draw may stop short of its end.
+a draw from p where the model is linear; elsewhere it bends as the plant does. All go through
+Levenberg-Marquardt side by side; along a valley that no run sees a draw may stop short of its end.
 
-**Some sampled, the others integrated out.** For sampled z_s the others z_o begin where the normal
-approximation has their mean, and follow by a Gauss-Newton step with the slopes J_o of the fit; p is
-evaluated there, and the rest is integrated out to second order. With H = 1 + A V^-1 A,
+**Sampling.** emcee moves the few parameters z_s that the data determine best relative to the prior; the
+others are integrated out to second order about one Gauss-Newton step from their conditional mean, with the
+slopes J_o of the fit and H = 1 + A V^-1 A,
 
     z_o = z_fit - H_oo^-1 H_os (z_s - z_fit) - H_oo^-1 g_o,     g = z - z_fit + J'Q K Q'd,
-    ln p(z_s) = ln p(z_s, z_o) + g_o' H_oo^-1 g_o / 2.
+    ln p(z_s) = ln p(z_s, z_o) + g_o' H_oo^-1 g_o / 2,
+
+and drawn afterwards, each as a fit of its own. Half of the moves are differential evolution, half proposals
+x' ~ t_6(m, s^2 C) about the normal approximation, accepted with min(1, p(x') t(x) / (p(x) t(x'))).
+**Converged** means that the chain is longer than 50 integrated autocorrelation times of every parameter [3]_.
 
 References
 ----------
-.. [1] Foreman-Mackey, Hogg, Lang, Goodman, "emcee: The MCMC Hammer", PASP 125 (2013) 306, and the package's
-   documentation on autocorrelation.
-.. [2] J. W. Miller, D. B. Dunson, "Robust Bayesian inference via coarsening", JASA 114 (2019).
-.. [3] J. M. Bardsley, A. Solonen, H. Haario, M. Laine, "Randomize-then-optimize", SIAM J. Sci. Comput. 36
+.. [1] J. W. Miller, D. B. Dunson, "Robust Bayesian inference via coarsening", JASA 114 (2019).
+.. [2] J. M. Bardsley, A. Solonen, H. Haario, M. Laine, "Randomize-then-optimize", SIAM J. Sci. Comput. 36
    (2014).
+.. [3] Foreman-Mackey, Hogg, Lang, Goodman, "emcee: The MCMC Hammer", PASP 125 (2013) 306, and the package's
+   documentation on autocorrelation.
 """
 
 from __future__ import annotations

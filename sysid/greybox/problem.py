@@ -3,28 +3,23 @@
 **Unknowns.** z = (theta - theta_prior) / sd_prior for each free parameter, theta its logarithm where it is
 positive; z ~ N(0, 1) is the prior and adds n residuals z to the cost.
 
-**Residuals.** Readings and free run are averaged over bins of a few seconds with the same weights; their
+**Residuals.** Readings and simulation are averaged over bins of a few seconds with the same weights; their
 difference is divided by the sensor's ``sd``. The model's error is slow, so neighbouring bins are
 correlated: all residuals of an output are divided by sqrt(tau), with tau the bins per independent one.
 
 **Starts** are nuisances of each log (:mod:`thermogrip.sysid.plant.simulation`), estimated anew at each
-iteration and held while the sensitivities are taken.
+iteration and held while the sensitivities are taken: differences over all parameters in one batch.
 
-**Sensitivities** are differences over all parameters in one batch of the compiled kernel: the step is
-smooth in p, so a relative step of 1e-5 leaves five digits; a test compares them with an independent solver's.
+**Drift.** Over hours a reading drifts from any lumped model. The error of bin t of an output is then an AR(1)
+drift s of standard deviation ``sd`` and correlation time ``time``, and white w_t of variance r per bin,
 
-**Drift.** Over hours a reading drifts from any lumped model. The error of bin t of an output is then modelled
-as
+    e_t = s_t + w_t,    s_(t+1) = rho s_t + sqrt(1 - rho^2) sd eta_t,    rho = exp(-bin / time).
 
-    e_t = s_t + w_t,    s_(t+1) = rho s_t + sqrt(1 - rho^2) sd eta_t,    rho = exp(-bin / time),
-
-an AR(1) drift s of standard deviation ``sd`` and correlation time ``time``, and white w_t of variance r per
-bin. Maximum likelihood is then least squares on the innovations of the steady Kalman filter of s,
+Maximum likelihood is then least squares on the innovations of the steady Kalman filter of s,
 
     v_t = (e_t - s_t) / sqrt(P + r),    s_(t+1) = rho (s_t + K v_t sqrt(P + r)),    K = P / (P + r),
 
-with P = rho^2 P r / (P + r) + (1 - rho^2) sd^2. The filter is linear, so innovations of a model's
-sensitivities are the sensitivities of its innovations.
+with P = rho^2 P r / (P + r) + (1 - rho^2) sd^2; they are linear in e, as the sensitivities are.
 """
 
 from __future__ import annotations

@@ -1,7 +1,6 @@
 """A model's equations, compiled and run over a log for many parameter sets at once.
 
-The equations come as three functions on lists of numbers (:class:`Equations`): what depends on the parameters
-alone, what depends on a switch besides, and the step.  Each is called once, with
+The equations come as functions on lists of numbers (:class:`Equations`). Each is called once, with
 :class:`Vector` for numbers, and leaves its instructions in one function,
 
     c = prepare(p)
@@ -14,23 +13,14 @@ which moves eight members of a batch through a log.  It is made anew in each pro
 a second; no file is written.  It holds no interpreter lock, so that blocks of eight run on all cores as plain
 threads.  A member's numbers do not depend on who its neighbours are.
 
-Importing this module imports llvmlite, so that models do it at their first rollout only.
-
-**Vectors of eight.**  A processor multiplies eight numbers as fast as one.  :class:`Vector` represents eight
-of them in a register, one for each of eight parameter sets.  It has no value; each ``+ - * /`` on it appends
-one instruction of LLVM.  So equations that are called once with vectors in place of numbers,
-
-    q[i] = q[i] + g[k] * (z[j] - z[i]),
-
-leave behind a straight line of instructions: which i, j and k belong together has been looked up, loops are
-unrolled, products with a constant 0 or 1 are gone.  LLVM turns the line into what the machine has (a register
-of AVX-512, two of AVX2, four of SSE2 or NEON).  All this takes no compiler beside llvmlite, which is a Python
-package.
+**Vectors of eight.**  A :class:`Vector` represents eight numbers in a register, one for each of eight
+parameter sets.  It has no value; each ``+ - * /`` on it appends one instruction of LLVM, so that indices are
+looked up, loops unrolled and products with a constant 0 or 1 gone when LLVM turns the line into what the
+machine has (a register of AVX-512, two of AVX2, four of SSE2 or NEON).
 
 No branch may depend on a value, for none is known: ``if vector > 0`` raises.  A choice is
 ``np.where(vector > 0, a, b)``; this, ``np.interp`` and NumPy's elementary functions work on vectors, so that
-equations meant for arrays do as well.  What processors lack (exp, sin, ...) is the C library's, called number
-by number.
+equations meant for arrays do as well.  What processors lack (exp, sin, ...) is the C library's.
 """
 
 from __future__ import annotations

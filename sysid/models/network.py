@@ -1,17 +1,9 @@
 """A lumped thermal network as a model: nodes, links, pipes, Peltiers, heaters, sensors.
 
 The network is declared in TOML (:mod:`thermogrip.sysid.models.network_spec`) and turned into lists of
-integers.  The arithmetic of a step is written once and runs on NumPy rows (one entry a parameter set), on
-CasADi symbols, and on SIMD vectors, which leave it behind as machine code
-(:mod:`thermogrip.sysid.models.jit_rollout`): no branch depends on a temperature, an input or a parameter.
-
-**At rest** a plant whose sensors read y was held there by some input v, not necessarily by the one of the
-first row.  :meth:`NetworkModel.rest` finds the temperatures x and the past input v together,
-
-    min  |heat(x, v)|^2 + w_y |y - output(x)|^2 + w_u |v - u|^2,
-
-v inside its range, with weights that make the sensors nearly exact and the input a mere tie-breaker: a tank
-at room temperature was not driven, a chamber at 35 degC was held by the duty that balances its losses.
+integers.  The arithmetic of a step is written once and runs on NumPy rows, on CasADi symbols, and on SIMD
+vectors (:mod:`thermogrip.sysid.models.jit_rollout`): no branch depends on a temperature, an input or a
+parameter.
 
 **Heat balance.**  Every state x_i is a temperature [degC] of a heat capacity C_i; z is x followed by the
 boundary temperatures (measured ambients, then fixed ones).  Heat flows through
@@ -27,25 +19,29 @@ node for q.  Conductances and flows may hang on a switch u_s (a pump): they have
 value. The current follows the command v = u / full + u_0 by two gains, I = I_max (g_heat max(v, 0) + g_cool
 min(v, 0)), and droops by r per 50 K between face and sink.  A pulse-width driver ("duty") pushes I_max (1 -
 r dT / 50) for the share v of the time, so that its Joule heat is proportional to v, not to its square.
-Commands smaller than a dead zone v_d move nothing: v - v_d beyond it replaces v.  a and R may follow the
-mean temperature of the element by a share per kelvin from 25 degC.  The bend b of a conductance (natural
-convection moves more the larger the difference) is 0 where the file does not ask for it.
+Beyond a dead zone v_d, v - v_d replaces v.  a and R may follow the mean temperature of the element by a share
+per kelvin from 25 degC.
+
+**At rest** a plant whose sensors read y was held there by some input v, not necessarily by the one of the
+first row.  :meth:`NetworkModel.rest` finds the temperatures x and v, inside its range, together,
+
+    min  |heat(x, v)|^2 + w_y |y - output(x)|^2 + w_u |v - u|^2,
+
+with weights that make the sensors nearly exact and the input a mere tie-breaker.
 
 **Time step.**  ROS2 of Verwer et al. [1]_, for dx/dt = f(x) over a step h with the input held:
 
     (1 - g h A) k_1 = f(x),    (1 - g h A) k_2 = f(x + h k_1) - 2 k_1,    x+ = x + h (3 k_1 + k_2) / 2
 
 is of second order for *any* matrix A, and L-stable with g = 1 - 1/sqrt(2) where A is the Jacobian.  A holds
-the conductances and flows, the only stiff terms (a pipe cell empties in a second); Peltiers and radiation
-(minutes) are left out of it.  So A changes with the switches alone and is factorised once per change, not
-once per step. Column by column 1 - g h A is diagonally dominant, so that it needs no pivots: the
-elimination order is found once per network, and a factorisation is a fixed list of multiplications.
+the conductances and flows, the only stiff terms (a pipe cell empties in a second).  So A changes with the
+switches alone and is factorised once per change. Column by column 1 - g h A is diagonally dominant, so that
+it needs no pivots: the (minimum-degree) elimination order is found once per network, and the elimination is
+played through on integers and written down as a list of multiplications.
 
 **Layout.**  States are numbered nodes first, then the cells of the pipes (water, then wall), then the sensors
 that lag.  A pipe of n cells with flow F and delay t holds F t of water, so each cell has the capacity F t /
-n; the chain's mean delay is t exactly and its spread t / sqrt(n), as in a tube with some mixing. The matrix 1
-- g h A has the same non-zero entries whatever the numbers.  A minimum-degree order keeps the fill low; the
-elimination is played through once here, on integers, and written down as a list of multiplications.
+n; the chain's mean delay is t exactly and its spread t / sqrt(n), as in a tube with some mixing.
 
 References
 ----------
@@ -55,7 +51,6 @@ References
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
@@ -67,7 +62,7 @@ from numpy.typing import ArrayLike
 
 from thermogrip.datasets.arrays import Array, Run, Values
 from thermogrip.datasets.errors import UserError
-from thermogrip.sysid.models.model import SMOOTH, Described, FreeRuns, roll_rows
+from thermogrip.sysid.models.model import SMOOTH, Described, FreeRuns
 from thermogrip.sysid.models.network_spec import Network, Pipe, named_network, network_from_dict
 
 if TYPE_CHECKING:
@@ -588,15 +583,12 @@ class NetworkModel(Described):
         return np.concatenate(parts, axis=-1)
 
     def rollout(self, x0: ArrayLike, u: ArrayLike, d: ArrayLike, p: ArrayLike, dt: float) -> Run:
-        """Simulate a batch, compiled where llvmlite is there."""
+        """Simulate a batch."""
         x0, u, d, p = (np.ascontiguousarray(value, dtype=float) for value in (x0, u, d, p))
         switched = [self.inputs.index(name) for name in self.switches]
         renew = np.ones(u.shape[1], dtype=bool)
         renew[1:] = np.any(u[:, 1:, switched] != u[:, :-1, switched], axis=(0, 2))
-        kernel = _kernel(self.steps)
-        if kernel is None:
-            return roll_rows(self.steps, x0, u, d, p, float(dt), renew)
-        return kernel.rollout(x0, u, d, p, float(dt), renew)
+        return _kernel(self.steps).rollout(x0, u, d, p, float(dt), renew)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the whole network as plain JSON."""
@@ -666,11 +658,8 @@ def _bounded_moves(jacobian: Array, residual: Array, v: Array, low: Array, high:
 
 
 @lru_cache(maxsize=64)
-def _kernel(steps: ThermalSteps) -> Kernel | None:
-    """Return the compiled steps, or None (with a warning) where llvmlite is missing."""
-    try:
-        from thermogrip.sysid.models.jit_rollout import Kernel
-    except ImportError:
-        warnings.warn("llvmlite is missing: networks run in NumPy, 100 times slower or more", stacklevel=3)
-        return None
+def _kernel(steps: ThermalSteps) -> Kernel:
+    """Return the compiled steps."""
+    from thermogrip.sysid.models.jit_rollout import Kernel  # pulls in llvmlite
+
     return Kernel(steps)

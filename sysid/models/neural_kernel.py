@@ -25,9 +25,6 @@ import numpy as np
 from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.compiled import numba
 
-# Of states about unit size: what rounding (1e-16 a step) adds up to at a pole of 0.999.
-TOGETHER = 1e-13
-
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def _begins(n: int, m: int, h: int) -> tuple[int, int, int, int, int]:
@@ -104,32 +101,22 @@ def _add_direct(p: Array, x: Array, w: Array, t: Array, s: Array, S: Array) -> N
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def _follow(
-    A: Array, p: Array, h: int, w: Array, low: Array, high: Array, x: Array, beside: Array, within: float
-) -> int:
-    """Fill the rows of x (N + 1, n) after the first, up to where it is ``within`` so much of ``beside`` (to
-    the end where that is negative), and return how many rows were filled."""
-    n, n_y, t, after = x.shape[1], low.shape[0], np.empty(h), np.empty(x.shape[1])
-    for row in range(w.shape[0]):
-        differs = within < 0.0
-        for i in range(n):
-            differs = differs or not abs(x[row, i] - beside[row, i]) <= within
-        if not differs:
-            return row
-        _units(p, x[row], w[row], t)
-        _advance(A, p, x[row], w[row], t, after)
-        for i in range(n):
-            x[row + 1, i] = min(max(after[i], low[i]), high[i]) if i < n_y else after[i]
-    return int(x.shape[0])
+def _step(A: Array, p: Array, w: Array, low: Array, high: Array, x: Array, t: Array, after: Array) -> None:
+    """Set ``after`` to the next state, clipped; ``t`` is room for the units."""
+    _units(p, x, w, t)
+    _advance(A, p, x, w, t, after)
+    for i in range(low.shape[0]):
+        after[i] = min(max(after[i], low[i]), high[i])
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def run_states(A: Array, theta: Array, h: int, x0: Array, w: Array, low: Array, high: Array) -> Array:
     """Return states (k, N + 1, n) for A (k, n, n), theta (k, n_theta), x0 (k, n) and one w (N, m)."""
-    x = np.empty((theta.shape[0], w.shape[0] + 1, x0.shape[1]))
-    for at in range(theta.shape[0]):
-        x[at, 0] = x0[at]
-        _follow(A[at], theta[at], h, w, low, high, x[at], x[at], -1.0)
+    x, t = np.empty((theta.shape[0], w.shape[0] + 1, x0.shape[1])), np.empty(h)
+    for k in range(theta.shape[0]):
+        x[k, 0] = x0[k]
+        for row in range(w.shape[0]):
+            _step(A[k], theta[k], w[row], low, high, x[k, row], t, x[k, row + 1])
     return x
 
 
@@ -138,31 +125,19 @@ def run_outputs(
     A: Array, theta: Array, h: int, x0: Array, w: Array, low: Array, high: Array
 ) -> tuple[Array, Array]:
     """Return the mean outputs (B, N + 1, n_y) of members A (k, n, n), theta (k, n_theta) and their last
-    states (B, k, n), for x0 (B, k, n) and one w (N, m).
-
-    Of a member the first run alone is kept on the way.  Others are computed until they are within
-    :data:`TOGETHER` of it, for a member forgets how it began.
-    """
-    batch, k, n = x0.shape
+    states (B, k, n), for x0 (B, k, n) and one w (N, m); no states on the way are kept."""
+    batch, members, n = x0.shape
     rows, n_y = w.shape[0] + 1, low.shape[0]
-    y, last = np.zeros((batch, rows, n_y)), np.empty((batch, k, n))
-    first, other = np.empty((rows, n)), np.empty((rows, n))
-    for at in range(k):
-        first[0] = x0[0, at]
-        _follow(A[at], theta[at], h, w, low, high, first, first, -1.0)
-        for row in range(rows):
-            for i in range(n_y):
-                y[0, row, i] += first[row, i] / k
-        last[:, at] = first[rows - 1]
-        for b in range(1, batch):
-            other[0] = x0[b, at]
-            differ = _follow(A[at], theta[at], h, w, low, high, other, first, TOGETHER)
-            for row in range(differ):
+    y, last = np.zeros((batch, rows, n_y)), x0.copy()
+    after, t = np.empty(n), np.empty(h)
+    for b in range(batch):
+        for k in range(members):
+            for row in range(rows):
                 for i in range(n_y):
-                    y[b, row, i] += (other[row, i] - first[row, i]) / k
-            if differ == rows:
-                last[b, at] = other[rows - 1]
-    y[1:] += y[0]
+                    y[b, row, i] += last[b, k, i] / members
+                if row < rows - 1:
+                    _step(A[k], theta[k], w[row], low, high, last[b, k], t, after)
+                    last[b, k] = after
     return y, last
 
 

@@ -153,7 +153,7 @@ class StateSpaceModel(BlackBox):
         """Simulate a batch, so many rows at a time that their states have :data:`_AT_ONCE` numbers."""
         x_end, u, d = (np.asarray(value, dtype=float) for value in (x0, u, d))
         rows = max(1, _AT_ONCE // max(1, x_end.size * max(1, round(dt / self.dt))))
-        if u.shape[1] <= rows or not self._in_whole_steps(dt):  # others are interpolated over the whole of it
+        if u.shape[1] <= rows:
             x = self.states(x_end, u, d, dt)
             return x @ self.C.T + self.y0, x[:, -1]
         y = np.empty((len(x_end), u.shape[1] + 1, len(self.outputs)))
@@ -168,9 +168,7 @@ class StateSpaceModel(BlackBox):
         """Return the states (n_batch, N + 1, n_x) of :meth:`rollout`."""
         x0 = np.asarray(x0, dtype=float)
         u, d = np.asarray(u, dtype=float), np.asarray(d, dtype=float)
-        times = round(dt / self.dt)
-        if not self._in_whole_steps(dt):
-            return self._uneven_states(x0, u, d, dt)
+        times = max(1, round(dt / self.dt))  # the step of a gap may differ a little from the model's
         if times > 1:
             u, d = np.repeat(u, times, axis=1), np.repeat(d, times, axis=1)
         push = self.push(u, d)
@@ -237,23 +235,6 @@ class StateSpaceModel(BlackBox):
     def _term_factors(self) -> list[list[tuple[int, bool]]]:
         return read_terms(self.terms, self.inputs + self.disturbances)
 
-    def _in_whole_steps(self, dt: float) -> bool:
-        """Tell whether ``dt`` [s] is a whole multiple of the model's own step."""
-        times = round(dt / self.dt)
-        return times >= 1 and abs(times * self.dt - dt) <= 1e-6 * dt
-
-    def _uneven_states(self, x0: Array, u: Array, d: Array, dt: float) -> Array:
-        """Run the nearest whole number of own steps over the stretch and interpolate the states."""
-        rows = u.shape[1]
-        own = max(1, round(rows * dt / self.dt))
-        edges = np.linspace(0.0, rows, own + 1)
-        held = [_means(np.asarray(part), edges) for part in (u, d)]
-        x = self.states(x0, held[0], held[1], self.dt)
-        at = np.linspace(0.0, own, rows + 1)
-        left = np.minimum(at.astype(int), own - 1)
-        share = (at - left)[None, :, None]
-        return np.asarray((1 - share) * x[:, left] + share * x[:, left + 1])
-
     def _frozen(self, u: Array, d: Array) -> tuple[Array, Array]:
         """Return A and the drive at fixed inputs."""
         A = self.A + sum(
@@ -297,11 +278,3 @@ def _dot(row: Array, values: Values) -> Any:
     for i in np.flatnonzero(row):
         total = total + float(row[i]) * values[int(i)]
     return total
-
-
-def _means(held: Array, edges: Array) -> Array:
-    """Return means (B, n_cell, n) of rows (B, N, n), held for one unit each, over cells between edges."""
-    area = np.concatenate([np.zeros((held.shape[0], 1, held.shape[2])), held.cumsum(axis=1)], axis=1)
-    left = np.minimum(edges.astype(int), held.shape[1] - 1)
-    total = area[:, left] + held[:, left] * (edges - left)[None, :, None]
-    return np.asarray(np.diff(total, axis=1) / np.diff(edges)[None, :, None])

@@ -10,41 +10,24 @@
         def rhs(self, x, u, d, p):
             return [p.inflow * u.pump - p.outflow * np.sqrt(np.maximum(x.level, 0.0))]
 
-No import of thermogrip is needed.  The arguments are named tuples, so ``x.level``, ``x[0]`` and
-``level, = x`` mean the same.  The same lines run on numbers, on rows of a batch, compiled, and on CasADi
-symbols, so a choice between two values is ``np.where`` or ``np.maximum``, never ``if``.  Whatever goes wrong
-inside the user's code is theirs to correct, so it becomes one line that names the file, the class and, for an
-exception, the line of their code where it was raised.
+The arguments are named tuples.  The same lines run on numbers, on rows of a batch, compiled
+(:mod:`thermogrip.sysid.models.jit_rollout`), and on CasADi symbols, so a choice between two values is
+``np.where`` or ``np.maximum``, never ``if``; what vectors cannot say (sorting, a function of SciPy) NumPy
+runs on whole batches, more slowly.  Whatever goes wrong inside the user's code becomes one line that names
+the file, the class and, for an exception, the line of their code where it was raised.
 
 **In time.**  With dx/dt = f(x, u, d, p) and u, d held over a step, each step of the simulation is cut into n
-pieces, each a step of the classical Runge-Kutta rule of fourth order.
-
-**How many pieces.**  :meth:`OwnModel.prepared` has the logs simulated with n and with 2 n pieces and doubles
-n until each output differs by less than a tenth of its sensor's ``sd`` (rms), and by less than that ``sd``
-anywhere.  For a smooth f the error of 2 n is a sixteenth of that difference; at a kink (an overflow, a
-limit, an empty tank) it is less favourable, and the difference shows that as well.  The fit does it at the
-prior and again where it ended.
-
-Rollouts are compiled where that can be (:mod:`thermogrip.sysid.models.jit_rollout`): the class's functions
-are called once, whatever they call in turn, and a loop in them is unrolled.  What vectors cannot say
-(sorting, say, or a function of SciPy) is left to NumPy, which runs the same lines on whole batches, more
-slowly; :attr:`OwnModel.slow_because` says why.
-
-**A step** of length h is
-
-    x+ = x + h/6 (k1 + 2 k2 + 2 k3 + k4),
-    k1 = f(x),   k2 = f(x + h/2 k1),   k3 = f(x + h/2 k2),   k4 = f(x + h k3),
-
-after which a state with limits is put back inside them.
+pieces, each a step of the classical Runge-Kutta rule of fourth order, after which a state with limits is put
+back inside them.  :meth:`OwnModel.prepared` doubles n until the logs simulated with n and with 2 n pieces
+differ by less than a tenth of each output's sensor ``sd`` (rms), and by less than that ``sd`` anywhere: for a
+smooth f the error of 2 n is a sixteenth of that difference.
 
 **The state at rest** of a class that has no ``rest`` of its own is the state x that some input v near u holds
 still and whose outputs read y,
 
     min  |T f(x, v) / s|^2 + w_y |(output(x) - y) / sd|^2 + w_u |(v - u) / range|^2,
 
-inside the limits, with s the class's spread of each state and T the seconds of a warm-up.  Few logs of such
-plants begin at rest: it is where the estimate of a start begins, and the warm-up then shifts it by what its
-readings say (:mod:`thermogrip.sysid.plant.simulation`).
+inside the limits, with s the class's spread of each state and T the seconds of a warm-up.
 """
 
 from __future__ import annotations
@@ -380,10 +363,8 @@ class OwnSteps:
 @lru_cache(maxsize=32)
 def compile_steps(code: OwnCode) -> tuple[Kernel | None, str]:
     """Return the compiled steps of a class, or None and why there are none."""
-    try:
-        from thermogrip.sysid.models.jit_rollout import Kernel
-    except ImportError:
-        return None, "llvmlite is missing"
+    from thermogrip.sysid.models.jit_rollout import Kernel  # pulls in llvmlite
+
     try:
         return Kernel(OwnSteps(code), in_pieces=True), ""
     except UserError as error:

@@ -33,7 +33,6 @@ from scipy.linalg import logm
 from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.atomic_files import atomic_path, write_atomic
 from thermogrip.datasets.errors import UserError, known_names
-from thermogrip.datasets.media import csv_text
 from thermogrip.datasets.provenance import KEY, provenance
 from thermogrip.sysid.models.model import GreyModel
 
@@ -144,7 +143,7 @@ def linearise_plant(
 
 
 def save_linear(near: LinearPlant, path: str | Path) -> Path:
-    """Write the matrices, names and operating point as JSON, CSV (a row an entry) or MATLAB file."""
+    """Write the matrices, names and operating point as JSON or MATLAB file."""
     file = Path(path)
     matrices = {"A": near.A, "B": near.B, "C": near.C, "D": np.zeros((len(near.outputs), len(near.inputs)))}
     labels = {"states": near.states, "inputs": near.inputs, "outputs": near.outputs}
@@ -156,19 +155,9 @@ def save_linear(near: LinearPlant, path: str | Path) -> Path:
         with atomic_path(file) as temporary:
             savemat(temporary, matrices | names | point | {"dt": near.dt or 0.0}, appendmat=False)
         return file
-    if file.suffix == ".json":
-        numbers = {name: value.tolist() for name, value in (matrices | point).items()}
-        lists = {name: list(words) for name, words in labels.items()}
-        return write_atomic(file, json.dumps(numbers | lists | {"dt": near.dt, KEY: provenance()}) + "\n")
-    axes = {"A": ("states", "states"), "B": ("states", "inputs"), "C": ("outputs", "states")}
-    axes["D"] = ("outputs", "inputs")
-    rows: list[tuple[object, ...]] = [("matrix", "row", "column", "value")]
-    for name, (down, across) in axes.items():
-        for row, values in zip(labels[down], matrices[name]):
-            rows += [(name, row, at, value) for at, value in zip(labels[across], values.tolist())]
-    for name, words in (("x0", "states"), ("u0", "inputs"), ("y0", "outputs")):
-        rows += [(name, label, "", value) for label, value in zip(labels[words], point[name].tolist())]
-    return write_atomic(file, csv_text(rows))
+    numbers = {name: value.tolist() for name, value in (matrices | point).items()}
+    lists = {name: list(words) for name, words in labels.items()}
+    return write_atomic(file, json.dumps(numbers | lists | {"dt": near.dt, KEY: provenance()}) + "\n")
 
 
 def operating_point(

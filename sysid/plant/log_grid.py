@@ -1,35 +1,28 @@
 """Logs as a model takes them: its signals in its units, on an even grid, cut where the input is unknown.
 
 **Cuts.**  After a gap of more than 10 s (and of five steps of a slow log) the input is unknown, so a new
-stretch begins there: no regressor reaches across it, and each stretch has an initial state of its own.
+stretch begins there with an initial state of its own.
 
 **Inputs.**  With the grid t_k = t_0 + k dt of a stretch, an input is the exact mean of its held value over
 [t_k, t_k + dt).  A plant (:func:`cut_stretches`) has a grid of its own step: a command that its driver rounds
 is what the driver made of it, and a measured ambient is smoothed over 20 s, for its sensor is slow and
 coarse.  Readings stay at their own times, and the outputs of the model are interpolated to them (the middle
-of the blocks of an averaged log).
-
-A reading that is logged with the input that led to it, or with the mean of the input since the row before,
-moves in the row of its input.  The logs of such a rig say of an input what was applied up to the row
-(``ends``), and every value is moved by one row.
+of the blocks of an averaged log).  Logs of a rig that says of an input what was applied up to the row
+(``ends``) are moved by one row.
 
 **Readings on the grid.**  For a black box (:func:`make_grid`) a reading is the mean of the line through the
 samples over [t_k - dt/2, t_k + dt/2], so that it is not shifted in time; where the grid is the log's own,
-the samples stand as they are.  A reading lost while the input is known stays NaN: what is scored or fitted by
-free run skips it, ARX leaves out rows that need it, and subspace fits take short holes for lines.
-SINDy needs whole rows of past readings; where most are broken it takes holes of up to :data:`BRIDGED` rows
-for lines (:func:`whole_readings`).
+the samples stand as they are.  A reading lost while the input is known stays NaN.
 
 **Why average.**  A converter of quantum q moves in steps; once the output moves less than q in one step of
 the grid, most of what an equation-error fit sees is rounding.  The step chosen here is the longest of 1, 2,
 3, 4, 5, 6, 8 .. 50 samples in which the output moves less than one quantum (rms; the next one is beyond
 it), at least a hundredth of the dominant time constant (finer ones add nothing) and at most a tenth of it.
 
-**Roles and units.**  A column's name says little about its role: ``t_room`` is what a plant of a room
-predicts, and what a plant of a heater is disturbed by.  Where a model is at hand, its roles are used
-(:func:`match_logs`).  Shares of full scale come as ``1`` (-1 to 1), ``percent`` or ``0_255``: one is a
-multiple of the other, so they are converted.  A column without a unit may be a share or a bare number of the
-model's own unit; values beyond 1 distinguish them.  Any other difference of units is refused.
+**Roles and units.**  Where a model is at hand, its roles are used (:func:`match_logs`): ``t_room`` is what a
+plant of a room predicts, and what a plant of a heater is disturbed by.  Shares of full scale come as ``1``
+(-1 to 1), ``percent`` or ``0_255``, so they are converted.  A column without a unit may be a share or a bare
+number of the model's own unit; values beyond 1 distinguish them.  Any other difference of units is refused.
 """
 
 from __future__ import annotations

@@ -115,17 +115,13 @@ def _optimal(
             against = ""
             if kind != "optimal":
                 against = (
-                    f"; after optimal {expected.narrower('optimal', kind):.3g} times narrower in the mean, "
-                    f"determinant {expected.determinant_ratio('optimal', kind):.3g} times smaller"
+                    f"; after optimal {expected.narrower('optimal', kind):.3g} times narrower in the mean"
                 )
             console.say(f"{kind}: {bits:.1f} bits{against}")
     for note in notes:
         console.say(f"note: {note}")
-    ratios = {
-        kind: expected.determinant_ratio("optimal", kind) for kind in expected.bits if kind != "optimal"
-    }
     answer = {"bits": expected.bits, "widths_90": expected.widths}
-    return log, answer | {"determinant_ratio": ratios, "notes": notes}
+    return log, answer | {"notes": notes}
 
 
 def schedule_for(

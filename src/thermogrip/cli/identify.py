@@ -522,9 +522,7 @@ def linearise(
     dt: Annotated[
         float | None, cli.opt("--dt", "S", "Step of the matrices; none: continuous.", min=1e-9)
     ] = None,
-    out: Annotated[
-        Path | None, cli.opt("--out", "FILE", "Matrices as .json, .csv (a row an entry) or .mat.")
-    ] = None,
+    out: Annotated[Path | None, cli.opt("--out", "FILE", "Matrices as .json or .mat.")] = None,
     report: cli.Report = None,
     network: cli.OwnNetwork = None,
     seed: cli.Seed = 0,
@@ -534,7 +532,7 @@ def linearise(
 
     Gains have 90 % intervals where the plant has draws."""
     if out is not None:
-        cli.new_file(out, (".json", ".csv", ".mat"))
+        cli.new_file(out, (".json", ".mat"))
     named = cli.numbers("--at", at)
     cli.choices("--at", named, plant, "inputs", "disturbances")
     loaded, console = cli.load_plant(plant, network), Console(as_json)

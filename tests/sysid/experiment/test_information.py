@@ -183,14 +183,6 @@ def test_limits_are_of_temperatures_and_a_margin_is_inside_them(
     assert ExperimentForecast(only, room=20.0, **limits).stays(u, margin=margin)
 
 
-@pytest.mark.parametrize(
-    ("valid", "still"), [((-1.0, 3.0), 0.0), ((2.0, 3.0), 2.0), ((-4.0, -1.0), -1.0), ((3.0, 3.0), 0.0)]
-)
-def test_an_input_at_rest_is_at_nought_or_what_is_nearest(valid: tuple[float, float], still: float):
-    assert ExperimentForecast(replace(lag(), valid={"q": valid}))._still("q") == still
-    assert ExperimentForecast(replace(lag(), valid={}))._still("q") == 0.0
-
-
 def test_signals_that_are_no_temperatures_begin_where_the_logs_had_them():
     model = StateSpaceModel(
         ("q",), ("wind", "air"), ("t", "n"), A=[[0.5]], B=[[5.0]], C=[[1.0], [0.0]], dt=2.0
@@ -204,18 +196,6 @@ def test_signals_that_are_no_temperatures_begin_where_the_logs_had_them():
     y, u, d, _ = seen[0]
     assert (y.tolist(), u.tolist(), d.tolist()) == ([22.0, 30.0], [0.0], [4.5, 22.0])
     assert ExperimentForecast(replace(plant, valid={})).room == 25.0
-
-
-def test_a_parameter_near_its_bound_is_moved_away_from_it(gripper: Plant):
-    steps = ExperimentForecast(gripper)._steps
-    sd = np.sqrt(np.diag(np.asarray(gripper.covariance)))
-    np.testing.assert_allclose(steps, 1e-3 * sd, rtol=1e-6)
-    name = gripper.free[0]
-    close = gripper.values[name] * np.exp(0.5 * steps[0])
-    near = replace(gripper, bounds=gripper.bounds | {name: (0.0, close)})
-    np.testing.assert_allclose(
-        ExperimentForecast(near)._steps, steps * np.where(np.arange(len(steps)), 1, -1)
-    )
 
 
 def test_draws_keep_the_limits_too_and_are_counted(gripper: Plant):
@@ -261,63 +241,6 @@ def test_the_belief_before_any_log_is_the_priors(name):
     assert sd == pytest.approx(wanted)
     assert {model.specs[n].scale for n in sd} == {"log", "linear"}
     assert plant.valid == {n: item.range for n, item in model.network.inputs.items() if item.range}
-
-
-@pytest.mark.parametrize(
-    ("network", "rows", "seconds"), [("gripper", 10_000, 0.0), ("tclab", 10_000, 60.0), ("tclab", 10, 5.0)]
-)
-def test_the_warm_up_informs_of_a_start_that_is_not_known(network: str, rows: int, seconds: float) -> None:
-    """The gripper starts at rest with its measured room; of a short experiment half may be warm-up."""
-    assert ExperimentForecast(plant_from_prior(load_network(network)))._warm_up(rows) == seconds
-
-
-@pytest.mark.parametrize(
-    ("network", "reference", "known"),
-    [
-        ("gripper", "t_tank", True),
-        ("gripper", None, False),
-        ("tclab", None, False),
-        ("tclab", "t1", False),
-    ],
-)
-def test_the_start_is_known_at_rest_with_a_measured_room_alone(network, reference, known):
-    plant = replace(plant_from_prior(load_network(network)), reference=reference)
-    assert ExperimentForecast(plant)._known == known
-
-
-def test_a_learnt_error_moves_disturbances_and_starts_too_and_scales_what_they_do(gripper: Plant):
-    n = len(gripper.free)
-    numbers = ErrorNumbers((0.1, 0.2), (3.0,), ((0.4, 0.5),), (0.6,), (0.7, 0.8), 10.0, 1, (1.1,))
-    spread = {"bias of t_ambient": 0.4, gripper.free[0]: 0.5}
-    fit = Intervals(numbers, np.eye(n).tolist(), spread_over_logs=spread)
-    plant = replace(gripper, scores=PlantScores(intervals=fit))
-    forecast = ExperimentForecast(plant, room=21.0)
-    rows, begin, d = forecast._moved
-    bare, bare_begin, bare_d = ExperimentForecast(gripper, room=21.0)._moved
-    modes = gripper.model.n_x
-    assert (len(bare), len(rows)) == (1 + n, 1 + n + 1 + modes)
-    np.testing.assert_array_equal(rows[: 1 + n], bare)
-    np.testing.assert_array_equal(rows[1 + n :], np.tile(bare[0], (1 + modes, 1)))
-    assert (bare_d.ravel().tolist(), d.ravel().tolist()) == (
-        [21.0] * (1 + n),
-        [21.0] * (1 + n) + [21.1] + [21.0] * modes,
-    )
-    np.testing.assert_array_equal(begin[: 2 + n], np.vstack([bare_begin, bare_begin[:1]]))
-    aside = (begin[2 + n :] - begin[0]) / 0.1
-    np.testing.assert_allclose(aside.T @ aside, gripper.model.spread, atol=1e-9)
-    assert len(ExperimentForecast(plant, starts=False)._moved[0]) == 2 + n
-    change = np.arange(1.0, len(rows))[:, None, None] * np.ones((1, 3, 2))
-    effects, starts = forecast._effects(forecast._error, change)
-    step = 1e-3 * np.sqrt(np.asarray(gripper.covariance)[0, 0])
-    np.testing.assert_allclose(effects[:, 0, 0], [0.5 / step, (n + 1) * 0.4 / 0.1], rtol=1e-6)
-    np.testing.assert_allclose(starts[:, 0, 0], np.arange(n + 2, n + 2 + modes) / 0.1)
-    u = np.tile([0.3, 1.0], (60, 1))
-    both = forecast.outputs(u)[0], forecast._run(u, *forecast._moved)
-    np.testing.assert_allclose(both[1][0], both[0], atol=1e-9)  # the plant's own run comes first
-    after = forecast.covariance(u)
-    np.testing.assert_allclose(after, after.T)
-    gain = forecast._gain(u, both[1])
-    np.testing.assert_allclose(after, forecast._root @ np.linalg.inv(gain) @ forecast._root.T, rtol=1e-6)
 
 
 def test_a_reading_counts_once_a_bin_or_correlation_time(gripper: Plant):

@@ -74,7 +74,6 @@ def test_the_optimal_schedule_informs_more_than_every_plain_one(designs):
     _, expected = designs
     for kind in ("prbs", "multisine", "staircase"):
         assert expected.bits["optimal"] > expected.bits[kind] + 3.0  # measured: 5 to 6 bits
-        assert expected.determinant_ratio("optimal", kind) > 64.0
     assert expected.narrower("optimal", "now") == pytest.approx(2 ** (expected.bits["optimal"] / 7))
 
 
@@ -119,13 +118,11 @@ def test_limits_hold_for_the_plant_and_its_draws(highest, most, slew, seed):
 
 def test_a_pump_is_switched_and_does_not_stutter():
     plant = plant_from_prior(load_network("gripper"))
-    log = optimal_schedule(
-        plant, 10.0, ranges={"drive": (-1.0, 1.0)}, highest=60.0, evaluations=60, switch_hold=45.0
-    )
+    log = optimal_schedule(plant, 10.0, ranges={"drive": (-1.0, 1.0)}, highest=60.0, evaluations=60)
     pump = log["pump"].values
     assert set(pump) == {0.0, 1.0}
     edges = np.flatnonzero(np.diff(pump))
-    assert np.diff(edges).min() * plant.dt >= 45.0
+    assert np.diff(edges).min() * plant.dt >= 30.0
     held = optimal_schedule(
         plant, 10.0, ranges={"drive": (-1.0, 1.0)}, highest=60.0, evaluations=20, hold=["pump"]
     )
@@ -222,133 +219,9 @@ def test_a_forecast_without_what_a_fit_knows_is_wrong(kept, forgotten, where):
     assert abs(ratio - 1.0) > TOLERANCE
 
 
-def test_square_waves_of_several_inputs_are_tried_together_and_a_quarter_apart():
-    def shapes(n):
-        low, high = np.zeros(n), np.ones(n)
-        limits = SimpleNamespace(n_cell=8, low=low, high=high, switch=low > high)
-        return [x.T.astype(int).tolist() for x in optimal._plain_shapes(limits)]
-
-    wave, later = [1, 1, 1, 1, 0, 0, 0, 0], [1, 1, 0, 0, 0, 0, 1, 1]
-    assert (len(shapes(1)), len(shapes(2))) == (2 + 4, 2 + 8)
-    assert shapes(2)[:4] == [[[1] * 8] * 2, [[0] * 8] * 2, [wave, wave], [wave, later]]
-
-
-def frame(
-    minutes: float = 20.0, shortest: float = 10.0, hold: tuple[str, ...] = (), slew: float = np.inf, **ranges
-):
-    """A drive from -2 to 3 and a pump that keeps its position for 25 s, on steps of 1 s."""
-    plant = SimpleNamespace(dt=1.0, inputs=("q", "pump"), model=SimpleNamespace(switches=("pump",)))
-    return optimal._Frame(plant, minutes, {"q": (-2.0, 3.0)} | ranges, shortest, 25.0, slew, hold)
-
-
-@pytest.mark.parametrize(
-    ("said", "n", "ratio", "cell", "n_cell", "together"),
-    [
-        ({}, 1200, 1, 10, 120, [1, 3]),  # (1200 - 6) / 10, in tens of seconds
-        ({"minutes": 60.0}, 3600, 4, 4, 225, [1, 2]),  # 15 s in steps of 4 s; 3594 / 16
-        ({"minutes": 60.0, "shortest": 5.0}, 3600, 4, 4, 225, [1, 2]),  # no more than 240
-        ({"shortest": 0.2}, 1200, 1, 5, 239, [1, 5]),
-        ({"minutes": 60.0, "shortest": 6.0, "hold": ("pump",)}, 3600, 4, 4, 225, [1, 1]),
-        ({"minutes": 16 / 60, "shortest": 4.0}, 16, 1, 4, 3, [1, 7]),
-    ],
-)
-def test_a_schedule_is_cut_into_cells(said, n, ratio, cell, n_cell, together):
-    found = frame(**said)
-    assert (found.n, found.ratio, found.dt, found.cell, found.n_cell) == (
-        n,
-        ratio,
-        float(ratio),
-        cell,
-        n_cell,
-    )
-    assert (found.rest, found.together.tolist(), found.still.tolist()) == (6, together, [0.0, 1.0])
-    held = "hold" in said
-    assert (found.low.tolist(), found.high.tolist()) == ([-2.0, 1.0 if held else 0.0], [3.0, 1.0])
-    assert found.switch.tolist() == [False, not held]
-
-
-def test_a_range_without_nought_rests_at_its_nearer_end_and_nothing_to_move_is_refused():
-    assert frame(q=(0.5, 3.0)).still.tolist() == [0.5, 1.0]
-    assert frame(q=(-2.0, -1.0), hold=("q",)).low.tolist() == [-1.0, 0.0]
-    with pytest.raises(UserError, match="no input has a range to move in"):
-        frame(q=(1.0, 1.0), hold=("pump",))
-    with pytest.raises(UserError, match=r"0.25 min are too short; take 0.3"):
-        frame(minutes=0.25)
-
-
-def test_cells_become_rows_and_rows_cells():
-    wide = frame(minutes=60.0)
-    cells = np.column_stack([np.linspace(-2, 3, 225), np.repeat(np.arange(113) % 2, 2)[:225]])
-    fine, coarse = wide.inputs(cells, coarse=False), wide.inputs(cells, coarse=True)
-    assert (fine.shape, coarse.shape) == ((3600, 2), (900, 2))
-    assert fine[:6].tolist() == [[0.0, 1.0]] * 6
-    assert coarse[:2].tolist() == [[0.0, 1.0]] * 2
-    for k in (0, 7, 223):
-        assert fine[6 + 16 * k : 22 + 16 * k].tolist() == [cells[k].tolist()] * 16
-        assert coarse[2 + 4 * k : 6 + 4 * k].tolist() == [cells[k].tolist()] * 4
-    np.testing.assert_array_equal(wide.to_cells(fine), cells)
-    beyond = wide.to_cells(fine * [9.0, 0.6])  # inside the range; a switch is one or nought
-    np.testing.assert_allclose(beyond, np.column_stack([np.clip(9 * cells[:, 0], -2, 3), cells[:, 1]]))
-    slow = frame(minutes=60.0, slew=0.01)  # 0.05 V of 5 V in a second; the pump is switched at once
-    drive = slow.inputs(np.tile([3.0, 0.0], (225, 1)), coarse=False)
-    np.testing.assert_allclose(drive[6:70, 0], np.minimum(0.05 * np.arange(1, 65), 3.0))
-    assert drive[6:70, 1].tolist() == [0.0] * 64
-    np.testing.assert_allclose(
-        slow.inputs(np.tile([3.0, 0.0], (225, 1)), coarse=True)[2:12, 0], 0.2 * np.arange(1, 11)
-    )
-
-
-def test_cells_beyond_the_limits_are_drawn_towards_rest_by_halving():
-    plain = frame()
-    cells = np.column_stack([np.full(120, 3.0), np.zeros(120)])
-    drawn = optimal._drawn(plain, cells, 0.25)
-    assert drawn[0].tolist() == [0.75, 0.0]  # a switch stays
-    found, value = optimal._shrunk(plain, lambda c: float(c.max()) if c.max() <= 1.2 else -np.inf, cells)
-    assert (found[0].tolist(), value) == ([3 * 0.375, 0.0], 3 * 0.375)  # 1/4, 3/8 of 1/2, 7/16, 13/32
-    assert optimal._shrunk(plain, lambda c: 7.0, cells) == (cells, 7.0)
-    assert optimal._shrunk(plain, lambda c: -np.inf, cells)[1] == -np.inf
-
-    def keep(most: float):
-        return optimal._keep_limits(plain, SimpleNamespace(stays=lambda u: u[:, 0].max() <= most), cells)
-
-    assert keep(3.0)[-1].tolist() == [3.0, 0.0]
-    assert keep(1.2)[-1].tolist() == [3 * 409 / 1024, 0.0]  # the tenth halving of what is 0.4
-    assert keep(-1.0) is None
-
-
-def test_an_exchange_moves_one_block_of_one_input_inside_its_range():
-    plain, rng = frame(), np.random.default_rng(0)
-    cells = np.column_stack([np.linspace(-2, 3, 120), np.repeat(np.arange(40) % 2, 3)])
-    pool = optimal._plain_shapes(plain)
-    moved, lengths = np.zeros(2), []
-    for _ in range(400):
-        new = optimal._exchanged(plain, cells, pool, rng)
-        changed = (new != cells).any(axis=0)
-        assert changed.sum() <= 1
-        moved += changed
-        assert -2.0 <= new[:, 0].min() <= new[:, 0].max() <= 3.0
-        assert set(new[:, 1]) <= {0.0, 1.0}
-        assert (new[:, 1].reshape(40, 3) == new[::3, 1][:, None]).all()  # three cells change as one
-        where = np.flatnonzero((new != cells).any(axis=1))
-        lengths.append(np.ptp(where) + 1 if where.size else 0)
-    assert moved.min() > 100
-    assert max(lengths) <= 60  # half of the schedule
-    assert max(lengths) > 40
-    held = frame(hold=("pump",))
-    for _ in range(50):
-        assert (optimal._exchanged(held, cells * [1, 0] + [0, 1], pool, rng)[:, 1] == 1.0).all()
-    levels = np.array([optimal._level(plain, 0, rng) for _ in range(2000)])
-    share = [np.mean(levels == -2.0), np.mean(levels == 3.0), np.mean(levels == 0.5)]
-    np.testing.assert_allclose(share, [0.35, 0.35, 0.1], atol=5 * np.sqrt(0.35 * 0.65 / 2000))
-    assert -2.0 <= levels.min() <= levels.max() <= 3.0
-    assert {optimal._level(plain, 1, rng) for _ in range(50)} == {0.0, 1.0}
-
-
 def test_ratios_of_schedules_are_powers_of_two_of_their_bits():
-    """Half a log2 of the determinant is a bit."""
     found = Expectation({"now": 0.0, "a": 3.0, "b": 1.0, "c": 900.0}, {"b": {"x": 1.0, "y": 2.0}})
-    assert (found.determinant_ratio("a", "b"), found.narrower("a", "b")) == (16.0, 2.0)
-    assert found.determinant_ratio("c", "now") == 2.0**1000
+    assert found.narrower("a", "b") == 2.0  # two bits, of two parameters
     assert found in {found}  # itself alone, and a key although its fields are none
 
 

@@ -152,34 +152,7 @@ def test_the_weight_of_an_output_that_drifts_is_left_as_it_is_stated():
 # ---- where it begins, where it ends ----
 
 
-@pytest.fixture
-def begun(monkeypatch: pytest.MonkeyPatch) -> list[Array]:
-    """Where each descent began."""
-    found: list[Array] = []
-    whole = greybox.levenberg_marquardt
-
-    def watched(linearise: Any, trials: Any, z0: Array, **options: Any) -> Any:
-        found.append(z0.copy())
-        return whole(linearise, trials, z0, **options)
-
-    monkeypatch.setattr(greybox, "levenberg_marquardt", watched)
-    return found
-
-
-def test_a_fit_begins_at_the_prior_or_near_what_is_named(begun: list[Array]):
-    stated: list[str] = []
-    logs = [a_log(1)]
-    fit_network(TwoGains(), logs)
-    assert begun[0].tolist() == [0.0, 0.0]
-    begun.clear()
-    fit_network(
-        TwoGains(), logs, near={"b": 6.0, "other": 1.0}, progress=lambda share, what: stated.append(what)
-    )
-    assert begun[0].tolist() == [0.0, 0.5]  # (6 - 4) / 4
-    assert "fitting from an earlier fit" in stated
-
-
-def test_a_model_that_needs_finer_steps_where_the_fit_ended_is_fitted_with_them(begun: list[Array]):
+def test_a_model_that_needs_finer_steps_where_the_fit_ended_is_fitted_with_them():
     class Fine(TwoGains):
         lags = (20.0, 100.0)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from typing import Any
 
 import numpy as np
@@ -14,7 +13,7 @@ from scipy.optimize import least_squares
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.sysid.models.model import roll_rows
-from thermogrip.sysid.models.network import PELTIER, NetworkModel, _kernel, load_network
+from thermogrip.sysid.models.network import PELTIER, NetworkModel, load_network
 from thermogrip.sysid.models.network_spec import builtin_networks, network_from_dict, read_network
 
 KELVIN = 273.15
@@ -187,18 +186,6 @@ def test_compiled_rows_and_symbols_run_the_same_equations(name: str):
         for k in range(n):
             x = function(x, ca.DM(u[b, k]), ca.DM(d[b, k]), ca.DM(p[b]))
         np.testing.assert_allclose(np.array(x).ravel(), end[b], rtol=0, atol=1e-10)
-
-
-def test_without_llvmlite_the_same_lines_run_in_numpy(monkeypatch: pytest.MonkeyPatch):
-    model = load_network("tclab")
-    u, d, x = np.full((1, 20, 2), 30.0), np.zeros((1, 20, 0)), np.full((1, 4), 25.0)
-    want = model.rollout(x, u, d, model.prior[None], 1.0)[0]
-    _kernel.cache_clear()
-    monkeypatch.setitem(sys.modules, "thermogrip.sysid.models.jit_rollout", None)
-    with pytest.warns(UserWarning, match="llvmlite is missing"):
-        got = model.rollout(x, u, d, model.prior[None], 1.0)[0]
-    _kernel.cache_clear()
-    np.testing.assert_allclose(got, want, atol=1e-12)
 
 
 @settings(max_examples=40, deadline=None)
