@@ -31,7 +31,6 @@ class SampledController:
         patience_s: float,
         clock: Callable[[], float],
         safe_drive: Mapping[str, float] | None = None,
-        on_off: Mapping[str, tuple[float, float, float]] | None = None,
     ) -> None:
         self.model, self.controlled, self.slew, self.clock = model, controlled, slew, clock
         self.lowest, self.highest = np.array([drive_range[name] for name in model.drives], dtype=float).T
@@ -42,10 +41,7 @@ class SampledController:
         # where the drives of a failing loop go
         safe = [(safe_drive or {}).get(name, rest) for name, rest in zip(model.drives, self._neutral)]
         self._safe = np.array(safe, dtype=float)
-        # least seconds off and on of drives that have these two positions
-        self._stays = {model.drives.index(name): (off, on) for name, (on, off, _) in (on_off or {}).items()}
         self._forget()
-        self._begin_positions()
         self._move = Move(as_drive(model.drives, self._u))
 
     def _forget(self) -> None:
@@ -121,40 +117,14 @@ class SampledController:
         before = np.clip(self._u, self.lowest, self.highest)
         slew = self.slew * (seconds / self.dt)
         wanted = np.where(np.isfinite(u), u, self._safe)
-        slewed = np.clip(np.clip(wanted, before - slew, before + slew), self.lowest, self.highest)
-        for j in self._stays:
-            at = round(before[j])
-            slewed[j] = at if self._wait_s(j) > 0 else round(min(max(wanted[j], 0.0), 1.0))
-        return np.asarray(slewed)
-
-    def _begin_positions(self) -> None:
-        """Forget when on/off drives went over."""
-        self._stayed = dict.fromkeys(self._stays, np.inf)  # seconds since then
-        self._placed: dict[int, int] = {}
-
-    def _wait_s(self, j: int) -> float:
-        """Return for how long an on/off drive may not go over yet [s]."""
-        at = round(min(max(self._u[j], 0.0), 1.0))
-        if self._placed.setdefault(j, at) != at:  # it was switched by somebody else
-            self._placed[j], self._stayed[j] = at, 0.0
-        return max(0.0, self._stays[j][at] - self._stayed[j] - self.times.waited_s - 1e-6)
+        return np.asarray(np.clip(np.clip(wanted, before - slew, before + slew), self.lowest, self.highest))
 
     def _answer(self, status: str, why: str, started: float) -> Move:
-        """Return the move of the drives in force; without any, the pump may rest. One that is switched is no
-        drive of the move, but its pump."""
-        names, u = self.model.drives, self._u
-        for j in self._stays:
-            at = round(u[j])
-            gone = at != self._placed.get(j, at)
-            self._stayed[j], self._placed[j] = 0.0 if gone else self._stayed[j] + self.times.waited_s, at
+        """Return the move of the drives in force; without any, the pump may rest."""
         self.times.moved()
-        pump = 0 if status == "off" and not np.any(u) else 1
-        switched = [j for j in self._stays if names[j] == "pump" and len(names) > 1]
-        if switched:
-            pump = self._placed[switched[0]]
-            names, u = tuple(np.delete(names, switched).tolist()), np.delete(u, switched)
-        drive, seconds = as_drive(names, u), self.clock() - started
-        self._move = Move(drive, pump, status, why, seconds)
+        pump = 0 if status == "off" and not np.any(self._u) else 1
+        drive = as_drive(self.model.drives, self._u)
+        self._move = Move(drive, pump, status, why, self.clock() - started)
         return self._move
 
     def _held_move(self, started: float) -> Move:

@@ -121,8 +121,8 @@ class CompiledStep:
         asked = np.array(self.c.given[begin : begin + len(controlled)])
         good = (asked >= model.coldest) & (asked <= model.hottest)
         now = np.where(good, asked, self.c.view("target", asked.shape))
-        at = self.reference.design.move_delay + np.arange(1, self.reference.optimiser.N + 1)
-        return targets_ahead(target, controlled, now, at, model.coldest, model.hottest)
+        samples = np.arange(1, self.reference.optimiser.N + 1)
+        return targets_ahead(target, controlled, now, samples, model.coldest, model.hottest)
 
     def _words(self, code: int, over: float, which: int, reading: Readings) -> str:
         """Return what the C advises of in words."""

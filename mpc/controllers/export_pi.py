@@ -38,8 +38,8 @@ def export_pi(controller: PIController, folder: str | Path) -> Export:
     if ahead:
         problem = f"feedforward of {', '.join(ahead)}: C does not work out the drive that holds a target"
         raise UserError(problem, hint="tune again, or set feedforward to 0 in the file")
-    if len(controller.loops) < len(controller.controlled) or controller.design.on_off:
-        raise UserError("an output or a switch has no loop, and C has no drive for it", hint="export the MPC")
+    if len(controller.loops) < len(controller.controlled):
+        raise UserError("an output has no loop, and C has no drive for it", hint="export the MPC")
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     files = {name: c_source(name) for name in ("tg_pi.h", "tg_pi.c")}

@@ -56,7 +56,6 @@ def linear_move(
     x = rest if not np.isfinite(x).all() else x
     plan = np.repeat(u[None, :], optimiser.n_b, axis=0)
     _, G = model.trajectory(x, plan, d, design.blocks)
-    G = G * np.where(np.isin(np.arange(model.n_u), model.on_off), 0.0, 1.0)  # no small signal: it stays on
     flat = G.reshape(optimiser.N, model.n_y, -1) * np.tile(model.span, optimiser.n_b)
     rows = [model.outputs.index(name) for name in design.controlled]
     return optimiser.linear_gains(flat, rows)
@@ -68,8 +67,7 @@ def linear_law(controller: ControllerParts) -> LinearLaw:
     F, B, E, H = augmented(controller)
     n_z, L = len(F), controller.observer.settled_gain(F)
     rows = [model.outputs.index(name) for name in controller.design.controlled]
-    graded = np.array([0.0 if j in model.on_off else 1.0 for j in range(n_u)])[:, None]
-    on_z, on_r, on_d, on_last = (graded * gain[:n_u] for gain in plan_gains(controller))
+    on_z, on_r, on_d, on_last = (gain[:n_u] for gain in plan_gains(controller))
     kept = np.eye(n_z) - L @ H
     to_drive = np.hstack([on_z @ kept, on_last])
     straight = np.hstack([on_z @ L, on_r, on_d])
@@ -119,9 +117,6 @@ def to_control(controller: ControllerParts) -> Any:
     """Return the law as a python-control ``StateSpace``; see :meth:`Controller.to_control`."""
     from thermogrip.sysid.plant.linearise import control_system
 
-    if controller.design.on_off:
-        problem = f"on_off: what switches {', '.join(controller.design.on_off)} is no linear system"
-        raise UserError(problem, hint="leave it on")
     if controller.design.zones:
         problem = "zones: a controller that may rest anywhere in them is no linear system"
         raise UserError(problem, hint="tune without them")

@@ -39,7 +39,7 @@ from thermogrip.datasets.arrays import Array, Mask
 from thermogrip.mpc.design.design import Design, PILoop
 from thermogrip.mpc.estimator.call_times import RESTART_S, SAME
 from thermogrip.mpc.estimator.fault_monitors import GainMonitor, StuckMonitor
-from thermogrip.mpc.estimator.oscillation import OscillationMonitor
+from thermogrip.mpc.estimator.oscillation import NOISE_SD, OscillationMonitor
 from thermogrip.mpc.estimator.reading_checks import follows
 from thermogrip.mpc.estimator.structure_monitor import StructureMonitor
 from thermogrip.mpc.interface import Move, Readings, Trajectory, number, target_now
@@ -119,12 +119,13 @@ class LoopMonitor:
         self._delay, self._lag = np.array([[a.delay, a.lag] for a in answers]).reshape(n, 2).T
         self._zone = np.array([design.zones.get(p.output, 0.0) for p in self.loops])
         self.names = tuple(p.output for p in self.loops)
-        allowed = 2.0 * design.overshoot
-        self.swings = OscillationMonitor(self.names, model.dt, self._delay.tolist(), [allowed] * n)
         filters = {name: design.observer(model) for name in model.drives}
         self.gain = GainMonitor(filters, float(np.max(self._promised, initial=0.0)))
         self.stuck = StuckMonitor(model.outputs)
         self.observer = design.observer(model)
+        noise = NOISE_SD * np.sqrt(self.observer.R[self._rows])
+        self._near = np.maximum(2.0 * design.overshoot, noise)  # of its target an output is there
+        self.swings = OscillationMonitor(self.names, model.dt, self._delay.tolist(), self._near.tolist())
         self.structure = StructureMonitor(plant, model, self.controlled)
         self.forget()
 
@@ -134,7 +135,6 @@ class LoopMonitor:
         self._time_s = np.nan
         self._u: Array | None = None
         self._goals: list[float] = []
-        self.swings.forget()
         self.structure.forget()
         self.gain.forget()
         self.stuck.forget()
@@ -143,6 +143,7 @@ class LoopMonitor:
     def _restart(self) -> None:
         """Begin anew, as towards a new target."""
         n = len(self.loops)
+        self.swings.restart()
         self._target = np.full(n, np.nan)
         self._error = np.full(n, np.nan)  # mean of the last errors
         self._limited_s, self._away_s, self._strange_s = np.zeros(n), np.zeros(n), 0.0
@@ -204,12 +205,11 @@ class LoopMonitor:
         if np.any(target != self._target):
             self._restart()
             self._target = target.copy()
-        swings = self.swings.note(y, target, seconds, self._zone.tolist())
-        near = self.swings.least
-        error = target - y
+        error, near = target - y, self._near
+        swings = self.swings.note(-np.sign(error) * np.maximum(np.abs(error) - self._zone, 0.0), seconds)
         begun = np.where(np.isfinite(self._error), self._error, error)
         self._error = np.where(np.isfinite(error), begun + _REMEMBER * (error - begun), begun)
-        limited = self._limits(u, seconds, near)
+        limited = self._limits(u, seconds)
         off, names = np.abs(self._error), self.names
         away = limited & (off > self._begun + near)
         self._away_s = np.where(away, self._away_s + seconds, 0.0)
@@ -229,10 +229,10 @@ class LoopMonitor:
         other = self.structure.said or self.gain.said
         return other or (f"{strange} or is it a load?" if strange and lasts else "")
 
-    def _limits(self, u: Array, seconds: float, near: Array) -> Mask:
+    def _limits(self, u: Array, seconds: float) -> Mask:
         """Note for how long drives have been at the limits to which errors drive them; return which are."""
         way, off = self._side * self._error, np.abs(self._error)
-        limited = (off > near) & np.where(way > 0, u >= self._high, u <= self._low)
+        limited = (off > self._near) & np.where(way > 0, u >= self._high, u <= self._low)
         self._limited_s = np.where(limited, self._limited_s + seconds, 0.0)
         fresh = ~limited | np.isinf(self._marked)
         self._stalled &= limited

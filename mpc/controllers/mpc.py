@@ -236,8 +236,8 @@ class Controller(Shown):
 
 
 def _in_c(reference: ReferenceController) -> CompiledStep | None:
-    """Return the steps in C, None where there is no compiler, nobody wants one, or a drive is switched."""
-    if reference.design.on_off or not wanted():  # no C chooses when an input is on or off
+    """Return the steps in C, None where there is no compiler, or nobody wants one."""
+    if not wanted():
         return None
     try:
         return CompiledStep(reference)

@@ -71,8 +71,6 @@ class PIController(SampledController):
         Where step times come from [s].
     safe_drive : dict of str to float, optional
         Where drives go without readings, in their units; 0 where absent.
-    on_off : dict of str to tuple of float, optional
-        As in :class:`~thermogrip.mpc.design.design.Design`.
     notes : dict, optional
         What the tuner found, kept in the file.
 
@@ -101,7 +99,6 @@ class PIController(SampledController):
         patience_s: float | None = None,
         clock: Callable[[], float] = time.perf_counter,
         safe_drive: Mapping[str, float] | None = None,
-        on_off: Mapping[str, tuple[float, float, float]] | None = None,
         notes: Mapping[str, Any] | None = None,
     ) -> None:
         model = PredictionModel(plant) if dt is None else prediction_model(plant, dt)
@@ -115,7 +112,6 @@ class PIController(SampledController):
             max(10.0, 5 * model.dt) if patience_s is None else patience_s,
             clock,
             safe_drive,
-            on_off,
         )
         self.plant, self.notes = plant, dict(notes or {})
         self.loops = pair_loops(plant, self.controlled) if loops is None else loops
@@ -147,7 +143,6 @@ class PIController(SampledController):
             slew_per_s=design.slew_per_s,
             patience_s=design.patience_s,
             safe_drive=design.safe_drive,
-            on_off=design.on_off,
             notes=notes,
         )
         made._design = design
@@ -179,7 +174,6 @@ class PIController(SampledController):
         """Forget the past; the plant is at rest at this reading, under the drive that holds it or that the
         reading has."""
         self._forget()
-        self._begin_positions()
         self.integral = np.zeros(len(self.loops))
         self._u = self._applied(reading, self._u)
         y, room = self._read(reading)
@@ -226,7 +220,6 @@ class PIController(SampledController):
         self._begun = np.where(np.isfinite(self._begun), self._begun, y)
         ahead, kept = self.terms(target, d)
         v = ahead.copy()
-        v[self.model.on_off] = 1.0  # nobody decides: it is on
         for at, (loop, (j, i)) in enumerate(zip(self.loops, self.ends)):
             if np.isfinite(error[i]):
                 v[j] = ahead[j] + loop.Kc * (error[i] - kept[at]) + self.integral[at]

@@ -45,7 +45,7 @@ from thermogrip.datasets.arrays import Array, Mask
 from thermogrip.mpc.controllers import advice
 from thermogrip.mpc.controllers.base import SampledController, targets_ahead
 from thermogrip.mpc.controllers.pi import PIController
-from thermogrip.mpc.design.design import DAY, Design
+from thermogrip.mpc.design.design import Design
 from thermogrip.mpc.estimator.call_times import RESTART_S, opening, shifted
 from thermogrip.mpc.estimator.observer import DisturbanceModel
 from thermogrip.mpc.estimator.reading_checks import ReadingMonitor, is_off
@@ -53,7 +53,6 @@ from thermogrip.mpc.interface import Move, Readings, Trajectory
 from thermogrip.mpc.native.shared_constants import CAUTION, MOST_CAUTION, STAYS, WEAK
 from thermogrip.mpc.optimiser.reach import Reach
 from thermogrip.mpc.optimiser.rti import BREAKS_FAR, Optimiser, Outcome, Sample
-from thermogrip.mpc.optimiser.switching import choose
 from thermogrip.mpc.plant.prediction import prediction_model
 
 if TYPE_CHECKING:
@@ -71,7 +70,6 @@ class ReferenceController(SampledController):
         super().__init__(
             *(model, design.controlled, design.drive_range, slew, design.patience_s, clock),
             design.safe_drive,
-            design.on_off,
         )
         self.design = design
         self.observer = design.observer(model)
@@ -80,7 +78,6 @@ class ReferenceController(SampledController):
         self.monitor = ReadingMonitor(model.n_y, spike=model.spike)
         self.reach = Reach(self.optimiser, self.observer)
         self.last_iterations = 0  # of the program, in the last step
-        self._waits = 0.0  # seconds until an on/off drive may go over, where it is to
         self._in_force: Array
         self._plan: Array | None  # (N, n_u), as it was made ``_age_s`` ago
         self._ramped: Array  # where targets are that may only ramp, NaN before the first
@@ -97,10 +94,11 @@ class ReferenceController(SampledController):
         """The plan that is still ahead, (N, n_u)."""
         return None if self._plan is None else shifted(self._plan, self._age_s / self.dt)
 
-    def reset(self, reading: Readings) -> None:
-        """Forget the past; see :meth:`thermogrip.mpc.controllers.mpc.Controller.reset`."""
-        self._start(*self._read(reading), self.observer.reset)
-        self._begin_positions()
+    def reset(self, reading: Readings, *, in_room: bool = False) -> None:
+        """Forget the past, see :meth:`thermogrip.mpc.controllers.mpc.Controller.reset`; ``in_room`` with the
+        plant linearised in its room, as C has it."""
+        begin = self.observer.reset_in_room if in_room else self.observer.reset
+        self._start(*self._read(reading), begin)
         self._u = self._in_force = self._applied(reading, self._u)
         self.pi.reset(reading)
         self.times.reset()
@@ -121,13 +119,14 @@ class ReferenceController(SampledController):
             self._refine(y)
             return self._held_move(started)
         event = self._absorb(y, d, applied) or (advice.STALE if self.times.stale else "")
-        in_force = self._u.copy()
         wanted, wrong = self._wanted(target)
         if not np.array_equal(wanted, self._target):
             self._side = self._sides(wanted)
         self._target = wanted
-        at = self.design.move_delay + np.arange(1, self.optimiser.N + 1)
-        ahead = targets_ahead(target, self.controlled, wanted, at, self.model.coldest, self.model.hottest)
+        samples = np.arange(1, self.optimiser.N + 1)
+        ahead = targets_ahead(
+            target, self.controlled, wanted, samples, self.model.coldest, self.model.hottest
+        )
         if self.design.ramp_per_s:
             wanted, ahead = self._ramp(wanted, ahead)
         u, status, lasting = self._decide(wanted, ahead, started)
@@ -135,9 +134,7 @@ class ReferenceController(SampledController):
             lasting = event or lasting
         if wrong and status == "ok":
             status = "infeasible"
-        self._u = self._within(u, self.times.slew_s)
-        # where the computer is slow, the drive of now goes on while the new one is worked out
-        self._in_force = in_force if self.design.move_delay else self._u
+        self._u = self._in_force = self._within(u, self.times.slew_s)
         return self._answer(status, wrong or lasting or event, started)
 
     def _start(self, y: Array, d: Array, begin: Callable[[Array, Array], None]) -> None:
@@ -183,8 +180,7 @@ class ReferenceController(SampledController):
             self.observer.look(self._d)
             self.monitor.expect(self.model.C @ (self.observer.now - self._seen))
         self._fresh = False
-        if not self.design.move_delay:
-            self._u = applied  # the slew limit counts from what was really applied
+        self._u = applied  # the slew limit counts from what was really applied
         self._d = np.where(np.isfinite(d), d, self._d)
         y, stays = self.monitor.screen(y, self.observer.reading())
         jumped = self._accept_jump(y, stays) if stays.any() else ""
@@ -285,8 +281,7 @@ class ReferenceController(SampledController):
             return "late", advice.TOO_LATE
         if (self._unread_s > 0).any():
             return "fallback_plan", self.say_unseen(self._unread_s)
-        waits = f"{', '.join(self.design.on_off)} may go over in {self._waits:.0f} s" if self._waits else ""
-        return "ok", waits
+        return "ok", ""
 
     def say_unseen(self, unread_s: Array) -> str:
         """Return what is said where controlled outputs were not read for so long (n_controlled,)."""
@@ -298,31 +293,13 @@ class ReferenceController(SampledController):
         last = np.clip(self._u, self.optimiser.lowest, self.optimiser.highest)
         observer = self.observer
         d = self._d + observer.disturbance_bias
-        x = observer.now
-        if self.design.move_delay:  # the drive applied now stays for one more sample
-            x = self.model.next_state(x, last + observer.drive_bias, d)
         guess, biases = self._guess(wanted, last), (observer.output_bias, observer.drive_bias)
         caution = min(max(1.0, float(np.max(np.abs(observer.innovation))) / CAUTION), MOST_CAUTION)
         slew_s = self.times.slew_s
-        sample = Sample(x, last, guess, d, wanted, self._side, *biases, slew_s, self._lost, caution)
-        sample = sample._replace(ahead=ahead, prices=self._prices())
-        self._waits = 0.0
-        if not self.design.on_off:
-            return self._converged(sample)
-        ((name, (on_s, off_s, price)),) = self.design.on_off.items()
-        j = self.model.drives.index(name)
-        at = float(round(last[j]))
-        choice = choose(
-            self.optimiser,
-            j,
-            lambda: self._converged(sample),
-            position=at,
-            wait_s=self._wait_s(j),
-            stays_s=off_s if at else on_s,
-            price=price,
+        sample = Sample(
+            observer.now, last, guess, d, wanted, self._side, *biases, slew_s, self._lost, caution
         )
-        self._waits = choice.wait_s
-        return choice.outcome
+        return self._converged(sample._replace(ahead=ahead))
 
     def _converged(self, sample: Sample) -> Outcome:
         """Return what one program gives, or as many as the design asks for until the plan stays."""
@@ -335,16 +312,6 @@ class ReferenceController(SampledController):
             found = self.optimiser.solve(sample)
         return replace(found, iterations=found.iterations + changes)
 
-    def _prices(self) -> Array | None:
-        """Return how many times the energy price counts in the samples (N,) that are predicted."""
-        tariff = self.design.tariff
-        if not tariff or not np.isfinite(self.times.now):
-            return None
-        seconds = (self.times.now + self.dt * np.arange(self.optimiser.N)) % DAY
-        starts, factors = np.array(tariff).T
-        at = np.searchsorted(starts, seconds, side="right") - 1  # -1: of the day before
-        return np.asarray(factors[at], dtype=np.float64)
-
     def _ramp(self, wanted: Array, ahead: Array | None) -> tuple[Array, Array | None]:
         """Return the targets now (n_controlled,), of those that may only ramp a sample further on the way,
         and what is ahead (N, n_controlled) from there."""
@@ -354,7 +321,7 @@ class ReferenceController(SampledController):
         reach = rates * self.times.waited_s
         now = np.where(np.isfinite(begun), np.clip(wanted, begun - reach, begun + reach), wanted)
         self._ramped = now
-        later = (self.design.move_delay + np.arange(1, self.optimiser.N + 1))[:, None] * rates * self.dt
+        later = np.arange(1, self.optimiser.N + 1)[:, None] * rates * self.dt
         if ahead is None and np.array_equal(now, wanted):
             return now, None
         ends = np.broadcast_to(wanted, later.shape) if ahead is None else ahead

@@ -20,14 +20,18 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationEr
 from thermogrip.datasets.atomic_files import read_toml
 from thermogrip.datasets.errors import UserError, known_names
 from thermogrip.datasets.limits import LARGEST
-from thermogrip.mpc.design.design import Design, check_design, default_controlled, default_design
-from thermogrip.mpc.plant.prediction import (
-    drive_names,
-    drive_range,
-    graded_drives,
-    step_response,
-    switching,
+from thermogrip.mpc.design.design import (
+    Design,
+    Finite,
+    NotNegative,
+    Positive,
+    Range,
+    check_design,
+    default_controlled,
+    default_design,
+    problem_of,
 )
+from thermogrip.mpc.plant.prediction import drive_names, drive_range, step_response
 
 if TYPE_CHECKING:
     from thermogrip.sysid.plant.plant import Plant
@@ -37,14 +41,9 @@ SPEC_TEMPLATE = (files(__package__) / "spec.toml").read_text(encoding="utf-8")
 _WATER = (2.0, 65.0)  # degC: neither ice nor scald in a tank of water
 _SAMPLES = 5  # of a step, at least
 _LEAST_SEEN = 1.0  # range of the logs [degC] within which steps would be lost in the noise
-_TAGS = ("tuple[", "dict[", "list[", "constrained-", "str")  # pydantic's names for one of several forms
 
-Positive = Annotated[float, Field(gt=0, le=LARGEST, allow_inf_nan=False)]
-NotNegative = Annotated[float, Field(ge=0, le=LARGEST, allow_inf_nan=False)]
-Finite = Annotated[float, Field(ge=-LARGEST, le=LARGEST, allow_inf_nan=False)]
 Deviation = Annotated[float, Field(ge=-50, le=50, allow_inf_nan=False)]
 Temperature = Annotated[float, Field(ge=-20, le=150, allow_inf_nan=False)]
-Range = tuple[Finite, Finite]
 
 
 def _ends(value: Any) -> Any:
@@ -68,16 +67,6 @@ class Settling(BaseModel):
     band_degC: Positive | None = None
     overshoot_degC: Positive | None = None
     bias_degC: Positive | None = None
-
-
-class OnOff(BaseModel):
-    """An input that the controller switches on and off."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    min_on_s: NotNegative = 0.0  # how long it stays on, and off, at least
-    min_off_s: NotNegative = 0.0
-    price: NotNegative = 0.0  # of a sample while it is on [degC^2]
 
 
 class Asked(NamedTuple):
@@ -135,11 +124,9 @@ class Spec(BaseModel):
     zones: dict[str, Positive] | None = None  # half width about a target in which an output may be anywhere
     hard: list[str] | None = None  # outputs whose limits give way last
     energy_price: NotNegative | dict[str, NotNegative] | None = None  # of a sample at full drive [degC^2]
-    tariff: list[tuple[NotNegative, NotNegative]] | None = None  # second of the day, times the price then
     ramp_per_s: Positive | dict[str, Positive] | None = None  # fastest change of a target [degC per s]
     safe_drive: Finite | dict[str, Finite] | None = None  # where a drive goes without its loop, in its units
     iterations: Annotated[int, Field(ge=1, le=50)] = 1  # programs a sample, until the plan stays
-    on_off: dict[str, OnOff] | None = None  # a pump or valve that the controller switches
 
     @model_validator(mode="after")
     def _agree(self) -> Spec:
@@ -149,14 +136,6 @@ class Spec(BaseModel):
             for name, own in (self.settling or {}).items():
                 if abs(start - target) <= (own.band_degC or 0.0):
                     raise ValueError(f"steps: {start:g} -> {target:g} stays inside the band of {name}")
-        ranges: dict[str, dict[str, Range]] = {"limits": self.limits or {}}
-        if self.drive_limits is not None:
-            one = self.drive_limits
-            ranges["drive_limits"] = one if isinstance(one, dict) else {"drive": one}
-        for key, group in ranges.items():
-            for low, high in group.values():
-                if not low < high:
-                    raise ValueError(f"{key}: {low:g} to {high:g} is empty")
         if isinstance(self.output, list) and len(set(self.output)) < len(self.output):
             raise ValueError("output: names one twice")
         times = {f"settling of {name}": own.within_s or 0.0 for name, own in (self.settling or {}).items()}
@@ -236,9 +215,8 @@ class Spec(BaseModel):
                 hint = known_names(name, plant.disturbances, "these are: {}")
                 raise UserError(f"disturbances: the plant has no measured disturbance {name}", hint=hint)
         plant = replace(plant, nominal=plant.nominal | (self.disturbances or {}))
-        plant = switching(plant, list(self.on_off or {}))
         ranges = dict(plant.valid)
-        for name, (low, high) in _by_drive("drive_limits", self.drive_limits, graded_drives(plant)).items():
+        for name, (low, high) in _by_drive("drive_limits", self.drive_limits, drive_names(plant)).items():
             (least, most), unit = drive_range(plant, name), plant.units.get(name, "1")
             of_unit = unit in ("percent", "0_255") or (unit == "1" and -1.0 <= least < most <= 1.0)
             if not of_unit:
@@ -273,9 +251,8 @@ class Spec(BaseModel):
             ambient=self.ambient_degC,
         )
         _check_length(self, design.dt)
-        graded = graded_drives(plant)
-        slews = {**design.slew_per_s, **_by_drive("slew_per_s", self.slew_per_s, graded)}
-        switches = {n: (one.min_on_s, one.min_off_s, one.price) for n, one in (self.on_off or {}).items()}
+        drives = drive_names(plant)
+        slews = {**design.slew_per_s, **_by_drive("slew_per_s", self.slew_per_s, drives)}
         values: dict[str, Any] = {"drive_range": _ranges(self, design), "slew_per_s": slews}
         if self.patience_s is not None:
             values["patience_s"] = self.patience_s
@@ -294,9 +271,9 @@ class Spec(BaseModel):
         counted = {name: given.get(name, 1.0) * design.weights.get(name, 1.0) for name in design.controlled}
         values["weights"] = {name: weight for name, weight in counted.items() if weight != 1.0}
         values |= {"zones": dict(self.zones or {}), "hard": tuple(self.hard or ())}
-        values |= {"tariff": tuple(self.tariff or ()), "iterations": self.iterations, "on_off": switches}
-        values["energy_price"] = _by_drive("energy_price", self.energy_price, graded)
-        values["safe_drive"] = _by_drive("safe_drive", self.safe_drive, drive_names(plant), of_all=graded)
+        values["iterations"] = self.iterations
+        values["energy_price"] = _by_drive("energy_price", self.energy_price, drives)
+        values["safe_drive"] = _by_drive("safe_drive", self.safe_drive, drives)
         ramp = self.ramp_per_s or {}
         values["ramp_per_s"] = ramp if isinstance(ramp, dict) else dict.fromkeys(design.controlled, ramp)
         _check_settling(self, design.controlled, values["ramp_per_s"])
@@ -306,7 +283,7 @@ class Spec(BaseModel):
 def _own_times(plant: Plant) -> dict[str, float]:
     """Return the output that each drive moves most, of those that are left, with its delay and lag [s]."""
     times: dict[str, float] = {}
-    for drive in graded_drives(plant):
+    for drive in drive_names(plant):
         answers = {name: step_response(plant, drive, name) for name in plant.outputs if name not in times}
         name = max(answers, key=lambda each: abs(answers[each].gain), default="")
         if name and answers[name].gain:
@@ -356,10 +333,9 @@ def _check_settling(spec: Spec, controlled: tuple[str, ...], ramps: Mapping[str,
 
 
 def _ranges(spec: Spec, design: Design) -> dict[str, Range]:
-    """Return the range of each drive under a spec; those that are on or off have none to choose."""
+    """Return the range of each drive under a spec."""
     ranges = dict(design.drive_range)
-    graded = tuple(name for name in ranges if name not in (spec.on_off or {}))
-    for name, (low, high) in _by_drive("drive_limits", spec.drive_limits, graded).items():
+    for name, (low, high) in _by_drive("drive_limits", spec.drive_limits, tuple(ranges)).items():
         least, most = ranges[name]
         if low < least - 1e-9 or high > most + 1e-9:
             problem = f"drive_limits: {low:g} to {high:g} of {name} leaves its range"
@@ -418,25 +394,18 @@ def spec_from_dict(content: Mapping[str, Any], *, file: str | Path | None = None
     try:
         return Spec.model_validate(dict(content))
     except ValidationError as error:
-        # of a value with several forms, what is wrong within one says more than that it is not another
-        first = min(error.errors(), key=lambda found: found["type"].endswith("_type"))
-        key = ".".join(str(part) for part in first["loc"] if not str(part).startswith(_TAGS))
-        text = first["msg"].removeprefix("Value error, ")
-        if first["type"] == "extra_forbidden":
-            text = "no such key"
-        problem = f"{key}: {text[0].lower()}{text[1:]}" if key else text
+        problem = problem_of(error)
+        key = problem.partition(":")[0].partition(".")[0]
         hint = known_names(key, Spec.model_fields, "the template of 'init spec' shows every key")
         raise UserError(problem, file=file, hint=hint) from error
 
 
-def _by_drive(
-    key: str, value: Any, drives: tuple[str, ...], *, of_all: tuple[str, ...] | None = None
-) -> dict[str, Any]:
-    """Return a value by drive; a single one is that of all these, or of ``of_all``."""
+def _by_drive(key: str, value: Any, drives: tuple[str, ...]) -> dict[str, Any]:
+    """Return a value by drive; a single one is that of all."""
     if value is None:
         return {}
     if not isinstance(value, dict):
-        return dict.fromkeys(drives if of_all is None else of_all, value)
+        return dict.fromkeys(drives, value)
     for name in value:
         if name not in drives:
             hint = known_names(name, drives, "it has {}")

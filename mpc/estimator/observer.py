@@ -81,9 +81,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
+from pydantic import Field, Strict
 from scipy.linalg import solve_discrete_are
 
 from thermogrip.datasets.arrays import Array, Mask
@@ -192,14 +193,18 @@ class DisturbanceModel:
         return len(self.names)
 
 
+#: A standard deviation, in any unit.
+Deviation = Annotated[float, Strict(), Field(ge=0, le=1e6)]
+
+
 @dataclass(frozen=True)
 class ObserverNoise:
     """Noise that the filter assumes, as standard deviations in a second; a reading's as it is."""
 
-    state: float = 0.005  # random heat in the states, in units of each state's own swing
-    drive: dict[str, float] = field(default_factory=dict)  # of a drive's bias, in its ranges
-    output: float = 0.03  # of a bias of an output, in its unit
-    reading: dict[str, float] = field(default_factory=dict)  # of one reading where the plant does not say
+    state: Deviation = 0.005  # random heat in the states, in units of each state's own swing
+    drive: dict[str, Deviation] = field(default_factory=dict)  # of a drive's bias, in its ranges
+    output: Deviation = 0.03  # of a bias of an output, in its unit
+    reading: dict[str, Deviation] = field(default_factory=dict)  # of one reading where the plant does not say
 
 
 def reading_noise(plant: Plant, output: str) -> float | None:
@@ -243,20 +248,18 @@ def choose_disturbances(
     *,
     ambient: float = 25.0,
     least: float = 1e-3,
-    count: int | None = None,
 ) -> DisturbanceModel:
-    """Return the first set of ``count`` disturbance states (one an output by default) that passes the rank
-    test of the module's theory.
+    """Return the first set of disturbance states, one an output, that passes the rank test of the module's
+    theory.
 
     The test is made at rest at ``ambient``; ``least`` is the steady change [degC] that 1 % of a drive's
     range, or 1 degC of bias, must make. A UserError says that no set is detectable.
     """
-    wanted = model.n_y if count is None else count
     _, A, B, E = model.linearise(*model.at_rest(ambient))
     chosen: list[tuple[str, int]] = []
     margin = float("inf")
     for entry in _in_order(model, controlled):
-        if len(chosen) == wanted:
+        if len(chosen) == model.n_y:
             break
         trial = _matrices(model, [*chosen, entry])
         scale = np.array([0.01 if kind == "input" else 1.0 for kind, _ in [*chosen, entry]])
@@ -264,24 +267,24 @@ def choose_disturbances(
         found = detectability_margin(A, model.C, into_state, trial[2], scale=scale)
         if found > least:
             chosen, margin = [*chosen, entry], found
-    if len(chosen) < min(wanted, len(controlled)):
+    if len(chosen) < len(controlled):
         from thermogrip.sysid.plant.plant import said_not_good
 
         raise UserError(
-            f"no disturbance model of {wanted} states is detectable from {', '.join(model.outputs)}",
+            f"no disturbance model of {model.n_y} states is detectable from {', '.join(model.outputs)}",
             hint="control an output that a drive can move"
             + (": identify does not call this plant good" if said_not_good(model.plant.verdict) else ""),
         )
     on_drive, on_disturbance, on_output = _matrices(model, chosen)
     names = {"input": model.drives, "output": model.outputs, "disturbance": model.disturbances}
     labels = tuple(f"{kind} {names[kind][at]}" for kind, at in chosen)
-    return DisturbanceModel(labels, on_drive, on_disturbance, on_output, margin if chosen else 0.0)
+    return DisturbanceModel(labels, on_drive, on_disturbance, on_output, margin)
 
 
 def _in_order(model: PredictionModel, controlled: tuple[str, ...]) -> list[tuple[str, int]]:
     first = [i for i, name in enumerate(model.outputs) if name in controlled]
     rest = [i for i in range(model.n_y) if i not in first]
-    order = [("input", j) for j in range(model.n_u) if j not in model.on_off]
+    order = [("input", j) for j in range(model.n_u)]
     order += [("output", i) for i in first + rest]
     return order + [("disturbance", k) for k in range(model.n_d)]
 

@@ -25,12 +25,6 @@ The plant is reported not to be the model at z >= 5, or where r' V^-1 r exceeds 
 alternative: 1 is what an honest plant has, 4 allows for readings twice as noisy as the model says.  A report
 stays until a window that would have shown it as well (its sd at most twice that of then) has z < 2.
 
-A plant that changes (a heat exchanger that fouls, a module that fades) has another theta in each window, and
-the posterior may allow each of them.  So every half window the last four, two at least, are fitted as one.
-Alternatives are a number, or what a drive does, that goes straight to 1 + s of it on the way; s of 1 % is
-tolerated, s beyond a half is none, and an honest plant is granted what is tolerated of the structures above.
-It is reported at z >= 6: where the Peltier's gain fades, the step of a model shows as a change of 3.
-
 It needs a posterior: a plant without one does not say which numbers it may honestly have.  A window is of
 calls at the sample time, with drive biases below 30 % of the range; another sample starts a new one.
 
@@ -66,9 +60,7 @@ _SOLVABLE = 1e9  # degC, or standard deviations: a run beyond diverges
 _DRIFT = 0.1  # degC of a sensor in a window
 _LAG, _SLOW, _ZONE = 0.5, 6.0, 0.02  # apparent delays, apparent delays, of a drive's range
 _TRIED = 0.3  # standard deviations, of a difference quotient
-_SHORTEST, _LONG = 2, 4  # windows in which a plant may change
-_CHANGE, _UNCHANGED, _PIECES = 0.05, 0.01, 8  # tried change; tolerated one; steps of its ramp
-_CHANGES, _MOST_CHANGE = 6.0, 0.5  # standard deviations; of itself
+_STEPS = 2  # of Gauss-Newton
 _MEND = "identify the plant anew"
 
 
@@ -81,13 +73,12 @@ class _Alternative(NamedTuple):
     tolerated: float
     two_sided: bool = False
     granted: bool = False  # whether an honest plant may have as much as is tolerated
-    sides: tuple[str, str] = ("faster", "slower")  # what it is where its parameter is below 0, and above
 
     def reported(self, size: float) -> str:
         """Return it in words."""
         amount = abs(size) * self.unit
         about = f"about {amount:.2g}" if amount < self.most else f"more than {self.most:.2g}"
-        return self.words.format(about, self.sides[size > 0])
+        return self.words.format(about, "slower" if size > 0 else "faster")
 
 
 @dataclass(frozen=True)
@@ -127,7 +118,7 @@ class StructureMonitor:
 
     def __init__(self, plant: Plant, model: PredictionModel, controlled: Sequence[str]) -> None:
         self.model, self.plant, self.denies = model, plant, False
-        self._structure = self._change = ""
+        self.said = ""
         self.spread = _posterior(plant)
         self._rows = [model.outputs.index(name) for name in controlled]
         if self.spread is None:
@@ -144,35 +135,17 @@ class StructureMonitor:
         for name, span in zip(model.drives, model.span):
             words = f"{name} has a dead zone of {{0}} {plant.units.get(name, '')}".strip()
             self.bank.append(_Alternative(words, _ZONE * float(span), 0.2 * float(span), 0.25))
-        pace = 6000.0 * _CHANGE / model.dt  # percent a minute of a change by one step in a sample
-        self.changes = [
-            _Alternative(
-                f"{what} {{1}} by {{0}} % a minute",
-                pace,
-                np.inf,
-                _UNCHANGED / _CHANGE,
-                two_sided=True,
-                sides=("falls", "rises"),
-            )
-            for what in (*plant.free, *(f"what {name} does" for name in model.drives))
-        ]
         self.forget()
 
     def forget(self) -> None:
         """Start afresh."""
-        self._structure, self._change, self._at, self._sd, self.denies = "", "", 0, 0.0, False
-        self._changing, self._changing_sd = 0, 0.0
+        self.said, self._at, self._sd, self.denies = "", 0, 0.0, False
         self.restart()
-
-    @property
-    def said(self) -> str:
-        """What the plant is that the model is not."""
-        return self._structure or self._change
 
     def restart(self) -> None:
         """Begin a new window; what is known stays."""
         if self.spread is not None:
-            self._history: deque[_Row] = deque(maxlen=(_LONG + 1) * self.window + 1)
+            self._history: deque[_Row] = deque(maxlen=2 * self.window + 1)
             self._count = 0
 
     def note(self, observer: Observer, y: Array, u: Array, d: Array) -> None:
@@ -191,10 +164,6 @@ class StructureMonitor:
             found = self.misfit(observer)
             if found is not None:
                 self._report(found)
-        if self._count >= _SHORTEST * self.window and self._count % max(1, self.window // 2) == 0:
-            found = self.change(observer)
-            if found is not None:
-                self._report_change(found, min(self._count, _LONG * self.window))
 
     def _report(self, found: Misfit) -> None:
         side = np.where([one.two_sided for one in self.bank], np.sign(found.size), 1.0)
@@ -204,52 +173,21 @@ class StructureMonitor:
         named = named[:own] if np.max(z[:own]) >= REPORTED else named
         at = int(np.argmax(np.where(named, (side * found.size / found.sd)[: len(named)], -np.inf)))
         if np.max(z) >= REPORTED or found.chi >= MISFIT:
-            self._structure = f"{self.bank[at].reported(float(found.size[at]))}: {_MEND}"
+            self.said = f"{self.bank[at].reported(float(found.size[at]))}: {_MEND}"
             self._at, self._sd = at, float(found.sd[at])
-        elif self._structure and found.sd[self._at] <= 2 * self._sd and z[self._at] < TAKEN_BACK:
-            self._structure = ""
-        self.denies = not self._structure
-
-    def _report_change(self, found: Misfit, count: int) -> None:
-        real = _CHANGE * np.abs(found.size) < _MOST_CHANGE
-        z, at = np.abs(found.z), int(np.argmax(np.where(real, np.abs(found.size) / found.sd, -1.0)))
-        if np.max(np.where(real, z, 0.0)) >= _CHANGES:
-            self._change = f"{self.changes[at].reported(float(found.size[at]) / count)}: {_MEND}"
-            self._changing, self._changing_sd = at, float(found.sd[at])
-        elif self._change and found.sd[self._changing] <= 2 * self._changing_sd:
-            self._change = "" if z[self._changing] < TAKEN_BACK else self._change
+        elif self.said and found.sd[self._at] <= 2 * self._sd and z[self._at] < TAKEN_BACK:
+            self.said = ""
+        self.denies = not self.said
 
     def misfit(self, observer: Observer) -> Misfit | None:
         """Return what the last window says; None where the model's run over it is not finite."""
         rows = list(self._history)[-(2 * self.window + 1) :]
-        found = self._fitted(observer, rows[-self.window :], 2)
+        found = self._fitted(observer, rows[-self.window :])
         if found is None:
             return None
-        return self._tested(self.bank, found, found.J, self._structures(found, rows, self.window))
+        return self._tested(found, self._structures(found, rows))
 
-    def change(self, observer: Observer) -> Misfit | None:
-        """Return what the last windows say of a plant that changes in them; None where the model's run over
-        them is not finite."""
-        rows, length = list(self._history), _LONG * self.window
-        found = self._fitted(observer, rows[-length:], 3)
-        if found is None:
-            return None
-        n_t, n_u, N = len(self.plant.free), self.model.n_u, len(found.drives)
-        by = _CHANGE * np.where(self.plant.log_scaled, 1.0, np.maximum(np.abs(self.plant.theta), 1e-9))
-        ramp = np.linspace(0.0, _CHANGE, N)[:, None] * np.eye(n_u)[:, None]
-        drives = np.concatenate([np.repeat(found.drives[None], n_t, axis=0), found.drives * (1 + ramp)])
-        drifting = np.vstack([np.diag(by), np.zeros((n_u, n_t))])
-        with np.errstate(all="ignore"):
-            base = found.run(found.z[None], found.drives[None], np.zeros((1, n_t)))
-            made = found.run(np.repeat(found.z[None], n_t + n_u, axis=0), drives, drifting) - base
-            a, honest = made[:, self.model.sub :: self.model.sub], self._structures(found, rows, length)
-        if not (np.abs(a).max() < _SOLVABLE and np.abs(honest).max() < _SOLVABLE):
-            return None
-        tolerated = np.array([one.tolerated for one in self.bank])[:, None]
-        known = np.vstack([found.J, tolerated * (honest * found.weight).reshape(len(honest), -1)])
-        return self._tested(self.changes, found, known, a)
-
-    def _fitted(self, observer: Observer, rows: Sequence[_Row], steps: int) -> _Fitted | None:
+    def _fitted(self, observer: Observer, rows: Sequence[_Row]) -> _Fitted | None:
         """Return the most likely run of the model over rows; None where it is not finite."""
         model, spread = self.model, self.spread
         if spread is None or len(rows) < _FEWEST:
@@ -260,9 +198,8 @@ class StructureMonitor:
         scale = np.concatenate([_STATE * observer.unit, np.sqrt(observer.P0 + first.w**2)])
         offset, found = observer.offset + observer.found_offset, observer.disturbance
 
-        def run(z: Array, drives: Array, drift: Array | None = None) -> Array:
-            """Return the outputs (B, N sub + 1, n_y) of unknowns z (B, m) under drives (B|1, N, n_u), theta
-            changing by drift (B, n_free) on the way."""
+        def run(z: Array, drives: Array) -> Array:
+            """Return the outputs (B, N sub + 1, n_y) of unknowns z (B, m) under drives (B|1, N, n_u)."""
             xw = np.concatenate([first.x, first.w]) + z[:, : n_x + n_w] * scale
             x, w, rest = xw[:, :n_x], xw[:, n_x:], z[:, n_x + n_w :]
             pushed = drives * (1 + _GAIN * rest[:, None, n_t:])
@@ -270,21 +207,15 @@ class StructureMonitor:
                 model.inputs(pushed + (w @ found.on_drive.T * model.span)[:, None]), model.sub, axis=1
             )
             held = np.repeat(d + (w @ found.on_disturbance.T)[:, None], model.sub, axis=1)
-            theta, step = rest[:, :n_t] @ spread.T, model.dt / model.sub
-            pieces = 1 if drift is None else min(_PIECES, fine.shape[1])
-            shown: list[Array] = []
-            for k, part in enumerate(np.array_split(np.arange(fine.shape[1]), pieces)):
-                here = theta if drift is None else theta + drift * ((k + 0.5) / pieces)
-                numbers = _numbers(self.plant, here)
-                made, x = model.model.rollout(x, fine[:, part], held[:, part], numbers, step)
-                shown.append(np.asarray(made)[:, k > 0 :])
-            return np.asarray(np.concatenate(shown, axis=1) + (w @ found.on_output.T)[:, None] + offset)
+            parameters = _numbers(self.plant, rest[:, :n_t] @ spread.T)
+            y, _ = model.model.rollout(x, fine, held, parameters, model.dt / model.sub)
+            return np.asarray(np.asarray(y) + (w @ found.on_output.T)[:, None] + offset)
 
         m = n_x + n_w + n_t + model.n_u
         z, weight = np.zeros(m), np.where(np.isfinite(y), 1 / np.sqrt(observer.R), 0.0)
         seen, tried = np.nan_to_num(y), np.vstack([np.zeros(m), _TRIED * np.eye(m)])
         with np.errstate(all="ignore"):  # a run that diverges is found below
-            for _ in range(steps):
+            for _ in range(_STEPS):
                 shown = run(z + tried, u[None])
                 at_rows = shown[:, model.sub :: model.sub]
                 J = ((at_rows[1:] - at_rows[0]) * weight / _TRIED).reshape(m, -1)
@@ -294,10 +225,10 @@ class StructureMonitor:
                 last, z = z, np.linalg.solve(J @ J.T + np.eye(m), J @ r)
         return _Fitted(run, last, J, r, shown[0], weight, u)
 
-    def _structures(self, found: _Fitted, rows: Sequence[_Row], length: int) -> Array:
+    def _structures(self, found: _Fitted, rows: Sequence[_Row]) -> Array:
         """Return what each alternative of the bank adds to the readings (n, N, n_y), by its unit."""
         model, u = self.model, found.drives
-        before, first = rows[:-length], rows[-length:][0]
+        before, first = rows[: -self.window], rows[-self.window :][0]
         each = np.eye(model.n_u)[:, None]
         late = u + each * self._share_late * (np.vstack([first.u, u[:-1]]) - u)
         cut = np.sign(u) * np.maximum(np.abs(u) - each * _ZONE * model.span, 0.0)
@@ -329,12 +260,12 @@ class StructureMonitor:
                 made.append(column)
         return np.array(made)
 
-    def _tested(self, bank: Sequence[_Alternative], found: _Fitted, J: Array, a: Array) -> Misfit:
-        """Return what a fit says of alternatives that add a (k, N, n_y); J (m, n) are the unknowns'."""
+    def _tested(self, found: _Fitted, a: Array) -> Misfit:
+        """Return what a fit says of the bank's alternatives, which add a (k, N, n_y)."""
         n_y, weight = self.model.n_y, found.weight
         drift = _DRIFT * np.linspace(0.0, 1.0, len(weight))[:, None] * np.eye(n_y)[:, None]
-        known = np.vstack([J, (drift * weight).reshape(n_y, -1)])
-        return _tested(bank, known, (a * weight).reshape(len(a), -1), found.r)
+        known = np.vstack([found.J, (drift * weight).reshape(n_y, -1)])
+        return _tested(self.bank, known, (a * weight).reshape(len(a), -1), found.r)
 
 
 def _tested(bank: Sequence[_Alternative], J: Array, a: Array, r: Array) -> Misfit:

@@ -34,7 +34,6 @@ _FIELDS: dict[str, tuple[bool, tuple[str, ...], str]] = {
     "n_c": (True, (), "controlled outputs"),
     "n_l": (True, (), "limited outputs"),
     "n_loops": (True, (), "of the PI controller"),
-    "move_delay": (True, (), "samples from a reading to its move"),
     "iteration_limit": (True, (), "of the quadratic program"),
     "blocks": (True, ("NB",), "samples in each block"),
     "controlled": (True, ("NC",), "which outputs"),
@@ -54,19 +53,12 @@ _FIELDS: dict[str, tuple[bool, tuple[str, ...], str]] = {
     "terminal": (False, (), ""),
     "weight": (False, ("NC",), "how many times the error of each controlled output counts"),
     "move": (False, (), ""),
-    "travel": (False, (), ""),
     "drive": (False, (), ""),
     "price": (False, (), "of an output in the overshoot band"),
     "dear": (False, ("NL",), "of one beyond its limits"),
     "zone": (False, ("NC",), "half width about a target in which an output may be anywhere, 0: none"),
     "energy": (False, ("NU",), "of a sample at full drive"),
     "ramp": (False, ("NC",), "fastest change of a target [its unit per s], 0: any"),
-    "tariff_from": (
-        False,
-        ("NT",),
-        "seconds of the day, and how often the price of energy counts from then on",
-    ),
-    "tariff": (False, ("NT",), ""),
     "overshoot": (False, (), "band beyond the target [degC]"),
     "patience_s": (False, (), "how long a plan is followed without a solve [s]"),
     "ambient": (False, (), "room where none is measured [degC]"),
@@ -130,10 +122,8 @@ class Sizes:
     NH: int
     NC: int
     NL: int
-    NP: int  # moves, where travel has a price
     NE: int  # numbers in the rows of the response
     NR: int  # targets of all samples, where some may only ramp
-    NT: int  # changes of the price in a day
     NO: int  # soft rows of all samples, of a linear plant
     NK: int  # what the model's ``prepare``, ``hold`` and ``partials`` hand over
     NF: int
@@ -167,7 +157,6 @@ def sizes_of(controller: ControllerParts, code: ModelCode, *, room: bool) -> Siz
     controlled, limited = (n_y, n_y) if room else (len(design.controlled), len(design.limits))
     most = -(-N // 32) * 32 if room else N
     longest = _whole(len(design.blocks) * model.n_u)
-    moves = len(design.blocks) * model.n_u if room or design.travel > 0 else 0
     entries = most * longest if room else _row_lengths(design.blocks, model.n_u)
     return Sizes(
         NX=model.n_x,
@@ -179,10 +168,8 @@ def sizes_of(controller: ControllerParts, code: ModelCode, *, room: bool) -> Siz
         NH=most,
         NC=controlled,
         NL=limited,
-        NP=moves,
-        NE=(controlled + limited) * entries + moves * longest,
+        NE=(controlled + limited) * entries,
         NR=most * controlled if design.ramp_per_s else 0,
-        NT=len(design.tariff),
         NO=0 if model.affine is None else most * (controlled + limited),
         NK=code.n_k,
         NF=code.n_h,
@@ -269,8 +256,7 @@ def numbers_of(controller: ControllerParts, k: Array) -> dict[str, Any]:
         (model, "sub dt span C spike unit coldest hottest least_d most_d warm"),
         (
             design,
-            "move_delay iterations blocks track terminal move travel drive price overshoot "
-            "patience_s ambient",
+            "iterations blocks track terminal move drive price overshoot patience_s ambient",
         ),
         (
             optimiser,
@@ -289,8 +275,6 @@ def numbers_of(controller: ControllerParts, k: Array) -> dict[str, Any]:
         "n_loops": len(loops),
         "iteration_limit": ITERATION_LIMIT,
         "ramp": [design.ramp_per_s.get(name, 0.0) for name in design.controlled],
-        "tariff_from": [second for second, _ in design.tariff],
-        "tariff": [factor for _, factor in design.tariff],
         "controlled": rows[: len(design.controlled)],
         "limited": rows[len(design.controlled) :],
         "loop_drive": [model.drives.index(loop.drive) for loop in loops],

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from types import ModuleType
 
-from thermogrip.mpc.design import design
 from thermogrip.mpc.estimator import call_times, observer, reading_checks
 from thermogrip.mpc.optimiser import qp, reach, rti
 
@@ -19,7 +18,6 @@ WEAK = 0.05  # of its gain at rest, below which a drive's bias is not learnt
 
 _SHARED: dict[ModuleType, tuple[str, ...]] = {
     call_times: ("RESTART_S", "SAME"),
-    design: ("DAY",),
     observer: ("LARGEST_BIAS", "NEWEST_INNOVATION"),
     qp: ("SHORT", "TOLERANCE"),
     reach: (
@@ -31,7 +29,6 @@ _SHARED: dict[ModuleType, tuple[str, ...]] = {
         "BARELY",
         "BREAKS",
         "BREAKS_FAR",
-        "CURVED",
         "FADING",
         "FIRST",
         "LITTLE",

@@ -30,17 +30,8 @@ weight: the size makes the edge one that a price does not cross by a little.  An
 ``price_k u_k / span`` for each sample.  Rows of a hard limit cost a thousand times as much as of a soft one:
 they give way where nothing else can.
 
-**Travel**, what the drives move in all, costs its price for each whole range: by soft rows
-0 <= Delta z <= 0, broken by s at travel (s + s^2 / 100).  Where that is more than moving a block would win,
-it stays exactly as the one before, so errors of a prediction below some size move nothing [1]_.
-
 A linear plant has none of those guards: G, H and the rows of the program are made once, only the free
 response, f and the bounds are new in a sample, and the program's plan is the best there is.
-
-References
-----------
-.. [1] M. Gallieri, J. Maciejowski, "lasso MPC: smart regulation of over-actuated systems", American Control
-   Conference, 2012.
 """
 
 from __future__ import annotations
@@ -69,8 +60,6 @@ LITTLE = 1e-7  # of its range, that a parked drive may be off in the program
 #: which moves all of a prediction, was answered with full drive wherever the band was used.
 FIRST = 0.2
 _DEAR = 1000.0  # times the price of a soft limit, of a hard one
-#: Square of a move beside the move, in the price of travel: the program's penalties may not be flat.
-CURVED = 0.01
 #: Of its unit, by which an output breaks its limit: it is reported, and the target cannot be had.
 BREAKS, BREAKS_FAR = 0.1, 0.5
 BARELY = 1.02  # a plan that is hardly better than the QP's is not worth a jump
@@ -91,7 +80,6 @@ class Sample(NamedTuple):
     lost: Mask | None = None  # (n_controlled,) outputs that cost nothing, and whose drives go to rest
     caution: float = 1.0  # how many times the design's move weight counts
     ahead: Array | None = None  # (N, n_controlled) targets of each sample, where they change
-    prices: Array | None = None  # (N,) how many times the energy price counts in each sample
 
 
 @dataclass(frozen=True)
@@ -107,7 +95,6 @@ class Outcome:
     # (n_u,) response of the controlled outputs to each drive's next block, over that at rest: below 0 the
     # gain has turned over
     authority: Array
-    cost: float = np.nan  # of the plan, where positions of on/off drives are given
 
 
 class Optimiser:
@@ -150,14 +137,13 @@ class Optimiser:
         self._A: Array | None = None
         self._kept: tuple[Any, Array, list[Array]] | None = None
         self._seen_rows, self._parked = list(range(len(self._rows))), list[int]()
-        self.positions: dict[int, Array] = {}  # (n_b,) of an on/off drive, in the next solve
         self.neutral = np.clip(np.zeros(model.n_u), self.lowest, self.highest)
         safe = [design.safe_drive.get(name, rest) for name, rest in zip(model.drives, self.neutral)]
         self.safe = np.array(safe, dtype=float)
         self.zone = np.array([design.zones.get(name, 0.0) for name in design.controlled])
         self.energy = np.array([design.energy_price.get(name, 0.0) for name in model.drives])
-        self._begins = np.cumsum(self.blocks) - np.array(self.blocks)
-        self._costs: Array | None = None  # (n_b, n_u) of this sample's energy, in ranges of the drives
+        # what energy costs, by unknown, in ranges of the drives
+        self._energy_cost = (self._lengths[:, None] * self.energy).ravel()
         self.at_rest = self._response_at_rest()
         self.pair = self._pairs()
         self.settled_gain = self._settled_gain()
@@ -173,11 +159,10 @@ class Optimiser:
         zoned, by_zone = self.zone[:, None] > 0, self.weight[:, None] * self._weight
         own, limited = np.where(zoned, by_zone, design.price), np.repeat(self.dear, self.N)
         first = np.where(zoned, by_zone, FIRST * design.price)
-        travel = np.full(n if design.travel > 0 else 0, design.travel)
-        prices = np.concatenate([np.full(2 * n, design.price), own.ravel(), limited, CURVED * travel])
+        prices = np.concatenate([np.full(2 * n, design.price), own.ravel(), limited])
         self.qp = CondensedQP(
             soft=np.arange(prices.size) >= 2 * n,
-            linear=np.concatenate([np.full(2 * n, design.price), first.ravel(), FIRST * limited, travel]),
+            linear=np.concatenate([np.full(2 * n, design.price), first.ravel(), FIRST * limited]),
             quadratic=2 * prices,
             time_limit_s=max(design.deadline_s, 1e-3),
         )
@@ -188,7 +173,7 @@ class Optimiser:
 
     def solve(self, sample: Sample) -> Outcome:
         """Improve a plan."""
-        x, last, guess, d, now, side, bias, drive_bias, slew_s, lost, caution, ahead, tariff = sample
+        x, last, guess, d, now, side, bias, drive_bias, slew_s, lost, caution, ahead = sample
         self._move = caution * self.design.move
         model, n_u = self.model, self.model.n_u
         # in samples, by how much more or less than in one the first move may go
@@ -200,9 +185,6 @@ class Optimiser:
             side = np.where(lost, 0.0, side)
         if ahead is not None:  # nothing is beyond a target that moves
             side = np.zeros(len(now))
-        self._costs = None
-        if self.energy.any():
-            self._costs = self.counted(tariff)[:, None] * self.energy
         guess = self._park(guess, last, more)
         linear = model.affine is not None
         y0, G = self._linearised(x, guess + drive_bias, d)
@@ -218,8 +200,7 @@ class Optimiser:
             return Outcome(plan, y0, answer.status, {}, answer.iterations, authority[0])
         if linear:
             y = free + G @ (plan / model.span).ravel()
-            cost = self._merit(plan[None], y[None], target, side, last)[0] if self.positions else np.nan
-            return Outcome(plan, y, "solved", self._broken(y), answer.iterations, authority[0], cost)
+            return Outcome(plan, y, "solved", self._broken(y), answer.iterations, authority[0])
 
         def predicted(plans: Array) -> Array:
             return self._simulate(x, plans + drive_bias, d) + bias
@@ -228,8 +209,7 @@ class Optimiser:
             return self._merit(plans, y, target, side, last)
 
         plan, y = self._best(plan, guess, y0, last, more, predicted, merit)
-        cost = merit(plan[None], y[None])[0] if self.positions else np.nan
-        return Outcome(plan, y, "solved", self._broken(y), answer.iterations, authority[0], cost)
+        return Outcome(plan, y, "solved", self._broken(y), answer.iterations, authority[0])
 
     def _linearised(self, x: Array, plan: Array, d: Array) -> tuple[Array, Array]:
         """Return the outputs along a plan, and G (N, n_y, n) by drives in their ranges."""
@@ -241,10 +221,6 @@ class Optimiser:
             self._G = G.reshape(self.N, self.model.n_y, -1) * self._spans
         return y, self._G
 
-    def counted(self, tariff: Array | None) -> Array:
-        """Return the samples of each block (n_b,), each as often as the energy price counts in it."""
-        return self._lengths if tariff is None else np.asarray(np.add.reduceat(tariff, self._begins))
-
     def _pairs(self) -> NDArray[np.int_]:
         """Return which controlled output each drive is there for: its PI loop's, else what it moves most."""
         pair = np.array(self.strongest)
@@ -253,16 +229,13 @@ class Optimiser:
         return pair
 
     def _park(self, plans: Array, last: Array, more: float) -> Array:
-        """Return plans (..., n_b, n_u) whose parked drives go to rest as fast as the slew allows, and whose
-        on/off drives are where they are to be."""
-        if not self._parked and not self.positions:
+        """Return plans (..., n_b, n_u) whose parked drives go to rest as fast as the slew allows."""
+        if not self._parked:
             return plans
         reach = (self.reach[:, None] + more) * self.slew
         path = np.clip(self.safe, last - reach, last + reach)
         plans = np.array(plans)
         plans[..., self._parked] = path[:, self._parked]
-        for j, positions in self.positions.items():
-            plans[..., j] = positions
         return plans
 
     def _best(
@@ -277,22 +250,19 @@ class Optimiser:
     ) -> tuple[Array, Array]:
         """Return the QP's plan, or one that the nonlinear simulation finds better, with its outputs."""
         self._solves += 1
-        plans = plan[None]
+        y = predicted(plan[None])
+        at_guess, cost = merit(np.stack([guess, plan]), np.stack([y_guess, y[0]]))
+        others = np.zeros((0, *plan.shape))
+        if cost > at_guess:
+            others = guess + np.array(SHARES)[:, None, None] * (plan - guess)
         if self._solves % LOOK_AROUND == 1:
-            plans = np.concatenate([plans, self._park(self._ramps(last, more), last, more)])
-        y = predicted(plans)
-        costs = merit(np.concatenate([guess[None], plans]), np.concatenate([y_guess[None], y]))
-        at_guess, costs = costs[0], costs[1:]
-        if costs[0] > at_guess:
-            shorter = guess + np.array(SHARES)[:, None, None] * (plan - guess)
-            tried = predicted(shorter)
-            plans, y = np.concatenate([plans[:1], shorter, plans[1:]]), np.concatenate([y[:1], tried, y[1:]])
-            costs = np.concatenate([costs[:1], merit(shorter, tried), costs[1:]])
-        if len(plans) == 1:
+            others = np.concatenate([others, self._park(self._ramps(last, more), last, more)])
+        if not len(others):
             return plan, y[0]
-        costs[1:] *= BARELY
+        y_others = predicted(others)
+        costs = BARELY * merit(others, y_others)
         best = int(np.argmin(costs))
-        return plans[best], y[best]
+        return (others[best], y_others[best]) if costs[best] < cost else (plan, y[0])
 
     def _response(self, G: Array) -> Array:
         """Return the response (n_b, n_u) to each block, summed over time, of the output moved most."""
@@ -338,11 +308,10 @@ class Optimiser:
             low, high = self.faded_range(away, drive_bias, authority, self.neutral, least)
         else:
             low, high = self._whole
-        if not self._parked and not self.positions:
+        if not self._parked:
             return low, high
         little = np.zeros(self.model.n_u)
-        given = [*self._parked, *self.positions]
-        little[given] = LITTLE * self.model.span[given]
+        little[self._parked] = LITTLE * self.model.span[self._parked]
         return self._park(low, last, more) - little, self._park(high, last, more) + little
 
     def faded_range(
@@ -385,10 +354,7 @@ class Optimiser:
         moves[:, :n_u] -= last / self.model.span
         squared = np.sum(moves * moves, axis=1)
         cost = self._move * squared + (shares * shares) @ self._drive_cost
-        if design.travel > 0:
-            cost += design.travel * (np.sum(np.abs(moves), axis=1) + CURVED * squared)
-        if self._costs is not None:
-            cost += shares @ self._costs.ravel()
+        cost += shares @ self._energy_cost
         over: list[tuple[float, Array]] = []
         for at in self._seen_rows:
             error = y[:, :, self._rows[at]] - target[:, at]
@@ -446,9 +412,7 @@ class Optimiser:
                 H += 2 * (self._move - self.design.move) * self._moves
             self._kept = key, H, weighted
         _, H, weighted = self._kept
-        f = np.zeros(H.shape[0])
-        if self._costs is not None:
-            f += self._costs.ravel()
+        f = self._energy_cost.copy()
         for at, row, part in zip(tracked, rows, weighted):
             f += part @ (free[:, row] - target[:, at])
         f[: self.model.n_u] -= 2 * self._move * (last / self.model.span)
@@ -467,8 +431,7 @@ class Optimiser:
         n, n_u, N = self.n_b * self.model.n_u, self.model.n_u, self.N
         soft = self._rows + self._limited
         if self._A is None:
-            still = [self.differences] if self.design.travel > 0 else []
-            self._A = np.concatenate([self._hard, *(G[:, row] for row in soft), *still])
+            self._A = np.concatenate([self._hard, *(G[:, row] for row in soft)])
         elif self.model.affine is None:
             self._A[2 * n :][: len(soft) * N].reshape(len(soft), N, n)[...] = G[:, soft].transpose(1, 0, 2)
         lower, upper = np.empty(len(self._A)), np.empty(len(self._A))
@@ -489,8 +452,6 @@ class Optimiser:
         for at, row in enumerate(self._limited):
             lower[rows], upper[rows] = self._limits[at, :, None] - free[:, row]
             rows = slice(rows.stop, rows.stop + N)
-        if self.design.travel > 0:
-            lower[rows.start :] = upper[rows.start :] = np.concatenate([before, np.zeros(n - n_u)])
         return self._A, lower, upper
 
     def _broken(self, y: Array) -> dict[str, float]:

@@ -33,7 +33,7 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -42,7 +42,7 @@ from numpy.typing import ArrayLike
 from scipy.optimize import least_squares
 
 from thermogrip.datasets.arrays import Array, Mask, Values
-from thermogrip.datasets.errors import UserError, known_names
+from thermogrip.datasets.errors import UserError
 from thermogrip.mpc.plant.along_plan import AlongPlan, SampleDerivatives
 
 if TYPE_CHECKING:
@@ -50,30 +50,9 @@ if TYPE_CHECKING:
     from thermogrip.sysid.plant.plant import Plant
 
 
-#: The unit of an input that is on or off and that the controller switches; others of these stay on.
-ON_OFF = "on_off"
-
-
 def drive_names(plant: Plant) -> tuple[str, ...]:
-    """Return the inputs that a controller moves: all but those that are on or off and not its own."""
-    others = [name for name in plant.model.switches if plant.units.get(name) != ON_OFF]
-    return tuple(name for name in plant.model.inputs if name not in others)
-
-
-def graded_drives(plant: Plant) -> tuple[str, ...]:
-    """Return the drives that have more than two positions."""
-    return tuple(name for name in drive_names(plant) if plant.units.get(name) != ON_OFF)
-
-
-def switching(plant: Plant, names: Sequence[str]) -> Plant:
-    """Return the plant whose on/off inputs of these names the controller switches."""
-    for name in names:
-        if name not in plant.model.switches:
-            hint = "it has none: such an input is 0 or 1 in all logs"
-            if plant.model.switches:
-                hint = known_names(name, plant.model.switches, "these are: {}")
-            raise UserError(f"on_off: the plant has no on/off input {name}", hint=hint)
-    return replace(plant, units={**plant.units, **dict.fromkeys(names, ON_OFF)}) if names else plant
+    """Return the inputs that a controller moves: all but those that are on or off, which stay on."""
+    return tuple(name for name in plant.model.inputs if name not in plant.model.switches)
 
 
 def drive_range(plant: Plant, name: str) -> tuple[float, float]:
@@ -85,8 +64,6 @@ def drive_range(plant: Plant, name: str) -> tuple[float, float]:
         return (-100.0 if low < 0 else 0.0), 100.0
     if unit == "0_255":
         return 0.0, 255.0
-    if unit == ON_OFF:
-        return 0.0, 1.0
     if unit == "1" and low >= -1.05 and high <= 1.05:
         return (-1.0 if low < 0 else 0.0), 1.0
     if not low < high:
@@ -122,10 +99,9 @@ class PredictionModel:
     model's steps in it.  A drive is between ``lowest`` and ``highest``, ``span`` wide, the unit in which
     drives are scaled, and ``neutral`` is no drive or what is nearest to none, all (n_u,).  A reading is
     between ``coldest`` and ``hottest``, and within ``spike`` (n_y,) of its prediction; ``unit`` (n_y,) is in
-    what figures of an output count.  Drives ``on_off`` are
-    0 or 1, at rest 1.  Outputs ``warm`` (n_y,) share a level at rest: the temperatures, or all.  Of the
-    measured disturbances ``rooms`` (n_d,) are temperatures of the room; ``seen_d`` (n_d, 2) is what the logs
-    showed, ``least_d`` to ``most_d`` what may be read, and a difference of less than ``close_d`` is none.
+    what figures of an output count.  Outputs ``warm`` (n_y,) share a level at rest: the temperatures, or
+    all.  Of the measured disturbances ``rooms`` (n_d,) are temperatures of the room; ``seen_d`` (n_d, 2) is
+    what the logs showed, ``least_d`` to ``most_d`` what may be read, a difference of ``close_d`` is none.
     """
 
     def __init__(self, plant: Plant, *, dt: float | None = None) -> None:
@@ -145,8 +121,6 @@ class PredictionModel:
         self.lowest, self.highest = ranges[:, 0], ranges[:, 1]
         self.span = self.highest - self.lowest
         self.neutral = np.clip(np.zeros(self.n_u), self.lowest, self.highest)
-        self.on_off = [j for j, name in enumerate(self.drives) if plant.units.get(name) == ON_OFF]
-        self.neutral[self.on_off] = 1.0
         seen = np.array([plant.valid.get(name, (-np.inf, np.inf)) for name in self.outputs], dtype=float)
         warm = np.array([plant.units.get(name, "degC") == "degC" for name in self.outputs])
         self.warm: Mask = warm if warm.any() else ~warm
@@ -587,7 +561,7 @@ def sample_time(plant: Plant) -> float:
     """
     found = []
     for output in plant.model.outputs:
-        answers = [step_response(plant, drive, output) for drive in graded_drives(plant)]
+        answers = [step_response(plant, drive, output) for drive in drive_names(plant)]
         best = max(answers, key=lambda answer: abs(answer.gain))
         if best.gain:
             low, high = plant.valid.get(output, (-np.inf, np.inf))

@@ -62,7 +62,7 @@ from thermogrip.mpc.design.design import Design
 from thermogrip.mpc.design.spec import Spec
 from thermogrip.mpc.estimator.observer import reading_noise
 from thermogrip.mpc.interface import Regulator
-from thermogrip.mpc.plant.prediction import graded_drives, held_start, prediction_model, step_response
+from thermogrip.mpc.plant.prediction import drive_names, held_start, prediction_model, step_response
 from thermogrip.mpc.tuning.minimum_time import full_drive_bound
 
 if TYPE_CHECKING:
@@ -159,7 +159,7 @@ def draws_of(plant: Plant, count: int) -> list[int]:
 @lru_cache(maxsize=16)
 def apparent_delays(plant: Plant, controlled: tuple[str, ...]) -> tuple[float, ...]:
     """Return the apparent delay [s] of each controlled output behind the drive that moves it most."""
-    drives = graded_drives(plant)
+    drives = drive_names(plant)
     answers = [[step_response(plant, drive, output) for drive in drives] for output in controlled]
     return tuple(max(max(of, key=lambda answer: abs(answer.gain)).delay, plant.dt) for of in answers)
 
@@ -191,7 +191,7 @@ def loads_of(plant: Plant, spec: Spec, design: Design) -> list[Load]:
     model = prediction_model(plant, plant.dt)
     d = tuple(model.undisturbed(spec.ambient_degC).tolist())
     _, held = held_start(model, design.controlled, target, d)
-    for name in graded_drives(plant):
+    for name in drive_names(plant):
         low, high = design.drive_range[name]
         at = 0.0 if held is None else float(held[model.drives.index(name)])
         side = 1.0 if high - at >= at - low else -1.0

@@ -560,7 +560,6 @@ def unknown_to_pi(spec: Spec) -> list[str]:
         "energy prices": spec.energy_price,
         "limits of outputs": spec.limits,
         "ramps": spec.ramps,
-        "what is switched": spec.on_off,
     }
     return [wish for wish, value in wishes.items() if value]
 

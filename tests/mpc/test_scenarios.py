@@ -78,29 +78,6 @@ def test_a_drive_bias_is_not_learnt_where_the_gain_has_turned_over(reversing_tan
     assert controller.observer.w[1] != before[1]
 
 
-def test_the_prediction_of_a_slow_computer_counts_from_when_its_move_is_applied(tank):
-    controller = ReferenceController(tank, default_design(tank, dt=2.0, move_delay=1))
-    found, solve = [], controller.optimiser.solve
-    controller.optimiser.solve = lambda sample: found.append(solve(sample)) or found[-1]
-    quiet = Surroundings(noise=0.0, quantum=0.0, move_delay_s=2.0)
-    seen = []
-
-    class Spy:
-        dt, controlled = controller.dt, controller.controlled
-        reset = controller.reset
-
-        def step(self, reading, target):
-            move = controller.step(reading, target)
-            seen.append((reading["t_tank"], found[-1].y[0, 0]))
-            return move
-
-    simulate_closed_loop(Spy(), tank, [(38.0, 60.0)], start=28.0, surroundings=quiet)
-    now, ahead = np.array(seen).T
-    # the plan's first sample ends two samples after the reading that made it
-    np.testing.assert_allclose(ahead[3:-2], now[5:], atol=0.03)
-    assert np.max(np.abs(ahead[3:-2] - now[4:-1])) > 0.1
-
-
 def test_anti_windup_takes_overshoot_away(tank, monkeypatch):
     over = []
     for uncut in (1e-9, np.inf):  # np.inf: the integrator goes on while the drive is limited
@@ -130,14 +107,6 @@ def test_a_target_beyond_the_tank_limit_is_called_infeasible_and_the_limit_holds
     assert loop.outputs["t_tank"].max() < 42
     free, _ = run(design_controller(tank, dt=2.0), tank, 28.0, 48.0)
     assert free.outputs["t_tank"].max() > 48
-
-
-def test_a_slow_computer_costs_no_overshoot_where_the_design_knows_of_it(tank, other_tank):
-    knows = design_controller(tank, dt=2.0, move_delay=1)
-    late = Surroundings(move_delay_s=2.0)
-    loop = simulate_closed_loop(knows, other_tank, [(38.0, 500.0)], start=28.0, surroundings=late)
-    assert loop.segments[0].overshoot <= 0.3
-    assert np.isfinite(loop.segments[0].settle_s)
 
 
 def test_two_runs_of_one_seed_are_the_same_and_another_seed_is_not(controller, other_tank):

@@ -30,10 +30,9 @@ from thermogrip.mpc.tuning.tune import rows_of, verdict_of
 from thermogrip.sysid.plant.plant import Plant
 
 QUIET = Surroundings(noise=0.02, quantum=0.0)
+
+
 # the board that closes the loops is not the model: 8 % less heat of one heater, a tenth more loss
-TARIFF = ((0.0, 1.0), (600.0, 3.0), (1200.0, 1.0), (1800.0, 3.0), (2400.0, 1.0))
-
-
 @pytest.fixture(scope="module")
 def board():
     plant = network_plant("tclab", t1=(20.0, 60.0), t2=(20.0, 60.0))
@@ -50,12 +49,12 @@ def run(controller: Controller, board, target=40.0, seconds=2400.0, **more) -> C
     return simulate_closed_loop(controller, board, [(target, seconds)], surroundings=QUIET, seed=3, **more)
 
 
-def spent(loop: ClosedLoop, tariff=((0.0, 1.0),), begin_s: float = 600.0) -> float:
-    """Seconds of full drive from then on, each as dear as the tariff has it."""
-    starts, factors = np.array(tariff).T
+def spent(loop: ClosedLoop, begin_s: float = 600.0) -> float:
+    """Seconds of full drive from then on."""
     time = loop.sample_time
-    dear = factors[np.searchsorted(starts, time, side="right") - 1] * (time >= begin_s)
-    return float(sum(np.sum(drive / 100.0 * dear) for drive in loop.drive.values()) * (time[1] - time[0]))
+    return float(
+        sum(np.sum(drive[time >= begin_s]) for drive in loop.drive.values()) / 100.0 * (time[1] - time[0])
+    )
 
 
 def test_in_a_zone_the_least_energy_is_spent_and_no_more_than_a_tenth_beyond_it_is_seen(board):
@@ -77,29 +76,6 @@ def test_without_a_price_an_output_in_its_zone_is_left_alone(board):
     tracked = run(kit(), board)
     assert max(moves) < 0.1 * max(np.sum(np.abs(np.diff(tracked.drive[name][240:]))) for name in ("q1", "q2"))
     assert all(np.all(np.abs(loop.outputs[name][-1500:] - 40.0) < 1.1) for name in ("t1", "t2"))
-
-
-def test_a_tariff_heats_before_it_rises(board):
-    zones, price = {"t1": 1.5, "t2": 1.5}, {"q1": 1.0, "q2": 1.0}
-    flat = run(kit(zones=zones, energy_price=price), board)
-    told = run(kit(zones=zones, energy_price=price, tariff=TARIFF), board)
-    rise = np.searchsorted(told.time, 1800.0)
-    assert told.outputs["t1"][rise] > flat.outputs["t1"][rise] + 0.8
-    assert spent(told, TARIFF) < 0.99 * spent(flat, TARIFF)
-    assert all(np.all(np.abs(told.outputs[name][600:] - 40.0) < 1.8) for name in ("t1", "t2"))
-
-
-def test_a_tariff_begins_anew_each_day_and_counts_from_the_readings_time():
-    tariff = ((100.0, 2.0), (200.0, 5.0))
-    controller = kit(
-        ReferenceController, zones={"t1": 1.0, "t2": 1.0}, energy_price={"q1": 1.0}, tariff=tariff
-    )
-    reading = {"t1": 25.0, "t2": 25.0, "t_ambient": 25.0}
-    for now, expected in ((0.0, 5.0), (86400.0 + 150.0, 2.0), (3 * 86400.0 + 201.0, 5.0)):
-        controller.reset(reading)
-        controller.step({**reading, "time_s": now}, 30.0)
-        assert controller._prices()[0] == expected
-    assert set(controller._prices()) == {5.0}
 
 
 def test_targets_ramp_no_faster_than_they_may_and_arrive(board):
@@ -246,7 +222,6 @@ REFUSED = [
     ({"zones": {"t3": 0.04}}, "zones: t3 is not regulated"),
     ({"zones": {"t1": 1.0}}, "zones: 1 about t1 is wider than band_degC, 0.25"),
     ({"energy_price": 1.0}, "energy_price without zones of t1, t2"),
-    ({"tariff": [[0, 1.0]]}, "tariff: there is no energy_price"),
     ({"ramp_per_s": {"t9": 1.0}}, "ramp_per_s: t9 is not regulated"),
     ({"hard": ["t1"]}, "hard: t1 has no limits"),
     ({"safe_drive": {"q1": 120.0}}, "safe_drive of q1 is 120, beyond its 0 to 100"),
@@ -279,20 +254,6 @@ def test_what_cannot_be_had_is_refused_in_one_line(keys, said):
 WIDE = {"band_degC": 1.0, "overshoot_degC": 1.0, "bias_degC": 1.0, "steps": [[25.0, 40.0]]}
 
 
-@pytest.mark.parametrize(
-    ("tariff", "said"),
-    [
-        ([[60, 1.0], [30, 2.0]], "tariff: seconds of the day must rise"),
-        ([[0, 1.0], [86400, 2.0]], "tariff: seconds of the day must rise"),
-    ],
-)
-def test_a_tariff_of_no_day_is_refused(tariff, said):
-    plant = network_plant("tclab", t1=(20.0, 60.0), t2=(20.0, 60.0))
-    keys = {"zones": {"t1": 1.0, "t2": 1.0}, "energy_price": 1.0, "tariff": tariff}
-    with pytest.raises(UserError, match=said):
-        spec_from_dict(WIDE | keys).design(plant)
-
-
 def test_energy_of_a_drive_that_goes_both_ways_has_no_price():
     keys = {"zones": {"t_surface": 1.0}, "energy_price": 1.0}
     with pytest.raises(UserError, match="energy_price: drive goes both ways"):
@@ -305,20 +266,17 @@ def test_what_may_rest_anywhere_is_no_linear_system():
 
 
 WISHES = {
-    "tariff": {"zones": {"t1": 1.5, "t2": 1.5}, "energy_price": {"q1": 1.0, "q2": 1.0}, "tariff": TARIFF},
     "ramp": {"ramp_per_s": {"t1": 0.04}, "limits": {"t2": (20.0, 50.0)}},
 }
 
 
 @GCC
-@pytest.mark.parametrize("wish", WISHES)
-def test_a_loop_of_tariffs_or_ramps_is_the_same_in_c(board, wish):
+def test_a_loop_of_ramps_is_the_same_in_c(board):
     """Step by step, and as a whole loop, whose first reading is at 0 s too."""
-    controller = kit(ReferenceController, **WISHES[wish])
+    limits = {"limits": {"t2": (20.0, 50.0)}}
+    controller = kit(ReferenceController, ramp_per_s={"t1": 0.04}, **limits)
     compiled = Controller(controller.model.plant, controller.design)
-    plain = run(
-        kit(**{key: WISHES[wish][key] for key in WISHES[wish] if key not in ("tariff", "ramp_per_s")}), board
-    )
+    plain = run(kit(**limits), board)
     ours = run(controller, board)
     wholly = compiled_loop(compiled, board, [(40.0, 2400.0)], surroundings=QUIET, seed=3)
     for loop in (run(compiled, board), wholly):
@@ -332,7 +290,6 @@ def test_wishes_are_in_the_controllers_file(tmp_path):
     wishes = {
         "zones": {"t1": 1.0, "t2": 2.0},
         "energy_price": {"q1": 1.0},
-        "tariff": ((0.0, 1.0), (600.0, 3.0)),
         "safe_drive": {"q2": 10.0},
         "iterations": 3,
         "limits": {"t1": (0.0, 60.0)},

@@ -1,15 +1,13 @@
-/* Read states, one a line, and answer what the controller does there: status, drives, plan.
+/* Read what a controller is given, a sample a line, and answer what it does: status, drives, plan.
  *
- * A line: x, w, measured disturbances, drives, whether there is a plan, the plan, target and side of before,
- * reading, its disturbances, target, whether time is up, the time of before, where targets ramp; numbers as %a or
- * "nan".
+ * A line: whether it starts at rest here, whether time is up, reading, measured disturbances, drives that were
+ * applied, target; numbers as %a or "nan".
  */
 #include "tg_design.h"
 
 #include <math.h>
 #include <stdio.h>
 #include <stdlib.h>
-#include <string.h>
 
 static tg_controller controller;
 
@@ -29,32 +27,18 @@ static int read_numbers(double *into, int n)
 int main(void)
 {
     tg_controller *c = &controller;
-    double y[TG_NY], d[TG_SOME(TG_ND)], target[TG_NC], planned, late, time_s;
-    double cold[TG_NY], room[TG_SOME(TG_ND)];
-    for (int i = 0; i < TG_NY; i++)
-        cold[i] = tg_the_design.ambient;
-    for (int i = 0; i < TG_SOME(TG_ND); i++)
-        room[i] = tg_the_design.usual_d[i];
+    double begins, late, y[TG_NY], d[TG_SOME(TG_ND)], applied[TG_NU], target[TG_NC];
     printf("ram %lu design %lu\n", (unsigned long)sizeof(tg_controller), (unsigned long)sizeof(tg_design));
-    for (;;) {
+    while (read_numbers(&begins, 1)) {
         tg_move move;
-        tg_reset(c, &tg_the_design, cold, room);
-        memset(c->found_offset, 0, sizeof c->found_offset);
-        if (!read_numbers(c->x, TG_NX))
-            return 0;
-        if (!read_numbers(c->w, TG_NW) || !read_numbers(c->d, TG_ND) || !read_numbers(c->u, TG_NU) ||
-            !read_numbers(&planned, 1) || !read_numbers(c->plan, tg_the_design.N * TG_NU) ||
-            !read_numbers(c->target, TG_NC) || !read_numbers(c->side, TG_NC) || !read_numbers(y, TG_NY) ||
-            !read_numbers(d, TG_ND) || !read_numbers(target, TG_NC) || !read_numbers(&late, 1) ||
-            !read_numbers(&time_s, 1) || !read_numbers(c->ramped, TG_NC))
+        if (!read_numbers(&late, 1) || !read_numbers(y, TG_NY) || !read_numbers(d, TG_ND) ||
+            !read_numbers(applied, TG_NU) || !read_numbers(target, TG_NC))
             return 1;
-        c->time_s = time_s;
+        if (begins != 0.0)
+            tg_reset(c, &tg_the_design, y, d);
         c->late = time_is_up;
         c->about = &late;
-        c->fresh = 0;
-        c->has_plan = planned != 0.0;
-        memcpy(c->in_force, c->u, sizeof c->in_force);
-        move = tg_step(c, NAN, y, d, NULL, target);
+        move = tg_step(c, NAN, y, d, applied, target);
         printf("%d", move.status);
         for (int j = 0; j < TG_NU; j++)
             printf(" %a", move.drive[j]);
@@ -62,4 +46,5 @@ int main(void)
             printf(" %a", tg_planned(c, j / TG_NU, j % TG_NU));
         printf("\n");
     }
+    return 0;
 }

@@ -246,8 +246,7 @@ static int absorb(tg_controller *c, double *y, const double *d, const double *ap
         expect(c);
     }
     c->fresh = 0;
-    if (!s->move_delay) /* the slew limit counts from what was really applied */
-        memcpy(c->u, applied, sizeof c->u);
+    memcpy(c->u, applied, sizeof c->u); /* the slew limit counts from what was really applied */
     for (int i = 0; i < TG_ND; i++)
         if (isfinite(d[i]))
             c->d[i] = d[i];
@@ -312,7 +311,7 @@ static void ramp(tg_controller *c)
     for (int k = 0; c->ramps && k < s->N; k++)
         for (int r = 0; r < s->n_c; r++) {
             double end = c->goals ? c->goals[k * s->n_c + r] : c->target[r];
-            double reach = (s->move_delay + k + 1) * s->ramp[r] * s->dt;
+            double reach = (k + 1) * s->ramp[r] * s->dt;
             if (s->ramp[r] > 0.0)
                 end = fmin(fmax(end, c->ramped[r] - reach), c->ramped[r] + reach);
             c->path[k * s->n_c + r] = end;
@@ -320,29 +319,6 @@ static void ramp(tg_controller *c)
 #else
     memcpy(c->ramped, c->target, sizeof c->ramped);
 #endif
-}
-
-void tg_set_prices(tg_controller *c)
-{
-    const tg_design *s = c->design;
-    int k = 0;
-    for (int b = 0; b < s->n_b; b++) {
-        c->dear[b] = s->blocks[b];
-#if TG_NT > 0
-        if (!isfinite(c->time_s))
-            continue;
-        c->dear[b] = 0.0;
-        for (int left = s->blocks[b]; left > 0; left--, k++) {
-            double second = (double)fmod(c->time_s + s->dt * k, TG_DAY), factor = s->tariff[TG_NT - 1]; /* of the day before */
-            if (second < 0.0)
-                second += TG_DAY;
-            for (int i = 0; i < TG_NT && s->tariff_from[i] <= second; i++)
-                factor = s->tariff[i];
-            c->dear[b] += factor;
-        }
-#endif
-    }
-    (void)k;
 }
 
 /* How many whole samples ago a plan was made, and the share of one. */
@@ -416,25 +392,17 @@ static int optimise(tg_controller *c)
 {
     const tg_design *s = c->design;
     int status, changes;
-    double last[TG_NU], guess[TG_Q_N], x[TG_NX], u[TG_NU], d[TG_SOME(TG_ND)], on_u[TG_NU], on_y[TG_NY];
+    double last[TG_NU], guess[TG_Q_N], d[TG_SOME(TG_ND)], on_u[TG_NU], on_y[TG_NY];
+    const double *x = tg_now(c);
     tg_biases(c, on_u, d, on_y);
     for (int i = 0; i < TG_ND; i++)
         d[i] += c->d[i];
-    for (int j = 0; j < TG_NU; j++) {
+    for (int j = 0; j < TG_NU; j++)
         last[j] = fmin(fmax(c->u[j], s->lowest[j]), s->highest[j]);
-        u[j] = last[j] + on_u[j];
-    }
-    memcpy(x, tg_now(c), sizeof x);
-    for (int part = 0; s->move_delay && part < s->sub; part++) { /* the drive applied now stays one sample more */
-        double next[TG_NX];
-        tg_model_next(x, u, d, s->k, next);
-        memcpy(x, next, sizeof x);
-    }
     tg_guess(c, last, guess);
     c->caution = 1.0;
     for (int i = 0; i < TG_NY; i++)
         c->caution = fmin(fmax(c->caution, fabs(c->innovation[i]) / TG_CAUTION), TG_MOST_CAUTION);
-    tg_set_prices(c);
     status = tg_optimise(c, x, last, guess, d, c->ramped, c->side, on_y, on_u);
     changes = c->iterations;
     for (int n = 1; n < s->iterations && status == TG_QP_SOLVED && !s->linear && has_moved(s, guess, c->best); n++) {
@@ -756,7 +724,7 @@ tg_move tg_step(tg_controller *c, tg_time time_s, const double *y, const double 
                 const double *target)
 {
     tg_move move;
-    double clean_y[TG_NY], clean_d[TG_SOME(TG_ND)], did[TG_NU], in_force[TG_NU], silent;
+    double clean_y[TG_NY], clean_d[TG_SOME(TG_ND)], did[TG_NU], silent;
     int said, wrong;
     receive(c, time_s, y, d, applied, clean_y, clean_d, did);
     pass(c, did);
@@ -766,7 +734,6 @@ tg_move tg_step(tg_controller *c, tg_time time_s, const double *y, const double 
     said = absorb(c, clean_y, clean_d, did, &silent);
     if (said == TG_ALL_WELL && c->stale)
         said = TG_STALE;
-    memcpy(in_force, c->u, sizeof in_force);
     wrong = set_target(c, target);
     ramp(c);
     decide(c, &move);
@@ -782,8 +749,7 @@ tg_move tg_step(tg_controller *c, tg_time time_s, const double *y, const double 
         move.over = silent;
     keep_within(c, move.drive);
     memcpy(c->u, move.drive, sizeof c->u);
-    /* where the computer is slow, the present drive stays while the new one is computed */
-    memcpy(c->in_force, c->design->move_delay ? in_force : c->u, sizeof c->in_force);
+    memcpy(c->in_force, move.drive, sizeof c->in_force);
     set_pump(&move);
     c->status = move.status;
     c->advice = move.advice;

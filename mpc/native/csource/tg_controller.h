@@ -83,7 +83,6 @@ typedef struct {
     double seen[TG_NX];                 /* the state after the newest reading */
     double integral[TG_NC];             /* of the PI controller */
     double caution;                     /* how many times the weight of moves counts */
-    double dear[TG_NB];                 /* samples of each block, each as often as the price of energy counts then */
     double ramped[TG_NC];               /* where targets are that may only ramp */
     double steady_x[TG_NX], steady_u[TG_NU], miss_sum; /* nearest to the targets, and evidence that they are missed */
     double nearest;                                    /* what the output that misses its target most can be held at */
@@ -101,7 +100,7 @@ typedef struct {
     double path[TG_SOME(TG_NR)]; /* in place of goals, where targets may only ramp */
     double G[TG_SOME(TG_NE)]; /* the response: the soft rows of the program, sample by sample */
     double y_guess[TG_NH * TG_NY], y_try[TG_NH * TG_NY];
-    double free[TG_NH * TG_SOME(TG_NS) + TG_NP];
+    double free[TG_NH * TG_SOME(TG_NS)];
     double seed[2 * TG_NX * TG_WIDE], seed_u[TG_NU * TG_WIDE], seed_d[TG_SOME(TG_ND) * TG_WIDE];
     double by_drives[4 * TG_SOME(TG_NF)]; /* what the drives of four blocks fix in the model's step */
     double partials[TG_SOME(TG_NM)], jacobian[TG_Z * TG_Z], spare[TG_Z * TG_Z];
@@ -148,7 +147,6 @@ void tg_hold_drives(tg_controller *c);
 double tg_planned(const tg_controller *c, int k, int j); /* drive j in the k-th sample from now */
 void tg_guess(const tg_controller *c, const double *last, double *guess);
 void tg_keep_plan(tg_controller *c);
-void tg_set_prices(tg_controller *c); /* of the samples ahead of its time */
 /* Outputs of a plan, sample by sample, plus the output bias. */
 void tg_simulate(tg_controller *c, const double *start, const double *plan, const double *drive_bias, const double *d,
                  const double *bias, double *y);

@@ -105,7 +105,6 @@ int tg_host_qp(tg_controller *c, int n, int s, const double *H, const double *f,
     q->stride = TG_NU;
     q->s = s;
     q->per = 1;
-    q->moves = 0;
     q->price[0] = q->at_end[0] = linear;
     q->ratio[0] = quadratic / linear;
     q->iteration_limit = 500;

@@ -5,13 +5,12 @@
  *
  *     H = 2 ( G'WG + move D'D + drive L ),     f = 2 ( G'W (y0 - G z0 - r) - move D'e ).
  *
- * Where travel has a price, D z are soft rows behind those of the samples, between e and e.
  * G is propagated as tangents of the step, a column for each drive of each block that has begun.  Its rows are the
  * soft rows of the program, for each sample those of the controlled, then of the limited outputs; the rows of four
  * samples are as long as the longest of them, so that what is added up over samples is added up for four at once.
  * A Peltier's gain falls in proportion to its drive: the gain along the guess gives the drive at which a quarter
- * remains, and no block goes further.  Where the simulated cost of the QP's plan is above that of the guess, or
- * every fifth sample, shorter moves and plain ramps are tried too: near the optimum of a Peltier element the
+ * remains, and no block goes further.  Where the simulated cost of the QP's plan is above that of the guess, shorter
+ * moves are tried too, and every fifth sample plain ramps: near the optimum of a Peltier element the
  * linearisation overestimates the effect, and beyond it the gain changes sign.
  * Of a linear plant G, and the factor of H while the weights stay, are made once, what the state makes of the outputs
  * is in the design, and the QP's plan is the best.
@@ -79,15 +78,6 @@ static void lay_out(tg_controller *c)
                     at += c->qp.filled[i];
                 }
         }
-    for (int j = 0, n = s->n_b * TG_NU; s->travel > 0.0 && j < n; j++, i++) { /* travel */
-        c->qp.start[i] = at;
-        c->qp.filled[i] = TG_WHOLE(n);
-        memset(c->G + at, 0, (size_t)c->qp.filled[i] * sizeof(double));
-        c->G[at + j] = 1.0;
-        if (j >= TG_NU)
-            c->G[at + j - TG_NU] = -1.0;
-        at += c->qp.filled[i];
-    }
     c->qp.A = c->G;
     c->laid_out = 1;
 }
@@ -298,9 +288,9 @@ static double merit(const tg_controller *c, const double *plan, const double *y,
     double cost = 0.0;
     for (int b = 0; b < s->n_b; b++)
         for (int j = 0; j < TG_NU; j++) {
-            double value = plan[b * TG_NU + j], energy = s->energy[j] * c->dear[b];
+            double value = plan[b * TG_NU + j], energy = s->energy[j] * s->blocks[b];
             double step = (value - (b ? plan[(b - 1) * TG_NU + j] : last[j])) / s->span[j];
-            cost += c->caution * s->move * step * step + s->travel * (fabs(step) + TG_CURVED * step * step);
+            cost += c->caution * s->move * step * step;
             value /= s->span[j];
             cost += s->drive * value * value * s->blocks[b] + energy * value;
         }
@@ -368,7 +358,7 @@ static void set_linear_cost(tg_controller *c, const double *target, const double
     tg_qp *q = &c->qp;
     memset(q->f, 0, sizeof q->f);
     for (int i = 0; i < q->n; i++)
-        q->f[i] = s->energy[i % TG_NU] * c->dear[i / TG_NU];
+        q->f[i] = s->energy[i % TG_NU] * s->blocks[i / TG_NU];
     for (int r = 0, apart, rows = s->n_c + s->n_l; r < s->n_c; r++) {
         const double *goal = goals_of(c, target, r, &apart);
         for (int k = 0; k < s->N; k += 4) {
@@ -472,7 +462,7 @@ static int is_kept(const tg_controller *c)
            !memcmp(c->kept_lost, c->lost, sizeof c->lost);
 }
 
-static void set_soft_rows(tg_controller *c, const double *target, const double *side, const double *last)
+static void set_soft_rows(tg_controller *c, const double *target, const double *side)
 {
     const tg_design *s = c->design;
     tg_qp *q = &c->qp;
@@ -496,10 +486,6 @@ static void set_soft_rows(tg_controller *c, const double *target, const double *
             lower[k * rows] = low + at;
             upper[k * rows] = high + at;
         }
-    }
-    for (int i = 0, at = 2 * q->n + s->N * rows; i < q->moves; i++) {
-        double before = i < TG_NU ? last[i] / s->span[i] : 0.0;
-        q->lower[at + i] = q->upper[at + i] = before;
     }
 }
 
@@ -570,7 +556,7 @@ static void consider(tg_controller *c, const double *x, const double *plan, cons
 
 static void try_others(tg_controller *c, const double *x, const double *guess, const double *d,
                        const double *target, const double *side, const double *bias, const double *drive_bias,
-                       const double *last, double least, int shorter)
+                       const double *last, double least, int shorter, int ramps)
 {
     static const double shares[4] = TG_SHARES;
     const tg_design *s = c->design;
@@ -581,7 +567,7 @@ static void try_others(tg_controller *c, const double *x, const double *guess, c
             plan[i] = guess[i] + shares[at] * (full[i] - guess[i]);
         consider(c, x, plan, d, target, side, bias, drive_bias, last, &least);
     }
-    for (int way = 0; way < 2; way++) { /* ramps: to none, and to the other end, which is not none */
+    for (int way = 0; ramps && way < 2; way++) { /* to none, and to the other end, which is not none */
         for (int b = 0; b < s->n_b; b++)
             for (int j = 0; j < TG_NU; j++) {
                 int up = s->lowest[j] == s->neutral[j] || (last[j] <= s->neutral[j] && s->highest[j] > s->neutral[j]);
@@ -626,12 +612,10 @@ int tg_optimise(tg_controller *c, const double *x, const double *last, const dou
     const tg_design *s = c->design;
     tg_qp *q = &c->qp;
     double at_guess, cost, guess[TG_Q_N], side[TG_NC];
-    int uphill;
+    int uphill, look_around;
     q->n = s->n_b * TG_NU;
     q->stride = TG_NU;
-    q->moves = s->travel > 0.0 ? q->n : 0;
-    q->travel = s->travel;
-    q->s = s->N * (s->n_c + s->n_l) + q->moves;
+    q->s = s->N * (s->n_c + s->n_l);
     set_prices(s, q);
     q->iteration_limit = s->iteration_limit;
     q->late = c->late;
@@ -657,7 +641,7 @@ int tg_optimise(tg_controller *c, const double *x, const double *last, const dou
     memcpy(c->kept_lost, c->lost, sizeof c->lost);
     set_linear_cost(c, target, last);
     set_bounds(c, guess, drive_bias, last);
-    set_soft_rows(c, target, side, last);
+    set_soft_rows(c, target, side);
     c->qp_status = tg_qp_solve(q);
     c->iterations = q->iterations;
     c->broken = 0.0;
@@ -675,9 +659,10 @@ int tg_optimise(tg_controller *c, const double *x, const double *last, const dou
     tg_simulate(c, x, c->best, drive_bias, d, bias, c->y_best);
     cost = merit(c, c->best, c->y_best, target, side, last);
     c->solves++;
-    uphill = cost > at_guess;
-    if (uphill || c->solves % TG_LOOK_AROUND == 1)
-        try_others(c, x, guess, d, target, side, bias, drive_bias, last, cost, uphill);
+    uphill = cost > at_guess; /* perhaps by rounding alone, so it is no reason for ramps */
+    look_around = c->solves % TG_LOOK_AROUND == 1;
+    if (uphill || look_around)
+        try_others(c, x, guess, d, target, side, bias, drive_bias, last, cost, uphill, look_around);
     find_broken(c);
     return c->qp_status;
 }

@@ -370,17 +370,14 @@ static int fewer(int a, int b) { return a < b ? a : b; }
 /* The price of breaking a soft row. */
 static double price_of(const tg_qp *q, int row)
 {
-    int at = row - 2 * q->n, end = q->s - q->moves;
-    if (at >= end)
-        return q->travel;
-    return at >= end - q->per ? q->at_end[at % q->per] : q->price[at % q->per];
+    int at = row - 2 * q->n;
+    return at >= q->s - q->per ? q->at_end[at % q->per] : q->price[at % q->per];
 }
 
 /* By what its square is dearer. */
 static double ratio_of(const tg_qp *q, int row)
 {
-    int at = row - 2 * q->n;
-    return at >= q->s - q->moves ? 2.0 * TG_CURVED : q->ratio[at % q->per];
+    return q->ratio[(row - 2 * q->n) % q->per];
 }
 
 /* Set the right side of a row in the set from its bound and its state. */

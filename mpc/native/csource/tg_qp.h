@@ -3,7 +3,7 @@
  *   minimise    1/2 x'Hx + f'x + sum over soft rows price (s + 1/2 ratio s^2)
  *   subject to  lower <= x <= upper                   rows 0 .. n-1, hard
  *               lower <= x_i - x_(i-stride) <= upper  rows n .. 2n-1, hard; x_(negative) is 0
- *               lower - s <= A x <= upper + s, s >= 0 rows 2n .. 2n+s-1, soft; the last of them price travel
+ *               lower - s <= A x <= upper + s, s >= 0 rows 2n .. 2n+s-1, soft
  *
  * The theory is at the head of tg_qp.c.
  */
@@ -15,7 +15,7 @@
 #define TG_FAR 1e15 /* a bound beyond it is none */
 
 #define TG_Q_N (TG_NB * TG_NU)
-#define TG_Q_S (TG_NH * TG_NS + TG_NP)
+#define TG_Q_S (TG_NH * TG_NS)
 #define TG_Q_M (2 * TG_Q_N + TG_Q_S)
 
 /* Rows are stored in whole groups of four numbers, zeros behind their last, and worked through four at a time. */
@@ -39,7 +39,7 @@ enum tg_qp_status {
 
 typedef struct {
     /* the problem */
-    int n, stride, s, per, moves; /* per: soft rows in a sample; moves: those at the end that price travel */
+    int n, stride, s, per; /* per: soft rows in a sample */
     double H[TG_Q_N * TG_Q_W]; /* lower triangle, rows of TG_Q_W; U' of H = UU' afterwards, its diagonal inverted */
     double f[TG_Q_W];
     double lower[TG_Q_M], upper[TG_Q_M]; /* beyond +-1e15: none */
@@ -47,7 +47,7 @@ typedef struct {
                       * behind; a multiple of four, and no fewer than the row before */
     int start[TG_Q_S > 0 ? TG_Q_S : 1], filled[TG_Q_S > 0 ? TG_Q_S : 1];
     double price[TG_NS > 0 ? TG_NS : 1], at_end[TG_NS > 0 ? TG_NS : 1]; /* of a sample's soft rows; of the last one's */
-    double ratio[TG_NS > 0 ? TG_NS : 1], travel; /* travel: the price of the rows at the end */
+    double ratio[TG_NS > 0 ? TG_NS : 1];
     int iteration_limit, kept; /* whether H (its factor) and A are those of the last solve */
     int (*late)(void *about); /* asked before every change of the working set: time is up; may be NULL */
     void *about;

@@ -130,9 +130,9 @@ def export(
     controller: ControllerFile,
     out: Annotated[Path, cli.opt("--out", "DIR", "Folder of the C files.")],
     check: Annotated[
-        bool, cli.flag("--check", "Build it (gcc) and compare it with Python on random states.")
+        bool, cli.flag("--check", "Build it (gcc) and compare it with Python in random loops.")
     ] = False,
-    states: Annotated[int, cli.opt("--states", None, "Random states of --check.", min=1)] = 3_000,
+    states: Annotated[int, cli.opt("--states", None, "Samples of --check.", min=1)] = 3_000,
     arduino: Annotated[bool, cli.flag("--arduino", "Write it as a library of the Arduino IDE.")] = False,
     ros2: Annotated[bool, cli.flag("--ros2", "Write it as a ROS 2 node in Python, not as C.")] = False,
     network: cli.OwnNetwork = None,
@@ -179,7 +179,8 @@ def export(
         if isinstance(loaded, PIController):
             found, how = check_pi(written, loaded, **about), "samples of random readings"
         else:
-            found, how = check_export(written, loaded, **about), "random states under the sanitizers"
+            found = check_export(written, loaded, **about)
+            how = "samples of random loops under the sanitizers"
     console.say(
         f"{found.states} {how}: drives differ by at most {found.difference:.1e} "
         f"of their range ({found.free} of them at no limit), same status in {found.same_status}. "

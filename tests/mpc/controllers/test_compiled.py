@@ -28,14 +28,12 @@ ZONES = {"zones": {"t1": 1.0, "t2": 1.5}, "energy_price": {"q1": 1.0, "q2": 0.5}
 CASES = {
     "a tank whose cooling turns over": (tank, {"dt": 2.0}),
     "its limit, and programs to convergence": (tank, {"limits": {"t_tank": (8.0, 45.0)}, "iterations": 5}),
-    "a slow computer": (tank, {"dt": 2.0, "move_delay": 1}),
     "both outputs by one drive": (make_tank, {"dt": 2.0, "controlled": ("t_tank", "t_surface")}),
     "a drive without a loop": (make_tank, {"dt": 2.0, "loops": (), "safe_drive": {"drive": 0.1}}),
     "two heaters": (board, {"dt": 5.0, "weights": {"t2": 9.0}}),
-    "zones, prices and a tariff": (board, {"dt": 5.0, "tariff": ((0.0, 1.0), (300.0, 4.0))} | ZONES),
+    "zones and prices": (board, {"dt": 5.0} | ZONES),
     "ramps": (board, {"dt": 5.0, "ramp_per_s": {"t1": 0.04}}),
     "a hard limit": (board, {"dt": 5.0, "limits": {"t2": (20.0, 38.0)}, "hard": ("t2",)}),
-    "travel has a price": (board, {"dt": 5.0, "travel": 2.0}),
     "outputs that cross": (crossed, {"controlled": ("b", "a"), "blocks": (1, 2, 3, 6)}),
 }
 

@@ -6,20 +6,18 @@ import os
 import re
 import shutil
 import subprocess
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from tests.mpc.makers import heater, kit, network_plant
+from tests.mpc.makers import heater, kit
 from thermogrip.datasets.errors import UserError
 from thermogrip.mpc.controllers import export as exports
 from thermogrip.mpc.controllers.export import Agreement, Export, check_export, export_controller
 from thermogrip.mpc.controllers.mpc import Controller
 from thermogrip.mpc.design.design import default_design
-from thermogrip.mpc.interface import STATUSES, Move
 from thermogrip.mpc.native.codegen import write_model
 from thermogrip.mpc.native.runtime import compiler
 from thermogrip.sysid.models.network import load_network
@@ -44,13 +42,15 @@ def run_example(export: Export) -> subprocess.CompletedProcess[str]:
 
 
 @needs_gcc
-def test_c_and_python_do_the_same_from_random_states(controller, tmp_path):
+def test_c_and_python_do_the_same_in_random_loops(controller, tmp_path):
+    """In a third of a thousand samples the plan of the program costs more than the last one, and others are
+    tried."""
     export = export_controller(controller, tmp_path)
-    found = check_export(export, controller, states=150)
+    found = check_export(export, controller, states=1300)
     assert found.difference <= 1e-9
-    assert found.same_status == 150
+    assert found.same_status == 1300
     assert found.passed
-    assert found.free > 30
+    assert found.free > 300
     assert found.ram > 8 * controller.model.n_x**2  # its covariance, for one
     assert found.flash > found.constants > 0
     assert 0 < found.stack < 10_000
@@ -147,18 +147,18 @@ def test_a_wrong_number_in_the_export_is_found(controller, tmp_path):
     wrong = re.sub(r"\.move = ([0-9.e-]+),", r".move = 1.01 * \1,", text)
     assert wrong != text
     design.write_text(wrong)
-    assert not check_export(export, controller, states=20, sanitize=False).passed
+    assert not check_export(export, controller, states=100, sanitize=False).passed
 
 
 @needs_gcc
 @pytest.mark.parametrize(
     ("make", "changes", "sanitize"),
     [
-        (heater, {"offset_free": False, "limits": {"t": (10.0, 55.0)}}, False),
-        (heater, {"ramp_per_s": {"t": 0.1}, "move_delay": 1, "limits": {"t": (22.0, 40.0)}}, False),
+        (heater, {"limits": {"t": (10.0, 55.0)}}, False),
+        (heater, {"ramp_per_s": {"t": 0.1}, "limits": {"t": (22.0, 40.0)}}, False),
         (
             heater,
-            {"travel": 2.0, "blocks": (1, 2, 3), "zones": {"t": 1.0}, "energy_price": {"q": 0.3}},
+            {"blocks": (1, 2, 3), "zones": {"t": 1.0}, "energy_price": {"q": 0.3}},
             False,
         ),
         (
@@ -176,14 +176,12 @@ def test_a_wrong_number_in_the_export_is_found(controller, tmp_path):
             {
                 "zones": {"t1": 1.5, "t2": 0.5},
                 "energy_price": {"q1": 0.5, "q2": 2.0},
-                "tariff": ((36000.0, 1.0), (43200.0, 4.0), (64800.0, 2.0)),
                 "ramp_per_s": {"t2": 0.02},
             },
             False,
         ),
-        long(heater, {"blocks": (1,), "move_delay": 1}, True),
+        long(heater, {"blocks": (1,)}, True),
         long(kit, {"dt": 10.0, "controlled": ("t2",), "limits": {"t1": (0.0, 50.0)}}, True),
-        long(kit, {"travel": 20.0, "limits": {"t1": (20.0, 42.0)}}, True),
         long(kit, {"blocks": (1, 2, 3)}, True),  # slews that end on ranges, a broken band
     ],
 )
@@ -191,7 +189,7 @@ def test_controllers_of_any_size_build_and_do_the_same(make, changes, sanitize, 
     controller = make(**changes)
     export = export_controller(controller, tmp_path)
     found = check_export(export, controller, states=40, sanitize=sanitize)
-    assert found.difference <= (1e-8 if "hard" in changes else 1e-9)
+    assert found.difference <= (1e-6 if "hard" in changes else 1e-9)
     assert found.same_status == 40
     assert found.passed
 
@@ -249,22 +247,6 @@ def test_an_export_passes_where_drives_and_statuses_are_the_same(
     assert Agreement(7, difference, 3, status, 1, 1, 1, 1).passed == passed
 
 
-def test_a_check_says_the_largest_difference_and_how_often_each_was_the_same(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
-    answers = [(0.0, True, True), (2e-3, False, True), (1e-4, True, False)]
-    built, left = [], iter(answers)
-    monkeypatch.setattr(exports, "compiler", lambda: "gcc")
-    monkeypatch.setattr(exports, "_make", lambda folder, *targets: built.append(targets))
-    answered = (100, 50), ["0 1"] * 3
-    monkeypatch.setattr(exports, "_answers", lambda export, given, sanitize: answered)
-    monkeypatch.setattr(exports, "_compare", lambda twin, state, answer: next(left))
-    monkeypatch.setattr(exports, "_footprint", lambda folder: (7000, 300))
-    found = exports.check_export(exports.Export(tmp_path, ()), heater(), states=3)
-    assert found == Agreement(3, 2e-3, 2, 2, 7000, 100, 50, 300)
-    assert built == [("all", "sanitized")]
-
-
 def test_sanitizers_must_not_change_an_answer():
     line = "0 " + " ".join(value.hex() for value in (0.25, -0.5))
     exports._same_answers([line, line], [line, line])
@@ -275,81 +257,31 @@ def test_sanitizers_must_not_change_an_answer():
             exports._same_answers([line, line], [line, other])
 
 
-def answer_of(move: Move, twin: Any, shift: float = 0.0) -> list[str]:
-    model = twin.model
-    drive = np.array(move.drives(model.drives))
-    plan = np.zeros((0, model.n_u)) if twin.plan is None else twin.plan
-    numbers = np.concatenate([drive[None] + shift, plan]).ravel().tolist()
-    return [str(STATUSES.index(move.status)), *(v.hex() for v in numbers)]
-
-
 @pytest.mark.parametrize(("make", "span"), [(heater, 1.0), (kit, 100.0)])
 def test_a_difference_is_in_shares_of_a_drives_range(make: Any, span: float):
-    twin = exports._twin(make())
-    rng, seen = np.random.default_rng(0), set()
-    for _ in range(24 if span == 1.0 else 2):
-        state = exports._random_state(twin, rng)
-        twin.clock.step = 60.0 if state.late else 0.0
-        twin.place(state)
-        reading = dict(zip(twin.model.outputs, state.y.tolist())) | dict(
-            zip(twin.model.disturbances, state.d_now.tolist())
-        )
-        move = twin.step(reading, dict(zip(twin.controlled, state.wanted.tolist())))
-        same = answer_of(move, twin)
-        difference, free, status = exports._compare(twin, state, same)
-        assert (difference, status) == (0.0, True)
-        moved = exports._compare(twin, state, answer_of(move, twin, shift=1e-3 * span))[0]
-        assert moved == pytest.approx(1e-3)
-        assert exports._compare(twin, state, same[:-1] if span == 1.0 else same[:-2])[0] == np.inf
-        other = [str((int(same[0]) + 1) % 6), *same[1:]]
-        assert not exports._compare(twin, state, other)[2]
-        seen.add(free)
-        drives = np.array(list(move.drive.values()) if isinstance(move.drive, dict) else [move.drive])
-        if free:  # then it is inside its range, and its slew from where it was
-            assert np.all((drives > 0) & (drives < span))
-            assert np.all(np.abs(drives - state.u) < twin.optimiser.slew)
-    assert span != 1.0 or True in seen  # the kit's are hardly ever
+    controller = make()
+    (sample,) = exports._random_loop(controller, 1, 0, None)
+    for shift, difference in ((0.0, 0.0), (1e-3, 1e-3)):
+        numbers = (span * (sample.drives + shift)).ravel()
+        answer = " ".join(["0", *(float(number).hex() for number in numbers)])
+        found = exports._difference(sample, answer, controller.model.span)
+        assert found == pytest.approx(difference, abs=1e-12)
+    short = answer.rsplit(" ", controller.model.n_u)[0]
+    assert exports._difference(sample, short, controller.model.span) == np.inf
 
 
-def test_random_states_hold_some_of_every_misfortune():
-    twin = exports._twin(heater())
-    rng = np.random.default_rng(1)
-    states = [exports._random_state(twin, rng) for _ in range(400)]
-    share = {
-        "late": np.mean([s.late for s in states]),
-        "no plan": np.mean([s.plan is None for s in states if not s.late]),
-        "late without a plan": np.mean([s.plan is None for s in states if s.late]),
-        "lost": np.mean([np.isnan(s.y) for s in states]),
-        "moved target": np.mean([np.any(s.wanted != s.target) for s in states]),
-        "out of range": np.mean([np.any((s.u < 0) | (s.u > 1)) for s in states]),
-    }
-    wanted = {"late": 0.05, "no plan": 0.05, "late without a plan": 0.5, "lost": 0.03, "moved target": 0.3}
-    for name, value in wanted.items():
-        n = {"late without a plan": 20}.get(name, 400)
-        assert abs(share[name] - value) < 4 * np.sqrt(value * (1 - value) / n), name
-    assert share["out of range"] < 0.05
-    for state in states[:50]:
-        assert state.flat().size == states[0].flat().size
-        assert np.all((state.plan_text >= 0) & (state.plan_text <= 1))
-
-
-def test_every_random_state_in_time_whose_output_is_read_is_one_for_the_optimiser():
-    """One whose reading is left out as a jump is not; and to find a rest for each takes longer than that."""
-    plant = network_plant("gripper", t_tank=(5.0, 60.0), t_surface=(5.0, 60.0))
-    twin = exports._twin(Controller(plant, default_design(plant)))
-    rng, rests, programs, asked = np.random.default_rng(0), [], [], []
-    rest, solve = twin.model.rest, twin.optimiser.solve
-    vars(twin.model)["rest"] = lambda y, d: rests.append(1) or rest(y, d)
-    vars(twin.optimiser)["solve"] = lambda sample: programs.append(1) or solve(sample)
-    skin = twin.model.outputs.index("t_surface")
-    for _ in range(40):
-        state = exports._random_state(twin, rng)
-        programs.clear()
-        exports._compare(twin, state, ["0"])
-        asked.append(len(programs))
-        assert asked[-1] == (not state.late and np.isfinite(state.y[skin]))
-    assert sum(asked) > 33  # of 40; late are 5 % of states, and 3 % of readings lost: 36.9 +- 1.7
-    assert len(rests) < 60  # a place for each, and a few to start with
+def test_random_loops_hold_some_of_every_misfortune():
+    controller = heater()
+    played = exports._random_loop(controller, 400, 1, None)
+    given = np.array([[float.fromhex(word) for word in sample.given.split()] for sample in played])
+    begins, late, y, applied, target = given.T
+    assert np.flatnonzero(begins).tolist() == list(range(0, 400, 40))
+    moved = np.mean((np.diff(target) != 0) & (begins[1:] == 0))
+    for share in (np.mean(late), np.mean(np.isnan(y)), moved):
+        assert 0.01 < share < 0.08
+    assert 0.0 < np.mean((applied < 0) | (applied > 1)) < 0.05
+    assert {sample.status for sample in played} >= {"ok", "late", "fallback_plan"}
+    assert 0.2 < np.mean([sample.free for sample in played]) < 0.9
 
 
 def test_the_readme_gives_the_controllers_own_numbers(tmp_path: Path):
@@ -358,19 +290,6 @@ def test_the_readme_gives_the_controllers_own_numbers(tmp_path: Path):
     text = " ".join((tmp_path / "README.md").read_text().split())
     assert "q1 in [0, 100]; q2 in [0, 100]" in text
     assert "double target[2] = {35.0, 35.0};" in text
-    low, high = exports._range_of(controller)
-    assert (low, high) == (20.0, 60.0)
-    room = np.full(controller.model.n_d, controller.design.ambient)
-    off = []
-    for level in np.linspace(low, high, 5):  # as far as the plant is not its tangent about the room
-        controller.observer.reset(np.full(2, level), room)
-        x = controller.observer.x
-        controller.observer.reset_in_room(np.full(2, level), room)
-        off.append(np.abs(controller.observer.x - x).max())
-    assert exports._rest_error(controller, low, high) == pytest.approx(max(off))
-    assert f"at most {max(off):.2g} degC" in text
-    plain = replace(controller.plant, valid={})
-    assert exports._range_of(Controller(plain, controller.design)) == (15.0, 45.0)
 
 
 def test_the_stack_is_the_largest_frame_of_the_library(tmp_path: Path):

@@ -119,9 +119,9 @@ def test_a_saved_controller_loads_and_moves_the_same(tank, tmp_path):
     ("change", "says"),
     [
         (lambda c: c.pop("design"), "design is missing"),
-        (lambda c: c["design"].pop("blocks"), "not a whole controller"),
-        (lambda c: c["design"].update(extra=1), "no field extra"),
-        (lambda c: c["design"].update(drive_range={"drive": [1.0, -1.0]}), "which is empty"),
+        (lambda c: c["design"].pop("blocks"), "blocks: field required"),
+        (lambda c: c["design"].update(extra=1), "extra: no such key"),
+        (lambda c: c["design"].update(drive_range={"drive": [1.0, -1.0]}), "1 to -1 is empty"),
         (lambda c: c["design"].update(controlled=["t_nose"]), "no output t_nose"),
         (lambda c: c.update(schema="thermogrip.plant"), "schema"),
         (lambda c: c["plant"].pop("values"), "not a whole plant"),

@@ -144,13 +144,8 @@ def test_a_prediction_that_fails_is_a_fallback_and_no_target_is_off(two, monkeyp
     assert (u.tolist(), said) == ([0.0, 0.0], ["off", "no target yet: drive to zero"])
 
 
-@pytest.mark.parametrize(
-    ("move_delay", "x"),
-    # 0.9 * 20 + 0.02 * 58 + 0.1 * 22 and 0.8 * 30 + 0.05 * 103 + 0.2 * 22
-    [(0, [20.0, 30.0]), (1, [21.36, 33.55])],
-)
-def test_the_optimiser_starts_where_the_next_drive_will_act(monkeypatch, move_delay, x):
-    two, asked = make_two(move_delay=move_delay), []
+def test_the_optimiser_starts_from_the_estimate_and_the_last_plan(monkeypatch):
+    two, asked = make_two(), []
     monkeypatch.setattr(two.optimiser, "solve", lambda sample: asked.append(sample) or FOUND)
     two.observer.x, two.observer.w, two.observer.found_offset = (
         np.array([20.0, 30.0]), np.array([0.03, -0.02]), np.array([0.4, 0.7]),
@@ -168,7 +163,7 @@ def test_the_optimiser_starts_where_the_next_drive_will_act(monkeypatch, move_de
         two._plan, two._age_s = plan, 2.0
         two._optimise(np.array([33.0, 30.0]), None)
         for name, wanted in {
-            "x": x, "last": [100.0, 60.0], "guess": guess, "d": [22.0], "slew_s": 5.0,
+            "x": [20.0, 30.0], "last": [100.0, 60.0], "guess": guess, "d": [22.0], "slew_s": 5.0,
             "target": [33.0, 30.0], "side": [1.0, -1.0], "bias": [0.4, 0.7], "drive_bias": [3.0, -2.0],
             "lost": [False, True],
         }.items():  # fmt: skip
@@ -230,9 +225,8 @@ def test_without_an_answer_there_is_the_plan_then_the_pi_then_none(
          "no reading for 45 s: the estimate was started again", [0, 0], 21.0),
     ],
 )  # fmt: skip
-@pytest.mark.parametrize("move_delay", [0, 1])
-def test_a_reading_is_taken_in_with_what_it_lacks(y, d, state, said, unread, room, move_delay):
-    two = make_two(move_delay=move_delay)
+def test_a_reading_is_taken_in_with_what_it_lacks(y, d, state, said, unread, room):
+    two = make_two()
     two.times.call({"time_s": 5.0})
     two.times.moved()
     two.times.call({"time_s": 8.5})
@@ -247,7 +241,7 @@ def test_a_reading_is_taken_in_with_what_it_lacks(y, d, state, said, unread, roo
     assert two._unread_s.tolist() == unread  # 3.5 s more
     assert two._d.tolist() == [room]
     again = said.startswith("no reading for")
-    assert two._u.tolist() == ([41.0, 63.0] if move_delay or again else [12.0, 13.0])
+    assert two._u.tolist() == ([41.0, 63.0] if again else [12.0, 13.0])
     assert not two._fresh
     assert (two._target.tolist(), two._side.tolist()) == ([33.0, 30.0], [1.0, -1.0])
     if again:
@@ -307,18 +301,15 @@ def test_a_drive_goes_back_by_its_slew_while_the_pump_is_off(tank):
         (("late", "there"), "", UNKNOWN, ("late", "target names c, controlled is b, a")),
     ],
 )  # fmt: skip
-@pytest.mark.parametrize("move_delay", [0, 1])
-def test_an_answer_has_the_status_and_the_first_cause(
-    monkeypatch, decided, said, target, answered, move_delay
-):
-    two = make_two(move_delay=move_delay)
+def test_an_answer_has_the_status_and_the_first_cause(monkeypatch, decided, said, target, answered):
+    two = make_two()
     two._u = np.array([41.0, 63.0])
     monkeypatch.setattr(two, "_absorb", lambda y, d, applied: said)
     monkeypatch.setattr(two, "_decide", lambda wanted, ahead, started: (np.array([99.0, 60.0]), *decided))
     move = two.step(READ, target)
     assert (move.status, move.advice) == answered
     assert move.drive == {"q1": 66.0, "q2": 60.0}  # 25 a sample
-    assert two._in_force.tolist() == ([41.0, 63.0] if move_delay else [66.0, 60.0])
+    assert two._in_force.tolist() == [66.0, 60.0]
     wanted = two._target.tolist()
     assert (wanted, two._side.tolist()) == ([30.0 + isinstance(target, dict), 30.0], [1.0, 1.0])
     two._side = np.array([7.0, 7.0])
@@ -343,8 +334,7 @@ def test_what_was_applied_is_read_drive_by_drive_and_a_stale_reading_is_none(mon
 
 def test_a_controller_has_what_its_design_says_and_a_reset_forgets_the_rest():
     ranges, slews = {"q1": (5.0, 80.0), "q2": (0.0, 90.0)}, {"q1": 4.0, "q2": 7.0}
-    two = make_two(offset_free=False, drive_range=ranges, slew_per_s=slews, dt=4.0)
-    assert two.disturbance.n_w == 0
+    two = make_two(drive_range=ranges, slew_per_s=slews, dt=4.0)
     assert [loop.feedforward for loop in two.pi.loops] == [0.0, 0.0]
     assert [loop.Kc for loop in two.pi.loops] == [loop.Kc for loop in two.design.loops]
     for made in (two, two.pi):

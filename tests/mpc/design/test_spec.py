@@ -73,7 +73,7 @@ def test_every_line_of_the_template_that_is_commented_out_is_valid_too():
         ("search_draws = 51", "search_draws: input should be less than or equal to 50"),
         ("check_draws = 201", "check_draws: input should be less than or equal to 200"),
         ("evaluations = 10001", "evaluations: input should be less than or equal to 10000"),
-        ("drive_limits = { q = [5, 5] }", "drive_limits: 5 to 5 is empty"),
+        ("drive_limits = { q = [5, 5] }", "drive_limits.q: 5 to 5 is empty"),
         ("drive_limits = [-2e12, 1]", "greater than or equal to -1000000000000"),
         ("settle_within_s = 900", "settle_within_s: 900 s is longer than each step is simulated"),
     ],

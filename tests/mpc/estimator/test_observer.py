@@ -115,7 +115,6 @@ MARGINS = {"q": 0.125, "q, b": 0.0997171, "q, a": 0.0746257, "a or b": 1.0, "roo
     [
         (("b",), {}, ("input q", "output b"), "q, b"),
         (("a",), {}, ("input q", "output a"), "q, a"),
-        (("b",), {"count": 1}, ("input q",), "q"),
         (("b",), {"least": 0.12}, ("input q",), "q"),
         (("a",), {"least": 0.09}, ("input q", "output b"), "q, b"),
         (("b",), {"least": 0.13}, ("output b", "output a"), "a or b"),
@@ -134,8 +133,6 @@ def test_a_drive_and_the_controlled_output_are_what_may_be_off(controlled, more,
 
 
 def test_what_no_set_of_disturbances_explains_is_refused() -> None:
-    none = choose_disturbances(MODEL, ("b",), count=0)
-    assert (none.names, none.margin) == ((), 0.0)
     for least in (0.12, 1e9):
         with pytest.raises(UserError, match="no disturbance model of 2 states is detectable from a, b"):
             choose_disturbances(MODEL, ("a", "b"), least=least)

@@ -322,14 +322,6 @@ def test_without_a_target_c_is_off_as_python_is(plant):
     assert (move.status, move.drive, move.pump) == ("off", 0.0, 0)
 
 
-def test_a_slow_computer_is_the_same_in_c(plant):
-    design = replace(default_design(plant), move_delay=1)
-    python, c = ReferenceController(plant, design), Controller(plant, design)
-    one = simulate_closed_loop(python, plant, [(33.0, 100.0)])
-    two = compiled_loop(c, plant, [(33.0, 100.0)])
-    np.testing.assert_allclose(two.drive["drive"], one.drive["drive"], atol=1e-9)
-
-
 def test_where_gcc_refuses_steps_run_in_python_and_that_is_reported(plant, tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setattr(build, "_FLAGS", ("-std=c99", "--no-such-flag"))

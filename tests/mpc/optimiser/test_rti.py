@@ -7,7 +7,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from scipy.optimize import minimize
 
 from tests.mpc.makers import WAYS, crossed
 from thermogrip.mpc.closed_loop.simulate import Surroundings, simulate_closed_loop
@@ -171,37 +170,6 @@ def test_the_program_costs_what_the_plan_costs_and_its_minimum_is_the_linear_law
     weights = np.array([1.5] * 5 + [6.5])
     of_b = [weights @ (outputs(plan)[:, 1] - 27.0) ** 2 for plan in PLANS]
     assert found - lost == pytest.approx(of_b[1] - of_b[0])
-
-
-@pytest.mark.parametrize(("travel", "stay"), [(1.0, 0), (8.0, 1), (60.0, 3), (400.0, 6)])
-def test_a_plan_under_a_price_of_travel_is_the_minimum_and_moves_where_it_wins_more(optimiser, travel, stay):
-    """The price is of each whole range and of a hundredth of its square; the minimum is also found by SciPy,
-    over moves up and moves down."""
-    priced = Optimiser(optimiser.model, replace(DESIGN, travel=travel, limits={}))
-    moves = [np.abs(np.diff(np.vstack([LAST, plan]) / SPAN, axis=0)) for plan in PLANS]
-    y, still = np.stack([outputs(plan) for plan in PLANS]), np.zeros(2)
-    found = priced._merit(PLANS, y, EACH, still, LAST)
-    more = [travel * np.sum(move + 0.01 * move**2) for move in moves]
-    np.testing.assert_allclose(found, [cost(p, limits=False) + m for p, m in zip(PLANS, more, strict=True)])
-
-    def total(ways: np.ndarray) -> float:
-        up, down = ways.reshape(2, 3, 2)
-        plan = LAST + SPAN * np.cumsum(up - down, axis=0)
-        return cost(plan, limits=False) + travel * float(np.sum(up + down + 0.01 * (up**2 + down**2)))
-
-    wide = replace(
-        DESIGN, travel=travel, limits={}, drive_range={"q1": (-900.0, 999.0), "q2": (-900.0, 999.0)}
-    )
-    free = Optimiser(optimiser.model, replace(wide, slew_per_s={"q1": 1e6, "q2": 1e6}, overshoot=900.0))
-    sample = Sample(START, LAST, np.tile(LAST, (3, 1)), np.array([ROOM]), TARGET, still, BIAS, still)
-    plan = free.solve(sample).plan
-    best = minimize(total, np.full(12, 1e-3), bounds=[(0.0, None)] * 12, method="L-BFGS-B",
-                    options={"maxiter": 20000, "maxfun": 200000, "ftol": 1e-15, "gtol": 1e-10})  # fmt: skip
-    up, down = best.x.reshape(2, 3, 2)
-    np.testing.assert_allclose(plan / SPAN, LAST / SPAN + np.cumsum(up - down, axis=0), atol=2e-4)
-    moved = np.abs(np.diff(np.vstack([LAST, plan]) / SPAN, axis=0))
-    np.testing.assert_array_equal(moved < 1e-9, np.abs(up - down) < 1e-6)
-    assert np.sum(moved < 1e-9) == stay
 
 
 @pytest.mark.parametrize(("side", "more"), [((1.0, 0.0), 0.0), ((-1.0, 1.0), 0.5), ((0.0, -1.0), -0.25)])
