@@ -301,6 +301,11 @@ class Design:
     def from_dict(cls, content: Mapping[str, Any]) -> Design:
         """Return the design that :meth:`to_dict` wrote; a missing or wrong field is a :class:`UserError`."""
         values = {key: value for key, value in content.items() if _WITHOUT.get(key, ...) != value}
+        if isinstance(loops := values.get("loops"), list):  # 0.1.0 kept an anti-windup time Tt too
+            values["loops"] = [
+                {key: value for key, value in loop.items() if key != "Tt"} if isinstance(loop, dict) else loop
+                for loop in loops
+            ]
         noise, ranges = values.get("noise"), values.get("drive_range")
         if isinstance(noise, dict) and isinstance(ranges, dict):
             values["noise"] = _noise_of(noise, ranges)

@@ -108,7 +108,7 @@ def test_a_controller_whose_limits_are_a_number_is_no_controller(bench: Bench) -
     for words in (["review", path], ["run", path, "--target", 30, "--twin", "plant.json", "--out", "r"]):
         done = bench.run(*words)
         assert (done.code, len(done.said)) == (2, 1)
-        assert f"{path}: its numbers make no controller" in done.err
+        assert f"{path}: slew_per_s: input should be a valid dictionary" in done.err
 
 
 def test_a_classifier_whose_parts_do_not_fit_together_is_damaged(bench: Bench) -> None:
