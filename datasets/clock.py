@@ -3,7 +3,8 @@
 A clock is known by its name, else by its behaviour: it rises from row to row in steps that are nearly even.
 Its unit is that of its header.  A header without one leaves the numbers:
 
-* between the years 2000 and 2100 they may be an epoch, in s, ms, us or ns;
+* dates between the years 2000 and 2100 they may be, as programs count them (:data:`_DATES`): in s, ms, us or
+  ns since 1970, or in what Windows, .NET, spreadsheets and MATLAB count;
 * with decimals, or less than 20 apart, they are seconds, as logs are written;
 * whole numbers further apart are seconds where their steps are whole minutes, and milliseconds or, from
   100 000 apart, microseconds of a board's counter where they are not.
@@ -20,7 +21,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,7 +42,6 @@ _STEP = re.compile(r"(?i)ts|dt|delta_?t|sampl(e|ing)_?(time|period|interval)")
 _COUNTER = re.compile(r"(?i)x|n|k|i|no|nr|id|index|idx|samples?|rows?|steps?|count(er)?|unnamed.*")
 _TIME_WORDS = {"ms": 1e-3, "milli": 1e-3, "us": 1e-6, "micro": 1e-6, "minute": 60.0, "hour": 3600.0}
 EPOCH = (946684800.0, 4102444800.0)  # s since 1970 of the years 2000 and 2100
-_EPOCH_UNITS = (1.0, 1e-3, 1e-6, 1e-9)  # s a count
 _MONOTONE = 0.9  # share of a clock's steps that do not run backward, and that are nearly even
 _EVEN = 0.2  # of their median, by which nearly even steps differ
 _COUNTS_APART, _MICROSECONDS_APART = 20.0, 1e5  # see the module's text
@@ -49,6 +49,30 @@ _PIECE_ROWS = 20  # of a part of a log that stands alone
 _ELAPSED = " as minutes and seconds"  # how times of two numbers are taken that begin at 00:00 or pass 23
 _MONTH_NAMES = ("jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec")
 _MONTHS = {month: str(number) for number, month in enumerate(_MONTH_NAMES, 1)}
+
+
+@dataclass(frozen=True)
+class _Counts:
+    """What the numbers of a clock mean."""
+
+    seconds: float  # a count
+    zero: float = 0.0  # of the counts [s since 1970]
+    calendar: str = ""  # whose days they are
+    doubt: str = ""  # what is a guess
+
+    def has(self, count: float) -> bool:
+        """Tell whether a count is a date between 2000 and 2100."""
+        return EPOCH[0] <= count * self.seconds + self.zero <= EPOCH[1]
+
+
+_DATES = (
+    *(_Counts(seconds) for seconds in (1.0, 1e-3, 1e-6, 1e-9)),  # since 1970
+    _Counts(1e-7, -11_644_473_600.0),  # FILETIME of Windows, since 1601
+    _Counts(1e-7, -62_135_596_800.0),  # ticks of .NET, since the year 1
+    _Counts(86400.0, -25569 * 86400.0, "a spreadsheet"),  # since 30 December 1899
+    _Counts(86400.0, -719529 * 86400.0, "MATLAB"),  # datenum
+)
+_DAYS_APART = 1 / 24  # days: a plant's rows are closer than an hour, which seconds so late in a day never are
 
 
 @dataclass(frozen=True)
@@ -119,10 +143,9 @@ def _of_numbers(header: str, table: Table, read: tuple[str, str, float]) -> Cloc
     rising = finite.size > 1 and np.mean(np.diff(finite) >= 0) >= _MONOTONE and np.ptp(finite) > 0
     if not (stated or rising):
         return None
-    doubt = ""
-    if unit == "1":
-        scale, doubt = _seconds_a_count(name, finite, wrapped=bool(notes))
-    seconds = to_record_unit(counts if scale == 1 else counts * scale, unit)[0]
+    meant = _what_counts_mean(name, finite, wrapped=bool(notes)) if unit == "1" else _Counts(scale)
+    scale, doubt = meant.seconds, meant.doubt
+    seconds = to_record_unit(counts if scale == 1 else counts * scale, unit)[0] + meant.zero
     seconds, restarts = _in_pieces(seconds, table.lines)
     if stated and scale == 1:
         converted = [f"time: converted from {unit} to s"] if unit != "s" else []
@@ -136,26 +159,31 @@ def _of_numbers(header: str, table: Table, read: tuple[str, str, float]) -> Cloc
     return Clock(seconds, frozenset([header]), (note, *notes, *restarts), 0.0, doubt)
 
 
-def _seconds_a_count(name: str, counts: Floats, *, wrapped: bool) -> tuple[float, str]:
-    """Return the seconds that one count of a clock without a unit means, and the doubt, if it is a guess."""
+def _what_counts_mean(name: str, counts: Floats, *, wrapped: bool) -> _Counts:
+    """Return what the counts of a clock without a unit mean."""
     word = next((f for begin, f in _TIME_WORDS.items() if name.lower().startswith(begin)), None)
-    epoch = next((f for f in _EPOCH_UNITS if EPOCH[0] <= float(counts[0]) * f <= EPOCH[1]), None)
     steps = np.diff(counts)
     usual = float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
     whole = bool(np.all(counts == np.rint(counts)))
+    likely = (date for date in _DATES if not date.calendar or (not whole and usual <= _DAYS_APART))
+    dates = next((date for date in likely if date.has(float(counts[0]))), None)
     of_board = whole and usual >= _COUNTS_APART and not np.all(steps % 60 == 0)
-    if word is not None and (epoch is None or epoch == 1.0):  # a board's counter may be as large as a date
-        return word, ""
-    if epoch is not None and not (epoch == 1.0 and of_board):
-        return epoch, ""
+    if word is not None and (dates is None or dates.seconds == 1.0):  # a board's counter may be as large
+        return _Counts(word)
+    if dates is not None and dates.calendar:
+        apart = f"so that rows are {usual * dates.seconds:.3g} s apart"
+        return replace(dates, doubt=f"{name} is taken as the time in days of {dates.calendar}, {apart}")
+    if dates is not None and not (dates.seconds == 1.0 and of_board):
+        return dates
     if not of_board:
         minutes = whole and usual >= _COUNTS_APART
         guess = f"{name} has no unit: taken as seconds, so that rows are {usual:g} s apart" if minutes else ""
-        return 1.0, guess
+        return _Counts(1.0, doubt=guess)
     # 32 bits of microseconds last for 72 minutes, of milliseconds for 50 days
     fine = usual >= _MICROSECONDS_APART or (wrapped and counts[-1] > 2**32)
     scale, unit = (1e-6, "microseconds") if fine else (1e-3, "milliseconds")
-    return scale, f"{name} has no unit: taken as {unit}, so that rows are {usual * scale:g} s apart"
+    doubt = f"{name} has no unit: taken as {unit}, so that rows are {usual * scale:g} s apart"
+    return _Counts(scale, doubt=doubt)
 
 
 def _unwrapped(counts: Floats, lines: NDArray[np.int64]) -> tuple[Floats, list[str]]:

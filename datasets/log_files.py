@@ -157,6 +157,7 @@ def read_log(
     if own:
         repairs = [line for line in table.meta.get("repairs", "").splitlines() if line]
     else:
+        roles = replace(roles, doubts=(*roles.doubts, *_code_doubts(roles.of, data)))
         time, data, found = _repair(time, data, units, roles.of, table)
         repairs += found
         if outputs is None:
@@ -363,14 +364,18 @@ def _one_column_a_signal(table: Table) -> Table:
     clocks += [h for h in table.numbers if read_header(h)[0] in ("time", "timestamp")]
     states = {h: switched(cells) for h, cells in table.text.items() if h not in clocks}
     named = [h for h in states if states[h] is None and 2 <= len({*table.text[h]}) <= MOST_SIGNALS]
-    readings = {h: values for h, values in {**table.numbers, **states}.items() if values is not None}
-    values = [h for h in readings if h not in clocks]
-    if not clocks or len(named) != 1 or len(values) != 1:
+    clocks = [h for h in clocks if len({*(table.text.get(h) or table.numbers[h].tolist())}) > 1]
+    if not clocks or len(named) != 1:
         return table
-    clock, by, value = clocks[0], named[0], values[0]
-    signals = np.array([name.rpartition(".")[2] for name in table.text[by]])
-    if len(table.lines) < 5 * np.unique(signals).size:
+    signals = np.array([name.rpartition(".")[2] for name in table.text[named[0]]])
+    columns = {**table.numbers, **{h: v for h, v in states.items() if v is not None}}
+    readings = {h: v for h, v in columns.items() if h not in clocks and np.isfinite(v).any()}
+    count = np.unique(signals).size
+    # a column with a number for each signal is its name once more
+    values = [h for h, v in readings.items() if len({*zip(signals, v)}) > count or np.unique(v).size < count]
+    if len(values) != 1 or len(table.lines) < 5 * count:
         return table
+    clock, value = clocks[0], values[0]
     clock_of_text = read_clock(table.text[clock]) if clock in table.text else None
     time = table.numbers[clock] if clock_of_text is None else clock_of_text[0]
     order = np.argsort(time, kind="stable")
@@ -419,6 +424,14 @@ def _repair(
         time, columns = time[first:last], {name: v[first:last] for name, v in columns.items()}
     repairs += repair.describe_gaps(time, {n: v for n, v in columns.items() if roles[n] == "input"})
     return time, columns, repairs
+
+
+def _code_doubts(roles: Mapping[str, str], columns: Mapping[str, Floats]) -> list[str]:
+    """Return a line for each reading with runs of what may be a sensor's code that no table has."""
+    inputs = [values for name, values in columns.items() if roles[name] == "input"]
+    readings = {name: v for name, v in columns.items() if roles[name] in ("output", "disturbance")}
+    doubts = (repair.doubt_codes(name, values, inputs) for name, values in readings.items())
+    return [doubt for doubt in doubts if doubt]
 
 
 def _without_half_lost(roles: Roles, time: Floats, columns: Mapping[str, Floats]) -> Roles:

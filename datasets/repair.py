@@ -169,25 +169,44 @@ def drop_codes(name: str, values: Floats) -> tuple[Floats, list[str]]:
     """Return a column with what is no reading but a sensor's code as NaN, and a line for each code."""
     repairs = []
     for code, whose in SENSOR_CODES.items():
-        rows = np.abs(values - code) < 1e-6
-        if values.size < SPIKE_WINDOW or not rows.any() or rows.all():
-            continue
-        moves = np.abs(np.diff(values))
-        between = rows[1:] ^ rows[:-1]
-        usual = moves[~(rows[1:] | rows[:-1]) & np.isfinite(moves)]
-        if not usual.any():  # no reading: it is held between levels, and the code may be one of them
-            continue
-        # a column that hardly ever moves does so by its steps
-        least = _CODE_JUMP * max(float(np.quantile(usual, 0.99)), float(usual[usual > 0].min()))
-        edges = np.flatnonzero(np.diff(rows.astype(int), prepend=0, append=0))
-        for start, stop in edges.reshape(-1, 2).tolist():
-            jumps = [moves[at] for at in (start - 1, stop - 1) if 0 <= at < moves.size and between[at]]
-            rows[start:stop] = all(jump > least or np.isnan(jump) for jump in jumps)
+        rows = _rows_beyond_jumps(values, np.abs(values - code) < 1e-6)
         if rows.any():
             values = np.where(rows, np.nan, values)
             count = int(rows.sum())
             repairs.append(f"{name}: {count} row{_s(count)} of {code:g} left empty, no reading ({whose})")
     return values, repairs
+
+
+def doubt_codes(name: str, values: Floats, inputs: Sequence[Floats]) -> str:
+    """Return the doubt on the end of an output's range where it is held in runs like a sensor's code, entered
+    and left by jumps while no input moves; empty where there is none."""
+    for end in (np.nanmin(values), np.nanmax(values)):
+        rows = _rows_beyond_jumps(values, values == end)
+        edges = np.flatnonzero(np.diff(rows.astype(int)))
+        by_input = [np.any(np.diff(u[max(at - SPIKE_LENGTH, 0) : at + 2])) for at in edges for u in inputs]
+        if rows.sum() > SPIKE_LENGTH * max(edges.size / 2, 1) and 2 * sum(map(bool, by_input)) <= len(
+            by_input
+        ):
+            says = f"{name} jumps to {end:g} and stays in {rows.sum()} rows while no input moves"
+            return f"{says}: if that is a sensor's code, leave those cells empty"
+    return ""
+
+
+def _rows_beyond_jumps(values: Floats, rows: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return those of the rows whose runs are entered and left by jumps as no other rows make."""
+    moves = np.abs(np.diff(values))
+    usual = moves[~(rows[1:] | rows[:-1]) & np.isfinite(moves)]
+    # without a move it is no reading: it is held between levels, and the code may be one of them
+    if values.size < SPIKE_WINDOW or not rows.any() or rows.all() or not usual.any():
+        return np.zeros(values.size, dtype=bool)
+    # a column that hardly ever moves does so by its steps
+    least = _CODE_JUMP * max(float(np.quantile(usual, 0.99)), float(usual[usual > 0].min()))
+    between, kept = rows[1:] ^ rows[:-1], rows.copy()
+    edges = np.flatnonzero(np.diff(rows.astype(int), prepend=0, append=0))
+    for start, stop in edges.reshape(-1, 2).tolist():
+        jumps = [moves[at] for at in (start - 1, stop - 1) if 0 <= at < moves.size and between[at]]
+        kept[start:stop] = all(jump > least or np.isnan(jump) for jump in jumps)
+    return kept
 
 
 def drop_stuck(name: str, values: Floats, inputs: Sequence[Floats]) -> tuple[Floats, list[str]]:

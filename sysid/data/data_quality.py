@@ -12,9 +12,7 @@ Every finding has a verdict (``ok``, ``warn``, ``fail``) and a consequence in wo
   in which only rows count at which the input moves: a level that is held adds nothing, and an output
   that settles under it shows how long it has been held.  A relay is asked whether it is switched at the same
   readings; of one that is on for a share of even windows the shares are tested.  In closed loop the noise is
-  in the input too, and equation-error fits are biased;
-* **drift**: do the two halves of a log differ in the level that a static regression on their input explains,
-  and the same **shift between logs**.
+  in the input too, and equation-error fits are biased.
 
 :func:`evidence` says what a plant rests on: between which temperatures, and how many minutes of each kind of
 drive. A model fitted on an hour of heating and two minutes of cooling is a model of heating.  Nothing in its
@@ -36,7 +34,7 @@ from thermogrip.datasets.repair import GAP_SECONDS, GAP_STEPS
 from thermogrip.datasets.resample import gaps
 from thermogrip.datasets.roles import FOLLOWED, IS_SET_POINT, explain_role
 from thermogrip.datasets.schema import Log, column, log_name
-from thermogrip.sysid.plant.log_grid import Grid, Rows, Segment, make_grid, quantum
+from thermogrip.sysid.plant.log_grid import Grid, Rows, make_grid, quantum
 from thermogrip.sysid.plant.plant import Plant
 
 Verdict = Literal["ok", "warn", "fail"]
@@ -59,8 +57,8 @@ _EVEN_WINDOWS = 0.9  # share of a relay's switchings, within a row of a whole nu
 class Finding:
     """One check of one channel of one log."""
 
-    # ``"quantum"``, ``"noise"``, ``"jitter"``, ``"gaps"``, ``"lost"``, ``"saturation"``, ``"excitation"``,
-    # ``"feedback"``, ``"drift"`` or ``"shift between logs"``
+    # ``"quantum"``, ``"noise"``, ``"jitter"``, ``"gaps"``, ``"lost"``, ``"saturation"``, ``"excitation"`` or
+    # ``"feedback"``
     check: str
     log: str  # where; empty where it concerns all
     channel: str
@@ -147,7 +145,6 @@ def check_data(
     for at, name in enumerate(u):
         found += _feedback_to(name, at, grid, logs)
     found += [_set_point(log_name(log), name) for log in logs for name in _set_points(log)]
-    found += _shifts(grid)
     return DataCheck(tuple(found))
 
 
@@ -408,62 +405,9 @@ def _bic(X: Array, v: Array) -> float:
     return float(n * np.log(max(_squares(X, v) / n, 1e-300)) + k * np.log(n)) if n > 3 * k else np.inf
 
 
-def _shifts(grid: Grid) -> list[Finding]:
-    """Level that the inputs do not explain: half against half, and log against log."""
-    slow = [np.hstack([_slow(segment.u), segment.d]) for segment in grid.segments]
-    w = np.concatenate(slow)
-    out = []
-    for i, name in enumerate(grid.outputs):
-        y = np.concatenate([segment.y[:, i] for segment in grid.segments])
-        known = np.isfinite(y)
-        X = np.column_stack([w, np.ones(len(w))])
-        left = y - X @ np.linalg.lstsq(X[known], y[known], rcond=None)[0]
-        spread, unit = float(np.nanstd(y)), grid.units[name]
-        parts = np.split(left, np.cumsum([len(s.time) for s in grid.segments])[:-1])
-        for segment, part in zip(grid.segments, parts):
-            half = len(part) // 2
-            move = float(np.nanmean(part[half:]) - np.nanmean(part[:half])) if _some(part, half) else 0.0
-            verdict: Verdict = "ok" if abs(move) < 0.5 * spread else "warn"
-            says = f"{name} drifts by {move:+.2g}{_unit(unit)} between the halves{_of(segment, grid)} "
-            says += "beyond what a static fit says"
-            out.append(Finding("drift", segment.log, name, move, unit, verdict, says))
-        if len(grid.logs) > 1:
-            out.append(_log_shift(grid, name, parts, spread, unit))
-    return out
-
-
-def _of(segment: Segment, grid: Grid) -> str:
-    """Return which seconds of its log a stretch is, where a gap leaves more than one."""
-    if sum(other.log == segment.log for other in grid.segments) == 1:
-        return ""
-    return f" of {segment.time[0]:.0f} to {segment.time[-1]:.0f} s"
-
-
 def _unit(unit: str) -> str:
     """Return what follows a number."""
     return "" if unit == "1" else f" {unit}"
-
-
-def _log_shift(grid: Grid, name: str, parts: list[Array], spread: float, unit: str) -> Finding:
-    by_log = [np.concatenate([p for s, p in zip(grid.segments, parts) if s.log == log]) for log in grid.logs]
-    levels = np.array([np.nanmean(part) if np.isfinite(part).any() else 0.0 for part in by_log])
-    size = float(np.ptp(levels))
-    shifted = size > 0.5 * spread
-    says = f"the level of {name} differs by {size:.2g}{_unit(unit)} between logs "
-    says += "beyond what a static fit says"
-    says += ": score on logs left out, not on the logs of the fit" if shifted else ""
-    return Finding("shift between logs", "", name, size, unit, "warn" if shifted else "ok", says)
-
-
-def _some(part: Array, half: int) -> bool:
-    return bool(np.isfinite(part[:half]).any() and np.isfinite(part[half:]).any())
-
-
-def _slow(u: Array) -> Array:
-    """Mean of the input over the tenth of the segment before each row: a static fit must not blame lag."""
-    width = len(u) // 10
-    area = np.vstack([np.repeat(u[:1], width, axis=0), u]).cumsum(axis=0)
-    return np.asarray((area[width:] - area[:-width]) / width)
 
 
 def reading_excess(logs: Sequence[Rows], outputs: Sequence[str], seconds: float) -> dict[str, float]:

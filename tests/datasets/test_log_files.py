@@ -510,6 +510,11 @@ def test_a_clock_is_seconds_since_1970_or_midnight(cells, seconds, note):
         ("ts,q1\n1700000000000,1\n1700000002500,1\n", [0, 2.5], ["q1"]),  # ms
         ("ts,q1\n1700000000,1\n1700000003,1\n", [0, 3], ["q1"]),  # s
         ("ts,q1\n1700000000,1\n1700000992,1\n", [1.7e6, 1700000.992], ["q1"]),  # ms of a board
+        ("ts,q1\n133540000000000000,1\n133540000025000000,1\n", [0, 2.5], ["q1"]),  # FILETIME of Windows
+        ("ts,q1\n638400000000000000,1\n638400000025000000,1\n", [0, 2.5], ["q1"]),  # ticks of .NET
+        ("ts,q1\n45323.25,1\n45323.255,1\n", [0, 432], ["q1"]),  # a spreadsheet's days
+        ("ts,q1\n739315.25,1\n739315.255,1\n", [0, 432], ["q1"]),  # MATLAB's
+        ("ts,q1\n45323.5,1\n45324.0,1\n", [45323.5, 45324], ["q1"]),  # no plant is read twice a day
         ("hours,q1\n1,1\n1.5,1\n", [3600, 5400], ["q1"]),
         ("minutes,q1\n1,1\n1.5,1\n", [60, 90], ["q1"]),
         ("us,q1\n1000,1\n1500,1\n", [1e-3, 1.5e-3], ["q1"]),
@@ -524,8 +529,9 @@ def test_a_clock_is_seconds_since_1970_or_midnight(cells, seconds, note):
 )
 def test_which_column_is_the_time_and_in_what_unit(write, text, time, left):
     log = read_log(write(text))
-    np.testing.assert_allclose(log["time"].values, time, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(log["time"].values, time, rtol=0, atol=1e-5)
     assert list(log) == left
+    assert ("in days of" in log.attrs["clock_doubts"]) == (time == [0, 432])
 
 
 def test_a_netcdf_file_is_repaired_and_has_names_of_its_own(tmp_path):
@@ -864,6 +870,53 @@ def test_a_table_with_a_reading_of_one_signal_in_a_row_has_a_column_for_each_sig
     assert np.diff(log["time"].values).tolist() == [30.0] * 39
     path.write_text("".join(["note,state,time_s\n", *(f"n{k},{k},{k}\n" for k in range(10))]))  # all differ
     assert list(read_log(path).data_vars) == ["state"]
+
+
+def test_an_annotated_table_of_readings_in_a_row_is_read_by_what_varies(write):
+    rows = "".join(
+        f",,{at},1970-01-01T00:00:00Z,2024-01-01T00:{k:02}:00Z,{20 + at * k},{name},rig\r\n"
+        for at, name in enumerate(("heater", "tank_temp"))
+        for k in range(30)
+    )
+    head = (
+        "#group,false,false,true,false,false,true,true\r\n,result,table,_start,_time,_value,_field,_from\r\n"
+    )
+    log = read_log(write(head + rows))
+    assert {str(name): item.values[:3].tolist() for name, item in log.items()} == {
+        "heater": [20, 20, 20],
+        "tank_temp": [20, 21, 22],
+    }
+    assert np.diff(log["time"].values).tolist() == [60.0] * 29
+
+
+def test_a_logger_that_was_started_again_writes_its_header_again(write):
+    run = "time,q1,temp\n" + "".join(f"{k},{k // 9},{20 + k / 8}\n" for k in range(30))
+    log = read_log(write(run + run))
+    assert "the header stands again in row 32" in log.attrs["repairs"]
+    assert "the clock starts again in row 33" in log.attrs["repairs"]
+    assert log.sizes["time"] == 60
+
+
+def test_a_unit_behind_each_number_is_the_column_s(write):
+    rows = "".join(f"10:00:{k:02},{k} %,{68 + k:.1f} °F\n" for k in range(9))
+    log = read_log(write("Time,Heater,Tank\n" + rows))
+    assert (log["Heater"].attrs["units"], log["Tank"].attrs["units"]) == ("percent", "degC")
+    np.testing.assert_allclose(column(log, "Tank"), 20 + np.arange(9) / 1.8)
+
+
+@pytest.mark.parametrize(
+    ("heater_moves", "said"), [(False, "plate jumps to -46.85 and stays in 30 rows"), (True, "")]
+)
+def test_runs_of_an_unknown_code_are_asked_about_unless_a_drive_makes_them(write, heater_moves, said):
+    heater = np.repeat([20, 80, 50, 90, 30, 70], 100)
+    plate = 25 + heater / 10 + 0.1 * np.random.default_rng(0).standard_normal(600)
+    for start in (130, 330, 530):
+        plate[start : start + 10] = -46.85
+        heater[start : start + 10] *= 0 if heater_moves else 1
+    rows = "".join(f"{k},{u},{y:.2f}\n" for k, (u, y) in enumerate(zip(heater, plate)))
+    doubts = read_log(write("time_s,heater,plate_degC\n" + rows)).attrs["role_doubts"]
+    assert said in doubts
+    assert ("jumps" in doubts) == bool(said)
 
 
 @pytest.mark.parametrize(

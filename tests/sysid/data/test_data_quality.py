@@ -120,19 +120,6 @@ def test_a_smooth_input_in_open_loop_is_not_accused_of_feedback():
     assert one([plant_log(1000, q=noisy, noise=0.0)], "feedback").verdict == "ok"
 
 
-def test_a_drift_says_which_stretch_it_is_of_where_a_gap_leaves_two():
-    time = np.arange(2000.0) + np.where(np.arange(2000) < 1200, 0.0, 60.0)
-    whole = check_data([plant_log(drift=12.0)], average=1.0).of("drift")
-    cut = check_data([plant_log(drift=12.0, time=time)], average=1.0).of("drift")
-    assert [finding.says.split(" between ")[1] for finding in whole] == [
-        "the halves beyond what a static fit says"
-    ]
-    assert [finding.says.split(" between ")[1].split(" beyond")[0] for finding in cut] == [
-        "the halves of 0 to 1199 s",
-        "the halves of 1260 to 2059 s",
-    ]
-
-
 # ---- each finding, number and words ----
 
 K = np.arange(200)
@@ -314,60 +301,6 @@ def test_the_condition_of_two_inputs_is_that_of_their_correlation(condition, ver
     (found,) = (f for f in check_data([log], average=1.0).of("excitation") if f.channel == "all inputs")
     assert found.value == pytest.approx(condition, rel=1e-4)
     assert (found.unit, found.verdict, found.says) == ("1", verdict, says)
-
-
-def step(size, n):
-    """A step in the middle of n rows of +-1."""
-    return 20 + (-1.0) ** np.arange(n) + size * (np.arange(n) >= n // 2)
-
-
-@pytest.mark.parametrize(("size", "verdict"), [(0.5, "ok"), (0.6, "warn"), (-0.6, "warn")])
-def test_a_drift_or_shift_beyond_half_the_spread_is_reported(size, verdict):
-    """The spread is sqrt(1 + size^2 / 4): 1.03 K and 1.04 K."""
-    told = [found_in(step(size, 200), "drift", q=np.full(200, 0.3))]
-    log = [
-        make_log(1.0 * K, {"q": (np.full(200, 0.3), "1", "input"), "t": (y, "degC", "output")}, name=name)
-        for name, y in (("a", 20 + ODD), ("b", 20 + ODD + size))
-    ]
-    (found,) = check_data(log, average=1.0).of("shift between logs")
-    told += [(found.value, found.unit, found.verdict, found.says)]
-    assert [item[0] for item in told] == pytest.approx([size, abs(size)])
-    says = f"the level of t differs by {abs(size):.2g} degC between logs beyond what a static fit says"
-    says += ": score on logs left out, not on the logs of the fit" if verdict == "warn" else ""
-    assert [item[1:] for item in told] == [
-        ("degC", verdict, f"t drifts by {size:+.2g} degC between the halves beyond what a static fit says"),
-        ("degC", verdict, says),
-    ]
-
-
-def test_a_number_without_a_unit_stands_alone():
-    y = 20 + ODD + 2.0 * (K >= 100)
-    log = make_log(1.0 * K, {"q": (np.full(200, 0.3), "1", "input"), "t": (y, "1", "output")}, name="a")
-    checked = check_data([log], average=1.0)
-    assert [found.says for found in checked.of("drift")] == [
-        "t drifts by +2 between the halves beyond what a static fit says"
-    ]
-    assert [found.says for found in checked.of("noise")] == ["t has noise of 2.7"]
-
-
-def test_a_drift_is_of_the_later_half_of_an_odd_number_of_rows_and_none_where_a_half_is_lost():
-    q, time = np.full(201, 0.3), np.arange(201.0)
-    jump = 20 + 2.0 * (time >= 100)
-    assert found_in(jump, "drift", q=q, time=time)[0] == pytest.approx(2.0)
-    for hidden in (time < 100, time >= 100):
-        y = np.where(hidden, np.nan, np.sin(time / 7))
-        assert found_in(y, "drift", q=q, time=time)[0] == 0.0
-
-
-def test_what_the_mean_input_of_the_last_tenth_explains_is_no_drift():
-    q = np.where(K < 130, 0.2, 0.9) + 0.1 * (K % 7)
-    mean = [np.append(np.full(19, q[0]), q)[k : k + 20].mean() for k in K]
-    assert abs(found_in(20 + 3 * np.array(mean), "drift", q=q)[0]) < 1e-9
-    air = (K > 120) * 1.0  # nor what a disturbance does
-    signals = {"q": (q, "1", "input"), "air": (air, "degC", "disturbance"), "t": (air + q, "degC", "output")}
-    assert check_data([make_log(1.0 * K, signals)], average=1.0).of("drift")[0].verdict == "ok"
-    signals["t"] = (mean + 5 * air, "degC", "output")
-    assert abs(check_data([make_log(1.0 * K, signals)], average=1.0).of("drift")[0].value) < 1e-9
 
 
 def driven(n, by, seed=0, own=1.0):
