@@ -22,10 +22,9 @@ when it is within 10 percent of the best, for its parameters mean something.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -37,9 +36,9 @@ from thermogrip.datasets.parallel import Workers, run_parallel
 from thermogrip.datasets.schema import Log, log_name
 from thermogrip.sysid.blackbox.fit import (
     BLACK_BOXES,
-    FAMILIES,
     RESAMPLED,
     BlackBoxFit,
+    family_of,
     fit_black_box,
     with_refits,
 )
@@ -60,10 +59,10 @@ from thermogrip.sysid.plant.fit_record import (
     HeldOut,
 )
 from thermogrip.sysid.plant.innovations import innovation_noise
-from thermogrip.sysid.plant.log_grid import Grid, match_logs, misfit, moved_before, signals
+from thermogrip.sysid.plant.log_grid import match_logs, misfit, moved_before, signals
 from thermogrip.sysid.plant.log_grid import rows_of as log_rows
 from thermogrip.sysid.plant.plant import Plant
-from thermogrip.sysid.validation.free_run import FreeRun
+from thermogrip.sysid.validation.free_run import FreeRun, warm_up_of
 from thermogrip.sysid.validation.goodness import doubts_of, verdict_of
 from thermogrip.sysid.validation.held_out import (
     Case,
@@ -76,7 +75,6 @@ from thermogrip.sysid.validation.held_out import (
     rows_of,
     run_held_out,
     searched_rows,
-    warm_up_of,
 )
 from thermogrip.sysid.validation.prediction_bands import between_runs, expected_error, part_errors
 
@@ -91,8 +89,6 @@ USUAL_MODELS = tuple(model for model in MODELS if model not in ON_REQUEST)
 LINEAR = ("arx", "oe", "armax", "bj", "subspace", "parsim")  # kept where another kind errs hardly less
 WITHIN_NOISE = 1.1  # of the best error: then the network is preferred, and a linear kind to neural models
 NO_DRAWS = (UserError, np.linalg.LinAlgError)  # what draws of a fit may fail with; the fit itself is sound
-#: Of the candidates, by time for a fit.
-_LONGEST = ("neural", "bj", "armax", "subspace", "parsim", "oe", "sindy", "network")
 
 Progress = Callable[[float, str], None]
 
@@ -147,7 +143,6 @@ def identify(
     order: int | None = None,
     delay: int | None = None,
     leave_one_out: bool = False,
-    posterior: bool = False,
     draws: int = 24,
     seed: int = 0,
     workers: Workers = 1,
@@ -173,15 +168,14 @@ def identify(
         the others are left out then. Searched where absent.
     leave_one_out : bool, optional
         Score each log by a fit to the others (at least two logs).
-    posterior : bool, optional
-        Sample the posterior of the network's parameters.
     draws : int, optional
-        Without the posterior: so many plants that agree with the logs stand in for it; of a black box, refits
-        to resampled logs.
+        So many plants that agree with the logs show how certain the kept one is: of a network, of the normal
+        approximation of its posterior (:func:`~thermogrip.sysid.greybox.posterior.sample_posterior` samples
+        it); of a black box, refits to resampled logs.
     seed : int, optional
     workers : int or str, optional
-        Local processes, or the address of a Dask scheduler, for the kinds of black boxes and for the logs
-        that are left out. The result is the same.
+        Local processes, or the address of a Dask scheduler, for the logs that are left out. The result is the
+        same.
     progress : callable, optional
         Called with (fraction done, what).
     early : callable, optional
@@ -209,42 +203,44 @@ def identify(
     >>> found.model, found.good, found.errors()["oe"] < 0.05
     ('oe', True, True)
     """
-    wanted = _Wanted(average, order, delay, leave_one_out, posterior, draws, seed, workers)
-    data = _read(logs, network if "network" in models else None, (inputs, outputs, disturbances), wanted)
-    kinds = _candidates(models, data.network)
-    cases = cases_of(data.logs, leave_one_out)
-    parts = _Parts(progress, (len(cases) + 1) * len(kinds) + 2)
-    boxes = _fit_black_boxes(kinds, data, wanted, parts, early)
+    task = _read(
+        as_logs(logs, inputs, outputs, disturbances),
+        network if "network" in models else None,
+        {"inputs": inputs, "outputs": outputs, "disturbances": disturbances},
+        _Options(average, order, delay, leave_one_out, draws, seed),
+    )
+    kinds = _candidates(models, task.network)
+    cases = cases_of(task.logs, leave_one_out)
+    steps = _Steps(progress, (len(cases) + 1) * len(kinds) + 2)
+    boxes = _fit_black_boxes(kinds, task, steps, early)
     finalists = kinds if leave_one_out else [k for k in kinds if k == "network" or boxes.kept_as(k)]
-    held_out = _hold_out(finalists, cases, boxes.kept, data, wanted, parts)
-    kind = choose_model(held_out.rows, sum(len(case.held) for case in cases))
+    folds = _hold_out(finalists, cases, boxes.kept, task, workers, steps)
+    kind = choose_model(_held_out_rows(folds), sum(len(case.held) for case in cases))
     kind = kind or (boxes.kept.kind if boxes.kept is not None else None)
     if kind is None:
-        raise _nothing_fitted((*boxes.refused, *held_out.refused), data)
-    plant, lost = _refit(kind, boxes.kept, held_out, data, wanted, parts)
-    return _judged(kind, plant, lost, boxes, held_out, data, wanted)
+        raise _nothing_fitted([*boxes.refused, *(line for fold in folds for line in fold.refused)], task)
+    plant, without_draws = _refit(kind, boxes.kept, task, steps)
+    return _judged(kind, plant, boxes, folds, task, without_draws)
 
 
 # read
 
 
 @dataclass(frozen=True)
-class _Wanted:
+class _Options:
     """What was asked for beside the data."""
 
     average: float | None
     order: int | None
     delay: int | None
     leave_one_out: bool
-    posterior: bool
     draws: int
     seed: int
-    workers: Workers
 
 
 @dataclass(frozen=True, eq=False)
-class _Data:
-    """The logs as all candidates see them."""
+class _Task:
+    """The logs as all candidates see them, and what was asked for."""
 
     logs: list[Log]
     network: GreyModel | None
@@ -255,30 +251,32 @@ class _Data:
     signals: tuple[SignalRole, ...]
     doubts: tuple[str, ...]
     notes: tuple[str, ...]  # what was converted, taken for rest, or left out
+    options: _Options
 
 
-_Lists = tuple[Sequence[str] | None, Sequence[str] | None, Sequence[str] | None]
-
-
-def _read(logs: Logs, network: GreyModel | str | Path | None, lists: _Lists, wanted: _Wanted) -> _Data:
+def _read(
+    logs: list[Log],
+    network: GreyModel | str | Path | None,
+    named: Mapping[str, Sequence[str] | None],
+    options: _Options,
+) -> _Task:
     """Return the logs in the roles and units of all candidates, checked; each is matched once."""
-    named = dict(zip(("inputs", "outputs", "disturbances"), lists))
-    read = as_logs(logs, *lists)
-    model, read, converted = _for_network(network, read)
+    model, logs, converted = _for_network(network, logs)
     if model is None:
-        read = without_still(read)
-    u, y, d = signals(read, **named)
+        logs = without_still(logs)
+    u, y, d = signals(logs, **named)
     # a network has a prior of what never moves, others nothing
-    still = still_inputs(model, read, u)
+    still = still_inputs(model, logs, u)
     u = tuple(name for name in u if name not in still)
-    read, rested = with_rest(read, u, y)
-    if wanted.leave_one_out and len(read) < 2:
+    logs, rested = with_rest(logs, u, y)
+    if options.leave_one_out and len(logs) < 2:
         raise UserError("leaving one log out needs at least two logs", hint="give another log")
-    checked = check_data(read, inputs=u, outputs=y, disturbances=d, average=wanted.average)
-    _ask_for_excitation(checked, u, read[0])
-    roles, unused = signal_roles(read, ([*u, *still], d, y), named, model, still)
-    doubts = role_doubts(read, named_all=lists[0] is not None and lists[1] is not None)
-    return _Data(read, model, u, y, d, checked, roles, doubts, (*converted, *rested, *unused))
+    checked = check_data(logs, inputs=u, outputs=y, disturbances=d, average=options.average)
+    _ask_for_excitation(checked, u, logs[0])
+    roles, unused = signal_roles(logs, ([*u, *still], d, y), named, model, still)
+    all_named = named["inputs"] is not None and named["outputs"] is not None
+    doubts = role_doubts(logs, named_all=all_named)
+    return _Task(logs, model, u, y, d, checked, roles, doubts, (*converted, *rested, *unused), options)
 
 
 def _ask_for_excitation(checked: DataCheck, inputs: Sequence[str], log: Log) -> None:
@@ -346,200 +344,102 @@ class _Boxes:
     def kept_as(self, kind: str) -> bool:
         return self.kept is not None and self.kept.kind == kind
 
-    def rows(self) -> list[Row]:
-        return [row for fit in self.fits for row in fold_rows(fit)]
-
 
 def _fit_black_boxes(
-    kinds: Sequence[str],
-    data: _Data,
-    wanted: _Wanted,
-    parts: _Parts,
-    early: Callable[[Identification], None] | None,
+    kinds: Sequence[str], task: _Task, steps: _Steps, early: Callable[[Identification], None] | None
 ) -> _Boxes:
     """Fit each black box to all logs: subspace models first, whose step the others take; neural models, which
-    take longest, last, and not at all where they are beyond reach. With ``leave_one_out`` they are fitted by
-    case instead."""
-    boxes = [] if wanted.leave_one_out else [kind for kind in kinds if kind != "network"]
-    found: dict[str, BlackBoxFit | str] = {}
+    take longest, last. With ``leave_one_out`` they are fitted by case instead."""
+    boxes = [] if task.options.leave_one_out else [kind for kind in kinds if kind != "network"]
+    fits: dict[str, BlackBoxFit] = {}
+    refused: dict[str, str] = {}
     grid = None
-    if "subspace" in boxes:
-        first = found["subspace"] = _fitted_here("subspace", data, wanted, parts)
-        if isinstance(first, BlackBoxFit):
-            grid = first.grid
+    for kind in sorted(boxes, key=lambda kind: (kind == "neural") - (kind == "subspace")):
+        report = steps.start(kind)
+        try:
+            beat = _to_beat(list(fits.values()), task.logs) if kind == "neural" else None
+            fits[kind] = _fit_box(kind, task.logs, task, report, grid=grid, beat=beat)
+        except UserError as error:
+            refused[kind] = f"{kind}: {error}"
+            continue
+        if kind == "subspace":
+            grid = fits[kind].grid
             if early is not None:
-                alone = _Boxes([first], [], first)
-                early(_judged("subspace", first.plant, [], alone, _HeldOut([], [], {}), data, wanted))
-    others = [kind for kind in boxes if kind not in ("subspace", "neural")]
-    found |= dict(zip(others, _fitted_side_by_side(others, data, wanted, parts, grid)))
-    if "neural" in boxes:
-        fits = [each for each in found.values() if isinstance(each, BlackBoxFit)]
-        found["neural"] = _fitted_neural(fits, data, wanted, parts)
-    every = [found[kind] for kind in boxes]
-    fits = [each for each in every if isinstance(each, BlackBoxFit)]
-    kept = choose_black_box(fits, data.logs) if fits else None
-    return _Boxes(fits, [each for each in every if isinstance(each, str)], kept)
+                early(_judged(kind, fits[kind].plant, _Boxes([fits[kind]], [], fits[kind]), [], task, []))
+    in_order = [fits[kind] for kind in boxes if kind in fits]
+    kept = choose_black_box(in_order, task.logs) if in_order else None
+    return _Boxes(in_order, [refused[kind] for kind in boxes if kind in refused], kept)
 
 
-def _fitted_side_by_side(
-    kinds: Sequence[str], data: _Data, wanted: _Wanted, parts: _Parts, grid: Grid | None
-) -> list[BlackBoxFit | str]:
-    """Return each kind fitted to all logs, or why it could not be."""
-    if wanted.workers == 1 or len(kinds) < 2:
-        return [_fitted_here(kind, data, wanted, parts, grid) for kind in kinds]
-    items = [(kind, _portable(data), wanted, None, grid) for kind in kinds]
-    report = parts.part("black boxes", of=len(kinds))
-    found = run_parallel(_fit_or_refusal, items, wanted.workers, report, what="fitting")
-    parts.next(len(kinds))
-    return found
-
-
-def _fitted_here(
-    kind: str,
-    data: _Data,
-    wanted: _Wanted,
-    parts: _Parts,
-    grid: Grid | None = None,
-    beat: Mapping[str, float] | None = None,
-) -> BlackBoxFit | str:
-    report = parts.part(kind)
-    found = _fit_or_refusal((kind, data, wanted, report, grid), beat)
-    if report is not None:
-        report(1.0, _in_short(found))
-    parts.next()
-    return found
-
-
-def _fitted_neural(
-    others: Sequence[BlackBoxFit], data: _Data, wanted: _Wanted, parts: _Parts
-) -> BlackBoxFit | str:
-    """Return the neural models, or why they were left out, or given up after the first parts held out."""
+def _to_beat(others: Sequence[BlackBoxFit], logs: Sequence[Log]) -> dict[str, float] | None:
+    """Return the errors by part that neural models have to come near to; refuse where they are beyond
+    reach."""
     if not others:
-        return _fitted_here("neural", data, wanted, parts)
-    if beyond_reach(others, data.logs):
-        parts.next()
-        return (
-            "neural: left out, for even without any error on held-out parts it would not be kept: "
-            "another run differs by more than the linear models err (--models neural fits it)"
+        return None
+    if beyond_reach(others, logs):
+        raise UserError(
+            "left out, for even without any error on held-out parts it would not be kept: another run "
+            "differs by more than the linear models err (--models neural fits it)"
         )
     choice = min((fit.choice for fit in others), key=lambda choice: choice.error)
-    beat = dict(zip((fold.label for fold in choice.folds), choice.errors[choice.structure].tolist()))
-    return _fitted_here("neural", data, wanted, parts, beat=beat)
-
-
-def _portable(data: _Data) -> _Data:
-    """Return the data without a network that another process cannot know: a class of the user's own."""
-    from thermogrip.sysid.models.network import NetworkModel
-
-    return data if isinstance(data.network, NetworkModel) else replace(data, network=None)
-
-
-def _fit_or_refusal(
-    item: tuple[str, _Data, _Wanted, Progress | None, Grid | None], beat: Mapping[str, float] | None = None
-) -> BlackBoxFit | str:
-    kind, data, wanted, report, grid = item
-    try:
-        return _fit_box(kind, data.logs, data, wanted, report, grid, beat)
-    except UserError as error:
-        return f"{kind}: {error}"
+    return dict(zip((fold.label for fold in choice.folds), choice.errors[choice.structure].tolist()))
 
 
 def _fit_box(
-    kind: str,
-    logs: Sequence[Log],
-    data: _Data,
-    wanted: _Wanted,
-    report: Progress | None,
-    grid: Grid | None = None,
-    beat: Mapping[str, float] | None = None,
+    kind: str, logs: Sequence[Log], task: _Task, report: Progress | None, **more: Any
 ) -> BlackBoxFit:
+    """Fit a black box to some logs; ``more`` are a grid and errors of :func:`fit_black_box`."""
     return fit_black_box(
         kind,
         logs,
-        inputs=data.inputs,
-        outputs=data.outputs,
-        disturbances=data.disturbances,
-        average=wanted.average,
-        order=wanted.order,
-        delay=wanted.delay,
-        grid=grid,
+        inputs=task.inputs,
+        outputs=task.outputs,
+        disturbances=task.disturbances,
+        average=task.options.average,
+        order=task.options.order,
+        delay=task.options.delay,
         progress=report,
-        beat=beat,
+        **more,
     )
-
-
-def _in_short(found: BlackBoxFit | str) -> str:
-    if isinstance(found, str):
-        return "refused"
-    choice = found.choice
-    return f"{choice.structure.label}, errs {100 * choice.error:.1f} % of the spread on held-out parts"
 
 
 # held out: the finalists on what they were fitted without
 
 
 @dataclass(frozen=True, eq=False)
-class _HeldOut:
-    """How the finalists did on what they were fitted without."""
+class _Fold:
+    """How a candidate did on what it was fitted without."""
 
-    rows: list[Row]
+    kind: str
     refused: list[str]
-    runs: dict[str, dict[str, FreeRun]]  # by candidate and what was held out
-    network: Plant | None = None  # fitted to all logs, where another process had the time
+    runs: dict[str, FreeRun]  # by what was held out
 
 
-class _Fold(NamedTuple):
-    """A candidate fitted to the training logs of a case (or why it was not), and its runs over the rest."""
-
-    plant: Plant | None
-    refused: tuple[str, ...]
-    runs: tuple[tuple[str, FreeRun], ...]
-
-
-_Item = tuple[str, Case, "BlackBoxFit | None", _Data, _Wanted, "Progress | None"]
+_FoldItem = tuple[str, Case, "BlackBoxFit | None", _Task, "Progress | None"]
 
 
 def _hold_out(
     kinds: Sequence[str],
     cases: Sequence[Case],
     kept: BlackBoxFit | None,
-    data: _Data,
-    wanted: _Wanted,
-    parts: _Parts,
-) -> _HeldOut:
+    task: _Task,
+    workers: Workers,
+    steps: _Steps,
+) -> list[_Fold]:
     """Fit each finalist without what is held out, and run it over that; on several processes where whole logs
-    are left out."""
+    are left out and they can know the network, which is no class of the user's own."""
+    from thermogrip.sysid.models.network import NetworkModel
+
     pairs = [(kind, case) for case in cases for kind in kinds]
-    everything = Case(data.logs, [])
-    elsewhere = wanted.leave_one_out and wanted.workers != 1
-    found: dict[int, _Fold] = {}
-    whole: Plant | None = None
-    if elsewhere:
-        sent = _portable(data)
-        shared = [k for k, (kind, _) in enumerate(pairs) if kind != "network" or sent.network is not None]
-        # what takes longest first: a process that begins with it last leaves others idle
-        shared.sort(key=lambda k: _LONGEST.index(pairs[k][0]) if pairs[k][0] in _LONGEST else len(_LONGEST))
-        todo = [(*pairs[k], kept, sent, wanted, None) for k in shared]
-        at = next((k for k, item in enumerate(todo) if item[0] == "network"), None)
-        if at is not None:  # the likely one: it is kept also where another errs a little less
-            todo.insert(at, ("network", everything, None, sent, wanted, None))
-        report = parts.part("left out", of=len(todo))
-        folds = run_parallel(_fold_of, todo, wanted.workers, report, what="fitting")
-        if at is not None:
-            whole = folds.pop(at).plant
-        found = dict(zip(shared, folds))
-    for k, (kind, case) in enumerate(pairs):
-        if k not in found:
-            report = parts.part(f"{kind} without {_names(case)}")
-            found[k] = _fold_of((kind, case, kept, data, wanted, report))
-        parts.next()
-    rows, refused, runs = list[Row](), list[str](), dict[str, dict[str, FreeRun]]()
-    for k, (kind, _) in enumerate(pairs):
-        refused += found[k].refused
-        for name, run in found[k].runs:
-            rows += rows_of(kind, run.plant, name, run, held_out=True)
-            runs.setdefault(kind, {})[name] = run
-    return _HeldOut(rows, refused, runs, whole)
+    portable = task.network is None or isinstance(task.network, NetworkModel)
+    if task.options.leave_one_out and workers != 1 and portable:
+        items: list[_FoldItem] = [(kind, case, kept, task, None) for kind, case in pairs]
+        report = steps.start("left out", of=len(items))
+        return run_parallel(_fold_of, items, workers, report, what="fitting")
+    return [
+        _fold_of((kind, case, kept, task, steps.start(f"{kind} without {_names(case)}")))
+        for kind, case in pairs
+    ]
 
 
 def _names(case: Case) -> str:
@@ -547,47 +447,45 @@ def _names(case: Case) -> str:
     return case.held[0].name if len(case.held) == 1 else f"{TAIL}each log"
 
 
-def _fold_of(item: _Item) -> _Fold:
-    """Fit a candidate to the training logs of a case and run it over what is held out; a network fitted to
-    all logs is drawn from at once."""
-    kind, case, kept, data, wanted, report = item
-    names = _names(case)
+def _fold_of(item: _FoldItem) -> _Fold:
+    """Fit a candidate to the training logs of a case and run it over what is held out."""
+    kind, case, kept, task, report = item
+    fold = _Fold(kind, [], {})
     try:
-        plant = _fitted(kind, case.train, kept, data, wanted, report)
+        plant = _fitted(kind, case.train, kept, task, report)
     except UserError as error:
-        return _Fold(None, (f"{kind} without {names}: {error}",), ())
-    if not case.held and wanted.draws and not wanted.posterior:
-        from thermogrip.sysid.greybox.posterior import fit_problem, with_draws
-
-        with suppress(*NO_DRAWS):  # who wants them meets the same fault, and says it
-            plant = with_draws(plant, fit_problem(plant, case.train), wanted.draws, seed=wanted.seed)
-    refused, runs = list[str](), list[tuple[str, FreeRun]]()
+        fold.refused.append(f"{kind} without {_names(case)}: {error}")
+        return fold
     for held in case.held:
         try:
-            runs.append((held.name, run_held_out(plant, held, unseen=True)))
+            fold.runs[held.name] = run_held_out(plant, held, unseen=True)
         except UserError as error:
-            refused.append(f"{kind} without {held.name}: {error}")
-    return _Fold(plant, tuple(refused), tuple(runs))
+            fold.refused.append(f"{kind} without {held.name}: {error}")
+    return fold
+
+
+def _held_out_rows(folds: Sequence[_Fold]) -> list[Row]:
+    return [
+        row
+        for fold in folds
+        for name, run in fold.runs.items()
+        for row in rows_of(fold.kind, run.plant, name, run, held_out=True)
+    ]
 
 
 def _fitted(
-    kind: str,
-    train: Sequence[Log],
-    kept: BlackBoxFit | None,
-    data: _Data,
-    wanted: _Wanted,
-    report: Progress | None,
+    kind: str, train: Sequence[Log], kept: BlackBoxFit | None, task: _Task, report: Progress | None
 ) -> Plant:
     """Return a candidate fitted to some logs: of the black box that is kept the same structure."""
     if kind == "network":
         from thermogrip.sysid.greybox.fit import fit_network  # pulls in llvmlite at the first fit
 
-        assert data.network is not None
-        return fit_network(data.network, train, progress=report)
+        assert task.network is not None
+        return fit_network(task.network, train, progress=report)
     if kept is None:
-        return _fit_box(kind, train, data, wanted, report).plant
+        return _fit_box(kind, train, task, report).plant
     grid = kept.grid.of(train, ends=kept.grid.ends)
-    model = FAMILIES[kind](grid, only=kept.choice.structure).get(kept.choice.structure)
+    model = family_of(kind)(grid, only=kept.choice.structure).get(kept.choice.structure)
     if model is None:
         raise UserError(f"{kind}: the chosen structure is unstable without the last part of the logs")
     return replace(kept.plant, model=model)
@@ -646,57 +544,31 @@ def choose_model(rows: Sequence[Row], complete: int) -> str | None:
     return "network" if mean.get("network", np.nan) <= WITHIN_NOISE * mean[best] else best
 
 
-def _nothing_fitted(refused: Sequence[str], data: _Data) -> UserError:
-    noisy = [finding.says for finding in data.checked.of("noise") if finding.verdict != "ok"]
+def _nothing_fitted(refused: Sequence[str], task: _Task) -> UserError:
+    noisy = [finding.says for finding in task.checked.of("noise") if finding.verdict != "ok"]
     problem = f"no model could be fitted ({refused[0] if refused else 'none was asked for'})"
-    return UserError(problem, hint="; ".join([*noisy, *data.doubts]) or None)
+    return UserError(problem, hint="; ".join([*noisy, *task.doubts]) or None)
 
 
 # refit: the chosen one on all logs, with what its uncertainty is drawn from
 
 
-def _refit(
-    kind: str,
-    kept: BlackBoxFit | None,
-    held_out: _HeldOut,
-    data: _Data,
-    wanted: _Wanted,
-    parts: _Parts,
-) -> tuple[Plant, list[str]]:
+def _refit(kind: str, kept: BlackBoxFit | None, task: _Task, steps: _Steps) -> tuple[Plant, list[str]]:
     """Return the plant of a kind fitted to all logs with its draws, and in words why it has none."""
-    report = parts.part(f"{kind} on all logs")
-    if kind == "network":
-        plant = held_out.network or _fitted(kind, data.logs, None, data, wanted, report)
-        parts.next()
-        if plant.samples is not None:  # another process has drawn already
-            return plant, []
-        return _network_draws(plant, data.logs, wanted, parts)
-    fit = kept or _fit_box(kind, data.logs, data, wanted, report)
-    parts.next()
-    if not wanted.draws or kind not in RESAMPLED:
-        return fit.plant, []
-    try:
-        return with_refits(fit, wanted.draws, seed=wanted.seed, progress=parts.part("draws")), []
-    except NO_DRAWS as error:
-        return fit.plant, [no_draws(kind, "draws", error)]
-
-
-def _network_draws(
-    plant: Plant, logs: Sequence[Log], wanted: _Wanted, parts: _Parts
-) -> tuple[Plant, list[str]]:
-    what = "posterior" if wanted.posterior else "draws"
-    if not (wanted.posterior or wanted.draws):
+    report = steps.start(f"{kind} on all logs")
+    box = None if kind == "network" else kept or _fit_box(kind, task.logs, task, report)
+    plant = box.plant if box is not None else _fitted(kind, task.logs, None, task, report)
+    if not task.options.draws or (box is not None and kind not in RESAMPLED):
         return plant, []
-    from thermogrip.sysid.greybox.posterior import fit_problem, sample_posterior, with_draws
-
-    report = parts.part(what)
+    n, seed, report = task.options.draws, task.options.seed, steps.start("draws")
     try:
-        if wanted.posterior:
-            return sample_posterior(plant, logs, seed=wanted.seed, progress=report)[0], []
-        problem = fit_problem(plant, logs)
-        return with_draws(plant, problem, wanted.draws, seed=wanted.seed, progress=report), []
+        if box is not None:
+            return with_refits(box, n, seed=seed, progress=report), []
+        from thermogrip.sysid.greybox.posterior import fit_problem, with_draws
+
+        return with_draws(plant, fit_problem(plant, task.logs), n, seed=seed, progress=report), []
     except NO_DRAWS as error:
-        return plant, [no_draws("network", what, error)]
+        return plant, [no_draws(kind, "draws", error)]
 
 
 def no_draws(model: str, what: str, error: Exception) -> str:
@@ -710,44 +582,45 @@ def no_draws(model: str, what: str, error: Exception) -> str:
 def _judged(
     kind: str,
     plant: Plant,
-    lost: Sequence[str],
     boxes: _Boxes,
-    held_out: _HeldOut,
-    data: _Data,
-    wanted: _Wanted,
+    folds: Sequence[_Fold],
+    task: _Task,
+    without_draws: Sequence[str],
 ) -> Identification:
     """Return the plant with its scores and expected errors, and all that was found beside it."""
     # the last part of the kept black box is scored at the logs' own rows
-    folds = [row for row in boxes.rows() if not (boxes.kept_as(row.model) and row.log.startswith(TAIL))]
-    rows = [*folds, *held_out.rows]
+    parts = [row for fit in boxes.fits for row in fold_rows(fit)]
+    parts = [row for row in parts if not (boxes.kept_as(row.model) and row.log.startswith(TAIL))]
+    rows = [*parts, *_held_out_rows(folds)]
     # the same warm-up as on what was held out, or errors of the start would stand beside ones without
-    starts = [0.0 if wanted.leave_one_out else warm_up_of(log["time"].values) for log in data.logs]
-    whole = [Held(log, log_name(log), start) for log, start in zip(data.logs, starts)]
+    starts = [0.0 if task.options.leave_one_out else warm_up_of(log["time"].values) for log in task.logs]
+    whole = [Held(log, log_name(log), start) for log, start in zip(task.logs, starts)]
     runs = tuple(run_held_out(plant, held) for held in whole)
     for held, run in zip(whole, runs):
         rows += rows_of(kind, plant, held.name, run, held_out=False)
-    plant = _with_expected(plant, kind, rows, data.logs)
+    plant = _with_expected(plant, kind, rows, task.logs)
+    refused = [line for fold in folds for line in fold.refused]
     # a fit without the last part that could not be run over it says nothing of another run either
-    not_scored = [note for note in held_out.refused if note.startswith(f"{kind} without ")]
-    doubts = (*data.doubts, *doubts_of(plant), *not_scored)
-    good, verdict = verdict_of(kind, plant, rows, data.checked, doubts)
-    covered = evidence(plant, [log_rows(log, plant.inputs, plant.outputs, ()) for log in data.logs])
+    not_scored = [line for line in refused if line.startswith(f"{kind} without ")]
+    doubts = (*task.doubts, *doubts_of(plant), *not_scored)
+    good, verdict = verdict_of(kind, plant, rows, task.checked, doubts)
+    covered = evidence(plant, [log_rows(log, plant.inputs, plant.outputs, ()) for log in task.logs])
     verdict += f" {covered.sentence(plant.units)}."
-    notes = (*data.notes, *boxes.refused, *held_out.refused, *lost, *_plant_notes(kind, plant))
+    notes = (*task.notes, *boxes.refused, *refused, *without_draws, *_plant_notes(kind, plant))
     return Identification(
         plant=replace(plant, verdict=verdict),
         model=kind,
         rows=tuple(rows),
-        data_check=data.checked,
+        data_check=task.checked,
         evidence=covered,
         good=good,
         doubts=doubts,
         verdict=verdict,
         notes=notes,
-        signals=data.signals,
+        signals=task.signals,
         runs=runs,
         searched=tuple(row for fit in boxes.fits for row in searched_rows(fit)),
-        held_out_runs=held_out.runs.get(kind, {}),
+        held_out_runs={name: run for fold in folds if fold.kind == kind for name, run in fold.runs.items()},
     )
 
 
@@ -781,17 +654,16 @@ def _plant_notes(model: str, plant: Plant) -> list[str]:
     return out
 
 
-class _Parts:
-    """Spreads the progress of parts over the whole."""
+class _Steps:
+    """Spreads the progress of steps over the whole."""
 
-    def __init__(self, progress: Progress | None, parts: int) -> None:
-        self._progress, self._parts, self._done = progress, parts, 0
+    def __init__(self, progress: Progress | None, steps: int) -> None:
+        self._progress, self._steps, self._done = progress, steps, 0
 
-    def part(self, what: str, of: int = 1) -> Progress | None:
+    def start(self, what: str, of: int = 1) -> Progress | None:
+        """Return where a step reports to that counts as so many."""
+        begin, self._done = self._done, self._done + of
         if self._progress is None:
             return None
-        whole, begin, parts = self._progress, self._done, self._parts
-        return lambda done, detail: whole((begin + of * done) / parts, f"{what}: {detail}")
-
-    def next(self, parts: int = 1) -> None:
-        self._done += parts
+        whole, steps = self._progress, self._steps
+        return lambda done, detail: whole((begin + of * done) / steps, f"{what}: {detail}")

@@ -1,6 +1,6 @@
 """Black-box fits: choose a structure, fit it to all logs, resample it to see how certain it is.
 
-The kinds (:data:`FAMILIES`) differ in the family of models
+The kinds (:data:`BLACK_BOXES`) differ in the family of models
 (:class:`thermogrip.sysid.blackbox.order_selection.Family`); averaging, the choice by held-out free run and
 what the plant keeps are the same for all.  Where the averaging is not prescribed, both the averaged rate and
 the logs' own are tried: a coarse converter calls for the former, a delay for the latter.  The step that
@@ -35,6 +35,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from importlib import import_module
 from itertools import pairwise
 from typing import Any
 
@@ -43,10 +44,6 @@ import numpy as np
 from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.errors import UserError, known_names
 from thermogrip.datasets.schema import Log
-from thermogrip.sysid.blackbox.armax import ArmaxSearch, armax_family
-from thermogrip.sysid.blackbox.arx import arx_family
-from thermogrip.sysid.blackbox.box_jenkins import NoiseSearch, bj_family
-from thermogrip.sysid.blackbox.neural import neural_family
 from thermogrip.sysid.blackbox.order_selection import (
     Choice,
     Family,
@@ -58,27 +55,25 @@ from thermogrip.sysid.blackbox.order_selection import (
     free_run_errors,
     free_run_misses,
 )
-from thermogrip.sysid.blackbox.output_error import Search, oe_family
-from thermogrip.sysid.blackbox.sindy import sindy_family
-from thermogrip.sysid.blackbox.subspace import parsim_family, subspace_family
 from thermogrip.sysid.data.data_quality import reading_excess
 from thermogrip.sysid.plant.fit_record import PlantScores, fit_logs
 from thermogrip.sysid.plant.log_grid import Grid, Segment, make_grid, rows_of
 from thermogrip.sysid.plant.plant import Plant
 from thermogrip.sysid.plant.simulation import READING_EVERY
 
-FAMILIES: dict[str, Family] = {
-    "arx": arx_family,
-    "oe": oe_family,
-    "armax": armax_family,
-    "bj": bj_family,
-    "subspace": subspace_family,
-    "parsim": parsim_family,
-    "sindy": sindy_family,
-    "neural": neural_family,
+#: The module of each kind, which is loaded where that is first fitted.
+_MODULES = {
+    "arx": "arx",
+    "oe": "output_error",
+    "armax": "armax",
+    "bj": "box_jenkins",
+    "subspace": "subspace",
+    "parsim": "subspace",
+    "sindy": "sindy",
+    "neural": "neural",
 }
-BLACK_BOXES = tuple(FAMILIES)
-_SEARCHES: dict[str, type[Search]] = {"oe": Search, "armax": ArmaxSearch, "bj": NoiseSearch}
+BLACK_BOXES = tuple(_MODULES)
+_SEARCHED = ("oe", "armax", "bj")  # kinds whose denominators are searched, and begin from those known
 # a refit of a neural model takes as long as its fit
 RESAMPLED = ("arx", "oe", "armax", "bj", "subspace", "parsim", "sindy")
 
@@ -104,6 +99,13 @@ class BlackBoxFit:
     plant: Plant
     choice: Choice  # the structure with its held-out errors
     grid: Grid  # the data that it was fitted to
+
+
+def family_of(kind: str) -> Family:
+    """Return the family of models of a kind."""
+    module = import_module(f"thermogrip.sysid.blackbox.{_MODULES[kind]}")
+    family: Family = getattr(module, f"{kind}_family")
+    return family
 
 
 def fit_black_box(
@@ -142,7 +144,7 @@ def fit_black_box(
     >>> fit.choice.structure.label, fit.plant.model.time_constants().round(0).tolist()  # -1/ln 0.95 s
     ('na 1, nb 1, delay 1', [20.0])
     """
-    if kind not in FAMILIES:
+    if kind not in BLACK_BOXES:
         raise UserError(f"no model of kind {kind!r}", hint=known_names(kind, BLACK_BOXES))
     family = _of_order(kind, order, delay)
     best: tuple[float, Grid, Choice] | None = None
@@ -168,7 +170,7 @@ def fit_black_box(
             best = error_of_readings, tried, choice
     if best is None:
         raise refused if refused is not None else UserError(f"{kind} could not be fitted")
-    chosen, choice = _with_convention(*best[1:], logs, family, warmup)
+    chosen, choice = _with_convention(kind, *best[1:], logs, family, warmup)
     return BlackBoxFit(kind, _plant(chosen, choice, logs), choice, chosen)
 
 
@@ -223,15 +225,15 @@ def _of_order(kind: str, order: int | None, delay: int | None) -> Family:
         if not 1 <= value <= _MOST_FIXED:
             raise UserError(f"{what} {value} is not between 1 and {_MOST_FIXED}", hint="give another")
         fixed[_FIXED[kind, what]] = (value,)
-    return partial(FAMILIES[kind], **fixed) if fixed else FAMILIES[kind]
+    return partial(family_of(kind), **fixed) if fixed else family_of(kind)
 
 
 def _with_convention(
-    grid: Grid, choice: Choice, logs: Sequence[Log], family: Family, warmup: float | None
+    kind: str, grid: Grid, choice: Choice, logs: Sequence[Log], family: Family, warmup: float | None
 ) -> tuple[Grid, Choice]:
     """Return grid and choice with inputs that were applied up to their rows where that errs clearly less;
     within a step that was averaged over several rows one row makes no difference."""
-    if grid.dt > 1.5 * grid.native or family in (sindy_family, neural_family):
+    if grid.dt > 1.5 * grid.native or kind in _AVERAGED:
         return grid, choice
     moved = replace(grid.of(logs, ends=True), why=grid.why)
     for tried in (partial(family, only=choice.structure), family):  # the same structure first: one fit a fold
@@ -254,7 +256,10 @@ def with_refits(
     """
     if fit.kind not in RESAMPLED:
         raise ValueError(f"{fit.kind} is not refitted; choose from {', '.join(RESAMPLED)}")
-    family, blocks = _near(fit), cut_into_blocks(fit.grid.segments)
+    blocks = cut_into_blocks(fit.grid.segments)
+    family: Callable[..., Mapping[Structure, Model]] = family_of(fit.kind)
+    if fit.kind in _SEARCHED:  # from the denominators of refits before: a quarter of the time
+        family = partial(family, searches=[])
     rng, most = np.random.default_rng(seed), _AGREES * _error(fit, fit.choice.model)
     said = []
     for what, draw, fewest in (("blocks", _drawn_blocks, _FEWEST), ("errors", _drawn_errors, _FEWEST // 2)):
@@ -275,14 +280,6 @@ def with_refits(
             return replace(fit.plant, refits=tuple(refits))
         said.append(f"of {tried} refits to resampled {what} only {len(refits)} agree with the logs")
     raise UserError(f"{fit.kind}: {'; '.join(said)}", hint="a smaller structure, or longer logs")
-
-
-def _near(fit: BlackBoxFit) -> Callable[..., Mapping[Structure, Model]]:
-    """Return the family; of the kinds that search denominators, one that begins from those of refits before:
-    a quarter of the time."""
-    family: Callable[..., Mapping[Structure, Model]] = FAMILIES[fit.kind]
-    search = _SEARCHES.get(fit.kind)
-    return family if search is None else partial(family, searches=[search() for _ in fit.grid.outputs])
 
 
 def _drawn_blocks(fit: BlackBoxFit, blocks: Sequence[Segment], rng: np.random.Generator) -> list[Segment]:

@@ -303,14 +303,15 @@ def oe_family(
     delays: Sequence[int] = (1, 2, 3),
     terms: Sequence[tuple[str, ...]] | None = None,
     only: order_selection.Structure | None = None,
-    searches: Sequence[Search] | None = None,
+    searches: list[Search] | None = None,
     search: type[Search] | None = None,
 ) -> Mapping[order_selection.Structure, StateSpaceModel]:
     """Return a model for each structure that has a stable one, by ``search`` of output error where absent;
-    ``searches``, one an output, remember the denominators of fits before.  Numerators of two rows alone err
+    ``searches``, empty at first, remember the denominators of fits before.  Numerators of two rows alone err
     alike on 14 public logs, and on the rig's four, left out in turn, by up to 41 % more."""
     out, kind = {}, search or Search
-    searches = searches or [kind() for _ in grid.outputs]
+    searches = [] if searches is None else searches
+    searches += [kind() for _ in grid.outputs[len(searches) :]]
     for products in order_selection.default_terms(grid) if terms is None else terms:
         w = order_selection.drives(grid, products)
         records = [Records([s.y[:, i] for s in grid.segments], w) for i in range(len(grid.outputs))]

@@ -13,29 +13,32 @@ Beside the free run stand
   hindsight. A model that does not beat it has learnt nothing from the input.
 
 The residual is tested twice (:mod:`thermogrip.sysid.validation.residual_tests`): is it white, and does it
-correlate with an input beyond the effect of an unknown start, uncertain parameters and slow noise? Only the
-latter leads to the note that a term may be missing, for at most one right model in a hundred. Whether that
-matters is another question: the verdict goes by how large the error is beside the stated one
-(:mod:`thermogrip.sysid.validation.verdict`).
+correlate with an input? Whether that matters is another question: the verdict goes by how large the error is
+beside the stated one (:mod:`thermogrip.sysid.validation.verdict`).
 
-After a gap of more than 10 s the input is unknown: the run starts afresh from its own warm-up, the next 60
-s are not scored, and the figure with the last row held through the gap is given with it.
+After a gap of more than 10 s the input is unknown: the run starts afresh from its own warm-up, and the next
+60 s are not scored.
+
+**Warm-up.**  A network has few states, and begins at rest where its sensors agree: 5 s.  A black box of one
+or two logs was scored with what stands for rest in a part of a log, fifty rows, and its slowest state needs a
+tenth of its time constant to show; no run spends more than a tenth of its log on that.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from thermogrip.datasets.arrays import Array, Mask
+from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.resample import block_means, gaps
-from thermogrip.datasets.schema import Log, column, columns
-from thermogrip.sysid.plant.fit_record import fit_logs, said_of_fit
-from thermogrip.sysid.plant.log_grid import Rows, cut_stretches, match_logs, rows_of
+from thermogrip.datasets.resample import gaps
+from thermogrip.datasets.schema import Log, column, columns, log_name
+from thermogrip.sysid.plant.fit_record import SEVERAL, fit_logs, said_of_fit
+from thermogrip.sysid.plant.log_grid import cut_stretches, match_logs
 from thermogrip.sysid.validation.residual_tests import (
     SQUARED,
     Correlation,
@@ -53,9 +56,8 @@ if TYPE_CHECKING:
     from pandas import DataFrame
 
     from thermogrip.sysid.plant.plant import Plant
-    from thermogrip.sysid.validation.prediction_bands import Band
+    from thermogrip.sysid.validation.prediction_bands import Band, InputEffect
 
-EXCEEDS = 2.0  # times the error of the fit, from which that is reported
 START = 0.1  # share of the squared error due to the start, from which that is reported
 
 
@@ -77,14 +79,11 @@ class FreeRun:
     scores: dict[str, Score]  # of the free run
     one_step: dict[str, Score]  # of the last reading plus the model's move
     naive: dict[str, dict[str, Score]]  # of the baselines ``"mean"`` and ``"no_input"``
-    held: dict[str, Score]  # with the last row held through the gaps; empty without a gap
     whiteness: dict[str, Correlation]  # autocorrelation of the residual
     # of the residual with the inputs before it, of those that move in this log; what a figure shows
     input_correlation: dict[str, dict[str, Correlation]]
     # tests of the residual for correlation with signals; empty without ``tests``
     residual: ResidualCorrelations
-    # how many times as far off as its fit an output is, where that is more than twice
-    exceeds_fit: dict[str, float]
     no_better: tuple[str, ...]  # outputs whose free run does not clearly beat the no-input baseline
     notes: tuple[str, ...]  # what limits these numbers
     warmup: float  # seconds whose readings set the state
@@ -106,12 +105,10 @@ class FreeRun:
 def free_run(
     plant: Plant,
     log: Log | DataFrame | str | Path,
-    warmup: float = 5.0,
-    score_from: float = 5.0,
-    average: float | None = None,
+    warmup: float | None = None,
+    score_from: float | None = None,
     *,
     tests: bool = True,
-    known: FreeRun | None = None,
 ) -> FreeRun:
     """Simulate the log and score it.
 
@@ -120,15 +117,11 @@ def free_run(
     plant : Plant
     log : Log, DataFrame, str or Path
     warmup : float, optional
-        Seconds at the start whose measured outputs may set the state.
+        Seconds at the start whose measured outputs may set the state; :func:`usual_warmup` where absent.
     score_from : float, optional
-        Samples before this many seconds are not scored.
-    average : float, optional
-        Score block means over this many seconds instead of samples.
+        Samples before this many seconds are not scored; where absent, those of the warm-up.
     tests : bool, optional
         Test whether the residual correlates with an input, which takes some dozens of free runs.
-    known : FreeRun, optional
-        The same run without tests, which then is not simulated again.
 
     Returns
     -------
@@ -155,76 +148,111 @@ def free_run(
     (True, 195, ())
     """
     (log,), converted = match_logs(plant, [log])
+    warmup = usual_warmup(plant, log) if warmup is None else warmup
+    score_from = warmup if score_from is None else score_from
     if score_from < warmup:
         raise UserError(
             f"scoring from {score_from:g} s would score readings of the {warmup:g} s warm-up",
             hint=f"score from {warmup:g} s on",
         )
-    simulated = plant.simulate(log, warmup=warmup, score_from=score_from) if known is None else known.log
-    rows = rows_of(log, plant.inputs, plant.outputs, plant.disturbances)
-    run, scored = columns(simulated, plant.outputs), column(simulated, "scored") > 0
-    units = {name: str(log[name].attrs.get("units", "1")) for name in plant.outputs}
-    pairs = _beside(plant, rows, run, scored, average)
-    both = pairs.outputs
-    scores, found = _scores(both, units), gaps(log)
-    held: dict[str, Score] = {}
-    if found and known is not None:
-        held = known.held
-    elif found:
-        through = plant.simulate(log, warmup=warmup, score_from=score_from, gaps="hold")
-        whole, kept = columns(through, plant.outputs), column(through, "scored") > 0
-        held = _scores(_beside(plant, rows, whole, kept, average).outputs, units)
-    mean = {n: score(y, np.full(y.shape, np.nanmean(y)), units[n]) for n, (y, _) in both.items()}
-    no_input = {n: score(y, no_input_baseline(pairs.time, y), units[n]) for n, (y, _) in both.items()}
-    with np.errstate(invalid="ignore"):  # a run that went to infinity makes no step there
-        one = {n: _one_step(y, v, units[n]) for n, (y, v) in both.items()}
-    no_better = tuple(
-        name for name in plant.outputs if not scores[name].rmse < NO_BETTER * no_input[name].rmse
+    simulated = plant.simulate(log, warmup=warmup, score_from=score_from)
+    pairs = _beside(plant, log, simulated)
+    errors = {name: y - v for name, (y, v) in pairs.outputs.items()}
+    moved = {name: column(log, name) for name in plant.inputs if np.ptp(column(log, name)) > 0}
+    scores, naive = _scores(plant, log, pairs), _baselines(plant, log, pairs)
+    tested = _tested(plant, log, simulated, scores, naive, warmup) if tests else _NOT_TESTED
+    run = FreeRun(
+        log=simulated,
+        scores=scores,
+        one_step=_one_step(plant, log, pairs),
+        naive=naive,
+        whiteness={name: autocorrelation(error) for name, error in errors.items()},
+        input_correlation={
+            name: {u: cross_correlation(error, w) for u, w in moved.items()} for name, error in errors.items()
+        },
+        residual=tested.residual,
+        no_better=tuple(
+            name for name in plant.outputs if not scores[name].rmse < NO_BETTER * naive["no_input"][name].rmse
+        ),
+        notes=(),
+        warmup=warmup,
+        plant=plant,
+        measured=log,
+        verdict=tested.verdict,
+        stated=tested.band,
     )
-    whiteness = {name: autocorrelation(y - v) for name, (y, v) in both.items()}
-    moved = {u: values for u, values in pairs.inputs.items() if np.ptp(values) > 0}
-    left = {n: {u: cross_correlation(y - v, w) for u, w in moved.items()} for n, (y, v) in both.items()}
-    residual = ResidualCorrelations({}, {})
-    if tests:
-        residual = residual_correlations(plant, cut_stretches(plant, log), run, scored, warmup=warmup)
-    # means over the fit's own blocks: an error as slow as the log correlates with no input, but shows here
-    blocks = _blocks_of_fit(plant, rows.time)
-    beyond = _beyond_fit(plant, residual, _beside(plant, rows, run, scored, blocks).outputs if blocks else {})
-    verdict, band, gain = None, None, list[str]()
-    if tests:
-        from thermogrip.sysid.validation.prediction_bands import free_run_band  # scipy.special
+    notes = [*said_of_fit(plant.fitted_to, *fit_logs([log])), *converted, *_notes(run, tested.by_inputs)]
+    return replace(run, notes=tuple(notes))
 
-        miss = rows.y - np.where(scored[:, None], run, np.nan)
-        off, gain = _gain(plant, log, miss, units)
-        band = free_run_band(plant, log, simulated, warmup=warmup)
-        readings = _beside(plant, rows, run, scored, None)
-        tested = replace(fit_logs([log])[0], start_s=float(rows.time[np.argmax(scored)]))
-        verdict = judge(
-            band,
-            {name: score(*pair).rmse for name, pair in readings.outputs.items()},
-            {n: score(y, no_input_baseline(readings.time, y)).rmse for n, (y, _) in readings.outputs.items()},
-            causes=_causes(miss, plant.outputs, residual.start),
-            gain=off,
-            seen=bool(said_of_fit(plant.fitted_to, tested)),
-        )
-    outside = _outside(plant, {name: column(log, name) for name in plant.valid if name in log})
-    unseen = [name for name in outside if name not in plant.outputs]
-    notes = (
-        *said_of_fit(plant.fitted_to, *fit_logs([log])),
-        *converted,
-        *_notes(float(rows.time[0]), found, held, () if _no_test(verdict) else no_better),
-        *_residual_notes(whiteness, residual, units, warmup, unseen, verdict),
-        *_excess_notes(plant, beyond, units, verdict),
-        *gain,
-        *_outside_notes(plant, outside),
-        *([] if verdict is None else [str(verdict)]),
+
+def usual_warmup(plant: Plant, log: Log) -> float:
+    """Return the seconds of readings that set the state where nothing is said; see the module's theory."""
+    if not plant.scores.held_out_by_part:
+        return max(5.0, plant.dt)
+    return max(5.0, plant.dt, warm_up_of_fit(plant, log), start_seconds(plant, log))
+
+
+def start_seconds(plant: Plant, log: Log) -> float:
+    """Return a tenth of the slowest time constant of a plant, at most a tenth of the log [s]."""
+    from thermogrip.sysid.export.dynamics import plant_dynamics
+
+    slowest, seconds = float("inf"), float(log["time"][-1] - log["time"][0])
+    with suppress(UserError):  # a plant that does not settle
+        slowest = float(plant_dynamics(plant, draws=0).time_constants[0])
+    return float(f"{min(slowest, seconds) / 10:.2g}")
+
+
+def warm_up_of(time: Array) -> float:
+    """Return the warm-up [s] of a log that may begin warm: fifty rows, a minute at most."""
+    return min(50.0 * float(np.median(np.diff(time))), 60.0)
+
+
+def warm_up_of_fit(plant: Plant, log: Log) -> float:
+    """Return the warm-up [s] that scored a black box of one or two logs; 0 for other plants."""
+    black_box = bool(plant.scores.held_out_by_part)
+    return warm_up_of(log["time"].values) if black_box and 0 < len(plant.logs) < SEVERAL else 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class _Tested:
+    """What tests of a run find."""
+
+    residual: ResidualCorrelations
+    verdict: Verdict | None = None
+    band: Band | None = None
+    by_inputs: InputEffect | None = None
+
+
+_NOT_TESTED = _Tested(ResidualCorrelations({}, {}))
+
+
+def _tested(
+    plant: Plant,
+    log: Log,
+    simulated: Log,
+    scores: Mapping[str, Score],
+    naive: Mapping[str, Mapping[str, Score]],
+    warmup: float,
+) -> _Tested:
+    """Test the residual of a run, and judge the plant by its readings."""
+    from thermogrip.sysid.validation.prediction_bands import effect_of_run, free_run_band  # scipy.special
+
+    run, scored = columns(simulated, plant.outputs), column(simulated, "scored") > 0
+    residual = residual_correlations(plant, cut_stretches(plant, log), run, scored, warmup=warmup)
+    error = np.where(scored[:, None], columns(log, plant.outputs) - run, np.nan)
+    by_inputs = effect_of_run(plant, error, log)
+    band = free_run_band(plant, log, simulated, warmup=warmup)
+    time = log["time"].values
+    rows = replace(fit_logs([log])[0], start_s=float(time[np.argmax(scored)]))
+    verdict = judge(
+        band,
+        {name: each.rmse for name, each in scores.items()},
+        {name: each.rmse for name, each in naive["no_input"].items()},
+        causes=_causes(error, plant.outputs, residual.start),
+        by_inputs=by_inputs,
+        seen=bool(said_of_fit(plant.fitted_to, rows)),
     )
-    exceeds_fit = {name: here / there for name, (here, there) in beyond.items()}
-    naive = {"mean": mean, "no_input": no_input}
-    return FreeRun(
-        simulated, scores, one, naive, held, whiteness, left, residual, exceeds_fit, no_better, notes, warmup,
-        plant, log, verdict, band,
-    )  # fmt: skip
+    return _Tested(residual, verdict, band, by_inputs)
 
 
 def _causes(miss: Array, outputs: Sequence[str], start: Mapping[str, float]) -> dict[str, dict[Cause, float]]:
@@ -264,61 +292,78 @@ def no_input_baseline(time: Array, measured: Array) -> Array:
 
 
 class _Pairs(NamedTuple):
-    """Readings beside the run at the same times (n,), NaN where not scored, and the inputs there."""
+    """Readings beside the run (n,), NaN where not scored."""
 
     time: Array
     outputs: dict[str, tuple[Array, Array]]  # measured, simulated
-    inputs: dict[str, Array]
 
 
-def _beside(plant: Plant, rows: Rows, run: Array, scored: Mask, average: float | None) -> _Pairs:
-    """Return what was measured beside the free run (n, n_y), in means over ``average`` [s] if given."""
-    time, n_y = rows.time, len(plant.outputs)
-    values = np.hstack([np.where(scored[:, None], np.hstack([rows.y, run]), np.nan), rows.u])
-    if average is not None:
-        held = np.arange(values.shape[1]) >= 2 * n_y
-        parts = block_means(time, values, held, seconds=average, after=rows.after, log=rows.log)
-        time, values = (np.concatenate(part) for part in zip(*parts))
+def _beside(plant: Plant, log: Log, simulated: Log) -> _Pairs:
+    """Return what was measured beside the free run."""
+    time, scored = log["time"].values, column(simulated, "scored") > 0
     if not scored.any():
         problem = f"nothing of its {np.ptp(time):g} s is left to score"
-        raise UserError(problem, file=rows.log, hint="give a longer log, or score from an earlier time")
-    measured, simulated, drives = values.T[:n_y], values.T[n_y : 2 * n_y], values.T[2 * n_y :]
-    outputs = dict(zip(plant.outputs, zip(measured, simulated)))
-    return _Pairs(time, outputs, dict(zip(plant.inputs, drives)))
+        hint = "give a longer log, or score from an earlier time"
+        raise UserError(problem, file=log_name(log), hint=hint)
+    read, run = (np.where(scored[:, None], columns(each, plant.outputs), np.nan) for each in (log, simulated))
+    return _Pairs(time, dict(zip(plant.outputs, zip(read.T, run.T))))
 
 
-def _one_step(y: Array, v: Array, unit: str) -> Score:
-    """Return the score of the last reading that came plus the run's move."""
-    known = np.isfinite(y)
-    y, v = y[known], v[known]
-    return score(y[1:], y[:-1] + np.diff(v), unit)
+def _unit(log: Log, name: str) -> str:
+    return str(log[name].attrs.get("units", "1"))
 
 
-def _scores(both: Mapping[str, tuple[Array, Array]], units: Mapping[str, str]) -> dict[str, Score]:
-    return {name: score(y, v, units[name]) for name, (y, v) in both.items()}
+def _scores(plant: Plant, log: Log, pairs: _Pairs) -> dict[str, Score]:
+    return {name: score(*pairs.outputs[name], _unit(log, name)) for name in plant.outputs}
 
 
-def _notes(
-    first: float, found: list[tuple[int, float, float]], held: Mapping[str, Score], no_better: tuple[str, ...]
-) -> list[str]:
-    """Return notes on the run's start at ``first`` [s], its gaps and its baselines."""
-    notes = []
+def _baselines(plant: Plant, log: Log, pairs: _Pairs) -> dict[str, dict[str, Score]]:
+    """Return the scores of the mean and of the decay without input, in hindsight."""
+    read = {name: pairs.outputs[name][0] for name in plant.outputs}
+    mean = {n: score(y, np.full(y.shape, np.nanmean(y)), _unit(log, n)) for n, y in read.items()}
+    no_input = {n: score(y, no_input_baseline(pairs.time, y), _unit(log, n)) for n, y in read.items()}
+    return {"mean": mean, "no_input": no_input}
+
+
+def _one_step(plant: Plant, log: Log, pairs: _Pairs) -> dict[str, Score]:
+    """Return the scores of the last reading that came plus the run's move."""
+    out = {}
+    for name in plant.outputs:
+        read, run = pairs.outputs[name]
+        known = np.isfinite(read)
+        read, run = read[known], run[known]
+        with np.errstate(invalid="ignore"):  # a run that went to infinity makes no step there
+            out[name] = score(read[1:], read[:-1] + np.diff(run), _unit(log, name))
+    return out
+
+
+def _notes(run: FreeRun, by_inputs: InputEffect | None) -> list[str]:
+    """Return what limits the scores of a run, and what its residual shows."""
+    plant, log, verdict = run.plant, run.measured, run.verdict
+    first, notes = float(log["time"][0]), []
     if first > 60:
         notes.append(
             f"the run starts at {first:g} s from its warm-up alone: what was warm and unseen is guessed; "
             f"give the whole log and score from {first:g} s to start where the log starts"
         )
-    beside = ", ".join(f"{name} {s.rmse:.3g} {s.unit}" for name, s in held.items())
-    for _, before, after in found:
-        notes.append(
-            f"no row from {before:g} to {after:g} s: the run starts afresh after it, the next 60 s are not "
-            f"scored (last row held instead: RMSE {beside})"
-        )
-    for name in no_better:
-        notes.append(
+    notes += [
+        f"no row from {before:g} to {after:g} s: the run starts afresh after it, the next 60 s are not scored"
+        for _, before, after in gaps(log)
+    ]
+    if verdict is None or verdict.standing != "no test":
+        notes += [
             f"{name}: hardly better than a model without input: the fit cannot be relied on for control"
-        )
-    return notes
+            for name in run.no_better
+        ]
+    outside = _outside(plant, {name: column(log, name) for name in plant.valid if name in log})
+    unseen = [name for name in outside if name not in plant.outputs]
+    units = {name: _unit(log, name) for name in plant.outputs}
+    notes += _residual_notes(run.whiteness, run.residual, units, run.warmup, unseen, verdict)
+    if by_inputs is not None:
+        remaining = ", ".join(f"{name} {rms:.2g} {units[name]}" for name, rms in by_inputs.remaining.items())
+        notes.append(f"most of the error is {by_inputs.words()}, which would leave {remaining}")
+    notes += _outside_notes(plant, outside)
+    return notes if verdict is None else [*notes, str(verdict)]
 
 
 def _residual_notes(
@@ -347,10 +392,6 @@ def _residual_notes(
     return notes
 
 
-def _no_test(verdict: Verdict | None) -> bool:
-    return verdict is not None and verdict.standing == "no test"
-
-
 def _small(verdict: Verdict | None) -> bool:
     """Return whether a run is known to err by no more than was stated."""
     return verdict is not None and verdict.standing not in ("worse", "another plant")
@@ -373,58 +414,6 @@ def _correlation_note(
     if unseen:
         why = f"the fit has not seen {', '.join(unseen)} as here, so this need not be a term that is missing"
     return f"{name}: the residual correlates with {what} (rms {size}, p = {found.p:.1g}): {why}"
-
-
-def _blocks_of_fit(plant: Plant, time: Array) -> float | None:
-    """Return the length of the blocks of a grey-box fit [s]; None where these rows make no such means."""
-    seconds = plant.scores.average_s
-    if not plant.scores.in_sample_rmse or seconds is None:  # a black box's noise is no error of its fit
-        return None
-    return seconds if float(np.median(np.diff(time))) <= seconds <= np.ptp(time) / 10 else None
-
-
-def _beyond_fit(
-    plant: Plant, residual: ResidualCorrelations, blocks: Mapping[str, tuple[Array, Array]]
-) -> dict[str, tuple[float, float]]:
-    """Return the errors here and in the fit of outputs whose error exceeds that of the fit by much."""
-    found = {}
-    for name, (y, v) in blocks.items():
-        here, there = score(y, v).rmse, plant.noise.get(name, 0.0)
-        if here > EXCEEDS * there > 0 and residual.start.get(name, 0.0) <= START:
-            found[name] = (here, there)
-    return found
-
-
-def _excess_notes(
-    plant: Plant,
-    beyond: Mapping[str, tuple[float, float]],
-    units: Mapping[str, str],
-    verdict: Verdict | None = None,
-) -> list[str]:
-    """Return by how much outputs exceed the error of the fit."""
-    why = "or the plant is not quite what it was in the fit"
-    why = "within the error that was stated" if _small(verdict) else why
-    return [
-        f"{name}: means over {plant.scores.average_s:g} s err by {here:.2g} {units[name]}, and "
-        f"by {there:.2g} {units[name]} in the fit: slow terms are missing, {why}"
-        for name, (here, there) in beyond.items()
-    ]
-
-
-def _gain(plant: Plant, log: Log, miss: Array, units: Mapping[str, str]) -> tuple[float | None, list[str]]:
-    """Return a gain that is not that of the fit, where it is most of the error, and what it explains."""
-    from thermogrip.sysid.validation.prediction_bands import gain_of_run  # scipy.special
-
-    found = gain_of_run(plant, miss, log)
-    if found is None:
-        return None, []
-    gain, left = found
-    sizes = ", ".join(f"{name} {rms:.2g} {units[name]}" for name, rms in zip(plant.outputs, left))
-    how = f"{100 * abs(gain):.0f} % {'more' if gain > 0 else 'less'}"
-    return gain, [
-        f"most of the error is one gain: inputs that do {how} than in the fit would leave {sizes}; another "
-        "supply, or another cooling? Identify with this log as well"
-    ]
 
 
 def _outside_notes(plant: Plant, outside: Mapping[str, float]) -> list[str]:

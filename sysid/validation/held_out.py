@@ -14,13 +14,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log, log_name
 from thermogrip.sysid.blackbox.fit import BlackBoxFit
-from thermogrip.sysid.plant.fit_record import HELD_OUT_SHARE, SEVERAL, TAIL
+from thermogrip.sysid.plant.fit_record import HELD_OUT_SHARE, TAIL
 from thermogrip.sysid.plant.plant import Plant
-from thermogrip.sysid.validation.free_run import FreeRun, free_run, no_input_baseline
+from thermogrip.sysid.validation.free_run import FreeRun, free_run, no_input_baseline, warm_up_of
 from thermogrip.sysid.validation.prediction_bands import check_ensemble
 
 SHOWN = 12  # structures of a kind
@@ -96,17 +95,6 @@ def run_held_out(plant: Plant, held: Held, *, unseen: bool = False) -> FreeRun:
     if unseen and plant.model.kind == "neural":
         check_ensemble(plant, held.log, warmup=warmup)
     return free_run(plant, held.log, warmup=warmup, score_from=max(warmup, held.score_from), tests=False)
-
-
-def warm_up_of(time: Array) -> float:
-    """Return the warm-up [s] of a log that may begin warm: fifty rows, a minute at most."""
-    return min(50.0 * float(np.median(np.diff(time))), 60.0)
-
-
-def warm_up_of_fit(plant: Plant, log: Log) -> float:
-    """Return the warm-up [s] that scored a black box of one or two logs; 0 for other plants."""
-    black_box = bool(plant.scores.held_out_by_part)
-    return warm_up_of(log["time"].values) if black_box and 0 < len(plant.logs) < SEVERAL else 0.0
 
 
 def rows_of(model: str, plant: Plant, name: str, run: FreeRun, *, held_out: bool) -> list[Row]:

@@ -63,6 +63,7 @@ from dataclasses import dataclass, field
 from statistics import NormalDist
 
 import numpy as np
+from scipy.signal import lfilter
 from scipy.special import ndtri, stdtrit
 
 from thermogrip.datasets.arrays import Array
@@ -80,6 +81,7 @@ MEDIAN = NormalDist().inv_cdf(0.75)  # of the size of a normal number, in standa
 _RANKS = 199  # quantiles of each part, of which their sum is made
 _DIVERGED = 1e6  # of an output's spread
 _SMALL = 0.05  # change of the inputs by which their effect is found
+_LATER = (1 / 30, 1 / 10, 1 / 3)  # of a run: lags of an effect that comes later; half a decade apart
 _UNLIKE = 0.1  # of the run's error: what a run unlike the fit adds, from which it is reported
 
 
@@ -223,26 +225,53 @@ def effect_of_inputs(plant: Plant, logs: Sequence[Log], gain: float) -> dict[str
     return dict(zip(plant.outputs, np.concatenate(changes).T))
 
 
-def gain_of_run(plant: Plant, miss: Array, log: Log) -> tuple[float, Array] | None:
-    """Return by how large a share the inputs did more in a run than in the fit, by least squares of what the
-    free run missed (n, n_y), NaN where it is not scored, in the spread of each output; and what that leaves
-    (n_y,) as rms. None where it is within two standard deviations of what differs from run to run, or leaves
-    half of the squared error."""
+@dataclass(frozen=True, eq=False)
+class InputEffect:
+    """What inputs did more in a run than in the fit."""
+
+    gain: float  # by how large a share
+    lag_s: float  # how long after the effect that the plant knows; 0: at once
+    remaining: dict[str, float]  # rms error by output that it leaves
+
+    def words(self) -> str:
+        """Return it in words."""
+        more = f"{100 * abs(self.gain):.0f} % {'more' if self.gain > 0 else 'less'}"
+        if self.lag_s == 0:
+            return f"one gain: inputs do {more} than in the fit (another supply, or another cooling?)"
+        later = f"about {self.lag_s:.2g} s later"
+        return f"slow: inputs do {more} than in the fit {later}, so slow terms are missing"
+
+
+def effect_of_run(plant: Plant, error: Array, log: Log) -> InputEffect | None:
+    """Return what inputs did more in a run than in the fit, at once or later, whichever is nearest by least
+    squares to the errors (n, n_y) of the free run, NaN where it is not scored, in the spread of each output.
+    None where that is within two standard deviations of what differs from run to run, or leaves half of the
+    squared error.  A gain alone would be taken for what a mass that soaks for longer than the fit does."""
     effects = effect_of_inputs(plant, [log], _SMALL)
-    effect = np.array([effects[name] for name in plant.outputs]).T / _SMALL
+    at_once = np.array([effects[name] for name in plant.outputs]).T / _SMALL
     spread = np.array([np.nanstd(column(log, name)) for name in plant.outputs])
+    spread = np.where(spread > 0, spread, 1.0)
     with np.errstate(over="ignore", invalid="ignore"):  # a run that diverged has no gain
-        known = (
-            np.isfinite(miss) & (np.abs(effect) < _DIVERGED * spread) & (np.abs(miss) < _DIVERGED * spread)
-        )
-    size, gap = (np.where(known, each / np.where(spread > 0, spread, 1.0), 0.0) for each in (effect, miss))
-    if not np.any(size):
+        known = np.isfinite(error) & (np.maximum(np.abs(at_once), np.abs(error)) < _DIVERGED * spread)
+    if not known.any():
         return None
-    gain = float(np.sum(size * gap) / np.sum(size**2))
-    if abs(gain) <= 2 * RUN_GAIN_SD or np.sum((gap - gain * size) ** 2) > 0.5 * np.sum(gap**2):
+    scaled_error = np.where(known, error / spread, 0.0)
+    step, seconds = float(log["time"].diff("time").median()), float(log["time"][-1] - log["time"][0])
+    best: tuple[float, float, float, Array] | None = None
+    for lag_s in (0.0, *(seconds * share for share in _LATER)):
+        keep = np.exp(-step / lag_s) if lag_s else 0.0
+        effect = lfilter([1 - keep], [1, -keep], np.where(np.isfinite(at_once), at_once, 0.0), axis=0)
+        size = np.where(known, effect / spread, 0.0)
+        gain = float(np.sum(size * scaled_error) / max(np.sum(size**2), 1e-300))
+        squares = float(np.sum((scaled_error - gain * size) ** 2))
+        if best is None or squares < best[0]:
+            best = squares, gain, lag_s, np.where(known, error - gain * effect, np.nan)
+    assert best is not None
+    squares, gain, lag_s, remaining = best
+    if abs(gain) <= 2 * RUN_GAIN_SD or squares > 0.5 * np.sum(scaled_error**2):
         return None
-    left = np.where(known, miss - gain * effect, np.nan)
-    return gain, np.sqrt(np.nanmean(left**2, axis=0))
+    rms = np.sqrt(np.nanmean(remaining**2, axis=0))
+    return InputEffect(gain, lag_s, dict(zip(plant.outputs, rms.tolist())))
 
 
 MOST_DISAGREEMENT = 0.4  # of the output's spread in the data of the fit

@@ -2,15 +2,12 @@
 
 **Correlations by lag.** With residuals e of n samples the autocorrelation r_k of a white sequence is N(0,
 1/n), so 95 % of its lags lie inside +-1.96/sqrt(n). The cross-correlation with an input u that is itself
-correlated is wider: with e and u independent, E e_i e_j u_i u_j = r_e(i - j) r_u(i - j), so c_k = (1/n)
-sum_i e_i u_(i-k) has (Bartlett)
+correlated is wider: c_k = (1/n) sum_i e_i u_(i-k) of independent e and u has (Bartlett)
 
     var c_k = (1/n) sum_j r_e(j) r_u(j).
 
-A residual that is not white means that one-step intervals are too narrow. Samples that are lost or not
-scored are left out of the sums, pair by pair. A residual that correlates with the input after lag zero
-means that a delay or a time constant is missing, but a count of lags outside of the band does not show it:
-lags of a slow input are not independent, of 41 either none lies outside or most do, and right models fail
+Samples that are lost or not scored are left out of the sums, pair by pair.  Lags of a slow input are not
+independent, of 41 either none lies outside of the band or most do, so a count of them rejects right models
 by the dozen. Hence a test.
 
 **Score test.** The residual of an output, in means over blocks, is modelled as
@@ -19,11 +16,10 @@ by the dozen. Hence a test.
 
 N b is what a right model may leave. Its columns are an offset of the sensor, of any size; the state in
 which each stretch begins, one prior sd in each direction (a few seconds of readings determine it poorly);
-the bias of an ambient; and the change by draws of the plant's parameters. w is white noise and two slow
-errors, learnt from this residual. x are first-order lags of 1, 4, 16 and 64 blocks of the input: a delay, a
-time constant or a heat flow that the model lacks is nearly a mixture of them. The output's own simulated
-value about its mean, squared and lagged likewise, represents a loss that curves (radiation, free
-convection). With V the covariance of N b + w and beta = 0,
+and the change by draws of the plant's parameters. x are first-order lags of 1, 4, 16 and 64 blocks of the
+input: a delay, a time constant or a heat flow that the model lacks is nearly a mixture of them. The output's
+own simulated value about its mean, squared and lagged likewise, represents a loss that curves (radiation,
+free convection). With V the covariance of N b + w and beta = 0,
 
     g = x' V^-1 e,      cov g = x' V^-1 x = H,      g' H^-1 g ~ chi-square, rank(H) degrees of freedom,
 
@@ -31,45 +27,35 @@ gives the probability p of at least this much. Of all pairs of an output and a s
 whose p is too small by Holm's rule at :data:`LEVEL`: at most one right model in a hundred has any, whatever
 the correlation time of its errors and the number of pairs.
 
-An error slower than a third of the log resembles an input that is as slow, and w absorbs it as noise:
-effects over so long a time are found late. Where N b alone explains much of e by its starts, that is
-reported too, for then a longer warm-up is missing, not a term.
-
-**Noise of block means**: white, and two slow errors,
-
-    cov(e_t, e_t') = w^2 [t = t'] + sum_m a_m^2 c(|t - t'|; tau_m),       m = 1, 2,
-
-c the autocovariance of an Ornstein-Uhlenbeck process that is averaged over blocks, as readings are: with
-the block as the unit of time and s = 1/tau,
+w is the sum of white noise and slow errors, Ornstein-Uhlenbeck processes with correlation times tau on a
+grid, averaged over blocks as readings are: with the block as the unit of time and s = 1/tau,
 
     c(0) = 2 (s - 1 + exp(-s)) / s^2,       c(k) = (2 sinh(s/2) / s)^2 exp(-k s)    for k > 0.
 
-The sampled form c(k) = exp(-k s) is too rough: fitted to a mean over blocks, whose fast part is weaker, it
-loses a third of the variance at low frequencies, where inputs act.
-
-The covariance is nearly diagonal in cosine coordinates (:mod:`thermogrip.sysid.greybox.noise_model`), with
-S_f at frequency f. The numbers maximise the likelihood of the series with columns X, whose coefficients are
-N(0, 1), integrated out, under wide log-normal priors:
-
-    -2 ln L = sum ln S_f + e' S^-1 e - g' A^-1 g + ln |A|,      A = 1 + X' S^-1 X,   g = X' S^-1 e.
+(The sampled form exp(-k s) loses a third of the variance at low frequencies, where inputs act.)  Their
+variances maximise the likelihood of e with beta = 0, under wide log-normal priors.  An error slower than a
+third of the log resembles an input that is as slow, and w absorbs it as noise: effects over so long a time
+are found late. Where N b alone explains much of e by its starts, that is reported too, for then a longer
+warm-up is missing, not a term.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.linalg import pinvh
 from scipy.optimize import minimize
 from scipy.signal import lfilter
 from scipy.special import chdtrc
 
 from thermogrip.datasets.arrays import Array, Mask
-from thermogrip.sysid.greybox.noise_model import Block, band_weights
 from thermogrip.sysid.plant.log_grid import Stretch, at_rows
-from thermogrip.sysid.plant.simulation import Start, find_starts
+from thermogrip.sysid.plant.simulation import find_starts
 
 if TYPE_CHECKING:
     from thermogrip.sysid.plant.plant import Plant
@@ -134,85 +120,27 @@ def _correlate(e: Array, u: Array, lags: NDArray[np.int_]) -> Array:
     return np.asarray(both[lags] / size)
 
 
-_SIZES = (0.3, 0.5, 0.5)  # prior medians of w and a_m, in rms of the series
-_SIZE_SD, _MEMORY_SD = 2.0, (1.0, 1.2)  # of their logarithms, and of those of the correlation times
-_FAST = 3.0  # prior median of the shorter correlation time [blocks]
-_SLOW = (12, 9.0)  # of the longer one: this part of the series, and at least so many blocks
-_LEAST = (
-    1e-6  # variance of a frequency: less than a thousandth of the series is no noise that can be determined
-)
+SQUARED = " squared"  # appended to an output whose residual may correlate with its own square
+LEVEL = 0.01  # share of right models for which any correlation may be significant
 
 
 @dataclass(frozen=True)
-class SlowNoise:
-    """Numbers of the covariance, in units of the series."""
+class ScoreTestSettings:
+    """Settings of the score test; lags and correlation times in blocks, sizes in rms of the residual."""
 
-    white: float  # w
-    sd: tuple[float, float]  # a_m
-    tau: tuple[float, float]  # tau_m [blocks]
-
-    def variances(self, n: int) -> Array:
-        """Return S_f of each band of frequencies of n blocks, (n_band,)."""
-        weights, lag = band_weights(n), np.arange(n)
-        out = np.full(len(weights), self.white**2)
-        for sd, tau in zip(self.sd, self.tau):
-            s = 1 / tau
-            decay = (2 * np.sinh(s / 2) / s) ** 2 * np.exp(-s * lag)
-            decay[0] = 2 * (s + np.expm1(-s)) / s**2
-            out += sd**2 * (weights @ decay)
-        return np.asarray(np.maximum(out, _LEAST))
-
-    def products(self, blocks: Sequence[Block]) -> Array:
-        """Return [X, e]' S^-1 [X, e], (q, q), of stretches of one output."""
-        parts = [
-            np.tensordot(1 / self.variances(block.n), block.products[:, 0, 0], axes=1) for block in blocks
-        ]
-        return np.asarray(np.sum(parts, axis=0))
+    most_blocks: int = 300  # of a log: a covariance of that size is inverted in milliseconds
+    fewest_blocks: int = 20  # with fewer the noise cannot be told from the input
+    input_lags: tuple[float, ...] = (1.0, 4.0, 16.0, 64.0)  # two octaves apart, to a fifth of the log
+    noise_taus: tuple[float, ...] = (2.0, 8.0, 32.0, 128.0)  # likewise, to a third of the log and more
+    noise_sd: float = 0.3  # prior median of each part of w
+    noise_log_sd: float = 2.0  # of its logarithm: it may be a fiftieth of that or fifty times
+    offset_sd: float = 30.0  # an offset of which nothing is known; no other column changes more
+    least_start: float = 0.02  # a direction of the start that moves no block by more is no column
+    draws: int = 24  # of the parameters
+    runs_at_once: int = 1_000_000  # outputs of the runs from starts at a time, 8 MB
 
 
-def learn_slow_noise(blocks: Sequence[Block]) -> SlowNoise:
-    """Return the numbers that a residual supports best."""
-    longest = max(block.n for block in blocks)
-    mean = np.log([*_SIZES, _FAST, max(longest / _SLOW[0], _SLOW[1])])
-    sd = np.array([_SIZE_SD] * 3 + list(_MEMORY_SD))
-
-    def cost(z: Array) -> float:
-        noise = _unpack(mean + sd * z)
-        logs = sum(float(block.sizes @ np.log(noise.variances(block.n))) for block in blocks)
-        return 0.5 * (logs + _squares(noise.products(blocks)) + float(z @ z))
-
-    found = minimize(
-        cost, np.zeros(5), method="L-BFGS-B", bounds=[(-4.0, 4.0)] * 5, options={"maxiter": 40, "ftol": 1e-7}
-    )
-    return _unpack(mean + sd * found.x)
-
-
-def _squares(products: Array) -> float:
-    """Return e' S^-1 e - g' A^-1 g + ln |A|."""
-    m = len(products) - 1
-    root = np.linalg.cholesky(products[:m, :m] + np.eye(m))
-    explained = np.linalg.solve(root, products[:m, -1])
-    return float(products[-1, -1] - explained @ explained + 2 * np.log(np.diag(root)).sum())
-
-
-def _unpack(v: Array) -> SlowNoise:
-    white, first, second, fast, slow = np.exp(v).tolist()
-    return SlowNoise(white, (first, second), (fast, slow))
-
-
-SQUARED = " squared"  # appended to an output whose residual may correlate with its own square
-LEVEL = 0.01  # share of right models for which any correlation may be significant
-_BLOCKS = 400  # of the longest stretch, at most
-_FEWEST = 20  # of a stretch, or it is left out
-_LAGS = (1.0, 4.0, 16.0, 64.0)  # [blocks]
-_DRAWS = 24
-_WIDE = 30.0  # rms of the residual: an offset of which nothing is known; a draw or a start changes no more
-_REST, _AFTER_GAP = 0.1, 3.0  # prior sd of a start at rest, and after a gap
-_BIAS_AT_REST = 0.05  # [K] sd of an ambient's bias after a start at rest
-_MODE = 0.02  # rms of the residual: a start that moves no block by more is left out
-_FARTHEST = 1e6  # rms of the residual: from a start that moves more, the run diverged
-_AT_ONCE = 1_000_000  # outputs of the runs from starts at a time, 8 MB, of which a few copies are alive
-_RANK = 1e-6  # of the largest: directions of x that are the others over again
+_SETTINGS = ScoreTestSettings()
 
 
 @dataclass(frozen=True)
@@ -249,71 +177,30 @@ def residual_correlations(
     rms = np.sqrt(np.nanmean(residual**2, axis=0)) if residual is not None else np.zeros(1)
     if residual is None or not rms.all():
         return ResidualCorrelations({}, {})
-    parts = _parts(plant, stretches, run, residual, rms, warmup)
-    if not parts:
+    block, width = _blocks_of_rows(plant, stretches)
+    read = np.isfinite(residual)
+    if min(len(np.unique(block[rows])) for rows in read.T) < _SETTINGS.fewest_blocks:
         return ResidualCorrelations({}, {})
-    signals = list(parts[0].tested)
+    drawn = _draw_changes(plant, stretches, run, warmup)
+    starts = _start_changes(plant, stretches, warmup, block, read)
+    signals = _signals(plant, stretches, run, width)
     tests: dict[str, dict[str, CorrelationTest]] = {}
-    start = {}
+    start_share: dict[str, float] = {}
     for j, name in enumerate(plant.outputs):
-        wanted = [s for s in signals if not s.endswith(SQUARED) or s == name + SQUARED]
-        tests[name], start[name] = _of_output(parts, j, wanted, float(rms[j]))
-    return ResidualCorrelations(_significant(tests), start)
-
-
-@dataclass(frozen=True, eq=False)
-class _Part:
-    """One stretch in blocks, in rms of the residual of each output."""
-
-    fixed: Array  # (n, n_y, m), columns of N that all stretches share
-    starts: Array  # (n, n_y, k), its own columns of N
-    tested: dict[str, Array]  # x (n, 4) by signal
-    residual: Array
-
-
-class _Blocks:
-    """Which rows of a stretch make which block."""
-
-    def __init__(self, stretch: Stretch, residual: Array, width: float) -> None:
-        known = np.isfinite(residual)
-        some = known.any(axis=1)
-        cell = np.floor(stretch.time / width + 1e-9).astype(int)
-        first, last = (int(cell[some][0]), int(cell[some][-1])) if some.any() else (0, -1)
-        cell, self.n = cell - first, last - first + 1
-        within = (cell >= 0) & (cell < self.n)
-        self._of_outputs = [_Cells.of(cell, rows) for rows in known.T]
-        self._of_inputs = _Cells.of(cell, within)
-        self.enough = min(each.place.size for each in self._of_outputs) >= max(_FEWEST, self.n / 2)
-
-    def of_readings(self, values: Array) -> Array:
-        """Return means (n, n_y, q) of values (rows, n_y, q) where each output was read; lines between."""
-        means = [cells.means(values[:, j], self.n) for j, cells in enumerate(self._of_outputs)]
-        return np.stack(means, axis=1)
-
-    def of_inputs(self, values: Array) -> Array:
-        """Return means (n, q) of values (rows, q) that are known at every row."""
-        return self._of_inputs.means(values, self.n)
-
-
-@dataclass(frozen=True, eq=False)
-class _Cells:
-    """The blocks of one signal."""
-
-    known: Mask  # which rows of the stretch count
-    place: NDArray[np.int_]  # the blocks that have any of these
-    where: NDArray[np.int_]  # of each known row, which of them
-    count: NDArray[np.int_]  # rows in each
-
-    @classmethod
-    def of(cls, cell: NDArray[np.int_], known: Mask) -> _Cells:
-        return cls(known, *np.unique(cell[known], return_inverse=True, return_counts=True))
-
-    def means(self, values: Array, n: int) -> Array:
-        """Return means (n, q) of values (rows, q), on lines between the blocks that have any."""
-        at, out = np.arange(n), np.empty((n, values.shape[1]))
-        for k, column in enumerate(values.T):
-            out[:, k] = np.interp(at, self.place, np.bincount(self.where, column[self.known]) / self.count)
-        return out
+        means = partial(_block_means, block=block, read=read[:, j])
+        null = _Null.of(
+            block=np.unique(block[read[:, j]]),
+            residual=means(residual[:, j] / rms[j]),
+            starts=_modes(starts[j] / rms[j]),
+            drawn=means(drawn[:, j] / rms[j]),
+        )
+        start_share[name] = null.start_share()
+        tests[name] = {
+            signal: null.test(means(x), float(rms[j]))
+            for signal, x in signals.items()
+            if not signal.endswith(SQUARED) or signal == name + SQUARED
+        }
+    return ResidualCorrelations(marked_by_holm(tests), start_share)
 
 
 def _residual(read: Array, run: Array, scored: Mask) -> Array | None:
@@ -328,180 +215,174 @@ def _residual(read: Array, run: Array, scored: Mask) -> Array | None:
     return np.where(known, read - run, np.nan)
 
 
-@dataclass(frozen=True, eq=False)
-class _Tested:
-    """A stretch that is long enough, its start and its blocks."""
-
-    stretch: Stretch
-    start: Start
-    blocks: _Blocks
-    after_gap: bool
-
-
-def _parts(
-    plant: Plant, stretches: Sequence[Stretch], run: Array, residual: Array, rms: Array, warmup: float
-) -> list[_Part]:
-    """Return the stretches that are long enough."""
-    starts = find_starts(plant, plant.p, stretches, warmup)
-    step = max(plant.dt, *(float(np.median(np.diff(s.time))) for s in stretches if s.time.size > 1), 1e-9)
-    width = step * max(1, int(np.ceil(max(s.time[-1] for s in stretches) / step / _BLOCKS)))
-    moved = [k for k in range(len(plant.inputs)) if any(np.ptp(s.u[:, k]) > 0 for s in stretches)]
-    tested = [
-        _Tested(stretch, start, _Blocks(stretch, residual[stretch.rows], width), after_gap=at > 0)
-        for at, (stretch, start) in enumerate(zip(stretches, starts))
-    ]
-    tested = [one for one in tested if one.blocks.enough]
-    draws = _draw_changes(plant, stretches, tested, run, rms, warmup) if tested else []
-    out = []
-    for one, drawn in zip(tested, draws):
-        blocks, rows = one.blocks, residual[one.stretch.rows]
-        nominal = _run(plant, one, one.start.x0[None])
-        biases = _bias_changes(plant, one, nominal)
-        offsets = np.tile(np.diag(np.full(len(rms), _WIDE)), (blocks.n, 1, 1))
-        out.append(
-            _Part(
-                np.concatenate([offsets, *(part / rms[:, None] for part in (drawn, biases))], axis=2),
-                _modes(_start_changes(plant, one) / rms[:, None]),
-                _signals(plant, one.stretch, nominal[0], moved, blocks, width / plant.dt),
-                blocks.of_readings(rows[:, :, None])[:, :, 0] / rms,
-            )
-        )
-    return out
+def _blocks_of_rows(plant: Plant, stretches: Sequence[Stretch]) -> tuple[NDArray[np.int_], float]:
+    """Return the number of each row's block, and the blocks' width [s]; stretches are so many numbers apart
+    that their errors are hardly correlated."""
+    steps = [float(np.median(np.diff(s.time))) for s in stretches if s.time.size > 1]
+    step = max(plant.dt, *steps, 1e-9)
+    seconds = sum(float(stretch.time[-1]) for stretch in stretches)
+    width = step * max(1, int(np.ceil(seconds / step / _SETTINGS.most_blocks)))
+    block, first = [], 0
+    for stretch in stretches:
+        block.append(first + np.floor(stretch.time / width + 1e-9).astype(int))
+        first = int(block[-1][-1]) + _SETTINGS.most_blocks
+    return np.concatenate(block), width
 
 
-def _draw_changes(
-    plant: Plant,
-    stretches: Sequence[Stretch],
-    tested: Sequence[_Tested],
-    run: Array,
-    rms: Array,
-    warmup: float,
-) -> list[Array]:
-    """Return by stretch the changes (n, n_y, n_draw) of draws of the parameters, one sd all together."""
-    out: list[list[Array]] = [[np.zeros((one.blocks.n, len(rms), 0))] for one in tested]
-    for k in range(1, _DRAWS + 1 if plant.uncertain else 1):
+def _block_means(values: Array, block: NDArray[np.int_], read: Mask) -> Array:
+    """Return means of values (rows, ...) over the rows of each block that were read, of blocks with any."""
+    _, place, count = np.unique(block[read], return_inverse=True, return_counts=True)
+    sums = np.zeros((len(count), *values.shape[1:]))
+    np.add.at(sums, place, values[read])
+    return np.asarray(sums / count.reshape(-1, *[1] * (values.ndim - 1)))
+
+
+def _draw_changes(plant: Plant, stretches: Sequence[Stretch], run: Array, warmup: float) -> Array:
+    """Return the changes (rows, n_y, n_draw) of draws of the parameters, one sd all together."""
+    changes = []
+    for k in range(1, _SETTINGS.draws + 1 if plant.uncertain else 1):
         change = plant.draw(k).over(stretches, warmup)[0] - run
-        if not np.isfinite(change).all():  # a draw that diverges has no information on small changes
-            continue
-        change /= max(1.0, float((np.abs(change).max(axis=0) / (_WIDE * rms)).max()))
-        for means, one in zip(out, tested):
-            means.append(one.blocks.of_readings(change[one.stretch.rows, :, None]))
-    return [np.concatenate(means, axis=2) / np.sqrt(max(1, len(means) - 1)) for means in out]
+        if np.isfinite(change).all():  # a draw that diverges has no information on small changes
+            changes.append(change)
+    return np.stack(changes, axis=2) / np.sqrt(len(changes)) if changes else np.zeros((*run.shape, 0))
 
 
-def _run(plant: Plant, one: _Tested, x0: Array, bias: Array | float = 0.0) -> Array:
-    """Return runs (B, N + 1, n_y) of a stretch from x0 (B, n_x), its ambients lower by ``bias`` (n_d,)."""
-    d = one.stretch.d - one.start.d_offset - bias
-    return plant.model.rollout(x0, one.stretch.u[None], d[None], plant.p[None], plant.dt)[0]
+def _start_changes(
+    plant: Plant, stretches: Sequence[Stretch], warmup: float, block: NDArray[np.int_], read: Mask
+) -> list[Array]:
+    """Return by output what a start of each stretch further by one prior sd in each direction changes in its
+    blocks, as columns (n, n_stretch n_x); what diverges is left at 0.  A few directions are run at a time and
+    none of their runs is kept, for there may be hundreds."""
+    n_x, n_y = plant.model.n_x, len(plant.outputs)
+    variances, axes = np.linalg.eigh(plant.model.spread)
+    directions = (axes * np.sqrt(np.maximum(variances, 0.0))).T
+    blocks = [np.unique(block[rows]) for rows in read.T]
+    columns = [np.zeros((len(numbers), len(stretches) * n_x)) for numbers in blocks]
+    for at, (stretch, start) in enumerate(zip(stretches, find_starts(plant, plant.p, stretches, warmup))):
+        u, d = stretch.u[None], (stretch.d - start.d_offset)[None]
+        together = max(1, _SETTINGS.runs_at_once // (len(stretch.u) * n_y))
+        for begin in range(0, n_x, together):
+            # a tenth of it: a state near a limit must not cross it
+            moved = start.x0 + 0.1 * directions[begin : begin + together]
+            with np.errstate(over="ignore", invalid="ignore"):  # a run from a far start may diverge
+                runs = plant.model.rollout(np.vstack([start.x0, moved]), u, d, plant.p[None], plant.dt)[0]
+                change = 10.0 * at_rows(stretch, runs[1:] - runs[0], plant.dt)
+            change[~np.isfinite(change).all(axis=(1, 2))] = 0.0
+            first = at * n_x + begin
+            for j, numbers in enumerate(blocks):
+                inside = np.isin(numbers, block[stretch.rows])
+                means = _block_means(change[:, :, j].T, block[stretch.rows], read[stretch.rows, j])
+                columns[j][inside, first : first + len(moved)] = means
+    return columns
 
 
-def _start_changes(plant: Plant, one: _Tested) -> Array:
-    """Return what a start further by one prior sd in each direction changes, in means (n, n_y, n_x) over
-    blocks.  A few directions are run at a time and none of their runs is kept, for there may be hundreds."""
-    size, axes = np.linalg.eigh(plant.model.spread)
-    root = axes * np.sqrt(np.maximum(size, 0.0))
-    root = root * (_AFTER_GAP if one.after_gap else _REST if one.start.level is not None else 1.0)
-    together = max(1, _AT_ONCE // (len(one.stretch.u) * len(plant.outputs)))
-    means = []
-    for begin in range(0, len(root), together):
-        # a tenth of it: a state near a limit must not cross it
-        moved = one.start.x0 + 0.1 * root.T[begin : begin + together]
-        with np.errstate(over="ignore", invalid="ignore"):  # a run from a far start may diverge
-            runs = _run(plant, one, np.vstack([one.start.x0, moved]))
-            runs[1:] -= runs[0]
-            change = at_rows(one.stretch, runs[1:], plant.dt)
-            change *= 10.0
-        np.clip(change, -1e100, 1e100, out=change)
-        np.nan_to_num(change, copy=False, nan=1e100)  # what diverged is left out later
-        means.append(one.blocks.of_readings(np.moveaxis(change, 0, 2)))
-    return np.concatenate(means, axis=2)
+def _modes(starts: Array) -> Array:
+    """Return the directions (n, k) in which columns (n, q) of starts move the blocks at all."""
+    modes = starts @ np.linalg.eigh(starts.T @ starts)[1]
+    return np.asarray(modes[:, np.abs(modes).max(axis=0, initial=0.0) > _SETTINGS.least_start])
 
 
-def _bias_changes(plant: Plant, one: _Tested, nominal: Array) -> Array:
-    """Return what the bias of each ambient changes of the run (1, N + 1, n_y), in means (n, n_y, k)."""
-    changes = [np.zeros((one.blocks.n, len(plant.outputs), 0))]
-    for k, name in enumerate(plant.disturbances):
-        sd = min(plant.nuisance.get(name, 0.0), np.inf if one.start.level is None else _BIAS_AT_REST)
-        if sd > 0:
-            run = _run(plant, one, one.start.x0[None], sd * (np.arange(len(plant.disturbances)) == k))
-            change = at_rows(one.stretch, run - nominal, plant.dt)[0]
-            changes.append(one.blocks.of_readings(change[:, :, None]))
-    return np.concatenate(changes, axis=2)
-
-
-def _modes(columns_of: Array) -> Array:
-    """Return the directions (n, n_y, k) in which starts (n, n_y, n_x) move the blocks at all."""
-    flat = columns_of.reshape(-1, columns_of.shape[2])
-    flat = flat[:, np.abs(flat).max(axis=0, initial=0.0) < _FARTHEST]
-    modes = flat @ np.linalg.eigh(flat.T @ flat)[1]
-    most = np.abs(modes).max(axis=0, initial=0.0)
-    modes = modes[:, most > _MODE] / np.maximum(1.0, most[most > _MODE] / _WIDE)
-    return np.asarray(modes.reshape(*columns_of.shape[:2], modes.shape[1]))
-
-
-def _signals(
-    plant: Plant, stretch: Stretch, run: Array, moved: Sequence[int], blocks: _Blocks, steps: float
-) -> dict[str, Array]:
-    """Return x (n, 4) by signal, of about unit size."""
-    given = {plant.inputs[k]: stretch.u[:, k] - stretch.u[0, k] for k in moved}
-    for k, name in enumerate(plant.outputs):
-        given[name + SQUARED] = (run[:-1, k] - run[:, k].mean()) ** 2
+def _signals(plant: Plant, stretches: Sequence[Stretch], run: Array, width: float) -> dict[str, Array]:
+    """Return x (rows, n_lag), of about unit size, of each input that moves and of each output's square."""
+    signals = {
+        name: [stretch.u[:, k] - stretch.u[0, k] for stretch in stretches]
+        for k, name in enumerate(plant.inputs)
+        if any(np.ptp(stretch.u[:, k]) > 0 for stretch in stretches)
+    }
+    for j, name in enumerate(plant.outputs):
+        squares = (run[:, j] - run[:, j].mean()) ** 2
+        signals[name + SQUARED] = [
+            np.interp(plant.dt * np.arange(len(s.u)), s.time, squares[s.rows]) for s in stretches
+        ]
+    keeps = [np.exp(-plant.dt / (lag * width)) for lag in _SETTINGS.input_lags]
     out = {}
-    for name, values in given.items():
-        keeps = [np.exp(-1 / (lag * steps)) for lag in _LAGS]
-        slow = np.stack([np.append(0.0, lfilter([1 - k], [1, -k], values)) for k in keeps], axis=1)
-        x = blocks.of_inputs(at_rows(stretch, slow[None], plant.dt)[0])
+    for name, values in signals.items():
+        rows = []
+        for stretch, on_grid in zip(stretches, values):
+            slow = np.stack([np.append(0.0, lfilter([1 - k], [1, -k], on_grid)) for k in keeps], axis=1)
+            rows.append(at_rows(stretch, slow[None], plant.dt)[0])
+        x = np.concatenate(rows)
         out[name] = x / max(float(np.abs(x).max()), 1e-300)
     return out
 
 
-def _of_output(
-    parts: Sequence[_Part], j: int, signals: Sequence[str], rms: float
-) -> tuple[dict[str, CorrelationTest], float]:
-    """Return the tests of one output's residual, and the share of its squares that is due to starts."""
-    own = [part.starts.shape[2] for part in parts]
-    ends, rows = np.cumsum([0, *own]), []
-    for part, begin in zip(parts, ends):
-        starts = np.zeros((len(part.residual), ends[-1]))
-        starts[:, begin : begin + part.starts.shape[2]] = part.starts[:, j]
-        x = [part.tested[name] for name in signals]
-        rows.append(np.column_stack([part.fixed[:, j], starts, *x, part.residual[:, j]]))
-    n_fixed = parts[0].fixed.shape[2]
-    m = n_fixed + int(ends[-1])
-    stored = [Block.of(row[:, None, :], (0,)) for row in rows]
-    null_columns = [*range(m), rows[0].shape[1] - 1]
-    null = [Block(b.n, b.outputs, b.products[..., null_columns, :][..., null_columns]) for b in stored]
-    P = learn_slow_noise(null).products(stored)
-    inner = np.linalg.inv(P[:m, :m] + np.eye(m))
-    H = P[m:, m:] - P[m:, :m] @ inner @ P[:m, m:]
-    plain = np.concatenate(rows)
-    moved = plain[:, n_fixed:m] @ (inner @ P[:m, -1])[n_fixed:]
-    rest = plain[:, -1] - moved
-    # of the squares of rows, which are 1 in the mean; means over blocks have less noise
-    share = max(0.0, float(plain[:, -1] @ plain[:, -1] - rest @ rest) / len(rest))
-    out = {}
-    for k, name in enumerate(signals):
-        at = slice(len(_LAGS) * k, len(_LAGS) * (k + 1))
-        p, beta = _score_test(H[at, at], H[at, -1])
-        left = plain[:, m:-1][:, at] - plain[:, :m] @ inner @ P[:m, m:-1][:, at]
-        out[name] = CorrelationTest(p, rms * float(np.sqrt(np.mean((left @ beta) ** 2))))
-    return out, share
+@dataclass(frozen=True, eq=False)
+class _Null:
+    """The residual of one output in blocks (n,), and what it is made of where the model is right."""
+
+    residual: Array
+    columns: Array  # N, (n, q)
+    starts: Array  # those of them that are starts
+    inverse: Array  # V^-1
+
+    @classmethod
+    def of(cls, *, block: NDArray[np.int_], residual: Array, starts: Array, drawn: Array) -> _Null:
+        """Learn the noise of a residual."""
+        offset = np.full((len(residual), 1), _SETTINGS.offset_sd)
+        columns = np.hstack([offset, starts, drawn])
+        columns /= np.maximum(1.0, np.abs(columns).max(axis=0) / _SETTINGS.offset_sd)
+        noise = learn_noise(block, residual, columns)
+        return cls(
+            residual, columns, columns[:, 1 : 1 + starts.shape[1]], np.linalg.inv(noise + columns @ columns.T)
+        )
+
+    def start_share(self) -> float:
+        """Return the share of the squared residual that is due to starts."""
+        rest = self.residual - self.starts @ (self.starts.T @ (self.inverse @ self.residual))
+        # of the squares of rows, which are 1 in the mean; means over blocks have less noise
+        return max(0.0, float(self.residual @ self.residual - rest @ rest) / len(rest))
+
+    def test(self, x: Array, rms: float) -> CorrelationTest:
+        """Test the residual against a signal x (n, n_lag)."""
+        weighted = self.inverse @ x
+        p, beta = _score_test(x.T @ weighted, weighted.T @ self.residual)
+        beyond_right = x - self.columns @ (self.columns.T @ weighted)
+        return CorrelationTest(p, rms * float(np.sqrt(np.mean((beyond_right @ beta) ** 2))))
+
+
+def learn_noise(block: NDArray[np.int_], residual: Array, columns: Array) -> Array:
+    """Return the covariance of w over blocks (n,) that a residual with columns N supports best."""
+    lag = np.abs(np.subtract.outer(block, block))
+    kernels = [np.eye(len(block))]
+    for s in 1 / np.array(_SETTINGS.noise_taus):
+        kernels.append(
+            np.where(
+                lag == 0, 2 * (s + np.expm1(-s)) / s**2, (2 * np.sinh(s / 2) / s) ** 2 * np.exp(-s * lag)
+            )
+        )
+    right = columns @ columns.T + 1e-6 * np.eye(len(block))
+
+    def variances(z: Array) -> Array:
+        return np.asarray(_SETTINGS.noise_sd**2 * np.exp(2 * _SETTINGS.noise_log_sd * z))
+
+    def cost(z: Array) -> tuple[float, Array]:
+        """Return -ln of likelihood and prior, and its slopes."""
+        parts = variances(z)
+        V = right + np.einsum("k,kij->ij", parts, kernels)
+        inverse, (_, log_det) = np.linalg.inv(V), np.linalg.slogdet(V)
+        explained = inverse @ residual
+        slope = [np.sum(inverse * kernel) - explained @ kernel @ explained for kernel in kernels]
+        slopes = _SETTINGS.noise_log_sd * parts * np.array(slope) + z
+        return 0.5 * float(log_det + residual @ explained + z @ z), slopes
+
+    start = np.zeros(len(kernels))
+    best = minimize(
+        cost, start, jac=True, method="L-BFGS-B", bounds=[(-4.0, 4.0)] * len(start), options={"ftol": 1e-7}
+    )
+    return np.asarray(np.einsum("k,kij->ij", variances(best.x), kernels))
 
 
 def _score_test(H: Array, g: Array) -> tuple[float, Array]:
     """Return p of the score g with covariance H, and beta = H^-1 g, in the directions that H has."""
-    size = np.sqrt(np.maximum(np.diag(H), 0.0))
-    size = np.where(size > 0, size, 1.0)
-    values, axes = np.linalg.eigh(H / np.outer(size, size))
-    keep = values > _RANK * max(float(values[-1]), 1e-300)
-    if not keep.any() or values[-1] <= 0:
-        return 1.0, np.zeros(len(g))
-    axes, values = axes[:, keep], values[keep]
-    along = axes.T @ (g / size)
-    return float(chdtrc(int(keep.sum()), float(along**2 @ (1 / values)))), axes @ (along / values) / size
+    size = np.sqrt(np.maximum(np.diag(H), 1e-300))
+    inverse, rank = pinvh(H / np.outer(size, size), rtol=1e-6, return_rank=True)
+    beta = inverse @ (g / size) / size
+    return (float(chdtrc(rank, g @ beta)) if rank else 1.0), beta
 
 
-def _significant(found: Mapping[str, Mapping[str, CorrelationTest]]) -> dict[str, dict[str, CorrelationTest]]:
+def marked_by_holm(
+    found: Mapping[str, Mapping[str, CorrelationTest]],
+) -> dict[str, dict[str, CorrelationTest]]:
     """Return the same tests, marked as significant by Holm's rule."""
     pairs = sorted((one.p, name, after) for name, row in found.items() for after, one in row.items())
     names: set[tuple[str, str]] = set()

@@ -14,8 +14,8 @@ input, both of the same readings,
     no test         the rows are those of the fit; or no right plant could have done better than without
                     input, X > 0.8 b, and this one did not do clearly worse than that (e > b / 0.8)
 
-What is worse is so by its *gain*, an *offset* or its *start* where one of them is most of the squared error
-of the worst output, else by its *dynamics*.
+What is worse is so by its *gain*, an effect of the inputs that comes *slowly*, an *offset* or its *start*
+where one of them is most of the squared error of the worst output, else by its *dynamics*.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from typing import TYPE_CHECKING, Literal, TypeAlias
 import numpy as np
 
 if TYPE_CHECKING:
-    from thermogrip.sysid.validation.prediction_bands import Band
+    from thermogrip.sysid.validation.prediction_bands import Band, InputEffect
 
 __all__ = ["MOST", "NO_BETTER", "Cause", "Standing", "Verdict", "judge"]
 
@@ -35,7 +35,7 @@ NO_BETTER = 0.8  # of the no-input error: a free run above it has not shown that
 MOST = 0.5  # of the squared error
 
 Standing: TypeAlias = Literal["as stated", "better", "worse", "another plant", "no test"]
-Cause: TypeAlias = Literal["", "gain", "offset", "start", "dynamics", "seen", "too little input"]
+Cause: TypeAlias = Literal["", "gain", "slow", "offset", "start", "dynamics", "seen", "too little input"]
 
 _MEANING: dict[Standing, str] = {
     "as stated": "the error is as stated",
@@ -46,6 +46,7 @@ _MEANING: dict[Standing, str] = {
 }
 _BECAUSE: dict[Cause, str] = {
     "": "",
+    "slow": "slow terms are missing, for inputs do more or less later",
     "offset": "most of it is a constant offset",
     "start": "most of it is the start, for the readings of the warm-up do not set the slow states",
     "dynamics": "the plant is not what it was in the fit, or was never run like this",
@@ -78,7 +79,7 @@ def judge(
     no_input: Mapping[str, float],
     *,
     causes: Mapping[str, Mapping[Cause, float]],
-    gain: float | None,
+    by_inputs: InputEffect | None,
     seen: bool,
 ) -> Verdict:
     """Return the verdict on a run, by output: its rms errors, those of the no-input baseline, and of the
@@ -91,14 +92,17 @@ def judge(
     worse = [
         name
         for name in stated
-        if not errors[name] <= band.likely[name][1] or (over[name] > 1 and (name in lost or gain is not None))
+        if not errors[name] <= band.likely[name][1]
+        or (over[name] > 1 and (name in lost or by_inputs is not None))
     ]
     if worse:
         worst = max(worse, key=lambda name: over[name])
         if not np.isfinite(errors[worst]):
             return Verdict("another plant", over, "dynamics")
-        if gain is not None:
-            return Verdict("worse", over, "gain", gain)
+        if by_inputs is not None and by_inputs.lag_s == 0:
+            return Verdict("worse", over, "gain", by_inputs.gain)
+        if by_inputs is not None:
+            return Verdict("worse", over, "slow")
         shares = causes.get(worst, {})
         cause = max(shares, key=lambda each: shares[each], default=None)
         if cause is not None and shares[cause] > MOST:

@@ -328,10 +328,10 @@ def test_a_plant_is_scored_log_by_log_beside_its_baselines(bench: Bench, stand_i
     sections = stand_in("thermogrip.report.plant.free_run_section", "a section")
     pages = stand_in("thermogrip.report.html.write_report")
     words = ["validate", "plant.json", "good.csv@:100", "good.csv@100:200"]
-    options = ["--warmup", "7", "--score-from", "9", "--average", "2", "--report", "v.html"]
+    options = ["--warmup", "7", "--score-from", "9", "--report", "v.html"]
     done = bench.run(*words, *options)
     assert done.code == 0, done
-    assert [(call.warmup, call.score_from, call.average) for call in runs] == [(7.0, 9.0, 2.0)] * 2
+    assert [(call.warmup, call.score_from) for call in runs] == [(7.0, 9.0)] * 2
     assert all(
         (call.args[0].inputs, call.args[1].attrs["name"][:4]) == (("drive", "pump"), "good") for call in runs
     )
@@ -363,7 +363,7 @@ def test_a_plant_is_scored_log_by_log_beside_its_baselines(bench: Bench, stand_i
     repairs = {"good@:100": ["taken from the start to 100 s"], "good@100:200": ["taken from 100 s to 200 s"]}
     logs = [one, one | {"log": "good@100:200"}]
     assert json.loads(bench.run(*words, "--json").out) == {"logs": logs, "repairs": repairs}
-    assert [(call.warmup, call.score_from, call.average) for call in runs[2:]] == [(5.0, 5.0, None)] * 2
+    assert [(call.warmup, call.score_from) for call in runs[2:]] == [(5.0, 5.0)] * 2
 
 
 def verdict_of(what: str) -> Verdict:
@@ -457,7 +457,7 @@ def test_a_plant_that_is_not_good_is_identified_anew_whatever_a_run_says(
 
 
 def test_a_warm_up_shorter_than_that_of_the_fit_is_told(bench: Bench, stand_in: StandIn) -> None:
-    stand_in("thermogrip.sysid.validation.held_out.warm_up_of_fit", 50.0)
+    stand_in("thermogrip.sysid.validation.free_run.warm_up_of_fit", 50.0)
     stand_in(
         "thermogrip.sysid.validation.free_run.free_run",
         SimpleNamespace(notes=(), band=lambda: None, verdict=None),

@@ -11,7 +11,7 @@ import pytest
 from scipy.signal import lfilter
 
 from thermogrip.datasets.schema import Log, make_log
-from thermogrip.sysid.blackbox.fit import FAMILIES
+from thermogrip.sysid.blackbox.fit import family_of
 from thermogrip.sysid.blackbox.order_selection import Model
 from thermogrip.sysid.plant.log_grid import Grid, make_grid
 
@@ -86,7 +86,7 @@ def _fit_one(kind: str, grid: Grid, *, variant: str = "", **orders: Any) -> Mode
     plain |= {"sindy": {"degrees": 2, "thresholds": 0.01, "memories": 1, "widths": 0}}
     orders = plain.get(kind, {}) | orders
     tried = {name: value if name == "members" else (value,) for name, value in orders.items()}
-    found = {s.label: m for s, m in FAMILIES[kind](grid, **tried).items() if variant in s.label}
+    found = {s.label: m for s, m in family_of(kind)(grid, **tried).items() if variant in s.label}
     if kind == "arx":  # coupled where it can be
         found = {s: m for s, m in found.items() if "coupled" in s} or found
     (model,) = found.values()  # ValueError where no structure could be fitted

@@ -345,7 +345,6 @@ def validate(
         float | None,
         cli.opt("--score-from", "S", "Samples before this are not scored; where absent, the warm-up.", min=0),
     ] = None,
-    average: Average = None,
     network: cli.OwnNetwork = None,
     columns: cli.Columns = None,
     dt: cli.Step = None,
@@ -376,7 +375,7 @@ def validate(
         for k, log in enumerate(logs):
             progress(k / len(logs), log.attrs["name"])
             seconds, first = starts[k]
-            runs.append(free_run(loaded, log, warmup=seconds, score_from=first, average=average))
+            runs.append(free_run(loaded, log, warmup=seconds, score_from=first))
     bands = [run.band() for run in runs]
     if report is not None:
         sections = [free_run_section(*each) for each in zip(runs, bands)]
@@ -400,7 +399,9 @@ def validate(
     code = cli.ANSWER_IS_NO if what in ("worse", "another plant", "start") else 0
     if what != "start":
         return cli.Done(what, code)
-    seconds = _start_seconds(loaded, logs)
+    from thermogrip.sysid.validation.free_run import start_seconds
+
+    seconds = min(start_seconds(loaded, log) for log in logs)
     more = ["--warmup", f"{seconds:g}", "--score-from", f"{seconds:g}"]
     command = shlex.join(["validate", str(plant), *map(str, paths), *more])
     return cli.Done(what, code, printable(command))
@@ -410,15 +411,12 @@ def _starts(
     console: Console, plant: Plant, logs: Sequence[Log], warmup: float | None, score_from: float | None
 ) -> list[tuple[float, float]]:
     """Return by log the warm-up and from when it is scored [s], and warn of one shorter than the fit's."""
-    from thermogrip.sysid.validation.held_out import warm_up_of_fit
+    from thermogrip.sysid.validation.free_run import usual_warmup, warm_up_of_fit
 
     out = []
     for log in logs:
         needed, name = warm_up_of_fit(plant, log), log.attrs["name"]
-        # a network has few states, and begins at rest where its sensors agree
-        slowest = _start_seconds(plant, [log]) if plant.scores.held_out_by_part else 0.0
-        usual = max(5.0, plant.dt, needed, slowest)
-        seconds = usual if warmup is None else warmup
+        seconds = usual_warmup(plant, log) if warmup is None else warmup
         if seconds < needed:
             console.warn(
                 f"{name}: {seconds:g} s of readings set the state, the fit was scored with {needed:g} s; "
@@ -426,14 +424,6 @@ def _starts(
             )
         out.append((seconds, seconds if score_from is None else score_from))
     return out
-
-
-def _start_seconds(plant: Plant, logs: Sequence[Log]) -> float:
-    """Return a warm-up [s] that shows the slowest time constant of a plant: a tenth of it, or of a log."""
-    shortest = min(float(log["time"][-1] - log["time"][0]) for log in logs)
-    dynamics, _ = _dynamics(plant)
-    slowest = float("inf") if dynamics is None else float(dynamics.time_constants[0])
-    return float(f"{min(slowest, shortest) / 10:.2g}")
 
 
 def _urgency(verdict: Verdict) -> str:

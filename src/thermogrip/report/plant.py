@@ -145,7 +145,7 @@ def identification_sections(
     every log.
 
     ``plant`` is the chosen one, with samples where ``record`` says how they were drawn.  Its free runs
-    are those of the comparison, now with residual tests.
+    are those of the comparison, with residual tests.
     """
     from thermogrip.sysid.validation.free_run import free_run
 
@@ -157,7 +157,7 @@ def identification_sections(
     if dynamics is not None:
         sections.append(dynamics_section(dynamics))
     for log, known in zip(logs, found.runs):
-        run = free_run(plant, log, known.warmup, known.warmup, known=known)
+        run = free_run(plant, log, known.warmup)
         sections.append(free_run_section(run, seen=True))
     return sections
 
@@ -354,9 +354,6 @@ def free_run_section(
     if run.verdict is not None:
         clauses.append(str(run.verdict))
     reasons, follows, outputs = [], _followed(run), tuple(run.scores)
-    if run.exceeds_fit:
-        times = ", ".join(f"{output} {ratio:.1f} times" for output, ratio in run.exceeds_fit.items())
-        reasons.append(f"above the error of the fit: {times}")
     if follows:
         reasons.append(f"residual correlation: {'; '.join(follows)}")
     clauses += reasons if run.verdict is None else []  # else they are its details
@@ -382,7 +379,7 @@ def free_run_section(
     parts += [Text(_sentence(note)) for note in run.notes if note != str(run.verdict)]
     title = title or f"Free run: {name}" + (" (in the fit)" if seen else "")
     if run.verdict is None:
-        tone = "warn" if run.no_better or run.exceeds_fit or follows else "good"
+        tone = "warn" if run.no_better or follows else "good"
     elif run.verdict.cause == "seen":  # an answer neither for the plant nor against it
         tone = "warn" if run.no_better else "plain"
     else:

@@ -13,7 +13,7 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import make_log
 from thermogrip.sysid import Plant, identify
 from thermogrip.sysid.blackbox import fit as fitting
-from thermogrip.sysid.blackbox.fit import FAMILIES, BlackBoxFit, cut_into_blocks, fit_black_box, with_refits
+from thermogrip.sysid.blackbox.fit import BlackBoxFit, cut_into_blocks, family_of, fit_black_box, with_refits
 from thermogrip.sysid.blackbox.order_selection import Choice, Fold, Structure
 from thermogrip.sysid.models.lti import StartPrior
 from thermogrip.sysid.plant import log_grid
@@ -33,7 +33,7 @@ def lagged_log(seed, n=1200, *, phi=0.9, noise=0.15):
 def fit_of(kind, log, **orders):
     """Return the fit of the first structure of these orders, which needs no choosing."""
     grid = make_grid([log], average=1.0)
-    structure, model = next(iter(FAMILIES[kind](grid, **{k: (v,) for k, v in orders.items()}).items()))
+    structure, model = next(iter(family_of(kind)(grid, **{k: (v,) for k, v in orders.items()}).items()))
     choice = Choice(structure, StartPrior(), {}, (), np.zeros((1, 1)), warmup=5, model=model)
     return BlackBoxFit(kind, Plant(model, {}, dt=1.0), choice, grid)
 
@@ -349,7 +349,7 @@ def test_inputs_up_to_their_rows_are_taken_where_that_errs_clearly_less(
     monkeypatch.setattr(made, lambda *a, average, ends, **n: stub_grid(dt=average, ends=ends))
     monkeypatch.setattr(fitting, "choose", choose_next)
     grid = stub_grid(dt=dt, why="so")
-    found, choice = fitting._with_convention(grid, first, [], FAMILIES[family], 9.0)
+    found, choice = fitting._with_convention(family, grid, first, [], family_of(family), 9.0)
     assert (found.ends, found.dt, found.why, choice is not first) == (moved, dt, "so", moved)
     assert asked == [(True, {"only": "s"}, 9 / dt), (True, None, 9 / dt)][: len(others)]
 
@@ -363,7 +363,7 @@ def test_refits_that_err_more_than_half_as_much_again_are_left_out(monkeypatch, 
         return {only: None if len(made) == 1 else len(made)}
 
     errors = {0: 0.2, **{k: 0.3 if k <= agree + 1 else 0.301 for k in range(1, 99)}}
-    monkeypatch.setitem(fitting.FAMILIES, "oe", family)
+    monkeypatch.setattr(fitting, "family_of", lambda kind: family)
     monkeypatch.setattr(fitting, "_error", lambda fit, model: errors[model])
     monkeypatch.setattr(fitting, "_drawn_errors", fitting._drawn_blocks)
     plant = fit_of("arx", lagged_log(0, 320), poles=1, delays=1, terms=()).plant
@@ -412,7 +412,7 @@ def board_log(seed, name, n=1500):
 
 @pytest.mark.parametrize("kind", ["arx", "oe"])
 def test_rounding_gives_an_input_that_never_moves_no_gain_in_any_structure(kind):
-    models = FAMILIES[kind](make_grid([board_log(0, "a"), board_log(1, "b")], average=2.0))
+    models = family_of(kind)(make_grid([board_log(0, "a"), board_log(1, "b")], average=2.0))
     still = [model.inputs.index("pump") for model in models.values()]
     gains = [m.C @ np.linalg.solve(np.eye(m.n_x) - m.A, m.B)[:, at] for m, at in zip(models.values(), still)]
     assert max(np.abs(gain).max() for gain in gains) == 0.0

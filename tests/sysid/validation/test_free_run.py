@@ -12,14 +12,12 @@ from scipy.stats import binom
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.log_files import read_log, write_log
-from thermogrip.datasets.resample import average
-from thermogrip.datasets.schema import columns, make_log
+from thermogrip.datasets.schema import make_log
 from thermogrip.sysid.models.state_space import StateSpaceModel
-from thermogrip.sysid.plant.fit_record import PlantScores, fit_logs
-from thermogrip.sysid.plant.log_grid import rows_of
+from thermogrip.sysid.plant.fit_record import fit_logs
 from thermogrip.sysid.plant.plant import Plant
 from thermogrip.sysid.validation import free_run as module
-from thermogrip.sysid.validation.free_run import Score, free_run, no_input_baseline, score
+from thermogrip.sysid.validation.free_run import free_run, no_input_baseline, score
 from thermogrip.sysid.validation.residual_tests import (
     Correlation,
     CorrelationTest,
@@ -58,16 +56,8 @@ def test_the_rmse_of_the_true_plant_is_the_noise():
     assert run.no_better == ()
 
 
-def beside(plant, log, simulated, average):
-    rows = rows_of(log, plant.inputs, plant.outputs, plant.disturbances)
-    run, scored = columns(simulated, plant.outputs), simulated["scored"].values > 0
-    return module._beside(plant, rows, run, scored, average)
-
-
 def test_a_run_to_infinity_scores_infinity_in_one_step_too_and_warns_of_nothing():
-    run = free_run(lag_plant(), lag_log(noise=0.1), tests=False)
-    run.log["t"][500:] = np.inf
-    again = free_run(lag_plant(), lag_log(noise=0.1), tests=False, known=run)
+    again = free_run(lag_plant(pole=3.0), lag_log(noise=0.1), tests=False)
     assert (again.scores["t"].rmse, again.one_step["t"].rmse) == (np.inf, np.inf)
     assert again.no_better == ("t",)
 
@@ -85,7 +75,7 @@ def test_one_step_flatters_a_wrong_model_and_free_run_does_not():
     assert any("correlates with q" in note for note in run.notes)
 
 
-def test_after_a_gap_sixty_seconds_are_not_scored_and_holding_stands_beside():
+def test_after_a_gap_sixty_seconds_are_not_scored():
     log = lag_log(1000)
     keep = np.r_[0:400, 440:1000]
     run = free_run(lag_plant(), log.isel(time=keep))
@@ -93,33 +83,7 @@ def test_after_a_gap_sixty_seconds_are_not_scored_and_holding_stands_beside():
     time = run.log["time"].values
     assert not scored[(time >= 440) & (time < 500)].any()
     assert scored[time >= 500].all()
-    assert run.held["t"].rmse >= 0
     assert any("399 to 440 s" in note for note in run.notes)
-
-
-def test_averages_score_block_means():
-    log = lag_log(2000, noise=0.3, seed=2)
-    plain, mean = (free_run(lag_plant(), log, average=a).scores["t"] for a in (None, 10.0))
-    assert mean.n == pytest.approx(plain.n / 10, abs=1)
-    assert mean.rmse == pytest.approx(plain.rmse / np.sqrt(10), rel=0.15)
-
-
-def test_means_of_the_residual_are_correlated_with_means_of_the_input():
-    log, fast = lag_log(2000, noise=0.3, seed=2), np.resize([0.0, 1.0, 1.0, 0.0, 1.0], 2000)
-    log["q"] = ("time", log["q"].values + fast, log["q"].attrs)
-    run = free_run(lag_plant(), log, average=10.0, tests=False)
-    pairs = beside(lag_plant(), log, run.log, 10.0)
-    means, (y, v) = average(log, 10.0), pairs.outputs["t"]
-    np.testing.assert_array_equal(pairs.time, means["time"].values)
-    wanted = cross_correlation(y - v, means["q"].values)
-    np.testing.assert_array_equal(run.input_correlation["t"]["q"].values, wanted.values)
-
-
-def test_blocks_begin_anew_after_a_gap():
-    log = lag_log(1000).isel(time=np.r_[0:405, 443:1000])
-    pairs = beside(lag_plant(), log, lag_plant().simulate(log), 10.0)
-    np.testing.assert_array_equal(pairs.time, average(log, 10.0)["time"].values)
-    assert 443.0 in pairs.time
 
 
 def test_inputs_outside_of_the_fit_are_noted():
@@ -203,7 +167,7 @@ def test_what_cannot_be_scored_is_refused():
     with pytest.raises(UserError, match="no such column"):
         free_run(lag_plant(), lag_log().drop_vars("q"))
     with pytest.raises(UserError, match="would score readings of the"):
-        free_run(lag_plant(), lag_log(), warmup=50.0)
+        free_run(lag_plant(), lag_log(), warmup=50.0, score_from=5.0)
 
 
 @pytest.mark.parametrize(
@@ -240,28 +204,6 @@ def offset_run(off: float, *, n: int = 101, scored_from: int = 0, q=None):
     return log, log.assign(t=log["t"] + off, scored=("time", 1.0 * (time >= scored_from)))
 
 
-@pytest.mark.parametrize(("baseline", "no_better"), [(1.25, ("t",)), (1.26, ())])
-def test_a_known_run_is_not_run_again_and_four_fifths_of_the_baseline_is_no_better(
-    monkeypatch, baseline, no_better
-):
-    log, seen = offset_run(1.0, n=21, scored_from=5)  # sixteen readings, each off by exactly 1
-    monkeypatch.delattr(Plant, "simulate")
-    monkeypatch.setattr(module, "no_input_baseline", lambda _, y: y - baseline)
-    plant = replace(lag_plant(), units={"q": "1", "t": "K"})
-    run = free_run(plant, log, tests=False, known=SimpleNamespace(log=seen, held={"t": 7}))
-    assert run.no_better == no_better
-    assert (run.scores["t"].rmse, run.scores["t"].n, run.scores["t"].unit) == (1.0, 16, "K")
-    assert (run.naive["no_input"]["t"].rmse, run.naive["no_input"]["t"].unit) == (baseline, "K")
-    assert (run.held, run.input_correlation) == ({}, {"t": {}})
-    assert (run.warmup, run.plant, run.log) == (5.0, plant, seen)
-    gap = np.r_[0:12, 23:30]
-    log, seen = (each.isel(time=gap) for each in offset_run(1.0, n=30, scored_from=5))
-    known = SimpleNamespace(log=seen, held={"t": Score(1.0, 7.0, "K", 2)})
-    assert free_run(plant, log, tests=False, known=known).held == known.held
-    with pytest.raises(UserError, match="nothing of its 29 s is left to score"):
-        free_run(plant, log, tests=False, known=SimpleNamespace(log=seen.assign(scored=0 * seen["scored"])))
-
-
 def test_baselines_and_correlations_are_those_of_the_scored_readings():
     log = lag_log(noise=0.1, seed=3)
     log["t"].values[40:50] = np.nan
@@ -283,25 +225,6 @@ def test_baselines_and_correlations_are_those_of_the_scored_readings():
 
 
 @pytest.mark.parametrize(
-    ("here", "noise", "seconds", "start", "found"),
-    [(0.5, 0.25, 5.0, 0.0, False), (0.5, 0.2499, 5.0, 0.1, True), (0.5, 0.2, 5.0, 0.11, False),
-     (0.5, 0.2, 1.0, 0.0, True), (0.5, 0.2, 0.9, 0.0, False), (0.5, 0.2, 10.0, 0.0, True),
-     (0.5, 0.2, 10.1, 0.0, False), (0.5, 0.0, 5.0, 0.0, False), (0.5, 0.2, None, 0.0, False)],
-)  # fmt: skip
-def test_an_error_of_more_than_twice_that_of_the_fit_is_stated(here, noise, seconds, start, found):
-    scores = PlantScores(average_s=seconds, in_sample_rmse={"fit": {"t": noise}})
-    plant = replace(lag_plant(), noise={"t": noise}, scores=scores)
-    residual = ResidualCorrelations({}, {"t": start})
-    log, seen = offset_run(here)
-    blocks = module._blocks_of_fit(plant, log["time"].values)
-    pairs = beside(plant, log, seen, blocks).outputs if blocks else {}
-    beyond = module._beyond_fit(plant, residual, pairs)
-    assert beyond == ({"t": (pytest.approx(here), noise)} if found else {})
-    black_box = replace(plant, scores=PlantScores(average_s=5.0))
-    assert module._blocks_of_fit(black_box, log["time"].values) is None
-
-
-@pytest.mark.parametrize(
     ("gain", "pole", "how"),
     [
         (0.5 / 1.25, 0.95, "25 % more"),
@@ -320,7 +243,8 @@ def test_one_gain_that_explains_most_of_the_error_is_said_and_a_lag_is_not_taken
     said = [note for note in free_run(plant, two).notes if "most of the error is one gain" in note]
     assert bool(said) == bool(how)
     if how:
-        assert f"inputs that do {how} than in the fit would leave t 0.1 degC, r 1" in said[0]
+        assert f"inputs do {how} than in the fit" in said[0]
+        assert said[0].endswith("which would leave t 0.1 degC, r 1 degC")
 
 
 @pytest.mark.parametrize(
@@ -339,16 +263,7 @@ def test_more_than_one_row_in_a_hundred_beyond_a_twentieth_of_the_range_is_outsi
     assert list(outside) == [*(["q"] if share else []), "t"]
 
 
-def test_notes_of_the_start_of_gaps_and_of_the_residual_to_the_letter():
-    assert module._notes(60.0, [], {}, ()) == []
-    held = {"t": Score(1.0, 0.12345, "K", 3), "r": Score(1.0, 2.0, "degC", 3)}
-    assert module._notes(61.5, [(1, 5.0, 70.25)], held, ("r",)) == [
-        "the run starts at 61.5 s from its warm-up alone: what was warm and unseen is guessed; "
-        "give the whole log and score from 61.5 s to start where the log starts",
-        "no row from 5 to 70.25 s: the run starts afresh after it, the next 60 s are not scored "
-        "(last row held instead: RMSE t 0.123 K, r 2 degC)",
-        "r: hardly better than a model without input: the fit cannot be relied on for control",
-    ]
+def test_notes_of_the_residual_to_the_letter():
     white: dict = {"t": SimpleNamespace(independent=False), "r": SimpleNamespace(independent=True)}
     pairs = {"q": CorrelationTest(0.0012, 0.345, True), "w": CorrelationTest(0.0012, 0.345)}
     residual = ResidualCorrelations({"t": pairs}, {"t": 0.5, "r": 0.123})
@@ -362,11 +277,6 @@ def test_notes_of_the_start_of_gaps_and_of_the_residual_to_the_letter():
     ]
     at_most = ResidualCorrelations({"r": {}}, {"r": 0.1})
     assert module._residual_notes({"r": white["r"]}, at_most, units, 5.0, []) == []
-    plant = replace(lag_plant(), scores=PlantScores(average_s=2.5))
-    assert module._excess_notes(plant, {"t": (0.512, 0.2)}, units) == [
-        "t: means over 2.5 s err by 0.51 K, and by 0.2 K in the fit: slow terms are missing, or the plant is "
-        "not quite what it was in the fit"
-    ]
 
 
 @pytest.mark.parametrize(

@@ -173,7 +173,7 @@ def test_what_lies_beyond_the_readings_of_the_fit_is_in_doubt(shown):
     far = times(log, 1.4)
     added = unlike_fit(plant, far, plant.simulate(far), 5.0)["t"]
     np.testing.assert_allclose(added[[99, 199, 299, 399]], [0.0, 20.0, 0.0, 6.0], atol=1e-3)
-    band = free_run(plant, far).band()
+    band = free_run(plant, far, 5.0).band()
     assert "unlike the fit" in band.own_error
     assert band.half["t"][199] > 1.64 * 20.0
     assert band.expected["t"] == pytest.approx(np.sqrt(np.mean((band.half["t"][5:] / 1.6449) ** 2)), rel=1e-3)

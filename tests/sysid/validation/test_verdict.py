@@ -9,11 +9,12 @@ import pytest
 from scipy.signal import lfilter
 
 from thermogrip.datasets.schema import Log, make_log
+from thermogrip.sysid.blackbox.fit import fit_black_box
 from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.fit_record import fit_logs
 from thermogrip.sysid.plant.plant import Plant
 from thermogrip.sysid.validation.free_run import free_run
-from thermogrip.sysid.validation.prediction_bands import Band
+from thermogrip.sysid.validation.prediction_bands import Band, InputEffect
 from thermogrip.sysid.validation.verdict import NO_BETTER, judge
 
 KEEP = 0.95
@@ -66,7 +67,8 @@ def test_the_verdict_follows_from_the_stated_error_and_from_no_input(errors, cau
     no_input = {"a": 0.99 / NO_BETTER, "b": 9.0}
     by_output = {"a": {}, "b": causes}
     for seen in (False, True):
-        found = judge(band(a=1.0, b=1.0), given, no_input, causes=by_output, gain=gain, seen=seen)
+        by_inputs = None if gain is None else InputEffect(gain, 0.0, {})
+        found = judge(band(a=1.0, b=1.0), given, no_input, causes=by_output, by_inputs=by_inputs, seen=seen)
         untested = seen and says[0] in ("as stated", "better")
         assert (found.standing, found.cause) == (("no test", "seen") if untested else says)
         assert found.over_stated == given
@@ -75,7 +77,7 @@ def test_the_verdict_follows_from_the_stated_error_and_from_no_input(errors, cau
 
 @pytest.mark.parametrize(("error", "standing"), [(0.9, "no test"), (1.2, "no test"), (1.3, "another plant")])
 def test_where_no_output_can_beat_no_input_the_log_is_no_test_unless_it_did_far_worse(error, standing):
-    found = judge(band(a=1.0), {"a": error}, {"a": 1.0}, causes={}, gain=None, seen=False)
+    found = judge(band(a=1.0), {"a": error}, {"a": 1.0}, causes={}, by_inputs=None, seen=False)
     assert found.standing == standing
     if standing == "no test":
         assert str(found) == (
@@ -85,7 +87,9 @@ def test_where_no_output_can_beat_no_input_the_log_is_no_test_unless_it_did_far_
 
 def test_an_error_that_the_start_explains_does_not_clear_a_plant_that_is_far_worse_than_no_input():
     # 11.7 degC beside 3.99 without input was taken for a log that is no test
-    found = judge(band(a=3.0), {"a": 11.7}, {"a": 3.99}, causes={"a": {"start": 0.95}}, gain=None, seen=False)
+    found = judge(
+        band(a=3.0), {"a": 11.7}, {"a": 3.99}, causes={"a": {"start": 0.95}}, by_inputs=None, seen=False
+    )
     assert (found.standing, found.cause) == ("worse", "start")
 
 
@@ -112,11 +116,32 @@ def test_a_gain_is_another_plant_and_the_same_is_not():
     assert standing[1.0].over_stated["t"] == pytest.approx(1.0, abs=0.05)
 
 
-def test_the_verdict_is_of_readings_whatever_is_averaged():
-    log = log_of()
-    one, mean = (free_run(block(), log, average=each) for each in (None, 20.0))
-    assert mean.scores["t"].rmse < 0.5 * one.scores["t"].rmse
-    assert mean.verdict == one.verdict
+def test_a_mass_that_soaks_for_longer_than_the_fit_lasted_is_slow_terms_and_no_gain():
+    # a heat-up of minutes knows nothing of it; one gain explains more than half of the squared error
+    time, q = np.arange(1200.0), np.ones(1200)
+    fast = lfilter([0, 10 * (1 - KEEP)], [1, -KEEP], q)
+    soaked = 5 * (1 - np.exp(-time / 1500))
+    t = 20 + fast + soaked + 0.1 * np.random.default_rng(4).standard_normal(time.size)
+    run = free_run(block(), make_log(time, {"q": (q, "1", "input"), "t": (t, "degC", "output")}))
+    assert run.verdict is not None
+    assert (run.verdict.standing, run.verdict.cause) == ("worse", "slow")
+    assert "slow terms are missing" in str(run.verdict)
+
+
+def test_a_black_box_begins_from_the_readings_that_its_fit_began_from():
+    # an arm that rings: eight poles, of which five rows of readings say nothing
+    poles = [0.995 * np.exp(1j * w) for w in (0.3, 0.9, 1.7, 2.3)]
+    a = np.real(np.poly([*poles, *np.conj(poles)]))
+    logs = []
+    for seed in (0, 1):
+        rng = np.random.default_rng(seed)
+        u = rng.standard_normal(1000)
+        y = lfilter([0, 1.0], a, u)[200:] + 0.01 * rng.standard_normal(800)
+        logs.append(make_log(np.arange(800.0), {"u": (u[200:], "V", "input"), "y": (y, "m", "output")}))
+    plant = fit_black_box("arx", [logs[0]], order=8).plant
+    run = free_run(plant, logs[1])
+    assert run.warmup == 50.0
+    assert not run.no_better
 
 
 def test_inputs_that_hardly_move_are_no_test_and_nothing_is_said_against_the_plant():
