@@ -290,7 +290,7 @@ def test_a_second_step_is_tried_beside_the_chosen_one(monkeypatch, kind, dt, row
         monkeypatch.setattr(module, "make_grid", lambda *a, average, **n: stub_grid((rows,), average or dt))
     monkeypatch.setattr(fitting, "choose", choose_by_step)
     monkeypatch.setattr(fitting, "_within_steps", lambda *grids: 0.0)
-    monkeypatch.setattr(fitting, "_with_convention", lambda grid, choice, *more: (grid, choice))
+    monkeypatch.setattr(fitting, "_with_convention", lambda kind, grid, choice, *more: (grid, choice))
     monkeypatch.setattr(fitting, "_plant", lambda *parts: None)
 
     def fit():
