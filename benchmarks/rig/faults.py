@@ -112,9 +112,9 @@ def _row(one: Outcome) -> str:
     name = one.drill.name + (", held" if one.drill.at > 100 and "held" not in one.drill.name else "")
     beyond = f"{max(one.excursion, 0.0):.1f}"
     if one.session.trip is None:
-        return f"| {name} | - | the session goes on: {one.session.verdict} | - | {beyond} | {one.rows} |"
+        return f"| {name} | - | the session goes on: {one.session.verdict} | - | {beyond} |"
     off = f"{one.off:.1f}" if one.off <= 0.1 else f"{one.detected + one.off:.1f} from the fault"
-    return f"| {name} | {one.detected:.1f} | `{one.session.trip.kind}` | {off} | {beyond} | {one.rows} |"
+    return f"| {name} | {one.detected:.1f} | `{one.session.trip.kind}` | {off} | {beyond} |"
 
 
 def _host_row(one: HostOutcome) -> str:
@@ -122,7 +122,7 @@ def _host_row(one: HostOutcome) -> str:
     by = f"`{trip['kind']}`" if trip else {"running": "the device alone"}.get(one.run.about["verdict"], "")
     by = by or ("refused; the first goes on" if "second" in one.drill.name else "power off on the way out")
     off = f"{one.off:.1f} from the fault"
-    return f"| {one.drill.name} | - | {by} | {off} | {max(one.excursion, 0.0):.1f} | {one.rows} |"
+    return f"| {one.drill.name} | - | {by} | {off} | {max(one.excursion, 0.0):.1f} |"
 
 
 if __name__ == "__main__":
