@@ -188,19 +188,14 @@ def test_a_long_table_is_cut_with_a_note(n: int, more: str, gripper: SimpleNames
     assert f"no contact, so no effusivity: {names}{' and 2 more' if more else ''} wrote" in words_of(out)
 
 
-@pytest.mark.parametrize(("text", "found"), [(None, None), ("0,12", (0.0, 12.0)), ("-5, 3.5", (-5.0, 3.5))])
-def test_a_range_has_two_ends(text: str | None, found: object) -> None:
-    assert verb._range(text) == found
-
-
 @pytest.mark.parametrize(
     ("text", "words"),
     [("warm", "is no range; write 0,12"), ("1,2,3", "is no range"),
      ("5,5", "is empty; give the lower end first"), ("9,1", "is empty"), ("nan,1", "is empty")],
 )  # fmt: skip
-def test_a_range_that_is_none_is_refused(text: str, words: str) -> None:
-    with pytest.raises(UserError, match=words):
-        verb._range(text)
+def test_a_range_that_is_none_is_refused(text: str, words: str, bench: Bench) -> None:
+    done = bench.run("effusivity", "grasps.csv", "--object-range", text, "--out", "e.csv")
+    assert (done.code, len(done.said), words in done.said[0]) == (2, 1, True)
 
 
 def test_a_record_says_which_contacts_lasted_longer_than_those_that_taught(

@@ -61,22 +61,18 @@ class AnyGuard(str):
         """Allow it."""
 
 
-def test_targets_go_to_the_outputs_that_are_regulated() -> None:
-    assert verbs._for_outputs(38.0, ("t1", "t2")) == {"t1": 38.0, "t2": 38.0}
-    assert verbs._for_outputs(38.0, ("t1",)) == 38.0
-    assert verbs._for_outputs({"t2": 1.0, "t1": 2.0}, ("t1", "t2")) == {"t2": 1.0, "t1": 2.0}
-    with pytest.raises(UserError, match="--target names t1; give one for each of t1, t2"):
-        verbs._for_outputs({"t1": 1.0}, ("t1", "t2"))
-    assert verbs._said({"t1": 40.0, "t2": 35.5}) == "t1 40, t2 35.5"
-    assert verbs._said(38.25) == "38.25"
-
-
-def test_an_object_has_a_material_and_a_temperature_or_there_is_none() -> None:
-    assert verbs._what_to_grasp(None, None) is None
-    assert verbs._what_to_grasp(0.0, "copper") == ("copper", 0.0)
-    for half in ((18.0, None), (None, "copper")):
-        with pytest.raises(UserError, match="one of --object and --material is missing"):
-            verbs._what_to_grasp(*half)
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("--target 30 --object 18", "one of --object and --material is missing"),
+        ("--target 30 --material copper", "one of --object and --material is missing"),
+        ("--target t_tank=30", "--target names t_tank; give one for each of t_surface"),
+    ],
+)
+def test_what_a_session_lacks_is_one_line(words: str, said: str, ran: SimpleNamespace) -> None:
+    done = ran.bench.run("run", "c.json", "--twin", "plant.json", *words.split(), "--out", "r")
+    assert (done.code, len(done.said), ran.sessions) == (2, 1, [])
+    assert said in done.said[0]
 
 
 @pytest.mark.parametrize(
