@@ -4,18 +4,14 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
 
 from tests.cli.conftest import Bench
 from tests.end_to_end.conftest import small_plant
-from thermogrip.cli.excite import expected_rows
 from thermogrip.datasets.log_files import read_log
 from thermogrip.datasets.schema import Log, make_log
-from thermogrip.sysid.experiment.optimal import Expectation
 from thermogrip.sysid.plant.plant import Plant
 
 
@@ -69,11 +65,3 @@ def test_without_a_plant_a_schedule_has_the_whole_range(bench: Bench) -> None:
     schedule = read_log(bench.path / "s.csv", inputs=["drive", "pump"], outputs=[])
     assert json.loads(done.out)["share"] == 1.0
     assert (schedule["drive"].min(), schedule["drive"].max()) == (-1.0, 1.0)
-
-
-def test_the_table_of_widths_has_a_column_a_schedule() -> None:
-    plant: Any = SimpleNamespace(free=("U", "C"), units={"C": "J/K"}, values={"U": 5.0, "C": 80.0})
-    widths = {"now": {"U": 4.0, "C": 40.0}, "optimal": {"U": 1.0, "C": 10.0}}
-    head, rows = expected_rows(plant, Expectation({}, widths))
-    assert head == ["parameter", "unit", "value", "now", "optimal"]
-    assert rows == [["U", "1", 5.0, 4.0, 1.0], ["C", "J/K", 80.0, 40.0, 10.0]]

@@ -109,15 +109,16 @@ def _optimal(
     """Return the most informative schedule and what is expected of it, and show that."""
     with console.progress("excite") as progress:
         log, expected, notes = optimal_for(plant, minutes, **limits, hold=hold, seed=seed, progress=progress)
-    console.table("Width of the 90 % intervals: now, and expected after", *expected_rows(plant, expected))
+    head = ["parameter", "unit", "value", *expected.widths]
+    rows = []
+    for name in plant.free:
+        widths = [of_schedule[name] for of_schedule in expected.widths.values()]
+        rows.append([name, plant.units.get(name, "1"), plant.values[name], *widths])
+    console.table("Width of the 90 % intervals: now, and expected after", head, rows)
     for kind, bits in expected.bits.items():
         if kind != "now":
-            against = ""
-            if kind != "optimal":
-                against = (
-                    f"; after optimal {expected.narrower('optimal', kind):.3g} times narrower in the mean"
-                )
-            console.say(f"{kind}: {bits:.1f} bits{against}")
+            narrower = f"; after optimal {expected.narrower('optimal', kind):.3g} times narrower in the mean"
+            console.say(f"{kind}: {bits:.1f} bits{'' if kind == 'optimal' else narrower}")
     for note in notes:
         console.say(f"note: {note}")
     answer = {"bits": expected.bits, "widths_90": expected.widths}
@@ -139,15 +140,16 @@ def schedule_for(
     from thermogrip.sysid.experiment.information import ExperimentForecast
     from thermogrip.sysid.experiment.schedules import excite as plain_schedule
 
-    ranges = _ranges(plant)
-    shapes: dict[str, NDArray[np.float64]] = {}
-    time = np.zeros(0)
-    for k, (name, (fast, slow)) in enumerate(_time_constants(plant).items()):
+    full: dict[str, NDArray[np.float64]] = {}
+    for k, (name, (low, high)) in enumerate(_ranges(plant).items()):
+        fast, slow = _time_constants(plant, name)
         log = plain_schedule(kind, minutes, dt=plant.dt, tau_fast=fast, tau_slow=slow, seed=seed + k)
-        shapes[name], time = column(log, "drive"), np.asarray(log["time"].values, dtype=float)
-    forecast = ExperimentForecast(plant, lowest=lowest, highest=highest)
-    share, drive = _largest(forecast, shapes, ranges, time)
-    variables = {name: (drive[name], plant.units.get(name, "1"), "input") for name in ranges}
+        # a drive that cannot go below zero swings about half of its share, one of both signs about zero
+        middle, reach = (0.5 * (low + high), 0.5 * (high - low)) if low >= 0 else (0.0, min(-low, high))
+        full[name] = middle + reach * column(log, "drive")
+    time = np.asarray(log["time"].values, dtype=float)
+    share = _largest(ExperimentForecast(plant, lowest=lowest, highest=highest), full, time.size)
+    variables = {name: (share * drive, plant.units.get(name, "1"), "input") for name, drive in full.items()}
     variables |= {name: (np.ones(time.size), "1", "input") for name in plant.model.switches}
     return make_log(time, variables, name=f"{kind} schedule"), share
 
@@ -189,7 +191,7 @@ def optimal_for(
         minutes,
         ranges=ranges,
         begin=plain if isinf(slew) else None,
-        shortest=min(fast for fast, _ in _time_constants(plant).values()),
+        shortest=min(_time_constants(plant, drive)[0] for drive in ranges),
         lowest=lowest,
         highest=highest,
         slew=slew / min(high - low for low, high in ranges.values()),
@@ -200,71 +202,38 @@ def optimal_for(
     return best, expect(plant, plain | {"optimal": best}), notes
 
 
-def expected_rows(plant: Plant, expected: Expectation) -> tuple[list[str], list[list[object]]]:
-    """Return head and rows of the table of interval widths now and after each schedule."""
-    kinds = list(expected.widths)
-    head = ["parameter", "unit", "value", *kinds]
-    rows: list[list[object]] = []
-    for name in plant.free:
-        widths = [expected.widths[kind][name] for kind in kinds]
-        rows.append([name, plant.units.get(name, "1"), plant.values[name], *widths])
-    return head, rows
-
-
 def _ranges(plant: Plant) -> dict[str, tuple[float, float]]:
     from thermogrip.mpc.plant.prediction import drive_names, drive_range
 
     return {name: drive_range(plant, name) for name in drive_names(plant)}
 
 
-def _time_constants(plant: Plant) -> dict[str, tuple[float, float]]:
-    """Return the fast and the slow time constant [s] to excite by each drive."""
+def _time_constants(plant: Plant, drive: str) -> tuple[float, float]:
+    """Return the fast and the slow time constant [s] to excite by a drive, of the output it moves most."""
     from thermogrip.mpc.plant.prediction import step_response
 
-    out = {}
-    for name in _ranges(plant):
-        answers = [step_response(plant, name, output) for output in plant.outputs]
-        best = max(answers, key=lambda answer: abs(answer.gain))
-        fast = max(best.delay, best.lag / 20, 2 * plant.dt)
-        out[name] = (fast, max(best.lag, 2 * fast))
-    return out
+    responses = [step_response(plant, drive, output) for output in plant.outputs]
+    largest = max(responses, key=lambda response: abs(response.gain))
+    fast = max(largest.delay, largest.lag / 20, 2 * plant.dt)
+    return fast, max(largest.lag, 2 * fast)
 
 
-def _largest(
-    forecast: ExperimentForecast,
-    shapes: dict[str, NDArray[np.float64]],
-    ranges: dict[str, tuple[float, float]],
-    time: NDArray[np.float64],
-) -> tuple[float, dict[str, NDArray[np.float64]]]:
-    """Return the largest share whose simulated outputs stay inside, and the drives."""
+def _largest(forecast: ExperimentForecast, full: dict[str, NDArray[np.float64]], n_rows: int) -> float:
+    """Return the largest share of the drives (n_rows,) at full range whose simulated outputs stay inside."""
     import numpy as np
 
-    def scaled(share: float) -> dict[str, NDArray[np.float64]]:
-        out = {}
-        for name, (low, high) in ranges.items():
-            # a drive that cannot go below zero swings about half of its share, one of both signs about zero
-            middle = share * 0.5 * (low + high) if low >= 0 else 0.0
-            reach = share * 0.5 * (high - low) if low >= 0 else share * min(-low, high)
-            out[name] = middle + reach * shapes[name]
-        return out
-
-    def stays(share: float) -> bool:
-        drive = scaled(share)
-        u = np.ones((time.size, len(forecast.plant.inputs)))
-        for k, name in enumerate(forecast.plant.inputs):
-            if name in drive:
-                u[:, k] = drive[name]
-        return forecast.stays(u)
-
+    inputs = forecast.plant.inputs
+    moved = np.array([name in full for name in inputs])
+    u = np.column_stack([full.get(name, np.ones(n_rows)) for name in inputs])
+    if forecast.stays(u):
+        return 1.0
     low, high = 0.0, 1.0
-    if stays(1.0):
-        return 1.0, scaled(1.0)
     for _ in range(HALVINGS):
         middle = 0.5 * (low + high)
-        low, high = (middle, high) if stays(middle) else (low, middle)
+        low, high = (middle, high) if forecast.stays(np.where(moved, middle * u, u)) else (low, middle)
     if low < 0.02:
         raise UserError(
             f"no schedule keeps the plant from {forecast.lowest:g} to {forecast.highest:g} degC",
             hint="widen --lowest and --highest",
         )
-    return low, scaled(low)
+    return low
