@@ -250,7 +250,7 @@ class ExperimentForecast:
     def _warm_up(self, rows: int) -> float:
         """Return the seconds from which a fit would estimate the start, 0 where it knows it or does not."""
         model = self.plant.model
-        if self._known or not isinstance(model, GreyModel) or model.drift:
+        if self._known or not isinstance(model, GreyModel):
             return 0.0
         return float(min(model.warmup, rows * self.dt / 2))
 

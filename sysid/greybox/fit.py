@@ -217,7 +217,7 @@ def fit_network(
     report(0.0, "fitting from the priors")
     solution = _descend(problem, np.zeros(len(problem.free)), report, (0.0, 0.6))
     tau = residual_tau(problem.errors(solution.z), problem.tau)
-    whiter = (tau < 0.8 * problem.tau) & np.array([slow is None for slow in problem.drift])
+    whiter = tau < 0.8 * problem.tau
     if whiter.any():
         problem = problem.with_tau(np.where(whiter, tau, problem.tau))
         solution = _descend(problem, solution.z, report, (0.8, 0.95))

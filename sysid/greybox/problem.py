@@ -9,17 +9,6 @@ correlated: all residuals of an output are divided by sqrt(tau), with tau the bi
 
 **Starts** are nuisances of each log (:mod:`thermogrip.sysid.plant.simulation`), estimated anew at each
 iteration and held while the sensitivities are taken: differences over all parameters in one batch.
-
-**Drift.** Over hours a reading drifts from any lumped model. The error of bin t of an output is then an AR(1)
-drift s of standard deviation ``sd`` and correlation time ``time``, and white w_t of variance r per bin,
-
-    e_t = s_t + w_t,    s_(t+1) = rho s_t + sqrt(1 - rho^2) sd eta_t,    rho = exp(-bin / time).
-
-Maximum likelihood is then least squares on the innovations of the steady Kalman filter of s,
-
-    v_t = (e_t - s_t) / sqrt(P + r),    s_(t+1) = rho (s_t + K v_t sqrt(P + r)),    K = P / (P + r),
-
-with P = rho^2 P r / (P + r) + (1 - rho^2) sd^2; they are linear in e, as the sensitivities are.
 """
 
 from __future__ import annotations
@@ -31,7 +20,6 @@ from typing import cast
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
-from scipy.signal import lfilter
 
 from thermogrip.datasets.arrays import Array, Mask
 from thermogrip.datasets.errors import UserError
@@ -43,19 +31,6 @@ from thermogrip.sysid.plant.plant import Plant
 from thermogrip.sysid.plant.simulation import Start, find_starts, predict
 
 _WARM_ROWS = 30  # of a log, from whose readings its start is estimated at least
-
-
-def innovations(errors: Array, *, sd: float, time: float, variance: float, bin_s: float) -> Array:
-    """Return the innovations (k, m) of errors (k, m) in bins of ``bin_s`` [s], in units of their sd, from the
-    drift's ``sd`` and ``time`` [s] and the ``variance`` of the rest of a bin."""
-    rho = float(np.exp(-bin_s / time))
-    push = (1 - rho**2) * sd**2
-    # P^2 + P (r (1 - rho^2) - push) - push r = 0
-    half = 0.5 * (variance * (1 - rho**2) - push)
-    P = -half + np.sqrt(half**2 + push * variance)
-    K = P / (P + variance)
-    predicted = lfilter([0.0, rho * K], [1.0, -rho * (1 - K)], errors, axis=-1)
-    return np.asarray((errors - predicted) / np.sqrt(P + variance))
 
 
 _STEP = 1e-4  # of a prior sd
@@ -90,7 +65,6 @@ class Problem:
     average: float  # length of a bin [s]
     sd: Array  # (n_y,), standard deviation of a bin about the model
     tau: Array  # (n_y,), bins per independent one
-    drift: tuple[tuple[float, float] | None, ...]  # sd and correlation time [s] of each output's AR(1) drift
     _starts: _Starts = field(default_factory=_Starts)
 
     @property
@@ -143,13 +117,8 @@ class Problem:
         ]
 
     def scaled(self, k: int, errors: Array) -> Array:
-        """Return the errors (k, m) of output k in sd; of one that drifts, their innovations."""
-        variance = float(self.sd[k] ** 2 * self.tau[k])
-        slow = self.drift[k]
-        if slow is None:
-            return np.asarray(errors / np.sqrt(variance))
-        sd, seconds = slow
-        return innovations(errors, sd=sd, time=seconds, variance=variance, bin_s=self.average)
+        """Return the errors (k, m) of output k in units of their sd."""
+        return np.asarray(errors / float(self.sd[k] * np.sqrt(self.tau[k])))
 
     def errors(self, z: Array) -> list[list[list[Array]]]:
         """Return the model's errors by log, stretch and output (bins in order of time)."""
@@ -262,7 +231,6 @@ def make_problem(model: GreyModel, logs: Sequence[Log], *, average: float, indep
         steps * plant.dt,
         sd,
         tau,
-        tuple(model.drift.get(name) for name in model.outputs),
     )
 
 

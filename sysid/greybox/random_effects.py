@@ -289,8 +289,8 @@ def _of_start(problem: Problem, at: int, k: int, p: Array, start: Start) -> list
 def _warm_up(
     problem: Problem, at: int, start: Start, merge: int, effects: Sequence[_Column]
 ) -> WarmUp | None:
-    """Return the first bins of a log; None where its start was not estimated from them, or they drift."""
-    if start.level is not None or any(problem.drift):
+    """Return the first bins of a log; None where its start was not estimated from them."""
+    if start.level is not None:
         return None
     read = [
         i

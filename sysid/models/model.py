@@ -146,7 +146,6 @@ class GreyModel(Model, Protocol):
     units: dict[str, str]  # of signals and parameters
     states: tuple[str, ...]
     sensor_sd: dict[str, float]  # of the mean over a bin about the model, by output
-    drift: dict[str, tuple[float, float]]  # sd and correlation time [s] of the slow error, by output
     nuisance: dict[str, float]  # how far each output and disturbance is off, from log to log
     reference: str | None  # the output that has no offset of its own, if one does not
     average: float  # length of the bins of a fit [s], where none is asked for

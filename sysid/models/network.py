@@ -494,11 +494,6 @@ class NetworkModel(Described):
         self.n_x = len(self.states)
         self.reference = next((name for name, item in network.outputs.items() if item.reference), None)
         self.sensor_sd = {name: item.sd for name, item in network.outputs.items()}
-        self.drift = {
-            name: (item.wander, item.wander_time)
-            for name, item in network.outputs.items()
-            if item.wander is not None and item.wander_time is not None
-        }
         self.command_steps = {k: item.step for k, item in network.inputs.items() if item.step is not None}
         self.average = network.average or max(5.0, 5 * self.dt)
         sd = np.full(self.n_x, 0.5)
@@ -607,15 +602,23 @@ class NetworkModel(Described):
 
 
 def _as_it_was_fitted(content: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a plant's network; 0.1.0 wrote no ``full_scale`` and took 1 for that of V, A, W and 1."""
+    """Return a plant's network; 0.1.0 wrote no ``full_scale`` and took 1 for that of V, A, W and 1, and until
+    0.2.0 the slow error of a sensor was a ``wander`` of the file."""
     out = dict(content)
-    inputs = out.get("inputs")
+    inputs, outputs = out.get("inputs"), out.get("outputs")
     if isinstance(inputs, Mapping):
         out["inputs"] = {
             name: {"full_scale": 1.0, **item}
             if isinstance(item, Mapping) and item.get("unit") in ("1", "A", "V", "W")
             else item
             for name, item in inputs.items()
+        }
+    if isinstance(outputs, Mapping):
+        out["outputs"] = {
+            name: {key: item[key] for key in item if key not in ("wander", "wander_time")}
+            if isinstance(item, Mapping)
+            else item
+            for name, item in outputs.items()
         }
     return out
 

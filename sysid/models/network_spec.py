@@ -103,17 +103,9 @@ class Output(_Table):
     node: Name
     unit: Literal["degC"] = "degC"
     lag: Name | None = None
-    sd: Positive = 0.1  # of a mean over the fit's bins about the model, beside a drift
+    sd: Positive = 0.1  # of a mean over the fit's bins about the model
     log_sd: NotNegative = 0.0  # of its offset
     reference: bool = False
-    wander: Positive | None = None  # sd of an error that drifts over hours (AR(1))
-    wander_time: Positive | None = None  # its correlation time [s]
-
-    @model_validator(mode="after")
-    def _whole(self) -> Output:
-        if (self.wander is None) != (self.wander_time is None):
-            raise ValueError("wander and wander_time come together")
-        return self
 
 
 class Node(_Table):

@@ -426,7 +426,6 @@ class OwnModel(Described):
         self.sensor_sd = {name: item.sd or found.get(name, 1.0) for name, item in code.outputs.items()}
         self.average, self.warmup = code.average or 5 * self.dt, code.warmup or 50 * self.dt
         self.independent = 4 * self.average
-        self.drift: dict[str, tuple[float, float]] = {}
         # no output defines a scale: a log that starts at rest is not recognised as such
         self.reference: str | None = None
         self.spread = np.diag(np.square(list(code.states.values())))

@@ -79,7 +79,6 @@ class TwoGains:
     states = ("soon", "late")
     smooth = 0.0
     command_steps: Mapping[str, float] = {}
-    drift: Mapping[str, tuple[float, float]] = {}
     name, dt, average, independent, warmup = "two gains", 1.0, 4.0, 60.0, 5.0
     reference: str | None = None
     units: Mapping[str, str] = {"q": "1", "t": "degC", "a": "K", "b": "K"}

@@ -141,14 +141,6 @@ def test_a_fit_whose_errors_are_whiter_than_a_reading_a_minute_is_done_again_wit
     assert np.abs(np.linalg.lstsq(jacobian, residual, rcond=None)[0]).max() < 1e-4
 
 
-def test_the_weight_of_an_output_that_drifts_is_left_as_it_is_stated():
-    class Drifting(TwoGains):
-        drift = {"t": (0.2, 200.0)}  # noqa: RUF012
-
-    plant = fit_network(Drifting(), [a_log(k, memory=0.5) for k in (1, 2)])
-    assert plant.scores.weight_s["t"] == 60.0
-
-
 # ---- where it begins, where it ends ----
 
 

@@ -5,14 +5,12 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import pytest
 from numpy.typing import ArrayLike
-from scipy.linalg import solve_triangular, toeplitz
 
 from tests.sysid.greybox.makers import TwoGains, a_log, heater, made
-from thermogrip.sysid.greybox.problem import Problem, innovations, make_problem, prior_plant
-from thermogrip.sysid.models.network import NetworkModel, load_network
-from thermogrip.sysid.models.network_spec import Parameter, network_from_dict
+from thermogrip.sysid.greybox.problem import Problem, make_problem, prior_plant
+from thermogrip.sysid.models.network import load_network
+from thermogrip.sysid.models.network_spec import Parameter
 
 Array = np.ndarray
 
@@ -120,33 +118,3 @@ def test_a_prior_as_a_plant_has_all_that_the_model_states():
     fixed = [name for name, spec in model.specs.items() if spec.fixed]
     assert fixed
     assert set(plant.free).isdisjoint(fixed)
-
-
-def test_an_output_that_drifts_is_fitted_by_its_innovations():
-    content = heater().to_dict()["network"]
-    content["outputs"]["t"] |= {"wander": 0.2, "wander_time": 300.0}
-    model, log = NetworkModel(network_from_dict(content)), made(0, seconds=300.0)
-    plain, slow = problem_of(heater(), log, average=5.0), problem_of(model, log, average=5.0)
-    z = np.full(3, 0.1)
-    errors = slow.errors(z)[0][0][0]
-    np.testing.assert_allclose(errors, plain.errors(z)[0][0][0])
-    variance = 0.05**2 * slow.tau[0]
-    want = innovations(errors[None], sd=0.2, time=300.0, variance=variance, bin_s=5.0)[0]
-    np.testing.assert_allclose(slow.linearise(z)[0][:-3], want)
-
-
-@pytest.mark.parametrize(("sd", "time", "noise"), [(0.1, 300.0, 0.05), (0.3, 20.0, 0.1), (0.02, 60.0, 0.2)])
-def test_innovations_are_what_the_past_does_not_predict(sd: float, time: float, noise: float):
-    bin_s, m = 2.0, 900
-    covariance = toeplitz(sd**2 * np.exp(-bin_s * np.arange(m) / time) + noise**2 * (np.arange(m) == 0))
-    errors = np.random.default_rng(0).normal(size=(3, m))
-    want = solve_triangular(np.linalg.cholesky(covariance), errors.T, lower=True).T
-    found = innovations(errors, sd=sd, time=time, variance=noise**2, bin_s=bin_s)
-    # the filter is the steady one: what it knew at the start is forgotten by then
-    np.testing.assert_allclose(found[:, 800:], want[:, 800:], atol=1e-6)
-
-
-def test_without_a_drift_innovations_are_the_errors_in_their_own_sd():
-    errors = np.random.default_rng(1).normal(size=(2, 50))
-    found = innovations(errors, sd=0.0, time=60.0, variance=0.04, bin_s=5.0)
-    np.testing.assert_allclose(found, errors / 0.2)

@@ -198,7 +198,7 @@ def test_how_a_stretch_is_cut(have, merge, pieces, sizes, outputs, monkeypatch):
 def test_the_first_bins_of_a_log_say_how_it_began():
     """A warm-up of 20 s and bins of 8 s: two of them, of the outputs that have half,
     by the effects that act there."""
-    given = {"warm_up": lambda at: 20.0, "drift": (None, None)}
+    given = {"warm_up": lambda at: 20.0}
     problem = SimpleNamespace(**vars(binned([[range(10), [0, 1, 9]]], [[range(10), [9]]])) | given)
     columns = [np.arange(10.0), np.array([2.0, 4.0, 6.0])]
     lead = random_effects._Column("", 1.0, 0.0, [columns])
@@ -218,8 +218,6 @@ def test_the_first_bins_of_a_log_say_how_it_began():
     assert lost.outputs == (0,)
     for changed, which in (({"level": 0}, [lead]), ({"level": None}, [others[1]])):
         assert random_effects._warm_up(problem, 0, SimpleNamespace(**changed), 2, which) is None
-    drifting = SimpleNamespace(**vars(problem) | {"drift": (None, (0.1, 60.0))})
-    assert random_effects._warm_up(drifting, 0, start, 2, [lead]) is None
 
 
 def test_a_start_after_a_gap_is_three_times_less_certain_than_the_first():

@@ -320,7 +320,7 @@ def test_of_two_peltiers_each_has_its_own_numbers():
 def test_what_a_network_says_of_its_signals_is_what_its_file_says():
     content = everything()
     content["outputs"] = {
-        "t": {"node": "far", "lag": "lag", "sd": 0.3, "log_sd": 0.2, "wander": 0.4, "wander_time": 900.0},
+        "t": {"node": "far", "lag": "lag", "sd": 0.3, "log_sd": 0.2},
         "ref": {"node": "tank", "reference": True},
     }
     content["disturbances"]["air"] = {"log_sd": 0.7}
@@ -328,7 +328,7 @@ def test_what_a_network_says_of_its_signals_is_what_its_file_says():
     content["nodes"]["sink"]["start_sd"] = 3.0
     model = model_of(content | {"average": 7.0, "dt": 0.5})
     assert (model.reference, model.sensor_sd) == ("ref", {"t": 0.3, "ref": 0.1})
-    assert (model.drift, model.command_steps) == ({"t": (0.4, 900.0)}, {"q": 0.5})
+    assert model.command_steps == {"q": 0.5}
     assert model.nuisance == {"t": 0.2, "ref": 0.0, "air": 0.7}
     assert (model.switches, model.average, model.dt) == (("pump",), 7.0, 0.5)
     assert (model.independent, model.warmup, model.smooth) == (60.0, 60.0, 20.0)
@@ -337,7 +337,7 @@ def test_what_a_network_says_of_its_signals_is_what_its_file_says():
         [500.0, 200.0, 80.0, 48.0, 15.0, 48.0, 15.0, 96.0, 3.0]
     )
     plain = model_of(everything())
-    assert (plain.reference, plain.drift, plain.command_steps) == (None, {}, {})
+    assert (plain.reference, plain.command_steps) == (None, {})
     assert "lag" not in model.to_dict()["network"]["outputs"]["ref"]
     with pytest.raises(UserError, match="the model holds no network; save the plant again"):
         NetworkModel.from_dict({"kind": "network"})
@@ -396,6 +396,13 @@ def test_a_plant_of_version_0_1_0_keeps_its_full_scale_of_1():
     content = heated(unit="V", range=[0.0, 10.0]).to_dict()
     del content["network"]["inputs"]["drive"]["full_scale"]
     assert heats(NetworkModel.from_dict(content), [25.0, 25.0], [0.5]) == pytest.approx([10.0, 0.0])
+
+
+def test_a_plant_of_version_0_2_0_may_have_a_sensor_that_wanders():
+    model = load_network("tclab")
+    content = model.to_dict()
+    content["network"]["outputs"]["t1"] |= {"wander": 0.1, "wander_time": 3000.0}
+    assert NetworkModel.from_dict(content).to_dict() == model.to_dict()
 
 
 def test_a_duty_driver_heats_by_the_square_of_the_current_while_it_is_on():
@@ -559,7 +566,6 @@ def test_rest_for_many_parameters_is_that_for_each(name: str, y: list[float], u:
         ("peltiers.tec", {"sink": "air"}, "peltiers.tec.sink: no node 'air'"),
         ("peltiers.tec", {"input": "fan"}, "peltiers.tec.input: no input 'fan'"),
         ("outputs.t", {"node": "nowhere"}, "outputs.t.node: no node 'nowhere'"),
-        ("outputs.t", {"wander": 0.1}, "wander and wander_time come together"),
         ("outputs", {k: {"node": "far", "reference": True} for k in "ab"}, "outputs: two are the reference"),
         ("inputs.q", {"unit": "furlong"}, "inputs.q.unit"),
         ("inputs.q", {"range": [5.0, 5.0]}, r"inputs.q.range: \[5.0, 5.0\] is empty"),
