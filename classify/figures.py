@@ -152,14 +152,14 @@ def _library_lines(axis: Axes, library: Mapping[str, float]) -> None:
     """Draw the library; lines too close for a name each have their names in a row, in the lines' order."""
     low, high = axis.get_xlim()
     rows = sorted((e, name) for name, e in library.items() if low <= e <= high)
-    least, near = 0.028 * np.log(high / low), list[tuple[float, list[str]]]()
+    least, clusters = 0.028 * np.log(high / low), list[tuple[float, list[str]]]()
     for effusivity, name in rows:
         axis.axvline(effusivity, color=_FAINT, lw=0.8, zorder=0)
-        if near and np.log(effusivity / near[-1][0]) <= least:
-            near[-1][1].append(name)
+        if clusters and np.log(effusivity / clusters[-1][0]) <= least:
+            clusters[-1][1].append(name)
         else:
-            near.append((effusivity, [name]))
-    for effusivity, names in near:
+            clusters.append((effusivity, [name]))
+    for effusivity, names in clusters:
         axis.text(
             effusivity,
             1.01,

@@ -30,14 +30,13 @@ from scipy.special import logsumexp
 
 from thermogrip.classify.estimators.base import Floats, GraspClassifier, normalised, pick
 from thermogrip.classify.estimators.posterior import PosteriorClassifier
-from thermogrip.datasets.errors import UserError, known_names
-from thermogrip.datasets.schema import make_log, unit_names
+from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.schema import unit_names
 from thermogrip.sysid.effusivity.predictive import PosteriorPredictive, next_touch
 from thermogrip.sysid.effusivity.quality import check_grasps
 
 if TYPE_CHECKING:
-    from thermogrip.datasets.schema import Grasps, Log
-    from thermogrip.sysid.plant.plant import Plant
+    from thermogrip.datasets.schema import Grasps
 
 _NEGLIGIBLE = 1e-4  # of probability: such a candidate's futures are not drawn
 
@@ -74,17 +73,17 @@ def expected_information(forecast: PosteriorPredictive, *, draws: int = 48, seed
     z = np.concatenate([half, -half])
     later, gain = np.zeros(n), np.zeros(n)
     for k in range(m):
-        at = np.flatnonzero(p[:, k] > _NEGLIGIBLE)
-        if not at.size:
+        likely = np.flatnonzero(p[:, k] > _NEGLIGIBLE)
+        if not likely.size:
             continue
-        y = mean[at, k, None, :] + z @ chol[at, k].transpose(0, 2, 1)
-        off = (y[:, None] - mean[at][:, :, None, :]) @ white[at].transpose(0, 1, 3, 2)
-        after = log_p[at][:, :, None] - 0.5 * ((off**2).sum(axis=3) + log_det[at][:, :, None])
+        y = mean[likely, k, None, :] + z @ chol[likely, k].transpose(0, 2, 1)
+        off = (y[:, None] - mean[likely][:, :, None, :]) @ white[likely].transpose(0, 1, 3, 2)
+        after = log_p[likely][:, :, None] - 0.5 * ((off**2).sum(axis=3) + log_det[likely][:, :, None])
         after = (after - logsumexp(after, axis=1, keepdims=True)).transpose(0, 2, 1)
         q = np.exp(after)
-        later[at] += p[at, k] * entropy(after).mean(axis=1)
-        kept = np.take_along_axis(q, best[at][:, None, None], axis=2)[:, :, 0]
-        gain[at] += p[at, k] * (q.max(axis=2) - kept).mean(axis=1)
+        later[likely] += p[likely, k] * entropy(after).mean(axis=1)
+        p_of_best = np.take_along_axis(q, best[likely][:, None, None], axis=2)[:, :, 0]
+        gain[likely] += p[likely, k] * (q.max(axis=2) - p_of_best).mean(axis=1)
     return Expected(np.maximum(now - later, 0.0), p.max(axis=1) + gain, gain)
 
 
@@ -146,8 +145,7 @@ def choose_next_touch(
     t_gripper : (n,) array_like, optional
         Temperatures to weigh [degC].
     seconds : callable, optional
-        Time to bring the gripper to a temperature [s], of
-        :func:`~thermogrip.classify.decisions.next_touch.by_plant`; by default it is done within the rest.
+        Time to bring the gripper to a temperature [s]; by default it is done within the rest.
     price : float, optional
         Of a second, in units of a right answer.
     rest, end : float, optional
@@ -182,15 +180,15 @@ def choose_next_touch(
         coupling=model.coupling_, rest=rest, end=end,
     )  # fmt: skip
     forecast = forecast._replace(log_p=normalised(forecast.log_p + model.log_prior(names)))
-    found = expected_information(forecast, draws=draws, seed=seed)
+    expected = expected_information(forecast, draws=draws, seed=seed)
     reach = np.array([0.0 if seconds is None else float(seconds(float(t))) for t in levels])
     whole = np.maximum(reach, rest) + end
     return NextTouch(
         t_gripper=levels,
-        information=found.information,
-        accuracy=found.accuracy,
+        information=expected.information,
+        accuracy=expected.accuracy,
         seconds=whole,
-        value=found.gain - price * whole,
+        value=expected.gain - price * whole,
         entropy=float(entropy(forecast.log_p[0])),
         accuracy_now=float(np.exp(forecast.log_p[0].max())),
     )
@@ -212,21 +210,21 @@ def advise_touches(
     """
     units = unit_names(grasps)
     names = list(dict.fromkeys(units.tolist()))
-    found: dict[str, dict[str, float | None]] = {}
+    advice_of: dict[str, dict[str, float | None]] = {}
     for k, name in enumerate(names):
         if progress is not None:
             progress(k / len(names), f"another touch of {name}")
         touched = pick(grasps, units == name)
         block = check_grasps(touched).usable_grasps(touched)
         if block is None:
-            found[name] = {"next_touch_degC": None, "next_touch_accuracy": None}
+            advice_of[name] = {"next_touch_degC": None, "next_touch_accuracy": None}
             continue
         choice = choose_next_touch(classifier, block, candidates=candidates, price=price)
         best, accuracy = None, choice.accuracy_now
         if choice.worth_it:
             best, accuracy = choice.best, float(choice.accuracy[choice.t_gripper == choice.best][0])
-        found[name] = {"next_touch_degC": best, "next_touch_accuracy": accuracy}
-    return [found[name] for name in units.tolist()]
+        advice_of[name] = {"next_touch_degC": best, "next_touch_accuracy": accuracy}
+    return [advice_of[name] for name in units.tolist()]
 
 
 def with_model(classifier: GraspClassifier) -> PosteriorClassifier:
@@ -237,51 +235,3 @@ def with_model(classifier: GraspClassifier) -> PosteriorClassifier:
         )
     classifier._check_fitted()
     return classifier
-
-
-_REST = 10.0  # s at the present temperature, of which the plant takes its state
-
-
-def by_plant(
-    plant: Plant, now: float, *, t_ambient: float, output: str = "t_surface", longest: float = 900.0
-) -> Callable[[float], float]:
-    """Return the time [s] from temperature ``now`` [degC] to another, for ``choose_next_touch(seconds=...)``:
-    when the plant's free run at full ``drive``, pump on, from rest first passes it (a controller that settles
-    there takes a little longer), infinite beyond ``longest`` [s]; a plant without that output or input is a
-    :class:`UserError`."""
-    for name, there in ((output, plant.outputs), ("drive", plant.inputs)):
-        if name not in there:
-            raise UserError(f"the plant has no {name!r}", hint=known_names(name, there, "it has {}"))
-    low, high = plant.valid.get("drive", (-1.0, 1.0))
-
-    def passed(drive: float) -> tuple[Floats, Floats]:
-        """Return times [s] and the skin's temperature under one drive."""
-        run = plant.simulate(_log(plant, now, t_ambient, longest, drive), warmup=_REST)
-        time = np.asarray(run["time"].values, dtype=float) - _REST
-        after = time >= 0
-        return time[after], np.asarray(run[output].values, dtype=float)[after]
-
-    up, down = passed(high), passed(low)
-
-    def seconds(there: float) -> float:
-        time, skin = up if there > now else down
-        past = skin >= there if there > now else skin <= there
-        if abs(there - now) < 1e-9:
-            return 0.0
-        return float(time[int(past.argmax())]) if past.any() else np.inf
-
-    return seconds
-
-
-def _log(plant: Plant, now: float, t_ambient: float, longest: float, drive: float) -> Log:
-    time = np.arange(0.0, _REST + longest, max(plant.dt, 0.5))
-    rest = time < _REST
-    columns: dict[str, Any] = {}
-    for name in plant.inputs:
-        values = np.where(rest, 0.0, drive) if name == "drive" else np.ones(time.size)
-        columns[name] = (values, "1", "input")
-    for name in plant.disturbances:
-        columns[name] = (np.full(time.size, t_ambient), "degC", "disturbance")
-    for name in plant.outputs:
-        columns[name] = (np.full(time.size, now), "degC", "output")
-    return make_log(time, columns, name="reach")

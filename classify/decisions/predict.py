@@ -162,9 +162,9 @@ def answer(
     if len(set(names)) < len(names):
         raise UserError("a candidate is named twice", hint="name each once")
     return [
-        found
+        one_answer
         for grasps in record_list(X)
-        for found in _answers(classifier, grasps, names, rule, object_range, nearest=nearest)
+        for one_answer in _answers(classifier, grasps, names, rule, object_range, nearest=nearest)
     ]
 
 
@@ -173,7 +173,7 @@ def classify_grasps(
 ) -> list[Row]:
     """Return :func:`answer` as rows of a table: ``grasp_id, material, p_<material>..., p_unknown,
     decided_at_s``, and where there is something to say ``misfit_sd, deviates, note, note_codes``."""
-    return [found.row() for found in answer(classifier, X, candidates, **options)]
+    return [one_answer.row() for one_answer in answer(classifier, X, candidates, **options)]
 
 
 def _answers(
@@ -184,14 +184,14 @@ def _answers(
     whole, grasps = not classifier.leaves_samples_out, with_object_range(as_read, object_range)
     quality = check_grasps(grasps, longest=classifier.longest_, whole_traces=whole)
     usable, units = quality.read(grasps), unit_names(grasps)
-    found = [] if usable is None else _named(classifier, usable, names, rule, nearest=nearest)
-    of_unit = {} if usable is None else dict(zip(unit_names(usable).tolist(), found))
+    named = [] if usable is None else _named(classifier, usable, names, rule, nearest=nearest)
+    of_unit = {} if usable is None else dict(zip(unit_names(usable).tolist(), named))
     last = _last_samples(grasps["time"].values, grasps["t_surface"].values, units)
-    left, answers = iter(found), list[Answer]()
+    unread, answers = iter(named), list[Answer]()
     for i, grasp_id in enumerate(grasps["grasp"].values.astype(str).tolist()):
         notes: tuple[Note, ...] = (Note("readings", quality.note[i]),) if quality.note[i] else ()
         if quality.usable[i]:
-            one = next(left)
+            one = next(unread)
             notes += one.notes
         elif units[i] in of_unit:
             one = of_unit[str(units[i])]
@@ -207,21 +207,21 @@ def _named(
 ) -> list[Answer]:
     """Return the answers of a classifier to grasps whose usable part is given, without their ids."""
     if rule is None:
-        found, units = classifier.answered(grasps, names), unit_names(grasps)
-        found = found._replace(log_p=joined_touches(classifier, found.log_p, units))
+        answered, units = classifier.answered(grasps, names), unit_names(grasps)
+        answered = answered._replace(log_p=joined_touches(classifier, answered.log_p, units))
         decided = _last_samples(grasps["time"].values, grasps["t_surface"].values, units)
     else:
-        found, decided = _stopped(classifier, grasps, names, rule)
+        answered, decided = _stopped(classifier, grasps, names, rule)
     out = []
-    for i, row in enumerate(found.log_p):
-        p_unknown, misfit = (float(v[i]) if np.isfinite(v[i]) else None for v in found[1:3])
+    for i, row in enumerate(answered.log_p):
+        p_unknown, misfit = (float(v[i]) if np.isfinite(v[i]) else None for v in answered[1:3])
         none = p_unknown is not None and p_unknown > _STRANGE
         out.append(
             Answer(
                 grasp_id="", material=UNKNOWN if none and not nearest else names[int(row.argmax())],
                 probabilities={name: float(p) for name, p in zip(names, np.exp(row))}, p_unknown=p_unknown,
                 decided_at=float(decided[i]), misfit_sd=misfit,
-                deviates=found.deviates[i] if none else "", notes=tuple(found.notes[i]),
+                deviates=answered.deviates[i] if none else "", notes=tuple(answered.notes[i]),
             )
         )  # fmt: skip
     return out
@@ -242,22 +242,21 @@ def _stopped(
     if has_touch_groups(grasps):
         problem = "touches of one block are answered together, no rule ends one of them"
         raise UserError(problem, file=log_name(grasps), hint="leave --early out, or the column touch_group")
-    seen = growing_windows(
+    windows = growing_windows(
         classifier,
         grasps,
         candidates=names,
         times=rule.times,
         end=contact_end(grasps, rule.end),
-        gain=rule.gain > 0,
     )
-    ended = stops(rule, seen, silent_windows(grasps, seen.times)).time
+    ended = stops(rule, windows, silent_windows(grasps, windows.times)).time
     out = Answered.nothing(ended.size, len(names))
     for time in np.unique(ended):
-        there = np.flatnonzero(ended == time)
-        cut = classifier.answered(pick(grasps, there).sel(time=slice(None, time + 1e-9)), names)
+        ended_then = np.flatnonzero(ended == time)
+        cut = classifier.answered(pick(grasps, ended_then).sel(time=slice(None, time + 1e-9)), names)
         pairs: Any = zip(out, cut)
-        for whole, part in pairs:
-            for i, value in zip(there.tolist(), part):
+        for whole, cut_values in pairs:
+            for i, value in zip(ended_then.tolist(), cut_values):
                 whole[i] = value
     return out, ended
 
@@ -295,8 +294,8 @@ def _cell(value: Any, unknown: str) -> str:
 
 def _last_samples(time: Floats, skin: Floats, units: NDArray[np.str_]) -> Floats:
     """Return the time of the last sample of each grasp's unit, (n_grasp,) [s]."""
-    seen = np.isfinite(skin)
-    return np.array([time[seen[units == unit].any(axis=0)][-1] for unit in units])
+    has_sample = np.isfinite(skin)
+    return np.array([time[has_sample[units == unit].any(axis=0)][-1] for unit in units])
 
 
 _STRANGE = 0.5  # p_unknown
@@ -311,13 +310,13 @@ def unexplained_effusivities(
     """Return the misfit of single touches under their effusivity [standard deviations], and in words why
     that does not explain them, with unknown object temperatures in the range ``stated`` [degC]."""
     ln_e = np.log([row.effusivity for row in rows])
-    at = np.flatnonzero((label_values(grasps, "touch_group") == "") & np.isfinite(ln_e))
-    if not at.size:
+    single = np.flatnonzero((label_values(grasps, "touch_group") == "") & np.isfinite(ln_e))
+    if not single.size:
         return {}
-    data = touches(with_object_range(grasps, stated), at=at)
-    hypotheses = free_hypotheses(device, device.found_effusivity(ln_e[at]))
-    sd = np.log(10) * np.array([rows[i].log10_effusivity_sd for i in at])
-    each, row = hypotheses._replace(ln_e_sd=sd), np.arange(at.size)
-    prior = prior_of(device, data, each)
-    found = unexplained(data, row, fit_pairs(device, data, row, each, prior=prior), prior)
-    return {str(name): why for name, why in zip(data.grasp_id, found)}
+    data = touches(with_object_range(grasps, stated), at=single)
+    hypotheses = free_hypotheses(device, device.found_effusivity(ln_e[single]))
+    sd = np.log(10) * np.array([rows[i].log10_effusivity_sd for i in single])
+    with_spread, row = hypotheses._replace(ln_e_sd=sd), np.arange(single.size)
+    prior = prior_of(device, data, with_spread)
+    misfits = unexplained(data, row, fit_pairs(device, data, row, with_spread, prior=prior), prior)
+    return {str(name): why for name, why in zip(data.grasp_id, misfits)}

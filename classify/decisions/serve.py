@@ -46,22 +46,22 @@ _NUMBERS = {META_NAMES.get(name, name) + ("" if unit == "1" else f"_{unit}"): na
 
 def reply(answer: Rows, request: bytes) -> dict[str, Any]:
     """Return the answer to one request, or what is wrong with it."""
-    given: Any = {}
+    content: Any = {}
     try:
-        given = _content(request)
-        (row,) = answer(grasp_of(given))
-        found = {key: _plain(value) for key, value in row.items() if key != "grasp_id"}
+        content = _content(request)
+        (row,) = answer(grasp_of(content))
+        response = {key: _plain(value) for key, value in row.items() if key != "grasp_id"}
     except UserError as error:
-        found = {"error": str(error)}
-    return ({"id": given["id"]} if "id" in given else {}) | found
+        response = {"error": str(error)}
+    return ({"id": content["id"]} if "id" in content else {}) | response
 
 
 def grasp_of(given: Mapping[str, Any]) -> Grasps:
     """Return the record of one grasp that a request describes."""
-    known = {"id", *_TRACES, *_NUMBERS}
+    known_keys = {"id", *_TRACES, *_NUMBERS}
     for name in given:
-        if name not in known:
-            raise UserError(f"{name!r} is unknown", hint=known_names(name, sorted(known)))
+        if name not in known_keys:
+            raise UserError(f"{name!r} is unknown", hint=known_names(name, sorted(known_keys)))
     traces = {ours: _numbers(given, name) for name, ours in _TRACES.items() if name in given}
     for name in ("time_s", "t_surface_degC"):
         if _TRACES[name] not in traces:
@@ -74,8 +74,8 @@ def grasp_of(given: Mapping[str, Any]) -> Grasps:
         traces["time"], [traces["t_surface"]], ["grasp"], name="request", t_surface_2=second, **about
     )
     record = with_lead_in(record)
-    time, seen = record["time"].values, ~record["t_surface"].isnull().values[0]
-    if not (seen & (time < 0)).any() or not (seen & (time > 0)).any():
+    time, has_sample = record["time"].values, ~record["t_surface"].isnull().values[0]
+    if not (has_sample & (time < 0)).any() or not (has_sample & (time > 0)).any():
         raise UserError("no sample before 0 s or none after", hint="0 s is the closed message")
     return record
 
@@ -85,14 +85,14 @@ def serve_lines(answer: Rows, requests: BinaryIO, answers: BinaryIO) -> int:
     n = 0
     while line := requests.readline(MOST_BYTES + 2):
         if not line.endswith(b"\n") and len(line) > MOST_BYTES:
-            found = _too_long()
+            response = _too_long()
             while line and not line.endswith(b"\n"):
                 line = requests.readline(MOST_BYTES)
         elif line.strip():
-            found = reply(answer, line)
+            response = reply(answer, line)
         else:
             continue
-        answers.write(json.dumps(found, allow_nan=False).encode() + b"\n")
+        answers.write(json.dumps(response, allow_nan=False).encode() + b"\n")
         answers.flush()
         n += 1
     return n
@@ -131,8 +131,8 @@ def application(replies: Callable[[bytes], dict[str, Any]], port: int) -> ASGIAp
             return JSONResponse({"error": f"the request did not come within {BODY_S:g} s"}, 408, end)
         except ClientDisconnect:  # nobody is there to read an answer
             return Response(status_code=400)
-        found = await asyncio.get_running_loop().run_in_executor(thread, replies, bytes(body))
-        return JSONResponse(found, 400 if "error" in found else 200)
+        response = await asyncio.get_running_loop().run_in_executor(thread, replies, bytes(body))
+        return JSONResponse(response, 400 if "error" in response else 200)
 
     return Starlette(routes=[Route("/", ask, methods=["POST"])])
 
@@ -157,16 +157,16 @@ def server(replies: Callable[[bytes], dict[str, Any]], listening: socket.socket)
 
 def _content(request: bytes) -> dict[str, Any]:
     try:
-        given = json.loads(request)
+        content = json.loads(request)
     except (ValueError, RecursionError) as error:
         raise UserError(f"is no JSON ({error})", hint="write an object on one line") from error
-    if not isinstance(given, dict):
+    if not isinstance(content, dict):
         raise UserError("is no JSON object", hint="write an object on one line")
-    name = given.get("id", 0)
+    name = content.get("id", 0)
     if not isinstance(name, str | int) or (isinstance(name, str) and re.search("[\ud800-\udfff]", name)):
-        del given["id"]
+        del content["id"]
         raise UserError("id is no text and no whole number", hint="leave it out, or number the requests")
-    return given
+    return content
 
 
 def _numbers(given: Mapping[str, Any], name: str) -> list[float]:

@@ -1,20 +1,14 @@
 """A stopping rule for contacts with a stated error, learnt from training grasps.
 
 At a time t of the contact the classifier has probabilities p from the readings so far.  The contact ends
-early when
-
-- the answer is **confident**: max p >= c; or
-- the answer is **final**: the rest of the contact is expected to make the answer right more often by less
-  than g (:mod:`thermogrip.classify.decisions.next_touch`), because the candidates that are left read alike.
-
-Both thresholds come from training grasps, each followed through growing windows.  c is the least one at which
-the grasps that stop for it are wrong no more often than stated: with k of n wrong, (k + 1) / (n + 2) <=
-error, the posterior mean of a rate after k of n (Laplace's rule of succession), so that n grasps cannot show
-an error below 1 / (n + 2).  And the classifier itself must expect no more: the mean of 1 - max p over them is
-at most the error too, since training grasps, which calibrated the gripper, are wrong less often than fresh
-ones (``docs/records/classification.md``).  g is what the user gives away in accuracy; as learnt it is
-lowered until the training grasps lose no more than that.  A rule is for the times at which it was learnt,
-close together at first: evaluating it more often stops earlier and errs more.
+early when the answer is **confident**, max p >= c.  The threshold comes from training grasps, each followed
+through growing windows: it is the least one at which the grasps that stop for it are wrong no more often than
+stated: with k of n wrong, (k + 1) / (n + 2) <= error, the posterior mean of a rate after k of n (Laplace's
+rule of succession), so that n grasps cannot show an error below 1 / (n + 2).  And the classifier itself must
+expect no more: the mean of 1 - max p over them is at most the error too, since training grasps, which
+calibrated the gripper, are wrong less often than fresh ones (``docs/records/classification.md``).  A rule is
+for the times at which it was learnt, close together at first: evaluating it more often stops earlier and errs
+more.
 
 **Sample by sample.**  A :class:`Stream` holds what a robot loop needs during one contact.  Each sample costs
 milliseconds, since every candidate's mode starts from the one of the sample before; :meth:`Stream.result`
@@ -35,7 +29,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from thermogrip.classify.decisions.next_touch import expected_information, with_model
+from thermogrip.classify.decisions.next_touch import with_model
 from thermogrip.classify.estimators.base import (
     Floats,
     GraspClassifier,
@@ -45,14 +39,12 @@ from thermogrip.classify.estimators.base import (
     pick,
     record_list,
 )
-from thermogrip.classify.estimators.posterior import PosteriorClassifier
 from thermogrip.classify.estimators.registry import load_classifier
 from thermogrip.datasets.atomic_files import read_json, write_json
 from thermogrip.datasets.errors import UserError, reading
 from thermogrip.datasets.limits import LARGEST, array_within, number_within
 from thermogrip.datasets.schema import HOTTEST, log_name, make_grasps
 from thermogrip.sysid.effusivity.posterior import material_fit
-from thermogrip.sysid.effusivity.predictive import rest_of_contact
 from thermogrip.sysid.effusivity.quality import GraspQuality, check_grasps
 
 if TYPE_CHECKING:
@@ -63,8 +55,7 @@ RULE_FILE = "stop_rule.json"  # beside classifier.json
 _CONTACT = 0.25  # s: readings until then may be of before contact
 
 _SCHEMA, _VERSION = "thermogrip.stop_rule", 1
-_RANGES = {"sure": (0.0, 1.0), "gain": (0.0, 1.0), "end": (0.0, 3600.0), "error": (0.0, 1.0)}  # of a file
-_GAINS = np.geomspace(1e-4, 0.05, 28)
+_RANGES = {"sure": (0.0, 1.0), "end": (0.0, 3600.0), "error": (0.0, 1.0)}  # of a file
 _SURE = np.concatenate([np.arange(0.5, 0.95, 0.05), 1 - np.geomspace(0.05, 1e-4, 28)])
 
 
@@ -73,8 +64,6 @@ class StopRule:
     """When to end a contact."""
 
     sure: float  # stop where the likeliest candidate has this probability
-    # stop where the rest of the contact is expected to win less than this share of right answers; 0 never
-    gain: float = 0.0
     times: tuple[float, ...] = TIMES  # when it is evaluated [s after the closed message]
     end: float = 10.0  # when contact ends anyway [s]
     error: float = 0.05  # stated share of wrong answers among contacts that it ended as confident
@@ -82,8 +71,8 @@ class StopRule:
 
     def __post_init__(self) -> None:
         ahead = all(t > 0 for t in self.times) and self.end > 0
-        if not (0 < self.sure <= 1 and self.gain >= 0 and 0 < self.error < 1 and ahead):
-            raise ValueError(f"need 0 < sure <= 1, gain >= 0, 0 < error < 1, times and end > 0, got {self}")
+        if not (0 < self.sure <= 1 and 0 < self.error < 1 and ahead):
+            raise ValueError(f"need 0 < sure <= 1, 0 < error < 1, times and end > 0, got {self}")
 
     def save(self, path: str | Path) -> Path:
         """Write the rule as JSON and return the path."""
@@ -136,7 +125,6 @@ class Windows(NamedTuple):
 
     times: Floats  # (n_t + 1,) [s]
     log_p: Floats  # (n, n_t + 1, m)
-    gain: Floats  # (n, n_t + 1), expected of reading on, zero at the end
 
 
 class Stops(NamedTuple):
@@ -144,7 +132,6 @@ class Stops(NamedTuple):
 
     time: Floats  # (n,) [s]
     answer: NDArray[np.int64]  # (n,) place of the likeliest candidate then
-    confident: NDArray[np.bool_]  # (n,) whether that is the reason
     early: NDArray[np.bool_]  # (n,) whether it is before the end
     p_wrong: Floats  # (n,) probability that the answer is wrong
 
@@ -156,73 +143,50 @@ def growing_windows(
     candidates: Sequence[str] | None = None,
     times: Sequence[float] = TIMES,
     end: float = 10.0,
-    gain: bool = True,
 ) -> Windows:
     """Return the probabilities at those ``times`` before ``end`` [s] and at the end, from the readings until
-    then; without ``gain`` the expected gain is infinite before the end."""
+    then."""
     model = with_model(classifier)
     names = model.asked(candidates)
-    at = np.array([*(t for t in sorted(times) if t < end), end])
-    log_p, won = [], []
-    u: Floats | None = None
-    for t in at:
-        p, gained, u = _window(model, grasps, names, float(t), end, u, gain or t >= end)
-        log_p.append(p)
-        won.append(gained)
-    return Windows(at, np.stack(log_p, axis=1), np.stack(won, axis=1))
-
-
-def _window(
-    model: PosteriorClassifier,
-    grasps: Grasps,
-    names: list[str],
-    t: float,
-    end: float,
-    u: Floats | None,
-    weigh: bool,
-) -> tuple[Floats, Floats, Floats | None]:
-    """Return log probabilities (n, m) at a time (the prior's before a first reading, a :class:`UserError`
-    where none comes), the gain of reading on (n,) if weighed, and the next start."""
-    odds = model.log_prior(names)
-    read = _read_by(grasps, t) | (t >= end)
-    log_p, gain = normalised(np.tile(odds, (read.size, 1))), np.full(read.size, np.inf)
-    if not read.any():
-        return log_p, gain, None
-    part, start = (grasps, u) if read.all() else (pick(grasps, read), None)
-    ahead = rest_of_contact(model.device_, part, names, until=t, end=end, start=start)
-    log_p[read] = normalised(ahead.log_p + odds)
-    if weigh:
-        gain[read] = expected_information(ahead._replace(log_p=log_p[read])).gain
-    return log_p, gain, ahead.u if read.all() else None
+    window_ends = np.array([*(t for t in sorted(times) if t < end), end])
+    odds, log_p = model.log_prior(names), []
+    start: Floats | None = None
+    for t in window_ends:
+        read = _read_by(grasps, float(t)) | (t >= end)  # where none comes the fit refuses the grasp
+        # before a first reading those of the prior
+        log_p.append(normalised(np.tile(odds, (read.size, 1))))
+        if read.any():
+            begun = grasps if read.all() else pick(grasps, read)
+            fit = material_fit(model.device_, begun, names, until=float(t), start=start)
+            log_p[-1][read] = normalised(fit.log_evidence + odds)
+            start = fit.u if read.all() else None
+    return Windows(window_ends, np.stack(log_p, axis=1))
 
 
 def silent_windows(grasps: Grasps, times: ArrayLike) -> NDArray[np.bool_]:
     """Return at which times each contact is too short for a decision, shape (n, n_time)."""
-    seen = [grasps.sel(time=slice(None, float(t) + 1e-9)) for t in np.asarray(times, dtype=float)]
-    return np.stack([check_grasps(part).undecided for part in seen], axis=1)
+    windows = [grasps.sel(time=slice(None, float(t) + 1e-9)) for t in np.asarray(times, dtype=float)]
+    return np.stack([check_grasps(window).undecided for window in windows], axis=1)
 
 
 def _read_by(grasps: Grasps, t: float) -> NDArray[np.bool_]:
     """Return which grasps have a reading of their contact by a time [s], (n,)."""
     time = np.asarray(grasps["time"].values, dtype=float)
-    there = (time > _CONTACT) & (time <= t + 1e-9)
-    return np.asarray(np.isfinite(grasps["t_surface"].values[:, there]).any(axis=1))
+    in_contact = (time > _CONTACT) & (time <= t + 1e-9)
+    return np.asarray(np.isfinite(grasps["t_surface"].values[:, in_contact]).any(axis=1))
 
 
 def stops(rule: StopRule, windows: Windows, silent: NDArray[np.bool_] | None = None) -> Stops:
     """Return where the rule ends each contact; not where it is ``silent`` (n, n_t + 1), unless at the end."""
-    confident = np.exp(windows.log_p.max(axis=2)) >= rule.sure
-    final = windows.gain < rule.gain
-    now = (confident | final) & (True if silent is None else ~silent)
+    now = (np.exp(windows.log_p.max(axis=2)) >= rule.sure) & (True if silent is None else ~silent)
     now[:, -1] = True
     first = now.argmax(axis=1)
-    at = np.arange(first.size)
+    grasp = np.arange(first.size)
     return Stops(
         windows.times[first],
-        windows.log_p[at, first].argmax(axis=1),
-        confident[at, first],
+        windows.log_p[grasp, first].argmax(axis=1),
         first < windows.times.size - 1,
-        -np.expm1(np.minimum(windows.log_p[at, first].max(axis=1), 0.0)),
+        -np.expm1(np.minimum(windows.log_p[grasp, first].max(axis=1), 0.0)),
     )
 
 
@@ -231,20 +195,18 @@ def learn_stop_rule(
     X: Records,
     *,
     error: float = 0.05,
-    loss: float = 0.01,
     times: Sequence[float] = TIMES,
     end: float = 10.0,
     progress: Callable[[float, str], None] | None = None,
 ) -> StopRule:
     """Return the rule under which training grasps stop earliest at the stated error.
 
-    ``error`` is the share of wrong answers among the contacts that stop because the answer is confident,
-    ``loss`` the share of right answers that may be given away by stopping where the rest is not expected to
-    help (0 never stops for that); UserError where so few grasps cannot show so small an error.
+    ``error`` is the share of wrong answers among the contacts that stop early; UserError where so few grasps
+    cannot show so small an error.
     """
-    if not (0 < error < 1 and 0 <= loss < 1):
-        raise UserError(f"error {error:g} or loss {loss:g} is no share", hint="give numbers between 0 and 1")
-    parts = []
+    if not 0 < error < 1:
+        raise UserError(f"error {error:g} is no share", hint="give a number between 0 and 1")
+    windows_of = []
     records = record_list(X)
     for k, record in enumerate(records):
         if progress is not None:
@@ -253,18 +215,17 @@ def learn_stop_rule(
         names = sorted(set(labels.tolist()))
         if len(names) < 2:
             continue
-        seen = growing_windows(
-            classifier, record, candidates=names, times=times, end=contact_end(record, end), gain=loss > 0
+        windows = growing_windows(
+            classifier, record, candidates=names, times=times, end=contact_end(record, end)
         )
-        parts.append((seen, np.array([names.index(label) for label in labels])))
-    return learn_from_windows(parts, error=error, loss=loss, times=times, end=end)
+        windows_of.append((windows, np.array([names.index(label) for label in labels])))
+    return learn_from_windows(windows_of, error=error, times=times, end=end)
 
 
 def learn_from_windows(
     parts: Sequence[tuple[Windows, NDArray[np.int64]]],
     *,
     error: float = 0.05,
-    loss: float = 0.01,
     times: Sequence[float] = TIMES,
     end: float = 10.0,
 ) -> StopRule:
@@ -276,20 +237,20 @@ def learn_from_windows(
             hint=f"give more, or state at least {1 / (n + 2):.2g}",
         )
     rule = StopRule(sure=1.0, times=tuple(times), end=end, error=error, n_grasp=n)
-    return _with_gain(_with_sure(rule, parts), parts, loss)
+    return _with_sure(rule, parts)
 
 
 def _with_sure(rule: StopRule, parts: Sequence[tuple[Windows, NDArray[np.int64]]]) -> StopRule:
     """Return the rule with the least threshold from which on all that enough reach keep the stated error."""
-    kept = 1.0
+    least_sure = 1.0
     for sure in _SURE[::-1]:
         wrong, p_wrong = _early(replace(rule, sure=float(sure)), parts)
         if 1 / (wrong.size + 2) > rule.error:
             continue  # so few are that confident: even with none of them wrong they show nothing
         if (wrong.sum() + 1) / (wrong.size + 2) > rule.error or p_wrong.mean() > rule.error:
             break
-        kept = float(sure)
-    return replace(rule, sure=kept)
+        least_sure = float(sure)
+    return replace(rule, sure=least_sure)
 
 
 def _early(
@@ -297,28 +258,11 @@ def _early(
 ) -> tuple[NDArray[np.bool_], Floats]:
     """Return which of the contacts that the rule ends early are wrong, and the stated probability of that."""
     wrong, p_wrong = [], []
-    for seen, true in parts:
-        found = stops(rule, seen)
-        wrong.append((found.answer != true)[found.early])
-        p_wrong.append(found.p_wrong[found.early])
+    for windows, true in parts:
+        stopped = stops(rule, windows)
+        wrong.append((stopped.answer != true)[stopped.early])
+        p_wrong.append(stopped.p_wrong[stopped.early])
     return np.concatenate(wrong), np.concatenate(p_wrong)
-
-
-def _with_gain(rule: StopRule, parts: Sequence[tuple[Windows, NDArray[np.int64]]], loss: float) -> StopRule:
-    """Return the rule with the largest threshold of the gain that loses no more accuracy than ``loss``."""
-    best = rule
-    right = _right(rule, parts)
-    for gain in _GAINS[loss >= _GAINS]:
-        now = replace(rule, gain=float(gain))
-        if right - _right(now, parts) > loss:
-            break
-        best = now
-    return best
-
-
-def _right(rule: StopRule, parts: Sequence[tuple[Windows, NDArray[np.int64]]]) -> float:
-    hits = [stops(rule, seen).answer == true for seen, true in parts]
-    return float(np.concatenate(hits).mean())
 
 
 def contact_end(grasps: Grasps, end: float) -> float:
@@ -447,12 +391,12 @@ class Stream:
         if quality.reason[0]:
             self.log_p = np.full(len(self.candidates), np.nan)
             return
-        seen = material_fit(self._model.device_, grasp, self.candidates, start=self._u)
-        self._u = seen.u
-        self.log_p = normalised(seen.log_evidence + self._odds)[0]
-        self._decide(grasp, quality)
+        fit = material_fit(self._model.device_, grasp, self.candidates, start=self._u)
+        self._u = fit.u
+        self.log_p = normalised(fit.log_evidence + self._odds)[0]
+        self._decide(quality)
 
-    def _decide(self, grasp: Grasps, quality: GraspQuality) -> None:
+    def _decide(self, quality: GraspQuality) -> None:
         """Ask the rule, at its own times only."""
         rule, now = self._rule, self._time[-1]
         if rule is None or self.decided_at is not None:
@@ -463,17 +407,8 @@ class Stream:
         self._evaluated = due
         if quality.undecided[0]:
             return
-        if np.exp(self.log_p.max()) >= rule.sure or self._gain(grasp, rule) < rule.gain:
+        if np.exp(self.log_p.max()) >= rule.sure:
             self.decided_at = now
-
-    def _gain(self, grasp: Grasps, rule: StopRule) -> float:
-        if rule.gain <= 0:
-            return np.inf
-        ahead = rest_of_contact(
-            self._model.device_, grasp, self.candidates,
-            until=self._time[-1], end=rule.end, start=self._u,
-        )  # fmt: skip
-        return float(expected_information(ahead._replace(log_p=self.log_p[None])).gain[0])
 
 
 def stop_callback(
@@ -498,15 +433,15 @@ def stop_callback(
         if stream is None or not np.array_equal(
             reading[: len(stream._time)], stream._reading, equal_nan=True
         ):
-            known = {
+            temperatures = {
                 name: float(grasp[name].values[0]) for name in ("t_object", "t_object_sd", "t_ambient")
                 if name in grasp
             }  # fmt: skip
-            stream = Stream(classifier, candidates=candidates, rule=rule, **known)
-        for at in range(len(stream._time), time.size):
-            found = stream.update(float(time[at]), float(reading[at]))
+            stream = Stream(classifier, candidates=candidates, rule=rule, **temperatures)
+        for sample in range(len(stream._time), time.size):
+            probabilities = stream.update(float(time[sample]), float(reading[sample]))
             if tell is not None:
-                tell(float(time[at]), found)
+                tell(float(time[sample]), probabilities)
         return stream.decided_at is not None
 
     return stop

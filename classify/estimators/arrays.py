@@ -78,22 +78,22 @@ def coded(y: Any) -> tuple[NDArray[np.str_], NDArray[Any] | None]:
     if y.dtype.kind == "f":
         assert_all_finite(y, input_name="y")
     check_classification_targets(y)
-    values, at = np.unique(y, return_inverse=True)
+    values, place = np.unique(y, return_inverse=True)
     if values.dtype.kind in "UO" and all(isinstance(value, str) for value in values):
         return np.asarray(y, dtype=str), None
-    return np.array([f"{k:06d}" for k in range(values.size)])[at], values
+    return np.array([f"{k:06d}" for k in range(values.size)])[place], values
 
 
 def _stated_times(columns: Sequence[Any]) -> dict[Any, float]:
     """Return the columns of a data frame that are times [s], none where others are not of a grasp."""
-    found, others = {}, []
+    times, others = {}, []
     for name in columns:
         try:
-            found[name] = float(name)
+            times[name] = float(name)
         except (TypeError, ValueError):
             others.append(name)
-    known = {*GRASP_NUMBERS, *GRASP_LABELS}
-    if found and (odd := [name for name in others if name not in known]):
+    of_grasp = {*GRASP_NUMBERS, *GRASP_LABELS}
+    if times and (odd := [name for name in others if name not in of_grasp]):
         problem = f"column {odd[0]!r} is no time and nothing of a grasp"
-        raise UserError(problem, hint=f"use {', '.join(sorted(known))}")
-    return found
+        raise UserError(problem, hint=f"use {', '.join(sorted(of_grasp))}")
+    return times

@@ -176,7 +176,9 @@ class GraspClassifier(_Sampled, ClassifierMixin, BaseEstimator, ABC):  # type: i
 
     def predict_log_proba(self, X: Records) -> Floats:
         """Return log class probabilities, shape (n_grasp, n_class), in the order of ``classes_``."""
-        return np.vstack([normalised(self._log_proba(self._as_trained(part))) for part in self._records(X)])
+        return np.vstack(
+            [normalised(self._log_proba(self._as_trained(record))) for record in self._records(X)]
+        )
 
     def predict_proba(self, X: Records) -> Floats:
         """Return class probabilities, shape (n_grasp, n_class); each row sums to 1."""
@@ -200,8 +202,8 @@ class GraspClassifier(_Sampled, ClassifierMixin, BaseEstimator, ABC):  # type: i
 
     def open_set_log_proba(self, X: Records, candidates: Sequence[str]) -> tuple[Floats, Floats]:
         """Return :meth:`candidate_log_proba` and :meth:`p_unknown`."""
-        found = [self.answered(part, candidates) for part in self._records(X)]
-        return np.vstack([one.log_p for one in found]), np.concatenate([one.p_unknown for one in found])
+        answers = [self.answered(record, candidates) for record in self._records(X)]
+        return np.vstack([one.log_p for one in answers]), np.concatenate([one.p_unknown for one in answers])
 
     def answered(self, grasps: Grasps, candidates: Sequence[str] | None = None) -> Answered:
         """Return all that there is to say of the grasps of one checked record."""
@@ -209,21 +211,21 @@ class GraspClassifier(_Sampled, ClassifierMixin, BaseEstimator, ABC):  # type: i
 
     def _answered(self, grasps: Grasps, names: list[str]) -> Answered:
         """Return the answers to a record that has the sensors of the training."""
-        known, log_p = self.asked(), normalised(self._log_proba(grasps))
-        at = [known.index(name) for name in names]
-        return Answered.nothing(len(log_p), len(names))._replace(log_p=normalised(log_p[:, at]))
+        classes, log_p = self.asked(), normalised(self._log_proba(grasps))
+        columns = [classes.index(name) for name in names]
+        return Answered.nothing(len(log_p), len(names))._replace(log_p=normalised(log_p[:, columns]))
 
     def asked(self, candidates: Sequence[str] | None = None) -> list[str]:
         """Return the candidates, each of which it :meth:`can_name`; by default all of ``classes_``."""
         self._check_fitted()
-        known = [str(c) for c in self.classes_]
-        names = known if candidates is None else [str(c) for c in candidates]
+        classes = [str(c) for c in self.classes_]
+        names = classes if candidates is None else [str(c) for c in candidates]
         for name in names:
             if not self.can_name(name):
-                hint = known_names(name, known, "it knows {}")
+                hint = known_names(name, classes, "it knows {}")
                 raise UserError(f"{name!r} is no class of this classifier", hint=hint)
         if not names:
-            raise UserError("no candidate is given", hint=f"name some of {', '.join(known)}")
+            raise UserError("no candidate is given", hint=f"name some of {', '.join(classes)}")
         return names
 
     def can_name(self, name: str) -> bool:
@@ -290,13 +292,13 @@ def record_list(X: Any) -> list[Grasps]:
     records = as_grasps(X)
     if not records:
         raise UserError("no grasps were given", hint="give at least one record")
-    for at, grasps in enumerate(records):
+    for i, grasps in enumerate(records):
         if not isinstance(grasps, xr.Dataset):
             raise UserError(
                 f"expected Grasps, got {type(grasps).__name__}", hint="use make_grasps or read_grasps"
             )
         check_grasps(grasps)
-        records[at] = as_record(grasps)
+        records[i] = as_record(grasps)
     return records
 
 
@@ -325,31 +327,31 @@ def grasp_labels(grasps: Grasps, y: ArrayLike | None = None) -> Labels:
 def record_labels(records: Sequence[Grasps], y: ArrayLike | None) -> list[Labels]:
     """Return the materials of each record's grasps: ``y``, which runs through all of them, or their own."""
     if y is None:
-        return [grasp_labels(part) for part in records]
+        return [grasp_labels(record) for record in records]
     labels = np.asarray(y).astype(str).ravel()
-    ends = np.cumsum([part.sizes["grasp"] for part in records])
+    ends = np.cumsum([record.sizes["grasp"] for record in records])
     if labels.size != ends[-1]:
         raise UserError(f"{labels.size} labels for {ends[-1]} grasps")
-    return [grasp_labels(part, chunk) for part, chunk in zip(records, np.split(labels, ends[:-1]))]
+    return [grasp_labels(record, chunk) for record, chunk in zip(records, np.split(labels, ends[:-1]))]
 
 
 def pick(grasps: Grasps, index: ArrayLike) -> Grasps:
     """Return some grasps of a record, by position or mask, under the same name."""
-    at = np.asarray(index)
-    part = grasps.isel(grasp=np.flatnonzero(at) if at.dtype == bool else at.astype(int))
-    check_grasps(part)
-    return part
+    position = np.asarray(index)
+    picked = grasps.isel(grasp=np.flatnonzero(position) if position.dtype == bool else position.astype(int))
+    check_grasps(picked)
+    return picked
 
 
 def common_times(records: Sequence[Grasps]) -> Floats:
     """Return the sample times [s] that all records share, to 1 us, at least two of them."""
     shared = np.round(records[0]["time"].values, 6)
-    for part in records[1:]:
-        shared = np.intersect1d(shared, np.round(part["time"].values, 6))
+    for record in records[1:]:
+        shared = np.intersect1d(shared, np.round(record["time"].values, 6))
     if shared.size < 2:
         raise UserError(
             "the grasps share no time axis",
-            file=" and ".join(log_name(part) for part in records),
+            file=" and ".join(log_name(record) for record in records),
             hint="record them at the same rate",
         )
     return np.asarray(shared, dtype=float)
@@ -365,16 +367,18 @@ def join_grasps(records: Sequence[Grasps], *, name: str | None = None) -> Grasps
         check_grasps(records[0])
         return records[0]
     times = common_times(records)
-    cut = [part.sel(time=times, method="nearest") for part in records]
+    cut = [record.sel(time=times, method="nearest") for record in records]
     fields: dict[str, Any] = {}
-    for key in [k for k in (*GRASP_NUMBERS, *GRASP_LABELS) if any(k in part for part in cut)]:
+    for key in [k for k in (*GRASP_NUMBERS, *GRASP_LABELS) if any(k in record for record in cut)]:
         empty: Any = np.nan if key in GRASP_NUMBERS else ""
-        blanks = [np.full(part.sizes["grasp"], empty) for part in cut]
-        fields[key] = np.concatenate([part[key].values if key in part else b for part, b in zip(cut, blanks)])
-    if all("t_surface_2" in part for part in cut):
-        fields["t_surface_2"] = np.concatenate([part["t_surface_2"].values for part in cut])
-    traces = np.concatenate([part["t_surface"].values for part in cut])
-    ids = [str(i) for part in cut for i in part["grasp"].values]
+        blanks = [np.full(record.sizes["grasp"], empty) for record in cut]
+        fields[key] = np.concatenate(
+            [record[key].values if key in record else b for record, b in zip(cut, blanks)]
+        )
+    if all("t_surface_2" in record for record in cut):
+        fields["t_surface_2"] = np.concatenate([record["t_surface_2"].values for record in cut])
+    traces = np.concatenate([record["t_surface"].values for record in cut])
+    ids = [str(i) for record in cut for i in record["grasp"].values]
     return make_grasps(times, traces, ids, name=name or "+".join(map(log_name, records)), **fields)
 
 
@@ -412,12 +416,12 @@ def as_array(
     >>> as_array(g)
     array([[23., 24., 25.]])
     """
-    own = np.round(np.asarray(grasps["time"].values, dtype=float), 6)
+    sample_times = np.round(np.asarray(grasps["time"].values, dtype=float), 6)
     grid = times_from(grasps, start) if times is None else np.asarray(times, dtype=float)
     blocks = []
     for key in ("t_surface", "t_surface_2"):
         if key in grasps:
-            rows = [_read_at(grid, own, row, grasps, i) for i, row in enumerate(grasps[key].values)]
+            rows = [_read_at(grid, sample_times, row, grasps, i) for i, row in enumerate(grasps[key].values)]
             block = np.vstack(rows)
             blocks.append(block - level(grasps, key)[:, None] if subtract_level else block)
     return np.hstack(blocks)
@@ -427,8 +431,8 @@ def times_from(grasps: Grasps, start: float) -> Floats:
     """Return the record's sample times from ``start`` on [s], to 1 us (-1e-16 s is 0 s), up to half a second
     after its shortest contact ends."""
     time = np.round(np.asarray(grasps["time"].values, dtype=float), 6) + 0.0  # no negative zero
-    seen = np.isfinite(grasps["t_surface"].values)
-    end = time[time.size - 1 - seen[:, ::-1].argmax(axis=1)].min()
+    has_sample = np.isfinite(grasps["t_surface"].values)
+    end = time[time.size - 1 - has_sample[:, ::-1].argmax(axis=1)].min()
     return np.asarray(time[(time >= start) & (time <= end + HELD_AT_AN_END)])
 
 
@@ -450,8 +454,8 @@ def level(grasps: Grasps, key: str = "t_surface") -> Floats:
 
 
 def _read_at(grid: Floats, own: Floats, row: Floats, grasps: Grasps, i: int) -> Floats:
-    seen = np.isfinite(row)
-    first, last = own[seen][0], own[seen][-1]
+    has_sample = np.isfinite(row)
+    first, last = own[has_sample][0], own[has_sample][-1]
     if grid[-1] > last + HELD_AT_AN_END or grid[0] < first - HELD_AT_AN_END:
         raise UserError(
             f"grasp {str(grasps['grasp'].values[i])!r} covers {first:g} to {last:g} s, "
@@ -459,16 +463,16 @@ def _read_at(grid: Floats, own: Floats, row: Floats, grasps: Grasps, i: int) -> 
             file=log_name(grasps),
             hint="cut all grasps alike or leave it out",
         )
-    return np.asarray(np.interp(grid, own[seen], row[seen]))
+    return np.asarray(np.interp(grid, own[has_sample], row[has_sample]))
 
 
 def check_shapes(arrays: dict[str, NDArray[Any]], **shapes: tuple[int | None, ...]) -> None:
     """Raise ValueError where an array that was read from a file has not the shape that it must have, or one
     that is divided by has what is not positive."""
     for name, shape in shapes.items():
-        found = arrays[name].shape
-        if len(found) != len(shape) or any(n not in (None, have) for n, have in zip(shape, found)):
-            raise ValueError(f"{name} has shape {found}")
+        actual = arrays[name].shape
+        if len(actual) != len(shape) or any(n not in (None, have) for n, have in zip(shape, actual)):
+            raise ValueError(f"{name} has shape {actual}")
         if name in _DIVISORS and not (arrays[name] > 0).all():
             raise ValueError(f"{name} is not positive")
 

@@ -80,17 +80,29 @@ from thermogrip.sysid.effusivity.data import object_range
 
 _COVARIANCE_GRID = np.geomspace(0.5, 200.0, 25)  # nu_0 - d - 1, grasps
 _MEAN_GRID = np.geomspace(0.001, 30.0, 16)  # kappa_0, grasps
-# K^2; at 2 K the error of some 0.5 K is as large as the difference between metals
-_HALF_WEIGHT = 4.0
-_LEAST_WEIGHT = 0.5  # grasps; with less a material's normalised features are unknown
-_T_OBJECT_SD = 0.5  # K, of a nominal object temperature
-_SD_WEIGHT = 4.0  # grasps that this prior counts for
-_STEPS, _STILL = 100, 1e-5  # of the expectation maximisation, and when it ends
-_DROWNED = 1e9  # in units of the scatter within a class
+
+
+@dataclass(frozen=True)
+class DensitySettings:
+    """What little is believed of features before the training, and how the search goes."""
+
+    half_weight_K2: float = 4.0  # at 2 K the error of some 0.5 K is as large as the difference between metals
+    least_weight: float = 0.5  # grasps; with less a material's normalised features are unknown
+    t_object_sd_K: float = 0.5  # of a nominal object temperature
+    sd_grasps: float = 4.0  # that this prior counts for
+    steps: int = 100  # of the expectation maximisation
+    still: float = 1e-5  # change that ends it
+    drowned: float = 1e9  # in units of the scatter within a class: the noise of a feature that is missing
+    # the end of a contact is a time of its own where it is so many times as late as the one before
+    own_end: float = 1.4
+    wide_sd_K: float = 2.0  # an object's temperature that is less certain is integrated over
+    nodes: int = 21  # temperatures of that integral
+    reach_sd: float = 2.5  # from the stated one, of that integral
+
+
+DENSITY = DensitySettings()
+
 _SECOND = "second_"  # prefix of the features of a second sensor
-_NEAR = 1.4  # the end of a contact is a time of its own where it is so many times as late as the one before
-_WIDE = 2.0  # K; an object's temperature that is less certain is integrated over
-_NODES, _REACH = 21, 2.5  # temperatures of that integral, up to so many sd from the stated one
 
 
 @dataclass(frozen=True)
@@ -108,7 +120,7 @@ class Readings:
         """Return the features over their gain, (n, d), and their noise, (n, d, d); NaN within 1 K."""
         with np.errstate(divide="ignore", invalid="ignore"):
             x = self.y / self.gain
-            sd = np.where(np.isfinite(self.t_object_sd), self.t_object_sd, _T_OBJECT_SD)[:, None]
+            sd = np.where(np.isfinite(self.t_object_sd), self.t_object_sd, DENSITY.t_object_sd_K)[:, None]
             off = np.where(self.gain == 1, 0.0, sd / self.gain) * x
             noise = self.noise / (self.gain[:, :, None] * self.gain[:, None, :]) + _outer(off)
         small = np.abs(self.difference) < features.LEAST_DIFFERENCE
@@ -138,29 +150,33 @@ class FeatureReader:
         are normalised, grasps of unknown temperature, and materials that were only touched at the skin's own.
         ``both``: those of a second sensor, too.
         """
-        end = min(float(np.median(np.concatenate([_last(part) for part in records]))), features.FIT_END)
+        end = min(float(np.median(np.concatenate([_last(record) for record in records]))), features.FIT_END)
         names, tables = [], []
-        for part in records:
-            table = _table(part, _times(part, end), both=both)
-            known = np.isfinite(table.values).mean(axis=0) > 0.5
-            names += [str(f) for f in table["feature"].values[known]]
+        for record in records:
+            table = _table(record, _times(record, end), both=both)
+            mostly_known = np.isfinite(table.values).mean(axis=0) > 0.5
+            names += [str(f) for f in table["feature"].values[mostly_known]]
             tables.append(table)
         names = sorted(set(names), key=_order)
         if not names:
             where = "+".join(map(log_name, records))
             raise UserError("no feature is known for every grasp", file=where, hint="record longer")
-        difference = np.concatenate([features.object_difference(part) for part in records])
+        difference = np.concatenate([features.object_difference(record) for record in records])
         usable, notes = _usable(difference, labels)
         reader = cls(names, any(map(features.can_normalise, records)) and bool(usable.any()), end)
         if not reader.normalise:
             usable = np.ones(labels.size, dtype=bool)
         elif both:
-            beside = np.concatenate([features.object_difference(_sensors(part)[1][1]) for part in records])
+            beside = np.concatenate(
+                [features.object_difference(_sensors(record)[1][1]) for record in records]
+            )
             if set(labels[usable]) - set(_seen(beside, labels)):
                 names = reader.names = [f for f in names if not f.startswith(_SECOND)]
                 notes.append("the second sensor is not read: its temperature was within 1 K of an object's")
-        parts = [reader._readings(part, table.reindex(feature=names)) for part, table in zip(records, tables)]
-        return reader, _joined(parts), usable, notes
+        readings = [
+            reader._readings(record, table.reindex(feature=names)) for record, table in zip(records, tables)
+        ]
+        return reader, _joined(readings), usable, notes
 
     def to_dict(self) -> dict[str, Any]:
         """Return a JSON-able description."""
@@ -186,12 +202,14 @@ class FeatureReader:
             noise, unknown = np.zeros((*y.shape, y.shape[1])), np.full(n, np.nan)
             return Readings(y, np.ones_like(y), noise, unknown, unknown)
         gain, noise = np.ones_like(y), np.zeros((*y.shape, y.shape[1]))
-        for prefix, part in _sensors(grasps):
-            own = [k for k, f in enumerate(self.names) if f.startswith(_SECOND) == bool(prefix)]
-            names = [self.names[k].removeprefix(_SECOND) for k in own]
-            gain[:, own] = features.object_difference(part)[:, None]
-            if own:  # a feature that nobody has is without noise
-                noise[np.ix_(range(n), own, own)] = np.nan_to_num(features.feature_noise(part, names))
+        for prefix, sensor in _sensors(grasps):
+            columns = [k for k, f in enumerate(self.names) if f.startswith(_SECOND) == bool(prefix)]
+            names = [self.names[k].removeprefix(_SECOND) for k in columns]
+            gain[:, columns] = features.object_difference(sensor)[:, None]
+            if columns:  # a feature that nobody has is without noise
+                noise[np.ix_(range(n), columns, columns)] = np.nan_to_num(
+                    features.feature_noise(sensor, names)
+                )
         sd = grasps["t_object_sd"].values if "t_object_sd" in grasps else np.full(n, np.nan)
         return Readings(y, gain, noise, np.asarray(sd, dtype=float), features.object_difference(grasps))
 
@@ -227,7 +245,7 @@ class BayesClassifier(GraspClassifier):
             raise UserError(f"shrinkage must be > 0 grasps, got {self.shrinkage}")
         labels = np.concatenate(labels_of)
         two_or_more(labels, "+".join(map(log_name, records)))
-        self.sensors_ = 2 if all("t_surface_2" in part for part in records) else 1
+        self.sensors_ = 2 if all("t_surface_2" in record for record in records) else 1
         self.reader_, all_read, usable, self.notes_ = FeatureReader.learn(
             records, labels, both=self.sensors_ == 2
         )
@@ -238,28 +256,32 @@ class BayesClassifier(GraspClassifier):
     def _fit_density(self, read: Readings, at: NDArray[np.intp]) -> None:
         """Find means, covariance and the error of object temperatures; ``at`` is the class of each grasp."""
         k, (n, d) = self.classes_.size, read.y.shape
-        seen = np.isfinite(read.y)
+        has_feature = np.isfinite(read.y)
         square = np.where(read.gain == 1, read.difference[:, None], read.gain) ** 2
-        clear = square / (square + _HALF_WEIGHT) if self.reader_.normalise else np.ones_like(square)
-        weight = np.where(seen & (read.gain != 0), clear, 0.0)
+        clear = square / (square + DENSITY.half_weight_K2) if self.reader_.normalise else np.ones_like(square)
+        weight = np.where(has_feature & (read.gain != 0), clear, 0.0)
         x = np.divide(read.y, read.gain, out=np.zeros_like(read.y), where=weight > 0)
         self.center_ = _weighted_mean(x, weight)
         means = np.array([_weighted_mean(x[at == m], weight[at == m], self.center_) for m in range(k)])
         self.scale_ = _within_class_sd(x, weight, means[at], self.center_)
-        x = np.where(seen, (x - self.center_) / self.scale_, ((means - self.center_) / self.scale_)[at])
+        x = np.where(
+            has_feature, (x - self.center_) / self.scale_, ((means - self.center_) / self.scale_)[at]
+        )
         self.shrinkage_, self.mean_shrinkage_ = self._shrinkages(x, weight.max(axis=1), at)
         y, noise = self._scaled(read)
         own_sd, knows_sd = read.t_object_sd, np.isfinite(read.t_object_sd)
-        typical = _T_OBJECT_SD if self.reader_.normalise else 0.0
+        typical = DENSITY.t_object_sd_K if self.reader_.normalise else 0.0
         zero = self.center_ / self.scale_
         # A missing feature is one that noise drowns: its precision is 0, and so are its row and column.
-        lost = np.where(seen, 0.0, _DROWNED)
-        noise = np.where(seen[:, :, None] & seen[:, None, :], noise, 0.0) + lost[:, :, None] * np.eye(d)
-        y, gain = np.where(seen, y, 0.0), np.where(seen, read.gain, 0.0)
+        lost = np.where(has_feature, 0.0, DENSITY.drowned)
+        noise = np.where(has_feature[:, :, None] & has_feature[:, None, :], noise, 0.0) + lost[
+            :, :, None
+        ] * np.eye(d)
+        y, gain = np.where(has_feature, y, 0.0), np.where(has_feature, read.gain, 0.0)
         means, covariance = np.zeros((k, d)), np.eye(d)
-        for _ in range(_STEPS):
+        for _ in range(DENSITY.steps):
             sd = np.where(knows_sd, own_sd, typical)
-            ray = np.where(seen, (means + zero)[at], 0.0) * (gain != 1)
+            ray = np.where(has_feature, (means + zero)[at], 0.0) * (gain != 1)
             between = gain[:, :, None] * covariance * gain[:, None, :]
             precision = np.linalg.inv(between + noise + sd[:, None, None] ** 2 * _outer(ray))
             prior = self.mean_shrinkage_ * np.linalg.inv(covariance)
@@ -271,20 +293,26 @@ class BayesClassifier(GraspClassifier):
                 spread[m] = np.linalg.inv(prior + np.sum(weighted * gain[g, None, :], axis=0))
                 means[m] = spread[m] @ np.einsum("gij,gj->i", weighted, y[g])
             pull = np.einsum("gij,gj->gi", precision, y - gain * means[at])
-            own = (gain * pull) @ covariance  # what each grasp is off its material, expected ...
-            left = covariance - covariance @ (gain[:, :, None] * precision * gain[:, None, :]) @ covariance
-            scatter = own.T @ own + left.sum(axis=0) + self.mean_shrinkage_ * means.T @ means
-            found = (self.shrinkage_ * np.eye(d) + scatter) / (self.shrinkage_ + n + 2)
+            scatter_mean = (gain * pull) @ covariance  # what each grasp is off its material, expected ...
+            scatter_covariance = (
+                covariance - covariance @ (gain[:, :, None] * precision * gain[:, None, :]) @ covariance
+            )
+            scatter = (
+                scatter_mean.T @ scatter_mean
+                + scatter_covariance.sum(axis=0)
+                + self.mean_shrinkage_ * means.T @ means
+            )
+            new_covariance = (self.shrinkage_ * np.eye(d) + scatter) / (self.shrinkage_ + n + 2)
             off = sd**2 * np.sum(ray * pull, axis=1)  # ... and by how much its temperature is off
             off_var = sd**2 - sd**4 * np.einsum("gi,gij,gj->g", ray, precision, ray)
-            moved = max(np.abs(found - covariance).max(), np.abs(means - before).max())
-            covariance = found
+            moved = max(np.abs(new_covariance - covariance).max(), np.abs(means - before).max())
+            covariance = new_covariance
             if self.reader_.normalise and not knows_sd.all():
-                total = np.sum((off**2 + off_var)[~knows_sd]) + _SD_WEIGHT * _T_OBJECT_SD**2
-                typical = float(np.sqrt(total / (_SD_WEIGHT + np.sum(~knows_sd))))
-            if moved < _STILL:
+                total = np.sum((off**2 + off_var)[~knows_sd]) + DENSITY.sd_grasps * DENSITY.t_object_sd_K**2
+                typical = float(np.sqrt(total / (DENSITY.sd_grasps + np.sum(~knows_sd))))
+            if moved < DENSITY.still:
                 break
-        informative = n - np.sum(np.linalg.inv(covariance) * left.sum(axis=0)) / d
+        informative = n - np.sum(np.linalg.inv(covariance) * scatter_covariance.sum(axis=0)) / d
         self.dof_ = float(self.shrinkage_ + informative + 2)  # nu_n - d + 1
         self.means_, self.mean_covariance_, self.covariance_ = means, spread, covariance
         self.t_object_sd_ = typical
@@ -309,37 +337,39 @@ class BayesClassifier(GraspClassifier):
         return self._log_density(grasps)[:, :-1]
 
     def _answered(self, grasps: Grasps, names: list[str]) -> Answered:
-        at, log_p = [self.asked().index(name) for name in names], self._log_density(grasps)
-        odds = logsumexp(log_p[:, at], axis=1) - np.log(len(at)) - log_p[:, -1]
-        found = Answered.nothing(len(log_p), len(names))
+        columns, log_p = [self.asked().index(name) for name in names], self._log_density(grasps)
+        odds = logsumexp(log_p[:, columns], axis=1) - np.log(len(columns)) - log_p[:, -1]
+        answered = Answered.nothing(len(log_p), len(names))
         unknown = np.asarray(expit(logit(self.prior_unknown) - odds))
-        return found._replace(log_p=normalised(log_p[:, at]), p_unknown=unknown)
+        return answered._replace(log_p=normalised(log_p[:, columns]), p_unknown=unknown)
 
     def _log_density(self, grasps: Grasps) -> Floats:
         """Return the log density of each grasp under each class, and last under an unknown material,
         (n_grasp, n_class + 1)."""
         read = self.reader_.read(grasps)
         unknown = np.isnan(read.difference)
-        wide = (unknown | (read.t_object_sd > _WIDE)) & self.reader_.normalise
+        wide = (unknown | (read.t_object_sd > DENSITY.wide_sd_K)) & self.reader_.normalise
         out = np.empty((wide.size, self.classes_.size + 1))
         out[~wide] = self._log_t_of(_rows(read, ~wide))
         if not wide.any():
             return out
-        part, unknown, some = pick(grasps, wide), unknown[wide], _rows(read, wide)
-        low, high = object_range(part).T
-        levels = np.stack([level(sensor) for _, sensor in _sensors(part)], axis=1)
+        record, unknown, some = pick(grasps, wide), unknown[wide], _rows(read, wide)
+        low, high = object_range(record).T
+        levels = np.stack([level(sensor) for _, sensor in _sensors(record)], axis=1)
         beside = levels[:, [int(f.startswith(_SECOND)) for f in self.feature_names_]]
         centre = np.where(unknown, (low + high) / 2, levels[:, 0] + np.where(unknown, 0.0, some.difference))
-        half = np.where(unknown, (high - low) / 2, _REACH * np.where(unknown, 0.0, some.t_object_sd))
-        z = np.linspace(-1.0, 1.0, _NODES)
-        log_w = np.where(unknown[:, None], 0.0, -0.5 * (_REACH * z) ** 2)
+        half = np.where(
+            unknown, (high - low) / 2, DENSITY.reach_sd * np.where(unknown, 0.0, some.t_object_sd)
+        )
+        z = np.linspace(-1.0, 1.0, DENSITY.nodes)
+        log_w = np.where(unknown[:, None], 0.0, -0.5 * (DENSITY.reach_sd * z) ** 2)
         log_w -= logsumexp(log_w, axis=1, keepdims=True)
-        each = np.empty((_NODES, *out[wide].shape))
-        for k, (at, weight) in enumerate(zip(z, log_w.T)):
-            gain = np.where(some.gain == 1, 1.0, (centre + at * half)[:, None] - beside)
+        log_t_at = np.empty((DENSITY.nodes, *out[wide].shape))
+        for k, (node, weight) in enumerate(zip(z, log_w.T)):
+            gain = np.where(some.gain == 1, 1.0, (centre + node * half)[:, None] - beside)
             sd = 0.6 * half * (z[1] - z[0])  # bells that wide, so far apart, add up to a smooth density
-            each[k] = weight[:, None] + self._log_t_of(replace(some, gain=gain, t_object_sd=sd))
-        out[wide] = logsumexp(each, axis=0)
+            log_t_at[k] = weight[:, None] + self._log_t_of(replace(some, gain=gain, t_object_sd=sd))
+        out[wide] = logsumexp(log_t_at, axis=0)
         return out
 
     def _log_t_of(self, read: Readings) -> Floats:
@@ -350,16 +380,19 @@ class BayesClassifier(GraspClassifier):
         middle = self.means_.mean(axis=0)
         off = self.means_ - middle
         strange = (k + 1) / (k * (k - 1)) * off.T @ off
-        kinds = [(mean, own, self.dof_) for mean, own in zip(self.means_, self.mean_covariance_)]
+        kinds = [
+            (mean, mean_covariance, self.dof_)
+            for mean, mean_covariance in zip(self.means_, self.mean_covariance_)
+        ]
         out = np.zeros((y.shape[0], k + 1))
         for has in np.unique(np.isfinite(y), axis=0):
             rows = (np.isfinite(y) == has).all(axis=1)
             gain, y_has = read.gain[np.ix_(rows, has)], y[np.ix_(rows, has)]
-            known = noise[rows][:, has][:, :, has]
-            for m, (mean, own, dof) in enumerate([*kinds, (middle, strange, k - 1.0)]):
+            noise_known = noise[rows][:, has][:, :, has]
+            for m, (mean, mean_covariance, dof) in enumerate([*kinds, (middle, strange, k - 1.0)]):
                 ray = (mean + zero)[has] * (gain != 1)
-                block = (self.covariance_ + own)[np.ix_(has, has)]
-                scale = gain[:, :, None] * block * gain[:, None, :] + known
+                block = (self.covariance_ + mean_covariance)[np.ix_(has, has)]
+                scale = gain[:, :, None] * block * gain[:, None, :] + noise_known
                 scale += sd[rows, None, None] ** 2 * _outer(ray)
                 out[rows, m] = _log_t(y_has - gain * mean[has], scale, dof)
         return out
@@ -387,15 +420,15 @@ class BayesClassifier(GraspClassifier):
 
 def _usable(difference: Floats, labels: Labels) -> tuple[NDArray[np.bool_], list[str]]:
     """Return which grasps have normalised features of at least two materials, and in words which have not."""
-    known = _seen(difference, labels)
-    if len(known) < 2:
+    seen_materials = _seen(difference, labels)
+    if len(seen_materials) < 2:
         return np.zeros(labels.size, dtype=bool), [
             "features stay in kelvin: object temperatures are unknown, or within 1 K of the skin's"
         ]
-    usable, notes = np.isfinite(difference) & np.isin(labels, known), []
-    if lost := [str(m) for m in np.unique(labels) if m not in known]:
+    usable, notes = np.isfinite(difference) & np.isin(labels, seen_materials), []
+    if lost := [str(m) for m in np.unique(labels) if m not in seen_materials]:
         notes.append(f"{', '.join(lost)} left out: no object of known temperature 1 K from the skin's")
-    unknown = int(np.sum(np.isin(labels, known) & ~np.isfinite(difference)))
+    unknown = int(np.sum(np.isin(labels, seen_materials) & ~np.isfinite(difference)))
     if unknown:
         notes.append(f"{unknown} grasps left out: their object temperature is unknown")
     return usable, notes
@@ -404,8 +437,8 @@ def _usable(difference: Floats, labels: Labels) -> tuple[NDArray[np.bool_], list
 def _seen(difference: Floats, labels: Labels) -> list[str]:
     """Return the materials whose normalised features grasps at these differences [K] show."""
     clear = np.abs(difference) >= features.LEAST_DIFFERENCE
-    weight = np.where(clear, difference**2 / (difference**2 + _HALF_WEIGHT), 0.0)
-    return [str(m) for m in np.unique(labels) if weight[labels == m].sum() >= _LEAST_WEIGHT]
+    weight = np.where(clear, difference**2 / (difference**2 + DENSITY.half_weight_K2), 0.0)
+    return [str(m) for m in np.unique(labels) if weight[labels == m].sum() >= DENSITY.least_weight]
 
 
 def _rows(read: Readings, at: NDArray[np.bool_]) -> Readings:
@@ -427,8 +460,8 @@ def _sensors(grasps: Grasps) -> list[tuple[str, Grasps]]:
 def _table(grasps: Grasps, times: Sequence[float], *, both: bool) -> xr.DataArray:
     """Return the features in kelvin (n, d), those of a second sensor behind those of the first."""
     tables = []
-    for prefix, part in _sensors(grasps)[: 2 if both else 1]:
-        table = features.linear_features(part, times)
+    for prefix, sensor in _sensors(grasps)[: 2 if both else 1]:
+        table = features.linear_features(sensor, times)
         tables.append(table.assign_coords(feature=[f"{prefix}{f}" for f in table["feature"].values]))
     return tables[0] if len(tables) == 1 else xr.concat(tables, "feature")
 
@@ -437,14 +470,14 @@ def _times(grasps: Grasps, end: float) -> list[float]:
     """Return when a response is read of the contacts of a record [s], an ``end`` that is late among these."""
     times = [t for t in features.RESPONSE_TIMES if t <= float(grasps["time"].values[-1]) + 0.05]
     before = max([t for t in times if t <= end + 0.05], default=0.0)
-    return sorted([*times, round(end, 2)]) if end > _NEAR * before else times
+    return sorted([*times, round(end, 2)]) if end > DENSITY.own_end * before else times
 
 
 def _order(name: str) -> tuple[bool, int, float]:
     """Return the place of a feature: by sensor, in the order of the table, responses by time."""
-    own = name.removeprefix(_SECOND)
-    kind = next(i for i, prefix in enumerate(features.KINDS) if own.startswith(prefix))
-    return own != name, kind, _time(name) if name.endswith("s") else 0.0
+    bare_name = name.removeprefix(_SECOND)
+    kind = next(i for i, prefix in enumerate(features.KINDS) if bare_name.startswith(prefix))
+    return bare_name != name, kind, _time(name) if name.endswith("s") else 0.0
 
 
 def _time(name: str) -> float:
@@ -454,8 +487,8 @@ def _time(name: str) -> float:
 
 def _last(grasps: Grasps) -> Floats:
     """Return when each trace was last read [s], (n_grasp,)."""
-    seen = np.isfinite(grasps["t_surface"].values)
-    return np.asarray(np.where(seen, grasps["time"].values, -np.inf).max(axis=1))
+    has_sample = np.isfinite(grasps["t_surface"].values)
+    return np.asarray(np.where(has_sample, grasps["time"].values, -np.inf).max(axis=1))
 
 
 def _weighted_mean(x: Floats, weight: Floats, otherwise: Floats | float = 0.0) -> Floats:

@@ -51,13 +51,13 @@ def linear_features(grasps: Grasps, times: Sequence[float]) -> xr.DataArray:
     of each grasp, (n_grasp, n): sums of samples less the level before contact; NaN where a trace ends
     before."""
     time = np.asarray(grasps["time"].values, dtype=float)
-    rise, seen = _filled(time, grasps["t_surface"].values - level(grasps)[:, None])
-    last = np.max(np.where(seen > 0, time, -np.inf), axis=1)
+    rise, begun = _filled(time, grasps["t_surface"].values - level(grasps)[:, None])
+    last = np.max(np.where(begun > 0, time, -np.inf), axis=1)
     names = [*(f"change_{t:g}s" for t in times), "late_slope"]
     values = np.full((last.size, len(names)), np.nan)
     for end in np.unique(last):
-        own = last == end
-        values[own] = rise[own] @ _linear_weights(tuple(time.tolist()), tuple(names), float(end))
+        ends_then = last == end
+        values[ends_then] = rise[ends_then] @ _linear_weights(tuple(time.tolist()), tuple(names), float(end))
     return xr.DataArray(
         values, dims=("grasp", "feature"), coords={"grasp": grasps["grasp"].values, "feature": names}
     )
@@ -70,15 +70,15 @@ def _linear_weights(time: tuple[float, ...], names: tuple[str, ...], last: float
     t, weights = np.asarray(time), np.full((len(time), len(names)), np.nan)
     for k, name in enumerate(names):
         slope = name == "late_slope"
-        asked = FIT_END if slope else float(name[len("change_") : -1])
-        at = min(asked, last)
-        used = (t >= 5.0) if slope else np.abs(t - at) <= max(_NEAR, _SHARE * at) + 1e-6
-        used &= t <= (at + 1e-6 if slope else last)
-        if used.sum() < (3 if slope else 1) or last < asked - max(0.06, 0.02 * asked):
+        nominal_time = FIT_END if slope else float(name[len("change_") : -1])
+        read_time = min(nominal_time, last)
+        used = (t >= 5.0) if slope else np.abs(t - read_time) <= max(_NEAR, _SHARE * read_time) + 1e-6
+        used &= t <= (read_time + 1e-6 if slope else last)
+        if used.sum() < (3 if slope else 1) or last < nominal_time - max(0.06, 0.02 * nominal_time):
             continue
         off = np.where(used, t - t[used].mean(), 0.0)
         lever = off / max(float(off @ off), 1e-12)
-        weights[:, k] = lever if slope else used / used.sum() + (at - t[used].mean()) * lever
+        weights[:, k] = lever if slope else used / used.sum() + (read_time - t[used].mean()) * lever
     return weights
 
 
@@ -92,9 +92,9 @@ def feature_noise(grasps: Grasps, names: Sequence[str]) -> Floats:
 def _sample_noise(grasps: Grasps) -> Floats:
     """Return the sd of the noise of one sample [K], (n_grasp,)."""
     second = np.abs(np.diff(grasps["t_surface"].values, n=2, axis=1))
-    seen = np.isfinite(second).any(axis=1)
+    has_difference = np.isfinite(second).any(axis=1)
     middle = np.full(second.shape[0], 0.0)
-    middle[seen] = np.nanmedian(second[seen], axis=1)
+    middle[has_difference] = np.nanmedian(second[has_difference], axis=1)
     return np.asarray(np.maximum(middle / (0.6745 * np.sqrt(6.0)), _LEAST_NOISE))
 
 
@@ -109,9 +109,9 @@ def _noise_shape(time: tuple[float, ...], names: tuple[str, ...]) -> Floats:
 
 def _filled(time: Floats, rise: Floats) -> tuple[Floats, Floats]:
     """Return the traces with lost samples interpolated, and 1.0 where a trace has begun and not ended."""
-    out, seen = np.zeros_like(rise), np.zeros_like(rise)
+    out, within_trace = np.zeros_like(rise), np.zeros_like(rise)
     for i, row in enumerate(rise):
         ok = np.isfinite(row)
         out[i] = np.interp(time, time[ok], row[ok])
-        seen[i] = (time >= time[ok][0]) & (time <= time[ok][-1])
-    return out, seen
+        within_trace[i] = (time >= time[ok][0]) & (time <= time[ok][-1])
+    return out, within_trace

@@ -108,8 +108,8 @@ class FeaturesLda(_Lda):
         self.classes_ = np.unique(labels)
         self._fit_rows(x[:, whole], labels)
         logits = self._discriminants(x[:, whole])
-        own = np.array([logits[labels == name].mean(axis=0) for name in self.classes_])
-        within = logits - own[np.searchsorted(self.classes_, labels)]
+        class_means = np.array([logits[labels == name].mean(axis=0) for name in self.classes_])
+        within = logits - class_means[np.searchsorted(self.classes_, labels)]
         self.spread_ = float(np.sum(_centred(within) ** 2) / max(labels.size - self.classes_.size, 1))
 
     def _rows(self, grasps: Grasps) -> Floats:

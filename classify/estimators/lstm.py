@@ -123,11 +123,11 @@ class LstmClassifier(JoinedClassifier):
         epochs = self.epochs
         split = _held_out(grasps, labels, seed=self.random_state)
         if split is not None and self.patience is not None and self.epochs > self.patience:
-            fitted, held = split
+            fitted, held_out = split
             self.mean_, self.sd_ = self._standard(real[fitted])
-            seen = self._series(real[held]), target[held]
+            held_out_series = self._series(real[held_out]), target[held_out]
             series, classes = self._copies(real[fitted], target[fitted])
-            epochs = _train(self, series, classes, epochs=epochs, held_out=seen).best
+            epochs = _train(self, series, classes, epochs=epochs, held_out=held_out_series).best
         self.mean_, self.sd_ = self._standard(real)
         series, classes = self._copies(real, target)
         self.weights_, self.loss_curve_, _ = _train(self, series, classes, epochs=epochs)
@@ -204,9 +204,9 @@ def _held_out(
         fewest = min(np.unique(groups[labels == name]).size for name in np.unique(labels))
         if fewest > 1:
             folds = StratifiedGroupKFold(min(5, fewest), shuffle=True, random_state=seed)
-            fitted, held = next(folds.split(labels, labels, groups))
-            if held.size and np.unique(labels[fitted]).size == np.unique(labels).size:
-                return fitted, held
+            fitted, held_out = next(folds.split(labels, labels, groups))
+            if held_out.size and np.unique(labels[fitted]).size == np.unique(labels).size:
+                return fitted, held_out
     return None
 
 
@@ -242,7 +242,9 @@ def _train(
             readout = torch.nn.Linear(model.hidden, model.classes_.size).to(device)
             adam = torch.optim.Adam([*network.parameters(), *readout.parameters()], lr=model.learning_rate)
             series, target = torch.from_numpy(x).to(device), torch.from_numpy(y).to(device)
-            seen = None if held_out is None else tuple(torch.from_numpy(each).to(device) for each in held_out)
+            held_out_tensors = (
+                None if held_out is None else tuple(torch.from_numpy(array).to(device) for array in held_out)
+            )
 
             def loss_of(series: Any, target: Any) -> Any:
                 return torch.nn.functional.cross_entropy(readout(network(series)[1][0][0]), target)
@@ -251,8 +253,8 @@ def _train(
             for epoch in range(1, epochs + 1):
                 total = torch.zeros((), device=device)
                 for rows in torch.randperm(len(y)).split(model.batch):  # type: ignore[no-untyped-call]
-                    at = rows.to(device)
-                    loss = loss_of(series[at], target[at])
+                    rows_there = rows.to(device)
+                    loss = loss_of(series[rows_there], target[rows_there])
                     adam.zero_grad(set_to_none=True)
                     loss.backward()
                     adam.step()
@@ -261,10 +263,10 @@ def _train(
                 if model.patience is None:
                     continue
                 with torch.no_grad():
-                    now = float(curve[-1] if seen is None else loss_of(*seen))
+                    now = float(curve[-1] if held_out_tensors is None else loss_of(*held_out_tensors))
                 if now < least - _LEAST_GAIN:
                     least, best, weights = now, epoch, _named(network, readout)
-                elif seen is not None and epoch - best >= model.patience:
+                elif held_out_tensors is not None and epoch - best >= model.patience:
                     break
             if model.patience is None:
                 weights = _named(network, readout)
@@ -278,16 +280,18 @@ def _device(name: str) -> str:
     """Return where to train."""
     import torch
 
-    there = torch.cuda.is_available()
-    if name == "cuda" and not there:
+    has_gpu = torch.cuda.is_available()
+    if name == "cuda" and not has_gpu:
         raise UserError("PyTorch finds no GPU", hint="use device cpu or auto")
-    return "cuda" if there and name != "cpu" else "cpu"
+    return "cuda" if has_gpu and name != "cpu" else "cpu"
 
 
 def _named(network: Any, readout: Any) -> Weights:
     """Return the weights of both PyTorch modules by name."""
-    parts = {"lstm": network.state_dict(), "readout": readout.state_dict()}
-    return {f"{name}.{k}": v.cpu().numpy().copy() for name, part in parts.items() for k, v in part.items()}
+    modules = {"lstm": network.state_dict(), "readout": readout.state_dict()}
+    return {
+        f"{name}.{k}": v.cpu().numpy().copy() for name, state in modules.items() for k, v in state.items()
+    }
 
 
 def _logits(weights: Mapping[str, NDArray[Any]], series: NDArray[np.float32]) -> Floats:

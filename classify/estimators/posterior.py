@@ -112,16 +112,16 @@ class PosteriorClassifier(GraspClassifier):
         from thermogrip.sysid.effusivity.calibration import calibrate_gripper
 
         self._check_params()
-        where = "+".join(str(part.attrs.get("name")) for part in records)
+        where = "+".join(str(record.attrs.get("name")) for record in records)
         self.classes_ = two_or_more(np.concatenate(labels), where)
-        records = [part.assign(material=("grasp", own)) for part, own in zip(records, labels)]
+        records = [record.assign(material=("grasp", materials)) for record, materials in zip(records, labels)]
         device = calibrate_gripper(records, start=self.device, seed=self.random_state, progress=progress)
         self.notes_ = [f"{m}: not in the materials table, learnt from its grasps" for m in device.unlisted]
         self.longest_ = longest_contact(records)
         self.coupling_: Coupling | None = None
-        for part in records:
-            if has_touch_groups(part):
-                self.coupling_ = learn_coupling(device, part, start=self.coupling_)
+        for record in records:
+            if has_touch_groups(record):
+                self.coupling_ = learn_coupling(device, record, start=self.coupling_)
         self.device_ = device
 
     def with_device(self, device: GripperModel, coupling: Coupling | None = None) -> Self:
@@ -160,12 +160,12 @@ class PosteriorClassifier(GraspClassifier):
     def candidate_log_proba(self, X: Records, candidates: Sequence[str]) -> Floats:
         """Return log probabilities of the candidates alone, (n_grasp, n_candidate)."""
         names = self.asked(candidates)
-        return np.vstack([self._answered(part, names, unknown=False).log_p for part in self._records(X)])
+        return np.vstack([self._answered(record, names, unknown=False).log_p for record in self._records(X)])
 
     def _answered(self, grasps: Grasps, names: list[str], *, unknown: bool = True) -> Answered:
         """Return the answers of one record; p_unknown, which takes longest, only where it is asked for."""
         group = label_values(grasps, "touch_group")
-        found = Answered.nothing(group.size, len(names))
+        answered = Answered.nothing(group.size, len(names))
         single = np.flatnonzero(group == "")
         evidence, odds = np.empty((group.size, len(names))), np.full(group.size, np.nan)
         if single.size:
@@ -177,13 +177,13 @@ class PosteriorClassifier(GraspClassifier):
             if unknown:
                 free = free_evidence(self.device_, data, fitted.mode.u[best], noise)
                 odds[single] = logsumexp(evidence[single], axis=1) - np.log(len(names)) - free
-                self._explain(found, single, data, names, fitted, best)
+                self._explain(answered, single, data, names, fitted, best)
         if single.size < group.size:
-            self._touched(found, grasps, names, evidence, odds, unknown=unknown)
+            self._touched(answered, grasps, names, evidence, odds, unknown=unknown)
         if unknown:
-            self._warn_of_training(found, grasps)
+            self._warn_of_training(answered, grasps)
         log_p = normalised(evidence + self.log_prior(names))
-        return found._replace(log_p=log_p, p_unknown=expit(logit(self.prior_unknown) - odds))
+        return answered._replace(log_p=log_p, p_unknown=expit(logit(self.prior_unknown) - odds))
 
     def _explain(
         self, found: Answered, at: NDArray[np.int64], data: Touches, names: list[str], fitted: Fitted,
@@ -209,21 +209,16 @@ class PosteriorClassifier(GraspClassifier):
         """Fill evidence (n, m) and odds (n,) of touches of one block, and add what there is to say of it."""
         fit = two_touch_fit(self.device_, grasps, names, coupling=self.coupling_)
         groups = free_touch_fit(self.device_, grasps, coupling=self.coupling_) if unknown else {}
-        for k, at in enumerate(fit.rows):
-            evidence[at] = fit.log_evidence[k]
-            if fit.as_taught[k] < 1 - _LIKELY:
-                loss = f"{fit.loss[k]:.2g} times as much as those of the training"
-                words = f"read as of a block that loses {loss}"
-                for i in at.tolist():
-                    found.notes[i].append(Note("beyond_training", words))
+        for k, rows in enumerate(fit.rows):
+            evidence[rows] = fit.log_evidence[k]
             if unknown:
                 free = groups[fit.groups[k]][0].log_evidence
-                odds[at] = logsumexp(fit.log_evidence[k]) - np.log(len(names)) - free
+                odds[rows] = logsumexp(fit.log_evidence[k]) - np.log(len(names)) - free
 
     def _warn_of_training(self, found: Answered, grasps: Grasps) -> None:
         """Add to the answers what of a record the training did not have."""
-        known = (self.coupling_ or Coupling()).longest_rest
-        rested = f"rested longer than the {known:g} s of the training: the answer may be too confident"
+        taught_rest = (self.coupling_ or Coupling()).longest_rest
+        rested = f"rested longer than the {taught_rest:g} s of the training: the answer may be too confident"
         for i in np.flatnonzero(rested_long(grasps, self.coupling_)).tolist():
             found.notes[i].append(Note("beyond_training", rested))
         trained, has = self.device_.second is not None, "t_surface_2" in grasps
@@ -273,7 +268,11 @@ def deviation_words(material: str, off: Floats, sd: Floats, misfit: float) -> st
         EFFUSIVITY: f"{np.exp(off[EFFUSIVITY]):.2f} times its block's effusivity",
         T_OBJECT: f"its block {abs(off[T_OBJECT]):.1f} K {warmer} than its nominal temperature",
     }
-    each = [(float(abs(off[k]) / sd[k]), text) for k, text in words.items() if sd[k] > 0]
-    each.append((misfit, "a trace that is not its own"))
-    unusual = [f"{text} ({far:.1f} sd)" for far, text in sorted(each, reverse=True) if far > _UNUSUAL][:2]
+    deviations = [(float(abs(off[k]) / sd[k]), text) for k, text in words.items() if sd[k] > 0]
+    deviations.append((misfit, "a trace that is not its own"))
+    unusual = [
+        f"{text} ({deviation:.1f} sd)"
+        for deviation, text in sorted(deviations, reverse=True)
+        if deviation > _UNUSUAL
+    ][:2]
     return f"as {material} it needs {' and '.join(unusual)}" if unusual else ""

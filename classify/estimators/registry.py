@@ -69,16 +69,16 @@ def make_classifier(
     check_name(name)
     module, kind_name = CLASSIFIERS[name]
     kind: Any = getattr(import_module(f"thermogrip.classify.{module}"), kind_name)
-    known = inspect.signature(kind.__init__).parameters
+    parameters = inspect.signature(kind.__init__).parameters
     for key in params:
-        if key not in known:
-            hint = known_names(key, [k for k in known if k != "self"], "it has {}")
+        if key not in parameters:
+            hint = known_names(key, [k for k in parameters if k != "self"], "it has {}")
             raise UserError(f"{name} has no parameter {key!r}", hint=hint)
-    if quick and "epochs" in known:
+    if quick and "epochs" in parameters:
         from thermogrip.classify.estimators.lstm import QUICK_EPOCHS
 
         params = {"epochs": QUICK_EPOCHS} | params
-    if seed is not None and "random_state" in known:
+    if seed is not None and "random_state" in parameters:
         params = {"random_state": seed} | params
     made: GraspClassifier = kind(**params)
     return made

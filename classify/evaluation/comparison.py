@@ -109,9 +109,11 @@ class Comparison(Shown):
         """What the scores have to be read with: leaks, materials that training lacks and how each classifier
         answered them, then what the records and their split bring."""
         leaks = [self._leak(row) for row in self.leaks if row["leak"]]
-        asked = [(condition, name) for condition in self.conditions for name in self.classifiers]
-        tested = [(self._tested(name, condition), condition, name) for condition, name in asked]
-        unseen = [_unseen(*each) for each in tested if not all(row["known"] for row in each[0])]
+        pairs = [(condition, name) for condition in self.conditions for name in self.classifiers]
+        tested = [(self._tested(name, condition), condition, name) for condition, name in pairs]
+        unseen = [
+            _unseen(*unknown_in) for unknown_in in tested if not all(row["known"] for row in unknown_in[0])
+        ]
         return (*leaks, *unseen, *self.of_records)
 
     def cautions_of(self, classifier: str, condition: str) -> list[Caution]:
@@ -166,9 +168,9 @@ class Comparison(Shown):
     def _scores(self) -> list[Row]:
         table = []
         for classifier in self.classifiers:
-            known = [r for r in self.predictions if r["classifier"] == classifier and r["known"]]
-            groups = {c: [r for r in known if r["condition"] == c] for c in self.conditions}
-            pooled = [r for r in known if not r["apart"]]
+            scored = [r for r in self.predictions if r["classifier"] == classifier and r["known"]]
+            groups = {c: [r for r in scored if r["condition"] == c] for c in self.conditions}
+            pooled = [r for r in scored if not r["apart"]]
             if len({r["condition"] for r in pooled}) > 1:
                 groups = {POOLED: pooled} | groups
             for condition, rows in groups.items():
@@ -215,8 +217,10 @@ class Comparison(Shown):
 
     def _time(self, classifier: str, rows: Sequence[Row], key: str) -> float | None:
         conditions = {r["condition"] for r in rows}
-        found = [r[key] for r in self.times if r["classifier"] == classifier and r["condition"] in conditions]
-        return float(np.mean(found)) if found else None
+        seconds = [
+            r[key] for r in self.times if r["classifier"] == classifier and r["condition"] in conditions
+        ]
+        return float(np.mean(seconds)) if seconds else None
 
     def confusion(self, classifier: str, condition: str = POOLED) -> tuple[list[str], Floats]:
         """Return the materials tested or predicted, and the confusion matrix: rows true, columns predicted,
@@ -290,13 +294,13 @@ class Comparison(Shown):
         for classifier in self.classifiers:
             rows = [r for r in self.predictions if r["classifier"] == classifier]
             rows = [r for r in rows if r["p_unknown"] is not None]
-            known = [r["p_unknown"] for r in rows if r["known"] and not r["apart"]]
+            p_of_known = [r["p_unknown"] for r in rows if r["known"] and not r["apart"]]
             strange = [r for r in rows if not r["known"]]
-            for material in sorted({r["material"] for r in strange}) if known else ():
+            for material in sorted({r["material"] for r in strange}) if p_of_known else ():
                 scored = [r["p_unknown"] for r in strange if r["material"] == material]
                 head = {"classifier": classifier, "material": material}
-                counts = {"n_unknown": len(scored), "n_known": len(known)}
-                table.append(head | counts | {"auroc": s.auroc(known, scored)})
+                counts = {"n_unknown": len(scored), "n_known": len(p_of_known)}
+                table.append(head | counts | {"auroc": s.auroc(p_of_known, scored)})
         return table
 
     def save(self, folder: str | Path) -> Path:
@@ -373,8 +377,8 @@ def _unseen(rows: Sequence[Row], condition: str, classifier: str) -> Caution:
 
 def grasp_numbers(rows: Sequence[Row]) -> NDArray[np.int64]:
     """Return the number of the distinct grasp of each row, counted from 0."""
-    at: dict[tuple[str, str], int] = {}
-    return np.array([at.setdefault((r["condition"], r["grasp_id"]), len(at)) for r in rows])
+    number_of: dict[tuple[str, str], int] = {}
+    return np.array([number_of.setdefault((r["condition"], r["grasp_id"]), len(number_of)) for r in rows])
 
 
 def _spread(name: str, found: s.Interval | s.CalibrationError) -> Row:

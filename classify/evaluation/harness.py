@@ -48,9 +48,20 @@ from thermogrip.datasets.schema import Grasps, log_name, unit_names
 from thermogrip.sysid.effusivity.quality import contact_faults
 
 LAST_UNTOUCHED = -0.5  # s; contact may precede the "closed" message by 0.3 s
-_LATEST_LEVEL, _LEVEL_SAMPLES = -0.25, 3
-_PROBE_EPOCHS = 100
-_LEAST_NOISE = 0.02  # degC
+
+
+@dataclass(frozen=True)
+class ProbeSettings:
+    """The leak probe: what is before contact, and when a label in it counts."""
+
+    level_until_s: float = -0.25  # contact may precede the closed message by 0.3 s
+    level_samples: int = 3  # that show a level
+    epochs: int = 100  # enough for a leak that matters
+    least_noise_K: float = 0.02  # a sensor that rests on one step shows less than it has
+    leak_level: float = 0.01  # of the test, shared among all of them
+
+
+PROBE = ProbeSettings()
 
 
 def untouched(grasps: Grasps, *, seed: int = 0) -> Grasps:
@@ -62,9 +73,11 @@ def untouched(grasps: Grasps, *, seed: int = 0) -> Grasps:
         values, base = out[key].values, level(grasps, key)
         early = values[:, time <= LAST_UNTOUCHED]
         spread = np.nanstd(early, axis=1) if early.shape[1] > 1 else np.zeros(base.size)
-        held = base[:, None] + np.maximum(spread, _LEAST_NOISE)[:, None] * rng.standard_normal(values.shape)
+        still_trace = base[:, None] + np.maximum(spread, PROBE.least_noise_K)[:, None] * rng.standard_normal(
+            values.shape
+        )
         after = (time > LAST_UNTOUCHED)[None, :] & np.isfinite(values)
-        out[key] = (("grasp", "time"), np.where(after, held, values), grasps[key].attrs)
+        out[key] = (("grasp", "time"), np.where(after, still_trace, values), grasps[key].attrs)
     return out
 
 
@@ -73,14 +86,14 @@ def has_before(grasps: Grasps) -> bool:
 
     What is needed is three readings up to 0.25 s before the message, which contact may precede by 0.3 s.
     """
-    return bool(np.sum(grasps["time"].values <= _LATEST_LEVEL) >= _LEVEL_SAMPLES)
+    return bool(np.sum(grasps["time"].values <= PROBE.level_until_s) >= PROBE.level_samples)
 
 
 def probe_clone(classifier: GraspClassifier) -> GraspClassifier:
     """Return an unfitted copy for the probe; a network trains briefly, enough for a leak that matters."""
     copy: GraspClassifier = clone(classifier)
     if "epochs" in copy.get_params():
-        copy.set_params(epochs=min(int(copy.get_params()["epochs"]), _PROBE_EPOCHS))
+        copy.set_params(epochs=min(int(copy.get_params()["epochs"]), PROBE.epochs))
     return copy
 
 
@@ -89,7 +102,6 @@ def binomial_p(right: float, n: int, by_chance: float) -> float:
     return float(binom.sf(np.ceil(right - 1e-9) - 1, n, by_chance))
 
 
-_LEAK_LEVEL = 0.01
 _PROBE_NAME = "untouched traces"
 
 
@@ -158,7 +170,9 @@ def evaluate(
     jobs = _jobs(named, plan, probe and not late)
     done = run_parallel(_run, jobs, workers, progress, what="train and test")
     order = {name: i for i, name in enumerate(named)}
-    results = sorted((r for part in done for r in part), key=lambda r: (order.get(r.classifier, -1), r.order))
+    results = sorted(
+        (r for job_results in done for r in job_results), key=lambda r: (order.get(r.classifier, -1), r.order)
+    )
     faults = [r for r in results if r.fault is not None]
     real = [r for r in results if not r.probe and r.fault is None]
     if faults and not real:
@@ -222,12 +236,15 @@ def _named(
     if isinstance(classifiers, str):
         raise UserError("classifiers is one word", hint="give a list of names")
     if isinstance(classifiers, Mapping):
-        named = {name: _grasp_classifier(given, seed) for name, given in classifiers.items()}
+        named = {
+            name: _grasp_classifier(classifier_or_name, seed)
+            for name, classifier_or_name in classifiers.items()
+        }
     else:
         named = {}
-        for given in classifiers:
-            classifier = _grasp_classifier(given, seed)
-            name = given if isinstance(given, str) else classifier_name(classifier)
+        for classifier_or_name in classifiers:
+            classifier = _grasp_classifier(classifier_or_name, seed)
+            name = classifier_or_name if isinstance(classifier_or_name, str) else classifier_name(classifier)
             if name in named:
                 raise UserError(f"two classifiers are called {name!r}", hint="give a dict of names")
             named[name] = classifier
@@ -250,7 +267,7 @@ def _grasp_classifier(given: Any, seed: int) -> GraspClassifier:
 
 def _late(plan: Plan) -> tuple[str, ...]:
     """Return a note on each record that begins with the contact: there the probe would see touch."""
-    records = [*(f.test for f in plan.folds), *(record for part in plan.training for record in part)]
+    records = [*(f.test for f in plan.folds), *(record for training in plan.training for record in training)]
     names = dict.fromkeys(log_name(record) for record in records if not has_before(record))
     return tuple(f"{name}: no three readings before contact, so there was no leak probe" for name in names)
 
@@ -291,8 +308,10 @@ def _taught_together(classifier: GraspClassifier, fold: Fold, training: Sequence
     """Return whether the training grasps of all conditions serve one of them."""
     if classifier.joins_touches:
         return True
-    far = [grasp_labels(part)[np.abs(object_difference(part)) >= LEAST_DIFFERENCE] for part in training]
-    return not fold.apart and set(fold.candidates) <= set(np.concatenate(far))
+    labels_far = [
+        grasp_labels(record)[np.abs(object_difference(record)) >= LEAST_DIFFERENCE] for record in training
+    ]
+    return not fold.apart and set(fold.candidates) <= set(np.concatenate(labels_far))
 
 
 def _run(job: _Job) -> list[_Result]:
@@ -344,7 +363,7 @@ def _rows(
     test: Grasps, units: np.ndarray[Any, Any], p: Floats, unknown: Floats, candidates: tuple[str, ...]
 ) -> list[Row]:
     materials = [str(m) for m in test["material"].values]
-    known = np.array([m in candidates for m in materials])
+    is_candidate = np.array([m in candidates for m in materials])
     true = np.array([candidates.index(m) if m in candidates else 0 for m in materials])
     loss, squared = s.log_loss(p, true), s.brier(p, true)
     best = p.argmax(axis=1)
@@ -353,11 +372,11 @@ def _rows(
             "grasp_id": str(units[i]),
             "material": materials[i],
             "predicted": candidates[best[i]],
-            "known": bool(known[i]),
-            "correct": bool(known[i] and best[i] == true[i]),
+            "known": bool(is_candidate[i]),
+            "correct": bool(is_candidate[i] and best[i] == true[i]),
             "confidence": float(p[i, best[i]]),
-            "log_loss": float(loss[i]) if known[i] else None,
-            "brier": float(squared[i]) if known[i] else None,
+            "log_loss": float(loss[i]) if is_candidate[i] else None,
+            "brier": float(squared[i]) if is_candidate[i] else None,
             "p_unknown": float(unknown[i]) if np.isfinite(unknown[i]) else None,
             "candidates": len(candidates),
             **{f"p_{name}": float(p[i, k]) for k, name in enumerate(candidates)},
@@ -388,7 +407,7 @@ def _leaks(probes: Sequence[_Result]) -> list[Row]:
                 "accuracy": accuracy,
                 "chance": by_chance,
                 "p_value": p,
-                "leak": bool(p < _LEAK_LEVEL / len(keys)),
+                "leak": bool(p < PROBE.leak_level / len(keys)),
             }
         )
     return table

@@ -89,8 +89,8 @@ def clopper_pearson(k: float, n: int, *, level: float = 0.95) -> tuple[float, fl
 def log_loss(p: ArrayLike, true: ArrayLike) -> Floats:
     """Return -ln p of the true class, shape (n,); ``p`` (n, K), ``true`` (n,) column numbers."""
     rows = np.asarray(p, dtype=float)
-    at = rows[np.arange(rows.shape[0]), np.asarray(true, dtype=int)]
-    return np.asarray(-np.log(np.maximum(at, _LEAST_PROBABILITY)))
+    p_true = rows[np.arange(rows.shape[0]), np.asarray(true, dtype=int)]
+    return np.asarray(-np.log(np.maximum(p_true, _LEAST_PROBABILITY)))
 
 
 def brier(p: ArrayLike, true: ArrayLike) -> Floats:
@@ -212,17 +212,17 @@ def calibration_interval(
     bins = np.eye(_EDGES.size - 1)[_bin_of(c)]  # (n, 10), one in each row
     tests = np.bincount(of).astype(float)
     gaps = _by_grasp(bins * (c - right)[:, None], of)
-    found = gaps.sum(axis=0) / c.size
-    value = float(np.abs(found).sum())
+    mean_gaps = gaps.sum(axis=0) / c.size
+    value = float(np.abs(mean_gaps).sum())
     chance = _calibrated(c, of, bins, tests.size, seed)
     p = (1 + int(np.sum(chance >= value - 1e-12))) / (1 + chance.size)
     if tests.size < 2:
         return CalibrationError(value, np.nan, np.nan, float(chance.mean()), p)
     counts = grasp_counts(tests.size, draws=draws, seed=seed)
-    off = (counts @ gaps) / (counts @ tests)[:, None] - found
+    off = (counts @ gaps) / (counts @ tests)[:, None] - mean_gaps
     tail = (1 + level) / 2
     low = value - float(np.quantile(np.abs(off).sum(axis=1), tail))
-    high = value + float(np.quantile(-off @ np.sign(found), tail))
+    high = value + float(np.quantile(-off @ np.sign(mean_gaps), tail))
     return CalibrationError(value, max(0.0, low), min(1.0, max(high, value)), float(chance.mean()), p)
 
 

@@ -76,8 +76,8 @@ def plan_folds(
         plan = _held_out(records, split, seed)
     else:
         raise UserError(f"split {split!r} is unknown", hint="use 'shipped', 'random', 'session' or 'block'")
-    given = records if test is None else []  # of test files no copy is let in
-    copies = [Caution("leak", name, words) for name, words in _copies(given).items()]
+    to_compare = records if test is None else []  # of test files no copy is let in
+    copies = [Caution("leak", name, words) for name, words in _copies(to_compare).items()]
     notes = (*plan.notes, *_strangers(plan.folds))
     return replace(plan, notes=notes, cautions=(*plan.cautions, *copies))
 
@@ -89,7 +89,7 @@ def scored_apart(grasps: Grasps) -> bool:
 
 
 def _shipped(records: Sequence[Grasps]) -> Plan:
-    trains = [part for part in (_marked(g, "train") for g in records) if part is not None]
+    trains = [marked for marked in (_marked(g, "train") for g in records) if marked is not None]
     folds, notes = [], []
     for grasps in records:
         name, test = log_name(grasps), _marked(grasps, "test")
@@ -100,11 +100,11 @@ def _shipped(records: Sequence[Grasps]) -> Plan:
             rows_train, rows_test = shipped(grasps)
             like, test = pick(grasps, rows_train), pick(grasps, rows_test)
         else:
-            found = _alike(test, trains)
-            if found is None:
+            alike = _alike(test, trains)
+            if alike is None:
                 notes.append(f"{name}: no training grasps, nor a condition at its temperatures: left out")
                 continue
-            like = found
+            like = alike
             notes.append(f"{name}: no training grasps of its own, those of {log_name(like)} are used")
         if len(set(grasp_labels(like))) < 2:
             notes.append(f"{name}: its training grasps are of one material: left out")
@@ -127,8 +127,8 @@ def _random(records: Sequence[Grasps], repeats: int, train_per_class: int, seed:
     for number, whole in enumerate(records):
         name = log_name(whole)
         few = _too_few(whole, train_per_class)
-        kept = ~np.isin(grasp_labels(whole), list(few))
-        if len(set(grasp_labels(whole)[kept])) < 2:
+        enough_grasps = ~np.isin(grasp_labels(whole), list(few))
+        if len(set(grasp_labels(whole)[enough_grasps])) < 2:
             enough = (
                 "grasps of one material"
                 if not few
@@ -140,7 +140,7 @@ def _random(records: Sequence[Grasps], repeats: int, train_per_class: int, seed:
             Caution("excluded_material", name, words, brief=f"no {material}")
             for material, words in few.items()
         ]
-        grasps = pick(whole, kept) if few else whole
+        grasps = pick(whole, enough_grasps) if few else whole
         try:
             splits = list(
                 by_grasp(grasps, train_per_class=train_per_class, repeats=repeats, seed=seed + 7919 * number)
@@ -149,8 +149,8 @@ def _random(records: Sequence[Grasps], repeats: int, train_per_class: int, seed:
             notes.append(f"{name}: {error.problem}: left out")
             continue
         folds += [
-            Fold(name, repeat, pick(grasps, train), pick(grasps, rest), scored_apart(grasps))
-            for repeat, (train, rest) in enumerate(splits)
+            Fold(name, repeat, pick(grasps, train), pick(grasps, test_rows), scored_apart(grasps))
+            for repeat, (train, test_rows) in enumerate(splits)
         ]
     if not folds:
         raise UserError("no condition can be split", hint="; ".join(notes))
@@ -175,20 +175,20 @@ def _held_out(records: Sequence[Grasps], kind: str, seed: int) -> Plan:
     rounds = _rounds(records, keys, kind, seed)
     folds: list[Fold] = []
     training, notes = [], []
-    for repeat, held in enumerate(rounds):
-        parts = []
+    for repeat, held_out in enumerate(rounds):
+        training_parts = []
         for grasps, key in zip(records, keys):
-            name, out = log_name(grasps), np.isin(key, list(held))
+            name, out = log_name(grasps), np.isin(key, list(held_out))
             train = None if out.all() else pick(grasps, ~out)
             if train is not None:
-                parts.append(train)
+                training_parts.append(train)
             if not out.any():
                 continue
             if train is None or len(set(grasp_labels(train))) < 2:
-                notes.append(f"{name}: without {', '.join(sorted(held))} too little is left to train on")
+                notes.append(f"{name}: without {', '.join(sorted(held_out))} too little is left to train on")
                 continue
             folds.append(Fold(name, repeat, train, pick(grasps, out), scored_apart(grasps)))
-        training.append(tuple(parts))
+        training.append(tuple(training_parts))
     if not folds:
         raise UserError(f"no condition can be split by {kind}", hint="; ".join(dict.fromkeys(notes)))
     return Plan(tuple(folds), tuple(training), tuple(dict.fromkeys(notes)))
@@ -197,15 +197,15 @@ def _held_out(records: Sequence[Grasps], kind: str, seed: int) -> Plan:
 def _groups(grasps: Grasps, kind: str) -> NDArray[np.str_]:
     """Return the session, or the material and block, of each grasp."""
     if kind == "session":
-        own = (
+        named = (
             grasps["session"].values.astype(str)
             if "session" in grasps
             else np.full(grasps.sizes["grasp"], "")
         )
-        return np.where(own == "", log_name(grasps), own)
+        return np.where(named == "", log_name(grasps), named)
     labels = grasp_labels(grasps)
-    own = grasps["block"].values.astype(str) if "block" in grasps else labels
-    return np.char.add(np.char.add(labels, " "), np.where(own == "", labels, own))
+    named = grasps["block"].values.astype(str) if "block" in grasps else labels
+    return np.char.add(np.char.add(labels, " "), np.where(named == "", labels, named))
 
 
 def _rounds(
@@ -247,7 +247,7 @@ def _from_files(records: Sequence[Grasps], tests: Sequence[Grasps]) -> Plan:
 def _training_grasps(records: Sequence[Grasps]) -> list[Grasps]:
     """Return of each record what is marked ``train``, or all of one that marks none."""
     marked = [_marked(g, "train") for g in records]
-    return [g if part is None else part for g, part in zip(records, marked)]
+    return [g if marked_part is None else marked_part for g, marked_part in zip(records, marked)]
 
 
 def _like_it(test: Grasps, trains: Sequence[Grasps]) -> Grasps:
@@ -287,31 +287,31 @@ def _refuse_repeated(records: Sequence[Grasps]) -> None:
             raise UserError(
                 f"two conditions are called {name!r}", hint="give each file once, under its own name"
             )
-    seen: dict[tuple[str, bytes], str] = {}
+    record_of: dict[tuple[str, bytes], str] = {}
     for grasps in records:
         for grasp_id, trace in zip(grasps["grasp"].values, grasps["t_surface"].values):
             key = (str(grasp_id), trace.tobytes())
-            if key in seen:
+            if key in record_of:
                 raise UserError(
-                    f"grasp {grasp_id!s} is in {seen[key]} too",
+                    f"grasp {grasp_id!s} is in {record_of[key]} too",
                     file=log_name(grasps),
                     hint="leave one out",
                 )
-            seen[key] = log_name(grasps)
+            record_of[key] = log_name(grasps)
 
 
 def _copies(records: Sequence[Grasps]) -> dict[str, str]:
     """Return by record how many of its grasps have the samples of others, where any has, in words."""
-    seen: dict[bytes, str] = {}
+    first_of: dict[bytes, str] = {}
     copies: dict[str, list[str]] = {}
     for grasps in records:
         for grasp_id, trace in zip(grasps["grasp"].values, grasps["t_surface"].values):
             key, name = trace.tobytes(), log_name(grasps)
             if np.unique(trace[np.isfinite(trace)]).size < _TELLING_VALUES:
                 continue  # a coarse sensor that reads the same twice
-            if key in seen:
-                copies.setdefault(name, []).append(f"{grasp_id} of {seen[key]}")
-            seen.setdefault(key, f"{name}/{grasp_id}")
+            if key in first_of:
+                copies.setdefault(name, []).append(f"{grasp_id} of {first_of[key]}")
+            first_of.setdefault(key, f"{name}/{grasp_id}")
     return {
         name: f"{len(pairs)} grasp(s) have the samples of another, {pairs[0]} first: a copy in training and "
         "in test is a leak"

@@ -291,11 +291,13 @@ def layer_on(effusivity: float, capacity: float, base: Impedance) -> Impedance:
     _positive(effusivity=effusivity, capacity=capacity)
 
     def impedance(s: Complex) -> Complex:
-        own = 1 / (effusivity * np.sqrt(s))
+        surface = 1 / (effusivity * np.sqrt(s))
         fade = np.exp(-2 * np.sqrt(s) * capacity / effusivity)
         below = base(s)
         return np.asarray(
-            own * (below * (1 + fade) + own * (1 - fade)) / (own * (1 + fade) + below * (1 - fade))
+            surface
+            * (below * (1 + fade) + surface * (1 - fade))
+            / (surface * (1 + fade) + below * (1 - fade))
         )
 
     return impedance

@@ -109,8 +109,8 @@ def stack_modes(stack: Stack) -> StackModes:
     matrix, root, half = _assembled(stack)
     lam, vectors = np.linalg.eigh(matrix)
     shape = vectors / root[:, None]
-    left, right = half[_N_OUTER - 1], half[_N_OUTER]
-    sensor = (left * shape[_N_OUTER - 1] + right * shape[_N_OUTER]) / (left + right)
+    outer_conductance, right = half[_N_OUTER - 1], half[_N_OUTER]
+    sensor = (outer_conductance * shape[_N_OUTER - 1] + right * shape[_N_OUTER]) / (outer_conductance + right)
     # the time stepping needs the sensor per unit of modal rise at the face; a mode that leaves the face still
     # is never excited
     still = np.abs(shape[0]) <= 1e-9 * np.abs(shape[0]).max()
@@ -145,9 +145,9 @@ def gripper_modes(stack: Stack) -> Any:
     """Return the gripper as the time stepping takes it."""
     from thermogrip.sysid.contact.time_stepping import grippers
 
-    found = stack_modes(stack)
+    modes = stack_modes(stack)
     return grippers(
-        found.lam[None], found.face[None], found.sensor[None], contact_numbers(stack, found)[None]
+        modes.lam[None], modes.face[None], modes.sensor[None], contact_numbers(stack, modes)[None]
     )
 
 
@@ -162,8 +162,8 @@ def step_response(
     """
     from thermogrip.sysid.contact.time_stepping import N_STEPPED, VALUE, contacts
 
-    given = (effusivity, capacity, h_c, stack.build_up if build_up is None else build_up)
-    e, c, h, tau = np.broadcast_arrays(*(np.atleast_1d(np.asarray(v, dtype=float)) for v in given))
+    arguments = (effusivity, capacity, h_c, stack.build_up if build_up is None else build_up)
+    e, c, h, tau = np.broadcast_arrays(*(np.atleast_1d(np.asarray(v, dtype=float)) for v in arguments))
     for name, value in (("effusivity", e), ("capacity", c), ("h_c", h)):
         if not (np.all(np.isfinite(value)) and np.all(value > 0)):
             raise ValueError(f"{name} must be positive and finite, got {value[~(value > 0)][:3]}")
@@ -188,8 +188,8 @@ def far_response(
 
 def contact_numbers(stack: Stack, modes: StackModes) -> Array:
     """Return resistance, lag, first, creep, settle, far loss and leak, which are beside the modes, (7,)."""
-    own = (stack.lag, stack.first, stack.creep, stack.settle, stack.g_far, stack.leak)
-    return np.array([modes.resistance, *own])
+    numbers = (stack.lag, stack.first, stack.creep, stack.settle, stack.g_far, stack.leak)
+    return np.array([modes.resistance, *numbers])
 
 
 #: A foam finger with a graphite sheet on a copper-filled silicone pipe, of the size of the example rig's.
@@ -276,7 +276,7 @@ class Grip:
             e = e * np.exp(np.array([self.effusivity_sd_ln.get(row.name, 0.0) for row in rows]) * normal[3])
             capacity = np.array([row.rho * row.c_p * self.length for row in rows])
         else:
-            e, h_c, capacity = (np.asarray(part, dtype=float) for part in blocks)
+            e, h_c, capacity = (np.asarray(column, dtype=float) for column in blocks)
         onset = self.onset + self.onset_sd * normal[1]
         away = t_object + self.bias + self.t_object_sd * normal[2]
         true = away + self.transit_loss * (ambient - away)
@@ -334,14 +334,14 @@ def simulate_grasps(
     (6, True, True)
     """
     rng = np.random.default_rng(seed)
-    each = [material for material in materials for _ in range(n)]
-    touches = grip.draw_many(each, t_object, rng, ambient=ambient, blocks=blocks)
+    material_of = [material for material in materials for _ in range(n)]
+    touches = grip.draw_many(material_of, t_object, rng, ambient=ambient, blocks=blocks)
     time, reading = record_touches(touches, rng, t_gripper=t_gripper, ambient=ambient, **readings)
     return make_grasps(
-        time, reading, [f"s{i:04d}" for i in range(len(each))], name=name, material=each,
-        t_object=np.full(len(each), t_object), t_gripper=np.full(len(each), t_gripper),
-        t_ambient=np.full(len(each), ambient),
-        split=["" if split is None else split(i % n) for i in range(len(each))],
+        time, reading, [f"s{i:04d}" for i in range(len(material_of))], name=name, material=material_of,
+        t_object=np.full(len(material_of), t_object), t_gripper=np.full(len(material_of), t_gripper),
+        t_ambient=np.full(len(material_of), ambient),
+        split=["" if split is None else split(i % n) for i in range(len(material_of))],
     )  # fmt: skip
 
 

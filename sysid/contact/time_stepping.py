@@ -122,14 +122,14 @@ def slab_modes(
     :class:`Gripper`, ``node`` and ``shares`` those of the quadrature."""
     start = _N_EXACT - 0.5
     for p in range(contact.shape[0]):
-        e, c, own = contact[p, 0], contact[p, 1], numbers[min(p, numbers.shape[0] - 1)]
-        unit, biot = (e / c) ** 2, own[5] * c / (e * e)
+        e, c, gripper_numbers = contact[p, 0], contact[p, 1], numbers[min(p, numbers.shape[0] - 1)]
+        unit, biot = (e / c) ** 2, gripper_numbers[5] * c / (e * e)
         top = np.sqrt(_FASTEST / unit) / np.pi
         # past it modes are too fast to count; a slab whose first dozen are has groups of a fixed span
         free = top > 3.0 * start
         top = top if free else 3.0 * start
         span, beyond = np.log(top / start), 2.0 / (c * np.pi**2 * unit * top)
-        series[p, 0] = own[0] + beyond
+        series[p, 0] = gripper_numbers[0] + beyond
         series[p, 1], series[p, 2] = (-beyond, 0.0) if free else (-2.0 * beyond, beyond)
         for j in range(N_MODE):
             y, share, along, by_span = N_MODE - 1.0 - j, 2.0, 0.0, 0.0
@@ -140,7 +140,7 @@ def slab_modes(
                     along, by_span = 0.5 * (1.0 + node[j]), 1.0 / span
             elif j < _N_GROUPED + 2:  # next Euler-Maclaurin term, f'(start)/24 as a difference of modes
                 share = 2.0 / 24.0 if j == _N_GROUPED else 2.0 - 2.0 / 24.0
-            beta, part, place, by_biot = np.pi * y, 1.0, 1.0, 0.0
+            beta, damping, place, by_biot = np.pi * y, 1.0, 1.0, 0.0
             square = beta * beta
             if biot > 0.0:
                 if j == N_MODE - 1:
@@ -148,25 +148,29 @@ def slab_modes(
                     beta = np.sqrt(biot / (1.0 + 0.5 * biot))
                 for _ in range(5):
                     square = beta * beta + biot * biot
-                    part = (np.pi * y + np.arctan(biot / beta) - beta) * square / (square + biot)
-                    beta += part
-                    if part < 1e-9 * beta:  # digits double with each step
+                    damping = (np.pi * y + np.arctan(biot / beta) - beta) * square / (square + biot)
+                    beta += damping
+                    if damping < 1e-9 * beta:  # digits double with each step
                         break
                 square = beta * beta + biot * biot
-                part, by_biot = square / (square + biot), biot / (square + biot)
-                place = np.pi * y / beta * part  # d ln beta / d ln y
+                damping, by_biot = square / (square + biot), biot / (square + biot)
+                place = np.pi * y / beta * damping  # d ln beta / d ln y
             elif j == N_MODE - 1:
-                part = 0.5  # a mode that nothing damps counts half
+                damping = 0.5  # a mode that nothing damps counts half
             rate = beta * beta * unit
-            modes[p, 0, j], modes[p, 1, j], modes[p, 3, j] = rate, share * part / c, -np.expm1(-rate * step)
+            modes[p, 0, j], modes[p, 1, j], modes[p, 3, j] = (
+                rate,
+                share * damping / c,
+                -np.expm1(-rate * step),
+            )
             if moves.shape[0] > 0:
                 by_e, by_c = -along * place - 2.0 * by_biot, along * place + by_biot
                 moves[p, 0, j], moves[p, 2, j] = 2.0 * by_e + 2.0, 2.0 * by_c - 2.0
                 moves[p, 1, j], moves[p, 3, j] = -along - by_span, along + by_span - 1.0
                 if biot > 0.0:
-                    lost, kept = biot * biot / square, beta * beta / square
-                    moves[p, 1, j] += (2.0 * (kept * by_e - 2.0 * lost) + 2.0) * by_biot
-                    moves[p, 3, j] += (2.0 * (kept * by_c + lost) - 1.0) * by_biot
+                    lost, kept_share = biot * biot / square, beta * beta / square
+                    moves[p, 1, j] += (2.0 * (kept_share * by_e - 2.0 * lost) + 2.0) * by_biot
+                    moves[p, 3, j] += (2.0 * (kept_share * by_c + lost) - 1.0) * by_biot
 
 
 class Gripper(NamedTuple):
@@ -179,10 +183,10 @@ class Gripper(NamedTuple):
 
 def grippers(lam: Array, face: Array, sensor: Array, numbers: Array) -> Gripper:
     """Return grippers of their modes (k, n), from slow to fast, and ``numbers`` (k, 7)."""
-    own = np.stack([lam, face, sensor], axis=1)
+    gripper_rows = np.stack([lam, face, sensor], axis=1)
     lag = np.repeat(1.0 / numbers[:, 1, None, None], 3, axis=1)
     lag[:, 2] = 0.0
-    return Gripper(np.concatenate([own, lag], axis=2), numbers)
+    return Gripper(np.concatenate([gripper_rows, lag], axis=2), numbers)
 
 
 def conductance(t: Array, h: Array, build_up: Array, numbers: Array) -> Array:
@@ -206,10 +210,10 @@ def contacts(
     ``nodes`` are dt, repeat and t of :class:`~thermogrip.sysid.contact.simulation.TimeNodes`.  Of the curves
     (n, 5), the value and its derivatives by ln h, ln tau_b, ln e, ln C, only the ``wanted`` are filled.
     """
-    (dt, repeat, t), n, own = nodes, len(contact), gripper.modes
-    modes, series = np.zeros((n, 4, N_MODE + own.shape[2])), np.empty((n, 3))
+    (dt, repeat, t), n, gripper_rows = nodes, len(contact), gripper.modes
+    modes, series = np.zeros((n, 4, N_MODE + gripper_rows.shape[2])), np.empty((n, 3))
     moves = np.empty((n if wanted[:, BY_E:].any() else 0, 4, N_MODE))
-    modes[:, :3, N_MODE:], modes[:, 3, N_MODE:] = own, -np.expm1(-own[:, 0] * dt[0])
+    modes[:, :3, N_MODE:], modes[:, 3, N_MODE:] = gripper_rows, -np.expm1(-gripper_rows[:, 0] * dt[0])
     slab_modes(contact, gripper.numbers, dt[0], _NODE, _SHARE, modes, moves, series)
     rise, slope, flux = (
         np.empty((n, N_STEPPED, t.size)),
@@ -262,34 +266,36 @@ def step_contacts(
                 low += 1
             for j in range(last + 1):
                 y, phi = rate[j] * step, m[j] / rate[j]
-                far, small = (step - phi) / y, y < _SMALL
-                b[j] = (step * (0.5 - y * (1.0 / 6.0 - y / 24.0)) if small else far) * weight[j]
-                a[j] = (step * (0.5 - y * (1.0 / 3.0 - 0.125 * y)) if small else phi - far) * weight[j]
+                general_form, small = (step - phi) / y, y < _SMALL
+                b[j] = (step * (0.5 - y * (1.0 / 6.0 - y / 24.0)) if small else general_form) * weight[j]
+                a[j] = (step * (0.5 - y * (1.0 / 3.0 - 0.125 * y)) if small else phi - general_form) * weight[
+                    j
+                ]
                 keep[j] = 1.0 - m[j]
                 gain[j] = keep[j] * b[j] + a[j]
             z[0], z[1], z[2], late[0], late[1], late[2] = series[p, 0], 0.0, 0.0, 0.0, 0.0, 0.0
-            seen = seen_late = 0.0
+            sensor_sum = seen_late = 0.0
             for j in range(last):
                 z[0] += b[j]
-                seen += b[j] * sensor[j]
+                sensor_sum += b[j] * sensor[j]
                 if j < low or j >= high:
                     late[0] += a[j]
                     seen_late += a[j] * sensor[j]
             for c in range(3, 5):
                 if wanted[p, c]:
-                    z[c], late[c], at = series[p, c - 2], 0.0, 3 * (c - 3)
+                    z[c], late[c], row = series[p, c - 2], 0.0, 3 * (c - 3)
                     for j in range(N_MODE):
                         by_rate, by_weight = moves[p, 2 * c - 6, j], moves[p, 2 * c - 5, j]
                         y = rate[j] * step
                         d_phi = step * keep[j] - m[j] / rate[j]
-                        far, small = -d_phi / y - b[j] / weight[j], y < _SMALL
-                        d_a = -step * y * (1.0 / 3.0 - 0.25 * y) if small else d_phi - far
-                        d_b = -step * y * (1.0 / 6.0 - y / 12.0) if small else far
+                        general_form, small = -d_phi / y - b[j] / weight[j], y < _SMALL
+                        d_a = -step * y * (1.0 / 3.0 - 0.25 * y) if small else d_phi - general_form
+                        d_b = -step * y * (1.0 / 6.0 - y / 12.0) if small else general_form
                         d_a = weight[j] * d_a * by_rate + a[j] * by_weight
                         d_b = weight[j] * d_b * by_rate + b[j] * by_weight
                         d_keep = -y * keep[j] * by_rate
-                        moved[at, j], moved[at + 1, j] = d_keep, d_keep * b[j] + keep[j] * d_b + d_a
-                        moved[at + 2, j] = d_b
+                        moved[row, j], moved[row + 1, j] = d_keep, d_keep * b[j] + keep[j] * d_b + d_a
+                        moved[row + 2, j] = d_b
                         z[c] += d_b
                         late[c] += d_a if j < low else 0.0
             for c in range(5):  # the state is less b q
@@ -304,13 +310,13 @@ def step_contacts(
                     if wanted[p, c]:
                         qc, total, at_sensor = q[c], 0.0, 0.0
                         if c > 2:
-                            at, q0 = 3 * (c - 3), q[0]
+                            row, q0 = 3 * (c - 3), q[0]
                             for j in range(low, N_MODE):
                                 v = (
                                     keep[j] * x[c, j]
                                     + gain[j] * qc
-                                    + moved[at, j] * x[0, j]
-                                    + moved[at + 1, j] * q0
+                                    + moved[row, j] * x[0, j]
+                                    + moved[row + 1, j] * q0
                                 )
                                 x[c, j] = v
                                 total += v
@@ -337,7 +343,7 @@ def step_contacts(
                             new = (
                                 driven - h * (w[c] + late[0] * q[c] + late[c] * q0 + z[c] * h * gap)
                             ) * invert
-                        v = s[c] + seen * new + seen_late * q[c]
+                        v = s[c] + sensor_sum * new + seen_late * q[c]
                         read[c] = keep[last] * read[c] + a[last] * node[c] + b[last] * v
                         q[c], node[c] = new, v
                         rise[p, c, i], slope[p, c, i] = read[c], (v - read[c]) * rate[last]

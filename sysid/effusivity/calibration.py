@@ -107,9 +107,36 @@ _WIDE: dict[str, tuple[float, float]] = {
 }
 FIRST_SPREAD = {"ln_h": 0.15, "ln_build_up": 0.1, "onset": 0.1, "t_object": 0.5, "ln_effusivity": 0.1}
 _LN_H = (float(np.log(1500.0)), 1.0)
-_GUESSES = 2.0  # grasps that the first guess of a spread counts for
-_EARLIER = 10.0  # grasps that an earlier calibration's spread counts for at most
-_EXACT = 1e-3  # of a wide prior's sd: numbers that count as exact keep this much, so that matrices invert
+
+
+@dataclass(frozen=True)
+class CalibrationSettings:
+    """How the search goes, and what little is believed before it."""
+
+    guesses: float = 2.0  # grasps that the first guess of a spread counts for
+    # that an earlier calibration's spread counts for at most: another day is alike, not the same
+    earlier_grasps: float = 10.0
+    # of a wide prior's sd: numbers that count as exact keep this much, so that matrices invert
+    exact: float = 1e-3
+    # of theta, mostly logarithms: from a cold start the first steps would leave the range of any gripper
+    longest_step: float = 1.5
+    # of fit and noise; a fourth moves no number of the bundled gripper by a hundredth of its sd
+    rounds: int = 3
+    steps: int = 40  # of one fit, at most
+    settled: float = 0.05  # change of -2 ln evidence
+    roughly_settled: float = 1.0  # before the noise is found anew, which makes more difference
+    least_ln_h_spread: float = 0.2  # from block to block: a few blocks cannot show less
+    slow_ln_build_up: float = 2.3  # ln s: a contact that builds up for as long as it lasts
+    least_white_K: float = 0.003  # a search that begins with less ends where rounding stops it
+    always_sd_K: float = 0.5  # of a discrepancy common to all grasps
+    share_sd: float = 0.02  # of a discrepancy by the difference between object and skin
+    onset_sd_s: float = 0.2  # of contact with each block about the mean
+    noise_steps: int = 300  # at most
+    noise_slope: float = 0.01  # nat per noise step that end the search
+    noise_slope_roughly: float = 0.3  # where it is found once more
+
+
+SETTINGS = CalibrationSettings()
 
 
 class Anchor(NamedTuple):
@@ -130,7 +157,7 @@ class ThetaPrior:
     mean: Array  # (n_theta,)
     precision: Array  # (n_theta, n_theta)
     spread: Mapping[str, float]  # from grasp to grasp
-    guesses: float = _GUESSES  # number of grasps that the spread counts for
+    guesses: float = SETTINGS.guesses  # number of grasps that the spread counts for
 
     def penalty(self, theta: Array) -> float:
         """Return the squared distance of theta from the mean, in standard deviations."""
@@ -168,18 +195,20 @@ def prior_of_gripper(gripper: GripperModel, labels: Sequence[str], known: Sequen
     wide = wide_prior(known)
     names = (*SHARED_NAMES, *block_names(labels))
     mean, sd = gripper_theta(gripper, labels, wide.mean), np.diag(wide.precision) ** -0.5
-    covariance = np.diag((_EXACT * sd) ** 2)
+    covariance = np.diag((SETTINGS.exact * sd) ** 2)
     known_to = gripper.uncertainty
     for i, name in enumerate(names):
         label = name.partition(" ")[2]
         if label and label not in gripper.blocks:
             covariance[i, i] = sd[i] ** 2
     if known_to is not None:
-        at = [i for i, name in enumerate(names) if name in known_to.names]
-        theirs = [known_to.names.index(names[i]) for i in at]
-        covariance[np.ix_(at, at)] += known_to.covariance[np.ix_(theirs, theirs)]
+        ours = [i for i, name in enumerate(names) if name in known_to.names]
+        theirs = [known_to.names.index(names[i]) for i in ours]
+        covariance[np.ix_(ours, ours)] += known_to.covariance[np.ix_(theirs, theirs)]
     spread = {k: float(getattr(gripper.spreads, k)) for k in FIRST_SPREAD}
-    return ThetaPrior(mean, np.asarray(np.linalg.inv(covariance)), spread, min(_EARLIER, gripper.spreads.dof))
+    return ThetaPrior(
+        mean, np.asarray(np.linalg.inv(covariance)), spread, min(SETTINGS.earlier_grasps, gripper.spreads.dof)
+    )
 
 
 def gripper_theta(gripper: GripperModel, labels: Sequence[str], otherwise: Array) -> Array:
@@ -205,7 +234,6 @@ _COLUMN = {
     "t_object": T_OBJECT,
     "ln_effusivity": EFFUSIVITY,
 }
-_LONGEST = 1.5  # of a step of theta, mostly logarithms
 
 
 @dataclass(frozen=True)
@@ -223,11 +251,11 @@ class Problem:
 
     def beyond(self, theta: Array) -> Array | None:
         """Return the discrepancy of every grasp, (n, 2, n_bin), None where none is fitted."""
-        if (found := self.discrepancy(theta)) is None:
+        if (discrepancy := self.discrepancy(theta)) is None:
             return None
         weight = at_knots(self.data.t)
-        share = (weight * found.share[self.which][:, None, :]).sum(axis=2)
-        return np.stack([weight @ found.always, share], axis=1)
+        share = (weight * discrepancy.share[self.which][:, None, :]).sum(axis=2)
+        return np.stack([weight @ discrepancy.always, share], axis=1)
 
     def discrepancy(self, theta: Array) -> Discrepancy | None:
         """Return the discrepancy in theta, between the shared numbers and the blocks' own."""
@@ -286,8 +314,8 @@ class Problem:
         u[:, BUILD_UP], u[:, ONSET], u[:, LEVEL] = value["ln_build_up"], value["onset"], self.data.level
         nominal = np.where(self.known, self.data.t_object + value["bias"], self.room)
         u[:, T_OBJECT] = nominal + value["transit_loss"] * self.room_difference()
-        if (found := self.discrepancy(theta)) is not None:
-            u[:, ONSET] += found.onset[self.which]
+        if (discrepancy := self.discrepancy(theta)) is not None:
+            u[:, ONSET] += discrepancy.onset[self.which]
         u[:, EFFUSIVITY] = self.ln_e(theta)[self.which]
         u[:, CAPACITY] = self.ln_capacity[self.which] + value["ln_depth"]
         return u
@@ -299,8 +327,8 @@ class Problem:
             s[:, column] = np.where(
                 self.rows(name), spread[name], UNKNOWN_OBJECT_SD if name == "t_object" else 0.0
             )
-        own = self.data.t_object_sd
-        s[:, T_OBJECT] = np.where(self.known & np.isfinite(own), own, s[:, T_OBJECT])
+        stated_sd = self.data.t_object_sd
+        s[:, T_OBJECT] = np.where(self.known & np.isfinite(stated_sd), stated_sd, s[:, T_OBJECT])
         s[:, LEVEL] = LEVEL_SD
         return s
 
@@ -341,9 +369,9 @@ def linearise(problem: Problem, theta: Array, w: Array, spread: Spread) -> Linea
         k[:, :, SHARED_NAMES.index(name)] = values
     n = len(problem.labels)
     for m in range(n):
-        own = problem.which == m
-        k[own, :, theta.size - 2 * n + m] = by_u[own, :, H]
-        k[own, :, theta.size - n + m] = by_u[own, :, EFFUSIVITY]
+        of_label = problem.which == m
+        k[of_label, :, theta.size - 2 * n + m] = by_u[of_label, :, H]
+        k[of_label, :, theta.size - n + m] = by_u[of_label, :, EFFUSIVITY]
     if theta.size > len(SHARED_NAMES) + 2 * n:
         assert beyond is not None
         weight = at_knots(data.t) * (data.count > 0)[:, :, None]
@@ -351,9 +379,9 @@ def linearise(problem: Problem, theta: Array, w: Array, spread: Spread) -> Linea
         k[:, :, first : first + KNOTS.size] = weight
         difference = (u[:, T_OBJECT] - u[:, LEVEL])[:, None, None]
         for m in range(n):
-            own, first = problem.which == m, first + KNOTS.size
-            k[own, :, first : first + KNOTS.size] = (weight * difference)[own]
-            k[own, :, theta.size - 3 * n + m] = by_u[own, :, ONSET]
+            of_label, first = problem.which == m, first + KNOTS.size
+            k[of_label, :, first : first + KNOTS.size] = (weight * difference)[of_label]
+            k[of_label, :, theta.size - 3 * n + m] = by_u[of_label, :, ONSET]
     return Linearised(y, by_u * scale[:, None, :], k)
 
 
@@ -392,7 +420,9 @@ def joint_step(
         move = np.linalg.solve(precision + damping * np.diag(np.diag(precision)), grad)
         move_w = np.einsum("nab,nb->na", inverse, grad_w - border @ move)
         # from a cold start the first steps would leave the range of any gripper
-        shorten = min(1.0, _LONGEST / float(np.abs(move).max()), 10 / float(np.abs(move_w).max()))
+        shorten = min(
+            1.0, SETTINGS.longest_step / float(np.abs(move).max()), 10 / float(np.abs(move_w).max())
+        )
         move, move_w = shorten * move, shorten * move_w
         if _objective(problem, theta + move, w + move_w, spread, whitener) < before + 1e-9:
             new_theta, new_w, damping = theta + move, w + move_w, max(damping * 0.1, 1e-9)
@@ -436,20 +466,10 @@ def _objective(problem: Problem, theta: Array, w: Array, spread: Spread, whitene
     return float((residual**2).sum() + (w**2).sum()) + problem.prior.penalty(theta)
 
 
-_ROUNDS = 3  # of fit and noise
-_STEPS = 40
-_SETTLED = 0.05  # change of -2 ln evidence
-_ROUGHLY = 1.0  # before the noise is found anew
-_LEAST_LN_H_SPREAD = 0.2
-_SLOW = 2.3  # ln s: a contact that builds up for as long as it lasts
-_WHITE = 0.003  # K: a search that begins with less ends where rounding stops it
 _SMOOTH = Noise(slow=0.01, correlation_time=1.2, misfit=0.005, growth=1.5, smooth=True)
-_ALWAYS_SD, _SHARE_SD, _ONSET_SD = 0.5, 0.02, 0.2  # of a discrepancy: K, share of the difference, s
 # ln white, ln slow, ln correlation time, ln misfit, growth: how well 200 grasps know each; where they may be
 _NOISE_STEPS = np.array([0.01, 0.1, 0.3, 0.1, 0.2])
 _NOISE_RANGE = np.array([(-8.0, 0.0), (-8.0, 0.0), (-1.0, 4.0), (-9.0, -3.0), (0.0, 2.0)])
-_NOISE_SEARCH, _NOISE_SLOPE = 300, 0.01  # steps at most, and nat per such step that end it
-_NOISE_ROUGHLY = 0.3  # where it is found once more
 
 
 def calibrate_gripper(
@@ -506,9 +526,9 @@ def calibrate_gripper(
     names = (*(() if prior is None else prior.trained_on), *(log_name(g) for g in grasps))
     length = block_length or (0.02 if prior is None else prior.block_length)
     report = progress or (lambda fraction, what: None)
-    found = _calibrated(data, materials or {}, start, prior, length, names, report)
+    gripper = _calibrated(data, materials or {}, start, prior, length, names, report)
     report(1.0, "calibrated")
-    return found
+    return gripper
 
 
 def _calibrated(
@@ -527,28 +547,28 @@ def _calibrated(
         spread = {k: float(getattr(earlier.spreads, k)) for k in spread}
         noise = earlier.noise
     w = _begin(problem, theta, spread)
-    rounds = _ROUNDS if earlier is None else 1
+    rounds = SETTINGS.rounds if earlier is None else 1
     for i in range(rounds):
 
         def report_round(fraction: float, what: str, i: int = i) -> None:
             report((i + fraction) / rounds, what)
 
         # the noise found after a round makes more difference than the end of its search
-        settled = _SETTLED if i == rounds - 1 else _ROUGHLY
+        settled = SETTINGS.settled if i == rounds - 1 else SETTINGS.roughly_settled
         last, w, spread = _fit(problem, theta, w, spread, noise, report_round, settled=settled)
         theta = last.theta
         if i < rounds - 1:
-            slope = _NOISE_SLOPE if i == rounds - 2 else _NOISE_ROUGHLY
+            slope = SETTINGS.noise_slope if i == rounds - 2 else SETTINGS.noise_slope_roughly
             noise = _fit_noise(problem, linearise(problem, theta, w, spread), w, noise, slope)
     if rounds > 1:
         problem, last, w, spread, noise = _discrepant(problem, last, w, spread, noise, report)
-    found = _gripper_model(problem, last, spread, noise, length, names, prior)
+    gripper = _gripper_model(problem, last, spread, noise, length, names, prior)
     if data.second is None:
-        return found
+        return gripper
     # unknown object temperatures are those that the first sensor found for the blocks that they are of
-    known = material_hypotheses(found, found.materials)
-    own = Hypotheses(*(h[problem.which] for h in known))
-    mode = fit_pairs(found, replace(data, second=None), np.arange(problem.which.size), own)
+    by_block = material_hypotheses(gripper, gripper.materials)
+    true_hypotheses = Hypotheses(*(h[problem.which] for h in by_block))
+    mode = fit_pairs(gripper, replace(data, second=None), np.arange(problem.which.size), true_hypotheses)
     t_object = np.where(problem.known, data.t_object, mode.u[:, T_OBJECT])
     sd = np.where(problem.known, data.t_object_sd, np.sqrt(mode.covariance[:, T_OBJECT, T_OBJECT]))
     beside = _calibrated(
@@ -556,7 +576,7 @@ def _calibrated(
         None if start is None else start.second, None if prior is None else prior.second, length, names,
         report,
     )  # fmt: skip
-    return replace(found, second=beside)
+    return replace(gripper, second=beside)
 
 
 _Fitted = tuple[Problem, Step, Array, Spread, Noise]
@@ -576,10 +596,10 @@ def _discrepant(
     if _search(problem, theta, w, spread, (noise, begin), (3, 3), least, progress) is None:
         return bare
     theta = problem.prior.mean.copy()
-    theta[SHARED_NAMES.index("ln_build_up")] = _SLOW
-    begin = replace(_SMOOTH, white=max(noise.white, _WHITE))
+    theta[SHARED_NAMES.index("ln_build_up")] = SETTINGS.slow_ln_build_up
+    begin = replace(_SMOOTH, white=max(noise.white, SETTINGS.least_white_K))
     start = theta, np.zeros(w.shape), dict(problem.prior.spread), (begin, begin)
-    return _search(problem, *start, (_STEPS, _STEPS, _STEPS), least, progress) or bare
+    return _search(problem, *start, (SETTINGS.steps, SETTINGS.steps, SETTINGS.steps), least, progress) or bare
 
 
 def _search(
@@ -596,7 +616,7 @@ def _search(
         if i > 0 and _log_evidence(problem, last, noise) < least:
             return None
         if i < len(looks) - 1:
-            slope = _NOISE_ROUGHLY if steps < _STEPS else _NOISE_SLOPE
+            slope = SETTINGS.noise_slope_roughly if steps < SETTINGS.steps else SETTINGS.noise_slope
             noise = _fit_noise(problem, linearise(problem, theta, w, spread), w, begin, slope)
     return problem, last, w, spread, noise
 
@@ -611,13 +631,13 @@ def _with_discrepancy(problem: Problem, theta: Array) -> tuple[Problem, Array]:
     """Return the problem and theta with a discrepancy of nothing, of which little is expected."""
     n, prior, first = len(problem.labels), problem.prior, len(SHARED_NAMES)
     x = np.log1p((KNOTS + 1.5) / 0.5)
-    near = np.exp(-0.5 * ((x[:, None] - x) / 0.4) ** 2) + 1e-4 * np.eye(KNOTS.size)
+    correlation = np.exp(-0.5 * ((x[:, None] - x) / 0.4) ** 2) + 1e-4 * np.eye(KNOTS.size)
     alike = 0.7 + 0.3 * np.eye(n)
     precision = block_diag(
         prior.precision[:first, :first],
-        np.linalg.inv(near) / _ALWAYS_SD**2,
-        np.kron(np.linalg.inv(alike), np.linalg.inv(near)) / _SHARE_SD**2,
-        np.eye(n) / _ONSET_SD**2,
+        np.linalg.inv(correlation) / SETTINGS.always_sd_K**2,
+        np.kron(np.linalg.inv(alike), np.linalg.inv(correlation)) / SETTINGS.share_sd**2,
+        np.eye(n) / SETTINGS.onset_sd_s**2,
         prior.precision[first:, first:],
     )
     nothing = np.zeros((n + 1) * KNOTS.size + n)
@@ -641,14 +661,14 @@ def _problem(
     touched = sorted(set(data.material.tolist()))
     library = {label: row for label in touched if (row := _row(label, materials)) is not None}
     labels = touched if prior is None else sorted({*touched, *prior.materials})
-    known = dict(zip(labels, anchors(labels, library, prior)))
-    theta = wide_prior([*known.values()])
+    anchor_of = dict(zip(labels, anchors(labels, library, prior)))
+    theta = wide_prior([*anchor_of.values()])
     if prior is not None:
-        theta = prior_of_gripper(prior, labels, [*known.values()])
+        theta = prior_of_gripper(prior, labels, [*anchor_of.values()])
     return Problem(
-        data, nodes_for(data), tuple(labels), tuple(known.values()),
+        data, nodes_for(data), tuple(labels), tuple(anchor_of.values()),
         np.array([labels.index(m) for m in data.material.tolist()]), theta,
-        np.log([row.heat_capacity * block_length for row in known.values()]),
+        np.log([row.heat_capacity * block_length for row in anchor_of.values()]),
     )  # fmt: skip
 
 
@@ -666,17 +686,17 @@ def _begin(problem: Problem, theta: Array, spread: Spread) -> Array:
 def _labelled(grasps: Sequence[Grasps], materials: Mapping[str, Material], least: int) -> Touches:
     if not grasps:
         raise UserError("no training grasps", hint="give at least one record with materials")
-    parts = []
+    records = []
     for record in grasps:
-        part = touches(record)
-        if np.any(part.material == ""):
-            lost = str(part.grasp_id[part.material == ""][0])
+        binned = touches(record)
+        if np.any(binned.material == ""):
+            lost = str(binned.grasp_id[binned.material == ""][0])
             raise UserError(
                 f"grasp {lost!r} has no material", file=log_name(record), hint="label or remove it"
             )
-        _check_labels(part, materials, log_name(record))
-        parts.append(part)
-    data = stack_touches(parts)
+        _check_labels(binned, materials, log_name(record))
+        records.append(binned)
+    data = stack_touches(records)
     if np.unique(data.material).size < least:
         raise UserError(
             f"all training grasps are of {str(data.material[0])!r}",
@@ -695,13 +715,11 @@ def _labelled(grasps: Sequence[Grasps], materials: Mapping[str, Material], least
 def _check_labels(part: Touches, materials: Mapping[str, Material], file: str) -> None:
     """Raise UserError, with file and grasp, at a label that is hardly another word than the table's."""
     for label in dict.fromkeys(part.material.tolist()):
-        near = get_close_matches(label.lower(), load_materials(), 1, 0.8)
-        if near and _row(label, materials) is None:
+        similar = get_close_matches(label.lower(), load_materials(), 1, 0.8)
+        if similar and _row(label, materials) is None:
             first = str(part.grasp_id[part.material == label][0])
             problem = f"grasp {first!r} is of {label!r}, which the materials table has not"
-            hint = (
-                f"did you mean {near[0]}? (a material that the table lacks needs a name less like its names)"
-            )
+            hint = f"did you mean {similar[0]}? (another material needs a name less like those of the table)"
             raise UserError(problem, file=file, column="material", hint=hint)
 
 
@@ -715,13 +733,13 @@ def _row(label: str, materials: Mapping[str, Material]) -> Material | None:
 
 def _fit(
     problem: Problem, theta: Array, w: Array, spread: Spread, noise: Noise, progress: Progress,
-    steps: int = _STEPS, settled: float = _SETTLED,
+    steps: int = SETTINGS.steps, settled: float = SETTINGS.settled,
 ) -> tuple[Step, Array, Spread]:  # fmt: skip
     """Alternate Gauss-Newton and EM until the evidence settles."""
     whitener, log_det = whiten(problem.data, noise)
     damping, before = 1e-3, np.inf
     for i in range(steps):
-        progress(i / _STEPS, f"gripper from {problem.which.size} grasps")
+        progress(i / SETTINGS.steps, f"gripper from {problem.which.size} grasps")
         step = joint_step(problem, theta, w, spread, whitener, damping)
         theta, damping = step.theta, step.damping
         spread, w = renew_spread(problem, spread, step.w, step.variance)
@@ -733,14 +751,14 @@ def _fit(
 
 
 def _fit_noise(
-    problem: Problem, lin: Linearised, w: Array, noise: Noise, slope: float = _NOISE_SLOPE
+    problem: Problem, lin: Linearised, w: Array, noise: Noise, slope: float = SETTINGS.noise_slope
 ) -> Noise:
     """Return the noise that makes the linearised residuals likeliest, nuisances marginalised, within
     ``slope``."""
     data = problem.data
-    there = data.count > 0
-    j = lin.by_w * there[:, :, None]
-    residual = (data.y - lin.y) * there + np.einsum("nik,nk->ni", j, w)
+    has_samples = data.count > 0
+    j = lin.by_w * has_samples[:, :, None]
+    residual = (data.y - lin.y) * has_samples + np.einsum("nik,nk->ni", j, w)
     outer = j @ j.transpose(0, 2, 1)
 
     def unpack(q: Array) -> Noise:
@@ -762,7 +780,10 @@ def _fit_noise(
 
 
 def _least(
-    cost: Callable[[Array], tuple[float, Array]], first: Array, n_grasp: int, slope: float = _NOISE_SLOPE
+    cost: Callable[[Array], tuple[float, Array]],
+    first: Array,
+    n_grasp: int,
+    slope: float = SETTINGS.noise_slope,
 ) -> Array:
     """Return where the cost of a noise is least, (5,), within ``slope``; ``cost`` gives its slopes too."""
 
@@ -774,7 +795,7 @@ def _least(
     best = minimize(
         scaled, first / _NOISE_STEPS, jac=True, method="L-BFGS-B",
         bounds=_NOISE_RANGE / _NOISE_STEPS[:, None],
-        options={"maxiter": _NOISE_SEARCH, "ftol": 0.0, "gtol": slope},
+        options={"maxiter": SETTINGS.noise_steps, "ftol": 0.0, "gtol": slope},
     )  # fmt: skip
     if not best.success:
         warnings.warn(
@@ -795,15 +816,15 @@ def _gripper_model(
     n = len(problem.labels)
     of_theta = np.delete(np.arange(theta.size), np.s_[len(SHARED_NAMES) : theta.size - 2 * n])
     # given the gripper: the scale that all blocks share is no news about one of them
-    own = np.sqrt(np.diag(np.linalg.inv(step.precision[-2 * n :, -2 * n :])))
+    block_sd = np.sqrt(np.diag(np.linalg.inv(step.precision[-2 * n :, -2 * n :])))
     before = {} if prior is None else {label: block.n_grasp for label, block in prior.blocks.items()}
     count = [int((problem.which == k).sum()) + before.get(label, 0) for k, label in enumerate(problem.labels)]
     blocks = {
         label: Block(
             ln_h=float(problem.ln_h(theta)[k]),
-            ln_h_sd=float(own[k]),
+            ln_h_sd=float(block_sd[k]),
             ln_effusivity=float(problem.ln_e(theta)[k]),
-            ln_effusivity_sd=float(own[n + k]),
+            ln_effusivity_sd=float(block_sd[n + k]),
             library_effusivity=float(row.effusivity),
             library_sd_ln=float(row.sd_ln),
             heat_capacity=float(row.heat_capacity),
@@ -811,14 +832,17 @@ def _gripper_model(
         )
         for k, (label, row) in enumerate(zip(problem.labels, problem.library))
     }
-    slope, level, left = _ln_h_line(blocks)
+    slope, level, ln_h_sd_of_blocks = _ln_h_line(blocks)
     covariance = np.linalg.inv(step.precision)[np.ix_(of_theta, of_theta)]
     names_of_theta = (*SHARED_NAMES, *block_names(problem.labels))
     return GripperModel(
         stack=stack_of(theta),
         noise=noise,
         spreads=Spreads(
-            **spread, ln_h_of_blocks=left, dof=problem.dof("ln_h"), insulator_dof=problem.dof("ln_effusivity")
+            **spread,
+            ln_h_of_blocks=ln_h_sd_of_blocks,
+            dof=problem.dof("ln_h"),
+            insulator_dof=problem.dof("ln_effusivity"),
         ),
         onset=shared["onset"],
         transit_loss=shared["transit_loss"],
@@ -840,9 +864,9 @@ def _ln_h_line(blocks: Mapping[str, Block]) -> tuple[float, float, float]:
     y = np.array([b.ln_h for b in blocks.values()])
     design = np.stack([x, np.ones_like(x)], axis=1)
     slope, level = np.linalg.solve(design.T @ design + np.diag([0.2**2 / 0.2**2, 0.0]), design.T @ y)
-    left = y - design @ np.array([slope, level])
+    residual = y - design @ np.array([slope, level])
     return (
         float(slope),
         float(level),
-        max(_LEAST_LN_H_SPREAD, float(np.sqrt((left**2).sum() / max(1, y.size - 2)))),
+        max(SETTINGS.least_ln_h_spread, float(np.sqrt((residual**2).sum() / max(1, y.size - 2)))),
     )

@@ -104,8 +104,8 @@ class ParameterCovariance:
     @classmethod
     def from_dict(cls, content: Mapping[str, Any]) -> ParameterCovariance:
         """Return what :meth:`to_dict` described."""
-        own = {key: name for name, key in _FILE_KEYS.items()}
-        names = tuple(own.get(name, name) for name in map(str, content["names"]))
+        name_of_key = {key: name for name, key in _FILE_KEYS.items()}
+        names = tuple(name_of_key.get(name, name) for name in map(str, content["names"]))
         return cls(names, np.asarray(content["covariance"], dtype=float))
 
 
@@ -134,9 +134,9 @@ class GripperSpread:
     bias: float = 0.20  # [K] two thermistors of 1 %
 
     def __post_init__(self) -> None:
-        for part in fields(self):
-            if not 0 <= getattr(self, part.name) < np.inf:
-                raise ValueError(f"{part.name} must be >= 0 and finite, got {getattr(self, part.name):g}")
+        for spread in fields(self):
+            if not 0 <= getattr(self, spread.name) < np.inf:
+                raise ValueError(f"{spread.name} must be >= 0 and finite, got {getattr(self, spread.name):g}")
 
     def covariance(self, names: Sequence[str]) -> Array:
         """Return the covariance that another gripper adds to the estimates called ``names``, (n, n)."""
@@ -149,8 +149,8 @@ class GripperSpread:
             [source.get(name, source.get(name.split(" ")[0], 0.0)) for name in names]
             for source in self._sources()
         ]
-        own = np.diag([self.block_contact if name.startswith("ln_h ") else 0.0 for name in names])
-        return np.column_stack([np.array(columns).T, own[:, own.any(axis=0)]])
+        per_block = np.diag([self.block_contact if name.startswith("ln_h ") else 0.0 for name in names])
+        return np.column_stack([np.array(columns).T, per_block[:, per_block.any(axis=0)]])
 
     def _sources(self) -> list[dict[str, float]]:
         """Return what each independent cause moves, and how far."""
@@ -170,13 +170,13 @@ def another_gripper(gripper: GripperModel, spread: GripperSpread | None = None) 
     """Return what one gripper's calibration leaves open about another one of its kind: the same numbers, less
     well known, from which a calibration on a few known grasps of the other one starts.  Where its file keeps
     no covariance its own numbers count as exact."""
-    known = gripper.uncertainty
-    if known is None:
+    covariance = gripper.uncertainty
+    if covariance is None:
         names = (*SHARED_NAMES, *block_names(gripper.materials))
-        known = ParameterCovariance(names, np.zeros((len(names), len(names))))
-    extra = (spread or GripperSpread()).covariance(known.names) * (WIDER**2 if spread is None else 1.0)
+        covariance = ParameterCovariance(names, np.zeros((len(names), len(names))))
+    extra = (spread or GripperSpread()).covariance(covariance.names) * (WIDER**2 if spread is None else 1.0)
     return replace(
-        gripper, uncertainty=ParameterCovariance(known.names, known.covariance + extra),
+        gripper, uncertainty=ParameterCovariance(covariance.names, covariance.covariance + extra),
         second=None if gripper.second is None else another_gripper(gripper.second, spread),
     )  # fmt: skip
 
@@ -228,7 +228,7 @@ class Spreads:
     insulator_dof: float = 1e6  # those of ``ln_effusivity``
 
     def __post_init__(self) -> None:
-        *sds, dof, insulator_dof = (getattr(self, part.name) for part in fields(self))
+        *sds, dof, insulator_dof = (getattr(self, spread.name) for spread in fields(self))
         if not (min(sds) >= 0 and min(dof, insulator_dof) > 0):
             raise ValueError(f"need spreads of 0 or more and degrees of freedom above 0, got {self}")
 
@@ -261,11 +261,11 @@ class Discrepancy:
     @classmethod
     def from_dict(cls, content: Mapping[str, Any], n_block: int) -> Discrepancy:
         """Return what a file holds; ValueError where a shape or a number is wrong."""
-        parts = [np.asarray(content[f.name], dtype=float) for f in fields(cls)]
+        curves = [np.asarray(content[f.name], dtype=float) for f in fields(cls)]
         shapes = [(KNOTS.size,), (n_block, KNOTS.size), (n_block,)]
-        if [p.shape for p in parts] != shapes or not all(np.isfinite(p).all() for p in parts):
+        if [p.shape for p in curves] != shapes or not all(np.isfinite(p).all() for p in curves):
             raise ValueError("discrepancy is of another shape, or not finite")
-        return cls(*parts)
+        return cls(*curves)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -332,21 +332,21 @@ class GripperModel:
 
     def discrepancy_of(self, ln_effusivity: Array) -> Discrepancy | None:
         """Return the discrepancy by other blocks, of found effusivities (n,)."""
-        if (own := self.discrepancy) is None:
+        if (learnt := self.discrepancy) is None:
             return None
         blocks = np.array([block.ln_effusivity for block in self.blocks.values()])
         order = np.argsort(blocks)
-        columns = np.column_stack([own.share, own.onset])[order].T
-        found = np.stack([np.interp(ln_effusivity, blocks[order], c) for c in columns], axis=1)
-        return replace(own, share=found[:, :-1], onset=found[:, -1])
+        columns = np.column_stack([learnt.share, learnt.onset])[order].T
+        interpolated = np.stack([np.interp(ln_effusivity, blocks[order], c) for c in columns], axis=1)
+        return replace(learnt, share=interpolated[:, :-1], onset=interpolated[:, -1])
 
     def beyond(self, t: Array, ln_effusivity: Array) -> Array:
         """Return the discrepancy of touches at times ``t`` (n or 1, n_bin) under found effusivities (n,),
         (n, 2, n_bin): always [K], and per degree between object and skin."""
         out = np.zeros((ln_effusivity.size, 2, t.shape[1]))
-        if (own := self.discrepancy_of(ln_effusivity)) is not None:
+        if (learnt := self.discrepancy_of(ln_effusivity)) is not None:
             weight = at_knots(t)
-            out[:, 0], out[:, 1] = weight @ own.always, (weight * own.share[:, None, :]).sum(axis=2)
+            out[:, 0], out[:, 1] = weight @ learnt.always, (weight * learnt.share[:, None, :]).sum(axis=2)
         return out
 
     def expected_ln_h(self, ln_effusivity: Array) -> Array:
@@ -363,9 +363,9 @@ class GripperModel:
         away = np.nan_to_num(np.asarray(room_difference, dtype=float))
         if self.uncertainty is None:
             return np.zeros(away.shape)
-        at = [self.uncertainty.names.index(name) for name in ("bias", "transit_loss")]
-        part = self.uncertainty.covariance[np.ix_(at, at)]
-        variance = part[0, 0] + 2 * part[0, 1] * away + part[1, 1] * away**2
+        place = [self.uncertainty.names.index(name) for name in ("bias", "transit_loss")]
+        covariance = self.uncertainty.covariance[np.ix_(place, place)]
+        variance = covariance[0, 0] + 2 * covariance[0, 1] * away + covariance[1, 1] * away**2
         return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
 
     def grip(self) -> Grip:
@@ -378,8 +378,8 @@ class GripperModel:
         ln_e = {name: block.ln_effusivity for name, block in self.blocks.items()}
         for name, material in load_materials().items():
             if name not in self.blocks:
-                found = np.log(np.array([material.effusivity]))
-                ln_e[name] = float(found[0] + self.effusivity_scale(found)[0][0])
+                ln_effusivity = np.log(np.array([material.effusivity]))
+                ln_e[name] = float(ln_effusivity[0] + self.effusivity_scale(ln_effusivity)[0][0])
                 ln_h[name] = float(self.expected_ln_h(np.array([ln_e[name]]))[0])
         spreads = self.spreads
         return Grip(
@@ -414,8 +414,8 @@ class GripperModel:
         if self.discrepancy is not None:
             numbers["discrepancy"] = {k: v.tolist() for k, v in vars(self.discrepancy).items()}
         numbers |= {} if self.second is None else {"second": self.second.to_dict()}
-        for part in ("stack", "noise", "spreads"):
-            numbers[part] = {_FILE_KEYS.get(k, k): v for k, v in numbers[part].items()}
+        for group in ("stack", "noise", "spreads"):
+            numbers[group] = {_FILE_KEYS.get(k, k): v for k, v in numbers[group].items()}
         numbers |= {"blocks": dict(numbers["blocks"]), "trained_on": [*self.trained_on]}
         numbers |= {} if self.uncertainty is None else {"knowledge": self.uncertainty.to_dict()}
         return {_FILE_KEYS.get(k, k): v for k, v in numbers.items()}
@@ -456,10 +456,10 @@ class GripperModel:
     def found_effusivity(self, ln_effusivity: Array) -> Array:
         """Return what ln e of the library's scale is on the gripper's own, of the same shape."""
         true = np.asarray(ln_effusivity, dtype=float)
-        found = true
+        on_own_scale = true
         for _ in range(5):  # found = true x scale(found), and the scale is smooth
-            found = true + self.effusivity_scale(found)[0]
-        return found
+            on_own_scale = true + self.effusivity_scale(on_own_scale)[0]
+        return on_own_scale
 
     def effusivity_scale(self, ln_effusivity: Array) -> tuple[Array, Array]:
         """Return mean and sd of ln(found / true) at found values ln e, of the same shape.
@@ -471,18 +471,18 @@ class GripperModel:
         """
         x = np.asarray(ln_effusivity, dtype=float)
         blocks = [*self.blocks.values()]
-        at = np.array([b.ln_effusivity for b in blocks])
-        seen = at - np.log([b.library_effusivity for b in blocks])
+        anchors = np.array([b.ln_effusivity for b in blocks])
+        ln_ratio = anchors - np.log([b.library_effusivity for b in blocks])
         prior = 0.3**2 if self.discrepancy is None else 0.6**2
         variance = np.array([b.library_sd_ln**2 + b.ln_effusivity_sd**2 for b in blocks]) + 0.1**2
 
         def kernel(a: Array, b: Array) -> Array:
             return np.asarray(prior * np.exp(-0.5 * ((a[:, None] - b[None, :]) / 1.5) ** 2))
 
-        cross = kernel(x.ravel(), at)
-        gain = np.linalg.solve(kernel(at, at) + np.diag(variance), cross.T).T
-        mean, left = gain @ seen, prior - (gain * cross).sum(axis=1)
-        return mean.reshape(x.shape), np.sqrt(np.maximum(left, 0.0)).reshape(x.shape)
+        cross = kernel(x.ravel(), anchors)
+        gain = np.linalg.solve(kernel(anchors, anchors) + np.diag(variance), cross.T).T
+        mean, variance_here = gain @ ln_ratio, prior - (gain * cross).sum(axis=1)
+        return mean.reshape(x.shape), np.sqrt(np.maximum(variance_here, 0.0)).reshape(x.shape)
 
 
 def load_default_gripper() -> GripperModel:

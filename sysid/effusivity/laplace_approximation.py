@@ -37,6 +37,7 @@ is the mixture (:func:`doubted`).
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -57,17 +58,38 @@ from thermogrip.sysid.effusivity.gripper_model import (
 
 H, BUILD_UP, ONSET, LEVEL, T_OBJECT, EFFUSIVITY, CAPACITY = range(7)
 N_NUISANCE = 7
-_EARLIEST_ONSET = 1.5  # s before the closed message
+
+
+@dataclass(frozen=True)
+class DoubtSettings:
+    """How far what was stated, or taught, may be off, and what then counts."""
+
+    earliest_onset_s: float = 1.5  # before the closed message
+    # of the size of a grasp's noise beside a learnt discrepancy (ToH: log loss .32 with it, .57 as
+    # stated)
+    noise_dof: float = 20.0
+    # all evidence beside a learnt discrepancy counts one over this: what differs from grasp to grasp is
+    # no noise
+    evidence_counts: float = 2.0
+    # beside a learnt discrepancy an object's distance from the skin is known to this share
+    gain_sd: float = 0.1
+    # an object that is less well known is one of a range of temperatures, 5 K or more
+    stated_sd_K: float = 1.5
+    slip_prior: float = 0.05  # probability that a stated temperature of an object is a slip (one in twenty)
+    # a stated temperature that is a slip is so many times as far off (Tukey's contaminated normal)
+    slip_times: float = 3.0
+    # of the prior variance of the temperature: readings that leave more do not tell a slip
+    telling_share: float = 0.5
+    # where logarithms of the rest are one off: a message that is late by a third of a second
+    unlike_onset_s: float = 0.3
+    # of an object's distance from the skin there: one that has gone a fifth of its way
+    unlike_object_share: float = 0.2
+
+
+DOUBT = DoubtSettings()
+
 SENSORS_APART = 0.3  # K: two thermistors of 1 %
-_DOF, _COUNTS, _GAIN_SD = 20.0, 2.0, 0.1
 UNEXPLAINED = 4.0  # standard deviations of the misfit; the example rig's grasps have 2.3 at most
-_STATED_SD = 1.5  # K: an object that is less well known is one of a range of temperatures, 5 K or more
-# Tukey's contaminated normal: one stated temperature of an object in twenty is three times as far off
-SLIPS, _SLIP = 0.05, 3.0
-_TELLING = 0.5  # of the prior variance of the temperature: readings that leave more do not tell a slip
-# s of onset, and share of an object's distance from the skin, where logarithms of the rest are one off: a
-# message that is late by a third of a second, an object that has gone a fifth of its way
-_UNLIKE_ONSET, _UNLIKE_OBJECT = 0.3, 0.2
 
 
 class Prior(NamedTuple):
@@ -94,13 +116,13 @@ class Mode(NamedTuple):
 
     def take(self, index: Any) -> Mode:
         """Return some of the rows."""
-        parts: Any = (part[index] for part in self)
-        return Mode(*parts)
+        fields: Any = (field[index] for field in self)
+        return Mode(*fields)
 
 
 def nodes_for(data: Touches) -> TimeNodes:
     """Return the time nodes that reach the last sample of an early contact."""
-    return time_nodes(data.end + _EARLIEST_ONSET)
+    return time_nodes(data.end + DOUBT.earliest_onset_s)
 
 
 def predict(stack: Stack, nodes: TimeNodes, data: Touches, u: Array, beyond: Array | None = None) -> Array:
@@ -150,9 +172,9 @@ def find_modes(
         u[:, LEVEL] = np.where(vary[:, LEVEL], data.level[row], u[:, LEVEL])
     dof = np.full(u.shape, np.inf) if prior.dof is None else prior.dof
     w_matrix, log_det = whitener
-    asked = pairs_asked(stack, nodes_for(data), data, row, beyond)
+    pairs = pairs_asked(stack, nodes_for(data), data, row, beyond)
     law = np.stack([prior.mean, prior.sd, dof], axis=1)
-    covariance, objective, misfit, settled = modes(asked, w_matrix, law, u, rivals=rivals)
+    covariance, objective, misfit, settled = modes(pairs, w_matrix, law, u, rivals=rivals)
     evidence = -0.5 * (objective + log_det[row]) + peak_ratio(dof, vary)
     return Mode(u, covariance, evidence, settled, misfit)
 
@@ -223,26 +245,26 @@ def prior_of(gripper: GripperModel, data: Touches, hypotheses: Hypotheses) -> Pr
     if (own_blocks := gripper.discrepancy_of(hypotheses.ln_e)) is not None:
         mean[:, ONSET] += own_blocks.onset
     mean[:, LEVEL], sd[:, LEVEL] = data.level, LEVEL_SD
-    known = np.isfinite(data.t_object)
+    is_stated = np.isfinite(data.t_object)
     lost = gripper.transit_loss * np.nan_to_num(data.t_ambient - data.t_object)
     room = np.where(np.isfinite(data.t_ambient), data.t_ambient, data.level)
-    mean[:, T_OBJECT] = np.where(known, data.t_object + gripper.bias + lost, room)
+    mean[:, T_OBJECT] = np.where(is_stated, data.t_object + gripper.bias + lost, room)
     # normal, so that it can be integrated exactly: with the variance of Student's t, which has none at two
     # degrees of freedom, of one training grasp a material: then the nominal one counts little
     beyond = max(spreads.dof - 2, 1e-9)
     learnt = min(spreads.t_object * np.sqrt(spreads.dof / beyond), UNKNOWN_OBJECT_SD)
-    own = np.where(np.isfinite(data.t_object_sd), data.t_object_sd, learnt)
-    own = np.hypot(own, gripper.nominal_sd(data.t_ambient - data.t_object))
-    sd[:, T_OBJECT] = np.where(known, own, UNKNOWN_OBJECT_SD)
+    stated_sd = np.where(np.isfinite(data.t_object_sd), data.t_object_sd, learnt)
+    stated_sd = np.hypot(stated_sd, gripper.nominal_sd(data.t_ambient - data.t_object))
+    sd[:, T_OBJECT] = np.where(is_stated, stated_sd, UNKNOWN_OBJECT_SD)
     mean[:, EFFUSIVITY], sd[:, EFFUSIVITY] = hypotheses.ln_e, hypotheses.ln_e_sd
     mean[:, CAPACITY] = hypotheses.ln_rho_c + np.log(gripper.block_length * gripper.depth_share)
     sd[:, CAPACITY] = hypotheses.ln_rho_c_sd
     if data.unlike.any():
         for k in (H, BUILD_UP, CAPACITY):
             sd[:, k] = np.hypot(sd[:, k], data.unlike)
-        sd[:, ONSET] = np.hypot(sd[:, ONSET], _UNLIKE_ONSET * data.unlike)
+        sd[:, ONSET] = np.hypot(sd[:, ONSET], DOUBT.unlike_onset_s * data.unlike)
         away = np.abs(mean[:, T_OBJECT] - data.level)
-        sd[:, T_OBJECT] = np.hypot(sd[:, T_OBJECT], _UNLIKE_OBJECT * data.unlike * away)
+        sd[:, T_OBJECT] = np.hypot(sd[:, T_OBJECT], DOUBT.unlike_object_share * data.unlike * away)
     return Prior(mean, sd, dof)
 
 
@@ -275,8 +297,8 @@ def with_second(
     second = gripper.second
     if second is None or data.second is None:
         return mode
-    beside, own = second_modes(gripper, data, row, hypotheses, mode)
-    return joined_modes(mode, prior, beside, own, second.bias - gripper.bias)
+    beside, second_prior = second_modes(gripper, data, row, hypotheses, mode)
+    return joined_modes(mode, prior, beside, second_prior, second.bias - gripper.bias)
 
 
 def second_modes(
@@ -286,10 +308,10 @@ def second_modes(
     assert gripper.second is not None
     assert data.second is not None
     second, others = gripper.second, hypotheses_of_second(gripper, gripper.second, hypotheses)
-    own = prior_of(second, data.second.known(row), others)
-    begin = own.mean.copy()
+    second_prior = prior_of(second, data.second.known(row), others)
+    begin = second_prior.mean.copy()
     begin[:, LEVEL], begin[:, T_OBJECT] = data.second.level[row], mode.u[:, T_OBJECT]
-    return _own_modes(second, data.second, row, others, own, begin, None), own
+    return _own_modes(second, data.second, row, others, second_prior, begin, None), second_prior
 
 
 def whitened(gripper: GripperModel, data: Touches) -> Whitened:
@@ -328,11 +350,11 @@ def joined_modes(first: Mode, prior: Prior, second: Mode, own: Prior, apart: flo
     the second saw of x is its posterior over its prior, a normal likelihood of precision :math:`1/V_2 -
     1/V_{02}`, its thermometer ``apart`` [K] above the first one's, give or take 0.3 K; all else is each
     sensor's own."""
-    seen, width = _seen_temperature(second, own)
-    off = seen - apart - first.u[:, T_OBJECT]
+    second_mean, width = _seen_temperature(second, own)
+    off = second_mean - apart - first.u[:, T_OBJECT]
     variance = first.covariance[:, T_OBJECT, T_OBJECT] + width + SENSORS_APART**2
     evidence = first.log_evidence + second.log_evidence + _log_normal(off, variance)
-    evidence -= _log_normal(seen - own.mean[:, T_OBJECT], own.sd[:, T_OBJECT] ** 2 + width)
+    evidence -= _log_normal(second_mean - own.mean[:, T_OBJECT], own.sd[:, T_OBJECT] ** 2 + width)
     settled, misfit = first.converged & second.converged, first.misfit + second.misfit
     column = first.covariance[:, :, T_OBJECT]
     moved = first.covariance - column[:, :, None] * (column / variance[:, None])[:, None, :]
@@ -349,21 +371,23 @@ def widened(mode: Mode, prior: Prior, n: NDArray[np.int64], bias: float) -> Mode
     distance from the skin at best, and to the thermometer's own ``bias`` [K], of which the discrepancy may
     have taken a part.
     """
-    evidence = mode.log_evidence + 0.5 * (mode.misfit - (_DOF + n) * np.log1p(mode.misfit / _DOF))
-    seen, width = _seen_temperature(mode, prior)
+    evidence = mode.log_evidence + 0.5 * (
+        mode.misfit - (DOUBT.noise_dof + n) * np.log1p(mode.misfit / DOUBT.noise_dof)
+    )
+    measured, width = _seen_temperature(mode, prior)
     x0, v0 = prior.mean[:, T_OBJECT], prior.sd[:, T_OBJECT] ** 2
-    width *= np.maximum(_COUNTS * (_DOF + mode.misfit) / (_DOF + n), 1.0)
-    width += (_GAIN_SD * (mode.u[:, T_OBJECT] - mode.u[:, LEVEL])) ** 2 + bias**2
+    width *= np.maximum(DOUBT.evidence_counts * (DOUBT.noise_dof + mode.misfit) / (DOUBT.noise_dof + n), 1.0)
+    width += (DOUBT.gain_sd * (mode.u[:, T_OBJECT] - mode.u[:, LEVEL])) ** 2 + bias**2
     u, covariance = mode.u.copy(), mode.covariance.copy()
     covariance[:, T_OBJECT, T_OBJECT] = v0 * width / (v0 + width)
-    u[:, T_OBJECT] = (x0 * width + seen * v0) / (v0 + width)
-    return mode._replace(u=u, covariance=covariance, log_evidence=evidence / _COUNTS)
+    u[:, T_OBJECT] = (x0 * width + measured * v0) / (v0 + width)
+    return mode._replace(u=u, covariance=covariance, log_evidence=evidence / DOUBT.evidence_counts)
 
 
 def slip_of(sd: ArrayLike) -> Array:
     """Return how many times as far off as its ``sd`` [K] a stated temperature that is a slip may be: three,
     no farther than one that nobody stated."""
-    return np.clip(UNKNOWN_OBJECT_SD / np.asarray(sd), 1.0, _SLIP)
+    return np.clip(UNKNOWN_OBJECT_SD / np.asarray(sd), 1.0, DOUBT.slip_times)
 
 
 def doubted(data: Touches, prior: Prior, mode: Mode) -> Mode:
@@ -372,14 +396,14 @@ def doubted(data: Touches, prior: Prior, mode: Mode) -> Mode:
     v0 = prior.sd[:, T_OBJECT] ** 2
     x0, v = prior.mean[:, T_OBJECT], mode.covariance[:, T_OBJECT, T_OBJECT]
     # beyond what readings know of it the normal distribution around the mode is no guide
-    telling = np.isfinite(data.t_object) & (v < _TELLING * v0) & mode.converged
+    telling = np.isfinite(data.t_object) & (v < DOUBT.telling_share * v0) & mode.converged
     precision = np.where(telling, 1 / v - 1 / v0, 1.0)
-    seen, width = x0 + (mode.u[:, T_OBJECT] - x0) / (v * precision), 1 / precision
+    measured, width = x0 + (mode.u[:, T_OBJECT] - x0) / (v * precision), 1 / precision
     wide = slip_of(np.sqrt(v0)) ** 2 * v0
-    ratio = _log_normal(seen - x0, wide + width) - _log_normal(seen - x0, v0 + width)
-    slip = np.where(telling, SLIPS * np.exp(np.clip(ratio, -700.0, 300.0)), 0.0)
-    total = np.where(telling, 1 - SLIPS, 1.0) + slip
-    share, apart = slip / total, (wide * seen + width * x0) / (wide + width) - mode.u[:, T_OBJECT]
+    ratio = _log_normal(measured - x0, wide + width) - _log_normal(measured - x0, v0 + width)
+    slip = np.where(telling, DOUBT.slip_prior * np.exp(np.clip(ratio, -700.0, 300.0)), 0.0)
+    total = np.where(telling, 1 - DOUBT.slip_prior, 1.0) + slip
+    share, apart = slip / total, (wide * measured + width * x0) / (wide + width) - mode.u[:, T_OBJECT]
     within = share * (wide * width / (wide + width) - v) + share * (1 - share) * apart**2
     # the rest of what is unknown goes along with the temperature
     column = mode.covariance[:, :, T_OBJECT] / v[:, None]
@@ -421,14 +445,14 @@ def fit_candidates(
     begin = None if start is None else np.repeat(start.reshape(n, m, -1), n_grade, axis=0)
     every = graded(data, gripper.grades)
     mode, prior, _ = candidate_modes(gripper, every, candidates, start=begin, noise=noise)
-    each = over_grades(gripper, mode.log_evidence.reshape(n, n_grade, m))
+    by_grade_and_candidate = over_grades(gripper, mode.log_evidence.reshape(n, n_grade, m))
     place, candidate = np.arange(n)[:, None] * n_grade, np.arange(m)
-    at = ((place + each.argmax(axis=1)) * m + candidate).ravel()
+    best_grade = ((place + by_grade_and_candidate.argmax(axis=1)) * m + candidate).ravel()
     first = (place * m + candidate).ravel()
-    by_grade = logsumexp(each, axis=2)
+    by_grade = logsumexp(by_grade_and_candidate, axis=2)
     return Fitted(
-        mode.take(at)._replace(log_evidence=logsumexp(each, axis=1).ravel()),
-        prior.take(at), np.repeat(np.arange(n), m), mode.take(first), prior.take(first),
+        mode.take(best_grade)._replace(log_evidence=logsumexp(by_grade_and_candidate, axis=1).ravel()),
+        prior.take(best_grade), np.repeat(np.arange(n), m), mode.take(first), prior.take(first),
         -np.expm1(by_grade[:, 0] - logsumexp(by_grade, axis=1)),
     )  # fmt: skip
 
@@ -445,15 +469,15 @@ def misfit_sd(data: Touches, row: NDArray[np.int64], mode: Mode) -> Array:
 def unexplained(data: Touches, row: NDArray[np.int64], mode: Mode, prior: Prior) -> list[tuple[float, str]]:
     """Return of each of n modes of touches ``row`` its misfit [standard deviations], and in words why it
     does not explain the touch, if it does not."""
-    misfits, found = misfit_sd(data, row, mode), []
+    misfits, reasons = misfit_sd(data, row, mode), []
     # of an object that is anywhere in a range the prior has the sd of a uniform law
     off, sd = np.abs(mode.u - prior.mean)[:, T_OBJECT], prior.sd[:, T_OBJECT]
-    for misfit, outside in zip(misfits.tolist(), (sd > _STATED_SD) & (off > np.sqrt(3.0) * sd)):
+    for misfit, outside in zip(misfits.tolist(), (sd > DOUBT.stated_sd_K) & (off > np.sqrt(3.0) * sd)):
         words = "the trace is not explained by the model" if misfit > UNEXPLAINED else ""
         if outside and not words:
             words = "explained only by an object outside of its range of temperatures"
-        found.append((misfit, f"{words}: the answer is unreliable" if words else ""))
-    return found
+        reasons.append((misfit, f"{words}: the answer is unreliable" if words else ""))
+    return reasons
 
 
 def over_grades(gripper: GripperModel, log_evidence: Array) -> Array:
@@ -472,10 +496,10 @@ def candidate_modes(
     row = np.repeat(np.arange(n), m)
     hypotheses = Hypotheses(*(np.tile(h, n) for h in one))
     begin = None if start is None else start.reshape(n * m, -1)
-    each = data.known(row)
-    prior = prior_of(gripper, each, hypotheses)
+    stated = data.known(row)
+    prior = prior_of(gripper, stated, hypotheses)
     mode = fit_rivals(gripper, data, row, hypotheses, start=begin, noise=noise, prior=prior)
-    return doubted(each, prior, mode), prior, row
+    return doubted(stated, prior, mode), prior, row
 
 
 def fit_rivals(
@@ -491,18 +515,25 @@ def fit_rivals(
     order = np.lexsort((mode.log_evidence, row))
     likeliest = np.empty(data.level.size, dtype=np.int64)
     likeliest[row[order]] = order  # of several the last one stays
-    at = np.flatnonzero((data.unlike[row] > 0) & (likeliest[row] != np.arange(row.size)))
-    if not at.size:
+    again_for = np.flatnonzero((data.unlike[row] > 0) & (likeliest[row] != np.arange(row.size)))
+    if not again_for.size:
         return mode
-    begin = mode.u[likeliest[row[at]]]
-    begin[:, EFFUSIVITY] = mode.u[at, EFFUSIVITY]
-    some = Hypotheses(*(part[at] for part in hypotheses))
+    begin = mode.u[likeliest[row[again_for]]]
+    begin[:, EFFUSIVITY] = mode.u[again_for, EFFUSIVITY]
+    some = Hypotheses(*(field[again_for] for field in hypotheses))
     again = fit_pairs(
-        gripper, data, row[at], some, start=begin, noise=noise, prior=prior.take(at), rivals=True
+        gripper,
+        data,
+        row[again_for],
+        some,
+        start=begin,
+        noise=noise,
+        prior=prior.take(again_for),
+        rivals=True,
     )
-    better = again.log_evidence > mode.log_evidence[at]
-    for whole, part in zip(mode, again):
-        whole[at[better]] = part[better]
+    better = again.log_evidence > mode.log_evidence[again_for]
+    for whole, field in zip(mode, again):
+        whole[again_for[better]] = field[better]
     return mode
 
 
@@ -523,13 +554,13 @@ def _trained(gripper: GripperModel, name: str) -> tuple[float, ...]:
 
 
 def _untrained(gripper: GripperModel, row: Material) -> tuple[float, ...]:
-    found = float(gripper.found_effusivity(np.log([row.effusivity]))[0])
-    scale_sd = gripper.effusivity_scale(np.array([found]))[1]
+    ln_effusivity = float(gripper.found_effusivity(np.log([row.effusivity]))[0])
+    scale_sd = gripper.effusivity_scale(np.array([ln_effusivity]))[1]
     scatter = gripper.spreads.ln_effusivity if row.effusivity < INSULATOR else 0.0
     return (
-        float(gripper.expected_ln_h(np.array(found))),
+        float(gripper.expected_ln_h(np.array(ln_effusivity))),
         float(np.hypot(gripper.spreads.ln_h_of_blocks, gripper.spreads.ln_h)),
-        float(found),
+        float(ln_effusivity),
         float(np.sqrt(row.effusivity_sd_ln**2 + float(scale_sd[0]) ** 2 + scatter**2)),
         float(np.log(row.rho * row.c_p)),
         0.05,

@@ -9,6 +9,7 @@ NumPy's, for some hundred pairs at once, whose arrays stay in the processor's ca
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,9 +19,26 @@ from thermogrip.datasets.arrays import Array, Mask
 from thermogrip.datasets.compiled import numba
 from thermogrip.sysid.contact.time_stepping import COMPILED, N_STEPPED, VALUE, Gripper, contacts
 
-_AT_ONCE = 1024  # pairs
-_MOST_STEPS = 20  # a pair that has not settled by then is hopeless in practice
-_LONGEST = 1.5
+
+@dataclass(frozen=True)
+class SearchSettings:
+    """How the search for a mode steps, and when it ends."""
+
+    pairs_at_once: int = 1024  # whose arrays stay in the processor's cache
+    most_steps: int = 20  # a pair that has not settled by then is hopeless in practice
+    longest_step: float = 1.5  # of a logarithm of the contact
+    # what even the best leaves unexplained counts more: where none explains the readings yet, as of a
+    # late contact, the right one may be that far behind
+    unexplained_times: float = 3.0
+    bent: float = 1.5  # times the quadratic model's curvature, from which on steps are shorter
+    far_bent: float = 4.0  # and from which on they are damped
+    no_damping: float = 1e-3  # a damping that counts as none
+    stale_K: float = 0.01  # that a temperature may move for slopes by the rest to stay
+    least_decrease: float = 0.01  # of -2 ln posterior: smaller predicted decreases end the search
+
+
+SEARCH = SearchSettings()
+
 # after so many steps, -2 ln posterior behind the best by the quadratic model: of 943 points of a free
 # effusivity that ended within 25 nats of the best, none was farther than 1734 after one, 356 after two and
 # 378 after three
@@ -29,14 +47,6 @@ _HOPELESS = {1: 6000.0, 2: 2000.0, 3: 1000.0, 4: 1000.0, 5: 1000.0} | dict.fromk
 # ended within 25 nats none was farther than 147 behind before a step, 54 after any number; what the best
 # leaves unexplained comes on top, some 45 times _UNEXPLAINED where the model is right
 _HOPELESS_STATED = {0: 300.0} | dict.fromkeys(range(1, 99), 100.0)
-# times what even the best leaves unexplained, more: where none explains the readings yet, as of a contact
-# that began later than was said, the right one may be that far behind
-_UNEXPLAINED = 3.0
-# times the quadratic model's curvature: from which on steps are shorter, and from which on they are damped
-_BENT, _FAR = 1.5, 4.0
-_HARDLY = 1e-3  # a damping that counts as none
-_STALE = 0.01  # K that a temperature may move for slopes by the rest to stay
-_LEAST_DECREASE = 0.01  # of -2 ln posterior: smaller predicted decreases end the search
 _H, _BUILD_UP, _ONSET, _LEVEL, _T, _E, _C = range(7)
 _LEFT = 7  # the column of what is left, after those of the derivatives
 RATE = 5  # the row of the slope, after the stepped curves
@@ -181,7 +191,7 @@ def predicted(
     before, after, whole = room[0], room[1], room[2]
     delayed, shifted = room[4:10], room[10:16]
     for p in range(row.size):
-        i, own, k = row[p], means[p], min(p, numbers.shape[0] - 1)
+        i, curves, k = row[p], means[p], min(p, numbers.shape[0] - 1)
         warmth, rate, way, leak, away = ambient[p], 0.0, 0.0, 0.0, 0.0
         if np.isfinite(warmth):
             rate, way, leak = numbers[k, 5] * np.exp(-u[p, _C]), warmth - u[p, _T], numbers[k, 6]
@@ -211,52 +221,54 @@ def predicted(
                 for m in range(n_bin):
                     if count[i, m] > 0.0:
                         if k >= 0:
-                            summed += 0.5 * (t[i, m] - t[i, k]) * (own[c, m] + own[c, k])
+                            summed += 0.5 * (t[i, m] - t[i, k]) * (curves[c, m] + curves[c, k])
                         whole[m], k = summed, m
                 for m in range(n_bin):
                     if before[m] >= 0.0:
                         low, high = int(before[m]), int(after[m])
                         ahead, bend = t[i, m] - late - t[i, low], 0.0
                         if high != low:
-                            bend = (own[c, high] - own[c, low]) / (t[i, high] - t[i, low])
-                        delayed[c, m] = whole[low] + ahead * (own[c, low] + 0.5 * bend * ahead)
-                        shifted[c, m] = own[c, low] + bend * ahead
-        difference, level, there = u[p, _T] - u[p, _LEVEL], u[p, _LEVEL], slopes[p]
+                            bend = (curves[c, high] - curves[c, low]) / (t[i, high] - t[i, low])
+                        delayed[c, m] = whole[low] + ahead * (curves[c, low] + 0.5 * bend * ahead)
+                        shifted[c, m] = curves[c, low] + bend * ahead
+        difference, level, derivatives = u[p, _T] - u[p, _LEVEL], u[p, _LEVEL], slopes[p]
         by_t, by_level = 1.0 if vary[p, _T] else 0.0, 1.0 if vary[p, _LEVEL] else 0.0
         for m in range(n_bin):
-            f, lost = own[VALUE, m] + beyond[p, 1, m], rate * delayed[VALUE, m]
+            f, lost = curves[VALUE, m] + beyond[p, 1, m], rate * delayed[VALUE, m]
             one = level + difference * f + way * lost + away * ramp[i, m] + beyond[p, 0, m]
             y[p, m] = one
-            there[_T, m] = by_t * (f - lost)
-            there[_LEVEL, m] = by_level * (1.0 - f - leak * ramp[i, m])
-            there[_LEFT, m] = read[i, m] - one
+            derivatives[_T, m] = by_t * (f - lost)
+            derivatives[_LEVEL, m] = by_level * (1.0 - f - leak * ramp[i, m])
+            derivatives[_LEFT, m] = read[i, m] - one
         for c in range(1, n_curve):
-            at, by_late = _CURVES[c - 1], 0.0
-            if at == _E:  # a denser or less conducting block passes the loss on later
+            nuisance, by_late = _CURVES[c - 1], 0.0
+            if nuisance == _E:  # a denser or less conducting block passes the loss on later
                 by_late = 2.0 * late
-            elif at == _C:
+            elif nuisance == _C:
                 by_late = -2.0 * late
-            if not (vary[p, at] and wanted[p, c]):
-                there[at] = 0.0
+            if not (vary[p, nuisance] and wanted[p, c]):
+                derivatives[nuisance] = 0.0
                 continue
-            sign = -1.0 if at == _ONSET else 1.0
-            less = 1.0 if at == _C else 0.0
+            sign = -1.0 if nuisance == _ONSET else 1.0
+            less = 1.0 if nuisance == _C else 0.0
             scale, passed = sign * difference, sign * rate * way
             for m in range(n_bin):
                 extra = delayed[c, m] + by_late * shifted[VALUE, m] - less * delayed[VALUE, m]
-                there[at, m] = scale * own[c, m] + passed * extra
+                derivatives[nuisance, m] = scale * curves[c, m] + passed * extra
 
 
 def products(asked: Asked, whitener: Array, u: Array, sd: Array, *, alike: bool = False) -> Array:
     """Return J' J, and J' r and r' r in the last row and column, (n, 8, 8): J in units of ``sd`` (n, 7), r
     the readings less those that ``u`` predicts, both whitened."""
-    found = []
-    for begin in range(0, len(u), _AT_ONCE):  # so many at once that they stay in the processor's cache
-        part = slice(begin, begin + _AT_ONCE)
-        some = asked.take(part)
-        columns = readings(some, u[part], sd[part] > 0.0, alike=alike)[1]
-        found.append(squares(whitener, some.row, columns))
-    matrix = found[0] if len(found) == 1 else np.concatenate(found)
+    blocks = []
+    for begin in range(
+        0, len(u), SEARCH.pairs_at_once
+    ):  # so many at once that they stay in the processor's cache
+        chunk = slice(begin, begin + SEARCH.pairs_at_once)
+        some = asked.take(chunk)
+        columns = readings(some, u[chunk], sd[chunk] > 0.0, alike=alike)[1]
+        blocks.append(squares(whitener, some.row, columns))
+    matrix = blocks[0] if len(blocks) == 1 else np.concatenate(blocks)
     scale = np.ones((len(u), _LEFT + 1))
     scale[:, :_LEFT] = sd
     matrix *= scale[:, :, None]
@@ -309,12 +321,12 @@ class Law(NamedTuple):
             one = np.ones(u.shape)
             return Penalty(square.sum(axis=1), w, one, one)
         k = self.per_dof
-        far = square * k
-        tail = 1.0 + far
+        tail_square = square * k
+        tail = 1.0 + tail_square
         bound = (1.0 + k) / tail
-        own = np.maximum(bound * (1.0 - far) / tail, 1e-3)
-        value = np.log1p(far) * (1.0 + k) / np.maximum(k, 1e-300)
-        return Penalty(np.where(k > 0.0, value, square).sum(axis=1), w * bound, bound, own)
+        curvature = np.maximum(bound * (1.0 - tail_square) / tail, 1e-3)
+        value = np.log1p(tail_square) * (1.0 + k) / np.maximum(k, 1e-300)
+        return Penalty(np.where(k > 0.0, value, square).sum(axis=1), w * bound, bound, curvature)
 
 
 class _Search(NamedTuple):
@@ -362,55 +374,59 @@ def search(
     """
     n, m = u.shape
     diagonal, none = np.arange(m), np.full(n, np.inf)
-    found = Found(u.copy(), np.empty((n, m + 1, m + 1)), none.copy(), np.zeros(n, dtype=bool))
+    ended = Found(u.copy(), np.empty((n, m + 1, m + 1)), none.copy(), np.zeros(n, dtype=bool))
     ahead = none.copy()  # what the next step should come to
-    here = _Search(
-        at=np.arange(n), law=law, sd=sd, trial=u, point=u, cost=none, matrix=found.matrix, slope=u, bound=u,
-        damping=np.full(n, 1e-2), part=none, slope_gain=none, bend=none, stale=found.settled,
+    state = _Search(
+        at=np.arange(n), law=law, sd=sd, trial=u, point=u, cost=none, matrix=ended.matrix, slope=u, bound=u,
+        damping=np.full(n, 1e-2), part=none, slope_gain=none, bend=none, stale=ended.settled,
     )  # fmt: skip
-    for step in range(_MOST_STEPS + 1):
-        there = products(asked.take(here.at), whitener, here.trial, here.sd, alike=step == 0)
-        here = _moved(*_refitted(here, there), step)
-        rhs, curved = here.matrix[:, :m, m] - here.slope, here.matrix[:, :m, :m].copy()
-        curved[:, diagonal, diagonal] += here.bound
+    for step in range(SEARCH.most_steps + 1):
+        tried = products(asked.take(state.at), whitener, state.trial, state.sd, alike=step == 0)
+        state = _moved(*_refitted(state, tried), step)
+        rhs, curved = state.matrix[:, :m, m] - state.slope, state.matrix[:, :m, :m].copy()
+        curved[:, diagonal, diagonal] += state.bound
         last = np.linalg.solve(curved, rhs[:, :, None])[:, :, 0]
         decrease = (last * rhs).sum(axis=1)
-        near = (decrease < _LEAST_DECREASE) & ~here.stale
-        left = ~near & (here.damping <= 1e9)
-        if step == _MOST_STEPS:
-            near[:], left[:] = False, False
+        settled = (decrease < SEARCH.least_decrease) & ~state.stale
+        going_on = ~settled & (state.damping <= 1e9)
+        if step == SEARCH.most_steps:
+            settled[:], going_on[:] = False, False
         if rivals:
-            ahead[here.at] = here.cost - decrease
-            left &= _hopeful(asked, step, ahead)[here.at]
-        if not left.all():
-            done = ~left
-            at = here.at[done]
-            found.u[at] = here.point[done] + np.where(near[done, None], last[done] * here.sd[done], 0.0)
-            found.cost[at] = here.cost[done] - np.where(near[done], decrease[done], 0.0)
-            found.matrix[at], found.settled[at] = here.matrix[done], near[done]
+            ahead[state.at] = state.cost - decrease
+            going_on &= _hopeful(asked, step, ahead)[state.at]
+        if not going_on.all():
+            done = ~going_on
+            finished = state.at[done]
+            ended.u[finished] = state.point[done] + np.where(
+                settled[done, None], last[done] * state.sd[done], 0.0
+            )
+            ended.cost[finished] = state.cost[done] - np.where(settled[done], decrease[done], 0.0)
+            ended.matrix[finished], ended.settled[finished] = state.matrix[done], settled[done]
             if done.all():
                 break
-            here, curved, rhs = here.take(left), curved[left], rhs[left]
-        gain, kept, move = decrease, np.zeros(1), last
-        if not left.all():
-            gain, move = decrease[left], last[left]
-        damped = here.damping > _HARDLY
+            state, curved, rhs = state.take(going_on), curved[going_on], rhs[going_on]
+        gain, damping_loss, move = decrease, np.zeros(1), last
+        if not going_on.all():
+            gain, move = decrease[going_on], last[going_on]
+        damped = state.damping > SEARCH.no_damping
         if damped.any():
-            own = curved[:, diagonal, diagonal]
-            curved[:, diagonal, diagonal] = own * (1.0 + here.damping[:, None])
+            own_curvature = curved[:, diagonal, diagonal]
+            curved[:, diagonal, diagonal] = own_curvature * (1.0 + state.damping[:, None])
             shorter = np.linalg.solve(curved, rhs[:, :, None])[:, :, 0]
-            kept = np.where(damped, here.damping * (own * shorter**2).sum(axis=1), 0.0)
+            damping_loss = np.where(damped, state.damping * (own_curvature * shorter**2).sum(axis=1), 0.0)
             move = np.where(damped[:, None], shorter, move)
             gain = np.where(damped, (shorter * rhs).sum(axis=1), gain)
-        move = move * here.sd
+        move = move * state.sd
         # no logarithm moves too far
-        part = np.minimum(here.part, _LONGEST / np.maximum(np.abs(move[:, _CONTACT]).max(axis=1), 1e-300))
-        part = np.where(here.stale, 0.0, part)  # slopes anew before another step
-        here = here._replace(
-            trial=here.point + part[:, None] * move, slope_gain=2.0 * part * gain,
-            bend=part * part * (gain - kept),
+        step_share = np.minimum(
+            state.part, SEARCH.longest_step / np.maximum(np.abs(move[:, _CONTACT]).max(axis=1), 1e-300)
+        )
+        step_share = np.where(state.stale, 0.0, step_share)  # slopes anew before another step
+        state = state._replace(
+            trial=state.point + step_share[:, None] * move, slope_gain=2.0 * step_share * gain,
+            bend=step_share * step_share * (gain - damping_loss),
         )  # fmt: skip
-    return found
+    return ended
 
 
 def _hopeful(asked: Asked, step: int, ahead: Array) -> Mask:
@@ -419,7 +435,7 @@ def _hopeful(asked: Asked, step: int, ahead: Array) -> Mask:
     np.minimum.at(best, asked.row, ahead)
     stated = np.isfinite(asked.data.t_object)
     limit = np.where(stated, _HOPELESS_STATED[step], _HOPELESS.get(step, np.inf))
-    return np.asarray(ahead < (best + limit + _UNEXPLAINED * np.maximum(best, 0.0))[asked.row])
+    return np.asarray(ahead < (best + limit + SEARCH.unexplained_times * np.maximum(best, 0.0))[asked.row])
 
 
 def _refitted(here: _Search, there: Array) -> tuple[_Search, Array, Mask]:
@@ -445,8 +461,8 @@ def _refitted(here: _Search, there: Array) -> tuple[_Search, Array, Mask]:
     scale[:, _LEVEL : _T + 1] = scale[:, -1:] = 1.0
     there *= scale[:, :, None]
     there *= scale[:, None, :]
-    far = ~apart | (grown < 0.2) | (grown > 5.0)
-    stale = far & (np.abs(trial[:, _T] - trial[:, _LEVEL] - before) > _STALE)
+    out_of_scale = ~apart | (grown < 0.2) | (grown > 5.0)
+    stale = out_of_scale & (np.abs(trial[:, _T] - trial[:, _LEVEL] - before) > SEARCH.stale_K)
     return here._replace(trial=trial), there, stale
 
 
@@ -462,11 +478,11 @@ def _moved(here: _Search, there: Array, stale: Mask, step: int) -> _Search:
     better = (tried < here.cost) | here.stale
     bend = np.where(here.stale, 1.0, np.maximum(here.bend, 1e-300))  # of no step none
     bent = np.where(here.stale, 0.0, (here.slope_gain + tried - here.cost) / bend)
-    far = bent > _FAR
+    strongly_bent = bent > SEARCH.far_bent
     damping = np.where(better, np.maximum(damping * 0.1, 1e-9), damping * 10.0)
-    damping = np.where(far, np.maximum(damping, 0.1 * np.minimum(bent, 1e6)), damping)
-    part = np.where((bent > _BENT) & ~far, 1.0 / np.maximum(bent, 1.0), 1.0)
-    new = new._replace(damping=damping, part=np.where(np.isfinite(tried), part, 0.3 * here.part))
+    damping = np.where(strongly_bent, np.maximum(damping, 0.1 * np.minimum(bent, 1e6)), damping)
+    step_share = np.where((bent > SEARCH.bent) & ~strongly_bent, 1.0 / np.maximum(bent, 1.0), 1.0)
+    new = new._replace(damping=damping, part=np.where(np.isfinite(tried), step_share, 0.3 * here.part))
     if better.all():
         return new
     row = better[:, None]
@@ -488,19 +504,19 @@ def modes(
     of one row are ``rivals``, one that is hopeless beside the best of them is left there, unsettled.
     """
     mean, sd, dof = law.transpose(1, 0, 2)
-    own = Law.of(mean, sd, dof)
-    found = search(asked, whitener, own, sd, u, rivals=rivals)
-    u[:] = found.u
-    inverse, log_det = curvature(found.matrix, own.penalty(u).own)
+    prior_law = Law.of(mean, sd, dof)
+    ended = search(asked, whitener, prior_law, sd, u, rivals=rivals)
+    u[:] = ended.u
+    inverse, log_det = curvature(ended.matrix, prior_law.penalty(u).own)
     covariance = inverse * (sd[:, :, None] * sd[:, None, :])
-    return covariance, found.cost + log_det, found.matrix[:, _LEFT, _LEFT], found.settled
+    return covariance, ended.cost + log_det, ended.matrix[:, _LEFT, _LEFT], ended.settled
 
 
 def curvature(matrix: Array, own: Array) -> tuple[Array, Array]:
     """Return the inverse (n, m, m) of the curvatures of ``matrix`` (n, m + 1, m + 1), the priors' ``own`` (n,
     m) added, and the logarithm of their determinants."""
-    curved, at = matrix[:, :-1, :-1].copy(), np.arange(own.shape[1])
-    curved[:, at, at] += own
+    curved, diagonal = matrix[:, :-1, :-1].copy(), np.arange(own.shape[1])
+    curved[:, diagonal, diagonal] += own
     sign, log_det = np.linalg.slogdet(curved)
     if not ((sign > 0.0) & np.isfinite(log_det)).all():  # not every LAPACK notices a NaN
         raise np.linalg.LinAlgError("the curvature of a grasp's posterior is not positive definite")

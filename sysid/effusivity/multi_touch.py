@@ -44,18 +44,6 @@ wood.  And a block's temperature is known to 3 % of its distance from the skin b
 from the skin where s was learnt.  Contact conductance scatters from touch to touch about the block's own by
 ``ln_h_sd``, which may be wider than between grasps of a series.  All of it is learnt from groups of known
 material by maximum likelihood (:func:`learn_coupling`); the defaults are those of the example rig.
-
-Blocks that lose more or less
------------------------------
-
-U is that of the training's blocks where they lay.  Free convection alone goes from 2 to 25 W/m2K, so blocks
-of another shape or in another place lose k times as much, ln k of sd 0.64.  A record decides: with a
-probability of 0.8 k is 1, else one of five, and then each block's way to the room is a fifth uncertain more.
-The groups j of a record lie in one place, so group i is answered by the mixture with
-
-    p(k | others) ~ p_k prod_{j != i} [0.9 Z_jk + 0.1 max_l Z_jl],
-
-of which each group decides no more than a factor of ten: it may be of no candidate.
 """
 
 from __future__ import annotations
@@ -64,11 +52,10 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Generic, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import logsumexp
 
 from thermogrip.datasets.arrays import Array, Mask
 from thermogrip.datasets.atomic_files import read_json, write_json
@@ -106,18 +93,22 @@ _RANGES = {  # of the numbers of a file
 }  # fmt: skip
 #: Time between two touches, where the record does not say [s].
 REST = 60.0
-_LAW, _UNEVEN = 0.15, 0.25  # of the way to the room, uncertain in an even block, and more in an uneven one
-_FAR_SD, _FAR = 0.03, 15.0  # of a temperature's distance from the skin, in quadrature beyond so many K
-# k, what blocks lose in units of the training's, and the prior probability of each
-_OTHER_LOSS, _LN_LOSS_SD = 0.2, 0.64
-_LN_K = np.array([0.0, -1.1, -0.55, 0.55, 1.1, 1.65])
-_LOSSES = tuple(np.exp(_LN_K).tolist())
-_OF_OTHERS = np.exp(-0.5 * (_LN_K[1:] / _LN_LOSS_SD) ** 2)
-_LOSS_PRIOR = np.concatenate([[1 - _OTHER_LOSS], _OTHER_LOSS * _OF_OTHERS / _OF_OTHERS.sum()])
-_ELSEWHERE = 0.2  # of the way to the room, uncertain from block to block where k is not 1
-_KNOWN, _STRANGE = np.log([0.9, 0.1])  # that a group is of a candidate, or of none
-_ASKED, _HOPELESS = 5, np.log(1e-3)  # groups that are asked at a time, and when a loss is asked no more
-_INTO = 2.0  # s into the next touch: where its reading knows most of the block
+
+
+@dataclass(frozen=True)
+class BlockSettings:
+    """What a block does between two touches, beyond what groups of known material teach."""
+
+    law_sd: float = 0.15  # of the way to the room, uncertain in an even block
+    uneven_sd: float = 0.25  # and more in an uneven one
+    far_sd: float = 0.03  # of a temperature's distance from the skin, in quadrature beyond far_K
+    far_K: float = 15.0  # as far as blocks lay from the skin where the coupling was learnt
+    into_s: float = 2.0  # the next touch: where its reading knows most of the block
+    longer_rest: float = 1.5  # times the longest rest that the coupling was learnt from
+    contradiction_sd: float = 5.0  # beyond which touches contradict each other
+
+
+BLOCK = BlockSettings()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -138,8 +129,8 @@ class Coupling:
         """Return the error of a temperature that a touch finds at a distance from the skin, beyond its noise
         [K]: two touches show the sum of the block's own AR(1) drift, of variance s^2 / 2 here, and of their
         errors, s^2 / 4 each, which are not identifiable apart."""
-        far = _FAR_SD * np.sqrt(np.maximum(np.square(distance) - _FAR**2, 0.0))
-        return np.asarray(np.hypot(0.5 * self.sd, far))
+        far_sd = BLOCK.far_sd * np.sqrt(np.maximum(np.square(distance) - BLOCK.far_K**2, 0.0))
+        return np.asarray(np.hypot(0.5 * self.sd, far_sd))
 
     def to_dict(self) -> dict[str, float]:
         """Return the numbers by name, without a longest rest that is not known."""
@@ -173,16 +164,15 @@ class Traces:
     skin: Array  # (n,), the gripper's temperature in the touch [degC]
     room: Array  # (n,), the room's, NaN where unknown [degC]
     rest: Array  # (n,), time since the touch before [s]
-    unlike: float = 0.0  # share of the way that is uncertain besides, from block to block
 
     def law(self, rest: float) -> Array:
         """Return which share of the way to the room is uncertain under each hypothesis, (m,)."""
         slowest = np.where(self.decay > 0, self.decay, np.inf).min(axis=1)
-        return np.asarray(np.hypot(_LAW + _UNEVEN * np.exp(-slowest * rest), self.unlike))
+        return np.asarray(BLOCK.law_sd + BLOCK.uneven_sd * np.exp(-slowest * rest))
 
     def drop(self, rest: float) -> Array:
         """Return rho of each hypothesis after a rest [s], (m,)."""
-        return np.asarray((self.moved * np.exp(-self.decay * (rest + _INTO))).sum(axis=1))
+        return np.asarray((self.moved * np.exp(-self.decay * (rest + BLOCK.into_s))).sum(axis=1))
 
 
 def traces_of(gripper: GripperModel, data: Touches, rest: Array, hypotheses: Hypotheses) -> Traces:
@@ -216,8 +206,8 @@ def joint_prior(
     p[:, :, 1, :, 1] = shared[0][:, None, None]
     p[:, :, 2, :, 2] = shared[1][:, None, None]
     p[:, :, 3, :, 3] = shared[2][:, None, None]
-    at = np.arange(n)
-    p[:, at, 1, at, 1] += coupling.ln_h_sd**2
+    touch = np.arange(n)
+    p[:, touch, 1, touch, 1] += coupling.ln_h_sd**2
     p[:, 0, 0, 0, 0] = variance
     for k in range(1, n):
         start = None if about is None else about[:, k - 1]
@@ -234,16 +224,16 @@ def _move(
 ) -> tuple[Array, Array, Array]:
     """Return gain and offset (m,) of the block's temperature from one touch to the next, and what is
     uncertain of how far the room takes one that is found at ``about`` (m,) [K]."""
-    rest = float(traces.rest[after])
-    taken = coupling.found * traces.drop(rest)
+    rest_s = float(traces.rest[after])
+    taken = coupling.found * traces.drop(rest_s)
     room = traces.room[before]
-    stay = np.exp(-coupling.loss * rest / traces.capacity) if np.isfinite(room) else 1.0
+    stay = np.exp(-coupling.loss * rest_s / traces.capacity) if np.isfinite(room) else 1.0
     gain = np.asarray(stay * (1 - taken))
     offset = stay * taken * traces.skin[before] + (1 - stay) * np.nan_to_num(room)
     if about is None:
         return gain, np.asarray(offset), np.zeros(gain.shape)
     way = gain * about + offset - (about - taken * (about - traces.skin[before]))
-    return gain, np.asarray(offset), np.asarray(traces.law(rest) * way)
+    return gain, np.asarray(offset), np.asarray(traces.law(rest_s) * way)
 
 
 SHARED = (T_OBJECT, H, EFFUSIVITY, CAPACITY)
@@ -273,17 +263,17 @@ class Joint(NamedTuple):
 
 def factor_of(mode: Mode, prior: Prior) -> Factor:
     """Return what the data alone say of x: the posterior at the mode with its prior divided out."""
-    at = list(SHARED)
-    sd = np.where(prior.sd[:, at] > 0, prior.sd[:, at], 1.0)
-    vary = prior.sd[:, at] > 0
-    scaled = mode.covariance[:, at][:, :, at] / (sd[:, :, None] * sd[:, None, :])
+    shared = list(SHARED)
+    sd = np.where(prior.sd[:, shared] > 0, prior.sd[:, shared], 1.0)
+    vary = prior.sd[:, shared] > 0
+    scaled = mode.covariance[:, shared][:, :, shared] / (sd[:, :, None] * sd[:, None, :])
     scaled += np.eye(N_SHARED) * ~vary[:, :, None]
     whole = np.linalg.inv(scaled)
-    w = np.where(vary, (mode.u[:, at] - prior.mean[:, at]) / sd, 0.0)
+    w = np.where(vary, (mode.u[:, shared] - prior.mean[:, shared]) / sd, 0.0)
     eta = np.einsum("nij,nj->ni", whole, w)
     size = mode.log_evidence + 0.5 * np.linalg.slogdet(whole)[1] - 0.5 * (eta * w).sum(axis=1)
     precision = (whole - np.eye(N_SHARED)) / (sd[:, :, None] * sd[:, None, :])
-    return Factor(size, prior.mean[:, at], eta / sd, precision)
+    return Factor(size, prior.mean[:, shared], eta / sd, precision)
 
 
 def combine(factor: Factor, mean: Array, covariance: Array) -> Joint:
@@ -292,8 +282,8 @@ def combine(factor: Factor, mean: Array, covariance: Array) -> Joint:
     k = n * N_SHARED
     lam = np.zeros((*lead, k, k))
     for i in range(n):
-        part = slice(i * N_SHARED, (i + 1) * N_SHARED)
-        lam[..., part, part] = factor.precision[..., i, :, :]
+        columns = slice(i * N_SHARED, (i + 1) * N_SHARED)
+        lam[..., columns, columns] = factor.precision[..., i, :, :]
     eta = factor.eta.reshape(*lead, k)
     away = mean - factor.centre.reshape(*lead, k)
     pulled = np.einsum("...ij,...j->...i", lam, away)
@@ -308,8 +298,6 @@ def combine(factor: Factor, mean: Array, covariance: Array) -> Joint:
 
 Rows = NDArray[np.int64]
 
-_LONGER = 1.5  # times the longest rest that the coupling was learnt from
-_CONTRADICTION = 5.0  # standard deviations
 # sd of the logarithms of found, loss, sd, ln_h_sd: the last two come out too small on the touches that
 # the blocks were learnt from too, so these lean more on where they start
 _LEAN = np.array([0.5, 1.0, 0.2, 0.2])
@@ -324,8 +312,6 @@ class TouchGroups:
     log_evidence: Array  # (n, m)
     t_object: Array  # (n, m), the block's temperature at the first touch under each candidate [degC]
     t_object_sd: Array  # (n, m) [K]
-    loss: Array  # (n,), what the block loses to the room, in units of what those of the training do
-    as_taught: Array  # (n,), probability that it is as much as those
 
 
 def touch_groups(grasps: Grasps) -> dict[str, Rows]:
@@ -338,7 +324,9 @@ def touch_groups(grasps: Grasps) -> dict[str, Rows]:
         )
     order = number_values(grasps, "touch")
     rows = {name: np.flatnonzero(label == name) for name in names}
-    return {name: at[np.argsort(order[at], kind="stable")] for name, at in rows.items()}
+    return {
+        name: group_rows[np.argsort(order[group_rows], kind="stable")] for name, group_rows in rows.items()
+    }
 
 
 def rested_long(grasps: Grasps, coupling: Coupling | None = None) -> Mask:
@@ -347,15 +335,18 @@ def rested_long(grasps: Grasps, coupling: Coupling | None = None) -> Mask:
     label = label_values(grasps, "touch_group")
     if (label == "").all():
         return np.zeros(grasps.sizes["grasp"], dtype=bool)
-    most = _LONGER * (coupling or Coupling()).longest_rest
-    return np.isin(label, [name for name, rest in _longest_rests(grasps).items() if rest > most])
+    most = BLOCK.longer_rest * (coupling or Coupling()).longest_rest
+    return np.isin(label, [name for name, rest_s in _longest_rests(grasps).items() if rest_s > most])
 
 
 def _longest_rests(grasps: Grasps) -> dict[str, float]:
     """Return the longest rest between touches of each group [s], 0 for a single touch."""
-    rest = number_values(grasps, "rest")
-    rest = np.where(np.isfinite(rest), rest, REST)
-    return {name: float(rest[at[1:]].max(initial=0.0)) for name, at in touch_groups(grasps).items()}
+    rest_s = number_values(grasps, "rest")
+    rest_s = np.where(np.isfinite(rest_s), rest_s, REST)
+    return {
+        name: float(rest_s[group_rows[1:]].max(initial=0.0))
+        for name, group_rows in touch_groups(grasps).items()
+    }
 
 
 def two_touch_fit(
@@ -368,30 +359,13 @@ def two_touch_fit(
     groups = list(rows.values())
     hypotheses = material_hypotheses(gripper, candidates)
     view = _view(gripper, grasps, hypotheses, coupling or Coupling(), until)
-    skin, m = view.data.level, hypotheses.ln_h.size
-
-    def ask(loss: float, which: list[int]) -> list[Joint]:
-        return _fits(_losing(view, loss), [groups[i] for i in which])
-
-    found = _by_loss(view, groups, ask, lambda fit: float(logsumexp(fit.log_evidence) - np.log(m)))
-    each = [
-        _mixed([fit[i] for fit in found.answers], found.log_prior[:, i], view.coupling, float(skin[at[0]]))
-        for i, at in enumerate(groups)
-    ]
-    evidence, t_object, sd = (np.array(part) for part in zip(*each))
-    return TouchGroups(tuple(rows), tuple(groups), evidence, t_object, sd, found.loss, found.as_taught)
-
-
-def _mixed(
-    fits: Sequence[Joint], log_prior: Array, coupling: Coupling, skin: float
-) -> tuple[Array, Array, Array]:
-    """Return evidence, temperature and its sd at the first touch, (m,) each, of a mixture over losses."""
-    log_z = log_prior[:, None] + np.array([fit.log_evidence for fit in fits])
-    total = logsumexp(log_z, axis=0)
-    share, t = np.exp(log_z - total), np.array([fit.mean[:, 0] for fit in fits])
-    own = np.array([fit.covariance[:, 0, 0] for fit in fits]) + coupling.touch_sd(t - skin) ** 2
-    mean = (share * t).sum(axis=0)
-    return total, mean, np.sqrt((share * (own + (t - mean) ** 2)).sum(axis=0))
+    fits = _fits(view, groups)
+    t_object = np.array([fit.mean[:, 0] for fit in fits])
+    skin = np.array([view.data.level[group_rows[0]] for group_rows in groups])
+    variance = np.array([fit.covariance[:, 0, 0] for fit in fits])
+    sd = np.sqrt(variance + view.coupling.touch_sd(t_object - skin[:, None]) ** 2)
+    evidence = np.array([fit.log_evidence for fit in fits])
+    return TouchGroups(tuple(rows), tuple(groups), evidence, t_object, sd)
 
 
 def free_touch_fit(
@@ -403,87 +377,22 @@ def free_touch_fit(
     rows = touch_groups(grasps)
     used = coupling or Coupling()
     data = touches(grasps, until=until)
-    whitener, rest = whiten(data, gripper.noise), number_values(grasps, "rest")
+    whitener, rest_s = whiten(data, gripper.noise), number_values(grasps, "rest")
 
     def view(x: Array) -> _View:
         hypotheses = free_hypotheses(gripper, x)
-        return _View(gripper, data, whitener, hypotheses, traces_of(gripper, data, rest, hypotheses), used)
+        return _View(gripper, data, whitener, hypotheses, traces_of(gripper, data, rest_s, hypotheses), used)
 
-    groups = list(rows.values())
-
-    def ask(loss: float, which: list[int]) -> list[list[posterior_grid.GridPosterior]]:
-        def joint(at: Rows, x: Array) -> Joint:
-            return _fits(_losing(view(x), loss), [at])[0]
-
-        return [_free(groups[i], joint, used, data.level[groups[i]]) for i in which]
-
-    found = _by_loss(view(np.array([9.0])), groups, ask, lambda fits: fits[0].log_evidence)
-    out = {}
-    for i, name in enumerate(rows):
-        log_z = found.log_prior[:, i] + [fits[i][0].log_evidence for fits in found.answers]
-        touched = zip(*(fits[i] for fits in found.answers))
-        out[name] = [posterior_grid.mixed(parts, log_z) for parts in touched]
-    return out
-
-
-_Answer = TypeVar("_Answer")
-
-
-class _ByLoss(NamedTuple, Generic[_Answer]):
-    """What each group of a record answers if blocks lose k times as much as those of the training."""
-
-    answers: list[list[_Answer]]  # of each k, of each group
-    log_prior: Array  # (n_k, n), of each k by the record's other groups
-    loss: Array  # (n,), k in the mean of its logarithm
-    as_taught: Array  # (n,), probability of k = 1
-
-
-def _by_loss(
-    view: _View, groups: list[Rows], ask: Callable[[float, list[int]], list[_Answer]],
-    evidence: Callable[[_Answer], float],
-) -> _ByLoss[_Answer]:  # fmt: skip
-    """Return what groups answer at each loss that the record leaves open; ``ask`` answers some of them."""
-    several = any(at.size > 1 and np.isfinite(view.traces.room[at]).any() for at in groups)
-    left = np.arange(len(_LOSSES) if several else 1)
-    answers: list[list[_Answer]] = [[] for _ in left]
-    total = np.log(_LOSS_PRIOR[left])
-    # a few at a time, from all over the record: a loss that these rule out is asked about no more
-    order = np.argsort(np.arange(len(groups)) % -(-len(groups) // _ASKED), kind="stable")
-    for first in range(0, len(groups), _ASKED):
-        likely = np.flatnonzero(total > total.max() + _HOPELESS)
-        which, left = order[first : first + _ASKED].tolist(), left[likely]
-        answers = [[*answers[i], *ask(_LOSSES[k], which)] for i, k in zip(likely, left)]
-        log_z = np.array([[evidence(answer) for answer in one] for one in answers])
-        says = np.logaddexp(_KNOWN + log_z, _STRANGE + log_z.max(axis=0))
-        total = np.log(_LOSS_PRIOR[left]) + says.sum(axis=1)
-    log_prior = total[:, None] - says
-    log_prior = log_prior - logsumexp(log_prior, axis=0)
-    share = np.exp(log_prior + log_z - logsumexp(log_prior + log_z, axis=0))
-    back = np.argsort(order)
-    loss, as_taught = np.exp(_LN_K[left] @ share), share[left == 0].sum(axis=0)
-    answers = [[one[i] for i in back] for one in answers]
-    return _ByLoss(answers, log_prior[:, back], loss[back], as_taught[back])
-
-
-def _losing(view: _View, loss: float) -> _View:
-    """Return the view of blocks that lose ``loss`` times as much to the room as those of the training."""
-    if loss == 1.0:
-        return view
-    coupling = replace(view.coupling, loss=loss * view.coupling.loss)
-    gripper, traces = _losing_by(view.gripper, loss), replace(view.traces, unlike=_ELSEWHERE)
-    return view._replace(gripper=gripper, coupling=coupling, traces=traces)
-
-
-def _losing_by(gripper: GripperModel, loss: float) -> GripperModel:
-    second = None if gripper.second is None else _losing_by(gripper.second, loss)
-    stack = replace(gripper.stack, g_far=loss * gripper.stack.g_far)
-    return replace(gripper, stack=stack, second=second)
+    return {
+        name: _free(group_rows, lambda at, x: _fits(view(x), [at])[0], used, data.level[group_rows])
+        for name, group_rows in rows.items()
+    }
 
 
 def _free(
     at: Rows, joint: Callable[[Rows, Array], Joint], coupling: Coupling, skin: Array
 ) -> list[posterior_grid.GridPosterior]:
-    x = np.linspace(*posterior_grid.LN_E_RANGE, posterior_grid.N_COARSE)
+    x = np.linspace(*posterior_grid.LN_E_RANGE, posterior_grid.GRID.coarse_points)
     fit = joint(at, x)
     for widen, n_point in posterior_grid.REFINEMENTS:
         more = posterior_grid.refined(x, fit.log_evidence, widen, n_point)
@@ -491,11 +400,11 @@ def _free(
         order = np.argsort(np.concatenate([x, more]))
         x = np.concatenate([x, more])[order]
         fit = Joint(*(np.concatenate(pair)[order] for pair in zip(fit, extra)))
-    own = np.diagonal(fit.covariance, axis1=1, axis2=2)[:, ::N_SHARED]
-    found, ln_h = fit.mean[:, ::N_SHARED], fit.mean[:, 1::N_SHARED]
-    sd = np.hypot(np.sqrt(own), coupling.touch_sd(found - skin))
+    variance = np.diagonal(fit.covariance, axis1=1, axis2=2)[:, ::N_SHARED]
+    t_object, ln_h = fit.mean[:, ::N_SHARED], fit.mean[:, 1::N_SHARED]
+    sd = np.hypot(np.sqrt(variance), coupling.touch_sd(t_object - skin))
     return [
-        posterior_grid.posterior_of(x, fit.log_evidence, found[:, k], sd[:, k], ln_h[:, k])
+        posterior_grid.posterior_of(x, fit.log_evidence, t_object[:, k], sd[:, k], ln_h[:, k])
         for k in range(skin.size)
     ]
 
@@ -506,9 +415,9 @@ def learn_coupling(gripper: GripperModel, grasps: Grasps, *, start: Coupling | N
 
     centre = start or Coupling()
     groups = [
-        (factor, view, at)
+        (factor, view, group_rows)
         for view, rows in _own_views(gripper, grasps, centre)
-        for factor, at in zip(_factors(view, rows), rows)
+        for factor, group_rows in zip(_factors(view, rows), rows)
     ]
     longest = max(_longest_rests(grasps).values())
     if start is not None:
@@ -516,15 +425,17 @@ def learn_coupling(gripper: GripperModel, grasps: Grasps, *, start: Coupling | N
     first = np.log([max(centre.found, 0.05), max(centre.loss, 1.0), centre.sd, centre.ln_h_sd])
 
     def coupling(q: Array) -> Coupling:
-        found, loss, sd, ln_h_sd = np.exp(np.clip(q, first - 3, first + 3))
+        found_share, loss, sd, ln_h_sd = np.exp(np.clip(q, first - 3, first + 3))
         return Coupling(
-            found=min(float(found), 2.0), loss=float(loss), sd=float(sd), ln_h_sd=float(ln_h_sd),
+            found=min(float(found_share), 2.0), loss=float(loss), sd=float(sd), ln_h_sd=float(ln_h_sd),
             longest_rest=longest,
         )  # fmt: skip
 
     def cost(q: Array) -> float:
         now = coupling(q)
-        fits = (combine(f, *_prior(view, at, now, f)).log_evidence[0] for f, view, at in groups)
+        fits = (
+            combine(f, *_prior(view, group_rows, now, f)).log_evidence[0] for f, view, group_rows in groups
+        )
         return float(0.5 * (((q - first) / _LEAN) ** 2).sum() - sum(fits))
 
     return coupling(np.asarray(minimize(cost, first, method="Nelder-Mead", options={"xatol": 0.01}).x))
@@ -537,21 +448,7 @@ def next_touch_prior(
     """Return the log evidence (m,) from the touches of one block, and the prior mean (m, 4) and covariance
     (m, 4, 4) of another touch's x = (T_obj, ln h, ln e, ln C) after a ``rest`` [s]."""
     at = _one_block(grasps)
-    hypotheses = material_hypotheses(gripper, candidates)
-    view = _view(gripper, grasps, hypotheses, coupling or Coupling())
-    k = len(_LOSSES) if np.isfinite(view.traces.room[at]).any() else 1
-    each = [_moved_on(_losing(view, loss), at, rest) for loss in _LOSSES[:k]]
-    log_z = np.array([one[0] for one in each]) + np.log(_LOSS_PRIOR[:k, None] / _LOSS_PRIOR[:k].sum())
-    log_evidence = logsumexp(log_z, axis=0)
-    share, means = np.exp(log_z - log_evidence), np.array([one[1] for one in each])
-    mean = (share[:, :, None] * means).sum(axis=0)
-    off = means - mean
-    within = np.array([one[2] for one in each]) + off[:, :, :, None] * off[:, :, None, :]
-    return log_evidence, mean, (share[:, :, None, None] * within).sum(axis=0)
-
-
-def _moved_on(view: _View, at: Rows, rest: float) -> tuple[Array, Array, Array]:
-    """Return log evidence, mean and covariance of the x of another touch at one loss."""
+    view = _view(gripper, grasps, material_hypotheses(gripper, candidates), coupling or Coupling())
     factor = _factors(view, [at])[0]
     if at.size > 1:
         factor = _factors(view, [at], _cavities(view, [at], [factor]))[0]
@@ -605,9 +502,9 @@ def _own_views(gripper: GripperModel, grasps: Grasps, coupling: Coupling) -> lis
     label = grasps["material"].values.astype(str)
     groups = list(touch_groups(grasps).values())
     return [
-        (_view(gripper, grasps, material_hypotheses(gripper, [name]), coupling), own)
-        for name in dict.fromkeys(label[at[0]] for at in groups)
-        if (own := [at for at in groups if label[at[0]] == name])
+        (_view(gripper, grasps, material_hypotheses(gripper, [name]), coupling), of_material)
+        for name in dict.fromkeys(label[group_rows[0]] for group_rows in groups)
+        if (of_material := [group_rows for group_rows in groups if label[group_rows[0]] == name])
     ]
 
 
@@ -615,8 +512,8 @@ def _factors(view: _View, groups: list[Rows], found: list[tuple[Array, Array]] |
     """Return a factor of leading shape (m, n) a group; ``found``, (m, n) each, replaces T's prior."""
     m = view.hypotheses.ln_h.size
     # group after group, hypothesis after hypothesis, touch after touch
-    row = np.concatenate([np.tile(at, m) for at in groups])
-    which = np.concatenate([np.repeat(np.arange(m), at.size) for at in groups])
+    row = np.concatenate([np.tile(group_rows, m) for group_rows in groups])
+    which = np.concatenate([np.repeat(np.arange(m), group_rows.size) for group_rows in groups])
     hypotheses = Hypotheses(*(h[which] for h in view.hypotheses))
     prior = prior_of(view.gripper, view.data.take(row), hypotheses)
     if found is not None:
@@ -630,7 +527,7 @@ def _factors(view: _View, groups: list[Rows], found: list[tuple[Array, Array]] |
     # away from a mode there is nothing to expand: such a hypothesis keeps its (hopeless) value everywhere
     lost = ~mode.converged
     whole.log_size[lost], whole.eta[lost], whole.precision[lost] = mode.log_evidence[lost], 0.0, 0.0
-    ends = np.cumsum([0, *(m * at.size for at in groups)])
+    ends = np.cumsum([0, *(m * group_rows.size for group_rows in groups)])
     return [whole.take(np.arange(a, b).reshape(m, -1)) for a, b in pairwise(ends.tolist())]
 
 
@@ -651,18 +548,18 @@ def _cavities(view: _View, groups: list[Rows], factors: list[Factor]) -> list[tu
     """Return mean and sd (m, n) of each touch's block temperature by the other touches alone, or the prior's
     where that contradicts the touch itself: such a hypothesis is hopeless, and an expansion there would reach
     too far."""
-    found = []
-    for at, factor in zip(groups, factors):
-        prior = _prior(view, at, view.coupling, factor)
+    cavities = []
+    for group_rows, factor in zip(groups, factors):
+        prior = _prior(view, group_rows, view.coupling, factor)
         mean, sd = np.empty(factor.log_size.shape), np.empty(factor.log_size.shape)
-        for k in range(at.size):
+        for k in range(group_rows.size):
             mean[:, k], sd[:, k] = _t_object(combine(_without(factor, [k]), *prior), k)
-            others = [j for j in range(at.size) if j != k]
-            own, own_sd = _t_object(combine(_without(factor, others), *prior), k)
-            apart = np.abs(mean[:, k] - own) > _CONTRADICTION * np.hypot(sd[:, k], own_sd)
+            others = [j for j in range(group_rows.size) if j != k]
+            own_mean, own_sd = _t_object(combine(_without(factor, others), *prior), k)
+            apart = np.abs(mean[:, k] - own_mean) > BLOCK.contradiction_sd * np.hypot(sd[:, k], own_sd)
             mean[apart, k], sd[apart, k] = factor.centre[apart, k, 0], UNKNOWN_OBJECT_SD
-        found.append((mean, sd))
-    return found
+        cavities.append((mean, sd))
+    return cavities
 
 
 def _without(factor: Factor, touches_left_out: Sequence[int]) -> Factor:
@@ -674,11 +571,11 @@ def _without(factor: Factor, touches_left_out: Sequence[int]) -> Factor:
 
 def _t_object(joint: Joint, k: int) -> tuple[Array, Array]:
     """Return mean and sd (m,) of the block's temperature at touch k."""
-    at = N_SHARED * k
-    return joint.mean[:, at], np.sqrt(joint.covariance[:, at, at])
+    column = N_SHARED * k
+    return joint.mean[:, column], np.sqrt(joint.covariance[:, column, column])
 
 
 def _fits(view: _View, groups: list[Rows]) -> list[Joint]:
     """Return evidence and posterior of each group, factors expanded around what the other touches say."""
     factors = _factors(view, groups, _cavities(view, groups, _factors(view, groups)))
-    return [combine(f, *_prior(view, at, view.coupling, f)) for f, at in zip(factors, groups)]
+    return [combine(f, *_prior(view, group_rows, view.coupling, f)) for f, group_rows in zip(factors, groups)]

@@ -100,14 +100,14 @@ def effusivity_posterior(
     (grasps,) = as_grasps(grasps)
     rows = touch_groups(grasps) if has_touch_groups(grasps) else {}
     alone = np.setdiff1d(np.arange(grasps.sizes["grasp"]), np.concatenate([[], *rows.values()]).astype(int))
-    found: dict[int, GridPosterior] = {}
+    posterior_of: dict[int, GridPosterior] = {}
     if alone.size:
         single = grid_posteriors(gripper, touches(grasps, until=until, at=alone))
-        found |= dict(zip(alone.tolist(), single))
+        posterior_of |= dict(zip(alone.tolist(), single))
     if rows:
         for name, fits in free_touch_fit(gripper, grasps, coupling=coupling, until=until).items():
-            found |= dict(zip(rows[name].tolist(), fits))
-    return [_row(gripper, str(name), found[i]) for i, name in enumerate(grasps["grasp"].values)]
+            posterior_of |= dict(zip(rows[name].tolist(), fits))
+    return [_row(gripper, str(name), posterior_of[i]) for i, name in enumerate(grasps["grasp"].values)]
 
 
 _LEVELS = (0.05, 0.5, 0.95)

@@ -13,6 +13,7 @@ normal density to 1e-6.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -40,15 +41,27 @@ from thermogrip.sysid.effusivity.laplace_approximation import (
 # diamond most (6.3e4, of one isotope 7.7e4); that far from its blocks a calibration's scale is known to 0.30
 # and 0.16 in the logarithm, and two of these are left on either side.
 LN_E_RANGE = (float(np.log(17.0)), float(np.log(1.1e5)))
-_LISTED_SD = 0.3  # of ln e about a material of the table, where objects are likeliest
-N_COARSE = 26
+
+
+@dataclass(frozen=True)
+class GridSettings:
+    """Where the density of ln e is looked for, and how finely."""
+
+    listed_sd: float = 0.3  # of ln e about a material of the table, where objects are likeliest
+    # over the prior: 0.35 of ln e apart, a third of the narrowest metal's density of one refinement
+    coarse_points: int = 26
+    fine_points: int = 160  # of a density
+    least_grade: float = 1e-4  # probability of a grade that has a part in a posterior
+    anywhere_sd: float = 1.0  # of ln e about a candidate's, where a free density is looked for
+    # of ln e, between the ends of the points about it: a density may lie at an end of the range
+    narrowest: float = 1e-3
+    grade_behind: float = 15.0  # nats, by the mode alone, from which on a grade has no part in the sum
+
+
+GRID = GridSettings()
+
 REFINEMENTS = ((12.0, 12), (7.0, 14))  # nats below the best point that each covers, and its points
-_FINE = 160  # points of a density
-_LEAST_GRADE = 1e-4  # probability of a grade that has a part in a posterior
-_ANYWHERE = 1.0  # of ln e about a candidate's, where a free density is looked for
 _AROUND = 1.2 * np.arange(-4.0, 5.0)  # sds about the free density's place
-_NARROWEST = 1e-3  # of ln e, between the ends of these points: a density may lie at an end of the range
-_GRADE_BEHIND = 15.0  # nats, by the mode alone, from which on a grade has no part in the sum
 
 
 class GridPosterior(NamedTuple):
@@ -66,12 +79,12 @@ class GridPosterior(NamedTuple):
 def grid_posteriors(gripper: GripperModel, data: Touches) -> list[GridPosterior]:
     """Return the posteriors of ln e: log-uniform prior over :data:`LN_E_RANGE`, h_c unknown."""
     n, n_grade = data.level.size, len(gripper.grades)
-    each = _posteriors(gripper, graded(data, gripper.grades))
-    evidence = np.array([one.log_evidence for one in each]).reshape(n, n_grade)
+    by_grade = _posteriors(gripper, graded(data, gripper.grades))
+    evidence = np.array([one.log_evidence for one in by_grade]).reshape(n, n_grade)
     weight = over_grades(gripper, evidence)
-    likely = weight > logsumexp(weight, axis=1, keepdims=True) + np.log(_LEAST_GRADE)
+    likely = weight > logsumexp(weight, axis=1, keepdims=True) + np.log(GRID.least_grade)
     return [
-        mixed([each[i * n_grade + k] for k in np.flatnonzero(likely[i])], weight[i, likely[i]])
+        mixed([by_grade[i * n_grade + k] for k in np.flatnonzero(likely[i])], weight[i, likely[i]])
         for i in range(n)
     ]
 
@@ -79,25 +92,25 @@ def grid_posteriors(gripper: GripperModel, data: Touches) -> list[GridPosterior]
 def _posteriors(gripper: GripperModel, data: Touches) -> list[GridPosterior]:
     """Return :func:`grid_posteriors` under the grade that each of the touches has."""
     noise = whitened(gripper, data)
-    x = np.tile(np.linspace(*LN_E_RANGE, N_COARSE), (data.level.size, 1))
-    found = _modes_at(gripper, data, noise, x, None)
+    x = np.tile(np.linspace(*LN_E_RANGE, GRID.coarse_points), (data.level.size, 1))
+    modes = _modes_at(gripper, data, noise, x, None)
     for widen, n_point in REFINEMENTS:
-        pairs = zip(x, found.log_evidence)
+        pairs = zip(x, modes.log_evidence)
         more = np.stack([refined(row, value, widen, n_point) for row, value in pairs])
         nearest = np.abs(more[:, :, None] - x[:, None]).argmin(axis=2)
-        start = np.take_along_axis(found.u, nearest[:, :, None], axis=1)
+        start = np.take_along_axis(modes.u, nearest[:, :, None], axis=1)
         start[:, :, EFFUSIVITY] = more
         extra = _modes_at(gripper, data, noise, more, start)
         x = np.concatenate([x, more], axis=1)
-        joined: Any = (np.concatenate(pair, axis=1) for pair in zip(found, extra))
+        joined: Any = (np.concatenate(pair, axis=1) for pair in zip(modes, extra))
         order = np.argsort(x, axis=1)
         row = np.arange(len(x))[:, None]
-        x, found = x[row, order], Mode(*joined).take((row, order))
-    value = found.log_evidence
+        x, modes = x[row, order], Mode(*joined).take((row, order))
+    value = modes.log_evidence
     if gripper.discrepancy is not None:  # its evidence counts little, so what objects are made of counts
         value = value + log_listed(x - gripper.effusivity_scale(x)[0])
-    sd = np.sqrt(found.covariance[:, :, T_OBJECT, T_OBJECT])
-    columns = zip(x, value, found.u[:, :, T_OBJECT], sd, found.u[:, :, H])
+    sd = np.sqrt(modes.covariance[:, :, T_OBJECT, T_OBJECT])
+    columns = zip(x, value, modes.u[:, :, T_OBJECT], sd, modes.u[:, :, H])
     return [posterior_of(*row) for row in columns]
 
 
@@ -106,13 +119,13 @@ def _modes_at(gripper: GripperModel, data: Touches, noise: Whitened, x: Array, s
     ...)."""
     n, m = x.shape
     row, hypotheses = np.repeat(np.arange(n), m), free_hypotheses(gripper, x)
-    each = data.known(row)
-    prior = prior_of(gripper, each, hypotheses)
+    stated = data.known(row)
+    prior = prior_of(gripper, stated, hypotheses)
     begin = None if start is None else start.reshape(n * m, -1)
     mode = fit_rivals(gripper, data, row, hypotheses, start=begin, noise=noise, prior=prior)
-    mode = doubted(each, prior, mode)
-    parts: Any = (part.reshape(n, m, *part.shape[1:]) for part in mode)
-    return Mode(*parts)
+    mode = doubted(stated, prior, mode)
+    fields: Any = (field.reshape(n, m, *field.shape[1:]) for field in mode)
+    return Mode(*fields)
 
 
 def free_evidence(gripper: GripperModel, data: Touches, near: Array, noise: Whitened) -> Array:
@@ -121,13 +134,13 @@ def free_evidence(gripper: GripperModel, data: Touches, near: Array, noise: Whit
     n_grade = len(gripper.grades)
     data, near = graded(data, gripper.grades), np.repeat(near, n_grade, axis=0)
     free = free_hypotheses(gripper, np.clip(near[:, EFFUSIVITY], *LN_E_RANGE))
-    prior = prior_of(gripper, data, free._replace(ln_e_sd=np.full(len(near), _ANYWHERE)))
+    prior = prior_of(gripper, data, free._replace(ln_e_sd=np.full(len(near), GRID.anywhere_sd)))
     mode = fit_pairs(gripper, data, np.arange(len(near)), free, start=near, noise=noise, prior=prior)
-    away = (mode.u[:, EFFUSIVITY] - prior.mean[:, EFFUSIVITY]) / _ANYWHERE
+    away = (mode.u[:, EFFUSIVITY] - prior.mean[:, EFFUSIVITY]) / GRID.anywhere_sd
     about = over_grades(gripper, (mode.log_evidence + 0.5 * away**2).reshape(-1, n_grade))
-    at = np.flatnonzero(about > about.max(axis=1, keepdims=True) - _GRADE_BEHIND)
+    likely = np.flatnonzero(about > about.max(axis=1, keepdims=True) - GRID.grade_behind)
     out = np.full(data.level.size, -np.inf)
-    out[at] = _evidence_about(gripper, data.take(at), taken(noise, at), mode.take(at))
+    out[likely] = _evidence_about(gripper, data.take(likely), taken(noise, likely), mode.take(likely))
     return np.asarray(logsumexp(over_grades(gripper, out.reshape(-1, n_grade)), axis=1))
 
 
@@ -136,8 +149,8 @@ def _evidence_about(gripper: GripperModel, data: Touches, noise: Whitened, mode:
     rule; points start where the other unknowns go along with ln e."""
     place, variance = mode.u[:, EFFUSIVITY], mode.covariance[:, EFFUSIVITY, EFFUSIVITY]
     lowest, highest = LN_E_RANGE
-    low = np.clip(place + _AROUND[0] * np.sqrt(variance), lowest, highest - _NARROWEST)
-    high = np.clip(place + _AROUND[-1] * np.sqrt(variance), low + _NARROWEST, highest)
+    low = np.clip(place + _AROUND[0] * np.sqrt(variance), lowest, highest - GRID.narrowest)
+    high = np.clip(place + _AROUND[-1] * np.sqrt(variance), low + GRID.narrowest, highest)
     x = low[:, None] + (high - low)[:, None] * np.linspace(0.0, 1.0, _AROUND.size)
     along = mode.covariance[:, :, EFFUSIVITY] / variance[:, None]
     start = mode.u[:, None] + along[:, None] * (x - place[:, None])[:, :, None]
@@ -151,9 +164,9 @@ def log_listed(ln_e: Array) -> Array:
     even odds that an object is of some material of the table, each within 30 %, or of any effusivity."""
     listed = np.log([material.effusivity for material in load_materials().values()])
     width = LN_E_RANGE[1] - LN_E_RANGE[0]
-    z = (ln_e[..., None] - listed) / _LISTED_SD
-    near = np.exp(-0.5 * z**2).mean(axis=-1) / (_LISTED_SD * np.sqrt(2 * np.pi))
-    return np.asarray(np.log(0.5 + 0.5 * width * near))
+    z = (ln_e[..., None] - listed) / GRID.listed_sd
+    density = np.exp(-0.5 * z**2).mean(axis=-1) / (GRID.listed_sd * np.sqrt(2 * np.pi))
+    return np.asarray(np.log(0.5 + 0.5 * width * density))
 
 
 def mixed(parts: Sequence[GridPosterior], log_weight: Array) -> GridPosterior:
@@ -161,11 +174,11 @@ def mixed(parts: Sequence[GridPosterior], log_weight: Array) -> GridPosterior:
     (n_part,)."""
     total = float(logsumexp(log_weight))
     share = np.exp(log_weight - total)
-    x = np.concatenate([part.x for part in parts])
-    mass = np.concatenate([s * part.mass for s, part in zip(share, parts)])
-    weight = np.concatenate([s * part.weight for s, part in zip(share, parts)])
+    x = np.concatenate([posterior.x for posterior in parts])
+    mass = np.concatenate([s * posterior.mass for s, posterior in zip(share, parts)])
+    weight = np.concatenate([s * posterior.weight for s, posterior in zip(share, parts)])
     order = np.argsort(x, kind="stable")
-    t_object, sd, ln_h = (np.concatenate(rest) for rest in zip(*(part[4:] for part in parts)))
+    t_object, sd, ln_h = (np.concatenate(columns) for columns in zip(*(posterior[4:] for posterior in parts)))
     return GridPosterior(x[order], mass[order], total, weight, t_object, sd, ln_h)
 
 
@@ -202,8 +215,8 @@ def posterior_of(x: Array, value: Array, t_object: Array, sd: Array, ln_h: Array
     (m,)."""
     from scipy.interpolate import Akima1DInterpolator
 
-    near = np.flatnonzero(value > value.max() - 20.0)
-    fine = np.linspace(x[max(near[0] - 1, 0)], x[min(near[-1] + 1, x.size - 1)], _FINE)
+    likely = np.flatnonzero(value > value.max() - 20.0)
+    fine = np.linspace(x[max(likely[0] - 1, 0)], x[min(likely[-1] + 1, x.size - 1)], GRID.fine_points)
     # 30 nats below the best nothing counts, and a cubic beside would swing
     log_density = Akima1DInterpolator(x, np.maximum(value, value.max() - 30.0))(fine)
     log_density[[0, -1]] -= np.log(2.0)  # by the trapezoidal rule

@@ -1,15 +1,9 @@
-"""What a gripper will read next, under each candidate: the rest of a contact, or another touch.
+"""What a gripper will read in another touch of a block, under each candidate.
 
-Under a candidate m the readings to come are nearly Gaussian.  For the **rest of a contact**, with the
-nuisances u known from the readings so far as N(u_m, P_m), noise C of past (p) and future (f) readings, and J
-= df/du,
-
-    y_f | y_p ~ N(f_f + K (y_p - f_p),  (J_f - K J_p) P_m (J_f - K J_p)' + C_ff - K C_pf),   K = C_fp C_pp^-1,
-
-since slow noise and the model's misfit remember.  For **another touch** of the same block nothing of it is
-read yet: what the block keeps (temperature, effusivity, heat capacity, part of the contact conductance) comes
-from the touches so far through :mod:`~thermogrip.sysid.effusivity.multi_touch`, the rest from the
-gripper's spreads, and
+Under a candidate the readings y to come are nearly Gaussian.  Nothing of the touch is read yet: what the
+block keeps (temperature, effusivity, heat capacity, part of the contact conductance) comes from the touches
+so far through :mod:`~thermogrip.sysid.effusivity.multi_touch`, the rest from the gripper's spreads, and with
+J = df/du
 
     y ~ N(f(mean), J P J' + C).
 
@@ -20,14 +14,13 @@ Nothing is simulated sample by sample: it costs a few evaluations of the respons
 A second sensor's readings of **another touch** stand beside the first one's, one normal distribution for
 both.  They share the block's temperature, which each thermometer has 0.3 K off the other, and with it what is
 known of it; contact, build-up and onset are each sensor's own.  The second one begins as it did in the last
-touch, or with the first one where the two began within 2 K of each other.  Of the rest of a contact it is
-left out, and more may be gained than is expected.
+touch, or with the first one where the two began within 2 K of each other.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -48,7 +41,6 @@ from thermogrip.sysid.effusivity.laplace_approximation import (
     SENSORS_APART,
     T_OBJECT,
     Hypotheses,
-    fit_candidates,
     hypotheses_of_second,
     jacobian,
     material_hypotheses,
@@ -60,10 +52,20 @@ from thermogrip.sysid.effusivity.multi_touch import SHARED, Coupling, next_touch
 if TYPE_CHECKING:
     from thermogrip.datasets.schema import Grasps
 
-_STEP = 0.5  # s: readings to come are taken as means over this
-_REGULATION = 0.35  # K: how far from its set point a gripper is at contact
-_ALIKE = 2.0  # K: sensors that begin so near to each other are both set
-_FIRST = 0.3  # s: before it the moment of contact matters too much for one expansion
+
+@dataclass(frozen=True)
+class ForecastSettings:
+    """Readings to come, and how a gripper begins."""
+
+    bin_s: float = 0.5  # readings to come are taken as means over this
+    regulation_sd_K: float = (
+        0.35  # how far from its set point a gripper is at contact, as simulated grasps are
+    )
+    alike_K: float = 2.0  # sensors that begin so near to each other are both set
+    first_s: float = 0.3  # before it the moment of contact matters too much for one expansion
+
+
+FORECAST = ForecastSettings()
 
 
 class PosteriorPredictive(NamedTuple):
@@ -72,44 +74,6 @@ class PosteriorPredictive(NamedTuple):
     log_p: Array  # (n, m), now
     mean: Array  # (n, m, n_reading), of the readings to come under each candidate [degC]
     covariance: Array  # (n, m, n_reading, n_reading) [K^2]
-    # (n, m, 7), of the rest of a contact: the modes, from which the next evaluation may start
-    u: Array | None = None
-
-
-def rest_of_contact(
-    gripper: GripperModel, grasps: Grasps, candidates: Sequence[str | Material], *, until: float,
-    end: float = 10.0, start: Array | None = None,
-) -> PosteriorPredictive:  # fmt: skip
-    """Return what the readings from ``until`` to ``end`` [s] will be, given those before."""
-    data = touches(grasps, until=until)
-    mode, prior, row, *_ = fit_candidates(gripper, data, candidates, start=start)
-    n, m = data.level.size, len(candidates)
-    log_p = mode.log_evidence.reshape(n, m)
-    log_p = log_p - logsumexp(log_p, axis=1, keepdims=True)
-    dt = _sample_time(grasps)
-    # the next sample is at until + dt
-    at = np.arange(until + 0.5 * (_STEP + dt), end, _STEP, dtype=np.float64)
-    whole, n_past = _extended(data, at, dt), data.y.shape[1]
-    noise = noise_covariance(whole, gripper.noise)
-    past, cross = noise[:, :n_past, :n_past], noise[:, n_past:, :n_past]
-    gain = np.linalg.solve(past, cross.transpose(0, 2, 1)).transpose(0, 2, 1)
-    left = noise[:, n_past:, n_past:] - gain @ cross.transpose(0, 2, 1)
-    y, slopes = jacobian(
-        gripper.stack,
-        nodes_for(whole),
-        whole.take(row),
-        mode.u,
-        prior.sd > 0,
-        gripper.beyond(whole.t[row], prior.mean[:, EFFUSIVITY]),
-    )
-    seen = np.where(data.count > 0, data.y, 0.0)[row] - np.where(data.count[row] > 0, y[:, :n_past], 0.0)
-    mean = y[:, n_past:] + np.einsum("nfp,np->nf", gain[row], seen)
-    moved = slopes[:, n_past:] - gain[row] @ slopes[:, :n_past]
-    covariance = moved @ mode.covariance @ moved.transpose(0, 2, 1) + left[row]
-    shape = (n, m, at.size, at.size)
-    return PosteriorPredictive(
-        log_p, mean.reshape(n, m, -1), covariance.reshape(shape), mode.u.reshape(n, m, -1)
-    )
 
 
 def next_touch(
@@ -124,8 +88,10 @@ def next_touch(
     data = _coming(np.repeat(temperature, m), room, end, _sample_time(grasps))
     u, spread = np.zeros((n * m, N_NUISANCE)), np.zeros((n * m, N_NUISANCE, N_NUISANCE))
     u[:, BUILD_UP], u[:, ONSET], u[:, LEVEL] = np.log(gripper.stack.build_up), gripper.onset, data.level
-    own = [BUILD_UP, ONSET, LEVEL]
-    spread[:, own, own] = np.square([gripper.spreads.ln_build_up, gripper.spreads.onset, _REGULATION])
+    own_nuisances = [BUILD_UP, ONSET, LEVEL]
+    spread[:, own_nuisances, own_nuisances] = np.square(
+        [gripper.spreads.ln_build_up, gripper.spreads.onset, FORECAST.regulation_sd_K]
+    )
     u[:, SHARED] = np.tile(x_mean, (n, 1))
     spread[:, np.array(SHARED)[:, None], SHARED] = np.tile(x_cov, (n, 1, 1))
     y, slopes, covariance = _to_come(gripper, data, u, spread)
@@ -133,14 +99,16 @@ def next_touch(
     last = touches(grasps)
     if gripper.second is not None and last.second is not None:
         one = material_hypotheses(gripper, candidates)
-        other = Hypotheses(*(np.tile(part, n) for part in hypotheses_of_second(gripper, gripper.second, one)))
+        other = Hypotheses(
+            *(np.tile(field, n) for field in hypotheses_of_second(gripper, gripper.second, one))
+        )
         begin = last.second.level[-1]
-        level = data.level if abs(begin - last.level[-1]) < _ALIKE else np.full(n * m, begin)
+        level = data.level if abs(begin - last.level[-1]) < FORECAST.alike_K else np.full(n * m, begin)
         begun = _coming(level, room, end, _sample_time(grasps))
         prior = prior_of(gripper.second, begun, other)
         prior.mean[:, T_OBJECT] = u[:, T_OBJECT] + gripper.second.bias - gripper.bias
         prior.sd[:, T_OBJECT] = np.hypot(np.sqrt(spread[:, T_OBJECT, T_OBJECT]), SENSORS_APART)
-        prior.sd[:, LEVEL] = _REGULATION
+        prior.sd[:, LEVEL] = FORECAST.regulation_sd_K
         own_spread = np.eye(N_NUISANCE) * (prior.sd**2)[:, :, None]
         y_2, slopes_2, covariance_2 = _to_come(gripper.second, begun, prior.mean, own_spread)
         cross = (slopes @ spread[:, :, [T_OBJECT]]) @ slopes_2[:, :, [T_OBJECT]].transpose(0, 2, 1)
@@ -170,31 +138,17 @@ def _sample_time(grasps: Grasps) -> float:
 
 def _samples(at: Array, dt: float) -> tuple[Array, NDArray[np.int64], Array]:
     """Return the samples of means over half a second at times ``at``: times, bins, and how many a bin."""
-    per = max(1, round(_STEP / dt))
+    per = max(1, round(FORECAST.bin_s / dt))
     times = at[:, None] + dt * (np.arange(per) - 0.5 * (per - 1))
     return times.ravel(), np.repeat(np.arange(at.size), per), np.full(at.size, float(per))
 
 
-def _extended(data: Touches, at: Array, dt: float) -> Touches:
-    """Return the touches with bins of readings to come at times ``at``."""
-    n, n_bin = data.y.shape
-    times, bins, count = _samples(at, dt)
-
-    def joined(past: Array, new: Array) -> Array:
-        return np.concatenate([past, np.broadcast_to(new, (n, new.size))], axis=1)
-
-    return replace(
-        data, sample_t=joined(data.sample_t, times),
-        sample_bin=np.concatenate([data.sample_bin, np.broadcast_to(n_bin + bins, (n, bins.size))], axis=1),
-        y=joined(data.y, np.zeros(at.size)), t=joined(data.t, at), count=joined(data.count, count),
-        ramp=joined(data.ramp, at - PUMP_OFF),
-    )  # fmt: skip
-
-
 def _coming(level: Array, room: float, end: float, dt: float) -> Touches:
     """Return touches of which nothing is read yet: a reading of the level, then one every half second."""
-    at = np.concatenate([[-1.0 - _STEP], np.arange(_FIRST + _STEP / 2, end, _STEP)])
-    times, bins, count = _samples(at, dt)
+    bin_times = np.concatenate(
+        [[-1.0 - FORECAST.bin_s], np.arange(FORECAST.first_s + FORECAST.bin_s / 2, end, FORECAST.bin_s)]
+    )
+    times, bins, count = _samples(bin_times, dt)
     n = level.size
     unknown = np.full(n, np.nan)
 
@@ -203,8 +157,8 @@ def _coming(level: Array, room: float, end: float, dt: float) -> Touches:
 
     return Touches(
         grasp_id=np.full(n, "next"), material=np.full(n, ""), sample_t=each(times),
-        sample_bin=np.broadcast_to(bins, (n, bins.size)).copy(), y=np.zeros((n, at.size)), t=each(at),
-        count=each(count), ramp=each(np.maximum(at - PUMP_OFF, 0.0)), level=level, t_object=unknown,
-        t_object_sd=unknown, t_ambient=np.full(n, room), excursion=np.zeros(n),
-        share=np.zeros(n), unlike=np.zeros(n),
+        sample_bin=np.broadcast_to(bins, (n, bins.size)).copy(), y=np.zeros((n, bin_times.size)),
+        t=each(bin_times), count=each(count), ramp=each(np.maximum(bin_times - PUMP_OFF, 0.0)), level=level,
+        t_object=unknown, t_object_sd=unknown, t_ambient=np.full(n, room), excursion=np.zeros(n),
+        share=np.zeros(n), unlike=np.zeros(n), since=np.full(n, -np.inf),
     )  # fmt: skip

@@ -59,31 +59,45 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
-#: No skin moves by so much from one reading to the next [K].
-LEAP = 10.0
+
+@dataclass(frozen=True)
+class ContactSettings:
+    """What a contact looks like: times, shares of the object's distance from the skin, sensor steps."""
+
+    leap_K: float = 10.0  # no skin moves by so much from one reading to the next
+    level_until_s: float = -0.25  # whatever the closed message misses the contact by
+    contact_after_s: float = 0.15  # whatever the closed message misses the contact by
+    surely_after_s: float = 0.25  # readings until then may be of before contact
+    # a block that moved five steps in the second before has no time constant above 0.6 s
+    saturated_s: float = 2.0
+    moving_s: float = 1.0  # the second before it saturates
+    begins_to_saturate_s: float = 0.3  # too short to tell a rail from a slow contact
+    moving_steps: int = 5  # of the sensor, in the second before it saturates
+    finest_step_K: float = 1e-3  # no thermometer's step is smaller
+    silent_samples: int = 30  # normal jitter stays within one step for so long once in 100 000 traces
+    telling_difference_K: float = 10.0  # a smaller one does not show whether there was a contact
+    # what a skin moves by at most without a contact: 0.5 % of 20 K as a pump stops
+    no_contact_share: float = 0.006
+    odd_share: float = 0.015  # less is odd; cork, the least of the examples, moves it by 0.035
+    contrary_share: float = 0.05  # beyond ten times what a skin moves by without a contact
+    # the least insulator of the library has moved the skin by no_contact_share then
+    least_contact_s: float = 3.0
+    just_now_s: float = 0.25  # of a contact that goes on
+    unknown_rest_s: float = 60.0  # between two touches, where the record does not say
+    # a contact up to so many times as long as the longest known one is not worth a word
+    read_whole: float = 1.2
+    latest_contact_s: float = 0.7  # after time 0; where most contacts show later it is not the closed message
+    # of the difference, within the record before contact: the pump's stop moves 0.005
+    moves_before_share: float = 0.04
+
+
+LIMITS = ContactSettings()
+
 #: Attribute of a record whose samples are all usable: nobody need check them again.
 CHECKED = "checked_samples"
 #: Why a grasp is unusable.
 NO_CONTACT, OUT_OF_RANGE = "no contact", "no reading within the sensor's range"
 CONTRARY = "the skin moves away from t_object: is that right, and in degC?"
-
-_BEFORE, _AFTER = -0.25, 0.15  # s: the level before contact, whatever the closed message misses it by
-_CONTACT = 0.25  # s: readings until then may be of before contact
-_STAYS, _MOVING = 2.0, 1.0  # s
-_BEGINS = 0.3  # s
-_STEPS = 5  # of the trace, in the second before it saturates
-_FINEST = 1e-3  # K: no thermometer's step is smaller
-_SILENT = 30  # samples
-_DIFFERENCE = 10.0  # K: a smaller one does not show whether there was a contact
-_NO_MOVE = 0.006  # of the difference: what a skin moves by at most without a contact
-_ODD_MOVE = 0.015  # of the difference: less is odd; cork, the least of the examples, moves it by 0.035
-_CONTRARY_MOVE = 0.05  # of the difference
-_LEAST_TIME = 3.0  # s of contact
-_JUST_NOW = 0.25  # s
-_REST = 60.0  # s between two touches, where the record does not say
-_READ_WHOLE = 1.2  # a contact up to so many times as long as the longest known one is not worth a word
-_LATEST = 0.7  # s
-_MOVES_BEFORE = 0.04  # of the difference, within the record before contact: the pump's stop moves 0.005
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,7 +127,7 @@ class GraspQuality:
         not moved (an insulator's, or about to touch), one that has just stood still in full motion (perhaps
         at the end of its sensor's range), and one without a reading yet."""
         trace = self._trace
-        unread = ~np.isfinite(trace.clean[:, trace.time > _CONTACT]).any(axis=1)
+        unread = ~np.isfinite(trace.clean[:, trace.time > LIMITS.surely_after_s]).any(axis=1)
         return np.asarray(unread | trace.unmoved() | trace.begins_to_saturate())
 
     def usable_grasps(self, grasps: Grasps) -> Grasps | None:
@@ -123,10 +137,10 @@ class GraspQuality:
             return None
         if self.usable.all():
             return grasps
-        kept = grasps.isel(grasp=self.usable)
+        usable = grasps.isel(grasp=self.usable)
         if not has_touch_groups(grasps):
-            return kept
-        return kept.assign(rest=("grasp", _rests(grasps, ~self.usable)[self.usable]))
+            return usable
+        return usable.assign(rest=("grasp", _rests(grasps, ~self.usable)[self.usable]))
 
     def read(self, grasps: Grasps) -> Grasps | None:
         """Return the usable grasps as an answer reads them: masked samples lost (NaN), and cut."""
@@ -146,21 +160,28 @@ def check_grasps(grasps: Grasps, *, longest: float = np.inf, whole_traces: bool 
     """
     time = np.asarray(grasps.variables["time"].values, dtype=float)
     raw = np.asarray(grasps.variables["t_surface"].values, dtype=float)
-    spiked, known = _spiked(raw), (number_values(grasps, name) for name in ("t_object", "t_object_sd"))
-    trace = _Trace(time, raw, np.where(spiked, np.nan, raw), spiked, *known)
-    seen = np.isfinite(trace.clean)
+    spiked, temperatures = _spiked(raw), (number_values(grasps, name) for name in ("t_object", "t_object_sd"))
+    trace = _Trace(time, raw, np.where(spiked, np.nan, raw), spiked, *temperatures)
+    has_reading = np.isfinite(trace.clean)
     clipped = _clipped(time, trace.clean)
     masked = np.asarray(spiked | clipped)
-    read = seen & ~clipped
+    read = has_reading & ~clipped
     out_of_range = clipped.any(axis=1) & ~(
-        read[:, time < _BEFORE].any(axis=1) & read[:, time > _AFTER].any(axis=1)
+        read[:, time < LIMITS.level_until_s].any(axis=1) & read[:, time > LIMITS.contact_after_s].any(axis=1)
     )
     why = np.where(trace.contradicts(), CONTRARY, np.where(out_of_range, OUT_OF_RANGE, ""))
-    reason = [str(words) for words in np.where(trace.stays(_NO_MOVE), NO_CONTACT, why)]
-    at, row, ever = clipped.argmax(axis=1), np.arange(len(clipped)), np.asarray(clipped.any(axis=1))
-    since, reading = np.where(ever, time[at], np.nan), np.where(ever, raw[row, at], np.nan)
+    reason = [str(words) for words in np.where(trace.stays(LIMITS.no_contact_share), NO_CONTACT, why)]
+    first_clipped, row, ever = (
+        clipped.argmax(axis=1),
+        np.arange(len(clipped)),
+        np.asarray(clipped.any(axis=1)),
+    )
+    since, reading = (
+        np.where(ever, time[first_clipped], np.nan),
+        np.where(ever, raw[row, first_clipped], np.nan),
+    )
     single = not has_touch_groups(grasps)
-    shortened = np.asarray((_ends(time, np.isfinite(raw)) > _READ_WHOLE * longest) & single)
+    shortened = np.asarray((_ends(time, np.isfinite(raw)) > LIMITS.read_whole * longest) & single)
     note = list(reason)
     for i in range(len(note)):
         if not note[i] and ever[i]:
@@ -191,7 +212,7 @@ class _Trace:
     @cached_property
     def level(self) -> Floats:
         """Mean before contact (n,) [degC]."""
-        return _means(self.clean[:, self.time < _BEFORE])
+        return _means(self.clean[:, self.time < LIMITS.level_until_s])
 
     @cached_property
     def difference(self) -> Floats:
@@ -211,27 +232,33 @@ class _Trace:
     def stays(self, share: float) -> Flags:
         """Return which grasps move by less than this share of a difference that would show contact, (n,)."""
         moves = np.abs(self.moved) < share * self.away
-        return np.asarray((self.away >= _DIFFERENCE) & moves & (self.time[-1] >= _LEAST_TIME))
+        return np.asarray(
+            (self.away >= LIMITS.telling_difference_K) & moves & (self.time[-1] >= LIMITS.least_contact_s)
+        )
 
     def contradicts(self) -> Flags:
         """Return which grasps move away from an object that is stated to be 10 K off or more, (n,)."""
-        against = -np.sign(self.difference) * self.moved > _CONTRARY_MOVE * self.away
-        return np.asarray((self.away >= _DIFFERENCE) & against & (self.time[-1] >= _LEAST_TIME))
+        against = -np.sign(self.difference) * self.moved > LIMITS.contrary_share * self.away
+        return np.asarray(
+            (self.away >= LIMITS.telling_difference_K) & against & (self.time[-1] >= LIMITS.least_contact_s)
+        )
 
     def unmoved(self) -> Flags:
         """Return which grasps, 10 K from their object, have not moved towards it yet, however short, (n,)."""
-        moved = _means(self.clean[:, self.time > self.time[-1] - _JUST_NOW]) - self.level
-        still = np.sign(self.difference) * moved < _NO_MOVE * self.away
-        return np.asarray((self.away >= _DIFFERENCE) & still)
+        moved = _means(self.clean[:, self.time > self.time[-1] - LIMITS.just_now_s]) - self.level
+        still = np.sign(self.difference) * moved < LIMITS.no_contact_share * self.away
+        return np.asarray((self.away >= LIMITS.telling_difference_K) & still)
 
     def begins_to_saturate(self) -> Flags:
         """Return which grasps have stood still for 0.3 s after full motion: too early to know why, (n,)."""
         still = np.zeros(len(self.clean), dtype=bool)
         for i, row in enumerate(self.clean):
-            seen = row[np.isfinite(row)]
+            readings = row[np.isfinite(row)]
             for sign in (1.0, -1.0):
-                if seen.size and sign * seen[-1] == (sign * seen).max():
-                    still[i] |= _saturates(self.time, sign * row, float(sign * seen[-1]), _BEGINS)
+                if readings.size and sign * readings[-1] == (sign * readings).max():
+                    still[i] |= _saturates(
+                        self.time, sign * row, float(sign * readings[-1]), LIMITS.begins_to_saturate_s
+                    )
         return still
 
 
@@ -284,7 +311,7 @@ def contact_faults(grasps: Grasps) -> list[str]:
     quality = check_grasps(grasps)
     trace, spiked = quality._trace, quality.spiked
     clipped, difference = np.isfinite(quality.clipped_at), trace.difference
-    still, wrong = trace.stays(_ODD_MOVE), trace.contradicts()
+    still, wrong = trace.stays(LIMITS.odd_share), trace.contradicts()
     faults = []
 
     def named(which: Flags) -> str:
@@ -306,8 +333,13 @@ def contact_faults(grasps: Grasps) -> list[str]:
         faults.append(f"{named(still)} {off:.0f} K from their object stay as they are: no contact?")
     if wrong.any():
         faults.append(f"{named(wrong)}: {CONTRARY}")
-    far = (np.abs(difference) >= _DIFFERENCE) & ~still & ~wrong & bool(trace.time[-1] >= _LEAST_TIME)
-    mistimed = _mistimed(trace.time, trace.clean[far], np.abs(difference[far]))
+    far_apart = (
+        (np.abs(difference) >= LIMITS.telling_difference_K)
+        & ~still
+        & ~wrong
+        & bool(trace.time[-1] >= LIMITS.least_contact_s)
+    )
+    mistimed = _mistimed(trace.time, trace.clean[far_apart], np.abs(difference[far_apart]))
     if mistimed:  # a contact before time 0 moves the skin too
         faults.append(mistimed)
     return faults
@@ -325,11 +357,11 @@ def touched_groups(record: Grasps) -> list[str]:
 
 def torn_names(touched: Iterable[tuple[str, Sequence[str]]]) -> list[str]:
     """Return what :func:`torn_groups` does, of the name of each file and its groups."""
-    found: dict[str, list[str]] = {}
+    files_of: dict[str, list[str]] = {}
     for file, groups in touched:
         for name in groups:
-            found.setdefault(name, []).append(file)
-    torn = {name: files for name, files in found.items() if len(files) > 1}
+            files_of.setdefault(name, []).append(file)
+    torn = {name: files for name, files in files_of.items() if len(files) > 1}
     if not torn:
         return []
     first, files = next(iter(torn.items()))
@@ -346,17 +378,17 @@ def _mistimed(time: Floats, skin: Floats, difference: Floats) -> str:
         return ""
     first, last = time <= time[0] + 0.55, (time >= -0.65) & (time <= -0.25)
     before = np.abs(_medians(skin[:, last]) - _medians(skin[:, first]))
-    early = int(np.sum(before > _MOVES_BEFORE * difference))
+    early = int(np.sum(before > LIMITS.moves_before_share * difference))
     if 2 * early > len(skin):
         return (
             f"{_counted(early)} of {len(skin)} move before time 0; time 0 must be the closed message, and "
             "the record must start before contact"
         )
     felt = [find_contact(time, row) for row in skin]
-    seen = np.array([t for t in felt if t is not None])
-    if seen.size and 2 * np.sum(seen > _LATEST) > len(felt):
+    contact_times = np.array([t for t in felt if t is not None])
+    if contact_times.size and 2 * np.sum(contact_times > LIMITS.latest_contact_s) > len(felt):
         return (
-            f"contact shows {np.median(seen):.1f} s after time 0 (median of {seen.size}); "
+            f"contact shows {np.median(contact_times):.1f} s after time 0 (median of {contact_times.size}); "
             "time 0 must be the closed message"
         )
     return ""
@@ -364,8 +396,8 @@ def _mistimed(time: Floats, skin: Floats, difference: Floats) -> str:
 
 def _medians(block: Floats) -> Floats:
     """Return the median of each row but for lost samples, NaN where there is none."""
-    found = [np.median(row[np.isfinite(row)]) if np.isfinite(row).any() else np.nan for row in block]
-    return np.array(found)
+    medians = [np.median(row[np.isfinite(row)]) if np.isfinite(row).any() else np.nan for row in block]
+    return np.array(medians)
 
 
 def _counted(n: int) -> str:
@@ -382,11 +414,14 @@ def _spiked(data: Floats) -> Flags:
         moves = np.abs(jumps[i])
         step = float(moves[moves > 0].min())  # a coarse sensor flickers by one of them
         spiked[i] = find_spikes(data[i], floor=max(SPIKE_FLOOR_K, 2.5 * step))
-    for i in np.flatnonzero((np.abs(jumps) > LEAP).any(axis=1)):
-        seen = np.flatnonzero(np.isfinite(data[i]))
-        for order in (seen, seen[::-1]):  # the few samples at either end that lie a leap away from the rest
-            leaps = np.flatnonzero(np.abs(np.diff(data[i][order[: SPIKE_LENGTH + 1]])) > LEAP)
-            if leaps.size and seen.size > 2 * SPIKE_LENGTH:
+    for i in np.flatnonzero((np.abs(jumps) > LIMITS.leap_K).any(axis=1)):
+        read_at = np.flatnonzero(np.isfinite(data[i]))
+        for order in (
+            read_at,
+            read_at[::-1],
+        ):  # the few samples at either end that lie a leap away from the rest
+            leaps = np.flatnonzero(np.abs(np.diff(data[i][order[: SPIKE_LENGTH + 1]])) > LIMITS.leap_K)
+            if leaps.size and read_at.size > 2 * SPIKE_LENGTH:
                 spiked[i, order[: leaps[-1] + 1]] = True
     return spiked
 
@@ -407,43 +442,45 @@ def _clipped(time: Floats, clean: Floats) -> Flags:
     return clipped
 
 
-def _saturates(time: Floats, row: Floats, top: float, stays_for: float = _STAYS) -> bool:
+def _saturates(time: Floats, row: Floats, top: float, stays_for: float = LIMITS.saturated_s) -> bool:
     """Return whether a trace gets to its highest reading in full motion, or falls silent there."""
-    seen = np.isfinite(row)
-    t, y = time[seen], row[seen]
-    there = (y == top) & (t > 0)
-    edges = np.flatnonzero(np.diff(there, prepend=False, append=False))
+    has_reading = np.isfinite(row)
+    t, y = time[has_reading], row[has_reading]
+    at_top = (y == top) & (t > 0)
+    edges = np.flatnonzero(np.diff(at_top, prepend=False, append=False))
     runs = edges.reshape(-1, 2)  # from, to (one past the last)
     n, seconds = runs[:, 1] - runs[:, 0], t[runs[:, 1] - 1] - t[runs[:, 0]]
     stays = seconds >= stays_for - 1e-9
     if not stays.any():
         return False
     moves = np.abs(np.diff(y))
-    step = max(float(moves[moves > 0].min(initial=np.inf)), _FINEST)
+    step = max(float(moves[moves > 0].min(initial=np.inf)), LIMITS.finest_step_K)
     first = runs[0, 0]
-    if y[first] - np.interp(t[first] - _MOVING, t, y) > _STEPS * step:
+    if y[first] - np.interp(t[first] - LIMITS.moving_s, t, y) > LIMITS.moving_steps * step:
         return True
-    before = y[t < _BEFORE]
+    before = y[t < LIMITS.level_until_s]
     jitter = np.diff(before)
     # two readings in turn are a quiet sensor between two steps
     jitters = min((jitter > 0).sum(), (jitter < 0).sum()) > 1 and np.unique(before).size > 2
-    return bool(jitters and (n[stays] >= _SILENT).any())
+    return bool(jitters and (n[stays] >= LIMITS.silent_samples).any())
 
 
 def _rests(grasps: Grasps, left_out: Flags) -> Floats:
     """Return each touch's time since the touch before that counts [s], NaN where unknown."""
-    rest, order = np.array(number_values(grasps, "rest")), number_values(grasps, "touch")
+    rest_s, order = np.array(number_values(grasps, "rest")), number_values(grasps, "touch")
     group, time = label_values(grasps, "touch_group"), grasps["time"].values
-    seen = np.isfinite(grasps["t_surface"].values)
+    has_reading = np.isfinite(grasps["t_surface"].values)
     for name in np.unique(group[left_out & (group != "")]):
-        at = np.flatnonzero(group == name)
+        group_rows = np.flatnonzero(group == name)
         more = 0.0
-        for i in at[np.argsort(order[at], kind="stable")]:
+        for i in group_rows[np.argsort(order[group_rows], kind="stable")]:
             if left_out[i]:
-                more += (rest[i] if np.isfinite(rest[i]) else _REST) + float(time[seen[i]][-1])
+                more += (rest_s[i] if np.isfinite(rest_s[i]) else LIMITS.unknown_rest_s) + float(
+                    time[has_reading[i]][-1]
+                )
             elif more > 0:
-                rest[i], more = (rest[i] if np.isfinite(rest[i]) else _REST) + more, 0.0
-    return rest
+                rest_s[i], more = (rest_s[i] if np.isfinite(rest_s[i]) else LIMITS.unknown_rest_s) + more, 0.0
+    return rest_s
 
 
 def number_values(grasps: Grasps, name: str) -> Floats:
@@ -456,9 +493,11 @@ def number_values(grasps: Grasps, name: str) -> Floats:
 
 def _means(block: Floats) -> Floats:
     """Return the mean of each row but for lost samples, NaN where all are lost."""
-    seen = np.isfinite(block)
-    n = seen.sum(axis=1)
-    return np.asarray(np.where(n > 0, np.where(seen, block, 0.0).sum(axis=1) / np.maximum(n, 1), np.nan))
+    has_reading = np.isfinite(block)
+    n = has_reading.sum(axis=1)
+    return np.asarray(
+        np.where(n > 0, np.where(has_reading, block, 0.0).sum(axis=1) / np.maximum(n, 1), np.nan)
+    )
 
 
 def _ends(time: Floats, seen: Flags) -> Floats:

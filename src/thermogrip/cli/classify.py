@@ -69,21 +69,21 @@ def touched_part(console: Console, records: Sequence[Grasps]) -> list[Grasps]:
     """Return the grasps to learn from without those that show no contact."""
     from thermogrip.sysid.effusivity.quality import check_grasps
 
-    kept = []
+    touched = []
     for record in records:
         quality = check_grasps(record)
         for words in dict.fromkeys(filter(None, quality.reason)):
             console.warn(f"{record.attrs['name']}: {quality.reason.count(words)} left out: {words}")
-        part = quality.usable_grasps(record)
-        kept += [] if part is None else [part]
-    if not kept:
+        usable = quality.usable_grasps(record)
+        touched += [] if usable is None else [usable]
+    if not touched:
         raise UserError("no grasp shows a contact", hint="give grasps that touched something")
-    return kept
+    return touched
 
 
 def training_part(console: Console, records: Sequence[Grasps], split: str | None) -> list[Grasps]:
     """Return the grasps to learn from: those marked ``train`` where there are any, or all."""
-    kept = []
+    training = []
     for record in records:
         has_split = "split" in record and bool((record["split"].values != "").any())
         if split == "train" and not has_split:
@@ -91,16 +91,16 @@ def training_part(console: Console, records: Sequence[Grasps], split: str | None
                 "has no split", file=record.attrs["name"], hint="fill the column split, or use --split all"
             )
         if split == "all" or not has_split:
-            kept.append(record)
+            training.append(record)
             continue
         marked = record["split"].values == "train"
         if marked.any():
-            kept.append(record.isel(grasp=marked))
+            training.append(record.isel(grasp=marked))
         else:
             console.warn(f"{record.attrs['name']}: no grasp is marked train, it is left out")
-    if not kept:
+    if not training:
         raise UserError("no grasp is marked train", hint="use --split all")
-    return kept
+    return training
 
 
 SHOWN, ON_A_PAGE = 40, 200  # rows of a long table: printed, and in a report
@@ -148,8 +148,8 @@ def effusivity(
     console = Console(as_json)
     device, coupling, longest = calibrated_device(console, calibrate or [], seed)
     ask = _Effusivity(device, coupling, longest, stated)
-    found = answer_files(console, "effusivity", grasps, ask.answer, out, pool, "nan")
-    rows = [row for each in found for row in each["rows"]]
+    answers = answer_files(console, "effusivity", grasps, ask.answer, out, pool, "nan")
+    rows = [row for of_file in answers for row in of_file["rows"]]
     shown = [
         (r["grasp_id"], r["effusivity"], r["effusivity_p05"], r["effusivity_p95"], r["t_object"])
         for r in rows[:SHOWN]
@@ -157,8 +157,8 @@ def effusivity(
     head = ("grasp", "effusivity", "5 %", "95 %", "object [degC]")
     console.table("Effusivity [W s^0.5 m^-2 K^-1], median and quantiles", head, shown)
     _say_more(console, len(rows))
-    missed = {name: why for each in found for name, why in each["missed"].items()}
-    unexplained = {name: why for each in found for name, why in each["unexplained"].items()}
+    missed = {name: why for of_file in answers for name, why in of_file["missed"].items()}
+    unexplained = {name: why for of_file in answers for name, why in of_file["unexplained"].items()}
     say_names(console, ((f"{why}, so no effusivity", name) for name, why in missed.items()))
     say_names(console, ((why, name) for name, why in unexplained.items()))
     console.say(f"wrote {out}")
@@ -330,8 +330,8 @@ def classify(
     pool = cli.workers_of(workers, cluster)
     from thermogrip.datasets.materials import load_materials
 
-    own = [name for name in cli.comma(candidates) or () if name not in load_materials()]
-    cli.choices("--materials", own, model_dir / "classifier.json", "classes")
+    unlisted = [name for name in cli.comma(candidates) or () if name not in load_materials()]
+    cli.choices("--materials", unlisted, model_dir / "classifier.json", "classes")
     console = Console(as_json)
     anywhere = Path.absolute if cluster else Path  # its workers run in other folders
     ask = _Question(
@@ -346,8 +346,8 @@ def classify(
         return _serve(console, ask, port)
     assert out is not None
     _answerer(ask)
-    found = answer_files(console, "classify", paths or [], ask.answer, out, pool)
-    rows = [row for each in found for row in each["rows"]]
+    answers = answer_files(console, "classify", paths or [], ask.answer, out, pool)
+    rows = [row for of_file in answers for row in of_file["rows"]]
     more = [key for key in ("next_touch_degC", "next_touch_accuracy") if key in rows[0]]
     shown = [
         (
@@ -413,9 +413,9 @@ class _Question:
 
     def answer(self, record: Grasps) -> dict[str, Any]:
         """Return the rows of a record, and warnings of it."""
-        said = Said()
-        cli.warn_of_contacts(said, [record])
-        return {"rows": _answerer(self)(record), "warnings": said.words}
+        warnings = Said()
+        cli.warn_of_contacts(warnings, [record])
+        return {"rows": _answerer(self)(record), "warnings": warnings.words}
 
     def load(self) -> Callable[[Grasps], list[dict[str, Any]]]:
         """Return what answers a record with a row a grasp."""
@@ -431,10 +431,10 @@ class _Question:
             model = _with_gripper(model).for_another_gripper(read_grasp_files(self.known))
 
         def rows_of(record: Grasps) -> list[dict[str, Any]]:
-            found = answer(
+            answers = answer(
                 model, record, self.candidates, rule=rule, object_range=self.stated, nearest=self.nearest
             )
-            rows = [one.row() for one in found]
+            rows = [one.row() for one in answers]
             if self.next_touch:  # at which temperature another touch of its block would be worth most
                 from thermogrip.classify.decisions.next_touch import advise_touches
 
@@ -483,19 +483,18 @@ class _Effusivity:
         from thermogrip.classify.decisions.predict import unexplained_effusivities
         from thermogrip.sysid.effusivity.data import with_object_range
 
-        said = Said()
-        cli.warn_of_contacts(said, [record])
-        record = _as_taught(said, record, self.longest, self.coupling)
+        warnings = Said()
+        cli.warn_of_contacts(warnings, [record])
+        record = _as_taught(warnings, record, self.longest, self.coupling)
         ranged = with_object_range(record, self.stated)
-        found = _effusivities(self.device, ranged, self.coupling)
-        misfits = unexplained_effusivities(self.device, record, found, self.stated)
-        rows = [asdict(row) for row in found]
+        estimates = _effusivities(self.device, ranged, self.coupling)
+        misfits = unexplained_effusivities(self.device, record, estimates, self.stated)
+        rows = [asdict(row) for row in estimates]
         for row in rows:
             row["misfit_sd"] = misfits.get(row["grasp_id"], (float("nan"), ""))[0]
         unexplained = {name: words for name, (_, words) in misfits.items() if words}
-        return {
-            "rows": rows, "unexplained": unexplained, "missed": _missed(record, rows), "warnings": said.words
-        }  # fmt: skip
+        missed = _missed(record, rows)
+        return {"rows": rows, "unexplained": unexplained, "missed": missed, "warnings": warnings.words}
 
 
 def materials(
@@ -627,22 +626,22 @@ def answer_files(
 
     files = list_grasp_files(paths)
     todo = [(file.absolute(), name) for file, name in zip(files, distinct_names(files))]
-    found: list[dict[str, Any]] = []
+    answers: list[dict[str, Any]] = []
     with console.progress(verb) as progress:
         progress(0.0, "grasps")
         for (file, name), each in zip(todo, in_order(partial(_answer_file, answer), todo, workers)):
             for words in each["warnings"]:
                 console.warn(words)
-            found.append(each)
+            answers.append(each)
             if out.is_dir():
                 table = file_stem((name or file.name).replace("/", "_"))
                 write_table(each["rows"], out / f"{table}.csv", unknown)
-            progress(len(found) / len(todo), file.name)
-    for words in torn_names((each["name"], each["groups"]) for each in found):
+            progress(len(answers) / len(todo), file.name)
+    for words in torn_names((each["name"], each["groups"]) for each in answers):
         console.warn(words)
     if not out.is_dir():
-        write_table([row for each in found for row in each["rows"]], out, unknown)
-    return found
+        write_table([row for each in answers for row in each["rows"]], out, unknown)
+    return answers
 
 
 def _answer_file(answer: Callable[[Grasps], dict[str, Any]], file: tuple[Path, str | None]) -> dict[str, Any]:

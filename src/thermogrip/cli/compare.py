@@ -97,26 +97,26 @@ def compare(
     records = touched_part(console, records)
     tests = None if tests is None else touched_part(console, tests)
     with console.progress("compare") as progress:
-        given = tests is not None or _has_split(records)
+        has_given_split = tests is not None or _has_split(records)
         anew = tests is None and repeats > 0
-        if given and anew and (why := _unsplittable(records, repeats, train_per_class, seed)):
+        if has_given_split and anew and (why := _unsplittable(records, repeats, train_per_class, seed)):
             console.warn(f"no random splits: {why}")
             anew = False
-        shares = _shares(progress, given, anew, by is not None)
+        shares = _shares(progress, has_given_split, anew, by is not None)
         again: dict[str, Any] = {"seed": seed, "workers": pool}
-        asked: dict[str, Callable[[], Comparison]] = {}
-        if given:
-            asked["files" if tests is not None else "shipped"] = partial(
+        evaluations: dict[str, Callable[[], Comparison]] = {}
+        if has_given_split:
+            evaluations["files" if tests is not None else "shipped"] = partial(
                 evaluate, models, records, test=tests, progress=shares["given"], **again
             )
         if anew:
             some: dict[str, Any] = {"repeats": repeats, "train_per_class": train_per_class}
-            asked["random"] = partial(
+            evaluations["random"] = partial(
                 evaluate, fast, records, split="random", progress=shares["random"], **some, **again
             )
         if by is not None:
-            asked[by] = partial(evaluate, fast, records, split=by, progress=shares["by"], **again)
-        made = {name: compared() for name, compared in asked.items()}
+            evaluations[by] = partial(evaluate, fast, records, split=by, progress=shares["by"], **again)
+        made = {name: compared() for name, compared in evaluations.items()}
         done = {name: replace(each, notes=(*left_out, *each.notes)) for name, each in made.items()}
         found = {name: each for name, each in done.items() if _scored(console, name, each, left_out)}
         if not found:

@@ -54,9 +54,9 @@ def session_section(sessions: Sequence[tuple[str, Session]], rig: str) -> Sectio
     chart = loops_chart({title: first.log}, {title: float(first.log["target_t_surface"].values[0])})
     failed = [title for title, s in sessions if s.verdict != "settled"]
     verdict = f"{len(sessions) - len(failed)} of {len(sessions)} sessions settled on {rig}."
-    parts: list[Any] = [Plot(chart, "The first session: settle, stop the pump, grasp."), Table(head, rows)]
-    parts += [Text(f"{title}: {s.advice}") for title, s in sessions if s.advice]
-    return Section("Does it settle and grasp?", tuple(parts), verdict, "warn" if failed else "good")
+    contents: list[Any] = [Plot(chart, "The first session: settle, stop the pump, grasp."), Table(head, rows)]
+    contents += [Text(f"{title}: {s.advice}") for title, s in sessions if s.advice]
+    return Section("Does it settle and grasp?", tuple(contents), verdict, "warn" if failed else "good")
 
 
 def touch_section(
@@ -66,11 +66,11 @@ def touch_section(
     materials says of them."""
     if not rows:
         return Section("What did it touch?", (), "Nothing: no session came to a grasp.", "warn")
-    known = [row for row in rows if row["true"] in taught]
+    taught_rows = [row for row in rows if row["true"] in taught]
     others = [row for row in rows if row["true"] not in taught]
-    right = sum(row["material"] == row["true"] for row in known)
+    right = sum(row["material"] == row["true"] for row in taught_rows)
     noticed = sum(_unknown(row) for row in others)
-    verdict = f"{right} of {len(known)} blocks of {', '.join(taught)} are named right"
+    verdict = f"{right} of {len(taught_rows)} blocks of {', '.join(taught)} are named right"
     if others:
         names = ", ".join(dict.fromkeys(row["true"] for row in others))
         verdict += f"; {noticed} of {len(others)} that was not taught ({names}) is called unknown"
@@ -78,7 +78,7 @@ def touch_section(
     head = ("true", "answer", *(key.removeprefix("p_") for key in named), "decided at [s]")
     shares = [[None if row[key] is None else round(row[key], 4) for key in named] for row in rows]
     table = tuple((r["true"], r["material"], *of, r["decided_at_s"]) for r, of in zip(rows, shares))
-    parts: list[Any] = [
+    contents: list[Any] = [
         Plot(grasps_chart({"": touched}), "The grasps as recorded; dotted: the gripper's message."),
         Table(head, table, "Posterior classifier, trained on the bundled training grasps"),
         *(Text(f"{row['true'].capitalize()}: {row['why']}.") for row in rows if row.get("why")),
@@ -89,8 +89,8 @@ def touch_section(
             "shows that the stages fit together, not how often they are right."
         ),
     ]
-    wrong = right < len(known) or noticed < len(others) or any(_unknown(row) for row in known)
-    return Section("What did it touch?", tuple(parts), f"{verdict}.", "warn" if wrong else "good")
+    wrong = right < len(taught_rows) or noticed < len(others) or any(_unknown(row) for row in taught_rows)
+    return Section("What did it touch?", tuple(contents), f"{verdict}.", "warn" if wrong else "good")
 
 
 def _unknown(row: Mapping[str, Any]) -> bool:
@@ -122,7 +122,7 @@ def comparison_sections(name: str, comparison: Comparison) -> list[Section]:
     scores = comparison.scores()
     groups = [row["condition"] for row in scores]
     shown = POOLED if POOLED in groups else groups[0]
-    parts: list[Any] = [
+    contents: list[Any] = [
         Picture(accuracy_figure(comparison), f"By condition.{_below(scores)} {comparison.interval_note}"),
         Table(
             *score_table(comparison),
@@ -137,9 +137,9 @@ def comparison_sections(name: str, comparison: Comparison) -> list[Section]:
         ),
     ]
     if comparison.leaks and not any(row["leak"] for row in comparison.leaks):
-        parts.append(Text("Leak probe: from samples before contact no classifier beats chance."))
+        contents.append(Text("Leak probe: from samples before contact no classifier beats chance."))
     if comparison.notes:
-        parts.append(Text("Notes: " + "; ".join(comparison.notes) + "."))
+        contents.append(Text("Notes: " + "; ".join(comparison.notes) + "."))
     kind = {
         "shipped": "Shipped split",
         "random": "Random splits",
@@ -151,9 +151,9 @@ def comparison_sections(name: str, comparison: Comparison) -> list[Section]:
     cautions = [f"{line}." for line in comparison.caution_lines()]
     best, others = _who_wins(comparison, shown)
     if others:
-        parts.insert(1, Text(others))
+        contents.insert(1, Text(others))
     verdict = " ".join([*cautions, best])
-    return [Section(title, tuple(parts), verdict, "warn" if cautions else "plain")]
+    return [Section(title, tuple(contents), verdict, "warn" if cautions else "plain")]
 
 
 def _below(scores: Sequence[Mapping[str, Any]]) -> str:
@@ -213,16 +213,16 @@ def effusivity_section(rows: Sequence[tuple[Mapping[str, Any], str]], of: int) -
     verdict = f"{len(answered)} of {len(rows)} grasps have an effusivity."
     verdict += f" The model does not explain {strange} of them." if strange else ""
     verdict += f" The first {len(rows)} of {of} are shown." if of > len(rows) else ""
-    parts: list[Any] = []
+    contents: list[Any] = []
     if answered:
         strips = [EffusivityRow(**{k: v for k, v in row.items() if k != "misfit_sd"}) for row in answered]
         library = {name: find_material(name).effusivity for name in _WELL_KNOWN}
         caption = "Posterior of each grasp, median and 90 % interval; lines: a few of `thermogrip materials`."
-        parts.append(Picture(effusivity_figure(strips, library), caption))
+        contents.append(Picture(effusivity_figure(strips, library), caption))
     caption = "Effusivity in W s^0.5 m^-2 K^-1, with 90 % intervals"
-    parts.append(Table(head, tuple(cells), caption, dense=True))
+    contents.append(Table(head, tuple(cells), caption, dense=True))
     good = len(answered) == len(rows) and not strange
-    return Section("What effusivity?", tuple(parts), verdict, "good" if good else "warn")
+    return Section("What effusivity?", tuple(contents), verdict, "good" if good else "warn")
 
 
 def _who_wins(comparison: Comparison, condition: str) -> tuple[str, str]:
@@ -232,7 +232,7 @@ def _who_wins(comparison: Comparison, condition: str) -> tuple[str, str]:
         (row for row in comparison.scores() if row["condition"] == condition), key=lambda row: row["log_loss"]
     )
     best = rows[0]
-    said = (
+    verdict = (
         f"{best['classifier']} has the lowest log loss ({best['log_loss']:.2f}; chance "
         f"{best['log_loss_chance']:.2f}) and {100 * best['accuracy']:.0f} % right of n = {best['n']} grasps"
         f"{_of_test(best)} ({100 * best['low']:.0f} to {100 * best['high']:.0f} %)."
@@ -249,4 +249,4 @@ def _who_wins(comparison: Comparison, condition: str) -> tuple[str, str]:
     if close:
         names = ", ".join(d["second"] if d["first"] == best["classifier"] else d["first"] for d in close)
         others.append(f"In accuracy n does not separate {best['classifier']} from {names}.")
-    return said, " ".join(others)
+    return verdict, " ".join(others)

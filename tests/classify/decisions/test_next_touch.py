@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
@@ -18,7 +17,6 @@ from thermogrip.classify.decisions import next_touch
 from thermogrip.classify.decisions.next_touch import (
     NextTouch,
     advise_touches,
-    by_plant,
     entropy,
     expected_information,
 )
@@ -27,8 +25,6 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.datasets.schema import Grasps
 from thermogrip.sysid.effusivity.predictive import PosteriorPredictive
-from thermogrip.sysid.models.state_space import StateSpaceModel
-from thermogrip.sysid.plant.plant import Plant
 
 
 @pytest.fixture(scope="module")
@@ -222,52 +218,7 @@ def test_advice_goes_to_every_touch_at_the_given_cost_per_second(
     assert told == [(k / 3, f"another touch of {name}") for k, name in enumerate("bcd")]
 
 
-@pytest.fixture
-def plant() -> Plant:
-    """One node of 200 s: full drive moves it by 0.2 K/s at first, to 40 K from the room in the end."""
-    dt = 0.5
-    model = StateSpaceModel(
-        ("drive",), ("t_ambient",), ("t_surface",),
-        A=np.array([[1 - dt / 200]]), B=np.array([[dt * 0.2]]), E=np.array([[dt / 200]]), C=np.eye(1), dt=dt,
-    )  # fmt: skip
-    units = {"drive": "1", "t_ambient": "degC", "t_surface": "degC"}
-    return Plant(
-        model, {}, dt=dt, units=units, noise={"t_surface": 0.01}, valid={"drive": (-0.5, 1.0)}, logs=("made",)
-    )
-
-
-HALF, FULL = {"drive": (-0.5, 1.0)}, {}  # downwards; a drive of unknown range goes from full to full
-
-
-LEFT = 0.9975**10  # of a difference from the room: readings of now are met half way through 10 s of rest
-
-
-@pytest.mark.parametrize(
-    ("valid", "now", "there", "left"),
-    [
-        (HALF, 25.0, 25.0, 1.0),
-        (HALF, 25.0, 40.0, 1 - 15 / 40),
-        (HALF, 25.0, 15.0, 1 - 10 / 20),
-        (FULL, 25.0, 10.0, 1 - 15 / 40),
-        # from 35 degC in a room of 25: full drive ends at 65, half of it downwards at 5
-        (HALF, 35.0, 50.0, 15 / (40 - 10 * LEFT)),
-        (HALF, 35.0, 20.0, 15 / (20 + 10 * LEFT)),
-        (HALF, 35.0, 4.0, 0.0),
-        (HALF, 25.0, 70.0, 0.0),
-        (HALF, 25.0, 64.5, 0.5 / 40),  # 876 s
-        (HALF, 25.0, 64.6, 0.0),  # more than 900 s
-    ],
-)
-def test_the_time_to_a_temperature_is_the_first_order_step_or_forever(
-    plant: Plant, valid: dict[str, tuple[float, float]], now: float, there: float, left: float
-) -> None:
-    seconds = by_plant(replace(plant, valid=valid), now, t_ambient=25.0)(there)
-    assert seconds == (0.5 * np.ceil(np.log(left) / np.log(0.9975)) if left else np.inf)
-
-
-def test_what_has_no_model_is_refused(plant: Plant, known: PosteriorClassifier, touched: Grasps) -> None:
-    with pytest.raises(UserError, match="no 't_skin'"):
-        by_plant(plant, 25.0, t_ambient=25.0, output="t_skin")
+def test_what_has_no_model_is_refused(known: PosteriorClassifier, touched: Grasps) -> None:
     with pytest.raises(UserError, match="cannot predict readings"):
         choose_next_touch(make_classifier("pca-lda"), touched)
     for wrong in ({"t_gripper": [np.nan]}, {"t_gripper": []}, {"price": -1e-9}, {"price": np.inf}):
@@ -275,15 +226,3 @@ def test_what_has_no_model_is_refused(plant: Plant, known: PosteriorClassifier, 
             choose_next_touch(known, touched, **wrong)  # type: ignore[arg-type]
     with pytest.raises(UserError, match="'goldd' is no class"):
         choose_next_touch(known, touched, candidates=["goldd", "iron"])
-
-
-def test_switches_are_on() -> None:
-    """A skin that a pump alone brings to the tank: without it nothing moves."""
-    model = StateSpaceModel(
-        ("drive", "pump"), ("t_ambient",), ("t_surface",), A=[[0.99, 0.0], [0.0, 1.0]],
-        B=[[0.2, 0.0], [0.0, 0.0]], E=[[0.01], [0.0]], C=[[0.0, 1.0]], dt=0.5, switches=("pump",),
-        A_switch={"pump": np.array([[0.0, 0.0], [0.05, -0.05]])},
-    )  # fmt: skip
-    units = {"drive": "1", "pump": "1", "t_ambient": "degC", "t_surface": "degC"}
-    pumped = Plant(model, {}, dt=0.5, units=units, valid={"drive": (-1.0, 1.0)}, logs=("made",))
-    assert 20.0 < by_plant(pumped, 25.0, t_ambient=25.0)(30.0) < 60.0

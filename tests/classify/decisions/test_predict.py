@@ -20,7 +20,6 @@ from thermogrip.classify import (
 )
 from thermogrip.classify.decisions.next_touch import advise_touches
 from thermogrip.classify.decisions.predict import unexplained_effusivities
-from thermogrip.classify.decisions.stopping_rule import StopRule
 from thermogrip.classify.estimators.base import GraspClassifier, pick
 from thermogrip.classify.estimators.posterior import PosteriorClassifier
 from thermogrip.datasets.errors import UserError
@@ -86,22 +85,6 @@ def test_the_decision_time_is_that_of_the_last_sample(
     times = [r["decided_at_s"] for r in classify_grasps(model, cut)]
     assert times[0] == pytest.approx(9.6)
     assert times[1] == pytest.approx(10.0)
-
-
-@pytest.mark.parametrize(("gain", "asked"), [(0.0, False), (1e-6, True)])
-def test_what_more_contact_would_bring_is_worked_out_only_for_a_rule_that_asks(
-    gain: float, asked: bool, three: Grasps, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    class Seen(Exception):
-        pass
-
-    def windows(*_: object, gain: bool, **__: object) -> None:
-        raise Seen(gain)
-
-    monkeypatch.setattr("thermogrip.classify.decisions.predict.growing_windows", windows)
-    with pytest.raises(Seen) as seen:
-        classify_grasps(make_classifier("bayes").fit(three), three, rule=StopRule(sure=0.99, gain=gain))
-    assert seen.value.args == (asked,)
 
 
 NAMES = ["copper", "iron", "wood"]

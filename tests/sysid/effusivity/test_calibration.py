@@ -61,7 +61,8 @@ def test_no_noise_nearby_is_likelier_than_that_of_a_calibration(name):
     for k, size in enumerate((0.002, 0.02, 0.02, 0.02, 0.02)):
         for side in (-1, 1):
             inside = np.clip(found + side * size * np.eye(5)[k], *calibration._NOISE_RANGE.T)
-            assert cost(inside)[0] > best - calibration._NOISE_SLOPE * size / calibration._NOISE_STEPS[k]
+            margin = calibration.SETTINGS.noise_slope * size / calibration._NOISE_STEPS[k]
+            assert cost(inside)[0] > best - margin
 
 
 def narrow(q):
