@@ -81,7 +81,7 @@ def tuning_sections(tuning: Tuning) -> list[Section]:
     for title, run in runs.items():
         tone = _tone(tuning.spec, run) if title in steps else ""
         sections.append(loop_section(run, design, steps.get(title, f"A load on {title}"), tone=tone))
-    seconds = [float(each) for run in runs.values() for each in run.seconds]
+    seconds = [float(step_s) for run in runs.values() for step_s in run.seconds]
     if seconds:
         sections.append(timing_section(seconds, design))
     return [*sections, spec_section(tuning)]
@@ -102,7 +102,7 @@ def tuning_section(tuning: Tuning) -> Section:
     meets = "meets" if tuning.meets_spec else "does not meet"
     answer = f"The {kind_of(tuning.controller)} {meets} the spec on every draw."
     scores = ", ".join(f"{name} {value:.3f}" for name, value in tuning.scores.items())
-    parts: list[Any] = [
+    evidence: list[Any] = [
         *([Plot(steps_chart(tuning.runs), _STEPS_CAPTION)] if tuning.runs else []),
         Table(*tuning_table(tuning), tuning_caption(tuning)),
         Text(f"{tuning.verdict.capitalize()}. {tuning.finding}"),
@@ -118,7 +118,7 @@ def tuning_section(tuning: Tuning) -> Section:
         ),
     ]
     tone = "good" if tuning.meets_spec else "warn"
-    return Section("Does the controller meet the spec?", tuple(parts), answer, tone, shown=2)
+    return Section("Does the controller meet the spec?", tuple(evidence), answer, tone, shown=2)
 
 
 def loop_section(run: ClosedLoop, design: Design, title: str, *, tone: str = "") -> Section:
@@ -137,11 +137,11 @@ def loop_section(run: ClosedLoop, design: Design, title: str, *, tone: str = "")
         f"Shaded: the band of \N{PLUS-MINUS SIGN}{_bands(run.band)}; dotted across: settled. Grey: limits of "
         f"drive and slew. By status: {counts}."
     )
-    parts: list[Any] = [Plot(chart, caption)]
+    evidence: list[Any] = [Plot(chart, caption)]
     advices = [text for text in dict.fromkeys(run.advice) if text]
-    parts += [Text(f"Advice of the controller: {'; '.join(advices[:5])}.")] if advices else []
+    evidence += [Text(f"Advice of the controller: {'; '.join(advices[:5])}.")] if advices else []
     whole = all(np.isfinite(segment.settle_s) for segment in run.segments)
-    return Section(title, tuple(parts), f"{words}.", tone or ("good" if whole else "warn"))
+    return Section(title, tuple(evidence), f"{words}.", tone or ("good" if whole else "warn"))
 
 
 def timing_section(seconds: Sequence[float], design: Design) -> Section:
@@ -167,7 +167,7 @@ def spec_section(tuning: Tuning) -> Section:
     kind, design = kind_of(tuning.controller), tuning.controller.design.to_dict()
     requested = tuning.spec.model_dump(mode="json")
     chosen = {name: design[name] for name in _OF_A_PI} if kind == "PI" else design
-    parts = tuple(
+    evidence = tuple(
         Table(
             (head, "value"),
             tuple(
@@ -178,7 +178,7 @@ def spec_section(tuning: Tuning) -> Section:
         for head, values, caption in (("key", requested, "The spec"), ("field", chosen, f"The {kind}"))
     )
     words = f"Seed {tuning.seed}; the same seed gives the same design."
-    return Section("What was requested, and the design", parts, words, shown=0)
+    return Section("What was requested, and the design", evidence, words, shown=0)
 
 
 def _bands(band: float | Mapping[str, float]) -> str:
@@ -191,9 +191,9 @@ def _bands(band: float | Mapping[str, float]) -> str:
 def _as_written(value: Any) -> str:
     """Return a value much as TOML has it, numbers with four digits."""
     if isinstance(value, Mapping):
-        return "; ".join(f"{name} = {_as_written(each)}" for name, each in value.items())
+        return "; ".join(f"{name} = {_as_written(item)}" for name, item in value.items())
     if isinstance(value, list):
-        return f"[{', '.join(_as_written(each) for each in value)}]"
+        return f"[{', '.join(_as_written(item) for item in value)}]"
     return short(value)
 
 
@@ -205,18 +205,18 @@ def session_sections(
     tone = "good" if session.verdict in ("settled", "followed") else "bad"
     events = tuple((event.time_s, event.kind, event.text) for event in session.events)
     table = Table(("time [s]", "event", "what"), events, "Events")
-    parts: list[Any] = [table, *([Text(f"Advice: {session.advice}.")] if session.advice else [])]
+    evidence: list[Any] = [table, *([Text(f"Advice: {session.advice}.")] if session.advice else [])]
     verdict = f"{session.verdict.capitalize()} on {rig}."
-    found = [Section("How did the session go?", tuple(parts), verdict, tone)]
+    sections = [Section("How did the session go?", tuple(evidence), verdict, tone)]
     if session.grasps is not None:
-        found.append(_contact_section(session.grasps, session.contact))
+        sections.append(_contact_section(session.grasps, session.contact))
     if len(moves) > 1:
         design = controller.design
         figures = _figures_of(session, controller.controlled)
         run = session_loop(session.log, moves, drive_range=design.drive_range, figures=figures)
-        found.append(loop_section(run, design, "The closed loop, as its sensors read it", tone=tone))
-        found.append(timing_section([move.seconds for _, move in moves], design))
-    return found
+        sections.append(loop_section(run, design, "The closed loop, as its sensors read it", tone=tone))
+        sections.append(timing_section([move.seconds for _, move in moves], design))
+    return sections
 
 
 def _figures_of(session: Session, controlled: Sequence[str]) -> dict[str, dict[str, float]]:
@@ -237,8 +237,8 @@ def _contact_section(grasps: Grasps, contact: float) -> Section:
         else "The skin felt no object: no contact, or one as warm as the skin."
     )
     caption = "The grasp as recorded; dotted: the message."
-    parts = (Plot(grasps_chart({"": [grasps]}), caption),)
-    return Section("What did the skin feel?", parts, felt, "good" if np.isfinite(contact) else "warn")
+    evidence = (Plot(grasps_chart({"": [grasps]}), caption),)
+    return Section("What did the skin feel?", evidence, felt, "good" if np.isfinite(contact) else "warn")
 
 
 def _uncertain(tuning: Tuning) -> bool:

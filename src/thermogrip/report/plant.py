@@ -66,22 +66,22 @@ def held_out_table(errors: Sequence[Row]) -> Cells:
             for name in ("rmse", "no_input_rmse")
         )
         fit, first = float(np.mean([row.fit_percent for row in rows])), rows[0]
-        what = log if len(rows) == 1 else f"{len(rows)} blocks: {', '.join(f'{r.rmse:.2g}' for r in rows)}"
+        title = log if len(rows) == 1 else f"{len(rows)} blocks: {', '.join(f'{r.rmse:.2g}' for r in rows)}"
         where = "held out" if held_out else "in the fit"
-        out.append((model, what, output, rmse, first.unit, fit, int(n.sum()), idle, where))
+        out.append((model, title, output, rmse, first.unit, fit, int(n.sum()), idle, where))
     return ("model", "log", "output", "RMSE", "unit", "fit [%]", "n", "no input", ""), tuple(out)
 
 
 def model_table(found: Identification) -> Table:
     """Return the candidate models as a small table: a row a model and output, a column a log."""
-    held = [row for row in found.rows if row.held_out]
-    logs = list(dict.fromkeys(row.log for row in held))
+    held_out = [row for row in found.rows if row.held_out]
+    logs = list(dict.fromkeys(row.log for row in held_out))
     rows = []
-    for model, output, unit in dict.fromkeys((row.model, row.output, row.unit) for row in held):
-        by_log = {row.log: row.rmse for row in held if (row.model, row.output) == (model, output)}
+    for model, output, unit in dict.fromkeys((row.model, row.output, row.unit) for row in held_out):
+        by_log = {row.log: row.rmse for row in held_out if (row.model, row.output) == (model, output)}
         rows.append((model, output, *(by_log.get(log) for log in logs), unit))
-    for output, unit in dict.fromkeys((row.output, row.unit) for row in held):
-        baseline = {row.log: row.no_input_rmse for row in held if row.output == output}
+    for output, unit in dict.fromkeys((row.output, row.unit) for row in held_out):
+        baseline = {row.log: row.no_input_rmse for row in held_out if row.output == output}
         rows.append(("no\N{NO-BREAK SPACE}input", output, *(baseline.get(log) for log in logs), unit))
     return Table(
         ("model", "output", *logs, "unit"),
@@ -95,7 +95,7 @@ def identification_section(found: Identification) -> Section:
     checks = [
         (f.verdict, f.check, f.log, f.channel, f.says) for f in found.data_check.findings if f.verdict != "ok"
     ]
-    parts: list[Any] = [
+    evidence: list[Any] = [
         Picture(
             plots.models_figure(found.rows),
             "Free-run error of every model on rows that it was not fitted to.",
@@ -111,24 +111,24 @@ def identification_section(found: Identification) -> Section:
         ),
     ]
     if checks:
-        parts.append(Table(("verdict", "check", "log", "channel", "finding"), tuple(checks), "Data check"))
-    parts += [Text(_sentence(note)) for note in found.notes]
+        evidence.append(Table(("verdict", "check", "log", "channel", "finding"), tuple(checks), "Data check"))
+    evidence += [Text(_sentence(note)) for note in found.notes]
     if found.searched:
-        parts.append(_structure_table(found.searched))
+        evidence.append(_structure_table(found.searched))
     tone = "good" if found.good else "warn"
-    return Section("Which plant is behind the logs?", tuple(parts), _sentence(found.verdict), tone)
+    return Section("Which plant is behind the logs?", tuple(evidence), _sentence(found.verdict), tone)
 
 
 def _structure_table(searched: Sequence[Searched]) -> Table:
     """Return the best structures of each kind, and the one that was kept, with their errors by fold."""
     head = ("model", "structure", "mean", *(f"fold {k + 1}" for k in range(len(searched[0].folds))), "")
     rows: list[tuple[Any, ...]] = []
-    for kind in dict.fromkeys(each.model for each in searched):
-        of_kind = [each for each in searched if each.model == kind]
+    for kind in dict.fromkeys(candidate.model for candidate in searched):
+        of_kind = [candidate for candidate in searched if candidate.model == kind]
         rows += [
-            (kind, each.structure, each.error, *each.folds, "kept" if each.kept else "")
-            for place, each in enumerate(of_kind)
-            if place < _STRUCTURES or each.kept
+            (kind, candidate.structure, candidate.error, *candidate.folds, "kept" if candidate.kept else "")
+            for place, candidate in enumerate(of_kind)
+            if place < _STRUCTURES or candidate.kept
         ]
     title = "Structures searched: RMSE over outputs' spread; kept: an average or the smallest near the best"
     return Table(head, tuple(rows), title)
@@ -168,8 +168,8 @@ def held_out_section(found: Identification) -> Section:
     words = (
         ", ".join(f"{o} {s.rmse:.2g}{_spaced(s.unit)}" for o, s in r.scores.items()) for r in runs.values()
     )
-    errors = "; ".join(f"{name}: {each}" for name, each in zip(runs, words))
-    parts = tuple(
+    errors = "; ".join(f"{name}: {error}" for name, error in zip(runs, words))
+    evidence = tuple(
         Plot(
             plots.free_run_chart(run, tuple(run.scores)[k : k + 2]),
             f"{name}: {found.model} fitted without it, simulated from the inputs alone (dashed), over what "
@@ -178,7 +178,7 @@ def held_out_section(found: Identification) -> Section:
         for name, run in runs.items()
         for k in range(0, len(run.scores), 2)
     )
-    return Section("Does it predict what it has not seen?", parts, f"RMSE of {errors}.", "plain")
+    return Section("Does it predict what it has not seen?", evidence, f"RMSE of {errors}.", "plain")
 
 
 def gain_table(found: Dynamics) -> Cells:
@@ -189,9 +189,9 @@ def gain_table(found: Dynamics) -> Cells:
 
 def time_constant_words(found: Dynamics) -> str:
     """Return the operating point, the time constants and what the intervals are of, in a sentence."""
-    near = found.near
+    linear = found.near
     point = ", ".join(
-        f"{name} {w:.3g}{_spaced(found.units.get(name, '1'))}" for name, w in zip(near.inputs, near.w)
+        f"{name} {w:.3g}{_spaced(found.units.get(name, '1'))}" for name, w in zip(linear.inputs, linear.w)
     )
     slow = [(tau, s) for tau, s in zip(found.time_constants, found.poles) if s.imag >= 0]
     taus = ", ".join(
@@ -211,7 +211,7 @@ def time_constant_words(found: Dynamics) -> str:
 
 def dynamics_section(found: Dynamics) -> Section:
     """Return the section of gains, step and frequency responses."""
-    parts = (
+    evidence = (
         Plot(
             plots.step_response_chart(found),
             "Response of each output to a step of one unit of each input; shaded: the interval.",
@@ -220,7 +220,7 @@ def dynamics_section(found: Dynamics) -> Section:
         Plot(plots.bode_chart(found), "Frequency response from each input; shaded: the interval."),
     )
     words = time_constant_words(found)
-    return Section("How does the plant respond?", parts, _sentence(words[0].upper() + words[1:]))
+    return Section("How does the plant respond?", evidence, _sentence(words[0].upper() + words[1:]))
 
 
 def _spaced(unit: str) -> str:
@@ -232,18 +232,18 @@ def parameters_section(plant: Plant, record: Posterior | None = None) -> Section
     from thermogrip.report.plots import corner_figure
     from thermogrip.sysid.greybox.identifiability import identifiability_report
 
-    parts: list[Any] = [Table(*parameter_table(plant, record), "Free parameters", dense=True)]
+    evidence: list[Any] = [Table(*parameter_table(plant, record), "Free parameters", dense=True)]
     verdict, *least = known_words(plant)
-    parts += [Text(words) for words in least]
-    found, tone = plant.scores.identifiability, "plain"
-    if found is not None and found.flat:
-        parts.append(Text(f"These cannot be estimated separately: {'; '.join(found.flat)}."))
+    evidence += [Text(words) for words in least]
+    identifiability, tone = plant.scores.identifiability, "plain"
+    if identifiability is not None and identifiability.flat:
+        evidence.append(Text(f"These cannot be estimated separately: {'; '.join(identifiability.flat)}."))
         tone = "warn"
     if record is not None:
         tone = tone if record.converged else "warn"
         verdict += "" if record.converged else f" The sampler has {record.verdict}."
         caption = f"{len(record.samples)} samples of what emcee moved, pair by pair; grey lines: the fit."
-        parts += [
+        evidence += [
             Picture(corner_figure(record), caption),
             Text(_sentence(record.likelihood)),
             Text(
@@ -253,13 +253,13 @@ def parameters_section(plant: Plant, record: Posterior | None = None) -> Section
                 f"Medians lie within {record.off_centre:.2f} standard deviations of the fitted values."
             ),
         ]
-    parts += _per_log(plant)
-    parts += [Text(_sentence(said)) for said in identifiability_report(plant)]
-    return Section("How well are its parameters known?", tuple(parts), verdict, tone, shown=0)
+    evidence += _per_log(plant)
+    evidence += [Text(_sentence(said)) for said in identifiability_report(plant)]
+    return Section("How well are its parameters known?", tuple(evidence), verdict, tone, shown=0)
 
 
 def known_words(plant: Plant) -> list[str]:
-    """Return in a sentence how many free parameters are known how well by their 90 % intervals, and in
+    """Return in a sentence how well the free parameters are known by their 90 % intervals, and in
     another which are known least."""
     intervals = plant.intervals(0.9)
     if not intervals:
@@ -268,14 +268,14 @@ def known_words(plant: Plant) -> list[str]:
         name: (high - low) / 2 / max(abs(plant.values[name]), 1e-300)
         for name, (low, high) in intervals.items()
     }
-    near, half = (sum(width <= share for width in off.values()) for share in (0.1, 0.5))
+    within_tenth, half = (sum(width <= share for width in off.values()) for share in (0.1, 0.5))
     least = sorted(off, key=lambda name: -off[name])[:3]
     ends = ", ".join(
         f"{name} ({intervals[name][0]:.3g} to {intervals[name][1]:.3g}{_spaced(plant.units.get(name, '1'))})"
         for name in least
     )
     return [
-        f"{near} of {len(off)} parameters are known within \N{PLUS-MINUS SIGN}10 %, {half} within "
+        f"{within_tenth} of {len(off)} parameters are known within \N{PLUS-MINUS SIGN}10 %, {half} within "
         f"\N{PLUS-MINUS SIGN}50 % (90 % intervals).",
         f"Known least: {ends}.",
     ]
@@ -296,8 +296,8 @@ def parameter_table(plant: Plant, record: Posterior | None = None) -> Cells:
     if record is not None:
         head[3:3], head[7:7] = ["mean", "sd"], ["ESS", "R-hat"]
         for k, row in enumerate(rows):
-            own = record.samples[:, k]
-            row[3:3] = [float(own.mean()), float(own.std(ddof=1))]
+            draws = record.samples[:, k]
+            row[3:3] = [float(draws.mean()), float(draws.std(ddof=1))]
             ess = record.ess.get(row[0])
             row[7:7] = [None if ess is None else round(ess), record.r_hat.get(row[0])]
     return tuple(head), tuple(map(tuple, rows))
@@ -305,10 +305,10 @@ def parameter_table(plant: Plant, record: Posterior | None = None) -> Cells:
 
 def _per_log(plant: Plant) -> list[Table]:
     """Return the table of what each log has of its own, empty where nothing is known of it."""
-    found = plant.scores.per_log
+    effects_by_log = plant.scores.per_log
     rows = [
         (log, effect, *number, _unit_of_effect(plant, effect))
-        for log, effects in found.items()
+        for log, effects in effects_by_log.items()
         for effect, number in effects.items()
     ]
     head = ("log", "effect", "value", "sd", "unit")
@@ -357,7 +357,7 @@ def free_run_section(
     if follows:
         reasons.append(f"residual correlation: {'; '.join(follows)}")
     clauses += reasons if run.verdict is None else []  # else they are its details
-    parts: list[Any] = [
+    evidence: list[Any] = [
         *(
             Plot(
                 plots.free_run_chart(run, outputs[k : k + 2], band),
@@ -375,8 +375,8 @@ def free_run_section(
             "a line below reports the inputs with which they correlate.",
         ),
     ]
-    parts += [Text(_sentence(f"{why[0].upper()}{why[1:]}")) for why in reasons if why not in clauses]
-    parts += [Text(_sentence(note)) for note in run.notes if note != str(run.verdict)]
+    evidence += [Text(_sentence(f"{why[0].upper()}{why[1:]}")) for why in reasons if why not in clauses]
+    evidence += [Text(_sentence(note)) for note in run.notes if note != str(run.verdict)]
     title = title or f"Free run: {name}" + (" (in the fit)" if seen else "")
     if run.verdict is None:
         tone = "warn" if run.no_better or follows else "good"
@@ -384,31 +384,31 @@ def free_run_section(
         tone = "warn" if run.no_better else "plain"
     else:
         tone = "good" if run.verdict.standing in ("as stated", "better") and not run.no_better else "warn"
-    return Section(title, tuple(parts), f"{'; '.join(clauses)}.", tone)
+    return Section(title, tuple(evidence), f"{'; '.join(clauses)}.", tone)
 
 
 def _followed(run: FreeRun) -> list[str]:
     """Return by output, in words, what its residual correlates with."""
     from thermogrip.sysid.validation.residual_tests import SQUARED
 
-    found = []
+    clauses = []
     for output, signals in run.residual.tests.items():
         named = [signal for signal, test in signals.items() if test.significant]
         words = ["its own square" if signal.endswith(SQUARED) else signal for signal in named]
-        found += [f"{output} with {' and '.join(words)}"] if words else []
-    return found
+        clauses += [f"{output} with {' and '.join(words)}"] if words else []
+    return clauses
 
 
 def band_words(band: Band) -> str:
-    """Return what the shaded band is, and how many readings it covers."""
+    """Return what the shaded band is, and the share of the readings that it covers."""
     inside = ", ".join(f"{100 * share:.0f} % of {name}" for name, share in band.inside.items())
     draws = f"{band.draws} draws of the parameters and " if band.draws else ""
-    said = f"{100 * band.level:.0f} % band from {draws}{band.own_error}; it covers {inside}"
+    words = f"{100 * band.level:.0f} % band from {draws}{band.own_error}; it covers {inside}"
     errors = ", ".join(
         f"{name} {band.expected[name]:.2g} ({low:.2g} to {high:.2g})"
         for name, (low, high) in band.likely.items()
     )
-    return said + (f" and stands for an RMSE of {errors}" if errors else "")
+    return words + (f" and stands for an RMSE of {errors}" if errors else "")
 
 
 def _sentence(text: str) -> str:
