@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import errno
 import os
-import pickle
-from collections.abc import Callable
-from pathlib import Path
 
 import pytest
 
@@ -67,11 +64,8 @@ BAD_WORDS: dict[str, tuple[str, tuple[str, ...]]] = {
         "identify good.csv --network none --inputs drive,valve --out p.json",
         ("valve", "good.csv"),
     ),
-    "a network without its file": ("identify good.csv --network none.toml --out p.json", ("none.toml",)),
     "a cut past the end": ("validate plant.json good.csv@5000:", ("good", "299.5")),
     "an output behind a file": ("identify good.csv --network none --out good.csv/p.json", ("good.csv",)),
-    "a log instead of a plant": ("validate good.csv good.csv", ("good.csv",)),
-    "a plant instead of a controller": ("review plant.json", ("plant.json",)),
     "a plant that lacks the columns of the log": ("validate plant.json more.csv", ("more.csv",)),
     "a material that is unknown": (
         "run c.json --target 30 --twin plant.json --object 43 --material coper --out r",
@@ -92,26 +86,6 @@ def test_a_bad_word_is_refused_by_name(what: str, bench: Bench) -> None:
     assert_refused(bench, list(words.split()), *names)
 
 
-def pickle_as_json(bench: Bench) -> Path:
-    return bench.write("evil.json", pickle.dumps({"schema": "thermogrip.plant"}))
-
-
-def json_cut_in_half(bench: Bench) -> Path:
-    text = (bench.path / "plant.json").read_bytes()
-    return bench.write("half.json", text[: len(text) // 2])
-
-
-@pytest.mark.parametrize("make", [pickle_as_json, json_cut_in_half])
-def test_a_damaged_plant_is_refused_and_runs_no_code(make: Callable[[Bench], Path], bench: Bench) -> None:
-    path = make(bench)
-    assert_refused(bench, ["validate", path, "good.csv"], path.name)
-
-
-def test_a_spec_with_an_unknown_key_names_it(bench: Bench) -> None:
-    path = bench.write("spec.toml", bench.run("init", "spec").out + "\nhapiness = 3\n")
-    assert_refused(bench, ["tune", "plant.json", "--spec", path, "--out", "c.json"], "spec.toml", "hapiness")
-
-
 @pytest.mark.parametrize(
     "words",
     [
@@ -129,12 +103,6 @@ def test_a_label_that_is_misspelt_is_named_with_its_file(bench: Bench, words: tu
     done = bench.run(*words)
     assert done.code == 0
     assert "unobtainium: not in the materials table, learnt from its grasps" in done.err
-
-
-def test_an_unknown_candidate_is_refused(bench: Bench) -> None:
-    assert bench.run("train", "grasps.csv", "--classifier", "features-lda", "--out", "m").code == 0
-    words = ["classify", "m", "more.csv", "--materials", "copper,gold", "--out", "p.csv"]
-    assert_refused(bench, words, "gold", "copper")
 
 
 def test_a_full_disk_is_one_line_and_leaves_no_half_file(

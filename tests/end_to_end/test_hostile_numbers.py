@@ -159,17 +159,6 @@ def test_any_number_of_a_settings_file_is_used_or_refused(
             assert line or not (value in NOT_NUMBERS or abs(value) > 1e300), (at, value)
 
 
-@pytest.mark.parametrize("step", STEPS)
-@pytest.mark.parametrize("where", [("dt",), ("model", "dt")])
-def test_a_step_that_no_rig_has_is_refused_in_one_line(
-    where: tuple[str, ...], step: float, bench: Bench
-) -> None:
-    path = bench.write("p.json", json.dumps(changed(small_plant().to_dict(), where, step)))
-    done = bench.run("validate", path, bench.path / "good.csv")
-    assert (done.code, len(done.said)) == (2, 1), done
-    assert "dt is" in done.err
-
-
 @pytest.mark.parametrize(
     "where",
     [("design", "dt"), ("plant", "dt"), ("plant", "noise", "t_surface"), ("plant", "valid", "drive", 1),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import http.client
-import json
 import re
 import socket
 import threading
@@ -132,11 +131,6 @@ def test_requests_reach_the_session_at_a_person_s_pace() -> None:
     assert (found.count(200), found.count(429)) == (2, 2998)
     state.take(message([], question=None))
     assert requests.take("answer", {"question": "2"})[0] == 409
-
-
-def test_a_mark_is_cut_to_its_length(watch: Watch) -> None:
-    assert ask(watch, "POST", "/bad", json.dumps({"text": "x" * 1000}))[0] == 200
-    assert _soon(watch.operator.take_bad) == ["x" * MOST_TEXT]
 
 
 def test_the_page_runs_its_own_script_only_and_asks_nobody_else() -> None:

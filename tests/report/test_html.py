@@ -25,7 +25,6 @@ from thermogrip.report.html import (
     Section,
     Table,
     Text,
-    draw,
     html_page,
     write_report,
 )
@@ -217,20 +216,6 @@ def test_a_page_has_no_control_characters() -> None:
     page = html_page(evil, evil, [Section(evil, (Text(evil), Table((evil,), ((evil,),), evil)), evil)])
     assert "t\\x1b[31m\\u202e\\x00" in page
     assert not set(page) & set("\x1b\u202e\x00")
-
-
-def test_what_was_drawn_before_is_not_drawn_again_as_the_page_is_written(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    sections = [Section("s", (picture(), Text("words")), "v")]
-    write_report(tmp_path / "late.html", "t", "l", sections)
-    sections = [Section("s", (picture(), Text("words")), "v")]
-    draw(sections)
-    monkeypatch.setattr(Figure, "savefig", None)
-    write_report(tmp_path / "early.html", "t", "l", sections)
-    late, early = ((tmp_path / f"{name}.html").read_text(encoding="utf-8") for name in ("late", "early"))
-    assert sections[0].parts[0].data_uri in late
-    assert sections[0].parts[0].data_uri in early
 
 
 def test_letters_that_the_font_has_not_are_no_warning(tmp_path: Path) -> None:

@@ -24,7 +24,7 @@ import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cache
 from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -115,7 +115,7 @@ class Picture:
     caption: str
     kind: str = "picture"
 
-    @cached_property
+    @property
     def data_uri(self) -> str:
         """Return the figure as a ``data:`` address."""
         return _data_uri(self.figure)
@@ -195,14 +195,6 @@ class Section:
     def __post_init__(self) -> None:
         if self.tone not in TONES:
             raise ValueError(f"tone {self.tone!r} is none of {TONES}")
-
-
-def draw(sections: Sequence[Section]) -> None:
-    """Draw the figures of sections now: else they are drawn as the page is written."""
-    for section in sections:
-        for evidence in section.parts:
-            if isinstance(evidence, Picture):
-                _ = evidence.data_uri
 
 
 def html_page(title: str, lead: str, sections: Sequence[Section]) -> str:
