@@ -180,7 +180,7 @@ def _of_test(row: Mapping[str, Any]) -> str:
 
 
 def _of_tested(row: Mapping[str, Any]) -> int | str:
-    """Return how many grasps were scored, of how many tested where some were not."""
+    """Return the number of grasps that were scored, of those tested where some were not."""
     return f"{row['n']}/{row['n_test']}" if row["n_test"] > row["n"] else int(row["n"])
 
 
