@@ -41,10 +41,12 @@ def make_folder(path: str | Path) -> None:
     that is refused."""
     folder = Path(path)
     with os_faults(path):
-        missing = [each for each in (folder, *folder.parents) if not each.exists()]
+        missing = [
+            missing_folder for missing_folder in (folder, *folder.parents) if not missing_folder.exists()
+        ]
         folder.mkdir(parents=True, exist_ok=True)
-        for each in missing:
-            _sync_folder(each.parent)
+        for missing_folder in missing:
+            _sync_folder(missing_folder.parent)
 
 
 # Windows writes a line end of two bytes unless it is asked not to; a child process gets no copy on either
@@ -139,16 +141,16 @@ def read_toml(path: str | Path, *, hint: str) -> dict[str, Any]:
 def read_json(path: str | Path, schema: str, version: int) -> dict[str, Any]:
     """Return the JSON object in ``path``, which must have this schema and no newer version."""
     raw = read_bytes(path, share=JSON_SHARE)
-    at: dict[str, Any] = {"file": path, "hint": f"it must be a JSON file of schema {schema!r}"}
-    with as_user_error(UnicodeDecodeError, "is not text, so it is not JSON", **at):
+    place: dict[str, Any] = {"file": path, "hint": f"it must be a JSON file of schema {schema!r}"}
+    with as_user_error(UnicodeDecodeError, "is not text, so it is not JSON", **place):
         text = raw.decode("utf-8")
-    too_deep = as_user_error(RecursionError, "is nested too deeply", **at)
-    with too_deep, as_user_error(ValueError, "is not JSON ({error})", **at):
+    too_deep = as_user_error(RecursionError, "is nested too deeply", **place)
+    with too_deep, as_user_error(ValueError, "is not JSON ({error})", **place):
         try:
             content = parse_json(text, parse_constant=_refuse_constant)
         except json.JSONDecodeError as error:
             problem = f"is not JSON ({error.msg}, column {error.colno})"
-            raise UserError(problem, **at, row=error.lineno) from error
+            raise UserError(problem, **place, row=error.lineno) from error
     check_json(content, schema, version, file=path)
     check_content(content, file=path)
     whole: dict[str, Any] = content
@@ -167,11 +169,13 @@ def parse_json(text: str, **options: Any) -> Any:
 def check_json(content: Any, schema: str, version: int, *, file: str | Path | None = None) -> None:
     """Raise :class:`UserError` where content is no JSON object of the schema, or newer than ``version``."""
     if not isinstance(content, dict) or content.get("schema") != schema:
-        found = content.get("schema") if isinstance(content, dict) else type(content).__name__
-        raise UserError(f"schema is {found!r}, not {schema!r}", file=file, hint="give the file of that stage")
-    found = content.get("version")
-    if not isinstance(found, int) or isinstance(found, bool) or not 1 <= found <= version:
-        problem = f"version {repr(found)[:20]} is not between 1 and {version}"
+        stated = content.get("schema") if isinstance(content, dict) else type(content).__name__
+        raise UserError(
+            f"schema is {stated!r}, not {schema!r}", file=file, hint="give the file of that stage"
+        )
+    stated = content.get("version")
+    if not isinstance(stated, int) or isinstance(stated, bool) or not 1 <= stated <= version:
+        problem = f"version {repr(stated)[:20]} is not between 1 and {version}"
         raise UserError(problem, file=file, hint="update thermogrip or write the file anew")
 
 
@@ -204,9 +208,9 @@ def _sync_folder(path: Path) -> None:
 def _mode_of(target: Path) -> int:
     """Return the permissions of the file that is replaced, else what the umask leaves (not 0600)."""
     with suppress(OSError):
-        found = os.lstat(target).st_mode
-        if stat.S_ISREG(found):  # a link is replaced, and where it leads to is not asked
-            return found & 0o777
+        mode = os.lstat(target).st_mode
+        if stat.S_ISREG(mode):  # a link is replaced, and where it leads to is not asked
+            return mode & 0o777
     mask = os.umask(0)
     os.umask(mask)
     return 0o666 & ~mask

@@ -82,27 +82,30 @@ def thin(columns: Sequence[Array], most: int) -> NDArray[np.intp]:
     n = len(columns[0])
     if n <= most:
         return np.arange(n)
-    kept = {0}
+    kept_rows = {0}
     rows = 1 + sum(2 + (not np.isfinite(values).all()) for values in columns)  # that a bin may keep
-    for part in np.array_split(np.arange(n), max(1, (most - 1) // rows)):
-        kept.add(int(part[-1]))
+    for bin_rows in np.array_split(np.arange(n), max(1, (most - 1) // rows)):
+        kept_rows.add(int(bin_rows[-1]))
         for values in columns:
-            known = np.isfinite(values[part])
-            if known.any():
-                seen = part[known]
-                kept |= {int(seen[values[seen].argmin()]), int(seen[values[seen].argmax()])}
-            if not known.all():
-                kept.add(int(part[~known][0]))
-    return np.array(sorted(kept))
+            finite = np.isfinite(values[bin_rows])
+            if finite.any():
+                finite_rows = bin_rows[finite]
+                kept_rows |= {
+                    int(finite_rows[values[finite_rows].argmin()]),
+                    int(finite_rows[values[finite_rows].argmax()]),
+                }
+            if not finite.all():
+                kept_rows.add(int(bin_rows[~finite][0]))
+    return np.array(sorted(kept_rows))
 
 
 def thinned(curve: Curve, most: int) -> Curve:
     """Return a curve of at most so many points."""
-    own = [part for part in (curve.y, curve.low, curve.high) if part is not None]
+    lines = [line for line in (curve.y, curve.low, curve.high) if line is not None]
     if len(curve.x) <= most:
         return curve
-    keep = thin(own, most)
-    x, y, *ends = (np.asarray(part)[keep] for part in (curve.x, *own))
+    keep = thin(lines, most)
+    x, y, *ends = (np.asarray(line)[keep] for line in (curve.x, *lines))
     low, high = ends or (None, None)
     return replace(curve, x=x, y=y, low=low, high=high)
 
@@ -123,17 +126,17 @@ def draw_chart(chart: Chart) -> Figure:
     for axis in axes.ravel():
         axis.set_axis_off()
     for k, column in enumerate(chart.columns):
-        at = k // across * len(heights)
-        own = axes[at : at + len(heights), k % across]
-        for panel, axis in zip(column, own):
+        first_row = k // across * len(heights)
+        column_axes = axes[first_row : first_row + len(heights), k % across]
+        for panel, axis in zip(column, column_axes):
             axis.set_axis_on()
-            if axis is not own[0]:
-                axis.sharex(own[0])
+            if axis is not column_axes[0]:
+                axis.sharex(column_axes[0])
             axis.tick_params(labelbottom=panel is column[-1])
             _draw(axis, panel)
             if chart.log:
                 axis.set_xscale("log")
-        own[len(column) - 1].set_xlabel(chart.x_label)
+        column_axes[len(column) - 1].set_xlabel(chart.x_label)
     entries: dict[str, Artist] = {}
     for axis in axes.T.ravel():
         for handle, label in zip(*axis.get_legend_handles_labels()):
@@ -150,10 +153,10 @@ def _draw(axis: Axes, panel: Panel) -> None:
         axis.set_yscale("log")
     for begin, end in panel.shaded:
         axis.axvspan(begin, end, color=SHADE, lw=0, zorder=0)
-    for at in panel.marks:
-        axis.axvline(at, color=INK, lw=0.9, ls=":")
+    for mark in panel.marks:
+        axis.axvline(mark, color=INK, lw=0.9, ls=":")
     for label, curve in _once((curve.label, thinned(curve, _STILL)) for curve in panel.curves):
-        own: dict[str, Any] = {"color": curve.colour, "label": label}
+        look: dict[str, Any] = {"color": curve.colour, "label": label}
         if curve.low is not None and curve.high is not None:
             axis.fill_between(
                 curve.x, curve.low, curve.high, color=curve.colour, alpha=0.18, lw=0,
@@ -161,9 +164,9 @@ def _draw(axis: Axes, panel: Panel) -> None:
             )  # fmt: skip
         if curve.dash:
             steps = "steps-post" if curve.step else "default"
-            axis.plot(curve.x, curve.y, lw=curve.width, ls=curve.dash, drawstyle=steps, **own)
+            axis.plot(curve.x, curve.y, lw=curve.width, ls=curve.dash, drawstyle=steps, **look)
         else:
-            axis.plot(curve.x, curve.y, "x", ms=4, **own)
+            axis.plot(curve.x, curve.y, "x", ms=4, **look)
     axis.set_ylabel(panel.label)
     if panel.title:
         axis.set_title(panel.title, fontsize=9)
@@ -171,7 +174,7 @@ def _draw(axis: Axes, panel: Panel) -> None:
 
 def _once(curves: Iterable[tuple[str, Curve]]) -> Iterable[tuple[str | None, Curve]]:
     """Yield each curve with its label, the first time only."""
-    seen = {""}
+    labels_shown = {""}
     for label, curve in curves:
-        yield None if label in seen else label, curve
-        seen.add(label)
+        yield None if label in labels_shown else label, curve
+        labels_shown.add(label)

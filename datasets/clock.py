@@ -119,19 +119,19 @@ def _behaves_as_clock(header: str, read: tuple[str, str, float], values: Floats)
 
 def _of_text(header: str, table: Table) -> Clock | None:
     """Return the clock in a column of dates or times of day, of which a second column may have the hours."""
-    cells, parts = table.text[header], [header]
+    cells, headers = table.text[header], [header]
     if ":" not in cells[0]:
         with_hours = [h for h in table.text if ":" in table.text[h][0]]
-        parts += [h for h in with_hours if read_clock(table.text[h][:20]) is not None][:1]
-        cells = [" ".join(row) for row in zip(*(table.text[h] for h in parts))]
+        headers += [h for h in with_hours if read_clock(table.text[h][:20]) is not None][:1]
+        cells = [" ".join(row) for row in zip(*(table.text[h] for h in headers))]
     read = read_clock(cells)
     if read is None:
         return None
     seconds, how = read
     zero = float(seconds[np.isfinite(seconds).argmax()])
-    note = f"time: {' and '.join(parts)} counted from the first row, {cells[0]}{how}"
+    note = f"time: {' and '.join(headers)} counted from the first row, {cells[0]}{how}"
     doubt = f"{header} is taken{how}; --dt S sets another step" if how == _ELAPSED else ""
-    return Clock(seconds - zero, frozenset(parts), (note,), zero, doubt)
+    return Clock(seconds - zero, frozenset(headers), (note,), zero, doubt)
 
 
 def _of_numbers(header: str, table: Table, read: tuple[str, str, float]) -> Clock | None:
@@ -150,12 +150,12 @@ def _of_numbers(header: str, table: Table, read: tuple[str, str, float]) -> Cloc
     if stated and scale == 1:
         converted = [f"time: converted from {unit} to s"] if unit != "s" else []
         return Clock(seconds, frozenset([header]), (*converted, *notes, *restarts), 0.0)
-    what = f"{header} is taken as the time in {unit if unit != '1' else 's'}"
+    taken = f"{header} is taken as the time in {unit if unit != '1' else 's'}"
     factor = "" if scale == 1 else f", times {scale:g}"
     if _TIME.fullmatch(name) is None and unit == "1" and not doubt:
         step = float(np.median(np.diff(finite)))
         doubt = f"{header} is taken as the time, its rows {step:g} s apart"
-    note = f"time: {what}{factor}" + ("; --dt S sets another step" if doubt else "")
+    note = f"time: {taken}{factor}" + ("; --dt S sets another step" if doubt else "")
     return Clock(seconds, frozenset([header]), (note, *notes, *restarts), 0.0, doubt)
 
 
@@ -192,13 +192,15 @@ def _unwrapped(counts: Floats, lines: NDArray[np.int64]) -> tuple[Floats, list[s
     steps = np.diff(counts)
     back = np.flatnonzero(steps < 0)
     usual = float(np.nanmedian(steps)) if back.size else 0.0
-    for at in back:
+    for row in back:
         for bits in (16, 32):
             for count in (1.0, 1e-3, 1e-6):  # the file may have it in s already
-                forward = float(steps[at]) + 2.0**bits * count
+                forward = float(steps[row]) + 2.0**bits * count
                 if 0 < forward <= 2 * usual:
-                    counts = counts + np.where(np.arange(counts.size) > at, 2.0**bits * count, 0.0)
-                    notes.append(f"time: a counter of {bits} bits wrapped in row {lines[at + 1]}: it goes on")
+                    counts = counts + np.where(np.arange(counts.size) > row, 2.0**bits * count, 0.0)
+                    notes.append(
+                        f"time: a counter of {bits} bits wrapped in row {lines[row + 1]}: it goes on"
+                    )
     return counts, notes
 
 
@@ -215,8 +217,8 @@ def _in_pieces(seconds: Floats, lines: NDArray[np.int64]) -> tuple[Floats, list[
         return seconds, []  # a stamp that is wrong begins no part that goes on as a clock does
     gap = 1.0 + max(GAP_SECONDS, GAP_STEPS * usual)
     seconds = seconds.copy()
-    for at in back:
-        seconds[at:] += seconds[at - 1] + gap - seconds[at]
+    for row in back:
+        seconds[row:] += seconds[row - 1] + gap - seconds[row]
     where = name_rows(lines[back])
     return seconds, [f"time: the clock starts again in {where}: new segments, after gaps of unknown length"]
 
@@ -237,27 +239,27 @@ def read_clock(cells: Sequence[str]) -> tuple[Floats, str] | None:
     offset) and how they were taken; None if they are none."""
     import pandas as pd
 
-    parts = pd.Series(list(cells), dtype=object).str.strip().str.extract(STAMP)
-    if parts[[1, 4]].isna().all(axis=1).mean() > 1 - _MONOTONE:
+    fields = pd.Series(list(cells), dtype=object).str.strip().str.extract(STAMP)
+    if fields[[1, 4]].isna().all(axis=1).mean() > 1 - _MONOTONE:
         return None
 
     def numbers(key: int) -> Floats:
-        return np.asarray(pd.to_numeric(parts[key].str.replace(",", "."), errors="coerce"), dtype=float)
+        return np.asarray(pd.to_numeric(fields[key].str.replace(",", "."), errors="coerce"), dtype=float)
 
     hour, minute, second = (np.nan_to_num(numbers(key)) for key in (4, 5, 6))
-    half = parts[7].str.lower()
+    half = fields[7].str.lower()
     hour = np.where(half.notna() & (hour == 12), 0, hour) + 12.0 * (half == "pm").to_numpy()
-    offset = parts[8].str.replace(":", "").str.extract(r"([+-])(\d{2})(\d{2})")
+    offset = fields[8].str.replace(":", "").str.extract(r"([+-])(\d{2})(\d{2})")
     shift = pd.to_numeric(offset[1]) * 60 + pd.to_numeric(offset[2])
     minute = minute - np.nan_to_num(np.asarray(shift.where(offset[0] == "+", -shift), dtype=float))
     of_day = 3600 * hour + 60 * minute + second
-    of_day[parts[[1, 4]].isna().all(axis=1)] = np.nan
-    if parts[1].isna().all() and parts[6].isna().all() and (hour.max() > 23 or not (hour[0] or minute[0])):
+    of_day[fields[[1, 4]].isna().all(axis=1)] = np.nan
+    if fields[1].isna().all() and fields[6].isna().all() and (hour.max() > 23 or not (hour[0] or minute[0])):
         return 60 * hour + minute, _ELAPSED
-    if parts[1].isna().all():
+    if fields[1].isna().all():
         steps = np.diff(of_day, prepend=of_day[0])
         return of_day + 86400.0 * np.cumsum(np.nan_to_num(steps) < -43200), ""
-    parts[2] = parts[2].str.lower().map(_MONTHS).fillna(parts[2])
+    fields[2] = fields[2].str.lower().map(_MONTHS).fillna(fields[2])
     first, middle, last = numbers(1), numbers(2), numbers(3)
     note = ""
     if np.nanmax(first) > 31:

@@ -115,9 +115,9 @@ def known_names(name: object, known: Iterable[str], words: str = "use {}") -> st
     >>> known_names("Drvie", ["drive", "pump"], "it has {}")
     "it has drive, pump; did you mean 'drive'?"
     """
-    by_lower = {each.lower(): each for each in known}
-    near = get_close_matches(str(name).lower(), by_lower, 1, 0.65)
-    meant = f"did you mean {by_lower[near[0]]!r}?" if near and by_lower[near[0]] != name else ""
+    by_lower = {known_name.lower(): known_name for known_name in known}
+    nearest = get_close_matches(str(name).lower(), by_lower, 1, 0.65)
+    meant = f"did you mean {by_lower[nearest[0]]!r}?" if nearest and by_lower[nearest[0]] != name else ""
     return "; ".join(filter(None, (words.format(", ".join(by_lower.values())), meant)))
 
 

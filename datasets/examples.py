@@ -50,8 +50,8 @@ def example_path(name: str) -> Path:
     """
     path = _folder() / f"{name}.csv.xz"
     if not path.is_file():
-        known = [*EXAMPLE_LOGS, *example_grasps()]
-        raise UserError(f"no example {name!r}", hint=known_names(name, known, "there are {}"))
+        example_names = [*EXAMPLE_LOGS, *example_grasps()]
+        raise UserError(f"no example {name!r}", hint=known_names(name, example_names, "there are {}"))
     return path
 
 

@@ -59,5 +59,5 @@ def split_cut(path: str | Path) -> tuple[Path, float, float]:
 def matching_files(path: str | Path) -> list[str]:
     """Return what a pattern with *, ? or [] that a shell left names, in order, without meta files of grasps;
     else the path itself."""
-    found = [] if os.path.exists(path) else sorted(glob(str(path), recursive=True))
-    return [name for name in found if not file_stem(name).endswith("_meta")] or [str(path)]
+    matches = [] if os.path.exists(path) else sorted(glob(str(path), recursive=True))
+    return [name for name in matches if not file_stem(name).endswith("_meta")] or [str(path)]

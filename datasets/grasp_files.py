@@ -112,10 +112,10 @@ def read_grasps(path: str | Path, *, name: str | None = None) -> Grasps:
 def _whole(grasps: Grasps, path: str | Path) -> Grasps:
     """Return grasps with their level before contact; UserError where one has no sample on either side."""
     grasps = with_lead_in(grasps)
-    time, seen = grasps["time"].values, np.isfinite(grasps["t_surface"].values)
+    time, finite = grasps["time"].values, np.isfinite(grasps["t_surface"].values)
     for side, has, hint in (
-        ("before", seen[:, time < 0].any(axis=1), "record from 2 s before, or give t_gripper_set_degC"),
-        ("after", seen[:, time > 0].any(axis=1), "is this a grasp? remove it or record the contact"),
+        ("before", finite[:, time < 0].any(axis=1), "record from 2 s before, or give t_gripper_set_degC"),
+        ("after", finite[:, time > 0].any(axis=1), "is this a grasp? remove it or record the contact"),
     ):
         if not has.all():
             grasp = str(grasps["grasp"].values[int(np.argmin(has))])
@@ -129,8 +129,10 @@ def as_grasps(grasps: Records) -> list[Grasps]:
     from pandas import DataFrame
 
     records = list(grasps) if isinstance(grasps, Sequence) and not isinstance(grasps, str) else [grasps]
-    read: list[Any] = [read_grasps(each) if isinstance(each, str | Path) else each for each in records]
-    return [from_frame(each) if isinstance(each, DataFrame) else each for each in read]
+    read: list[Any] = [
+        read_grasps(record) if isinstance(record, str | Path) else record for record in records
+    ]
+    return [from_frame(record) if isinstance(record, DataFrame) else record for record in read]
 
 
 def from_frame(frame: DataFrame) -> Grasps:
@@ -190,7 +192,7 @@ def read_grasp_files(paths: Sequence[str | Path]) -> list[Grasps]:
 def list_grasp_files(paths: Sequence[str | Path]) -> list[Path]:
     """Return the grasp files in paths and folders, as of :func:`read_grasp_files`, unread."""
     files: list[Path] = []
-    for path in (Path(name) for given in paths for name in matching_files(given)):
+    for path in (Path(name) for pattern in paths for name in matching_files(pattern)):
         files += _in_folder(path) if path.is_dir() else [path]
     return files
 
@@ -221,10 +223,10 @@ def grasp_file_parts(path: Path) -> list[Path]:
 def check_apart(out: str | Path, paths: Sequence[str | Path]) -> None:
     """Refuse an output that is among the files that are read, or would be the next time."""
     place, hint = Path(os.path.realpath(out)), "choose another name or folder for --out"
-    for given in paths:
-        if place.match(os.path.realpath(given)) and not os.path.isdir(given):
+    for pattern in paths:
+        if place.match(os.path.realpath(pattern)) and not os.path.isdir(pattern):
             raise UserError("is to be read and written", file=out, hint=hint)
-        for path in map(Path, matching_files(given)):
+        for path in map(Path, matching_files(pattern)):
             if path.is_dir():
                 folder = path.resolve()
                 if place.parent == folder:
@@ -282,8 +284,10 @@ def _samples_of(table: Table, facts: Table | None) -> _Samples:
     others = [h for h in (*table.text, *table.numbers) if not h.startswith((*_CHANNELS, "grasp_id", "pump"))]
     if others and facts is not None:
         repairs.append(f"not used: {', '.join(others)}")
-    kept = {name: values for name, values in channels.items() if name in ("t_surface", "t_surface_2")}
-    return _Samples(ids, np.round(time, 6), kept, repairs)
+    skin_channels = {
+        name: values for name, values in channels.items() if name in ("t_surface", "t_surface_2")
+    }
+    return _Samples(ids, np.round(time, 6), skin_channels, repairs)
 
 
 def _onto_one_axis(samples: _Samples, order: Sequence[str], file: str) -> tuple[Floats, dict[str, Floats]]:
@@ -316,7 +320,7 @@ def _rows_of(ids: NDArray[np.str_], order: Sequence[str]) -> list[Rows]:
     """Return the rows of each grasp, in the order of the file."""
     names, index = np.unique(ids, return_inverse=True)
     by_name = np.split(np.argsort(index, kind="stable"), np.cumsum(np.bincount(index))[:-1])
-    return [by_name[at] for at in np.searchsorted(names, order)]
+    return [by_name[place] for place in np.searchsorted(names, order)]
 
 
 def _is_even(axis: Floats, step: float) -> bool:
@@ -332,17 +336,17 @@ def _is_even(axis: Floats, step: float) -> bool:
 def _common_step(times: Sequence[Floats], order: Sequence[str], file: str) -> float:
     """Return the median over grasps of the mean step, in which a hole counts as the steps that it is long."""
     steps = np.full(len(times), np.nan)
-    for at, time in enumerate(times):
+    for grasp, time in enumerate(times):
         if time.size > 1:
             moves = np.diff(time)
-            steps[at] = np.ptp(time) / np.maximum(np.round(moves / np.median(moves)), 1).sum()
+            steps[grasp] = np.ptp(time) / np.maximum(np.round(moves / np.median(moves)), 1).sum()
     if np.isnan(steps).all():
         raise UserError("no grasp has two samples", file=file, hint="give the whole recording of each grasp")
     step = float(np.nanmedian(steps))
     odd = np.abs(steps / step - 1) > 0.2  # NaN compares false
     if odd.any():
-        at = int(odd.argmax())
-        problem = f"grasp {order[at]!r} has a step of {steps[at]:g} s, the others {step:g} s"
+        grasp = int(odd.argmax())
+        problem = f"grasp {order[grasp]!r} has a step of {steps[grasp]:g} s, the others {step:g} s"
         raise UserError(problem, file=file, hint="give grasps of another rate a file of their own")
     plain = float(f"{step:.2g}")
     return plain if abs(plain / step - 1) < 0.01 else float(f"{step:.4g}")
@@ -350,31 +354,33 @@ def _common_step(times: Sequence[Floats], order: Sequence[str], file: str) -> fl
 
 def _on_axis(axis: Floats, time: Floats, values: Floats, step: float) -> Floats:
     """Return a grasp on the axis: as it is where it has a sample, NaN where none is near."""
-    out, known = np.full(axis.size, np.nan), np.isfinite(values)
-    if not known.any():
+    out, finite = np.full(axis.size, np.nan), np.isfinite(values)
+    if not finite.any():
         return out
-    t = time[known]
+    t = time[finite]
     after = np.clip(np.searchsorted(t, axis), 0, t.size - 1)
     before = np.clip(np.searchsorted(t, axis, side="right") - 1, 0, t.size - 1)
-    near = (axis >= t[0] - 0.5 * step) & (axis <= t[-1] + 0.5 * step) & (t[after] - t[before] <= 1.5 * step)
-    out[near] = np.interp(axis[near], t, values[known])
+    has_neighbours = (
+        (axis >= t[0] - 0.5 * step) & (axis <= t[-1] + 0.5 * step) & (t[after] - t[before] <= 1.5 * step)
+    )
+    out[has_neighbours] = np.interp(axis[has_neighbours], t, values[finite])
     return out
 
 
 def _meta_path(path: str | Path) -> Path:
     stem = file_stem(path)
     choices = [Path(path).with_name(f"{stem}_meta{ending}") for ending in _ENDINGS]
-    found = next((p for p in choices if p.exists()), None)
-    if found is None:
+    meta_path = next((p for p in choices if p.exists()), None)
+    if meta_path is None:
         hint = f"put {choices[0].name} beside it: grasp_id,material,t_object_nominal_degC,..."
         raise UserError("its meta file is missing", file=path, hint=hint)
-    return found
+    return meta_path
 
 
 def _name_of_fact(header: str, file: str | None = None) -> tuple[str, str]:
     """Return what a record calls a column of the meta file, and its unit; no name where it means nothing."""
-    known = ("grasp_id", *GRASP_LABELS, *GRASP_NUMBERS)
-    if not re.fullmatch(r"\S+", header) or not header.lower().startswith(known):
+    prefixes = ("grasp_id", *GRASP_LABELS, *GRASP_NUMBERS)
+    if not re.fullmatch(r"\S+", header) or not header.lower().startswith(prefixes):
         return "", ""
     name, unit = split_header(header, file=file)
     return name.lower() if name.lower() in GRASP_LABELS else _FROM_META.get(name, name), unit  # "Material"
@@ -395,7 +401,7 @@ def _facts_of(table: Table, rows: Sequence[int]) -> tuple[dict[str, Any], list[s
                 raise UserError(f"unit {unit!r} does not fit", file=table.file, column=header, hint=hint)
             facts[name] = numbers[[*rows]]
         elif name in GRASP_LABELS:
-            facts[name] = [table.text[header][at] for at in rows]
+            facts[name] = [table.text[header][row] for row in rows]
         elif name != "grasp_id" and not header.startswith((*_CHANNELS, "pump")):
             unknown.append(header)
     return facts, unknown
@@ -407,14 +413,14 @@ def _rows_of_meta(table: Table, order: Sequence[str], file: str) -> list[int]:
         hint = "give each grasp's name as in the sample file"
         raise UserError("no column grasp_id", file=table.file, hint=hint)
     rows: dict[str, int] = {}
-    for at, grasp in enumerate(table.text["grasp_id"]):
+    for row_of_table, grasp in enumerate(table.text["grasp_id"]):
         if grasp in rows or grasp not in order:
             problem = f"grasp {grasp!r} has no samples in {Path(file).name}"
-            hint, row = "remove the row or add the samples", int(table.lines[at])
+            hint, row = "remove the row or add the samples", int(table.lines[row_of_table])
             if grasp in rows:
                 problem, hint = f"grasp_id {grasp!r} occurs twice", "give each its own"
             raise UserError(problem, file=table.file, row=row, hint=hint)
-        rows[grasp] = at
+        rows[grasp] = row_of_table
     for grasp in order:
         if grasp not in rows:
             problem = f"no row for grasp {grasp!r} of {Path(file).name}"
@@ -476,8 +482,8 @@ def _of_dataset(data: xr.Dataset, path: str | Path, called: str | None = None) -
         raise UserError(f"holds a {schema}, not grasps", file=path, hint="give a file of grasps")
     stem = called or file_stem(path)
     data.attrs["name"] = called or data.attrs.get("name", stem)
-    known = {"t_surface", "t_surface_2", *GRASP_NUMBERS, *GRASP_LABELS}
-    data = data[[name for name in data.data_vars if name in known]]
+    variables = {"t_surface", "t_surface_2", *GRASP_NUMBERS, *GRASP_LABELS}
+    data = data[[name for name in data.data_vars if name in variables]]
     if "grasp" in data.coords:
         data = data.assign_coords(grasp=("grasp", data["grasp"].values.astype(str)))
     expected = {"time": "s", "t_surface": "degC", "t_surface_2": "degC", **GRASP_NUMBERS}

@@ -53,15 +53,15 @@ def most_unpacked(packed: int) -> int:
 def check_source(path: str | Path) -> int:
     """Return the size of a file [bytes], 0 where it is a pipe; UserError where there is none to read."""
     with os_faults(path):
-        found = os.stat(path)
-    if stat.S_ISDIR(found.st_mode):
+        about = os.stat(path)
+    if stat.S_ISDIR(about.st_mode):
         raise UserError("is a folder", file=path, hint="name a file")
     # what a shell makes of <(command), and stdin
     handed = str(path).startswith(("/dev/fd/", "/proc/self/fd/")) or str(path) == "/dev/stdin"
-    if not stat.S_ISREG(found.st_mode) and not (handed and stat.S_ISFIFO(found.st_mode)):
+    if not stat.S_ISREG(about.st_mode) and not (handed and stat.S_ISFIFO(about.st_mode)):
         raise UserError("is no file but a device, a pipe or a socket", file=path, hint="name a file")
     note_read(path)
-    return found.st_size if stat.S_ISREG(found.st_mode) else 0
+    return about.st_size if stat.S_ISREG(about.st_mode) else 0
 
 
 def check_size(size: int, *, file: str | Path, what: str = "is", share: int = 1) -> None:
@@ -76,32 +76,32 @@ def check_unpacked(packed: int, unpacked: int, *, file: str | Path, what: str = 
     """Raise :class:`UserError` where a file of ``packed`` bytes holds or declares too many bytes."""
     check_size(unpacked, file=file, what=what)
     if unpacked > most_unpacked(packed):
-        seen = f"{_megabytes(unpacked)} or more from {_megabytes(packed)}"
+        growth = f"{_megabytes(unpacked)} or more from {_megabytes(packed)}"
         hint = f"if it is what you want to read, set {LIMIT_VARIABLE} to its MB"
-        raise UserError(f"{what} {seen}, which no record does", file=file, hint=hint)
+        raise UserError(f"{what} {growth}, which no record does", file=file, hint=hint)
 
 
 def read_within(stream: BinaryIO, most: int) -> bytes:
     """Return what a stream holds, at most ``most`` + 1 bytes; the caller compares the length."""
-    found, left = io.BytesIO(), most + 1  # its value is no second copy, as that of a join is
-    while left > 0 and (piece := stream.read(min(left, 4 * _MB))):
-        found.write(piece)
-        left -= len(piece)
-    return found.getvalue()
+    content, bytes_left = io.BytesIO(), most + 1  # its value is no second copy, as that of a join is
+    while bytes_left > 0 and (piece := stream.read(min(bytes_left, 4 * _MB))):
+        content.write(piece)
+        bytes_left -= len(piece)
+    return content.getvalue()
 
 
 def unpack_within(stream: BinaryIO, source: BinaryIO, *, file: str | Path) -> bytes:
     """Return what ``stream`` unpacks from the open file ``source``; what came out is compared with what has
     been read so far, so what grows too much is refused after 8 MiB."""
-    found = io.BytesIO()
+    content = io.BytesIO()
     while True:
-        left = most_unpacked(source.tell()) + 1 - found.tell()
-        piece = stream.read(min(left, 4 * _MB))
+        bytes_left = most_unpacked(source.tell()) + 1 - content.tell()
+        piece = stream.read(min(bytes_left, 4 * _MB))
         if not piece:
             break
-        found.write(piece)
-        check_unpacked(source.tell(), found.tell(), file=file)
-    return found.getvalue()
+        content.write(piece)
+        check_unpacked(source.tell(), content.tell(), file=file)
+    return content.getvalue()
 
 
 class Unpacker:
@@ -113,10 +113,10 @@ class Unpacker:
 
     def __call__(self, packing: str, data: bytes) -> bytes:
         """Return what ``data``, packed with bz2, lz4 or zstd, holds; KeyError if it is with another."""
-        found = _PACKINGS[packing](data, most_unpacked(self._packed) - self._found + 1)
-        self._found += len(found)
+        unpacked = _PACKINGS[packing](data, most_unpacked(self._packed) - self._found + 1)
+        self._found += len(unpacked)
         check_unpacked(self._packed, self._found, file=self._file)
-        return found
+        return unpacked
 
     def declare(self, size: int) -> None:
         """Refuse a chunk that declares too much."""
@@ -143,10 +143,10 @@ def _zstd(data: bytes, most: int) -> bytes:
 
 
 def _unpacked(unpacker: Any, data: bytes, most: int) -> bytes:
-    found: bytes = unpacker.decompress(data, max_length=most)
-    if len(found) < most and not unpacker.eof:
+    unpacked: bytes = unpacker.decompress(data, max_length=most)
+    if len(unpacked) < most and not unpacker.eof:
         raise EOFError("the chunk is cut off")
-    return found
+    return unpacked
 
 
 _PACKINGS: dict[str, Callable[[bytes, int], bytes]] = {"bz2": _bz2, "lz4": _lz4, "zstd": _zstd}
@@ -202,11 +202,11 @@ def array_within(content: Mapping[str, Any], key: str, largest: float = LARGEST)
 
 
 def _place(place: Any) -> str:
-    parts = []
+    keys = []
     while place is not None:
         place, key = place
-        parts.append(str(key)[:40])
-    return ".".join(reversed(parts))
+        keys.append(str(key)[:40])
+    return ".".join(reversed(keys))
 
 
 def _chosen() -> int | None:

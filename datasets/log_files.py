@@ -143,23 +143,23 @@ def read_log(
     data, units, time, repairs = read.values, read.units, read.clock.seconds, read.repairs
     sha256 = hash_columns({"time": time, **data})
     if not data:
-        what = "a time column and nothing else" if read.clock.columns else "no column of numbers"
-        raise UserError(f"has {what}", file=file, hint="add inputs and outputs")
+        content = "a time column and nothing else" if read.clock.columns else "no column of numbers"
+        raise UserError(f"has {content}", file=file, hint="add inputs and outputs")
     lists = {"inputs": inputs, "outputs": outputs, "disturbances": disturbances}
-    there = {name: role for name, role in (known or {}).items() if name in units}
+    known_here = {name: role for name, role in (known or {}).items() if name in units}
     in_file = {
         name: table.attrs[header]["role"]
         for header, name in read.names_of.items()
         if table.attrs.get(header, {}).get("role")
     }
-    roles = assign_roles(units, given=in_file | there, columns=data, file=str(file), **lists)
-    own = table.meta.get("schema") == "thermogrip.log"
-    if own:
+    roles = assign_roles(units, given=in_file | known_here, columns=data, file=str(file), **lists)
+    written_by_us = table.meta.get("schema") == "thermogrip.log"
+    if written_by_us:
         repairs = [line for line in table.meta.get("repairs", "").splitlines() if line]
     else:
         roles = replace(roles, doubts=(*roles.doubts, *_code_doubts(roles.of, data)))
-        time, data, found = _repair(time, data, units, roles.of, table)
-        repairs += found
+        time, data, findings = _repair(time, data, units, roles.of, table)
+        repairs += findings
         if outputs is None:
             roles = _without_half_lost(roles, time, data)
     variables = {name: (data[name], units[name], roles.of[name]) for name in data}
@@ -174,7 +174,7 @@ def read_log(
     if EPOCH[0] <= began <= EPOCH[1]:
         log.attrs["began"] = str(np.datetime64(round(began), "s")) + "Z"
     log.attrs["guesses"] = "\n".join(f"{name}: {why}" for name, why in roles.reasons.items())
-    if own:
+    if written_by_us:
         log.attrs.update({k: v for k, v in table.meta.items() if k not in ("schema", "version")})
     else:
         log.attrs["clock_doubts"] = read.clock.doubt
@@ -186,11 +186,11 @@ def as_logs(logs: Logs, *lists: Sequence[str] | None, known: Mapping[str, str] |
     """Return logs as they are, DataFrames and files as :func:`read_log` reads them in these roles."""
     from xarray import Dataset
 
-    given = list(logs) if isinstance(logs, Sequence) and not isinstance(logs, str) else [logs]
-    found = [log if isinstance(log, Dataset) else read_log(log, *lists, known=known) for log in given]
-    for at, log in enumerate(found):
-        log.attrs["name"] += f" {at + 1}" if log.attrs["name"] == "DataFrame" and len(given) > 1 else ""
-    return found
+    several = list(logs) if isinstance(logs, Sequence) and not isinstance(logs, str) else [logs]
+    read = [log if isinstance(log, Dataset) else read_log(log, *lists, known=known) for log in several]
+    for place, log in enumerate(read):
+        log.attrs["name"] += f" {place + 1}" if log.attrs["name"] == "DataFrame" and len(several) > 1 else ""
+    return read
 
 
 def write_log(log: Log, path: str | Path) -> Path:
@@ -257,11 +257,11 @@ def _read_netcdf_table(path: str | Path) -> Table:
     if "time" not in data.dims or "time" not in data.variables:
         problem = "no time axis"
         raise UserError(problem, file=path, hint="give it a dimension and a variable 'time' in seconds")
-    numbers, attrs, left = {}, {}, []
+    numbers, attrs, not_over_time = {}, {}, []
     for key in ["time", *data.data_vars]:
         name, variable = str(key), data[key]
         if variable.dims != ("time",):
-            left.append(name)
+            not_over_time.append(name)
             continue
         if variable.dtype.kind not in "fiub":
             problem = f"holds {variable.dtype}, not numbers"
@@ -274,7 +274,7 @@ def _read_netcdf_table(path: str | Path) -> Table:
         if unit is not None:
             attrs[name]["units"] = convention_unit(str(unit), name, str(path))
     meta = {str(key): str(value) for key, value in data.attrs.items()}
-    notes = (f"left out, not over time alone: {', '.join(left)}",) if left else ()
+    notes = (f"left out, not over time alone: {', '.join(not_over_time)}",) if not_over_time else ()
     return Table(str(path), numbers, {}, np.arange(1, data.sizes["time"] + 1), attrs, meta, notes)
 
 
@@ -345,15 +345,17 @@ def _states_as_columns(table: Table, clock: Clock) -> Table:
         if not 2 <= len(counts) <= MOST_STATES or counts.total() < 5 * len(counts):
             continue
         cells = text.pop(header)
-        rest = next(
+        resting_state = next(
             (word for word in counts if word.lower() in ("off", "idle", "0")),
             max(counts, key=counts.__getitem__),
         )
         made = []
-        for state in sorted(counts.keys() - {rest}):
+        for state in sorted(counts.keys() - {resting_state}):
             made.append(unused(f"{header}_{state}", numbers))
             numbers[made[-1]] = np.array([float(cell == state) if cell else np.nan for cell in cells])
-        notes.append(f"{header}: words read as columns of 0 and 1 ({', '.join(made)}), all 0 in {rest}")
+        notes.append(
+            f"{header}: words read as columns of 0 and 1 ({', '.join(made)}), all 0 in {resting_state}"
+        )
     return replace(table, numbers=numbers, text=text, notes=(*table.notes, *notes))
 
 
@@ -381,13 +383,13 @@ def _one_column_a_signal(table: Table) -> Table:
     order = np.argsort(time, kind="stable")
     times, first = np.unique(time[order], return_index=True)
     numbers = {} if clock in table.text else {clock: times}
-    text = {clock: [table.text[clock][order[at]] for at in first]} if clock in table.text else {}
+    text = {clock: [table.text[clock][order[row]] for row in first]} if clock in table.text else {}
     for signal in dict.fromkeys(signals.tolist()):
-        own = order[signals[order] == signal]
-        newest = np.searchsorted(time[own], times, side="right") - 1
-        numbers[signal] = np.where(newest < 0, np.nan, readings[value][own[newest]])
-    each = ", ".join(sorted({*signals}))
-    note = f"a reading of one signal in a row: {each} each hold until their next reading"
+        rows_of_signal = order[signals[order] == signal]
+        newest = np.searchsorted(time[rows_of_signal], times, side="right") - 1
+        numbers[signal] = np.where(newest < 0, np.nan, readings[value][rows_of_signal[newest]])
+    signal_names = ", ".join(sorted({*signals}))
+    note = f"a reading of one signal in a row: {signal_names} each hold until their next reading"
     lines = np.arange(1, times.size + 1)
     return replace(table, numbers=numbers, text=text, lines=lines, notes=(*table.notes, note))
 
@@ -400,23 +402,23 @@ def _repair(
     columns = {name: values[rows] for name, values in columns.items()}
     if time.size < 2:
         raise UserError(f"{time.size} row(s) are not a log", file=table.file, hint="give at least two rows")
-    time, found = since_first_row(time)
-    repairs += found + repair.describe_steps(time)
+    time, findings = since_first_row(time)
+    repairs += findings + repair.describe_steps(time)
     inputs, stuck = [values for name, values in columns.items() if roles[name] == "input"], False
     for name, values in columns.items():
         if roles[name] == "output" and inputs:
-            moving, found = repair.drop_stuck(name, values, inputs)
-            repairs, stuck = repairs + found, stuck or bool(found)
+            moving, findings = repair.drop_stuck(name, values, inputs)
+            repairs, stuck = repairs + findings, stuck or bool(findings)
             if np.isfinite(moving).any():
                 values = moving
             else:  # nothing is left of it to be predicted
                 roles[name] = "other"
-        columns[name], found = _repair_column(name, values, time, units[name], roles[name], table.file)
-        repairs += found
-    time, columns, found = _drop_unknown_start(time, columns, roles, table.file)
-    repairs += found
-    known = [np.isfinite(v) for n, v in columns.items() if roles[n] == "output"]
-    read = np.any(known or [np.ones(time.size, dtype=bool)], axis=0)
+        columns[name], findings = _repair_column(name, values, time, units[name], roles[name], table.file)
+        repairs += findings
+    time, columns, findings = _drop_unknown_start(time, columns, roles, table.file)
+    repairs += findings
+    finite_outputs = [np.isfinite(v) for n, v in columns.items() if roles[n] == "output"]
+    read = np.any(finite_outputs or [np.ones(time.size, dtype=bool)], axis=0)
     if stuck and not (read[0] and read[-1]):  # a held-out part without any reading has no error
         first, last = int(read.argmax()), int(read.size - read[::-1].argmax())
         count = read.size - (last - first)
@@ -442,9 +444,9 @@ def _without_half_lost(roles: Roles, time: Floats, columns: Mapping[str, Floats]
     reasons = {n: f"it has no reading in {100 * lost[n]:.0f} % of the rows, {whole} has" for n in out}
     doubts = []
     for name, why in reasons.items():
-        seen = time[np.isfinite(columns[name])]
-        part = f"LOG@{seen[0]:.6g}:{seen[-1]:.6g}"
-        doubts.append(f"{name} is left out: {why}; to fit it too, cut the log to where it reads: {part}")
+        read_times = time[np.isfinite(columns[name])]
+        log_cut = f"LOG@{read_times[0]:.6g}:{read_times[-1]:.6g}"
+        doubts.append(f"{name} is left out: {why}; to fit it too, cut the log to where it reads: {log_cut}")
     roles_left = roles.of | dict.fromkeys(out, "other")
     return Roles(roles_left, roles.reasons | reasons, (*roles.doubts, *doubts))
 
@@ -462,10 +464,10 @@ def _repair_column(
         return values, []
     lost = int(np.isnan(values).sum())
     repairs = [f"{name}: {lost} lost sample{'' if lost == 1 else 's'} left empty"] if lost else []
-    values, found = repair.reject_spikes(
+    values, spikes = repair.reject_spikes(
         name, values, time, floor=repair.SPIKE_FLOOR_K if unit == "degC" else None
     )
-    return values, repairs + found + (repair.check_plausible(name, values, file) if unit == "degC" else [])
+    return values, repairs + spikes + (repair.check_plausible(name, values, file) if unit == "degC" else [])
 
 
 def _drop_unknown_start(
@@ -485,14 +487,14 @@ def _drop_unknown_start(
 def _cut(log: Log, start: float, stop: float, file: Path) -> Log:
     from thermogrip.datasets.resample import cut  # it loads xarray
 
-    part = cut(log, start, stop)
-    part.attrs["name"] = f"{log.attrs['name']}@{_end(start)}:{_end(stop) or 'end'}"
+    log_part = cut(log, start, stop)
+    log_part.attrs["name"] = f"{log.attrs['name']}@{_end(start)}:{_end(stop) or 'end'}"
     repairs = [line for line in str(log.attrs["repairs"]).splitlines() if line]
     first = f"{_end(start)} s" if np.isfinite(start) else "the start"
     last = f"{_end(stop)} s" if np.isfinite(stop) else "the end"
     repairs.append(f"taken from {first} to {last}; the lines above speak of the whole log")
-    part.attrs["repairs"] = "\n".join(repairs if len(repairs) > 1 else [repairs[0].split(";")[0]])
-    return part
+    log_part.attrs["repairs"] = "\n".join(repairs if len(repairs) > 1 else [repairs[0].split(";")[0]])
+    return log_part
 
 
 def _end(value: float) -> str:
@@ -520,8 +522,8 @@ def _write_parquet(log: Log, path: str | Path) -> Path:
 
     fields = [pa.field("time", pa.float64(), metadata={"units": "s"})]
     for name, variable in log.data_vars.items():
-        kept = {key: variable.attrs[key] for key in ("units", "role")}
-        fields.append(pa.field(str(name), pa.float64(), metadata=kept))
+        kept_attrs = {key: variable.attrs[key] for key in ("units", "role")}
+        fields.append(pa.field(str(name), pa.float64(), metadata=kept_attrs))
     schema = pa.schema(fields, metadata={str(key): str(value) for key, value in log.attrs.items()})
     arrays = [pa.array(log[field.name].values, from_pandas=False) for field in fields]
     table = pa.Table.from_arrays(arrays, schema=schema)

@@ -90,6 +90,6 @@ def find_material(name: str) -> Material:
         return by_name[wanted]
     close = difflib.get_close_matches(wanted, by_name, n=4, cutoff=0.7)
     close += [n for n in by_name if wanted and wanted in n][:4]
-    near = list(dict.fromkeys(by_name[n].name for n in close))
-    hint = f"did you mean {', '.join(near)}?" if near else "'thermogrip materials' lists them all"
+    nearest = list(dict.fromkeys(by_name[n].name for n in close))
+    hint = f"did you mean {', '.join(nearest)}?" if nearest else "'thermogrip materials' lists them all"
     raise UserError(f"no material {name!r}", hint=hint)

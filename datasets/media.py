@@ -114,7 +114,7 @@ class Shown:
         raise NotImplementedError
 
     def __repr__(self) -> str:
-        lines = [printable(f"  {name:16}  {what}") for name, what in self._facts().items()]
+        lines = [printable(f"  {name:16}  {fact}") for name, fact in self._facts().items()]
         lines = lines if len(lines) < 12 else [*lines[:9], "  ...", lines[-1]]  # the last one is the verdict
         cut = [line if len(line) <= 110 else f"{line[:107]}..." for line in lines]
         return "\n".join([type(self).__name__, *cut])

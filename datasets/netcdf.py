@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from thermogrip.datasets.atomic_files import atomic_path
 from thermogrip.datasets.errors import UserError, os_faults, reading
 from thermogrip.datasets.limits import check_source, check_unpacked, most_bytes, most_unpacked
-from thermogrip.datasets.units import UNITS, to_record_unit
+from thermogrip.datasets.units import UNITS, any_unit, to_record_unit
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -26,15 +26,6 @@ if TYPE_CHECKING:
 _ADDED = ("Conventions", "title", "source")  # to files of versions up to 0.2
 _MOST_MEMBERS = 4096  # of a file
 _PART = 16 << 20  # bytes of text that are looked at in one piece
-
-# how other programs write the units that thermogrip reads
-_ALIASES = {
-    "celsius": "degC", "Celsius": "degC", "degree_Celsius": "degC", "degrees_Celsius": "degC", "°C": "degC",
-    "degree_C": "degC", "degrees_C": "degC", "kelvin": "K", "Kelvin": "K", "degK": "K", "°F": "degF",
-    "fahrenheit": "degF", "Fahrenheit": "degF", "%": "percent", "volt": "V", "ampere": "A", "watt": "W",
-    "second": "s", "seconds": "s", "sec": "s", "milliseconds": "ms", "minutes": "min", "minute": "min",
-    "": "1", repr(1 / 255): "0_255",
-}  # fmt: skip
 
 
 def check_netcdf(path: str | Path) -> None:
@@ -97,20 +88,20 @@ def check_hdf5(opened: Any, path: str | Path) -> None:
 def _in_memory(variable: Any) -> int:
     """Return the bytes that a variable may take as an array: of float, of text, or of one chunk of it."""
     h5py = import_module("h5py")
-    size, each = int(variable.size), max(8, int(variable.dtype.itemsize))
-    chunk = math.prod(variable.chunks or ()) * each
+    size, cell_bytes = int(variable.size), max(8, int(variable.dtype.itemsize))
+    chunk = math.prod(variable.chunks or ()) * cell_bytes
     if h5py.check_string_dtype(variable.dtype) is None and h5py.check_vlen_dtype(variable.dtype) is None:
-        return max(size * each, chunk)
+        return max(size * cell_bytes, chunk)
     # each text may be one and the same long one: they are measured in parts that no length can make large
     longest = int(variable.file.id.get_filesize())
-    part, found = max(1, _PART // longest), 0
-    if size * longest <= _PART or size * each > most_bytes() or variable.ndim != 1:
-        return max(size * (each if variable.ndim == 1 else longest), chunk)
-    for start in range(0, size, part):
-        found += sum(len(text) + 64 for text in variable[start : start + part])
-        if found > most_unpacked(longest):
+    rows_at_once, text_bytes = max(1, _PART // longest), 0
+    if size * longest <= _PART or size * cell_bytes > most_bytes() or variable.ndim != 1:
+        return max(size * (cell_bytes if variable.ndim == 1 else longest), chunk)
+    for start in range(0, size, rows_at_once):
+        text_bytes += sum(len(text) + 64 for text in variable[start : start + rows_at_once])
+        if text_bytes > most_unpacked(longest):
             break
-    return max(found, chunk)
+    return max(text_bytes, chunk)
 
 
 def write_netcdf(data: xr.Dataset, path: str | Path) -> Path:
@@ -138,11 +129,15 @@ def record_unit(variable: xr.DataArray, name: str, file: str) -> tuple[NDArray[n
 
 
 def convention_unit(unit: str, name: str, file: str) -> str:
-    known = _ALIASES.get(unit, unit)
-    if known not in (*UNITS, "1"):
+    """Return the unit of records that a program means, by the CF conventions or as a header would have it."""
+    word = unit.replace("degree_", "deg").replace("degrees_", "deg")  # degree_C, degrees_Celsius
+    known_unit, scale = ("0_255", 1.0) if unit == repr(1 / 255) else any_unit(word)
+    if unit in ("", "1"):
+        return "1"
+    if not known_unit or scale != 1.0:
         hint = f"use one of {' '.join(UNITS)} 1"
         raise UserError(f"unit {unit!r} is unknown", file=file, column=name, hint=hint)
-    return known
+    return known_unit
 
 
 def _text_as_str(data: xr.Dataset) -> xr.Dataset:

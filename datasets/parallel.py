@@ -254,7 +254,7 @@ def _check_cluster(client: Any, address: str) -> None:
     hint = f"install thermogrip {__version__} on all of them"
     with as_user_error(ModuleNotFoundError, f"a worker of {address} has no thermogrip", hint=hint):
         theirs = client.run(_versions).values()
-    differ = {name: {there[name] for there in theirs} - {ours[name]} for name in ours}
+    differ = {name: {versions[name] for versions in theirs} - {ours[name]} for name in ours}
     if any(differ.values()):
         words = (
             f"{name} {', '.join(sorted(those))} for {ours[name]}" for name, those in differ.items() if those

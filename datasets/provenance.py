@@ -91,17 +91,17 @@ def provenance() -> dict[str, Any]:
 
     now = _WORK.get() or _Work([Path(sys.argv[0]).name, *sys.argv[1:]])
     try:
-        here = os.getcwd()
+        folder = os.getcwd()
     except OSError:  # it was removed, which must not cost what is being written
-        here = ""
-    below = here.rstrip(os.sep) + os.sep
+        folder = ""
+    below = folder.rstrip(os.sep) + os.sep
     for name in now.read:
         now.read[name] = now.read[name] or _hash(name)
     return {
         "thermogrip": __version__,
         "written": _date(),
         "command": shlex.join(now.words),
-        "git": _commit_of(here) if here else None,
+        "git": _commit_of(folder) if folder else None,
         "seed": now.seed,
         "inputs": {name.removeprefix(below): digest for name, digest in now.read.items()},
     }
@@ -110,8 +110,8 @@ def provenance() -> dict[str, Any]:
 def _date() -> str:
     """Return the time in UTC, of the environment where that sets one."""
     epoch = os.environ.get("SOURCE_DATE_EPOCH", "")
-    at = time.gmtime(int(epoch) if _EPOCH.fullmatch(epoch) else None)
-    return time.strftime("%Y-%m-%dT%H:%M:%SZ", at)
+    moment = time.gmtime(int(epoch) if _EPOCH.fullmatch(epoch) else None)
+    return time.strftime("%Y-%m-%dT%H:%M:%SZ", moment)
 
 
 def _hash(name: str) -> str:

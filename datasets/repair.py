@@ -127,13 +127,13 @@ def gap_rows(time: Floats, longer_than: float = GAP_SECONDS) -> NDArray[np.int64
 def describe_gaps(time: Floats, inputs: dict[str, Floats]) -> list[str]:
     """Return a line a gap, with the inputs before and after it."""
     repairs = []
-    for at in gap_rows(time):
+    for row in gap_rows(time):
         moved = ", ".join(
-            f"{name} {values[at]:g} before, {values[at + 1]:g} after" for name, values in inputs.items()
+            f"{name} {values[row]:g} before, {values[row + 1]:g} after" for name, values in inputs.items()
         )
-        length = time[at + 1] - time[at]
+        length = time[row + 1] - time[row]
         repairs.append(
-            f"gap of {length:.2f} s from {time[at]:.2f} to {time[at + 1]:.2f} s"
+            f"gap of {length:.2f} s from {time[row]:.2f} to {time[row + 1]:.2f} s"
             + (f" ({moved})" if moved else "")
         )
     return repairs
@@ -143,25 +143,25 @@ def find_spikes(values: Floats, *, floor: float | None, step: float = 0.0) -> ND
     """Return which samples (n,) of a channel are spikes, by the rule above; NaN is skipped.  ``floor`` is the
     least deviation that can be one, None to derive it from the channel; ``step`` is that of the rows [s]."""
     spikes = np.zeros(values.shape, dtype=bool)
-    seen = np.flatnonzero(np.isfinite(values))
-    if seen.size < SPIKE_WINDOW:
+    finite_rows = np.flatnonzero(np.isfinite(values))
+    if finite_rows.size < SPIKE_WINDOW:
         return spikes
     from scipy.ndimage import median_filter
 
-    good = values[seen]
+    good = values[finite_rows]
     deviation = good - median_filter(good, size=SPIKE_WINDOW, mode="nearest")
     threshold = max(
         _floor(good) if floor is None else floor, 6 * 1.4826 * float(np.median(np.abs(deviation)))
     )
-    far = np.abs(deviation) > threshold
+    is_far = np.abs(deviation) > threshold
     entered = np.concatenate([[False], np.abs(np.diff(good)) > threshold])
-    for start in np.flatnonzero(far & entered):
-        length = _spike_length(good, far, int(start), threshold)
-        spikes[seen[start : start + length]] = True
+    for start in np.flatnonzero(is_far & entered):
+        length = _spike_length(good, is_far, int(start), threshold)
+        spikes[finite_rows[start : start + length]] = True
     if step >= _SLOW_ROWS and spikes.any():
-        others = good[~spikes[seen]]
+        others = good[~spikes[finite_rows]]
         low, high = float(others.min()), float(others.max())
-        spikes[seen] &= (good < low - (high - low)) | (good > high + (high - low))
+        spikes[finite_rows] &= (good < low - (high - low)) | (good > high + (high - low))
     return spikes
 
 
@@ -183,7 +183,9 @@ def doubt_codes(name: str, values: Floats, inputs: Sequence[Floats]) -> str:
     for end in (np.nanmin(values), np.nanmax(values)):
         rows = _rows_beyond_jumps(values, values == end)
         edges = np.flatnonzero(np.diff(rows.astype(int)))
-        by_input = [np.any(np.diff(u[max(at - SPIKE_LENGTH, 0) : at + 2])) for at in edges for u in inputs]
+        by_input = [
+            np.any(np.diff(u[max(edge - SPIKE_LENGTH, 0) : edge + 2])) for edge in edges for u in inputs
+        ]
         if rows.sum() > SPIKE_LENGTH * max(edges.size / 2, 1) and 2 * sum(map(bool, by_input)) <= len(
             by_input
         ):
@@ -201,12 +203,12 @@ def _rows_beyond_jumps(values: Floats, rows: NDArray[np.bool_]) -> NDArray[np.bo
         return np.zeros(values.size, dtype=bool)
     # a column that hardly ever moves does so by its steps
     least = _CODE_JUMP * max(float(np.quantile(usual, 0.99)), float(usual[usual > 0].min()))
-    between, kept = rows[1:] ^ rows[:-1], rows.copy()
+    between, beyond_jumps = rows[1:] ^ rows[:-1], rows.copy()
     edges = np.flatnonzero(np.diff(rows.astype(int), prepend=0, append=0))
     for start, stop in edges.reshape(-1, 2).tolist():
-        jumps = [moves[at] for at in (start - 1, stop - 1) if 0 <= at < moves.size and between[at]]
-        kept[start:stop] = all(jump > least or np.isnan(jump) for jump in jumps)
-    return kept
+        jumps = [moves[step] for step in (start - 1, stop - 1) if 0 <= step < moves.size and between[step]]
+        beyond_jumps[start:stop] = all(jump > least or np.isnan(jump) for jump in jumps)
+    return beyond_jumps
 
 
 def drop_stuck(name: str, values: Floats, inputs: Sequence[Floats]) -> tuple[Floats, list[str]]:
@@ -219,9 +221,9 @@ def drop_stuck(name: str, values: Floats, inputs: Sequence[Floats]) -> tuple[Flo
     ends = np.flatnonzero(np.append(np.diff(values) != 0, True))
     starts = np.append(0, ends[:-1] + 1)
     moved = travel[ends] - travel[starts]
-    at = int(np.argmax(moved))
-    run, most = slice(int(starts[at]), int(ends[at]) + 1), float(moved[at])
-    stayed = float(np.maximum(np.delete(moved, at) - 1, 0).sum())
+    longest = int(np.argmax(moved))
+    run, most = slice(int(starts[longest]), int(ends[longest]) + 1), float(moved[longest])
+    stayed = float(np.maximum(np.delete(moved, longest) - 1, 0).sum())
     chance = (stayed + 1) / (travel[-1] - most + 2)
     likely = most <= 2 or chance >= 1 or chance ** (most - 1) > _STUCK_CHANCE
     if values.size < SPIKE_WINDOW or likely or not np.isfinite(values[run]).all():
@@ -239,7 +241,7 @@ def reject_spikes(
     spikes = find_spikes(values, floor=floor, step=float(np.median(np.diff(time))))
     if not spikes.any():
         return values, []
-    worst = ", ".join(f"{values[at]:g} at {time[at]:.2f} s" for at in np.flatnonzero(spikes)[:5])
+    worst = ", ".join(f"{values[row]:g} at {time[row]:.2f} s" for row in np.flatnonzero(spikes)[:5])
     more = ", ..." if spikes.sum() > 5 else ""
     repairs = f"{name}: {spikes.sum()} spike sample{_s(int(spikes.sum()))} rejected ({worst}{more})"
     return np.where(spikes, np.nan, values), [repairs]

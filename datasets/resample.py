@@ -64,8 +64,8 @@ def gaps(log: Log, longer_than: float = 10.0) -> list[tuple[int, float, float]]:
     median steps; in an averaged log the blocks end where the gaps of the log itself were."""
     time = log["time"].values
     begins = [float(t) for t in str(log.attrs.get(_AFTER_GAP, "")).split()]
-    found = np.union1d(gap_rows(time, longer_than), np.flatnonzero(np.isin(time[1:], begins)))
-    return [(int(at), float(time[at]), float(time[at + 1])) for at in found]
+    gap_starts = np.union1d(gap_rows(time, longer_than), np.flatnonzero(np.isin(time[1:], begins)))
+    return [(int(row), float(time[row]), float(time[row + 1])) for row in gap_starts]
 
 
 def average(log: Log, seconds: float) -> Log:
@@ -94,24 +94,24 @@ def average(log: Log, seconds: float) -> Log:
     >>> average(log, 1.0)["t"].values, average(log, 1.0)["pump"].values
     (array([20.1, 20.4]), array([0.5, 0.5]))
     """
-    held = names(log, "input") + names(log, "disturbance")
+    held_names = names(log, "input") + names(log, "disturbance")
     wanted = tuple(str(key) for key in log.data_vars)
-    is_held = np.array([name in held for name in wanted], dtype=bool)
-    after = [at + 1 for at, _, _ in gaps(log)]
-    parts = block_means(
+    is_held = np.array([name in held_names for name in wanted], dtype=bool)
+    after = [column_place + 1 for column_place, _, _ in gaps(log)]
+    segments = block_means(
         log["time"].values, columns(log, wanted), is_held, seconds=seconds, after=after, log=log_name(log)
     )
-    begins, means = np.concatenate([t for t, _ in parts]), np.concatenate([v for _, v in parts])
+    begins, means = np.concatenate([t for t, _ in segments]), np.concatenate([v for _, v in segments])
     variables = {
-        name: (means[:, at], log[name].attrs["units"], log[name].attrs["role"])
-        for at, name in enumerate(wanted)
+        name: (means[:, column_place], log[name].attrs["units"], log[name].attrs["role"])
+        for column_place, name in enumerate(wanted)
     }
     repairs = [line for line in str(log.attrs.get("repairs", "")).splitlines() if line]
     repairs.append(f"averaged over {seconds:g} s")
     log = make_log(begins, variables, name=log_name(log), repairs=repairs)
     log.attrs["averaged_s"] = seconds  # a free run compares with the middle of a block, not with its start
-    if len(parts) > 1:
-        log.attrs[_AFTER_GAP] = " ".join(repr(float(t[0])) for t, _ in parts[1:])
+    if len(segments) > 1:
+        log.attrs[_AFTER_GAP] = " ".join(repr(float(t[0])) for t, _ in segments[1:])
     return log
 
 
@@ -125,14 +125,14 @@ def block_means(
     if not seconds >= step * (1 - 1e-9):
         problem = f"cannot average over {seconds:g} s: the rows are {step:g} s apart"
         raise UserError(problem, file=log, hint="choose a longer block")
-    parts = [
+    segments = [
         _blocks(time[a:b], values[a:b], held, seconds=seconds, step=step)
         for a, b in pairwise([0, *after, time.size])
     ]
-    if (n := sum(begins.size for begins, _ in parts)) < 2:
+    if (n := sum(begins.size for begins, _ in segments)) < 2:
         problem = f"{n} block of {seconds:g} s is not a log"
         raise UserError(problem, file=log, hint="choose a shorter block")
-    return parts
+    return segments
 
 
 def _blocks(
@@ -146,11 +146,11 @@ def _blocks(
     edges[-1] = min(edges[-1], time[-1] + step)  # the last row is held for one step, not for the whole block
     means = np.empty((filled.size, values.shape[1]))
     means[:, is_held] = held_means(time, values[:, is_held], edges)[filled]
-    for at in np.flatnonzero(~is_held):
-        there = np.isfinite(values[:, at])
-        count = np.bincount(where[there], minlength=filled.size)
-        total = np.bincount(where[there], weights=values[there, at], minlength=filled.size)
-        means[:, at] = np.where(count > 0, total / np.maximum(count, 1), np.nan)
+    for sampled in np.flatnonzero(~is_held):
+        finite = np.isfinite(values[:, sampled])
+        count = np.bincount(where[finite], minlength=filled.size)
+        total = np.bincount(where[finite], weights=values[finite, sampled], minlength=filled.size)
+        means[:, sampled] = np.where(count > 0, total / np.maximum(count, 1), np.nan)
     return edges[filled], means
 
 
@@ -158,6 +158,6 @@ def held_means(time: Floats, values: Floats, edges: Floats) -> Floats:
     """Return the means of the staircases (n_time, n) over the cells between the edges."""
     area = np.zeros_like(values)
     np.cumsum(values[:-1] * np.diff(time)[:, None], axis=0, out=area[1:])
-    at = np.clip(np.searchsorted(time, edges, side="right") - 1, 0, None)
-    integral = area[at] + values[at] * (edges - time[at])[:, None]
+    row = np.clip(np.searchsorted(time, edges, side="right") - 1, 0, None)
+    integral = area[row] + values[row] * (edges - time[row])[:, None]
     return np.asarray(np.diff(integral, axis=0) / np.diff(edges)[:, None], dtype=float)

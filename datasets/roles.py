@@ -75,10 +75,8 @@ _HELD_SHARE, _HELD_SIZE = 0.5, 0.05  # of rows with a move; of the range that it
 _FEW = 20  # rows: too few to distinguish chance from rule
 _COUNTS = 0.9  # of the rows have the same step
 _SHOWS = 5  # moves of two columns, by which they may be one signal
-_SHARED = 1 / 3  # of the wider one of two ranges: two sensors of one plant
 _EXACT, _ROUNDED = 1e-6, 0.05  # of a column's range; of its standard deviation, that rounding takes at most
 _LAGS, _STRONG, _MOST_ROWS = (2, 6), 10.0, 20_000
-_MEANS = 300  # over a log, that show what moves slowly
 
 
 @dataclass(frozen=True)
@@ -223,14 +221,10 @@ def roles_of_data(
         if help_.max() > _STRONG:
             out[name] = "output", f"{FOLLOWS} {names[int(help_.argmax())]}"
     roles |= {name: role for name, (role, _) in out.items()}
-    held = next((n for n in names if roles.get(n) == "input" and _is_held(columns[n])), None)
-    read = [n for n in names if roles.get(n) == "output"]
+    has_held_input = any(roles.get(n) == "input" and _is_held(columns[n]) for n in names)
     for name in [n for n in open_ if n not in roles]:
         why = "no other column predicts its course"
-        out[name] = ("disturbance" if held or units[name] == "degC" else "input"), why
-        like = next((n for n in read if held and _overlap(columns[name], columns[n]) >= _SHARED), None)
-        if like is not None:
-            out[name] = "output", f"its values lie as those of {like}"
+        out[name] = ("disturbance" if has_held_input or units[name] == "degC" else "input"), why
     roles |= {name: role for name, (role, _) in out.items()}
     clear = {role for name, role in roles.items() if name not in open_}
     if len(open_) == 1 and "disturbance" in clear and "output" not in clear:
@@ -278,8 +272,8 @@ def _doubts(
 
 def _helps_beside(columns: Mapping[str, Floats], name: str, output: str, inputs: Sequence[str]) -> bool:
     """Tell whether the past of a column helps to predict an output beside that of the inputs and its own."""
-    own, *others = _scaled([columns[n] for n in (output, name, *inputs)])
-    return all(_gain(own, others[0], others[1:], lags) > _STRONG for lags in _LAGS)
+    reading, *others = _scaled([columns[n] for n in (output, name, *inputs)])
+    return all(_gain(reading, others[0], others[1:], lags) > _STRONG for lags in _LAGS)
 
 
 def _heated_rooms(
@@ -312,11 +306,13 @@ def _followed(
     """Return the held columns whose levels a reading comes to while another column drives it, as set points,
     and the readings that no name shows, as outputs."""
     likely = [n for n in columns if guesses.get(n, ("", ""))[1] in (NO_CLUE, BY_UNIT)]
-    held = [n for n in likely if _is_held(columns[n])]
+    held_names = [n for n in likely if _is_held(columns[n])]
     out: dict[str, tuple[str, str]] = {}
-    for goal in held:
+    for goal in held_names:
         read = [
-            n for n in columns if n not in held and guesses.get(n, ("output", ""))[0] in ("output", "other")
+            n
+            for n in columns
+            if n not in held_names and guesses.get(n, ("output", ""))[0] in ("output", "other")
         ]
         reading = next((n for n in read if _comes_to(columns[n], columns[goal])), None)
         if reading is None:
@@ -337,7 +333,9 @@ def _comes_to(reading: Floats, goal: Floats) -> bool:
     the last half of each hold."""
     bounds = [0, *(np.flatnonzero(np.diff(goal)) + 1), goal.size]
     holds = [(goal[a], reading[(a + b) // 2 : b]) for a, b in pairwise(bounds) if b - a >= _FEW]
-    pairs = [(level, np.median(part)) for level, part in holds if np.isfinite(part).all()]
+    pairs = [
+        (level, np.median(second_half)) for level, second_half in holds if np.isfinite(second_half).all()
+    ]
     levels = np.array([level for level, _ in pairs])
     off = [abs(level - value) <= _HELD_SIZE * np.ptp(levels) for level, value in pairs]
     return np.unique(levels).size >= 3 and float(np.mean(off)) > 0.5
@@ -368,20 +366,12 @@ def _unnamed_causes(
 def _is_moved(columns: Mapping[str, Floats], name: str, drives: Sequence[str]) -> bool:
     """Tell whether the past of a drive helps to predict a column, row by row or in means over many rows, as
     long as the column is not stuck."""
-    known = np.isfinite(drop_stuck(name, columns[name], [columns[n] for n in drives])[0])
-    if known.sum() < _FEW:
+    is_sound = np.isfinite(drop_stuck(name, columns[name], [columns[n] for n in drives])[0])
+    if is_sound.sum() < _FEW:
         return True  # nothing of it speaks against
-    some = [columns[n][known] for n in (name, *drives)]
-    for length in {1, max(1, some[0][:_MOST_ROWS].size // _MEANS)}:
-        means = [_means(values, length) for values in _scaled(some)]
-        if any(_gain(means[0], drive, (), lags) > _STRONG for drive in means[1:] for lags in _LAGS):
-            return True
-    return False
-
-
-def _means(values: Floats, length: int) -> Floats:
-    """Return the means of so many rows each."""
-    return np.asarray(values[: values.size // length * length].reshape(-1, length).mean(axis=1))
+    some = [columns[n][is_sound] for n in (name, *drives)]
+    reading, *moves = _scaled(some)
+    return any(_gain(reading, drive, (), lags) > _STRONG for drive in moves for lags in _LAGS)
 
 
 def _words(name: str) -> str:
@@ -396,16 +386,10 @@ def _mostly_even(steps: Floats) -> bool:
 
 def _is_held(values: Floats) -> bool:
     """Tell whether a column moves in few rows, and then far, as what a person or a relay sets does."""
-    known = values[np.isfinite(values)]
-    moves = np.abs(np.diff(known))
-    held = 0 < np.count_nonzero(moves) <= _HELD_SHARE * known.size
-    return bool(held and np.median(moves[moves > 0]) >= _HELD_SIZE * np.ptp(known))
-
-
-def _overlap(one: Floats, other: Floats) -> float:
-    """Return the share of the wider range of two columns that both have."""
-    low, high = np.nanmin([one, other], axis=1), np.nanmax([one, other], axis=1)
-    return float((high.min() - low.max()) / (high - low).max())
+    finite = values[np.isfinite(values)]
+    moves = np.abs(np.diff(finite))
+    rarely_moves = 0 < np.count_nonzero(moves) <= _HELD_SHARE * finite.size
+    return bool(rarely_moves and np.median(moves[moves > 0]) >= _HELD_SIZE * np.ptp(finite))
 
 
 def _unlike_inputs(
@@ -415,11 +399,11 @@ def _unlike_inputs(
     ``stated`` is held; where none is, a controller moves them."""
     by_unit = [n for n, (role, why) in guesses.items() if role == "input" and why.startswith("its unit")]
     likely = [n for n, (role, why) in guesses.items() if role == "input" or why == NO_CLUE]
-    held = next((name for name in (*stated, *likely) if _is_held(columns[name])), None)
+    held_input = next((name for name in (*stated, *likely) if _is_held(columns[name])), None)
     finite = {name: columns[name][np.isfinite(columns[name])] for name in by_unit}
     moving = [n for n, v in finite.items() if np.count_nonzero(np.diff(v)) > _HELD_SHARE * len(v)]
-    why = f"it moves in most rows, and {held} is held between its moves, as inputs are"
-    return dict.fromkeys(moving if held else (), ("other", why))
+    why = f"it moves in most rows, and {held_input} is held between its moves, as inputs are"
+    return dict.fromkeys(moving if held_input else (), ("other", why))
 
 
 def _copies(
@@ -433,11 +417,11 @@ def _copies(
     moving = {n: v[:_MOST_ROWS] for n, v in columns.items() if np.ptp(v) > 0}  # of lost values none
     out: dict[str, tuple[str, str]] = {}
     order = sorted(moving, key=lambda n: (n in guesses) + (guesses.get(n, ("", ""))[1] == NO_CLUE))
-    for at, name in enumerate(order):
+    for place, name in enumerate(order):
         if name not in guesses:
             continue
         (role, why), values = guesses[name], moving[name]
-        for other in [n for n in order[:at] if n not in out]:
+        for other in [n for n in order[:place] if n not in out]:
             role_of_other = guesses.get(other, (role, ""))[0]
             if not _one_signal(values, moving[other]) or {role, role_of_other} == {"input", "output"}:
                 continue
@@ -453,7 +437,7 @@ def _copies(
             continue
         goals = [n for n in moving if n != name and (_SETPOINT.search(_words(n)) or _is_held(moving[n]))]
         goals = [n for n in goals if not _one_signal(values, moving[n])]
-        pairs = ((g, n) for g in goals for n in order[:at] if n not in (*goals, *out))
+        pairs = ((g, n) for g in goals for n in order[:place] if n not in (*goals, *out))
         both = next(((g, n) for g, n in pairs if _explains(values, moving[g], moving[n])), None)
         if both is not None:
             out[name] = "other", f"it is computed from {both[0]} and {both[1]}"
@@ -473,8 +457,8 @@ def _explains(y: Floats, *some: Floats) -> bool:
     moves = np.abs(np.diff(y))
     least = max(_EXACT * float(np.ptp(y)), float(moves[moves > 0].min(initial=np.inf)))
     for rows in (slice(0, 200), slice(None)):
-        left = y[rows] - x[rows] @ np.linalg.lstsq(x[rows], y[rows], rcond=None)[0]
-        if np.abs(left).max() > least or left.std() > _ROUNDED * y.std():
+        residual = y[rows] - x[rows] @ np.linalg.lstsq(x[rows], y[rows], rcond=None)[0]
+        if np.abs(residual).max() > least or residual.std() > _ROUNDED * y.std():
             return False
     return True
 
@@ -492,9 +476,9 @@ def _predictive_gain(columns: Sequence[Floats]) -> Floats:
 def _scaled(columns: Sequence[Floats]) -> list[Floats]:
     """Return the first rows of columns, gaps filled, of mean 0 and standard deviation 1."""
     scaled = []
-    for values in (each[:_MOST_ROWS] for each in columns):
-        at, known = np.arange(values.size), np.isfinite(values)
-        filled = np.interp(at, at[known], values[known]) if known.any() else np.zeros(values.size)
+    for values in (column[:_MOST_ROWS] for column in columns):
+        rows, finite = np.arange(values.size), np.isfinite(values)
+        filled = np.interp(rows, rows[finite], values[finite]) if finite.any() else np.zeros(values.size)
         scaled.append((filled - filled.mean()) / (np.std(filled) or 1.0))
     return scaled
 
@@ -514,6 +498,6 @@ def _gain(y: Floats, x: Floats, beside: Sequence[Floats], lags: int) -> float:
         target = y[lags:]
         return float(np.sum((target - z @ np.linalg.lstsq(z, target, rcond=None)[0]) ** 2)) + 1e-12 * rows
 
-    known = [past(values) for values in (y, *beside)]
-    gain = rows * np.log(left(known) / left([*known, past(x)])) - lags * np.log(rows)
+    pasts = [past(values) for values in (y, *beside)]
+    gain = rows * np.log(left(pasts) / left([*pasts, past(x)])) - lags * np.log(rows)
     return max(0.0, float(gain))

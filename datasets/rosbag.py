@@ -88,8 +88,8 @@ def read_topic_map(path: str | Path) -> TopicMap:
     unknown = sorted(set(content) - {"schema", "version", "clock", "stamp", "columns"})
     is_map = content.get("schema") == "thermogrip.topics" and isinstance(content.get("columns"), dict)
     if unknown or not is_map:
-        what = f"has the unknown key {unknown[0]!r}" if unknown else "is no topic map"
-        raise UserError(what, file=path, hint="write a fresh one with `thermogrip init topics`")
+        fault = f"has the unknown key {unknown[0]!r}" if unknown else "is no topic map"
+        raise UserError(fault, file=path, hint="write a fresh one with `thermogrip init topics`")
     columns = {name: _column(name, entry, path) for name, entry in content["columns"].items()}
     clock, stamp = str(content.get("clock", "")), str(content.get("stamp", "log"))
     if clock and clock not in columns:
@@ -122,9 +122,9 @@ def read_rosbag_table(path: str | Path, topics: TopicMap | None = None) -> Table
     series: dict[str, tuple[list[float], list[float]]] = {}
     columns: dict[str, Column] = {} if wanted is None else dict(wanted.columns)
     stamp = "log" if wanted is None else wanted.stamp
-    seen: dict[str, str] = {}
+    type_of_topic: dict[str, str] = {}
     for message in _messages(file, notes):
-        seen[message.topic] = message.type
+        type_of_topic[message.topic] = message.type
         if wanted is None:
             _guess(message, columns, file)
         for name, column in columns.items():
@@ -132,7 +132,7 @@ def read_rosbag_table(path: str | Path, topics: TopicMap | None = None) -> Table
                 times, values = series.setdefault(name, ([], []))
                 times.append(_stamped(message, stamp, file))
                 values.append(_number(message, column, name, file))
-    _check_found(columns, series, seen, file)
+    _check_found(columns, series, type_of_topic, file)
     return _table(file, columns, series, "" if wanted is None else wanted.clock, notes)
 
 
@@ -197,9 +197,9 @@ def _listed(path: Path) -> list[str]:
     data = read_bytes(path)
     check_size(len(data), file=path, share=64)
     with reading("is no metadata of a ROS 2 bag", file=path, hint="copy the bag again"):
-        found = YAML(typ="safe").load(data)["rosbag2_bagfile_information"]
-        names = [Path(str(name)).name for name in found["relative_file_paths"]]
-        packed_whole = str(found.get("compression_mode", "")).lower() == "file"
+        about_bag = YAML(typ="safe").load(data)["rosbag2_bagfile_information"]
+        names = [Path(str(name)).name for name in about_bag["relative_file_paths"]]
+        packed_whole = str(about_bag.get("compression_mode", "")).lower() == "file"
     if packed_whole:
         problem = f"names {names[0] if names else 'files'}, which is compressed whole"
         raise UserError(problem, file=path, hint=_UNPACK)
@@ -218,8 +218,8 @@ def _guess(message: Message, columns: dict[str, Column], file: Path) -> None:
     """Add a column for a topic that is seen for the first time and has one number."""
     if any(column.topic == message.topic for column in columns.values()):
         return
-    known = next((f for f in _NUMBERS if _has(message.content, f)), "")
-    field = "value" if message.attrs.get("units") else known
+    number_field = next((f for f in _NUMBERS if _has(message.content, f)), "")
+    field = "value" if message.attrs.get("units") else number_field
     try:
         float(_field(message.content, field))
     except _NO_NUMBER:
@@ -240,15 +240,15 @@ def _has(content: Any, field: str) -> bool:
 
 def _field(content: Any, path: str) -> Any:
     """Return a nested field; only data is looked at, no method is called."""
-    for part in path.split("."):
-        if part.lstrip("-").isdigit():
-            content = content[int(part)]
+    for key in path.split("."):
+        if key.lstrip("-").isdigit():
+            content = content[int(key)]
         elif isinstance(content, dict):
-            content = content[part]
-        elif part.startswith("_"):
-            raise KeyError(part)
+            content = content[key]
+        elif key.startswith("_"):
+            raise KeyError(key)
         else:
-            content = getattr(content, part)
+            content = getattr(content, key)
     return content
 
 
@@ -264,9 +264,12 @@ def _stamped(message: Message, stamp: str, file: Path) -> float:
     if stamp == "log":
         return message.time
     try:
-        at = _field(message.content, "header.stamp")
-        seconds, part = (_either(at, "sec", "secs"), _either(at, "nanosec", "nsecs"))
-        return float(seconds) + 1e-9 * float(part)
+        stamp_of_header = _field(message.content, "header.stamp")
+        seconds, nanoseconds = (
+            _either(stamp_of_header, "sec", "secs"),
+            _either(stamp_of_header, "nanosec", "nsecs"),
+        )
+        return float(seconds) + 1e-9 * float(nanoseconds)
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         problem = f"{message.topic} ({message.type}) has no header.stamp"
         raise UserError(problem, file=file, hint='set stamp = "log" in the topic map') from error
@@ -323,16 +326,16 @@ def _in_order(times: list[float], values: list[float]) -> tuple[Floats, Floats]:
 
 
 def _held(axis: Floats, times: Floats, values: Floats) -> Floats:
-    at = np.searchsorted(times, axis, "right") - 1
-    return np.where(at >= 0, values[np.maximum(at, 0)], np.nan)
+    row = np.searchsorted(times, axis, "right") - 1
+    return np.where(row >= 0, values[np.maximum(row, 0)], np.nan)
 
 
 def _nearest(axis: Floats, times: Floats, values: Floats) -> Floats:
     after = np.clip(np.searchsorted(times, axis), 0, times.size - 1)
     before = np.maximum(after - 1, 0)
-    at = np.where(np.abs(times[after] - axis) <= np.abs(axis - times[before]), after, before)
+    nearest = np.where(np.abs(times[after] - axis) <= np.abs(axis - times[before]), after, before)
     step = float(np.median(np.diff(times))) if times.size > 1 else np.inf
-    return np.where(np.abs(times[at] - axis) <= 0.5 * step + 1e-6, values[at], np.nan)
+    return np.where(np.abs(times[nearest] - axis) <= 0.5 * step + 1e-6, values[nearest], np.nan)
 
 
 def _messages(file: Path, notes: list[str]) -> Iterator[Message]:
@@ -341,16 +344,16 @@ def _messages(file: Path, notes: list[str]) -> Iterator[Message]:
     if not os.path.isdir(file):
         yield from _messages_of_file(file, notes)
         return
-    parts = bag_parts(file)
+    bag_files = bag_parts(file)
     if not (file / "metadata.yaml").is_file():
         notes.append("has no metadata.yaml: its writer died; all of its files are read")
-    elif all(part.suffix.lower() == ".db3" for part in parts):
-        check_size(sum(check_source(part) for part in parts), file=file)
-        parts = parts[:1]  # the reader of one reads all that the metadata name
-    for part in parts:
+    elif all(bag_file.suffix.lower() == ".db3" for bag_file in bag_files):
+        check_size(sum(check_source(bag_file) for bag_file in bag_files), file=file)
+        bag_files = bag_files[:1]  # the reader of one reads all that the metadata name
+    for bag_file in bag_files:
         part_notes: list[str] = []
-        yield from _messages_of_file(part, part_notes)
-        notes += [f"{part.name}: {line}" for line in part_notes]
+        yield from _messages_of_file(bag_file, part_notes)
+        notes += [f"{bag_file.name}: {line}" for line in part_notes]
 
 
 def _messages_of_file(file: Path, notes: list[str]) -> Iterator[Message]:
@@ -398,9 +401,11 @@ def _bound_chunks(reader: Any, file: Path) -> Callable[[bytes], bytes]:
     unpack = Unpacker(file)
     packings = {function: name for name, function in decompressors.items() if name != "none"}
     for bag in reader.readers:
-        for at, chunk in bag.chunks.items():
+        for offset, chunk in bag.chunks.items():
             if chunk.decompressor in packings:
-                bag.chunks[at] = chunk._replace(decompressor=partial(unpack, packings[chunk.decompressor]))
+                bag.chunks[offset] = chunk._replace(
+                    decompressor=partial(unpack, packings[chunk.decompressor])
+                )
     return lambda raw: raw
 
 
@@ -503,8 +508,8 @@ class _Decoders:
             name = schema.name if "/msg/" in schema.name else schema.name.replace("/", "/msg/", 1)
             problem = f"the definition of {schema.name} cannot be read"
             with reading(problem, file=self._file, hint="write the file again"):
-                found = get_types_from_msg(schema.data.decode(), name)
-                self._store.register({k: v for k, v in found.items() if k not in self._store.fielddefs})
+                definitions = get_types_from_msg(schema.data.decode(), name)
+                self._store.register({k: v for k, v in definitions.items() if k not in self._store.fielddefs})
             self._known[schema.name] = name
         return self._known[schema.name]
 

@@ -118,8 +118,8 @@ def _time_faults(time: NDArray[np.float64]) -> Iterator[tuple[str, str]]:
     if not np.all(np.isfinite(time)):
         yield "time is not finite everywhere", "remove the rows without a time"
     if np.any(np.diff(time) <= 0):
-        at = int(np.argmax(np.diff(time) <= 0))
-        yield f"time does not increase after {time[at]:g} s", "sort the rows by time"
+        row = int(np.argmax(np.diff(time) <= 0))
+        yield f"time does not increase after {time[row]:g} s", "sort the rows by time"
 
 
 def _variable_faults(variable: xr.DataArray) -> Iterator[tuple[str, str | None]]:
@@ -167,8 +167,8 @@ def hash_columns(data: Mapping[str, NDArray[np.float64]]) -> str:
     """Return the SHA-256 of columns, in whatever order they stand."""
     # + 0.0: -0 and 0 are one number, of two byte patterns
     values = [np.asarray(v, dtype="<f8") + 0.0 for v in data.values()]
-    each = sorted(hashlib.sha256(one.tobytes()).digest() for one in values)
-    return hashlib.sha256(b"".join(each)).hexdigest()
+    digests = sorted(hashlib.sha256(one.tobytes()).digest() for one in values)
+    return hashlib.sha256(b"".join(digests)).hexdigest()
 
 
 def make_grasps(
@@ -275,10 +275,10 @@ def _grasp_faults(grasps: xr.Dataset) -> Iterator[tuple[str, str | None]]:
     for need in ("grasp", "time"):
         if need not in grasps.coords:
             yield f"no {need} axis", "give the record dims 'grasp' and 'time'"
-    found = grasps.variables  # a DataArray made of one costs more than to check it
-    if "t_surface" not in grasps or found["t_surface"].dims != ("grasp", "time"):
+    variables = grasps.variables  # a DataArray made of one costs more than to check it
+    if "t_surface" not in grasps or variables["t_surface"].dims != ("grasp", "time"):
         yield "no t_surface of dims (grasp, time)", None
-    time, ids = found["time"].values, found["grasp"].values
+    time, ids = variables["time"].values, variables["grasp"].values
     if ids.size == 0:
         yield "holds no grasp", "give at least one"
     if time.size < 2 or not np.all(np.isfinite(time)) or np.any(np.diff(time) <= 0):
@@ -289,10 +289,10 @@ def _grasp_faults(grasps: xr.Dataset) -> Iterator[tuple[str, str | None]]:
     unique, counts = np.unique(ids, return_counts=True)
     if np.any(counts > 1):
         yield f"grasp_id {str(unique[counts > 1][0])!r} occurs twice", "give each its own"
-    lost = ~np.isfinite(found["t_surface"].values).any(axis=1)
+    lost = ~np.isfinite(variables["t_surface"].values).any(axis=1)
     if lost.any():
         yield f"grasp {str(ids[lost][0])!r} has no temperature", "remove it"
-    for label in np.unique(found["split"].values.astype(str)) if "split" in grasps else ():
+    for label in np.unique(variables["split"].values.astype(str)) if "split" in grasps else ():
         plain = label.strip().lower()
         if plain != label and plain in ("train", "test"):  # it would be left out of both without a word
             yield f"split {label!r} is neither train nor test", f"write {plain!r}"
@@ -303,20 +303,20 @@ def _grasp_faults(grasps: xr.Dataset) -> Iterator[tuple[str, str | None]]:
             for i, k in np.argwhere(np.abs(values) > HOTTEST)[:1]:  # NaN compares false
                 problem = f"grasp {str(grasps['grasp'].values[i])!r} has a {name} of {values[i, k]:g} degC"
                 yield problem, "give degrees Celsius, or end the column's name in _K if it is kelvin"
-    rest = grasps.variables["rest"].values if "rest" in grasps else np.zeros(len(ids))
-    for k in np.flatnonzero(rest < 0):  # NaN compares false
+    rests = grasps.variables["rest"].values if "rest" in grasps else np.zeros(len(ids))
+    for k in np.flatnonzero(rests < 0):  # NaN compares false
         hint = "give the seconds since the touch before, or leave it empty"
-        yield f"grasp {str(ids[k])!r} has a rest of {float(rest[k]):g} s", hint
+        yield f"grasp {str(ids[k])!r} has a rest of {float(rests[k]):g} s", hint
     if "touch" not in grasps or "touch_group" not in grasps:
         return
     group = label_values(grasps, "touch_group")
     touch = np.asarray(grasps.variables["touch"].values, dtype=float)
     for name in np.unique(group[group != ""]):
-        at = np.flatnonzero(group == name)
-        known = np.isfinite(touch[at])
-        numbers, counts = np.unique(touch[at][known], return_counts=True)
-        if known.any() and not known.all():
-            unnumbered = str(ids[at[~known][0]])
+        grasps_of_group = np.flatnonzero(group == name)
+        is_numbered = np.isfinite(touch[grasps_of_group])
+        numbers, counts = np.unique(touch[grasps_of_group][is_numbered], return_counts=True)
+        if is_numbered.any() and not is_numbered.all():
+            unnumbered = str(ids[grasps_of_group[~is_numbered][0]])
             problem = f"grasp {unnumbered!r} of touch_group {str(name)!r} has no touch, others of it have"
             yield problem, "number all touches of a block, or none"
         if (counts > 1).any():

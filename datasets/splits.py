@@ -40,11 +40,11 @@ def by_grasp(
             )
             raise UserError(problem, file=log_name(grasps), hint="lower --train-per-class or record more")
     rng = np.random.default_rng(seed)
-    known = material != ""
+    has_material = material != ""
     for _ in range(repeats):
         chosen = np.concatenate([rng.permutation(units)[:train_per_class] for units in classes.values()])
         in_train = np.isin(unit, chosen)
-        yield np.flatnonzero(known & in_train), np.flatnonzero(known & ~in_train)
+        yield np.flatnonzero(has_material & in_train), np.flatnonzero(has_material & ~in_train)
 
 
 def shipped(grasps: Grasps) -> Split:
@@ -62,7 +62,7 @@ def _whole(grasps: Grasps, label: NDArray[np.str_], name: str) -> None:
     """Refuse a touch group whose touches differ in the label that is split by."""
     groups = label_values(grasps, "touch_group")
     for group in np.unique(groups[groups != ""]):
-        found = np.unique(label[groups == group]).tolist()
-        if len(found) > 1:
-            problem = f"touch group {str(group)!r} is in {name} {found[0]!r} and {found[1]!r}"
+        labels = np.unique(label[groups == group]).tolist()
+        if len(labels) > 1:
+            problem = f"touch group {str(group)!r} is in {name} {labels[0]!r} and {labels[1]!r}"
             raise UserError(problem, file=log_name(grasps), hint="its touches must agree")

@@ -123,9 +123,9 @@ def read_csv_table(path: str | Path, *, text: Callable[[str], bool] | None = Non
     data, file = _text_of(path), str(path)
     with as_user_error(csv.Error, "the header is no line of names", file=file, hint="correct it"):
         layout = _first_line_as_names(data, file)
-    for at, name in enumerate(layout.names):
-        if not name or name in layout.names[:at]:
-            problem = f"column {at + 1} has no name" if not name else f"column {name!r} occurs twice"
+    for place, name in enumerate(layout.names):
+        if not name or name in layout.names[:place]:
+            problem = f"column {place + 1} has no name" if not name else f"column {name!r} occurs twice"
             raise UserError(problem, file=file, row=layout.skip, hint="name each column once")
     return _parse_table(data, layout, file, text or (lambda name: False), tolerated=0.0)
 
@@ -148,14 +148,14 @@ def parse_text(data: bytes, file: str, columns: Sequence[str] | None = None) -> 
     layout = find_layout(data, file)
     notes = (*coded, *labelled, *layout.notes)
     if columns is not None:
-        own = [name for name in layout.names if not name.startswith(_LEFT_OUT)]
-        layout = replace(layout, names=[*_new_names(columns, len(own), file), *layout.names[len(own) :]])
+        named = [name for name in layout.names if not name.startswith(_LEFT_OUT)]
+        layout = replace(layout, names=[*_new_names(columns, len(named), file), *layout.names[len(named) :]])
         notes = tuple(note for note in notes if "--columns" not in note)
     if layout.separator == " ":  # one run at a time: [ ]+$ would look at each of its blanks again
         data = re.sub(rb"(?m)^ | ?\r?$", b"", re.sub(rb"[ \t]+", b" ", data))
     table = _parse_table(data, replace(layout, notes=notes), file, lambda name: False, _TOLERATED)
-    kept = {name: values for name, values in table.numbers.items() if not name.startswith(_LEFT_OUT)}
-    return replace(table, numbers=kept)
+    numbers = {name: values for name, values in table.numbers.items() if not name.startswith(_LEFT_OUT)}
+    return replace(table, numbers=numbers)
 
 
 def _new_names(columns: Sequence[str], n: int, file: str | Path) -> list[str]:
@@ -171,11 +171,11 @@ def _new_names(columns: Sequence[str], n: int, file: str | Path) -> list[str]:
 
 def check_header(headers: Sequence[str], names: Sequence[str], file: str) -> None:
     """Refuse names where a table has no header, with the ``--columns`` that would give them to it."""
-    known = {header.lower() for header in headers}
+    header_words = {header.lower() for header in headers}
     spare = len(headers) - len(names)
-    if not names or spare < 0 or known != {f"c{at + 1}" for at in range(len(headers))}:
+    if not names or spare < 0 or header_words != {f"c{place + 1}" for place in range(len(headers))}:
         return
-    if not known & {name.strip().lower() for name in names}:
+    if not header_words & {name.strip().lower() for name in names}:
         words = [*["time_s"][:spare], *names, *["-"] * (spare - 1)]
         hint = f"name its columns in their order, such as --columns {','.join(words)} (-: left out)"
         raise UserError("has no header", file=file, hint=hint)
@@ -184,9 +184,9 @@ def check_header(headers: Sequence[str], names: Sequence[str], file: str) -> Non
 def find_layout(data: bytes, file: str) -> Layout:
     """Return how a text is a table, from its first lines."""
     head: list[tuple[int, str]] = []
-    for at, raw in enumerate(_lines(data[: 1 << 20]), start=1):
+    for line_number, raw in enumerate(_lines(data[: 1 << 20]), start=1):
         if len(head) < _HEAD_LINES and raw.strip():
-            head.append((at, raw.decode("utf-8", errors="replace").strip("\r\n")))
+            head.append((line_number, raw.decode("utf-8", errors="replace").strip("\r\n")))
     separator, first = _best_separator(head)
     if first is None:
         return _first_line_as_names(data, file)
@@ -196,7 +196,7 @@ def find_layout(data: bytes, file: str) -> Layout:
         raise UserError(f"has {n} columns, more than {MOST_COLUMNS}", file=file, hint="leave some out")
     header, used = _names_above(head[:first], n, separator)
     hollow = not header[-1] and all(row[-1] == "" for row in rows)  # every line ends with a separator
-    nameless = [f"c{at}" for at, name in enumerate(header[: n - hollow], 1) if not name]
+    nameless = [f"c{line_number}" for line_number, name in enumerate(header[: n - hollow], 1) if not name]
     notes = []
     if len(nameless) == n - hollow:
         above = len(_split(head[first - 1][1].lstrip("#%/ "), separator)) if first else 0
@@ -205,10 +205,12 @@ def find_layout(data: bytes, file: str) -> Layout:
     if nameless and not notes:
         notes.append(f"without a name: {', '.join(nameless)}")
     names: list[str] = []
-    for at, name in enumerate(header):
-        names.append(unused(name or f"c{at + 1}", names, "{1}_{0}"))  # the unit at the end stays there
-        if name and names[at] != name:
-            notes.append(f"{name} occurs again: named {names[at]}")
+    for line_number, name in enumerate(header):
+        names.append(
+            unused(name or f"c{line_number + 1}", names, "{1}_{0}")
+        )  # the unit at the end stays there
+        if name and names[line_number] != name:
+            notes.append(f"{name} occurs again: named {names[line_number]}")
     if hollow:
         names[-1] = f"{_LEFT_OUT}end"
     passed = sum(not line.startswith(_COMMENT) for _, line in head[:first]) - used
@@ -312,7 +314,9 @@ def _are_units(cells: Sequence[str]) -> bool:
 def _first_line_as_names(data: bytes, file: str) -> Layout:
     """Return the layout of a table whose first line, comments aside, is its header."""
     lines = enumerate(io.BytesIO(data), start=1)
-    first = next(((at, raw) for at, raw in lines if raw.strip() and not raw.startswith(b"#")), None)
+    first = next(
+        ((line_number, raw) for line_number, raw in lines if raw.strip() and not raw.startswith(b"#")), None
+    )
     if first is None:
         raise UserError("has only comments", file=file, hint="give a header and at least two rows")
     skip, raw = first
@@ -357,7 +361,7 @@ def _without_labels(data: bytes) -> tuple[bytes, tuple[str, ...]]:
         cells = _labelled(raw.decode("utf-8", "replace"))
         rows.append(",".join(cells[name] for name in names) if cells.keys() >= {*names} else "")
     passed = sum(not row and bool(raw.strip()) for row, raw in zip(rows, _lines(data)))
-    first = next((at for at, row in enumerate(rows) if row), 0)
+    first = next((place for place, row in enumerate(rows) if row), 0)
     rows[max(first - 1, 0) : first] = [",".join(names)]  # in place of a line before, if there is one
     notes = [f"lines have readings beside their names: {', '.join(names)}"]
     notes += [f"{passed} line(s) without them passed over"] if passed else []
@@ -499,21 +503,21 @@ def read_column(
     if wrong.size and separator != "," and _has_decimal_comma(cells):
         values, notes = _to_numbers([cell.replace(",", ".") for cell in cells], lost), [_COMMAS]
         wrong = _not_numbers(cells, values, lost)
-    known = len(cells) - sum(cell in lost for cell in cells)
+    cells_known = len(cells) - sum(cell in lost for cell in cells)
     if tolerated and wrong.size and (united := _without_unit(name, cells, lost)) is not None:
         return read_column(*united, lines, file, separator, tolerated)
     first = cells[wrong[0]] if wrong.size else ""
-    states = switched(cells) if tolerated and len({cells[at].lower() for at in wrong}) > 1 else None
+    states = switched(cells) if tolerated and len({cells[row].lower() for row in wrong}) > 1 else None
     if states is not None and np.isfinite(values).any():
         return Column(name, text=[*cells])  # numbers and both states of a switch: readings of several signals
-    if wrong.size <= 2 * tolerated * known:
+    if wrong.size <= 2 * tolerated * cells_known:
         if wrong.size:
             where = f"{name_rows(lines[wrong], 5)}: {_shown(first)}"
             notes = [f"{name}: {wrong.size} cell(s) that are no numbers left empty ({where})", *notes]
         return Column(name, values, notes=tuple(notes))
     if tolerated and (states := switched(cells)) is not None:
         return Column(name, states, notes=(f"{name}: words as {_shown(first)} read as 0 and 1",))
-    if tolerated and (wrong.size >= _MOST * known or STAMP.fullmatch(first)):
+    if tolerated and (wrong.size >= _MOST * cells_known or STAMP.fullmatch(first)):
         return Column(name, text=[*cells])
     hint = "write a number, leave the cell empty, or drop the column"
     if re.fullmatch(r"[+-]?\d+,\d+", first):
@@ -529,10 +533,12 @@ _COMMAS = "numbers have a decimal comma"
 
 def _to_numbers(cells: Sequence[str], lost: Container[str]) -> NDArray[np.float64]:
     """Return the numbers of cells, NaN where one is none."""
-    known = ["nan" if cell in lost else cell for cell in cells]
-    if (plain := _plain_numbers(known)) is not None:
+    number_words = ["nan" if cell in lost else cell for cell in cells]
+    if (plain := _plain_numbers(number_words)) is not None:
         return plain
-    return np.array([float(cell) if _NUMBER.fullmatch(cell) else np.nan for cell in known], dtype=float)
+    return np.array(
+        [float(cell) if _NUMBER.fullmatch(cell) else np.nan for cell in number_words], dtype=float
+    )
 
 
 def _plain_numbers(cells: Sequence[str]) -> NDArray[np.float64] | None:
@@ -551,7 +557,7 @@ def _not_numbers(
 ) -> NDArray[np.int64]:
     """Return which cells are neither numbers nor lost."""
     at_nan = np.flatnonzero(np.isnan(values)).tolist()
-    return np.array([at for at in at_nan if cells[at] not in lost], dtype=np.int64)
+    return np.array([row for row in at_nan if cells[row] not in lost], dtype=np.int64)
 
 
 def _has_decimal_comma(cells: Sequence[str]) -> bool:
@@ -577,7 +583,7 @@ def switched(cells: Sequence[str]) -> NDArray[np.float64] | None:
     where there are other words, or two of one meaning."""
     words, lost = [cell.strip().lower() for cell in cells], {word.lower() for word in _LOST}
     values = _to_numbers(words, lost)
-    states = {words[at] for at in _not_numbers(words, values, lost)}
+    states = {words[row] for row in _not_numbers(words, values, lost)}
     if not states <= {*_SWITCH} or len({_SWITCH[state] for state in states}) < len(states):
         return None
     return np.array([_SWITCH.get(word, value) for word, value in zip(words, values.tolist())], dtype=float)
@@ -590,15 +596,17 @@ def _shown(cell: str) -> str:
 def _joined(faults: Sequence[UserError], names: Sequence[str]) -> UserError:
     """Return all that is wrong with a file as one error, of a log with what reads the rest of it."""
     first, bad = faults[0], {fault.column for fault in faults}
-    kept = ",".join("-" if name in bad else name.replace(",", " ") for name in names)
+    column_words = ",".join("-" if name in bad else name.replace(",", " ") for name in names)
     hint = first.hint
     if bad - {None} and len(bad) < len(names):
-        command = shlex.join(["thermogrip", "identify", str(first.file), "--columns", kept])
+        command = shlex.join(["thermogrip", "identify", str(first.file), "--columns", column_words])
         hint = f"{hint}, or leave columns out: {command}"
     if len(faults) == 1:
         return UserError(first.problem, file=first.file, row=first.row, column=first.column, hint=hint)
-    each = [f"row {f.row}" + (f", column {f.column}" if f.column else "") + f": {f.problem}" for f in faults]
-    return UserError(f"{len(faults)} faults: " + "; ".join(each), file=first.file, hint=hint)
+    fault_lines = [
+        f"row {f.row}" + (f", column {f.column}" if f.column else "") + f": {f.problem}" for f in faults
+    ]
+    return UserError(f"{len(faults)} faults: " + "; ".join(fault_lines), file=first.file, hint=hint)
 
 
 def frame_table(
@@ -612,8 +620,8 @@ def frame_table(
         frame = frame.rename_axis(str(frame.index.name or "time")).reset_index()
     lines = np.arange(1, len(frame) + 1)
     columns: list[Column] = []
-    for at, name in enumerate(map(str, frame.columns)):
-        values = frame.iloc[:, at]
+    for place, name in enumerate(map(str, frame.columns)):
+        values = frame.iloc[:, place]
         if text is not None and text(name):
             columns.append(
                 Column(name, text=values.astype(object).where(values.notna(), "").astype(str).tolist())
@@ -649,16 +657,16 @@ def read_matlab_table(path: str | Path, columns: Sequence[str] | None = None) ->
         hint = "save the signals as vectors or a matrix (timeseries and tables are objects of MATLAB's own)"
         raise UserError("has no columns of numbers", file=path, hint=hint)
     n = max(set(lengths), key=lambda length: (length * lengths.count(length), length))
-    kept = {name: values for name, values in arrays.items() if values.shape[0] == n}
+    arrays_kept = {name: values for name, values in arrays.items() if values.shape[0] == n}
     numbers = {
-        name if values.shape[1] == 1 else f"{name}_{at + 1}": values[:, at]
-        for name, values in kept.items()
-        for at in range(values.shape[1])
+        name if values.shape[1] == 1 else f"{name}_{place + 1}": values[:, place]
+        for name, values in arrays_kept.items()
+        for place in range(values.shape[1])
     }
-    other_lengths = [name for name in arrays if name not in kept]
+    other_lengths = [name for name in arrays if name not in arrays_kept]
     notes = [f"left out, of another length: {', '.join(other_lengths)}"] if other_lengths else []
-    if len(kept) == 1 and len(numbers) > 1:
-        numbers = {f"c{at}": values for at, values in enumerate(numbers.values(), 1)}
+    if len(arrays_kept) == 1 and len(numbers) > 1:
+        numbers = {f"c{place}": values for place, values in enumerate(numbers.values(), 1)}
         if columns is None:
             notes.append(f"no header: {_NAMELESS.format(len(numbers))}")
     if columns is not None:
@@ -694,18 +702,18 @@ def _unpacked_matlab(raw: bytes, path: str | Path) -> bytes:
     if raw[126:128] not in (b"IM", b"MI"):
         return raw
     order: Literal["little", "big"] = "little" if raw[126:128] == b"IM" else "big"
-    out, at, total = [raw[:128]], 128, 0
-    while at < len(raw):
-        kind, size = (int.from_bytes(raw[at + k : at + k + 4], order) for k in (0, 4))
-        part, at = raw[at : at + 8 + size], at + 8 + size
+    out, offset, total = [raw[:128]], 128, 0
+    while offset < len(raw):
+        kind, size = (int.from_bytes(raw[offset + k : offset + k + 4], order) for k in (0, 4))
+        element, offset = raw[offset : offset + 8 + size], offset + 8 + size
         if kind == 15:  # miCOMPRESSED
             unpacker = zlib.decompressobj()
-            part = unpacker.decompress(part[8:], limits.most_unpacked(len(raw)) - total + 1)
-            total += len(part)
+            element = unpacker.decompress(element[8:], limits.most_unpacked(len(raw)) - total + 1)
+            total += len(element)
             limits.check_unpacked(len(raw), total, file=path)
-        if at > len(raw):
+        if offset > len(raw):
             raise ValueError("it was cut off")
-        out.append(part)
+        out.append(element)
     return b"".join(out)
 
 
@@ -754,9 +762,9 @@ def _check_parquet(opened: Any, packed: int, path: str | Path) -> None:
     about, columns = opened.metadata, len(opened.schema_arrow)
     if columns > MOST_COLUMNS:
         raise UserError(f"has {columns} columns, more than {MOST_COLUMNS}", file=path, hint="leave some out")
-    groups = [about.row_group(at) for at in range(about.num_row_groups)]
+    groups = [about.row_group(place) for place in range(about.num_row_groups)]
     rows = max(about.num_rows, sum(group.num_rows for group in groups))
-    pages = sum(group.column(at).total_uncompressed_size for group in groups for at in range(columns))
+    pages = sum(group.column(place).total_uncompressed_size for group in groups for place in range(columns))
     limits.check_unpacked(packed, max(8 * rows * columns, pages), file=path, what="declares")
 
 

@@ -31,8 +31,9 @@ _FOREIGN = {
     "C": "_degC", "F": "_degF", "celsius": "_degC", "Celsius": "_degC", "degK": "_K", "kelvin": "_K",
     "Kelvin": "_K", "fahrenheit": "_degF", "Fahrenheit": "_degF", "deg": "_degC", "pct": "_percent",
     "perc": "_percent", "%": "_percent", "sec": "_s", "secs": "_s", "seconds": "_s", "second": "_s",
-    "msec": "_ms", "minutes": "_min", "minute": "_min", "mins": "_min", "h": "_s", "hr": "_s", "hours": "_s",
-    "hour": "_s", "us": "_s", "ns": "_s", "days": "_s", "mV": "_V", "kV": "_V", "volt": "_V", "volts": "_V",
+    "degCelsius": "_degC", "milliseconds": "_ms", "msec": "_ms", "minutes": "_min", "minute": "_min",
+    "mins": "_min", "h": "_s", "hr": "_s", "hours": "_s", "hour": "_s", "us": "_s", "ns": "_s", "days": "_s",
+    "mV": "_V", "kV": "_V", "volt": "_V", "volts": "_V",
     "mA": "_A", "uA": "_A", "amp": "_A", "amps": "_A", "ampere": "_A", "mW": "_W", "kW": "_W", "watt": "_W",
     "watts": "_W", "mK": "_K", "Hz": "", "kHz": "", "Pa": "", "kPa": "", "bar": "", "rpm": "", "kg": "",
     "mm": "", "Ohm": "", "ohm": "", "kOhm": "", "J": "", "kJ": "", "N": "", "lpm": "", "LPM": "",
@@ -85,24 +86,24 @@ def read_header(header: str, others: Sequence[str] = ()) -> tuple[str, str, floa
     for unit in UNITS:
         if header.endswith(f"_{unit}") and not (series and len(unit) == 1):
             return _plain(header.removesuffix(f"_{unit}")), unit, 1.0
-    found = _UNIT_AT_END.fullmatch(header) if len(header) <= _LONGEST else None
-    if found is None:
+    match = _UNIT_AT_END.fullmatch(header) if len(header) <= _LONGEST else None
+    if match is None:
         return _plain(header), "1", 1.0
-    name, inside = found["name"], found["inside"]
-    word = (found["after"] if inside is None else inside).strip()
+    name, inside = match["name"], match["inside"]
+    word = (match["after"] if inside is None else inside).strip()
     if inside is not None and word in ("", "-", "1"):
         return _plain(name), "1", 1.0
-    unit, scale = _any_unit(word)
+    unit, scale = any_unit(word)
     timed = unit in _TIMES and re.search(r"(?i:time|elapsed)|^t$", name) is None
     if inside is None and unit and len(word) == 1 and word != "%":
         lower = word.islower() and DRIVE.match(name.lower())
-        unit = "" if series or lower or (found["mark"] or "").isspace() else unit
+        unit = "" if series or lower or (match["mark"] or "").isspace() else unit
     if (inside is None and timed) or (word == "deg" and not re.match(r"(?i)t\d*(_|$)|.*temp", name)):
         unit = ""
     return (_plain(name), unit, scale) if unit else (_plain(header), "1", 1.0)
 
 
-def _any_unit(word: str) -> tuple[str, float]:
+def any_unit(word: str) -> tuple[str, float]:
     """Return the unit that a word means and the factor to it; an empty one where it means none."""
     degrees = any(sign in word for sign in "°º˚℃")
     word = re.sub(r"[°º˚\s]", "", word).replace("℃", "C").replace("µ", "u").replace("μ", "u")
@@ -164,7 +165,10 @@ def find_column(entry: str, units: Mapping[str, str], file: str | None = None) -
     if entry in units:
         return entry
     likely = {entry, _plain(entry), read_header(entry)[0]}
-    for found in (likely & {*units}, {n for n in units if n.lower() in {word.lower() for word in likely}}):
-        if len(found) == 1:
-            return found.pop()
+    for candidates in (
+        likely & {*units},
+        {n for n in units if n.lower() in {word.lower() for word in likely}},
+    ):
+        if len(candidates) == 1:
+            return candidates.pop()
     raise UserError("no such column", file=file, column=entry, hint=known_names(entry, units, "it has {}"))

@@ -128,7 +128,7 @@ def check_data(
     logs = as_logs(logs, inputs, outputs, disturbances)
     grid = make_grid(logs, inputs=inputs, outputs=outputs, disturbances=disturbances, average=average)
     u, y = grid.inputs, grid.outputs
-    found: list[Finding] = []
+    findings: list[Finding] = []
     for log in logs:
         channels = {
             name: _Channel(log_name(log), name, str(log[name].attrs.get("units", "1")), column(log, name))
@@ -136,16 +136,16 @@ def check_data(
         }
         steps = np.diff(log["time"].values)
         usual = float(np.median(steps))
-        found += _times(log_name(log), steps, usual, gaps(log))
+        findings += _times(log_name(log), steps, usual, gaps(log))
         for name in y:
             channel, averaged = channels[name], grid.dt if grid.dt > 1.5 * usual else None
-            found += [_quantum(channel, averaged), _lost(channel), _noise(channel)]
-        found += [_saturation(channels[name]) for name in u if name not in grid.switches]
-    found += _excitation(grid)
-    for at, name in enumerate(u):
-        found += _feedback_to(name, at, grid, logs)
-    found += [_set_point(log_name(log), name) for log in logs for name in _set_points(log)]
-    return DataCheck(tuple(found))
+            findings += [_quantum(channel, averaged), _lost(channel), _noise(channel)]
+        findings += [_saturation(channels[name]) for name in u if name not in grid.switches]
+    findings += _excitation(grid)
+    for place, name in enumerate(u):
+        findings += _feedback_to(name, place, grid, logs)
+    findings += [_set_point(log_name(log), name) for log in logs for name in _set_points(log)]
+    return DataCheck(tuple(findings))
 
 
 class _Channel(NamedTuple):
@@ -166,12 +166,12 @@ def _times(log: str, steps: Array, usual: float, holes: Sequence[tuple[int, floa
     says, even = f"rows are {usual:.3g} s apart, give or take {100 * jitter:.1f} %", jitter < 0.2
     if not even:
         says += ": time stamps are uncertain, fast dynamics cannot be trusted"
-    found = Finding("jitter", log, "time", jitter, "1", "ok" if even else "warn", says)
+    evenness = Finding("jitter", log, "time", jitter, "1", "ok" if even else "warn", says)
     if not holes:
-        return [found, Finding("gaps", log, "time", 0.0, "s", "ok", "no gap longer than 10 s")]
+        return [evenness, Finding("gaps", log, "time", 0.0, "s", "ok", "no gap longer than 10 s")]
     longest = max(after - before for _, before, after in holes)
     says = f"{len(holes)} gap(s), the longest {longest:.0f} s: the input is unknown there"
-    return [found, Finding("gaps", log, "time", longest, "s", "warn", says)]
+    return [evenness, Finding("gaps", log, "time", longest, "s", "warn", says)]
 
 
 def _quantum(channel: _Channel, averaged: float | None) -> Finding:
@@ -235,14 +235,14 @@ def _excitation(grid: Grid, most: int = 6) -> list[Finding]:
     out = []
     rows = np.concatenate([segment.u for segment in grid.segments])
     moves = np.ptp(rows, axis=0) > 1e-9 * np.abs(rows).max(axis=0)  # averages round
-    for at, name in enumerate(grid.inputs):
-        if not moves[at]:
+    for place, name in enumerate(grid.inputs):
+        if not moves[place]:
             says = f"{name} never moves: nothing can be learnt about it"
             verdict: Verdict = "warn" if name in grid.switches else "fail"
             out.append(Finding("excitation", "", name, 0.0, "orders", verdict, says))
             continue
-        order = _order(grid, [at], most)
-        count = sum(int(np.count_nonzero(np.abs(np.diff(s.u[:, at])) > 1e-9)) for s in grid.segments)
+        order = _order(grid, [place], most)
+        count = sum(int(np.count_nonzero(np.abs(np.diff(s.u[:, place])) > 1e-9)) for s in grid.segments)
         good = order >= 3 and (count >= 4 or name in grid.switches)
         says = f"{name} moves {count} times and excites {order} of {most} orders"
         says += "" if good else ": too little for more than a gain"
@@ -269,8 +269,8 @@ def _order(grid: Grid, which: list[int], most: int) -> int:
 def _feedback(grid: Grid, at: int, name: str, lags: int = 3) -> Finding:
     """F test: does the past of the outputs help to predict the input beyond its own past?"""
     # a smooth input is predicted by many of its own rows: with few of them, outputs that filter it would help
-    own = min(_OWN_LAGS, key=lambda n: _bic(*_moves(grid, at, own=n, others=0)))
-    (X, v), (Z, _) = (_moves(grid, at, own=own, others=n) for n in (0, lags))
+    own_lags = min(_OWN_LAGS, key=lambda n: _bic(*_moves(grid, at, own=n, others=0)))
+    (X, v), (Z, _) = (_moves(grid, at, own=own_lags, others=n) for n in (0, lags))
     moves = (
         int(np.count_nonzero(np.abs(v - X[:, 0]) > 1e-9 * np.ptp(v))) if len(v) else 0
     )  # X[:, 0] is u[k-1]
@@ -296,9 +296,9 @@ def _feedback(grid: Grid, at: int, name: str, lags: int = 3) -> Finding:
 def _helped(X: Array, Z: Array, v: Array, moves: int) -> tuple[float, float]:
     """Return the share of v that Z explains beyond X, and the chance of it if it did not."""
     less, more = (_squares(W, v) for W in (X, Z))
-    extra, left = Z.shape[1] - X.shape[1], moves - Z.shape[1]
-    ratio = (less - more) / extra / max(more / left, 1e-300)
-    return 1 - more / max(less, 1e-300), float(f_distribution.sf(ratio, extra, left))
+    extra, degrees_of_freedom = Z.shape[1] - X.shape[1], moves - Z.shape[1]
+    ratio = (less - more) / extra / max(more / degrees_of_freedom, 1e-300)
+    return 1 - more / max(less, 1e-300), float(f_distribution.sf(ratio, extra, degrees_of_freedom))
 
 
 def _relay_feedback(grid: Grid, at: int, name: str) -> Finding:
@@ -314,9 +314,9 @@ def _relay_feedback(grid: Grid, at: int, name: str) -> Finding:
             y, edges = segment.y[:, output], np.flatnonzero(np.diff(segment.u[:, at])) + 1
             lengths |= {*np.diff(edges).tolist()}
             for first, last in zip(edges[:-2], edges[2:]):
-                part = y[first : last + 1]
-                if np.isfinite(part).all() and np.ptp(part) > 0:
-                    ratios.append(abs(part[-1] - part[0]) / np.ptp(part))
+                between_edges = y[first : last + 1]
+                if np.isfinite(between_edges).all() and np.ptp(between_edges) > 0:
+                    ratios.append(abs(between_edges[-1] - between_edges[0]) / np.ptp(between_edges))
         if len(ratios) >= _SWITCHINGS:
             least, switchings = min(least, float(np.median(ratios))), len(ratios)
     closed = least <= _SAME_READING and len(lengths) > 2
@@ -416,10 +416,10 @@ def reading_excess(logs: Sequence[Rows], outputs: Sequence[str], seconds: float)
     within = [max(0.0, 1.0 - rows.step / seconds) for rows in logs]
     out = {}
     for k, name in enumerate(outputs):
-        known = np.concatenate([
+        squares = np.concatenate([
             share * _second_differences(rows.y[:, k], np.diff(rows.time)) for rows, share in zip(logs, within)
         ])  # fmt: skip
-        out[name] = float(np.sqrt(known.mean() / 6)) if known.size else 0.0
+        out[name] = float(np.sqrt(squares.mean() / 6)) if squares.size else 0.0
     return out
 
 
@@ -445,32 +445,32 @@ class Evidence:
 
     def sentence(self, units: dict[str, str]) -> str:
         """Return it in words, for a verdict."""
-        seen = ", ".join(
+        ranges = ", ".join(
             f"{name} between {low:.3g} and {high:.3g} {units.get(name, '1')}".removesuffix(" 1")
             for name, (low, high) in self.ranges.items()
         )
-        said = [f"The logs cover {seen} (98 % of the readings)"]
+        clauses = [f"The logs cover {ranges} (98 % of the readings)"]
         for kind in self.thin:
             minutes = self.minutes[kind]
-            said.append(
+            clauses.append(
                 f"{kind} rests on {minutes:.0f} of {self.total:.0f} minutes"
                 if minutes
                 else f"{kind} never occurs"
             )
-        return "; ".join(said)
+        return "; ".join(clauses)
 
 
 def evidence(plant: Plant, logs: Sequence[Rows]) -> Evidence:
     """Return what ``logs``, in the plant's signals, cover of its inputs and outputs."""
     spent = [_spent(np.diff(rows.time)) for rows in logs]
-    total = float(sum(part.sum() for part in spent)) / 60
+    total = float(sum(seconds.sum() for seconds in spent)) / 60
     minutes: dict[str, float] = {}
     thin = []
     for k, name in enumerate(plant.inputs):
         values = [rows.u[:, k] for rows in logs]
         kinds = _kinds(name, values, on_off=name in plant.model.switches)
         for kind, chosen in kinds.items():
-            minutes[kind] = float(sum(part[mask].sum() for part, mask in zip(spent, chosen))) / 60
+            minutes[kind] = float(sum(seconds[mask].sum() for seconds, mask in zip(spent, chosen))) / 60
             if minutes[kind] < min(THIN_MINUTES, THIN_SHARE * total):
                 thin.append(kind)
     ranges = {}

@@ -39,20 +39,23 @@ def with_rest(
     """
     u = [columns(log, inputs) for log in logs]
     least = MOVED * np.ptp(np.concatenate(u), axis=0)
-    moved = [np.flatnonzero(np.any(np.abs(np.diff(each, axis=0)) > least, axis=1)) + 1 for each in u]
+    moved = [
+        np.flatnonzero(np.any(np.abs(np.diff(inputs_of_log, axis=0)) > least, axis=1)) + 1
+        for inputs_of_log in u
+    ]
     if not any(map(len, moved)) or any(rows[-1] > _EARLY for rows in moved if len(rows)):
         return list(logs), []
-    out, said = [], []
+    out, notes = [], []
     for log, rows in zip(logs, moved):
         if not len(rows) or not (at_rest := _first_readings(log, outputs, int(rows[0]) + 1)):
             out.append(log)
             continue
         out.append(_begun_earlier(log, at_rest))
-        said.append(
+        notes.append(
             f"{log_name(log)}: begins with the only move of an input; taken to have rested at its first "
             f"readings before ({_ADDED} rows of that are in the fit): record a minute of rest to make sure"
         )
-    return out, said
+    return out, notes
 
 
 def _first_readings(log: Log, outputs: Sequence[str], n: int) -> dict[str, float]:

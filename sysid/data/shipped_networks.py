@@ -38,8 +38,8 @@ def shipped_network(logs: Sequence[Log]) -> NetworkModel | None:
     one."""
     networks = [named_network(name) for name in builtin_networks()]
     for network in networks:
-        if (found := _fitting(network, _by_name(network, logs[0]), logs)) is not None:
-            return found
+        if (named := _fitting(network, _by_name(network, logs[0]), logs)) is not None:
+            return named
     likely = [_fitting(network, _by_role(network, logs), logs) for network in networks]
     alone = [network for network in likely if network is not None]
     return alone[0] if len(alone) == 1 else None
@@ -67,10 +67,10 @@ def in_log_units(model: NetworkModel, logs: Sequence[Log]) -> NetworkModel:
             continue
         largest = max(float(np.nanmax(np.abs(column(log, name)), initial=0.0)) for log in columns)
         bare = unit == "1" and largest > 1 + 1e-9  # a number of the network's own unit, which is not written
-        own, theirs = (1.0, 1.0) if bare else (SHARES[item.unit], SHARES[unit])
-        scaled = {"full_scale": item.full_scale * theirs / own, "unit": unit}
-        scaled["range"] = tuple(end * theirs / own for end in item.range)
-        scaled["step"] = None if item.step is None else item.step * theirs / own
+        network_share, theirs = (1.0, 1.0) if bare else (SHARES[item.unit], SHARES[unit])
+        scaled = {"full_scale": item.full_scale * theirs / network_share, "unit": unit}
+        scaled["range"] = tuple(end * theirs / network_share for end in item.range)
+        scaled["step"] = None if item.step is None else item.step * theirs / network_share
         inputs[name] = item.model_copy(update=scaled)
     if all(item is model.network.inputs[name] for name, item in inputs.items()):
         return model
@@ -96,10 +96,10 @@ def in_logged_room(model: NetworkModel, logs: Sequence[Log]) -> tuple[NetworkMod
     if prior.fixed or not prior.bounds[0] <= value <= prior.bounds[1]:
         return model, []
     sd = float(np.hypot(_BESIDE_SENSOR, np.nanstd(readings)))
-    known = prior.model_copy(
+    prior_of_logs = prior.model_copy(
         update={"value": value, "sd": sd, "low": prior.bounds[0], "high": prior.bounds[1]}
     )
-    parameters = dict(network.parameters) | {room: known}
+    parameters = dict(network.parameters) | {room: prior_of_logs}
     note = f"{room} of the network: {value:.1f} degC, within {sd:.1f}, as {name} of the logs reads"
     return NetworkModel(network.model_copy(update={"parameters": parameters})), [note]
 
@@ -147,29 +147,31 @@ def _by_name(network: Network, log: Log, *, needs_inputs: bool = True) -> dict[s
     written: dict[str, list[str]] = {}
     for name in log.data_vars:
         written.setdefault(str(name).lower(), []).append(str(name))
-    found = {name: written.get(name.lower(), []) for group in _tables(network) for name in group}
-    found |= {name: [name] for name in found if name in log}
+    columns_of = {name: written.get(name.lower(), []) for group in _tables(network) for name in group}
+    columns_of |= {name: [name] for name in columns_of if name in log}
     if not needs_inputs:
-        upper = all(same[0].isupper() for same in found.values() if same)
-        found |= {n: [n.upper() if upper else n] for n in network.inputs if not found[n]}
-    return {name: same[0] for name, same in found.items()} if all(map(len, found.values())) else None
+        upper = all(same[0].isupper() for same in columns_of.values() if same)
+        columns_of |= {n: [n.upper() if upper else n] for n in network.inputs if not columns_of[n]}
+    return (
+        {name: same[0] for name, same in columns_of.items()} if all(map(len, columns_of.values())) else None
+    )
 
 
 def _by_role(network: Network, logs: Sequence[Log]) -> dict[str, str] | None:
     """Return the column of each signal by role, unit and order; None where they are not as many."""
-    log, found = logs[0], dict[str, str]()
+    log, columns_of = logs[0], dict[str, str]()
     for role, table in zip(("input", "disturbance", "output"), _tables(network)):
         columns = [name for name in names(log, role) if _moves(logs, name)]
         wanted = [name for name, item in table.items() if not getattr(item, "switch", False)]
         switches = [name for name in table if name not in wanted]
         on_off = [name for name in columns if switches and set(column(log, name)) <= {0.0, 1.0}]
-        rest = [name for name in columns if name not in on_off]
-        if (len(on_off), len(rest)) != (len(switches), len(wanted)):
+        graded = [name for name in columns if name not in on_off]
+        if (len(on_off), len(graded)) != (len(switches), len(wanted)):
             return None
-        if not all(_suits(log, name, table[of]) for name, of in zip(rest, wanted)):
+        if not all(_suits(log, name, table[of]) for name, of in zip(graded, wanted)):
             return None
-        found |= dict(zip([*wanted, *switches], [*rest, *on_off]))
-    return found
+        columns_of |= dict(zip([*wanted, *switches], [*graded, *on_off]))
+    return columns_of
 
 
 def _suits(log: Log, name: str, item: Any) -> bool:
@@ -179,8 +181,8 @@ def _suits(log: Log, name: str, item: Any) -> bool:
     if item.unit == "degC":
         return has == item.unit or (has == "1" and _TEMPERATURE.fullmatch(name) is not None)
     signed = bool(getattr(item, "range", (0, 0))[0] < 0)
-    known = has == item.unit or (has in SHARES and item.unit in SHARES)
-    return known and signed == bool(np.nanmin(column(log, name)) < 0)
+    convertible = has == item.unit or (has in SHARES and item.unit in SHARES)
+    return convertible and signed == bool(np.nanmin(column(log, name)) < 0)
 
 
 def _tables(network: Network) -> tuple[Mapping[str, Any], Mapping[str, Any], Mapping[str, Any]]:

@@ -167,14 +167,14 @@ def test_names_go_first_and_data_are_asked_where_these_show_no_input_or_no_outpu
     assert assign_roles({"q1": "1", "t_x": "degC", "b": "1"}, columns=named).of["b"] == "other"
 
 
-def test_beside_held_inputs_a_second_sensor_is_read_and_the_rest_is_a_disturbance():
+def test_beside_held_inputs_what_nothing_predicts_is_a_disturbance():
     slow = 20 + 30 * plant_of(HELD)
     walk, room = np.cumsum(np.random.default_rng(8).standard_normal((2, 600)), axis=1)
     columns = {"c2": HELD, "c4": slow, "c5": 25 + 80 * walk / np.ptp(walk), "c6": 22 + room / np.ptp(room)}
     found = assign_roles(dict.fromkeys(columns, "1"), columns=columns)
     roles, reasons = found.of, found.reasons
-    assert roles == {"c2": "input", "c4": "output", "c5": "output", "c6": "disturbance"}
-    assert reasons["c5"] == "its values lie as those of c4"
+    assert roles == {"c2": "input", "c4": "output", "c5": "disturbance", "c6": "disturbance"}
+    assert reasons["c5"] == "no other column predicts its course"
 
 
 def test_beside_a_set_point_input_and_output_are_the_controllers():
