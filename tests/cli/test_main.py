@@ -78,6 +78,32 @@ def test_every_verb_has_two_examples_that_its_own_options_understand_and_a_next_
     assert not re.search(r"<[a-z]", options)  # no <list[str]>
 
 
+#: What other people's scripts type; an option goes only with a major version.
+SCRIPTED = {
+    "demo": "--out",
+    "identify": "--out --network --inputs --outputs --disturbances --models --average --leave-one-out "
+    "--posterior --no-posterior --report --json",
+    "validate": "--warmup --score-from --average --json",
+    "simulate": "--out --warmup",
+    "excite": "--kind --minutes --plant --out",
+    "tune": "--out --spec --report",
+    "export": "--out --check",
+    "run": "--target --port --twin --draw --from --hold --object --material --grasp-time --settle-timeout --out",
+    "effusivity": "--calibrate --out",
+    "train": "--classifier --split --out",
+    "classify": "--materials --out",
+    "compare": "--test --classifiers --repeats --train-per-class --out",
+    "paper": "--quick --out",
+    "virtual": "--protocol --plant",
+}
+
+
+@pytest.mark.parametrize("verb", SCRIPTED)
+def test_what_scripts_type_is_an_option(verb: str, capsys: pytest.CaptureFixture[str]) -> None:
+    main([verb, "--help"])
+    assert set(SCRIPTED[verb].split()) <= set(re.findall(r"--[a-z-]+", capsys.readouterr().out))
+
+
 def test_the_help_says_of_each_verb_a_whole_sentence(capsys: pytest.CaptureFixture[str]) -> None:
     main(["--help"])
     shown = capsys.readouterr().out.split("To begin:")[1]

@@ -345,6 +345,7 @@ def validate(
         float | None,
         cli.opt("--score-from", "S", "Samples before this are not scored; where absent, the warm-up.", min=0),
     ] = None,
+    average: Average = None,
     network: cli.OwnNetwork = None,
     columns: cli.Columns = None,
     dt: cli.Step = None,
@@ -375,7 +376,7 @@ def validate(
         for k, log in enumerate(logs):
             progress(k / len(logs), log.attrs["name"])
             seconds, first = starts[k]
-            runs.append(free_run(loaded, log, warmup=seconds, score_from=first))
+            runs.append(free_run(loaded, log, warmup=seconds, score_from=first, average=average))
     bands = [run.band() for run in runs]
     if report is not None:
         sections = [free_run_section(*each) for each in zip(runs, bands)]
