@@ -82,8 +82,8 @@ def _hear(port: Port, question: bytes) -> bytes:
     port.drop_input()
     port.write(question)
     heard, end = b"", time.monotonic() + _ROUND_S
-    while (left := end - time.monotonic()) > 0:
-        piece = port.read(left)
+    while (remaining_s := end - time.monotonic()) > 0:
+        piece = port.read(remaining_s)
         heard += piece
         if not piece or heard.endswith(b"\n"):
             break

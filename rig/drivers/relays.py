@@ -146,8 +146,10 @@ class RelayRig:
         reading, orders = self.rig.read(), self._orders()
         drive = dict(self._requested)
         for name, relay in self.relays.items():
-            applied = {each: reading.drive[each] for each in {relay.heater, relay.cooler} - {""}}
-            differs = [abs(value - orders[each]) / self._full(each) for each, value in applied.items()]
+            applied = {channel: reading.drive[channel] for channel in {relay.heater, relay.cooler} - {""}}
+            differs = [
+                abs(value - orders[channel]) / self._full(channel) for channel, value in applied.items()
+            ]
             if max(differs) > _SAME:
                 share = applied[relay.heater] / self._full(relay.heater)
                 if relay.cooler not in ("", relay.heater):
@@ -177,14 +179,14 @@ class RelayRig:
 
     def wait(self, seconds: float) -> None:
         """Let time pass, and switch meanwhile what is due."""
-        left = seconds
-        while left > _NOW_S:
+        remaining_s = seconds
+        while remaining_s > _NOW_S:
             due = min((self._due_s(*key) for key in self._switches), default=inf)
-            step = min(left, max(due, _SHORTEST_S))
+            step = min(remaining_s, max(due, _SHORTEST_S))
             self.rig.wait(step)
-            left -= step
+            remaining_s -= step
             self._pass_time()
-            if left > _NOW_S and self._switch():
+            if remaining_s > _NOW_S and self._switch():
                 self.rig.apply(self._orders(), self._pump)
 
     def grasp(self, material: str, t_object: float) -> None:
@@ -239,8 +241,8 @@ class RelayRig:
         """Return what the device is told."""
         orders = {name: self._requested[name] for name in self._through}
         for name, relay in self.relays.items():
-            for each in filter(None, (relay.heater, relay.cooler)):
-                orders.setdefault(each, 0.0)
+            for channel in filter(None, (relay.heater, relay.cooler)):
+                orders.setdefault(channel, 0.0)
             if self._switches[name, 1].on:
                 orders[relay.heater] = self._full(relay.heater)
             elif relay.cooler and self._switches[name, -1].on:
@@ -260,7 +262,7 @@ def read_relays(path: str | Path) -> dict[str, Relay]:
     >>> read_relays(path)
     {'q1': Relay(heater='q1', cooler='', on_s=10.0, off_s=10.0, dead_s=0.0)}
     """
-    found, keys = {}, {key.name: key.type for key in fields(Relay)}
+    relays, keys = {}, {key.name: key.type for key in fields(Relay)}
     content = read_toml(path, hint="write [q1] and below it on_s = 10")
     for name, table in content.items():
         if not isinstance(table, dict):
@@ -269,13 +271,13 @@ def read_relays(path: str | Path) -> dict[str, Relay]:
             if key not in keys:
                 raise UserError(f"{name}.{key}: no such key", file=path, hint=known_names(key, keys))
             number = isinstance(value, int | float) and not isinstance(value, bool)
-            fits, what = isinstance(value, str), "the name of an input"
+            fits, allowed = isinstance(value, str), "the name of an input"
             if keys[key] == "float":
-                fits, what = number and 0 <= value <= _LONGEST_S, f"a time of 0 to {_LONGEST_S:g} s"
+                fits, allowed = number and 0 <= value <= _LONGEST_S, f"a time of 0 to {_LONGEST_S:g} s"
             if not fits:
-                raise UserError(f"{name}.{key}: {value!r} is not {what}", file=path, hint="correct it")
+                raise UserError(f"{name}.{key}: {value!r} is not {allowed}", file=path, hint="correct it")
         times = {key: float(value) for key, value in table.items() if keys[key] == "float"}
-        found[name] = Relay(table.get("heater", name), table.get("cooler", ""), **times)
-    if not found:
+        relays[name] = Relay(table.get("heater", name), table.get("cooler", ""), **times)
+    if not relays:
         raise UserError("has no relay", file=path, hint="write [q1] and below it on_s = 10")
-    return found
+    return relays

@@ -74,8 +74,8 @@ class InputSteps:
         """Return inputs (N, n_u) and disturbances (N, n_d) of the steps from this one on, if it is kept."""
         if since < self.first:
             raise ValueError(f"step {since} is forgotten, the oldest that is kept is {self.first}")
-        at = range(since - self.first, len(self._u))
-        return np.array([self._u[k] for k in at]), np.array([self._d[k] for k in at])
+        places = range(since - self.first, len(self._u))
+        return np.array([self._u[k] for k in places]), np.array([self._d[k] for k in places])
 
     def part(self, time: float) -> float:
         """Return how much of the step that is not complete has passed at a time, as a fraction."""
@@ -121,8 +121,8 @@ class History:
 
     def begin(self, time: float) -> Estimate | None:
         """Return the newest estimate up to a time [s]; None where there is none or inputs since are lost."""
-        found = next((one for one in reversed(self._kept) if one.time <= time + 1e-6), None)
-        return found if found is not None and found.step >= self.steps.first else None
+        begin = next((one for one in reversed(self._kept) if one.time <= time + 1e-6), None)
+        return begin if begin is not None and begin.step >= self.steps.first else None
 
     def after(self, time: float) -> list[Estimate]:
         """Return the estimates later than a time [s]."""
@@ -132,8 +132,8 @@ class History:
         """Return reading less path (B, n_readings, n_y) of every later estimate, for paths with the outputs
         ``y`` (B, N + 1, n_y) [degC] at native steps, that of ``begin`` first."""
         later = self.after(begin.time)
-        at = [m.step - begin.step for m in later]
-        return np.asarray(np.array([m.y for m in later])[None] - y[:, at])
+        steps_since = [m.step - begin.step for m in later]
+        return np.asarray(np.array([m.y for m in later])[None] - y[:, steps_since])
 
 
 class RigModel:
@@ -184,11 +184,6 @@ class RigModel:
         return np.asarray((rows[:, 1:] - rows[:, :1]) / 1e-3)
 
 
-_LARGEST_DRIVE_BIAS = 0.5
-_START_X, _START_W, _START_B = 0.5, 0.03, 0.3  # standard deviations at a start from rest
-_NOT_AT_REST = 100.0  # times the variance of the states
-
-
 @dataclass(frozen=True)
 class FilterSettings:
     """Noise intensities of the filter, and the innovation that makes a reading suspect."""
@@ -199,6 +194,12 @@ class FilterSettings:
     drive: float = keyed(0.002, "drive_per_sqrt_s", 1e-5, 0.1)  # of a drive's bias [1/sqrt(s)]
     output: float = keyed(0.002, "output_K_per_sqrt_s", 1e-5, 1)  # of an output's bias [K/sqrt(s)]
     reading: float = keyed(0.08, "reading_K", 0.001, 5)  # least noise of a reading [K]
+    largest_drive_bias: float = 0.5  # a driver that gives half, or half more, is at fault in any case
+    # standard deviations at a start from rest: of the states and of outputs' biases [K], of drives' biases
+    start_state: float = 0.5
+    start_drive: float = 0.03
+    start_output: float = 0.3
+    not_at_rest: float = 100.0  # times the variance of the states: 5 K, as a heatsink may be off the water
 
 
 class RigFilter:
@@ -219,7 +220,7 @@ class RigFilter:
         n_w, n_b = len(model.drives), len(self.biased)
         biases = [np.full(n_w, s.drive), np.full(n_b, s.output)]
         self._q = np.concatenate([s.state * unit, *biases]) ** 2
-        start = [_START_X * unit, np.full(n_w, _START_W), np.full(n_b, _START_B)]
+        start = [s.start_state * unit, np.full(n_w, s.start_drive), np.full(n_b, s.start_output)]
         self._p0 = np.concatenate(start) ** 2
         self._R = np.array([max(plant.noise.get(n, s.reading), s.reading) for n in plant.outputs]) ** 2
         self._keep = keep
@@ -229,17 +230,17 @@ class RigFilter:
         plant = self.model.plant
         usual = float(np.nanmean(y)) if np.isfinite(y).any() else 25.0
         self.d = np.where(np.isfinite(d), d, np.nan_to_num(plant.undisturbed(usual)))
-        rest = np.where(np.isfinite(y), y - self.model.offsets, usual)
+        resting_outputs = np.where(np.isfinite(y), y - self.model.offsets, usual)
         self.at_rest = self._agree(y)
         if not self.at_rest:  # outputs that disagree are at no rest: the reference says how warm it is
-            rest[:] = rest[self._reference]
+            resting_outputs[:] = resting_outputs[self._reference]
         self.u = np.array([1.0 if n in plant.model.switches else 0.0 for n in plant.inputs])
-        self.x = np.asarray(plant.model.rest(rest, self.u, self.d, self.model.p), dtype=float)
+        self.x = np.asarray(plant.model.rest(resting_outputs, self.u, self.d, self.model.p), dtype=float)
         self.w, self.b = np.zeros(len(self.model.drives)), np.zeros(len(plant.outputs))
         self._P = np.diag(self._p0)
         if not self.at_rest:
             n = self.x.size
-            self._P[np.arange(n), np.arange(n)] *= _NOT_AT_REST
+            self._P[np.arange(n), np.arange(n)] *= self.settings.not_at_rest
         self.steps = InputSteps(plant.dt, time, time)
         self.expected = self._now(time)
 
@@ -254,19 +255,20 @@ class RigFilter:
 
     def correct(self, y: Array) -> None:
         """Correct the estimate with readings y (n_y,) [degC], NaN where one is suspect."""
-        seen = np.flatnonzero(np.isfinite(y))
-        if not seen.size:
+        read_outputs = np.flatnonzero(np.isfinite(y))
+        if not read_outputs.size:
             return
-        H = self._H(seen)
+        H = self._H(read_outputs)
         PH = self._P @ H.T
-        gain = np.linalg.solve(H @ PH + np.diag(self._R[seen]), PH.T).T
-        change = gain @ (y - self.expected)[seen]
+        gain = np.linalg.solve(H @ PH + np.diag(self._R[read_outputs]), PH.T).T
+        change = gain @ (y - self.expected)[read_outputs]
         n, m = self.x.size, self.w.size
         self.x = self.x + change[:n]
-        self.w = np.clip(self.w + change[n : n + m], -_LARGEST_DRIVE_BIAS, _LARGEST_DRIVE_BIAS)
+        largest = self.settings.largest_drive_bias
+        self.w = np.clip(self.w + change[n : n + m], -largest, largest)
         self.b[self.biased] += change[n + m :]
-        left = np.eye(self._P.shape[0]) - gain @ H
-        self._P = left @ self._P @ left.T + (gain * self._R[seen]) @ gain.T
+        remaining = np.eye(self._P.shape[0]) - gain @ H
+        self._P = remaining @ self._P @ remaining.T + (gain * self._R[read_outputs]) @ gain.T
 
     def loosen(self) -> None:
         """Add the start's variance to the states': an output was not described for a while."""
@@ -295,9 +297,11 @@ class RigFilter:
 
     def driven(self, u: Array) -> Array:
         """Return inputs (..., n_u) with the drive biases of now, not beyond what a driver could give."""
-        out, at = self.model.biased(u, self.w), self.model.drive_at
-        slack = _LARGEST_DRIVE_BIAS * self.model.half
-        out[..., at] = np.clip(out[..., at], self.model.ranges[:, 0] - slack, self.model.ranges[:, 1] + slack)
+        out, columns = self.model.biased(u, self.w), self.model.drive_at
+        slack = self.settings.largest_drive_bias * self.model.half
+        out[..., columns] = np.clip(
+            out[..., columns], self.model.ranges[:, 0] - slack, self.model.ranges[:, 1] + slack
+        )
         return out
 
     def _agree(self, y: Array) -> bool:
@@ -308,8 +312,8 @@ class RigFilter:
         if not np.isfinite(y).any():
             return False
         level = (y - self.model.offsets)[np.isfinite(y)]
-        near = not rooms.size or abs(float(level.mean()) - rooms[0]) < 2.0
-        return bool(near and np.ptp(level) < 0.7)
+        near_room = not rooms.size or abs(float(level.mean()) - rooms[0]) < 2.0
+        return bool(near_room and np.ptp(level) < 0.7)
 
     def _propagate(self, u: Array, d: Array) -> None:
         """Predict over whole native steps: u (N, n_u), d (N, n_d)."""
@@ -318,8 +322,8 @@ class RigFilter:
         x = np.repeat(self.x[None], 1 + n + m, axis=0)
         x[np.arange(1, n + 1), np.arange(n)] += tiny
         many = np.repeat(self.driven(u)[None], 1 + n + m, axis=0)
-        for j, at in enumerate(model.drive_at):
-            many[1 + n + j, :, at] += 1e-3 * model.half[j]
+        for j, input_index in enumerate(model.drive_at):
+            many[1 + n + j, :, input_index] += 1e-3 * model.half[j]
         _, after = model.rollout(x, many, np.repeat(d[None], 1 + n + m, axis=0))
         if not np.isfinite(after).all():
             return  # a diverging model predicts nothing; limits still hold
@@ -334,10 +338,10 @@ class RigFilter:
     def _now(self, time: float) -> Array:
         """Return the readings expected at a time that may lie between two native steps."""
         y = self.model.output(self.x)
-        part = self.steps.part(time)
-        if part > 1e-6:
+        passed_share = self.steps.part(time)
+        if passed_share > 1e-6:
             u = self.driven(self.u)[None, None]
-            y = y + part * (self.model.run(self.x[None], u, self.d[None, None])[0, -1] - y)
+            y = y + passed_share * (self.model.run(self.x[None], u, self.d[None, None])[0, -1] - y)
         return np.asarray(y + self.model.offsets + self.b)
 
     def _H(self, seen: NDArray[np.intp]) -> Array:

@@ -79,11 +79,21 @@ _REVERSED = Cause("reversed", _MODULE, "the module is wired the wrong way round"
 _HALF = Cause("driver", _DRIVER, "the driver gives half of what is asked")
 _PUMP = Cause("pump", "the pump", "the pump has stopped")
 _DANGER = ("driver", "reversed", "pump", "drift", "model")  # the most dangerous first: it does not obey
-_ONSETS = (0.0, 0.25, 0.5, 0.75, 0.85, 0.9, 0.95)  # of a window, where something may have gone wrong
-_LATE_S, _LATE_RARITY = (3.0, 5.0, 8.0), 1.2
-_WRONG_COST = 0.15  # of its own errors, for a sensor that may read anything
-_EXPLAINS = 0.35  # of the unexplained cost, that an explanation must stay below
-_ALIKE = 2.5  # times the best cost, below which the next best is as good
+
+
+@dataclass(frozen=True)
+class ExplainSettings:
+    """Numbers of the search for a cause."""
+
+    onsets: tuple[float, ...] = (0.0, 0.25, 0.5, 0.75, 0.85, 0.9, 0.95)  # shares of a window
+    late_s: tuple[float, ...] = (3.0, 5.0, 8.0)  # of a sensor that follows its path late [s]
+    late_rarity: float = 1.2
+    wrong_cost: float = 0.15  # of its own errors, for a sensor that may read anything
+    explains: float = 0.35  # of the unexplained cost, that an explanation must stay below
+    alike: float = 2.5  # times the best cost, below which the next best is as good
+
+
+_EXPLAIN = ExplainSettings()
 
 
 def explain_window(model: RigModel, past: History, seconds: float) -> list[Cause]:
@@ -102,23 +112,23 @@ def explain_window(model: RigModel, past: History, seconds: float) -> list[Cause
         best[cause] = min(cause.rarity * float(c), best.get(cause, np.inf))
     best |= _sensor_costs(model, past, begin, y[0])
     ranked = sorted(best, key=lambda cause: (best[cause], cause.text))
-    if not ranked or best[ranked[0]] >= _EXPLAINS * float(cost[0]):
+    if not ranked or best[ranked[0]] >= _EXPLAIN.explains * float(cost[0]):
         return []
-    return ranked[:1] + [cause for cause in ranked[1:2] if best[cause] < _ALIKE * best[ranked[0]]]
+    return ranked[:1] + [cause for cause in ranked[1:2] if best[cause] < _EXPLAIN.alike * best[ranked[0]]]
 
 
 def by_danger(causes: Sequence[Cause], output: str) -> list[tuple[str, str]]:
     """Return kind and subject of each cause, the most dangerous first; without one the output's model."""
-    found = dict.fromkeys((cause.kind, cause.subject) for cause in causes) or [("model", output)]
-    return sorted(found, key=lambda pair: _DANGER.index(pair[0]))
+    kinds = dict.fromkeys((cause.kind, cause.subject) for cause in causes) or [("model", output)]
+    return sorted(kinds, key=lambda pair: _DANGER.index(pair[0]))
 
 
 def _hypotheses(model: RigModel, u: Array, w: Array) -> tuple[list[Cause], Array]:
     """Return causes (no fault first) and inputs (B, N, n_u) of what was applied (N, n_u) with biases w of the
     drives, which hold until the onset, and not for what a broken driver gives."""
     causes, rows = [_NO_FAULT], [model.biased(u, w)]
-    for part in _ONSETS:
-        since = int(part * len(u))
+    for onset in _EXPLAIN.onsets:
+        since = int(onset * len(u))
         for cause, wrong in _wrong_drives(model, u[since:]) + _wrong_pump(model, u[since:]):
             causes.append(cause)
             rows.append(np.concatenate([rows[0][:since], wrong]))
@@ -127,14 +137,14 @@ def _hypotheses(model: RigModel, u: Array, w: Array) -> tuple[list[Cause], Array
 
 def _wrong_drives(model: RigModel, u: Array) -> list[tuple[Cause, Array]]:
     out = []
-    for at, half, (low, high) in zip(model.drive_at, model.half, model.ranges):
-        faults = [(_NOTHING, np.clip(0.0, low, high)), (_FULL_DRIVE, high), (_HALF, 0.5 * u[:, at])]
+    for input_index, half, (low, high) in zip(model.drive_at, model.half, model.ranges):
+        faults = [(_NOTHING, np.clip(0.0, low, high)), (_FULL_DRIVE, high), (_HALF, 0.5 * u[:, input_index])]
         if low < 0:
-            faults += [(_FULL_COOLING, low), (_REVERSED, np.clip(-u[:, at], low, high))]
+            faults += [(_FULL_COOLING, low), (_REVERSED, np.clip(-u[:, input_index], low, high))]
         for cause, values in faults:
             changed = u.copy()
-            changed[:, at] = values
-            if np.max(np.abs(changed[:, at] - u[:, at]), initial=0.0) > 0.1 * half:
+            changed[:, input_index] = values
+            if np.max(np.abs(changed[:, input_index] - u[:, input_index]), initial=0.0) > 0.1 * half:
                 out.append((cause, changed))
     return out
 
@@ -142,26 +152,28 @@ def _wrong_drives(model: RigModel, u: Array) -> list[tuple[Cause, Array]]:
 def _wrong_pump(model: RigModel, u: Array) -> list[tuple[Cause, Array]]:
     if "pump" not in model.plant.inputs:
         return []
-    at = model.plant.inputs.index("pump")
-    if not u[:, at].max(initial=0.0) > 0.5:
+    pump_index = model.plant.inputs.index("pump")
+    if not u[:, pump_index].max(initial=0.0) > 0.5:
         return []
     still = u.copy()
-    still[:, at] = 0.0
+    still[:, pump_index] = 0.0
     return [(_PUMP, still)]
 
 
 def _sensor_costs(model: RigModel, past: History, begin: Estimate, path: Array) -> dict[Cause, float]:
     """Return the cost where one sensor alone is wrong, or late, given the model's path (N + 1, n_y)."""
-    own = np.nansum(past.errors(begin, path[None])[0] ** 2, axis=0)
-    found = {}
+    own_costs = np.nansum(past.errors(begin, path[None])[0] ** 2, axis=0)
+    costs = {}
     for k, name in enumerate(model.plant.outputs):
-        others = float(own.sum() - own[k])
-        if len(own) > 1:
-            found[Cause("drift", name, f"{name} alone is wrong")] = others + _WRONG_COST * float(own[k])
-        late = [_late(path, k, seconds / model.plant.dt) for seconds in _LATE_S]
+        others = float(own_costs.sum() - own_costs[k])
+        if len(own_costs) > 1:
+            costs[Cause("drift", name, f"{name} alone is wrong")] = others + _EXPLAIN.wrong_cost * float(
+                own_costs[k]
+            )
+        late = [_late(path, k, seconds / model.plant.dt) for seconds in _EXPLAIN.late_s]
         least = float(np.nansum(past.errors(begin, np.array(late))[:, :, k] ** 2, axis=1).min())
-        found[Cause("drift", name, f"{name} is late")] = others + _LATE_RARITY * least
-    return found
+        costs[Cause("drift", name, f"{name} is late")] = others + _EXPLAIN.late_rarity * least
+    return costs
 
 
 def _late(path: Array, k: int, steps: float) -> Array:
@@ -170,12 +182,6 @@ def _late(path: Array, k: int, steps: float) -> Array:
     out = path.copy()
     out[:, k] = np.concatenate([np.full(shift, path[0, k]), path[: len(path) - shift, k]])
     return out
-
-
-_MOST_DRIFT, _LEAST_LINEAR = 0.2, 0.2  # shares of a parameter
-_DRIFT_SIGMAS = 3.0
-_COMPARED_EVERY_S = 1.0  # a tenth of the shortest window; it costs half of a look
-_BIAS_AFTER_S = 60.0  # a bias is not evaluated before the filter has seen something
 
 
 @dataclass(frozen=True)
@@ -192,7 +198,11 @@ class ModelSettings(FilterSettings):
     # of a drive's bias, a share of what was asked for lately: three of the 5 % from run to run
     drive_limit: float = keyed(0.15, "drive_limit", 0.01, 0.45)
     warm_up: float = keyed(60.0, "warm_up_s", 0, 3600)  # nothing is compared where it starts not at rest [s]
-    drift: float = keyed(0.0, "drift", 0, _MOST_DRIFT)  # share by which each plant parameter may have drifted
+    drift: float = keyed(0.0, "drift", 0, 0.2)  # share by which each plant parameter may have drifted
+    least_linear: float = 0.2  # of a parameter on a linear scale, whose value may be next to 0
+    drift_sigmas: float = 3.0  # standard deviations of a drift that are no fault
+    compared_every_s: float = 1.0  # a tenth of the shortest window; it costs half of a look
+    bias_after_s: float = 60.0  # a bias is not evaluated before the filter has seen something
 
 
 @dataclass(frozen=True)
@@ -224,14 +234,14 @@ def drift_steps(plant: Plant, drift: float) -> Array:
     if not names:
         problem = "the plant has no parameters that could drift"
         raise UserError(problem, hint="identify a network, or leave the drift out of the guard file")
-    least = [_LEAST_LINEAR if plant.scales.get(name) == "linear" else 0.0 for name in names]
+    least = [ModelSettings.least_linear if plant.scales.get(name) == "linear" else 0.0 for name in names]
     return np.asarray(drift * np.maximum(np.abs(plant.p), least), dtype=float)
 
 
 def drift_spread(slopes: Array) -> Array:
     """Return three standard deviations (n_y,) of where a window ends [K], slopes (n_y, n_p) to what each
     parameter may be off."""
-    return np.asarray(_DRIFT_SIGMAS * np.sqrt(np.sum(slopes**2, axis=1) / 3))
+    return np.asarray(ModelSettings.drift_sigmas * np.sqrt(np.sum(slopes**2, axis=1) / 3))
 
 
 def _window_slopes(
@@ -248,10 +258,10 @@ def _window_slopes(
     u, d = past.steps.rows(begin.step)
     p = np.repeat(model.p[None], n + 1, axis=0)
     p[np.arange(1, n + 1), np.arange(n)] += steps
-    many = [np.repeat(part[None], n + 1, axis=0) for part in (begin.x, u, d)]
+    many = [np.repeat(repeated[None], n + 1, axis=0) for repeated in (begin.x, u, d)]
     y = np.asarray(model.rollout(many[0], many[1], many[2], p)[0])
-    at = [m.step - begin.step for m in _recent(past, begin, smooth)]
-    ends = y[:, at].mean(axis=1)
+    steps_of_ends = [m.step - begin.step for m in _recent(past, begin, smooth)]
+    ends = y[:, steps_of_ends].mean(axis=1)
     return ends[0] - y[0, 0], (ends[1:] - ends[0]).T
 
 
@@ -301,8 +311,8 @@ class ModelMonitor:
         """Say whether the innovation of a reading [degC] is too large."""
         if name not in self.plant.outputs:
             return False
-        at = self.plant.outputs.index(name)
-        return bool(self._since[at] <= self._time) and self._filter.is_jump(at, value)
+        output_index = self.plant.outputs.index(name)
+        return bool(self._since[output_index] <= self._time) and self._filter.is_jump(output_index, value)
 
     def update(
         self, time: float, values: Mapping[str, float], masked: frozenset[str] = frozenset()
@@ -314,14 +324,16 @@ class ModelMonitor:
         self._filter.correct(y)
         self._past.add(self._filter.moment(time, y))
         done = self._filter.steps.done
-        self.compared_now = done != self._compared and time >= self._compared_at + _COMPARED_EVERY_S - 1e-6
+        self.compared_now = (
+            done != self._compared and time >= self._compared_at + self.settings.compared_every_s - 1e-6
+        )
         if not self.compared_now:
             return []
         self._compared, self._compared_at = done, time
         compared = self.compare()
         self.share = max((one.excess for one in compared), default=0.0)
-        found = [self._with_drift(one) for one in compared if one.off > one.allowed]
-        return [one for one in found if one.off > one.allowed] + self._biases(time, compared)
+        residuals = [self._with_drift(one) for one in compared if one.off > one.allowed]
+        return [one for one in residuals if one.off > one.allowed] + self._biases(time, compared)
 
     def compare(self) -> list[Residual]:
         """Return every window and output that can be compared now, whether within what is allowed or not."""
@@ -370,10 +382,10 @@ class ModelMonitor:
         """Return a residual with the uncertainty of the plant's parameters; a drive's bias that was such a
         parameter is wrong once the rig does something else: the path without it counts where that is nearer,
         and no further away than the parameters explain."""
-        found = self._slopes(one.window)
-        if found is None:
+        drift_of_window = self._slopes(one.window)
+        if drift_of_window is None:
             return one
-        change, slopes = found
+        change, slopes = drift_of_window
         k = self.plant.outputs.index(one.subject)
         more, unbiased = float(drift_spread(slopes)[k]), float(change[k])
         may = [one.expected] + [unbiased] * (abs(unbiased - one.expected) <= more)
@@ -384,39 +396,39 @@ class ModelMonitor:
         """Say whether the effect of the drives' biases in a longest window may be the plant's parameters."""
         longest = max(self.settings.windows)
         windows = [one for one in compared if one.window == longest]
-        found = self._slopes(longest) if windows else None
-        if found is None:
+        drift_of_window = self._slopes(longest) if windows else None
+        if drift_of_window is None:
             return False
-        change, slopes = found
+        change, slopes = drift_of_window
         rows = [self.plant.outputs.index(one.subject) for one in windows]
         effect = np.abs(np.array([one.expected for one in windows]) - change[rows])
         tolerated = np.minimum(drift_spread(slopes)[rows], [one.allowed for one in windows])
         return bool((effect <= tolerated).all())
 
     def _biases(self, time: float, compared: list[Residual]) -> list[Residual]:
-        if time < self.compared_from + _BIAS_AFTER_S:
+        if time < self.compared_from + self.settings.bias_after_s:
             return []
-        s, found = self.settings, []
+        s, residuals = self.settings, []
         for k in self._filter.biased:
             bias = float(self._filter.b[k])
             if abs(bias) > s.bias_limit and self._since[k] < time:
-                found.append(Residual("bias", self.plant.outputs[k], 0.0, 0.0, bias, s.bias_limit))
+                residuals.append(Residual("bias", self.plant.outputs[k], 0.0, 0.0, bias, s.bias_limit))
         for j, (bias, sd) in enumerate(zip(self._filter.w.tolist(), self._filter.bias_spread().tolist())):
             if abs(bias) <= 5 * sd:  # five: of 5,700 estimates without a fault the largest was 3.1
                 continue
             limit = float(np.hypot(s.drive_limit * self._largest_drive(j), 5 * sd))
             if abs(bias) > limit and not self._drifted(compared):
-                found.append(Residual("bias", self.drives[j], 0.0, 0.0, bias, limit))
-        return found
+                residuals.append(Residual("bias", self.drives[j], 0.0, 0.0, bias, limit))
+        return residuals
 
     def _largest_drive(self, j: int) -> float:
         """Return the largest drive of the longest window by its effect over its slope, a fraction of half its
         range; infinite where the slope is 0."""
-        model, now, steps, at = self._model, self._filter, self._past.steps, self._model.drive_at[j]
+        model, now, steps, input_index = self._model, self._filter, self._past.steps, self._model.drive_at[j]
         applied = steps.rows(steps.first)[0]
-        largest, less = applied[np.abs(applied[:, at]).argmax(), at], 0.01 * model.half[j]
+        largest, less = applied[np.abs(applied[:, input_index]).argmax(), input_index], 0.01 * model.half[j]
         u = np.repeat(np.repeat(now.u[None, None], 3, axis=0), len(applied), axis=1)
-        u[:, :, at] = np.array([0.0, largest - np.copysign(less, largest), largest])[:, None]
+        u[:, :, input_index] = np.array([0.0, largest - np.copysign(less, largest), largest])[:, None]
         d = np.repeat(np.repeat(now.d[None, None], 3, axis=0), len(applied), axis=1)
         without, slightly_less, end = model.run(np.repeat(now.x[None], 3, axis=0), u, d)[:, -1]
         effect, slope = np.abs(end - without), np.abs(end - slightly_less) / 0.01

@@ -38,7 +38,6 @@ from thermogrip.sysid.plant.plant import Plant
 
 #: The hottest limit that may be stated [degC]: above the thermocouples of a kiln (type S ends at 1768 degC).
 HOTTEST = 1800.0
-_LOST_SHARE, _LOST_S = 0.25, 60.0
 
 
 @dataclass(frozen=True)
@@ -56,6 +55,9 @@ class SensorSettings:
     pairs: Mapping[tuple[str, str], float] = field(default_factory=dict)  # may differ by so much [K]
     pair_limit: float = keyed(4.0, "pair_limit_K", 0.1, 50)  # of ``x`` and ``x_2``, always a pair [K]
     pair_s: float = keyed(30.0, "pair_s", 0, 3600)  # for how long a pair may differ by more [s]
+    # share of the last minute without a good reading that trips: three in a row come every 84 readings then
+    lost_share: float = 0.25
+    lost_s: float = 60.0  # memory of that share [s]
 
 
 @dataclass
@@ -88,12 +90,12 @@ def room_sensors(
     """Return those of a rig's sensors that read the room; an output never does, whatever its name; sensors
     that the plant does not know are the room's where they are ``stated`` or, without a statement, called
     so."""
-    known: set[str] = set(outputs)
+    known_signals: set[str] = set(outputs)
     rooms: set[str] = set()
     if plant is not None:
         rooms = set(room_disturbances(plant))
-        known |= {*plant.outputs, *plant.inputs, *plant.disturbances}
-    unknown = set(names) - known
+        known_signals |= {*plant.outputs, *plant.inputs, *plant.disturbances}
+    unknown = set(names) - known_signals
     if stated is None:
         rooms |= {name for name in unknown if guess_role(name, "degC") == "disturbance"}
     else:
@@ -157,7 +159,8 @@ class SensorMonitor:
         accepted: dict[str, float] = {}
         suspect: dict[str, str] = {}
         trip: Trip | None = None
-        newer, self._seen = 1 - exp((self._seen - time) / _LOST_S), time
+        newer = 1 - exp((self._seen - time) / self.settings.lost_s)
+        self._seen = time
         for name, value in values.items():
             memory = self._memory.setdefault(name, _Memory(value, time, since=time, last=value))
             memory.lost_share += newer * ((memory.bad > 0) - memory.lost_share)
@@ -169,7 +172,9 @@ class SensorMonitor:
             if why:
                 suspect[name] = why
                 memory.bad += 1
-                often = memory.bad >= self.settings.bad_in_a_row or memory.lost_share >= _LOST_SHARE
+                often = (
+                    memory.bad >= self.settings.bad_in_a_row or memory.lost_share >= self.settings.lost_share
+                )
                 if often and name not in rooms:
                     trip = trip or self._lost(name, value, time, memory, why)
             else:

@@ -70,10 +70,10 @@ def guard_from_dict(content: Mapping[str, Any], *, file: str | Path | None = Non
         values["rooms"] = _names(content["room_sensors"], file)
     values["limits"] = {name: _limit(name, pair, file) for name, pair in tables.get("limits", {}).items()}
     for name, kind in _TABLES.items():
-        found = _values(tables.get(name, {}), kind, f"{name}.", file)
+        table_values = _values(tables.get(name, {}), kind, f"{name}.", file)
         if name == "sensors":
-            found["pairs"] = _pairs(content.get("pairs", []), file)
-        values["rules" if name == "no_model" else name] = kind(**found)
+            table_values["pairs"] = _pairs(content.get("pairs", []), file)
+        values["rules" if name == "no_model" else name] = kind(**table_values)
     settings = GuardSettings(**values, file="" if file is None else str(file))
     for problem, hint in _faults(settings):
         raise UserError(problem, file=file, hint=hint)
@@ -82,21 +82,21 @@ def guard_from_dict(content: Mapping[str, Any], *, file: str | Path | None = Non
 
 def _values(table: Mapping[str, Any], kind: type[Any], where: str, file: str | Path | None) -> dict[str, Any]:
     """Return the settings of a table by name; a key that is unknown, or a value outside, is refused."""
-    found, keys = {}, _keys(kind)
+    values_by_name, keys = {}, _keys(kind)
     for name, value in table.items():
         if name not in keys:
             raise UserError(f"{where}{name}: no such key", file=file, hint=_instead(name, keys))
-        found[keys[name].name] = _value(f"{where}{name}", value, keys[name], file)
-    return found
+        values_by_name[keys[name].name] = _value(f"{where}{name}", value, keys[name], file)
+    return values_by_name
 
 
 def _instead(name: str, keys: Mapping[str, Any]) -> str:
     """Return what to do about an unknown key: its unit, its table, or a similar key."""
-    near = [key for key in keys if key.startswith(f"{name}_")] or get_close_matches(name, keys, 1)
+    similar = [key for key in keys if key.startswith(f"{name}_")] or get_close_matches(name, keys, 1)
     tables = [table for table, kind in _TABLES.items() if name in _keys(kind)]
     if tables:
         return f"write it below [{tables[0]}]"
-    return f"write {near[0]}; {_TEMPLATE_HINT}" if near else _TEMPLATE_HINT
+    return f"write {similar[0]}; {_TEMPLATE_HINT}" if similar else _TEMPLATE_HINT
 
 
 def _value(name: str, value: Any, key: Field[Any], file: str | Path | None) -> Any:
@@ -105,8 +105,8 @@ def _value(name: str, value: Any, key: Field[Any], file: str | Path | None) -> A
     if "tuple" in str(key.type):
         pair = key.type == "tuple[float, float]"
         if not isinstance(value, list) or len(value) not in ((2,) if pair else range(1, 7)):
-            what = "a pair [lowest, highest]" if pair else "a list of 1 to 6 numbers"
-            raise UserError(f"{name}: {value!r} is not {what}", file=file, hint=hint)
+            form = "a pair [lowest, highest]" if pair else "a list of 1 to 6 numbers"
+            raise UserError(f"{name}: {value!r} is not {form}", file=file, hint=hint)
         return tuple(_number(name, one, span, hint, file) for one in value)
     number = _number(name, value, span, hint, file)
     if key.type != "int":
@@ -144,7 +144,7 @@ def _names(value: Any, file: str | Path | None) -> tuple[str, ...]:
 
 def _pairs(tables: Any, file: str | Path | None) -> dict[tuple[str, str], float]:
     """Return by how much two sensors of one temperature may differ [K]."""
-    found = {}
+    pair_limits = {}
     hint = 'write [[pairs]], sensors = ["a", "b"], limit_K = 4.0'
     for table in tables if isinstance(tables, list) else [tables]:
         if not isinstance(table, dict) or set(table) != {"sensors", "limit_K"}:
@@ -153,8 +153,8 @@ def _pairs(tables: Any, file: str | Path | None) -> dict[tuple[str, str], float]
         if not isinstance(names, list) or len(names) != 2 or not all(isinstance(n, str) for n in names):
             raise UserError("pairs.sensors: is not two names", file=file, hint=hint)
         limit = _number("pairs.limit_K", table["limit_K"], (0.1, 50), hint, file)
-        found[str(names[0]), str(names[1])] = limit
-    return found
+        pair_limits[str(names[0]), str(names[1])] = limit
+    return pair_limits
 
 
 def _faults(settings: GuardSettings) -> Iterator[tuple[str, str]]:

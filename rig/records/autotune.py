@@ -105,21 +105,21 @@ class Autotune:
         """Make the folder, or take up what is in it; UserError where that was asked otherwise."""
         make_folder(self.folder)
         file, target = self.folder / "autotune.json", self.target
-        asked = {"target": dict(target) if isinstance(target, Mapping) else target, **self.about}
+        request = {"target": dict(target) if isinstance(target, Mapping) else target, **self.about}
         if file.exists():
             content = read_json(file, SCHEMA, VERSION)
-            if content["asked"] != asked:
-                differs = next(key for key in asked if content["asked"].get(key) != asked[key])
+            if content["asked"] != request:
+                differs = next(key for key in request if content["asked"].get(key) != request[key])
                 problem = f"is of another autotune, with {differs} {content['asked'].get(differs)}"
                 raise UserError(problem, file=self.folder, hint="choose another folder, or ask the same")
             self.known = content["known"]
-            for each in self._folders():
-                recover(each)
+            for run_folder in self._folders():
+                recover(run_folder)
             if spent := self.spent_s:
                 self.say(f"goes on after {spent / 60:.1f} min on the rig")
         elif any(self.folder.iterdir()):
             raise UserError("holds something else", file=self.folder, hint="give a new folder")
-        self._asked = asked
+        self._asked = request
         self._note()
 
     def _note(self, **known: Any) -> None:
@@ -292,8 +292,8 @@ class Autotune:
         self.tuning.save(self.folder / "controller.json")
         if self.tuning.interrupted:
             raise KeyboardInterrupt
-        known = {"minutes": round(self.spent_s / 60, 1), "good": self.identified.good}
-        self._note(tuned=known | {"verdict": self.tuning.verdict})
+        figures_so_far = {"minutes": round(self.spent_s / 60, 1), "good": self.identified.good}
+        self._note(tuned=figures_so_far | {"verdict": self.tuning.verdict})
         self.say(f"{self.tuning.verdict}: {self.tuning.finding}")
 
     def _check(self) -> None:
@@ -334,14 +334,14 @@ def _finite(figures: Mapping[str, float]) -> dict[str, float | None]:
 
 def _ranges(rig: Rig) -> dict[str, tuple[float, float]]:
     """Return what each drive may be; UserError where its unit does not say."""
-    found = {}
+    ranges = {}
     for name, unit in rig.units.items():
         ends = range_of(unit, None)
         if ends is None:
             problem = f"the range of {name} [{unit}] is unknown"
             raise UserError(problem, hint="record a log of it, and go on with identify and tune")
-        found[name] = ends
-    return found
+        ranges[name] = ends
+    return ranges
 
 
 @contextmanager

@@ -100,8 +100,8 @@ def read_plan(path: str | Path) -> list[Trial]:
         problem = f"has the unknown column {unknown[0]!r}" if unknown else "lacks material or target_degC"
         raise UserError(problem, file=path, row=1, hint=known_names("".join(unknown[:1]), sorted(_KNOWN)))
     trials = []
-    for at, line in enumerate(table.lines.tolist()):
-        cells = {name: values[at] for name, values in table.text.items() if values[at]}
+    for row, line in enumerate(table.lines.tolist()):
+        cells = {name: values[row] for name, values in table.text.items() if values[row]}
         trials.append(_trial(cells, path, int(line)))
     return trials
 
@@ -237,14 +237,16 @@ def run_batch(
                 if stopped or (ready is not None and not ready(k, trial)):
                     return _batch(path, plan, "stopped", "run the same command again to go on", sessions)
                 run = next_folder(path, k)
-                known = _with_temperature(trial, k, plan, path, first_touch)
-                described = {**(about or {}), "trial": k + 1, **asdict(known)}
-                with RunFolder(run, described, files=files) as kept_in, through(kept_in) as recorder:
-                    kept: dict[str, Any] = {"stop": stop, "guard": guard, "recorder": recorder}
-                    kept |= {"operator": operator, **options}
-                    thing = _object(known, k)
-                    session = run_session(source.rig, controller, known.target, grasp=thing, **kept)
-                    kept_in.finish(session)
+                described = _with_temperature(trial, k, plan, path, first_touch)
+                described = {**(about or {}), "trial": k + 1, **asdict(described)}
+                with RunFolder(run, described, files=files) as run_folder, through(run_folder) as recorder:
+                    session_args: dict[str, Any] = {"stop": stop, "guard": guard, "recorder": recorder}
+                    session_args |= {"operator": operator, **options}
+                    thing = _object(described, k)
+                    session = run_session(
+                        source.rig, controller, described.target, grasp=thing, **session_args
+                    )
+                    run_folder.finish(session)
                 sessions += 1
                 verdict, advice = _judged(session, k, trial, run, judge)
                 if verdict == "done":
@@ -297,18 +299,18 @@ def collect(folder: str | Path, *, name: str = "") -> Grasps:
     runs = [run for k in range(n_trial) if (run := good_run(path, k)) is not None]
     if not runs:
         raise UserError("has no good grasp yet", file=path, hint="run the batch first")
-    parts = [read_grasps(run / "grasps.csv") for run in runs]
-    step = float(np.median(np.diff(parts[0]["time"].values)))
-    ticks = [np.round(part["time"].values / step).astype(int) for part in parts]
+    grasps = [read_grasps(run / "grasps.csv") for run in runs]
+    step = float(np.median(np.diff(grasps[0]["time"].values)))
+    ticks = [np.round(one_grasp["time"].values / step).astype(int) for one_grasp in grasps]
     first, last = min(int(t[0]) for t in ticks), max(int(t[-1]) for t in ticks)
-    readings = np.full((len(parts), last - first + 1), np.nan)
-    for row, (part, at) in enumerate(zip(parts, ticks)):
-        readings[row, at - first] = part["t_surface"].values[0]
+    readings = np.full((len(grasps), last - first + 1), np.nan)
+    for row, (one_grasp, at) in enumerate(zip(grasps, ticks)):
+        readings[row, at - first] = one_grasp["t_surface"].values[0]
     per_grasp: dict[str, list[Any]] = {}
     for key in (*GRASP_NUMBERS, *GRASP_LABELS):
-        if any(key in part for part in parts):
+        if any(key in one_grasp for one_grasp in grasps):
             lost: Any = np.nan if key in GRASP_NUMBERS else ""
-            per_grasp[key] = [part[key].values[0] if key in part else lost for part in parts]
+            per_grasp[key] = [one_grasp[key].values[0] if key in one_grasp else lost for one_grasp in grasps]
     return make_grasps(
         np.round(np.arange(first, last + 1) * step, 9),
         readings,
@@ -322,8 +324,12 @@ def good_run(folder: Path, k: int) -> Path | None:
     """Return the folder of trial k's good run, None where it has none yet."""
     for run in _attempts(folder, k):
         with suppress(UserError):  # a run that cannot be read is not good
-            found = read_run(run)
-            if found.about.get("verdict") == "settled" and (run / "grasps.csv").is_file() and not found.bad:
+            content = read_run(run)
+            if (
+                content.about.get("verdict") == "settled"
+                and (run / "grasps.csv").is_file()
+                and not content.bad
+            ):
                 return run
     return None
 
@@ -335,16 +341,16 @@ def next_folder(folder: Path, k: int) -> Path:
 
 
 def _attempts(folder: Path, k: int) -> list[Path]:
-    found: list[Path] = []
-    while (run := folder / (f"{k + 1:04d}-{len(found) + 1}" if found else f"{k + 1:04d}")).is_dir():
-        found.append(run)
-    return found
+    attempts: list[Path] = []
+    while (run := folder / (f"{k + 1:04d}-{len(attempts) + 1}" if attempts else f"{k + 1:04d}")).is_dir():
+        attempts.append(run)
+    return attempts
 
 
 def _object(trial: Trial, k: int) -> Object:
-    known = {"t_object": trial.t_object, "t_object_sd": trial.t_object_sd}
-    given: dict[str, Any] = {name: value for name, value in known.items() if value is not None}
-    return Object(trial.material, labels=trial.labels, grasp_id=f"{k + 1:04d}", **given)
+    temperature = {"t_object": trial.t_object, "t_object_sd": trial.t_object_sd}
+    stated: dict[str, Any] = {name: value for name, value in temperature.items() if value is not None}
+    return Object(trial.material, labels=trial.labels, grasp_id=f"{k + 1:04d}", **stated)
 
 
 def _with_temperature(

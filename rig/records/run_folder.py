@@ -151,10 +151,10 @@ class RunFolder:
 
     def _end(self, result: Mapping[str, Any]) -> None:
         """Wait for the disk and write the result; UserError where it refuses, if no row has said so."""
-        known = (UserError,) if self._disk.refused else ()
-        with suppress(*known), os_faults(self.path):
+        already_reported = (UserError,) if self._disk.refused else ()
+        with suppress(*already_reported), os_faults(self.path):
             self.sync()
-        with suppress(*known):
+        with suppress(*already_reported):
             self._write_about(result)
 
     def close(self) -> None:
@@ -189,13 +189,13 @@ class RunFolder:
 
 def made_with(files: Mapping[str, Path]) -> dict[str, Any]:
     """Return when a run began, the versions of what it runs on, and the hashes of its files by their role."""
-    found = {}
+    versions = {}
     for name in _PACKAGES:
         with suppress(PackageNotFoundError):
-            found[name] = version(name)
+            versions[name] = version(name)
     return {
         "began": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
-        "versions": {"python": platform.python_version(), **found},
+        "versions": {"python": platform.python_version(), **versions},
         "files": {name: {"path": str(path), "sha256": file_hash(path)} for name, path in files.items()},
     }
 
@@ -218,9 +218,9 @@ def refuse_used(folder: Path) -> None:
     refuse_links(folder)
     if (folder / "run.json").exists():
         raise UserError("holds a run already", file=folder, hint="choose another folder")
-    there = next((name for name in NAMES if (folder / name).exists()), "")
-    if there:
-        problem = f"holds a {there} that would be overwritten"
+    overwritten = next((name for name in NAMES if (folder / name).exists()), "")
+    if overwritten:
+        problem = f"holds a {overwritten} that would be overwritten"
         raise UserError(problem, file=folder, hint="choose another folder")
 
 
@@ -309,10 +309,10 @@ class _Lines:
         self._size = 0
 
     def write(self, line: bytes) -> None:
-        rest = memoryview(line)
+        unwritten = memoryview(line)
         try:
-            while rest:
-                rest = rest[_write(self._file, rest) :]
+            while unwritten:
+                unwritten = unwritten[_write(self._file, unwritten) :]
         except OSError:
             with suppress(OSError):  # the reader drops half a line, too
                 os.ftruncate(self._file, self._size)
@@ -443,12 +443,12 @@ def recover(folder: str | Path) -> Recovery:
     samples, events = path / "samples.csv", path / "events.jsonl"
     for name, whole in ((samples.name, _samples(samples)[2]), (events.name, _events(events)[1])):
         if whole.lost:
-            kept = _keep(path / name)
-            findings.append(f"{name} as it was found is kept as {kept}")
+            damaged_name = _keep(path / name)
+            findings.append(f"{name} as it was found is kept as {damaged_name}")
             write_atomic(path / name, b"".join(line + b"\n" for line in whole.lines))
     if run.grasps is not None and _written_grasps(path)[0] is None:
-        there = [name for name in _GRASPS if (path / name).is_file()]
-        findings += [f"{name} as it was found is kept as {_keep(path / name)}" for name in there]
+        half_written = [name for name in _GRASPS if (path / name).is_file()]
+        findings += [f"{name} as it was found is kept as {_keep(path / name)}" for name in half_written]
         write_grasps(run.grasps, path / "grasps.csv")
         findings.append("the grasp that was not written whole was cut from the samples")
     verdict = run.about.get("verdict", "running")
@@ -468,9 +468,9 @@ def mark_bad(folder: str | Path, why: str) -> None:
     path = Path(folder)
     run = read_run(path)
     refuse_links(path)
-    at = 0.0 if run.log is None else float(run.log["time"].values[-1])
+    last_s = 0.0 if run.log is None else float(run.log["time"].values[-1])
     before = b"".join(one + b"\n" for one in _events(path / "events.jsonl")[1].lines)
-    write_atomic(path / "events.jsonl", before + event_line(Event(at, "bad", why)))
+    write_atomic(path / "events.jsonl", before + event_line(Event(last_s, "bad", why)))
     if (path / "SHA256SUMS").is_file():
         write_sums(path)
 
@@ -513,7 +513,7 @@ def _whole_lines(path: Path, good: Any) -> _Whole:
     if not path.is_file():
         return _Whole([], ())
     data = read_bytes(path)
-    body, _, rest = data.rpartition(b"\n")
+    body, _, unended = data.rpartition(b"\n")
     lines = body.split(b"\n") if body or data.startswith(b"\n") else []
     flags = [good(at, line) for at, line in enumerate(lines)]
     last = max((at for at, ok in enumerate(flags) if ok), default=-1)
@@ -522,7 +522,7 @@ def _whole_lines(path: Path, good: Any) -> _Whole:
         for at in range(last)
         if not flags[at]
     ]
-    tail = sum(len(line) + 1 for line in lines[last + 1 :]) + len(rest)
+    tail = sum(len(line) + 1 for line in lines[last + 1 :]) + len(unended)
     if tail:
         lost.append(f"{path.name}: the last {tail} bytes are no whole line (cut off while it was written)")
     return _Whole([line for line, ok in zip(lines, flags) if ok], tuple(lost))
@@ -558,7 +558,7 @@ def _names(line: bytes) -> list[str]:
 
 
 def _events(path: Path) -> tuple[tuple[Event, ...], _Whole]:
-    found: list[Event] = []
+    whole_events: list[Event] = []
 
     def good(at: int, line: bytes) -> bool:
         try:
@@ -566,21 +566,23 @@ def _events(path: Path) -> tuple[tuple[Event, ...], _Whole]:
             time_s, data = float(one["time_s"]), dict(one.get("data", {}))
             if not isfinite(time_s):
                 return False
-            found.append(Event(time_s, str(one["kind"]), str(one["text"]), data))
+            whole_events.append(Event(time_s, str(one["kind"]), str(one["text"]), data))
         except Exception:  # whatever a damaged line makes it stumble over
             return False
         return True
 
     whole = _whole_lines(path, good)
-    return tuple(found), whole
+    return tuple(whole_events), whole
 
 
 def _rooms(header: list[str], events: tuple[Event, ...]) -> frozenset[str]:
     """Return the room's sensors as the session recorded them, by name for a run of an older version."""
     readings = {h.removesuffix("_degC") for h in header if h.endswith("_degC")}
-    kept = next((e.data["rooms"] for e in events if e.kind == "phase" and "rooms" in e.data), None)
+    recorded = next((e.data["rooms"] for e in events if e.kind == "phase" and "rooms" in e.data), None)
     return (
-        frozenset(readings.intersection(map(str, kept))) if isinstance(kept, list) else room_sensors(readings)
+        frozenset(readings.intersection(map(str, recorded)))
+        if isinstance(recorded, list)
+        else room_sensors(readings)
     )
 
 

@@ -98,12 +98,12 @@ class LineParser:
     def feed(self, data: bytes) -> list[Line | Damaged]:
         """Take what was received and return the lines that it completes, in order."""
         events: list[Line | Damaged] = []
-        *ended, rest = data.split(b"\n")
+        *ended, unended = data.split(b"\n")
         for piece in ended:
             self._add(piece)
             events += [decode_line(bytes(self._pending))] if self._pending else []
             self.reset()
-        self._add(rest)
+        self._add(unended)
         return events
 
     def reset(self) -> None:
@@ -346,7 +346,7 @@ class HostEnd:
     def _event(self, line: Line | Damaged) -> Event:
         if isinstance(line, Damaged):
             return line
-        kind, rest = line.words[0], line.words[1:]
+        kind, answer_words = line.words[0], line.words[1:]
         if line.seq == 0:
             return _announcement(line)
         if kind not in ("ok", "err"):
@@ -355,10 +355,10 @@ class HostEnd:
             return Unexpected("duplicate" if line.seq == self._seq else "late", line)
         try:
             if kind == "err":
-                _check(len(rest) == 1 and rest[0] in REFUSALS)
-                answered: Event = Refused(self._open, rest[0])
+                _check(len(answer_words) == 1 and answer_words[0] in REFUSALS)
+                answered: Event = Refused(self._open, answer_words[0])
             else:
-                answered = Answer(self._open, self._content(rest))
+                answered = Answer(self._open, self._content(answer_words))
         except ValueError:
             return Unexpected("content", line)
         self._open = None
@@ -374,9 +374,9 @@ class HostEnd:
 
     def _fits(self, heard: State) -> bool:
         """Say whether it has as many numbers as the device has drives and sensors, where known."""
-        known = self.identity
+        identity = self.identity
         shape = (len(heard.drive), len(heard.temperatures))
-        return known is None or shape == (len(known.drives), len(known.sensors))
+        return identity is None or shape == (len(identity.drives), len(identity.sensors))
 
 
 def request_words(request: Request) -> tuple[str, ...]:
@@ -386,11 +386,11 @@ def request_words(request: Request) -> tuple[str, ...]:
 
 def parse_request(words: Sequence[str]) -> Request | str:
     """Return the question that the words are, or the code to refuse them with."""
-    word, *rest = words
+    word, *arguments = words
     if word not in _KINDS:
         return "unknown"
     try:
-        return _KINDS[word](*(form(text) for form, text in zip(_FORMS.get(word, ()), rest, strict=True)))
+        return _KINDS[word](*(form(text) for form, text in zip(_FORMS.get(word, ()), arguments, strict=True)))
     except ValueError:
         return "syntax"
 

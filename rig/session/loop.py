@@ -96,10 +96,10 @@ class Loop:
     def read(self, read: Callable[[], Reading]) -> None:
         """Take a reading, with the host's times at which it was asked for and had: how late the loop is with
         it afterwards is no fault of the rig's clock."""
-        asked = None if self.clock is None else self.clock()
+        asked_s = None if self.clock is None else self.clock()
         self.reading: Reading = read()
         self.heard = self.now()
-        self.asked = self.heard if asked is None else asked
+        self.asked = self.heard if asked_s is None else asked_s
 
     @property
     def rooms(self) -> frozenset[str]:
@@ -174,20 +174,20 @@ class Loop:
         for why in self.operator.take_bad():
             if sum(event.kind == "bad" for event in self.events) < MOST_MARKS:
                 self.note("bad", why)
-        found = self.guard.check(
+        findings = self.guard.check(
             self.reading,
             self.heard,
             asked=self.asked,
             touching=self.touching,
             stop_asked=self.operator.stop_asked,
         )
-        self.accepted, self.fresh = found.values, found.fresh
-        for name, why in found.suspect.items():
+        self.accepted, self.fresh = findings.values, findings.fresh
+        for name, why in findings.suspect.items():
             text = f"{name} is suspect ({why}); the last good value is used"
             if not any((event.kind, event.text) == ("lost", text) for event in self.events):
                 self.note("lost", text)
-        if found.trip is not None:
-            raise TripError(self.of_this_rig(found.trip))
+        if findings.trip is not None:
+            raise TripError(self.of_this_rig(findings.trip))
 
     def controller_reading(self) -> dict[str, float]:
         """Return the reading for the controller, the last good value where one is lost."""
@@ -204,8 +204,8 @@ class Loop:
         try:
             self.ask(lambda: self.rig.apply(drive, self.move.pump))
         except ValueError as error:
-            asked = ", ".join(f"{name} {value:g}" for name, value in drive.items())
-            trip = Trip("drive", self.reading.time_s, asked, "a drive that the rig can take", str(error))
+            wanted = ", ".join(f"{name} {value:g}" for name, value in drive.items())
+            trip = Trip("drive", self.reading.time_s, wanted, "a drive that the rig can take", str(error))
             raise TripError(trip) from error
         self.guard.applied(drive, self.move.pump, self.now())
         return drive
@@ -318,11 +318,11 @@ class Loop:
         happened = Counter((notice.kind, notice.text) for notice in self.rig.notices())
         for (kind, text), times in happened.items():
             self.note(kind, text if times == 1 else f"{text} ({times} times)")
-            at = self.reading.time_s
+            time_s = self.reading.time_s
             if kind == "reset":
-                trip = Trip("device", at, "the device", "to hold the drive", text)
+                trip = Trip("device", time_s, "the device", "to hold the drive", text)
             elif kind == "expired" and trip is None:
-                trip = Trip("frozen", at, "this program", "a drive renewed within 2 s", text)
+                trip = Trip("frozen", time_s, "this program", "a drive renewed within 2 s", text)
         if trip is not None:
             raise TripError(trip)
 

@@ -234,8 +234,8 @@ def run_session(
     >>> session.verdict, abs(session.bias) < 0.25
     ('settled', True)
     """
-    watch, asked = Guard(skin=output) if guard is None else guard, operator or Operator()
-    run = Loop(rig, controller, recorder, progress, watch, clock, listener, asked, band)
+    watch, requests = Guard(skin=output) if guard is None else guard, operator or Operator()
+    run = Loop(rig, controller, recorder, progress, watch, clock, listener, requests, band)
     thing = Object(*grasp) if isinstance(grasp, tuple) else grasp
     _check_object(thing, run)
     verdict, touched, trip = "tripped", None, None
@@ -311,9 +311,9 @@ def _touch(
     run.move = Move(drive=run.no_drive(), pump=0)
     run.ends = run.reading.time_s + n_lead * dt
     run.sample("pump_off", n_lead, dt)
-    closed, known = run.reading.time_s, thing.t_object
+    closed, t_object_source = run.reading.time_s, thing.t_object
     run.ends = closed + seconds
-    t_object = float(run.accepted[known] if isinstance(known, str) else known)
+    t_object = float(run.accepted[t_object_source] if isinstance(t_object_source, str) else t_object_source)
     t_gripper = run.target.get(output, np.nan)
     about = {
         "grasp_id": thing.grasp_id, "material": thing.material, "t_object": t_object,
@@ -355,8 +355,8 @@ def grasp_of_rows(
     """
     room = next((value for name, value in rows[0].items() if name.removesuffix("_degC") in rooms), np.nan)
     labels = {key: [about.get(key) or ""] for key in GRASP_LABELS if about.get(key)}
-    given = {key: about[key] for key in GRASP_NUMBERS if key in about}
-    numbers = {key: [np.nan if value is None else float(value)] for key, value in given.items()}
+    stated_numbers = {key: about[key] for key in GRASP_NUMBERS if key in about}
+    numbers = {key: [np.nan if value is None else float(value)] for key, value in stated_numbers.items()}
     second = f"{output}_2_degC"
     twin = [[row[second] for row in rows]] if second in rows[0] else None
     material, t_object = labels.get("material", [""])[0], numbers.get("t_object", [np.nan])[0]
@@ -446,8 +446,8 @@ class Playback:
     def _check(self, name: str, values: Array, span: tuple[float, float], allowed: str = "") -> None:
         wrong = np.flatnonzero(~((values >= span[0]) & (values <= span[1])))  # also NaN
         if wrong.size:
-            at, hint = int(wrong[0]), allowed or f"{span[0]:g} to {span[1]:g}"
-            problem = f"the schedule's {name} is {values[at]:g} at {self._time[at]:g} s"
+            row, hint = int(wrong[0]), allowed or f"{span[0]:g} to {span[1]:g}"
+            problem = f"the schedule's {name} is {values[row]:g} at {self._time[row]:g} s"
             raise UserError(problem, hint=f"write {hint}")
 
     @property

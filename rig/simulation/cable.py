@@ -102,9 +102,9 @@ class SocketLink:
 
     def pull(self) -> None:
         """Hang up and listen no more."""
-        for each in (self._client, self._server):
-            if each is not None:
-                each.close()
+        for end in (self._client, self._server):
+            if end is not None:
+                end.close()
         self._client = self._server = None
 
     def read(self, seconds: float) -> bytes:

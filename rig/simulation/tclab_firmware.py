@@ -63,8 +63,8 @@ class TCLabCore:
 
     def receive(self, data: bytes, now_ms: int) -> bytes:
         """Take what came over the line and return what goes back."""
-        *commands, rest = (self._pending + data.replace(b"\r", b"\n")).split(b"\n")
-        self._pending = rest[-_LONGEST:]
+        *commands, unended = (self._pending + data.replace(b"\r", b"\n")).split(b"\n")
+        self._pending = unended[-_LONGEST:]
         return b"".join(self._answer(command[:_LONGEST]) for command in commands if command.strip())
 
     def _answer(self, command: bytes) -> bytes:
@@ -78,9 +78,9 @@ class TCLabCore:
                 self._power = [0.0, 0.0]
                 return ["Start" if word == "A" else "Stop"]
             case "Q1" | "Q2" | "R1" | "R2":
-                at = int(word[1]) - 1
-                self._power[at] = _clip(value, 100.0) if word[0] == "Q" else self._power[at]
-                return [f"{self._power[at]:.3f}"]
+                heater = int(word[1]) - 1
+                self._power[heater] = _clip(value, 100.0) if word[0] == "Q" else self._power[heater]
+                return [f"{self._power[heater]:.3f}"]
             case "P1" | "P2":
                 self._ceilings[int(word[1]) - 1] = _clip(value, 255.0)
                 return [f"{self._ceilings[int(word[1]) - 1]:.2f}"]

@@ -54,8 +54,8 @@ class _Contact:
         """Return what the object adds to the skin's reading [K], which alone would be at ``alone``."""
         if time > self.opened:
             return self.left * float(np.exp((self.opened - time) / recovery))
-        at = np.array([time - self.closed])
-        share, room = float(self.touch.response(at)[0]), float(self.touch.by_room(at)[0])
+        since_closed = np.array([time - self.closed])
+        share, room = float(self.touch.response(since_closed)[0]), float(self.touch.by_room(since_closed)[0])
         return (self.touch.t_object - self.skin) * share + room - self._undone(time, alone)
 
     def follow(self, time: float, alone: float) -> None:
@@ -65,11 +65,11 @@ class _Contact:
 
     def _undone(self, time: float, alone: float) -> float:
         """Return what the object undoes of the skin's own way since it closed [K]."""
-        at, own = np.array([*self.times, time]), np.array([*self.alone, alone])
+        times, skin_alone = np.array([*self.times, time]), np.array([*self.alone, alone])
         onset = self.touch.onset
         # what the skin did before it was touched is answered from then on
-        since = np.maximum(0.5 * (at[1:] + at[:-1]), self.closed + onset)
-        return float(self.touch.response(time - since + onset) @ np.diff(own))
+        since = np.maximum(0.5 * (times[1:] + times[:-1]), self.closed + onset)
+        return float(self.touch.response(time - since + onset) @ np.diff(skin_alone))
 
 
 class Twin:
@@ -146,8 +146,8 @@ class Twin:
         self.noise, self.slow_noise, self.slow_time, self.quantum = noise, slow_noise, slow_time, quantum
         self._pace = pace
         self.offsets = dict(plant.offsets if offsets is None else offsets)
-        given = dict(limits or {})
-        self.limits = {name: given.get(name) or _input_range(plant, name) for name in self._drives()}
+        stated_limits = dict(limits or {})
+        self.limits = {name: stated_limits.get(name) or _input_range(plant, name) for name in self._drives()}
         self._contact_model = contact  # the example rig's is read when something is grasped
         self._noise_rng, self._grasp_rng = (
             np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(2)
@@ -188,8 +188,8 @@ class Twin:
         if self._newest is None or self._newest.time_s != self.time:
             true = self.truth()
             values = {name: self._sensor(name, value) for name, value in true.items()}
-            known = dict(zip(self.plant.disturbances, self._d.tolist(), strict=True))
-            values |= {name: round(known[name], 1) for name in room_disturbances(self.plant)}
+            disturbances = dict(zip(self.plant.disturbances, self._d.tolist(), strict=True))
+            values |= {name: round(disturbances[name], 1) for name in room_disturbances(self.plant)}
             self._newest = Reading(self.time, values, dict(self._drive), self._pump)
         return Reading(self.time, self._newest.values, dict(self._drive), self._pump)
 
@@ -242,8 +242,8 @@ class Twin:
             grip = load_default_gripper().grip()
             # a calibration's bias is on the scale of its sensor, whose offset a reading gets anyhow
             self._contact_model = replace(grip, bias=grip.bias - self.offsets.get(self.skin, 0.0))
-        known = self.ambient if np.isnan(t_object) else t_object
-        return self._contact_model.draw(material, known, rng, ambient=self.ambient)
+        temperature = self.ambient if np.isnan(t_object) else t_object
+        return self._contact_model.draw(material, temperature, rng, ambient=self.ambient)
 
     def release(self) -> None:
         """Open the gripper."""
@@ -328,9 +328,9 @@ class Twin:
     def _sensor(self, name: str, true: float) -> float:
         if name == self.plant.outputs[0]:  # the slow noise of all sensors moves on once a sample
             keep = float(np.exp(-(self.time - self._slow_at) / self.slow_time))
-            for each in self._slow:
+            for sensor in self._slow:
                 fresh = self.slow_noise * np.sqrt(1 - keep**2) * self._noise_rng.standard_normal()
-                self._slow[each] = keep * self._slow[each] + fresh
+                self._slow[sensor] = keep * self._slow[sensor] + fresh
             self._slow_at = self.time
         value = (
             true
@@ -349,8 +349,8 @@ class Twin:
 
 def _input_range(plant: Plant, name: str) -> tuple[float, float]:
     unit = plant.units.get(name, "1")
-    known = range_of(unit, plant.valid.get(name) if unit == "1" else None)
-    if known is None:
+    ends = range_of(unit, plant.valid.get(name) if unit == "1" else None)
+    if ends is None:
         problem = f"the range of {name} [{unit}] is unknown"
         raise UserError(problem, hint=f"give it: limits={{{name!r}: (lo, hi)}}")
-    return known
+    return ends

@@ -90,8 +90,8 @@ class Bench:
         names = [s.name for s in self.board.sensors]
         default = self.twin.skin if self.twin.skin in names else names[0]
         name = default if sensor is None else sensor
-        known = set(options) <= {"rate", "seconds", "kelvin"}
-        if kind not in SENSOR_FAULTS or name not in names or not known:
+        options_fit = set(options) <= {"rate", "seconds", "kelvin"}
+        if kind not in SENSOR_FAULTS or name not in names or not options_fit:
             raise ValueError(f"no fault {kind!r} of {name!r} with {options}; sensors are {', '.join(names)}")
         fault = _SensorFault(kind, self.time, held=self._shown.get(name, 0))
         self._faults[name] = replace(fault, **options)
@@ -396,8 +396,8 @@ class VirtualDevice:
         if not isinstance(self._clock, ScaledClock):
             return _POLL_S
         with self._lock:
-            left = self._due() / 1000 - self.time
-        return min(_POLL_S, max(0.0, left / self._clock.speed))
+            remaining_s = self._due() / 1000 - self.time
+        return min(_POLL_S, max(0.0, remaining_s / self._clock.speed))
 
     def _pull_or_plug(self, *, pull: bool) -> None:
         """Pull the cable or plug it in, between two reads of the thread that serves."""

@@ -91,8 +91,8 @@ class RigOptions:
     def check(self) -> None:
         """Raise UserError unless either hardware or a plant to simulate is named."""
         if (self.twin is None) == (self.port is None):
-            given = "no rig is given" if self.twin is None else "--port and --twin are both given"
-            raise UserError(given, hint="give --port DEV, or --twin PLANT to simulate")
+            problem = "no rig is given" if self.twin is None else "--port and --twin are both given"
+            raise UserError(problem, hint="give --port DEV, or --twin PLANT to simulate")
         if self.port is not None and (self.start is not None or self.draw):
             raise UserError("--from and --draw are of the twin", hint="leave them away with --port")
 
@@ -439,14 +439,20 @@ def recover(
 
     console = Console(as_json)
     results = []
-    for each in folders:
-        done = recover(each)
+    for run in folders:
+        done = recover(run)
         for line in done.findings:
-            console.say(f"{each.name}: {line}")
+            console.say(f"{run.name}: {line}")
         rows = 0 if done.run.log is None else done.run.log.sizes["time"]
         verdict = done.run.about["verdict"]
         results.append(
-            {"run": each, "changed": done.changed, "said": done.findings, "rows": rows, "verdict": verdict}
+            {
+                "run": run,
+                "changed": done.changed,
+                "said": done.findings,
+                "rows": rows,
+                "verdict": verdict,
+            }
         )
     if out is not None:
         export_run(folders[0], out)
@@ -551,8 +557,8 @@ def targets_of(target: str) -> float | dict[str, float]:
 def _one_goal(target: str | None, profile: Path | None, grasps: bool) -> float | dict[str, float]:
     """Return the targets that were typed, none where a profile has them; one of the two must be given."""
     if (target is None) == (profile is None):
-        given = "no target is given" if target is None else "--target and --profile are both given"
-        raise UserError(given, hint="give --target DEGC, or --profile PROFILE.csv")
+        problem = "no target is given" if target is None else "--target and --profile are both given"
+        raise UserError(problem, hint="give --target DEGC, or --profile PROFILE.csv")
     if target is None and grasps:
         raise UserError("a profile ends without a grasp", hint="leave --object and --material away")
     return {} if target is None else targets_of(target)
@@ -618,11 +624,12 @@ def _ready(n: int, watch: Watch) -> Callable[[int, Trial], bool]:
     """Return what asks for the next object."""
 
     def ready(k: int, trial: Trial) -> bool:
-        at = "unknown temperature" if trial.t_object is None else f"{trial.t_object} degC"
-        what = f"trial {k + 1} of {n}: {trial.material or 'unknown'}, {at}, skin to {trial.target:g} degC"
+        warmth = "unknown temperature" if trial.t_object is None else f"{trial.t_object} degC"
+        block = f"{trial.material or 'unknown'}, {warmth}"
+        question = f"trial {k + 1} of {n}: {block}, skin to {trial.target:g} degC"
         choices = (("", "It is ready"), ("q", "Stop the batch"))
-        said = watch.ask(what, "Enter when it is ready, q to stop", choices)
-        return said.lower() not in ("q", "quit", "n", "no")
+        answer = watch.ask(question, "Enter when it is ready, q to stop", choices)
+        return answer.lower() not in ("q", "quit", "n", "no")
 
     return ready
 
@@ -633,10 +640,10 @@ def _verdict(console: Console, watch: Watch) -> Callable[[int, Trial, Session], 
     def verdict(k: int, trial: Trial, session: Session) -> str:
         if session.contact != session.contact:
             console.warn("the skin felt nothing: no object, or one as warm as the skin")
-        said = watch.ask(
+        answer = watch.ask(
             "was it good", "Enter to keep it, or what was bad", (("", "Keep it"),), "what was bad"
         )
-        return "" if said.lower() in ("y", "yes", "ok") else said
+        return "" if answer.lower() in ("y", "yes", "ok") else answer
 
     return verdict
 
@@ -646,8 +653,8 @@ def _cleared(watch: Watch) -> Callable[[int, Trial, Trip], bool]:
 
     def cleared(k: int, trial: Trial, trip: Trip) -> bool:
         choices = (("c", "It is cleared: do this trial again"), ("", "End the batch"))
-        said = watch.ask(trip.line(), "c when it is cleared, Enter to end the batch", choices)
-        if done := said.lower() in ("c", "cleared"):
+        answer = watch.ask(trip.line(), "c when it is cleared, Enter to end the batch", choices)
+        if done := answer.lower() in ("c", "cleared"):
             watch.cleared()
         return done
 
@@ -665,9 +672,9 @@ def _first_touch(grasps: Grasps) -> tuple[float, float]:
 def _run_folders(folder: Path) -> list[Path]:
     """Return the runs in a folder by name: itself, or those of a batch; UserError where there is none."""
     tried = (folder, *sorted(folder.glob("*")))
-    found = [p for p in tried if (p / "run.json").is_file() or (p / "samples.csv").is_file()]
-    if found:
-        return found[:1] if found[0] == folder else found
+    runs = [p for p in tried if (p / "run.json").is_file() or (p / "samples.csv").is_file()]
+    if runs:
+        return runs[:1] if runs[0] == folder else runs
     if (folder / "batch.json").is_file():
         raise UserError("is a batch without a run", file=folder, hint="give the same batch command again")
     raise UserError("is no run folder", file=folder, hint="give the folder of --out")
@@ -677,9 +684,9 @@ def _fault(text: str) -> tuple[float, str]:
     """Return when and what, of ``60:sensor_open``."""
     when, _, name = text.partition(":")
     try:
-        at = float(when)
+        due_s = float(when)
     except ValueError:
-        at = float("nan")
-    if not 0 <= at < float("inf"):
+        due_s = float("nan")
+    if not 0 <= due_s < float("inf"):
         raise UserError(f"--fault {text!r} has no time", hint="write 60:sensor_open")
-    return at, cli.choice("--fault", name, tuple(FAULTS))
+    return due_s, cli.choice("--fault", name, tuple(FAULTS))

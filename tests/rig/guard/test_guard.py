@@ -485,12 +485,12 @@ def test_without_a_model_the_drive_of_the_rules_is_the_largest_share_of_a_range(
 
 def test_a_skin_is_masked_while_it_touches_and_for_a_minute_after(plant: Plant) -> None:
     guard, model = told(plant)
-    for time, touching in ((1.0, False), (2.0, True), (3.0, False), (62.9, False), (63.0, False)):
-        guard._time, guard._now, guard._fresh = time - 1.0, time - 1.0, (time - 1.0,) * 2
-        check(guard, reading(time, 25.0), touching=touching)
+    for time in [*map(float, range(1, 63)), 62.9, 63.0]:
+        check(guard, reading(time, 25.0), touching=time == 2.0)
         assert guard.ready(72.9) == (time < 2.0)
-        assert guard.ready(73.0) == (not touching)
-    assert [bool(one.args[2]) for one in model.update.call_args_list] == [False, True, True, True, False]
+        assert guard.ready(73.0) == (time != 2.0)
+    masked = {one.args[0]: bool(one.args[2]) for one in model.update.call_args_list}
+    assert [masked[time] for time in (1.0, 2.0, 3.0, 62.9, 63.0)] == [False, True, True, True, False]
 
 
 @pytest.mark.parametrize("kind", ["prbs", "multisine", "staircase"])

@@ -37,11 +37,9 @@ def test_the_template_has_a_key_for_every_setting() -> None:
     kinds = {"sensors": SensorSettings, "model": ModelSettings, "no_model": RuleSettings}
     for name, kind in kinds.items():
         beside = {"pairs"} if name == "sensors" else set()  # a table of its own
-        assert len(content[name]) == len({field.name for field in fields(kind)} - beside)
+        assert len(content[name]) == len({field.name for field in fields(kind) if field.metadata} - beside)
     single = {key for key, value in content.items() if not isinstance(value, dict)}
-    assert len(single) == len(
-        {f.name for f in fields(GuardSettings)} - {"sensors", "model", "rules", "file", "limits", "rooms"}
-    )
+    assert len(single) == len([field for field in fields(GuardSettings) if field.metadata])
 
 
 def test_every_line_of_the_template_may_be_changed() -> None:
