@@ -58,7 +58,9 @@ class BackOff:
     """Retries of what was lost: after ``first`` seconds, then twice as long each time, up to ``longest``."""
 
     def __init__(self, clock: Callable[[], float], *, first: float, longest: float) -> None:
-        self._clock, self._first, self._longest = clock, first, longest
+        self._clock = clock
+        self._first = first
+        self._longest = longest
         self._wait, self.next_try = first, -float("inf")
 
     def due(self) -> bool:

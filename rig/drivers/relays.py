@@ -106,7 +106,9 @@ class RelayRig:
     """
 
     def __init__(self, rig: Rig, relays: Mapping[str, Relay], clock: Callable[[], float]) -> None:
-        self.rig, self.relays, self._clock = rig, dict(relays), clock
+        self.rig = rig
+        self.relays = dict(relays)
+        self._clock = clock
         for relay in self.relays.values():
             for name in filter(None, (relay.heater, relay.cooler)):
                 if name not in rig.units:
@@ -120,7 +122,9 @@ class RelayRig:
             for sign in ((1, -1) if relay.cooler else (1,))
         }
         self._requested = dict.fromkeys(self.units, 0.0)
-        self._pump, self._now, self._read_at = 0, clock(), clock()
+        self._pump = 0
+        self._now = clock()
+        self._read_at = clock()
         self._on_s = dict.fromkeys(self.relays, 0.0)  # since the last reading, the cooler's below zero
 
     @property

@@ -63,10 +63,15 @@ class TCLabRig(NoticeBook):
         clock: Callable[[], float] = time.monotonic,
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
-        self.port, self.highest, self.jump, self.timeout = port, highest, jump, timeout
+        self.port = port
+        self.highest = highest
+        self.jump = jump
+        self.timeout = timeout
         super().__init__(clock)
         self._beat = Metronome(clock, sleep)
-        self._set, self._pump, self._bad = [0.0, 0.0], 0, 0
+        self._set = [0.0, 0.0]
+        self._pump = 0
+        self._bad = 0
         self._last: tuple[float, list[float]] | None = None
         self._lost, self.closed = False, False
         self._known_at, self._heard = 0, 0  # the connection whose board is known; bytes so far
@@ -145,7 +150,9 @@ class TCLabRig(NoticeBook):
         with suppress(PortError):  # whatever the back-off of a lost port says: this is the last chance
             self.port.open()
         self._end_heaters()
-        self.closed, self._last, self._pump = True, None, 0
+        self.closed = True
+        self._last = None
+        self._pump = 0
         self.port.close()
 
     def _greet(self, seconds: float) -> str:

@@ -46,12 +46,16 @@ class DeviceRig(NoticeBook):
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
         super().__init__(clock)
-        self.port, self.timeout, self.tries = port, timeout, tries
+        self.port = port
+        self.timeout = timeout
+        self.tries = tries
         self._beat = Metronome(clock, sleep)
         self._host = protocol.HostEnd()
         self._known: protocol.State | None = None
         self._heard, self._silent = 0, False  # bytes so far; whether the last question was met with none
-        self._greeted_at, self._lost, self.closed = 0, False, False
+        self._greeted_at = 0
+        self._lost = False
+        self.closed = False
         port.open()
         self.identity = self._first_hello(greeting)
 

@@ -90,7 +90,9 @@ class DeviceCore:
     def __post_init__(self) -> None:
         self._parser = protocol.LineParser()
         self._zero = (0,) * len(self.board.drives)
-        self._drive, self._pump, self._grip = self._zero, 0, 0
+        self._drive = self._zero
+        self._pump = 0
+        self._grip = 0
         self._expires_ms, self._flow_ms = 0, 0
         self._bad_counts = [_BadCount() for _ in self.board.sensors]
         self._values: tuple[Value, ...] = ("open",) * len(self.board.sensors)
@@ -210,7 +212,9 @@ class DeviceCore:
             return "interlock"
         if not self._pump:
             self._flow_ms = now_ms  # a pump that starts has its time to turn, whatever the last one did
-        self._drive, self._pump, self.mode = request.drive, request.pump, "armed"
+        self._drive = request.drive
+        self._pump = request.pump
+        self.mode = "armed"
         self._expires_ms = now_ms + request.ttl_ms
         return ""
 
@@ -219,7 +223,9 @@ class DeviceCore:
             self._switch_off("expired")
 
     def _switch_off(self, mode: str) -> None:
-        self._drive, self._pump, self.mode = self._zero, 0, mode
+        self._drive = self._zero
+        self._pump = 0
+        self.mode = mode
 
 
 def _kind(sensor: Sensor, value: Value) -> str:

@@ -664,7 +664,9 @@ class Guard:
         kind, subject = kinds[0]
         repeats, seconds = self.sensors.same_for(name)
         if repeats >= 4 and abs(alarm.measured) < abs(alarm.expected):
-            kind, subject, because = "stuck", name, f"bit for bit the same for {seconds:.0f} s"
+            kind = "stuck"
+            subject = name
+            because = f"bit for bit the same for {seconds:.0f} s"
             kinds = [(kind, subject)]
         return Trip(
             kind=kind,

@@ -60,7 +60,9 @@ class InputSteps:
             self._accumulate(grid - self.time, u)
             self._u.append(self._total / self._passed)
             self._d.append(d.copy())
-            self._total, self._passed, self.time = np.zeros_like(u), 0.0, grid
+            self._total = np.zeros_like(u)
+            self._passed = 0.0
+            self.time = grid
             self.done += 1
         self._accumulate(max(until - self.time, 0.0), u)
         self.time = max(until, self.time)
@@ -317,7 +319,9 @@ class RigFilter:
 
     def _propagate(self, u: Array, d: Array) -> None:
         """Predict over whole native steps: u (N, n_u), d (N, n_d)."""
-        model, n, m = self.model, self.x.size, self.w.size
+        model = self.model
+        n = self.x.size
+        m = self.w.size
         tiny = 1e-4 * np.maximum(1.0, np.abs(self.x))
         x = np.repeat(self.x[None], 1 + n + m, axis=0)
         x[np.arange(1, n + 1), np.arange(n)] += tiny

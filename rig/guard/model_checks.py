@@ -296,7 +296,10 @@ class ModelMonitor:
         self._past.add(self._filter.moment(time, y))
         self._masked: frozenset[str] = frozenset()
         self._since = np.full(len(self.plant.outputs), self.compared_from)
-        self._time, self._compared, self.compared_now, self.share = time, 0, False, 0.0
+        self._time = time
+        self._compared = 0
+        self.compared_now = False
+        self.share = 0.0
         self._compared_at = float("-inf")
 
     def predict(
@@ -337,7 +340,10 @@ class ModelMonitor:
 
     def compare(self) -> list[Residual]:
         """Return every window and output that can be compared now, whether within what is allowed or not."""
-        model, past, s, plant = self._model, self._past, self.settings, self.plant
+        model = self._model
+        past = self._past
+        s = self.settings
+        plant = self.plant
         switches = [at for at, name in enumerate(plant.inputs) if name in plant.model.switches]
         found = []
         for length, floor in zip(s.windows, s.floors):
@@ -424,7 +430,10 @@ class ModelMonitor:
     def _largest_drive(self, j: int) -> float:
         """Return the largest drive of the longest window by its effect over its slope, a fraction of half its
         range; infinite where the slope is 0."""
-        model, now, steps, input_index = self._model, self._filter, self._past.steps, self._model.drive_at[j]
+        model = self._model
+        now = self._filter
+        steps = self._past.steps
+        input_index = self._model.drive_at[j]
         applied = steps.rows(steps.first)[0]
         largest, less = applied[np.abs(applied[:, input_index]).argmax(), input_index], 0.01 * model.half[j]
         u = np.repeat(np.repeat(now.u[None, None], 3, axis=0), len(applied), axis=1)

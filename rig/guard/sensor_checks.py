@@ -199,7 +199,9 @@ class SensorMonitor:
         if value != memory.last:
             memory.quantum = min(memory.quantum, abs(value - memory.last))
             memory.changes += 1
-            memory.same, memory.since, memory.last = 0, time, value
+            memory.same = 0
+            memory.since = time
+            memory.last = value
             return None
         memory.same += 1
         needed = repeats_needed(memory.quantum, self.settings.noise, self.settings.alpha)

@@ -48,7 +48,9 @@ if TYPE_CHECKING:
 SCHEMA, VERSION = "thermogrip.autotune", 1
 #: Candidates that a log of minutes is fitted with; the others take longer, and longer logs.
 MODELS = ("arx", "oe", "subspace", "network")
-HOLD, BITS, OVERSHOOT = 6.0, 15, 0.15
+HOLD = 6.0
+BITS = 15
+OVERSHOOT = 0.15
 EXCITED = 0.25  # of the way to the target, by which a target is moved
 LEAST_S = 120.0  # of a log: the first minute of one sets the state, and is not scored
 

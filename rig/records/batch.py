@@ -225,7 +225,9 @@ def run_batch(
     """
     path = Path(folder)
     _keep_plan(path, plan)
-    sessions, verdict, advice = 0, "done", ""
+    sessions = 0
+    verdict = "done"
+    advice = ""
     with closing(_Source(rig)) as source:
         for k, trial in enumerate(plan):
             if good_run(path, k) is not None:
@@ -237,15 +239,13 @@ def run_batch(
                 if stopped or (ready is not None and not ready(k, trial)):
                     return _batch(path, plan, "stopped", "run the same command again to go on", sessions)
                 run = next_folder(path, k)
-                described = _with_temperature(trial, k, plan, path, first_touch)
-                described = {**(about or {}), "trial": k + 1, **asdict(described)}
+                warmed = _with_temperature(trial, k, plan, path, first_touch)
+                described = {**(about or {}), "trial": k + 1, **asdict(warmed)}
                 with RunFolder(run, described, files=files) as run_folder, through(run_folder) as recorder:
                     session_args: dict[str, Any] = {"stop": stop, "guard": guard, "recorder": recorder}
                     session_args |= {"operator": operator, **options}
-                    thing = _object(described, k)
-                    session = run_session(
-                        source.rig, controller, described.target, grasp=thing, **session_args
-                    )
+                    thing = _object(warmed, k)
+                    session = run_session(source.rig, controller, warmed.target, grasp=thing, **session_args)
                     run_folder.finish(session)
                 sessions += 1
                 verdict, advice = _judged(session, k, trial, run, judge)

@@ -62,7 +62,9 @@ class Port:
         baudrate: int = BAUDRATE,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        self.url, self.baudrate, self.opened = url, baudrate, 0
+        self.url = url
+        self.baudrate = baudrate
+        self.opened = 0
         self._serial: Any = None
         self._back_off = BackOff(clock, first=FIRST_WAIT_S, longest=LONGEST_WAIT_S)
 

@@ -279,7 +279,9 @@ class Loop:
 
     def wait(self, seconds: float) -> None:
         """Let time pass, looking at the rig and renewing its drive; the last look is the next sample."""
-        looks, begin, passed = max(1, ceil(seconds / LOOK_S - 1e-6)), self.reading.time_s, 0
+        looks = max(1, ceil(seconds / LOOK_S - 1e-6))
+        begin = self.reading.time_s
+        passed = 0
         while True:
             self._look(seconds / looks)
             # a look that came late by whole ones counts as those: the sample keeps its time

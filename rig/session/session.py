@@ -238,7 +238,9 @@ def run_session(
     run = Loop(rig, controller, recorder, progress, watch, clock, listener, requests, band)
     thing = Object(*grasp) if isinstance(grasp, tuple) else grasp
     _check_object(thing, run)
-    verdict, touched, trip = "tripped", None, None
+    verdict = "tripped"
+    touched = None
+    trip = None
     with stop_signals():
         try:
             run.start(target if isinstance(target, Mapping) else {output: float(target)})

@@ -48,8 +48,12 @@ class StepTest:
         has_pump: bool = False,
         dt: float = 1.0,
     ) -> None:
-        self.dt, self.seconds, self.done = dt, seconds, False
-        self._ranges, self._targets, self._has_pump = dict(ranges), dict(targets), has_pump
+        self.dt = dt
+        self.seconds = seconds
+        self.done = False
+        self._ranges = dict(ranges)
+        self._targets = dict(targets)
+        self._has_pump = has_pump
         self._turns: list[tuple[str, float]] = []
 
     def reset(self, reading: Readings) -> None:

@@ -142,8 +142,14 @@ class Twin:
         recovery: float = 20.0,
         pace: Callable[[float], None] | None = None,
     ) -> None:
-        self.plant, self.ambient, self.skin, self.recovery = plant, ambient, skin, recovery
-        self.noise, self.slow_noise, self.slow_time, self.quantum = noise, slow_noise, slow_time, quantum
+        self.plant = plant
+        self.ambient = ambient
+        self.skin = skin
+        self.recovery = recovery
+        self.noise = noise
+        self.slow_noise = slow_noise
+        self.slow_time = slow_time
+        self.quantum = quantum
         self._pace = pace
         self.offsets = dict(plant.offsets if offsets is None else offsets)
         stated_limits = dict(limits or {})
@@ -157,7 +163,9 @@ class Twin:
         self._pump = 1
         self.time, self.closed = 0.0, False
         self.history: list[dict[str, float]] = []
-        self._k, self._elapsed, self._slow_at = 0, 0.0, 0.0
+        self._k = 0
+        self._elapsed = 0.0
+        self._slow_at = 0.0
         self._applied = np.zeros(len(plant.inputs))  # integral of the inputs over the step so far
         self._slow = {name: slow_noise * self._noise_rng.standard_normal() for name in plant.outputs}
         self._newest: Reading | None = None
@@ -257,7 +265,9 @@ class Twin:
 
     def close(self) -> None:
         """Switch drive and pump off and refuse to switch them on again."""
-        self._drive, self._pump, self.closed = dict.fromkeys(self._drive, 0.0), 0, True
+        self._drive = dict.fromkeys(self._drive, 0.0)
+        self._pump = 0
+        self.closed = True
 
     def truth(self) -> dict[str, float]:
         """Return the true outputs now: no noise, offset or rounding; the skin with its object."""
