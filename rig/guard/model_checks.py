@@ -40,10 +40,9 @@ the window and the outputs,
 
     cost = rarity * sum e^2,
 
-rarity more than 1 for what hardly happens (nobody rewires a rig that runs).  A sensor that is wrong alone
-leaves the other outputs on the model's path, and one that is late follows that path some seconds behind.  The
-cheapest is the explanation if its cost is a small part of that without any fault, and the next best is named
-as well where the readings cannot distinguish the two.
+rarity more than 1 for what is rare (nobody rewires a rig that runs).  A sensor that is wrong alone leaves the
+other outputs on the model's path.  The cheapest is the explanation if its cost is a small part of that
+without any fault, and the next best is named as well where the readings cannot distinguish the two.
 """
 
 from __future__ import annotations
@@ -86,8 +85,6 @@ class ExplainSettings:
     """Numbers of the search for a cause."""
 
     onsets: tuple[float, ...] = (0.0, 0.25, 0.5, 0.75, 0.85, 0.9, 0.95)  # shares of a window
-    late_s: tuple[float, ...] = (3.0, 5.0, 8.0)  # of a sensor that follows its path late [s]
-    late_rarity: float = 1.2
     wrong_cost: float = 0.15  # of its own errors, for a sensor that may read anything
     explains: float = 0.35  # of the unexplained cost, that an explanation must stay below
     alike: float = 2.5  # times the best cost, below which the next best is as good
@@ -161,27 +158,15 @@ def _wrong_pump(model: RigModel, u: Array) -> list[tuple[Cause, Array]]:
 
 
 def _sensor_costs(model: RigModel, past: History, begin: Estimate, path: Array) -> dict[Cause, float]:
-    """Return the cost where one sensor alone is wrong, or late, given the model's path (N + 1, n_y)."""
+    """Return the cost where one sensor alone is wrong, given the model's path (N + 1, n_y)."""
     own_costs = np.nansum(past.errors(begin, path[None])[0] ** 2, axis=0)
     costs = {}
     for k, name in enumerate(model.plant.outputs):
         others = float(own_costs.sum() - own_costs[k])
         if len(own_costs) > 1:
-            costs[Cause("drift", name, f"{name} alone is wrong")] = others + _EXPLAIN.wrong_cost * float(
-                own_costs[k]
-            )
-        late = [_late(path, k, seconds / model.plant.dt) for seconds in _EXPLAIN.late_s]
-        least = float(np.nansum(past.errors(begin, np.array(late))[:, :, k] ** 2, axis=1).min())
-        costs[Cause("drift", name, f"{name} is late")] = others + _EXPLAIN.late_rarity * least
+            wrong = _EXPLAIN.wrong_cost * float(own_costs[k])
+            costs[Cause("drift", name, f"{name} alone is wrong")] = others + wrong
     return costs
-
-
-def _late(path: Array, k: int, steps: float) -> Array:
-    """Return a path (N + 1, n_y) whose output k comes so many steps late."""
-    shift = min(round(steps), len(path) - 1)
-    out = path.copy()
-    out[:, k] = np.concatenate([np.full(shift, path[0, k]), path[: len(path) - shift, k]])
-    return out
 
 
 @dataclass(frozen=True)

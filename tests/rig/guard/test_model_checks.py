@@ -18,7 +18,6 @@ from thermogrip.rig.guard.model_checks import (
     ModelMonitor,
     Residual,
     _hypotheses,
-    _late,
     _sensor_costs,
     _window_slopes,
     _wrong_drives,
@@ -177,7 +176,6 @@ def monitor(unit: str, full: float, sensors: int, names: tuple[str, str] = ("a",
 def explained(
     real: float | None = None,
     *,
-    late: float = 0.0,
     off: float = 0.0,
     onset: float = 0.0,
     unit: str = "1",
@@ -186,15 +184,14 @@ def explained(
 ) -> str:
     """Rest a minute, ask for 0.6 of full drive, and let ``real`` of it come ``onset`` seconds later."""
     made, rng = monitor(unit, full, sensors), np.random.default_rng(0)
-    x, path = np.zeros(2), [np.zeros(2)]
+    x = np.zeros(2)
     for k in range(1, 145):
         since = (k - 121) * DT
         asked = 0.6 if since >= 0 else 0.0
         x = A @ x + B * (asked if real is None or since < onset else real)
-        path.append(x)
         y = 25.0 + x
         if since >= 0:
-            y[1] = 25.0 + path[k - round(late / DT)][1] + off
+            y[1] = 25.0 + x[1] + off
         y += 0.02 * rng.standard_normal(2)
         follow(made, k * DT, {"q": asked * full}, dict(zip("ab", y[:sensors].tolist())))
     return ", or ".join(cause.text for cause in explain_window(made._model, made._past, 12.0))
@@ -209,9 +206,6 @@ STORIES = [
     ({"real": 0.3}, "the driver gives half of what is asked"),
     ({"real": 0.0, "onset": 6.0}, "the driver gives nothing"),
     ({"real": -1.0, "onset": 6.0}, "the driver is stuck at full cooling"),
-    ({"late": 3.0}, "b is late"),
-    ({"late": 5.0}, "b is late"),
-    ({"late": 8.0}, "b is late"),
     ({"off": 3.0}, "b alone is wrong"),
 ]
 
@@ -250,15 +244,15 @@ def test_before_there_is_a_window_nothing_is_reported() -> None:
 HALF = Cause("driver", "the driver", "the driver gives half of what is asked")
 PUMP = Cause("pump", "the pump", "the pump has stopped")
 REVERSED = Cause("reversed", "the module", "the module is wired the wrong way round", 2.0)
-LATE, WRONG = (Cause("drift", "a", f"a {words}") for words in ("is late", "alone is wrong"))
+OTHER, WRONG = (Cause("drift", name, f"{name} alone is wrong") for name in "ca")
 
 
 @pytest.mark.parametrize(
     ("causes", "kinds"),
-    [([], [("model", "b")]), ([LATE, HALF], [("driver", "the driver"), ("drift", "a")]),
+    [([], [("model", "b")]), ([OTHER, HALF], [("driver", "the driver"), ("drift", "c")]),
      ([WRONG, PUMP], [("pump", "the pump"), ("drift", "a")]),
      ([PUMP, REVERSED], [("reversed", "the module"), ("pump", "the pump")]),
-     ([LATE, WRONG], [("drift", "a")])],
+     ([WRONG, WRONG], [("drift", "a")])],
 )  # fmt: skip
 def test_the_most_dangerous_kind_comes_first(causes: list[Cause], kinds: list[tuple[str, str]]) -> None:
     assert by_danger(causes, "b") == kinds
@@ -281,7 +275,7 @@ def history(readings: list[list[float]], n_y: int = 2) -> History:
     return past
 
 
-def test_the_cost_of_a_sensor_that_is_late_or_wrong_is_of_all_readings() -> None:
+def test_the_cost_of_a_sensor_that_is_wrong_is_of_all_readings() -> None:
     """Path a = k, b = 0 for 20 s; a is read 5 s late and once not at all, b is 2 K off in 3 readings."""
     model = RigModel(integrator(outputs=("a", "b")))
     path = np.column_stack([np.arange(21.0), np.zeros(21)])
@@ -291,23 +285,15 @@ def test_the_cost_of_a_sensor_that_is_late_or_wrong_is_of_all_readings() -> None
     cost = {c.text: v for c, v in _sensor_costs(model, past, past.begin(0.0), path).items()}
     own = 1 + 4 + 9 + 16 + 25.0 * 15  # 1 to 4 s: k^2; later 5^2, without that of 10 s
     assert cost == {
-        "a is late": pytest.approx(12.0),
         "a alone is wrong": pytest.approx(12.0 + 0.15 * own),
-        "b is late": pytest.approx(own + 1.2 * 12.0),
         "b alone is wrong": pytest.approx(own + 0.15 * 12.0),
     }
 
 
-def test_a_late_output_is_its_path_shifted_and_the_first_value_before() -> None:
-    path = np.array([[1.0, 5.0], [2.0, 6.0], [4.0, 7.0], [8.0, 9.0]])
-    assert _late(path, 0, 1.6).tolist() == [[1.0, 5.0], [1.0, 6.0], [1.0, 7.0], [2.0, 9.0]]
-    assert _late(path, 1, 99.0)[:, 1].tolist() == [5.0] * 4
-
-
 @pytest.mark.parametrize(
     ("costs", "left"),
-    [({}, []), ({LATE: 34.9}, [LATE]), ({LATE: 35.0}, []), ({LATE: 10.0, WRONG: 24.9}, [LATE, WRONG]),
-     ({LATE: 10.0, WRONG: 25.0}, [LATE]), ({WRONG: 5.0, LATE: 5.0, PUMP: 5.0}, [WRONG, LATE])],
+    [({}, []), ({OTHER: 34.9}, [OTHER]), ({OTHER: 35.0}, []), ({OTHER: 10.0, WRONG: 24.9}, [OTHER, WRONG]),
+     ({OTHER: 10.0, WRONG: 25.0}, [OTHER]), ({WRONG: 5.0, OTHER: 5.0, PUMP: 5.0}, [WRONG, OTHER])],
 )  # fmt: skip
 def test_an_explanation_is_a_third_of_the_cost_and_the_next_is_named_if_alike(
     monkeypatch: pytest.MonkeyPatch, costs: dict[Cause, float], left: list[Cause]
