@@ -31,10 +31,18 @@ from thermogrip.datasets.atomic_files import read_toml
 from thermogrip.datasets.errors import UserError, known_names
 from thermogrip.rig.interface import UNIT_RANGES, Event, Reading, Rig, check_order
 
-_NOW_S = 1e-6  # a switching that is due within this is due
-_SHORTEST_S = 0.01  # wait between two switchings: what comes later for it is owed
-_SAME = 0.01  # of full: a device rounds what it applies
-_LONGEST_S = 3600.0
+
+@dataclass(frozen=True)
+class Switching:
+    """Numbers of all relays."""
+
+    now_s: float = 1e-6  # a switching that is due within this is due
+    shortest_s: float = 0.01  # wait between two switchings: what comes later for it is owed
+    same: float = 0.01  # of full: a device rounds what it applies
+    longest_s: float = 3600.0  # that a least time may be
+
+
+_SWITCHING = Switching()
 
 
 @dataclass(frozen=True)
@@ -63,7 +71,7 @@ class Switch:
             self.debt += (max(share, 0.0) - 1.0) * seconds
             return
         least = min(self.debt, 0.0) if share < 0 else -inf
-        most = max(0.5 * self._on_s, self._off_s) + _SHORTEST_S
+        most = max(0.5 * self._on_s, self._off_s) + _SWITCHING.shortest_s
         self.debt = min(max(self.debt + share * seconds, least), most)
 
     def due_s(self, share: float) -> float:
@@ -154,7 +162,7 @@ class RelayRig:
             differs = [
                 abs(value - orders[channel]) / self._full(channel) for channel, value in applied.items()
             ]
-            if max(differs) > _SAME:
+            if max(differs) > _SWITCHING.same:
                 share = applied[relay.heater] / self._full(relay.heater)
                 if relay.cooler not in ("", relay.heater):
                     share -= applied[relay.cooler] / self._full(relay.cooler)
@@ -184,13 +192,13 @@ class RelayRig:
     def wait(self, seconds: float) -> None:
         """Let time pass, and switch meanwhile what is due."""
         remaining_s = seconds
-        while remaining_s > _NOW_S:
+        while remaining_s > _SWITCHING.now_s:
             due = min((self._due_s(*key) for key in self._switches), default=inf)
-            step = min(remaining_s, max(due, _SHORTEST_S))
+            step = min(remaining_s, max(due, _SWITCHING.shortest_s))
             self.rig.wait(step)
             remaining_s -= step
             self._pass_time()
-            if remaining_s > _NOW_S and self._switch():
+            if remaining_s > _SWITCHING.now_s and self._switch():
                 self.rig.apply(self._orders(), self._pump)
 
     def grasp(self, material: str, t_object: float) -> None:
@@ -236,7 +244,7 @@ class RelayRig:
 
     def _switch(self) -> bool:
         """Switch what is due; say whether anything was."""
-        due = [key for key in self._switches if self._due_s(*key) <= _NOW_S]
+        due = [key for key in self._switches if self._due_s(*key) <= _SWITCHING.now_s]
         for key in due:
             self._switches[key].go_over()
         return bool(due)
@@ -277,7 +285,8 @@ def read_relays(path: str | Path) -> dict[str, Relay]:
             number = isinstance(value, int | float) and not isinstance(value, bool)
             fits, allowed = isinstance(value, str), "the name of an input"
             if keys[key] == "float":
-                fits, allowed = number and 0 <= value <= _LONGEST_S, f"a time of 0 to {_LONGEST_S:g} s"
+                fits = number and 0 <= value <= _SWITCHING.longest_s
+                allowed = f"a time of 0 to {_SWITCHING.longest_s:g} s"
             if not fits:
                 raise UserError(f"{name}.{key}: {value!r} is not {allowed}", file=path, hint="correct it")
         times = {key: float(value) for key, value in table.items() if keys[key] == "float"}

@@ -26,6 +26,7 @@ import re
 import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
+from dataclasses import dataclass
 from statistics import median
 
 from thermogrip.datasets.errors import UserError
@@ -35,13 +36,25 @@ from thermogrip.rig.serial.port import Port, PortError
 from thermogrip.rig.serial.protocol import REFUSALS
 
 HEATERS, SENSORS = ("q1", "q2"), ("t1", "t2")
-LOWEST, CEILING = -49.9, 130.0  # degC: outside, the converter is at its end and the sensor open or shorted
-BAD_SCANS = 4
-TIMEOUT = 0.5  # s, of a line
-_FRESH_S = 10.0
 _NUMBER = re.compile(rb"(-?(?:0|[1-9][0-9]{0,3})\.[0-9]{3})\r?\n")
 _VERSION = re.compile(rb"TCLab Firmware [ -~]+\r?\n")
 _STOP = re.compile(rb"Stop\r?\n")
+
+
+@dataclass(frozen=True)
+class BoardSettings:
+    """What a scan of the board may be."""
+
+    # degC: outside, the converter (-50 degC, 1023 counts of 0.32 K) is at its end, the sensor open or short
+    lowest: float = -49.9
+    ceiling: float = 130.0
+    bad_scans: int = 4  # in a row that trip, as on our own firmware
+    timeout_s: float = 0.5  # of a line
+    fresh_s: float = 10.0  # age of a scan from which a jump is counted: a heater does 0.35 K/s
+    same: float = 0.002  # percent: the board answers with three digits
+
+
+BOARD = BoardSettings()
 
 
 class TCLabRig(NoticeBook):
@@ -58,7 +71,7 @@ class TCLabRig(NoticeBook):
         *,
         highest: float = 80.0,
         jump: float = 3.0,
-        timeout: float = TIMEOUT,
+        timeout: float = BOARD.timeout_s,
         greeting: float = 6.0,
         clock: Callable[[], float] = time.monotonic,
         sleep: Callable[[float], None] = time.sleep,
@@ -173,10 +186,10 @@ class TCLabRig(NoticeBook):
         for channel, value in enumerate(power):
             text = f"Q{channel + 1} {value:.3f}".encode()
             took = float(self._ask(text, 1, _NUMBER)[0])
-            if abs(took - value) > 0.002:
+            if abs(took - value) > BOARD.same:
                 self._wait_for_silence()
                 took = float(self._ask(text, 1, _NUMBER)[0])  # an answer that slipped, or was spoilt
-            if abs(took - value) > 0.002:
+            if abs(took - value) > BOARD.same:
                 problem = f"took {took:g} % where q{channel + 1} = {value:g} %"
                 raise PortError("lost", problem, file=self.port.url, hint="check cable and power")
             self._set[channel] = round(value, 3)
@@ -191,19 +204,19 @@ class TCLabRig(NoticeBook):
             numbers = [median(column) for column in zip(*scans)]
             self._note("damaged", "a scan that could not be right was asked again")
         temperatures, heaters = numbers[:2], numbers[2:]
-        if any(abs(now - then) > 0.002 for now, then in zip(heaters, self._set)):
+        if any(abs(now - then) > BOARD.same for now, then in zip(heaters, self._set)):
             was = ", ".join(f"{value:g} %" for value in self._set)
             self._note("reset", f"the heaters are not what was set ({was}): the board was reset")
             self._set = list(heaters)
         self._last = (self._clock(), temperatures)
-        lost = [not LOWEST < value < CEILING for value in temperatures]
+        lost = [not BOARD.lowest < value < BOARD.ceiling for value in temperatures]
         return [float("nan") if bad else value for bad, value in zip(lost, temperatures)], heaters
 
     def _suspect(self, numbers: list[float]) -> bool:
-        if any(abs(now - then) > 0.002 for now, then in zip(numbers[2:], self._set)):
+        if any(abs(now - then) > BOARD.same for now, then in zip(numbers[2:], self._set)):
             return True
-        if self._last is None or self._clock() - self._last[0] > _FRESH_S:
-            return any(not LOWEST < value < self.highest for value in numbers[:2])
+        if self._last is None or self._clock() - self._last[0] > BOARD.fresh_s:
+            return any(not BOARD.lowest < value < self.highest for value in numbers[:2])
         return any(abs(now - then) > self.jump for now, then in zip(numbers[:2], self._last[1]))
 
     def _scan(self) -> list[float]:
@@ -217,7 +230,7 @@ class TCLabRig(NoticeBook):
             if not value <= self.highest
         ]
         self._bad = self._bad + 1 if bad else 0
-        if self._bad < BAD_SCANS or self.faults:
+        if self._bad < BOARD.bad_scans or self.faults:
             return
         self.faults = tuple(bad)
         shown = ", ".join(f"{n} {v:.1f} degC" for n, v in zip(SENSORS, temperatures))
@@ -239,7 +252,7 @@ class TCLabRig(NoticeBook):
         version = self._once(b"VER", 1, _VERSION)
         if not version or not (scan := self._once(b"SCAN", 4, _NUMBER)):
             raise PortError("lost", "does not answer", file=self.port.url, hint="check cable and power")
-        heaters_as_set = all(abs(float(now) - then) <= 0.002 for now, then in zip(scan[2:], self._set))
+        heaters_as_set = all(abs(float(now) - then) <= BOARD.same for now, then in zip(scan[2:], self._set))
         same = any(self._set) and heaters_as_set
         if not same or version[0].decode("ascii").strip() != self.version:
             problem = "may be another board now, or was reset: no serial number and no heater tells"
@@ -278,7 +291,8 @@ class TCLabRig(NoticeBook):
 
     def _wait_for_silence(self) -> None:
         """Let late answers come, and throw them away; of what never falls silent, those of four lines."""
-        silence = min(self.timeout, TIMEOUT)  # who waits longer for answers need not wait longer for none
+        # who waits longer for answers need not wait longer for none
+        silence = min(self.timeout, BOARD.timeout_s)
         end = time.monotonic() + 4 * silence
         while time.monotonic() < end and self.port.read(silence):
             pass

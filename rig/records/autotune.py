@@ -11,7 +11,7 @@ Each session has a run folder of its own in the folder (``01-step``, ``02-loop``
 far stands beside them.  Whatever ended it, the same call goes on from the sessions that are there.
 
 **How long a loop's log is.**  SIMC's integral time is 8 delays of what it controls (or the lag, where that is
-shorter), and the loop settles within a few of them.  The step is held for ``HOLD`` of these; a bit of the
+shorter), and the loop settles within a few of them.  The step is held for six of these; a bit of the
 PRBS lasts half of one, the time in which the loop answers a change of its target.
 """
 
@@ -48,11 +48,20 @@ if TYPE_CHECKING:
 SCHEMA, VERSION = "thermogrip.autotune", 1
 #: Candidates that a log of minutes is fitted with; the others take longer, and longer logs.
 MODELS = ("arx", "oe", "subspace", "network")
-HOLD = 6.0
-BITS = 15
-OVERSHOOT = 0.15
-EXCITED = 0.25  # of the way to the target, by which a target is moved
-LEAST_S = 120.0  # of a log: the first minute of one sets the state, and is not scored
+
+
+@dataclass(frozen=True)
+class LoopLog:
+    """How the log under the first loop is excited."""
+
+    hold: float = 6.0  # integral times for which the step is held: the loop has settled by then
+    bits: int = 15  # the period of a register of four bits, the shortest in which every pair of bits occurs
+    overshoot: float = 0.15  # of the way from where it began, kept off the limit: by SIMC a tenth
+    excited: float = 0.25  # of the way to the target, by which a target is moved
+    least_s: float = 120.0  # the first minute of a log sets the state, and is not scored
+
+
+LOG = LoopLog()
 
 
 class Tripped(Exception):
@@ -142,7 +151,7 @@ class Autotune:
         for path in (*self._folders("step"), *self._folders("loop")):
             run = read_run(path)
             whole = run.about.get("verdict") == "played" or path.name.endswith("loop")
-            if run.log is not None and whole and np.ptp(run.log["time"].values) >= LEAST_S:
+            if run.log is not None and whole and np.ptp(run.log["time"].values) >= LOG.least_s:
                 logs.append(run.log)
         return logs
 
@@ -192,7 +201,7 @@ class Autotune:
     def _highest(self, guard: Guard, name: str, begin: float, goal: float) -> float:
         """Return the target of an output, or as far as one may go without a limit in reach."""
         low, high = guard.limits_of(name)
-        reserve = LIMIT_MARGIN + OVERSHOOT * abs(goal - begin)
+        reserve = LIMIT_MARGIN + LOG.overshoot * abs(goal - begin)
         return float(np.clip(goal, low + reserve, high - reserve))
 
     def _next(self, kind: str) -> Path:
@@ -238,8 +247,8 @@ class Autotune:
         """Record a loop under the PI; False where there is no time for one."""
         loop, targets = self._pi(), self._targets(self.identified.plant)
         slowest = max(each.Ti for each in loop.loops)
-        seconds = min(self.left_s, (HOLD + 0.5 * BITS) * slowest)
-        if seconds < LEAST_S:
+        seconds = min(self.left_s, (LOG.hold + 0.5 * LOG.bits) * slowest)
+        if seconds < LOG.least_s:
             return False
         if "first" not in self.known:
             loops = [f"{p.drive} on {p.output}, Kc {p.Kc:.3g}, Ti {p.Ti:.3g} s" for p in loop.loops]
@@ -257,25 +266,25 @@ class Autotune:
         if session.trip is not None:
             raise Tripped(session.advice)
         if "pi" not in self.known:
-            self._note(pi=step_of(session.log, targets, HOLD * slowest))
+            self._note(pi=step_of(session.log, targets, LOG.hold * slowest))
         return True
 
     def _excited(self, targets: Mapping[str, float], slowest: float, seconds: float, guard: Guard) -> Profile:
         """Return the targets of a loop's log: held, then moved by a PRBS, each output by its own."""
         from thermogrip.sysid.experiment.schedules import prbs
 
-        bits = int((seconds - HOLD * slowest) / (0.5 * slowest))
+        bits = int((seconds - LOG.hold * slowest) / (0.5 * slowest))
         turn = len(self._folders("loop"))
-        time = HOLD * slowest + 0.5 * slowest * np.repeat(np.arange(max(bits, 0) + 1), 2)[1:-1]
+        time = LOG.hold * slowest + 0.5 * slowest * np.repeat(np.arange(max(bits, 0) + 1), 2)[1:-1]
         moved = {}
         for k, (name, goal) in enumerate(targets.items()):
             begin = self.known["start"].get(name, goal)
-            highest = self._highest(guard, name, begin, goal + EXCITED * (goal - begin))
+            highest = self._highest(guard, name, begin, goal + LOG.excited * (goal - begin))
             base = goal if abs(goal - begin) < abs(highest - begin) else highest
             shape = prbs(max(bits, 1), hold=1, seed=turn + k)
-            levels = highest + EXCITED * (goal - begin) * (shape - 1)
+            levels = highest + LOG.excited * (goal - begin) * (shape - 1)
             moved[name] = np.concatenate([[base, base], np.repeat(levels[: max(bits, 0)], 2)])
-        begins = np.array([0.0, HOLD * slowest])
+        begins = np.array([0.0, LOG.hold * slowest])
         return Profile(np.concatenate([begins, time]) if bits > 0 else np.array([0.0, seconds]), moved)
 
     def _tune(self) -> None:

@@ -14,7 +14,7 @@ import pytest
 
 from tests.live.conftest import Running, paced_twin
 from thermogrip.datasets.errors import UserError
-from thermogrip.live.server import MOST_ROWS, MOST_TEXT, Requests, State, page_text
+from thermogrip.live.server import PAGE, Requests, State, page_text
 from thermogrip.live.watch import Show, Watch
 from thermogrip.report.console import Console
 
@@ -90,7 +90,7 @@ def test_what_is_no_request_is_refused_and_is_no_traceback(
     ]:  # fmt: skip
         assert ask(watch, "POST", "/bad", body)[0] == status, body[:20]
     marks = _soon(watch.operator.take_bad)
-    assert marks == ["9" * MOST_TEXT]
+    assert marks == ["9" * PAGE.most_text]
     assert capfd.readouterr().err.count("\n") <= 2  # the address, and a line of the view
 
 
@@ -161,13 +161,13 @@ def test_a_viewer_gets_all_once_and_then_what_is_new() -> None:
 
 def test_old_rows_are_thinned_and_new_ones_are_whole() -> None:
     state = State()
-    for k in range(3 * MOST_ROWS):
+    for k in range(3 * PAGE.most_rows):
         state.take(message([[float(k), 0.0]]))
     times = [row[0] for row in state.whole()["rows"]]
-    assert len(times) <= MOST_ROWS
+    assert len(times) <= PAGE.most_rows
     assert times[0] == 0.0
     assert times == sorted(times)
-    assert times[-1000:] == [float(k) for k in range(3 * MOST_ROWS - 1000, 3 * MOST_ROWS)]
+    assert times[-1000:] == [float(k) for k in range(3 * PAGE.most_rows - 1000, 3 * PAGE.most_rows)]
 
 
 def test_a_posterior_begins_anew_with_each_contact() -> None:

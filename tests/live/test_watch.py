@@ -24,16 +24,16 @@ from thermogrip.report.console import Console
 
 
 def test_a_page_that_hangs_holds_up_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "_GOODBYE_S", 0.5)
+    monkeypatch.setattr(module, "WATCH", replace(module.WATCH, goodbye_s=0.5))
     with Watch("run", Console(), Show(live=0)) as watch:
         page = watch._page
         assert page is not None
         os.kill(page.pid, signal.SIGSTOP)
         wide = replace(NOW, values={f"t_{k}": float(k) for k in range(200)})
         # who waited for the page would wait here: more than the queue and the pipe to it hold
-        for _ in range(3 * module._KEEP):
+        for _ in range(3 * module.WATCH.keep):
             watch.listen(wide)
-        assert len(watch._queue) <= module._KEEP  # the oldest are dropped
+        assert len(watch._queue) <= module.WATCH.keep  # the oldest are dropped
     assert page.poll() is not None
 
 

@@ -27,6 +27,7 @@ import time
 from collections import deque
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import suppress
+from dataclasses import dataclass
 from importlib.resources import files
 from typing import TYPE_CHECKING, Any
 
@@ -39,13 +40,22 @@ if TYPE_CHECKING:
     from uvicorn import Server
 
 HOST = "127.0.0.1"
-EVERY_S = 0.1  # between two events to a viewer
-ALIVE_S = 1.0  # at most
-LINGER_S = 600.0  # that a page whose session was killed may still be opened
-MOST_ROWS = 4000  # that are kept; older ones are thinned
-MOST_BYTES = 4096  # of a request
-MOST_TEXT = 200  # characters, of what a viewer says
-MARK_EVERY_S = 1.0  # at most: nobody types another reason in less
+
+
+@dataclass(frozen=True)
+class PageSettings:
+    """How much a page holds, how often it is sent, and what a viewer may send."""
+
+    every_s: float = 0.1  # between two events to a viewer
+    alive_s: float = 1.0  # at most
+    linger_s: float = 600.0  # that a page whose session was killed may still be opened
+    most_rows: int = 4000  # that are kept; older ones are thinned
+    most_bytes: int = 4096  # of a request
+    most_text: int = 200  # characters, of what a viewer says
+    mark_every_s: float = 1.0  # at most: nobody types another reason in less
+
+
+PAGE = PageSettings()
 
 
 class State:
@@ -54,7 +64,7 @@ class State:
     def __init__(self) -> None:
         self.columns: list[str] = []
         self.history: list[list[Any]] = []
-        self.recent: deque[list[Any]] = deque(maxlen=MOST_ROWS)
+        self.recent: deque[list[Any]] = deque(maxlen=PAGE.most_rows)
         self.posterior: list[list[Any]] = []
         self.now: dict[str, Any] = {}
         self.count = self.messages = 0
@@ -75,8 +85,8 @@ class State:
         self.history += rows
         self.recent.extend(rows)
         self.count += len(rows)
-        if len(self.history) > MOST_ROWS:
-            half = MOST_ROWS // 2
+        if len(self.history) > PAGE.most_rows:
+            half = PAGE.most_rows // 2
             self.history[:half] = self.history[:half:2]
         self.now, self.over = message, bool(message["ended"])
         self.messages += 1
@@ -120,7 +130,7 @@ class Requests:
         if state.lost or state.over:
             return 409, "the session is not there any more"
         if do == "bad":
-            if self._clock() - self._marked < MARK_EVERY_S:
+            if self._clock() - self._marked < PAGE.mark_every_s:
                 return 429, "it was marked a moment ago"
             self._marked, once = self._clock(), ""  # each of them counts
         elif do == "answer":
@@ -220,7 +230,7 @@ def application(state: State, ask: Callable[[dict[str, Any]], None], *, port: in
         body = b""
         async for chunk in request.stream():
             body += chunk
-            if len(body) > MOST_BYTES:
+            if len(body) > PAGE.most_bytes:
                 return JSONResponse({"refused": "too long"}, 413)
         try:
             words = _words(body)
@@ -239,7 +249,7 @@ def _words(body: bytes) -> dict[str, str]:
     content = parse_json(body.decode())
     if not isinstance(content, dict):
         raise ValueError("no object")
-    return {key: str(content[key])[:MOST_TEXT] for key in ("text", "question") if key in content}
+    return {key: str(content[key])[: PAGE.most_text] for key in ("text", "question") if key in content}
 
 
 async def _events(state: State) -> AsyncIterator[str]:
@@ -252,12 +262,12 @@ async def _events(state: State) -> AsyncIterator[str]:
             yield f"data: {json.dumps(content)}\n\n"
         if state.over:
             return
-        await asyncio.sleep(EVERY_S)
+        await asyncio.sleep(PAGE.every_s)
         content = {}
         if messages != state.messages:
             content = state.since(count)
             count, messages = state.count, state.messages
-        elif time.monotonic() - last_sent_s > ALIVE_S:
+        elif time.monotonic() - last_sent_s > PAGE.alive_s:
             content = {"rows": [], "posterior": state.posterior, **state._present()}
 
 
@@ -285,7 +295,7 @@ async def _serve(settings: dict[str, Any], lines: Iterator[bytes], listener: soc
         state.lose()
         if state.over or server is None:
             ended.set()
-        loop.call_later(LINGER_S, ended.set)
+        loop.call_later(PAGE.linger_s, ended.set)
 
     def hear() -> None:
         for line in lines:
@@ -295,7 +305,7 @@ async def _serve(settings: dict[str, Any], lines: Iterator[bytes], listener: soc
     threading.Thread(target=hear, daemon=True).start()
     running = None if server is None else asyncio.create_task(server.serve(sockets=[listener]))  # type: ignore[list-item]
     await ended.wait()
-    await asyncio.sleep(2 * EVERY_S)  # every viewer is sent the end
+    await asyncio.sleep(2 * PAGE.every_s)  # every viewer is sent the end
     if server is not None and running is not None:
         server.should_exit = True
         await running

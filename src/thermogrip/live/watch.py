@@ -30,7 +30,7 @@ import typer
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.media import printable
-from thermogrip.live.server import LINGER_S
+from thermogrip.live.server import PAGE
 from thermogrip.live.terminal import line, panel
 from thermogrip.live.trip_command import TripCommand
 from thermogrip.report.console import Console, plain
@@ -38,13 +38,21 @@ from thermogrip.rig.session.loop import PHASES
 from thermogrip.rig.session.signals import check_stopped
 from thermogrip.rig.session.snapshot import Operator, Snapshot
 
-EVERY_S = 0.1  # between two looks at the queue
-REFRESH_S = 0.5  # of the terminal
-_KEEP = 4096  # snapshots that wait
-_SWITCH_S = 5e-4  # after which a thread that shows passes Python's lock on (5 ms elsewhere)
-_PATIENCE_S = 10.0  # for the page's process to start
-_GOODBYE_S = 4.0  # for it to end
-_RELOAD_S = 2.0  # a page that is loaded anew is back within
+
+@dataclass(frozen=True)
+class WatchSettings:
+    """How often a session is shown, and how long anything is waited for."""
+
+    every_s: float = 0.1  # between two looks at the queue
+    refresh_s: float = 0.5  # of the terminal
+    keep: int = 4096  # snapshots that wait
+    switch_s: float = 5e-4  # after which a thread that shows passes Python's lock on (5 ms elsewhere)
+    patience_s: float = 10.0  # for the page's process to start
+    goodbye_s: float = 4.0  # for it to end
+    reload_s: float = 2.0  # a page that is loaded anew is back within
+
+
+WATCH = WatchSettings()
 
 
 @dataclass(frozen=True)
@@ -90,8 +98,8 @@ class Watch:
         self.operator = Operator()
         self._show.check()
         self._command = None if self._show.on_trip is None else TripCommand(self._show.on_trip, console.warn)
-        self._queue: deque[Snapshot] = deque(maxlen=_KEEP)
-        self._posterior: deque[list[Any]] = deque(maxlen=_KEEP)
+        self._queue: deque[Snapshot] = deque(maxlen=WATCH.keep)
+        self._posterior: deque[list[Any]] = deque(maxlen=WATCH.keep)
         self._now: Snapshot | None = None
         self._heard = time.monotonic()
         self._fraction, self._what = 0.0, ""
@@ -183,7 +191,7 @@ class Watch:
         if self._show.live is not None or self._show.foxglove is not None:
             self._open_page()
         self._switch = sys.getswitchinterval()
-        sys.setswitchinterval(_SWITCH_S)
+        sys.setswitchinterval(WATCH.switch_s)
         self._view.resume()
         self._thread = threading.Thread(target=self._work, name="watch", daemon=True)
         self._thread.start()
@@ -199,7 +207,7 @@ class Watch:
             with suppress(KeyboardInterrupt):
                 self._stay()
         self._over.set()
-        self._thread.join(_GOODBYE_S)
+        self._thread.join(WATCH.goodbye_s)
         if self._thread.is_alive() and self._page is not None:  # it writes to a process that hangs
             self._page.kill()
             self._thread.join()
@@ -214,25 +222,25 @@ class Watch:
         self._view.pause()
         sys.stderr.write("the session has ended; close the page, or press Ctrl-C here\n")
         sys.stderr.flush()
-        end = time.monotonic() + LINGER_S
+        end = time.monotonic() + PAGE.linger_s
         while self._reached and time.monotonic() < end:
             if self._viewers:
                 end = float("inf")
             elif self._viewers == 0:
-                end = min(end, time.monotonic() + _RELOAD_S)
-            time.sleep(EVERY_S)
+                end = min(end, time.monotonic() + WATCH.reload_s)
+            time.sleep(WATCH.every_s)
 
     def _work(self) -> None:
         """Show what is new until the end, and that too."""
         shown = 0.0
         while True:
-            over = self._over.wait(EVERY_S)
+            over = self._over.wait(WATCH.every_s)
             taken = _drain(self._queue)
             if taken:
                 self._now, self._heard = taken[-1], time.monotonic()
             for snapshot in taken:
                 self._view.add(snapshot)
-            if over or time.monotonic() - shown > REFRESH_S:
+            if over or time.monotonic() - shown > WATCH.refresh_s:
                 shown = time.monotonic()
                 self._view.show(last=over)
             self._send(taken, over)
@@ -286,7 +294,7 @@ class Watch:
         opening: dict[str, Any] = {}
         for text in page.stdout:
             opening |= json.loads(text)
-            if opening.keys() & {"ready", "error"} or time.monotonic() - begin > _PATIENCE_S:
+            if opening.keys() & {"ready", "error"} or time.monotonic() - begin > WATCH.patience_s:
                 break
         self._reader = threading.Thread(target=self._read_page, args=(page,), daemon=True)
         self._reader.start()
@@ -328,7 +336,7 @@ class Watch:
         with suppress(OSError):
             page.stdin.close()
         try:
-            page.wait(_GOODBYE_S)
+            page.wait(WATCH.goodbye_s)
         except subprocess.TimeoutExpired:
             page.kill()
             page.wait()
