@@ -16,8 +16,8 @@ The residual is tested twice (:mod:`thermogrip.sysid.validation.residual_tests`)
 correlate with an input? Whether that matters is another question: the verdict goes by how large the error is
 beside the stated one (:mod:`thermogrip.sysid.validation.verdict`).
 
-After a gap of more than 10 s the input is unknown: the run starts afresh from its own warm-up, and the next
-60 s are not scored.
+After a gap of more than 10 s the input is unknown: the run starts afresh from its own warm-up, the next
+60 s are not scored, and the figure with the last row held through the gap is given with it.
 
 **Warm-up.**  A network has few states, and begins at rest where its sensors agree: 5 s.  A black box of one
 or two logs was scored with what stands for rest in a part of a log, fifty rows, and its slowest state needs a
@@ -35,7 +35,7 @@ import numpy as np
 
 from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.resample import gaps
+from thermogrip.datasets.resample import block_means, gaps
 from thermogrip.datasets.schema import Log, column, columns, log_name
 from thermogrip.sysid.plant.fit_record import SEVERAL, fit_logs, said_of_fit
 from thermogrip.sysid.plant.log_grid import cut_stretches, match_logs
@@ -79,6 +79,7 @@ class FreeRun:
     scores: dict[str, Score]  # of the free run
     one_step: dict[str, Score]  # of the last reading plus the model's move
     naive: dict[str, dict[str, Score]]  # of the baselines ``"mean"`` and ``"no_input"``
+    held: dict[str, Score]  # with the last row held through the gaps; empty without a gap
     whiteness: dict[str, Correlation]  # autocorrelation of the residual
     # of the residual with the inputs before it, of those that move in this log; what a figure shows
     input_correlation: dict[str, dict[str, Correlation]]
@@ -108,6 +109,7 @@ def free_run(
     warmup: float | None = None,
     score_from: float | None = None,
     *,
+    average: float | None = None,
     tests: bool = True,
 ) -> FreeRun:
     """Simulate the log and score it.
@@ -120,6 +122,8 @@ def free_run(
         Seconds at the start whose measured outputs may set the state; :func:`usual_warmup` where absent.
     score_from : float, optional
         Samples before this many seconds are not scored; where absent, those of the warm-up.
+    average : float, optional
+        Compare means over this many seconds, as a coarse sensor needs it; the tests see the samples.
     tests : bool, optional
         Test whether the residual correlates with an input, which takes some dozens of free runs.
 
@@ -156,16 +160,21 @@ def free_run(
             hint=f"score from {warmup:g} s on",
         )
     simulated = plant.simulate(log, warmup=warmup, score_from=score_from)
-    pairs = _beside(plant, log, simulated)
+    pairs = _beside(plant, log, simulated, average)
     errors = {name: y - v for name, (y, v) in pairs.outputs.items()}
-    moved = {name: column(log, name) for name in plant.inputs if np.ptp(column(log, name)) > 0}
+    moved = {name: values for name, values in pairs.inputs.items() if np.ptp(values) > 0}
     scores, naive = _scores(plant, log, pairs), _baselines(plant, log, pairs)
-    tested = _tested(plant, log, simulated, scores, naive, warmup) if tests else _NOT_TESTED
+    held = {}
+    if gaps(log):
+        through = plant.simulate(log, warmup=warmup, score_from=score_from, gaps="hold")
+        held = _scores(plant, log, _beside(plant, log, through, average))
+    tested = _tested(plant, log, simulated, warmup) if tests else _NOT_TESTED
     run = FreeRun(
         log=simulated,
         scores=scores,
         one_step=_one_step(plant, log, pairs),
         naive=naive,
+        held=held,
         whiteness={name: autocorrelation(error) for name, error in errors.items()},
         input_correlation={
             name: {u: cross_correlation(error, w) for u, w in moved.items()} for name, error in errors.items()
@@ -230,8 +239,6 @@ def _tested(
     plant: Plant,
     log: Log,
     simulated: Log,
-    scores: Mapping[str, Score],
-    naive: Mapping[str, Mapping[str, Score]],
     warmup: float,
 ) -> _Tested:
     """Test the residual of a run, and judge the plant by its readings."""
@@ -242,7 +249,8 @@ def _tested(
     error = np.where(scored[:, None], columns(log, plant.outputs) - run, np.nan)
     by_inputs = effect_of_run(plant, error, log)
     band = free_run_band(plant, log, simulated, warmup=warmup)
-    time = log["time"].values
+    time, readings = log["time"].values, _beside(plant, log, simulated)
+    scores, naive = _scores(plant, log, readings), _baselines(plant, log, readings)
     rows = replace(fit_logs([log])[0], start_s=float(time[np.argmax(scored)]))
     verdict = judge(
         band,
@@ -292,21 +300,31 @@ def no_input_baseline(time: Array, measured: Array) -> Array:
 
 
 class _Pairs(NamedTuple):
-    """Readings beside the run (n,), NaN where not scored."""
+    """Readings beside the run at the same times (n,), NaN where not scored, and the inputs there."""
 
     time: Array
     outputs: dict[str, tuple[Array, Array]]  # measured, simulated
+    inputs: dict[str, Array]
 
 
-def _beside(plant: Plant, log: Log, simulated: Log) -> _Pairs:
-    """Return what was measured beside the free run."""
+def _beside(plant: Plant, log: Log, simulated: Log, average: float | None = None) -> _Pairs:
+    """Return what was measured beside the free run, in means over ``average`` [s] if given."""
     time, scored = log["time"].values, column(simulated, "scored") > 0
     if not scored.any():
         problem = f"nothing of its {np.ptp(time):g} s is left to score"
         hint = "give a longer log, or score from an earlier time"
         raise UserError(problem, file=log_name(log), hint=hint)
     read, run = (np.where(scored[:, None], columns(each, plant.outputs), np.nan) for each in (log, simulated))
-    return _Pairs(time, dict(zip(plant.outputs, zip(read.T, run.T))))
+    inputs = columns(log, plant.inputs)
+    if average is not None:
+        values, n_y = np.hstack([read, run, inputs]), len(plant.outputs)
+        is_held = np.arange(values.shape[1]) >= 2 * n_y
+        after = [row + 1 for row, _, _ in gaps(log)]
+        blocks = block_means(time, values, is_held, seconds=average, after=after, log=log_name(log))
+        time, values = (np.concatenate(segments) for segments in zip(*blocks))
+        read, run, inputs = np.split(values, [n_y, 2 * n_y], axis=1)
+    pairs = dict(zip(plant.outputs, zip(read.T, run.T)))
+    return _Pairs(time, pairs, dict(zip(plant.inputs, inputs.T)))
 
 
 def _unit(log: Log, name: str) -> str:
@@ -346,8 +364,10 @@ def _notes(run: FreeRun, by_inputs: InputEffect | None) -> list[str]:
             f"the run starts at {first:g} s from its warm-up alone: what was warm and unseen is guessed; "
             f"give the whole log and score from {first:g} s to start where the log starts"
         )
+    held = ", ".join(f"{name} {score.rmse:.3g} {score.unit}" for name, score in run.held.items())
     notes += [
-        f"no row from {before:g} to {after:g} s: the run starts afresh after it, the next 60 s are not scored"
+        f"no row from {before:g} to {after:g} s: the run starts afresh after it, the next 60 s are not "
+        f"scored (last row held instead: RMSE {held})"
         for _, before, after in gaps(log)
     ]
     if verdict is None or verdict.standing != "no test":

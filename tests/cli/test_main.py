@@ -88,7 +88,8 @@ SCRIPTED = {
     "excite": "--kind --minutes --plant --out",
     "tune": "--out --spec --report",
     "export": "--out --check",
-    "run": "--target --port --twin --draw --from --hold --object --material --grasp-time --settle-timeout --out",
+    "run": "--target --port --twin --draw --from --hold --object --material --grasp-time --settle-timeout "
+    "--out",
     "effusivity": "--calibrate --out",
     "train": "--classifier --split --out",
     "classify": "--materials --out",

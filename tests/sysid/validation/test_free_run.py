@@ -12,6 +12,7 @@ from scipy.stats import binom
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.log_files import read_log, write_log
+from thermogrip.datasets.resample import average
 from thermogrip.datasets.schema import make_log
 from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.fit_record import fit_logs
@@ -84,6 +85,37 @@ def test_after_a_gap_sixty_seconds_are_not_scored():
     assert not scored[(time >= 440) & (time < 500)].any()
     assert scored[time >= 500].all()
     assert any("399 to 440 s" in note for note in run.notes)
+
+
+def test_the_score_with_the_last_row_held_stands_beside_that_of_a_run_with_a_gap():
+    log = lag_log(1000)
+    steady, stepped = log.copy(deep=True), log.copy(deep=True)
+    for each, q_in_gap in ((steady, 1.0), (stepped, 5.0)):
+        q = log["q"].values.copy()
+        q[395:441], q[400:440] = 1.0, q_in_gap
+        t = lfilter([0, 0.5], [1, -0.95], q)
+        each["q"], each["t"] = ("time", q, log["q"].attrs), ("time", t, log["t"].attrs)
+    keep = np.r_[0:400, 440:1000]
+    known, unknown = (free_run(lag_plant(), each.isel(time=keep)) for each in (steady, stepped))
+    assert known.held["t"].rmse < 1e-5  # what was held is what was there
+    assert unknown.held["t"].rmse > 0.01
+    assert any(f"RMSE t {unknown.held['t'].rmse:.3g} degC" in note for note in unknown.notes)
+    assert free_run(lag_plant(), log).held == {}
+
+
+def test_averages_score_means_and_their_correlation_with_the_inputs_means():
+    log = lag_log(2000, noise=0.3, seed=2)
+    plain, mean = (free_run(lag_plant(), log, average=seconds).scores["t"] for seconds in (None, 10.0))
+    assert mean.n == pytest.approx(plain.n / 10, abs=1)
+    assert mean.rmse == pytest.approx(plain.rmse / np.sqrt(10), rel=0.15)
+    fast = np.resize([0.0, 1.0, 1.0, 0.0, 1.0], 2000)
+    log["q"] = ("time", log["q"].values + fast, log["q"].attrs)
+    run = free_run(lag_plant(), log, average=10.0, tests=False)
+    error = log["t"].values - np.where(run.log["scored"] > 0, run.log["t"].values, np.nan)
+    log["error"] = ("time", error, log["t"].attrs)
+    means = average(log, 10.0)
+    want = cross_correlation(means["error"].values, means["q"].values)
+    np.testing.assert_allclose(run.input_correlation["t"]["q"].values, want.values, rtol=1e-9)
 
 
 def test_inputs_outside_of_the_fit_are_noted():
