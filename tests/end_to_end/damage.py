@@ -72,8 +72,6 @@ KINDS = {
     ),
     "topics.toml": Kind(("topics.toml",), "simulate plant.json one.mcap --out s.csv"),
     "run/": Kind(("run/*",), "recover run"),
-    "batch/": Kind(("batch/batch.json",), "batch controller.json plan.csv --twin plant.json --out batch"),
-    "plan.csv": Kind(("plan.csv",), "batch controller.json plan.csv --twin plant.json --out b"),
 }
 
 
@@ -187,12 +185,10 @@ def whole_files(folder: Path) -> None:
         samples=kit.prior * np.exp(rng.normal(0, 0.01, (40, len(kit.prior)))),
     )  # fmt: skip
     net.save(folder / "net.json")
-    design_controller(net, dt=5.0, controlled=("t1",)).save(folder / "netcontrol.json")
     header = ",".join(("time_s", *kit.inputs, *(f"{n}_degC" for n in (*kit.outputs, *kit.disturbances))))
     n_signals = len(kit.outputs) + len(kit.disturbances)
     lines = [f"{k},{50 * (k % 40 > 20)},0" + ",25" * n_signals for k in range(120)]
     (folder / "kit.csv").write_text("\n".join([header, *lines]) + "\n")
-    (folder / "plan.csv").write_text("material,t_object_degC,target_degC\nwood,23,30\ncopper,23,30\n")
     here = os.getcwd()
     os.chdir(folder)
     try:
@@ -201,7 +197,6 @@ def whole_files(folder: Path) -> None:
         run = "run controller.json --target 30 --twin plant.json --object 20 --material wood --out run"
         assert main(run.split()) == 0
         (folder / "run" / "SHA256SUMS").unlink()  # as of a run that was killed: its files are looked at
-        assert main(["batch", "controller.json", "plan.csv", "--twin", "plant.json", "--out", "batch"]) == 0
     finally:
         os.chdir(here)
 

@@ -21,7 +21,6 @@ from thermogrip.rig.records.batch import read_plan
 from thermogrip.rig.records.run_folder import read_run, recover
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="children are forked")
-SLOW = {"batch/", "plan.csv"}  # a second each: these have tests of their own below
 
 
 @pytest.fixture(scope="module")
@@ -31,7 +30,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.mark.parametrize("kind", [kind for kind in KINDS if kind not in SLOW])
+@pytest.mark.parametrize("kind", KINDS)
 def test_a_damaged_file_is_read_or_refused(kind: str, whole: Path) -> None:
     ends = read_many(kind, whole, range(-1, 2))
     assert ends.pop(-1) in ("0", "3")  # the whole one
