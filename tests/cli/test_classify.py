@@ -16,7 +16,6 @@ import pytest
 
 from tests.cli.conftest import Bench, StandIn, shares, words_of
 from thermogrip.classify.decisions.predict import Answer, Note
-from thermogrip.classify.estimators.posterior import PosteriorClassifier
 from thermogrip.cli import classify as verb
 from thermogrip.cli.classify import SHOWN, say_names, touched_part, training_part
 from thermogrip.datasets.errors import UserError
@@ -419,16 +418,6 @@ def test_a_single_grasp_is_named(named: SimpleNamespace, stand_in: StandIn) -> N
     assert (done.code, "a iron 0.75 0.125 9 wrote p.csv" in words_of(done.out)) == (0, True), done
 
 
-def test_early_answers_are_those_of_the_stop_rule(named: SimpleNamespace) -> None:
-    done = named.bench.run("classify", "m", "grasps.csv", "--early", "--out", "p.csv", "--json")
-    assert done.code == 0, done
-    assert (named.asked[0].rule, named.asked[0].args[2], named.rules[0].args) == (
-        "a rule",
-        None,
-        (Path("m"),),
-    )
-
-
 @pytest.mark.parametrize(
     "words", [[], ["grasps.csv"], ["--out", "p.csv"], ["grasps.csv", "--out", "p.csv", "--serve"],
               ["--serve", "--out", "p.csv"], ["grasps.csv", "--out", "p.csv", "--port", "0"]]
@@ -456,41 +445,6 @@ def test_requests_are_answered_by_lines_or_over_http(named: SimpleNamespace, sta
     stand_in("thermogrip.cli.classify.find_spec")
     refused = named.bench.run("classify", "m", "--serve", "--port", "0")
     assert (refused.code, "thermogrip[live]" in refused.said[0]) == (2, True)
-
-
-def test_another_gripper_is_known_by_its_grasps_or_not_at_all(
-    named: SimpleNamespace, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    asked: list[Any] = []
-    named.model = PosteriorClassifier()
-    monkeypatch.setattr(
-        PosteriorClassifier,
-        "for_another_gripper",
-        lambda self, known: (asked.append(known), "another")[1],
-    )
-    words = ["classify", "m", "grasps.csv", "--out", "p.csv"]
-    for other in (["--known", "more.csv"], []):
-        assert named.bench.run(*words, *other).code == 0
-    assert asked == [[named.record]]
-    assert [call.args[0] for call in named.asked] == ["another", named.model]
-    named.model = "a model"
-    refused = named.bench.run(*words, "--known", "more.csv")
-    assert (refused.code, "train a posterior classifier" in refused.said[0]) == (2, True)
-
-
-def test_another_touch_is_a_column_of_its_own(named: SimpleNamespace, stand_in: StandIn) -> None:
-    def advise(*_: Any, **__: Any) -> list[dict[str, Any]]:
-        return [{"next_touch_degC": 15.0, "next_touch_accuracy": 0.9}, {"next_touch_degC": None} | {
-            "next_touch_accuracy": None}]  # fmt: skip
-
-    asked = stand_in("thermogrip.classify.decisions.next_touch.advise_touches", advise)
-    words = ["classify", "m", "grasps.csv", "--out", "p.csv", "--materials", "iron,wood"]
-    done = named.bench.run(*words, "--next-touch")
-    assert done.code == 0, done
-    assert (asked[0].args, asked[0].candidates) == (("a model", "ranged"), ("iron", "wood"))
-    said = words_of(done.out)
-    assert "decided at [s] touch at [degC] then right" in said
-    assert "a iron 0.75 0.125 9 15 0.9 b - - 8 - -" in said
 
 
 @pytest.mark.parametrize(("n", "more"), [(1, ""), (SHOWN, ""), (SHOWN + 1, " and 1 more")])
