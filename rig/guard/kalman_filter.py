@@ -163,10 +163,10 @@ class RigModel:
         out[..., self.drive_at] += w * self.half
         return out
 
-    def rollout(self, x: Array, u: Array, d: Array, p: Array | None = None) -> tuple[Array, Array]:
+    def rollout(self, x: Array, u: Array, d: Array) -> tuple[Array, Array]:
         """Return outputs (B, N + 1, n_y) without offsets and last states (B, n_x) of runs from x (B, n_x)
-        under u (B, N, n_u), d (B, N, n_d) and parameters p (B, n_p), or the model's own."""
-        return self.plant.model.rollout(x, u, d, self.p[None] if p is None else p, self.plant.dt)
+        under u (B, N, n_u) and d (B, N, n_d)."""
+        return self.plant.model.rollout(x, u, d, self.p[None], self.plant.dt)
 
     def run(self, x: Array, u: Array, d: Array) -> Array:
         """Return the outputs (B, N + 1, n_y) of such a run without the offsets [degC]."""

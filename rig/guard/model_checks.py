@@ -24,15 +24,8 @@ drive, but more of it where more drive hardly does more, near a Peltier element'
 the effect of inputs differs by 5 % of itself (:data:`~thermogrip.sysid.plant.fit_record.RUN_GAIN_SD`), so
 ``drive_limit`` is three of that.
 
-**A rig that has drifted.**  Where the user states a drift s (a share, 0.05 say), each parameter may be
-theta_i (1 + s delta_i) with delta_i uniform between -1 and 1, of variance 1/3 (of a parameter on a linear
-scale, whose value may be next to 0, s is a share of at least 0.2).  A window then ends elsewhere by G delta,
-G its slopes, and a residual is no fault where it is below
-
-    allowed + min(3 sqrt(G G' / 3), allowed),
-
-so no window ever is more than twice as wide as without.  The bias of a drive beyond its limit is no fault
-where all that it does in a longest window is below min(3 sqrt(G G' / 3), allowed).
+**A rig that has drifted** a little from its plant (its water, its paste) needs a larger ``share`` and
+``drive_limit``: docs/howto/rig.md.
 
 **Which fault explains a window** whose residual is too large?  The window is simulated again under each fault
 that may have happened in it, from several onsets on.  With e = reading less path, summed over the readings of
@@ -48,12 +41,11 @@ without any fault, and the next best is named as well where the readings cannot 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from thermogrip.datasets.arrays import Array
-from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.limits import keyed
 from thermogrip.rig.guard.kalman_filter import Estimate, FilterSettings, History, RigFilter, RigModel
 from thermogrip.sysid.plant.plant import Plant
@@ -183,9 +175,6 @@ class ModelSettings(FilterSettings):
     # of a drive's bias, a share of what was asked for lately: three of the 5 % from run to run
     drive_limit: float = keyed(0.15, "drive_limit", 0.01, 0.45)
     warm_up: float = keyed(60.0, "warm_up_s", 0, 3600)  # nothing is compared where it starts not at rest [s]
-    drift: float = keyed(0.0, "drift", 0, 0.2)  # share by which each plant parameter may have drifted
-    least_linear: float = 0.2  # of a parameter on a linear scale, whose value may be next to 0
-    drift_sigmas: float = 3.0  # standard deviations of a drift that are no fault
     compared_every_s: float = 1.0  # a tenth of the shortest window; it costs half of a look
     bias_after_s: float = 60.0  # a bias is not evaluated before the filter has seen something
 
@@ -212,44 +201,6 @@ class Residual:
         return abs(self.measured - self.expected)
 
 
-def drift_steps(plant: Plant, drift: float) -> Array:
-    """Return by how much each parameter (n_p,) of a plant may be off that has drifted by a share; a plant
-    without parameters is a :class:`UserError`."""
-    names = plant.model.parameters
-    if not names:
-        problem = "the plant has no parameters that could drift"
-        raise UserError(problem, hint="identify a network, or leave the drift out of the guard file")
-    least = [ModelSettings.least_linear if plant.scales.get(name) == "linear" else 0.0 for name in names]
-    return np.asarray(drift * np.maximum(np.abs(plant.p), least), dtype=float)
-
-
-def drift_spread(slopes: Array) -> Array:
-    """Return three standard deviations (n_y,) of where a window ends [K], slopes (n_y, n_p) to what each
-    parameter may be off."""
-    return np.asarray(ModelSettings.drift_sigmas * np.sqrt(np.sum(slopes**2, axis=1) / 3))
-
-
-def _window_slopes(
-    model: RigModel, past: History, smooth: float, length: float, steps: Array
-) -> tuple[Array, Array] | None:
-    """Return how far the path of a window without drive biases goes (n_y,) [K], and its slopes (n_y, n_p).
-
-    The slopes are the further change with each parameter moved by ``steps`` (n_p,); None without such a
-    window.
-    """
-    begin, n = past.begin(past.now - length), len(steps)
-    if begin is None or begin.step >= past.steps.done:
-        return None
-    u, d = past.steps.rows(begin.step)
-    p = np.repeat(model.p[None], n + 1, axis=0)
-    p[np.arange(1, n + 1), np.arange(n)] += steps
-    many = [np.repeat(repeated[None], n + 1, axis=0) for repeated in (begin.x, u, d)]
-    y = np.asarray(model.rollout(many[0], many[1], many[2], p)[0])
-    steps_of_ends = [m.step - begin.step for m in _recent(past, begin, smooth)]
-    ends = y[:, steps_of_ends].mean(axis=1)
-    return ends[0] - y[0, 0], (ends[1:] - ends[0]).T
-
-
 def _recent(past: History, begin: Estimate, smooth: float) -> list[Estimate]:
     """Return the estimates that the end of a window is the mean of."""
     return [m for m in past.after(past.now - smooth) if m.time > begin.time]
@@ -267,8 +218,6 @@ class ModelMonitor:
         self.settings = ModelSettings() if settings is None else settings
         self._model = RigModel(plant)
         self.drives = self._model.drives
-        drift = self.settings.drift
-        self._drift_steps = drift_steps(plant, drift) if drift > 0 else None
         keep = int(np.ceil(max(self.settings.windows) / plant.dt)) + 8
         self._filter, self._seconds = RigFilter(self._model, self.settings, keep), keep * plant.dt
 
@@ -320,8 +269,7 @@ class ModelMonitor:
         self._compared, self._compared_at = done, time
         compared = self.compare()
         self.share = max((one.excess for one in compared), default=0.0)
-        residuals = [self._with_drift(one) for one in compared if one.off > one.allowed]
-        return [one for one in residuals if one.off > one.allowed] + self._biases(time, compared)
+        return [one for one in compared if one.off > one.allowed] + self._biases(time)
 
     def compare(self) -> list[Residual]:
         """Return every window and output that can be compared now, whether within what is allowed or not."""
@@ -364,39 +312,7 @@ class ModelMonitor:
                 self._since[k] = max(time, self.compared_from)
         self._masked = masked
 
-    def _slopes(self, window: float) -> tuple[Array, Array] | None:
-        if self._drift_steps is None:
-            return None
-        return _window_slopes(self._model, self._past, self.settings.smooth, window, self._drift_steps)
-
-    def _with_drift(self, one: Residual) -> Residual:
-        """Return a residual with the uncertainty of the plant's parameters; a drive's bias that was such a
-        parameter is wrong once the rig does something else: the path without it counts where that is nearer,
-        and no further away than the parameters explain."""
-        drift_of_window = self._slopes(one.window)
-        if drift_of_window is None:
-            return one
-        change, slopes = drift_of_window
-        k = self.plant.outputs.index(one.subject)
-        more, unbiased = float(drift_spread(slopes)[k]), float(change[k])
-        may = [one.expected] + [unbiased] * (abs(unbiased - one.expected) <= more)
-        near = min(may, key=lambda expected: abs(one.measured - expected))
-        return replace(one, expected=near, allowed=one.allowed + min(more, one.allowed))
-
-    def _drifted(self, compared: list[Residual]) -> bool:
-        """Say whether the effect of the drives' biases in a longest window may be the plant's parameters."""
-        longest = max(self.settings.windows)
-        windows = [one for one in compared if one.window == longest]
-        drift_of_window = self._slopes(longest) if windows else None
-        if drift_of_window is None:
-            return False
-        change, slopes = drift_of_window
-        rows = [self.plant.outputs.index(one.subject) for one in windows]
-        effect = np.abs(np.array([one.expected for one in windows]) - change[rows])
-        tolerated = np.minimum(drift_spread(slopes)[rows], [one.allowed for one in windows])
-        return bool((effect <= tolerated).all())
-
-    def _biases(self, time: float, compared: list[Residual]) -> list[Residual]:
+    def _biases(self, time: float) -> list[Residual]:
         if time < self.compared_from + self.settings.bias_after_s:
             return []
         s, residuals = self.settings, []
@@ -408,7 +324,7 @@ class ModelMonitor:
             if abs(bias) <= 5 * sd:  # five: of 5,700 estimates without a fault the largest was 3.1
                 continue
             limit = float(np.hypot(s.drive_limit * self._largest_drive(j), 5 * sd))
-            if abs(bias) > limit and not self._drifted(compared):
+            if abs(bias) > limit:
                 residuals.append(Residual("bias", self.drives[j], 0.0, 0.0, bias, limit))
         return residuals
 

@@ -67,18 +67,6 @@ def test_virtual_prints_its_port_and_serves_until_it_is_stopped(protocol: str, p
     assert served.returncode == 130, complaint
 
 
-def test_a_drift_of_a_plant_without_parameters_is_refused_in_one_line(
-    plant_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    controller = Controller(Plant.load(plant_file)).save(tmp_path / "controller.json")
-    words = ["run", str(controller), "--twin", str(plant_file), "--target", "t1=30,t2=28"]
-    (tmp_path / "guard.toml").write_text("[model]\ndrift = 0.05\n")
-    assert main([*words, "--guard", str(tmp_path / "guard.toml"), "--out", str(tmp_path / "run")]) == 2
-    said = capsys.readouterr().err.strip().splitlines()[-1]
-    assert said.startswith("thermogrip: the plant has no parameters that could drift; ")
-    assert not (tmp_path / "run").exists()
-
-
 def test_record_writes_what_the_schedule_did(device: VirtualDevice, tmp_path: Path) -> None:
     schedule = tmp_path / "schedule.csv"
     rows = [f"{k},{40 if k >= 5 else 0},{20 if k >= 10 else 0}" for k in range(20)]

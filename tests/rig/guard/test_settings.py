@@ -48,7 +48,7 @@ def test_every_line_of_the_template_may_be_changed() -> None:
             if isinstance(value, dict) or key in ("windows_s", "floors_K", "expiry_s"):
                 continue
             other: Any = [one * 0.9 for one in value] if isinstance(value, list) else value * 0.9
-            other = {"bad_in_a_row": 2, "believable_degC": [-6, 76], "drift": 0.05}.get(key, other)
+            other = {"bad_in_a_row": 2, "believable_degC": [-6, 76]}.get(key, other)
             content = {key: other} if not table else {table: {key: other}}
             assert guard_from_dict(content) != GuardSettings(), key
 
@@ -102,7 +102,7 @@ RANGES = """stale_s .5 60; expiry_s .5 2; clock_slack_s .1 60; drive_slack .005 
 sensors.rate_K_per_s .05 100; sensors.slack_K 0 10; sensors.bad_in_a_row 1 20; sensors.noise_K .001 5;
 sensors.alpha 1e-15 1e-3; sensors.pair_limit_K .1 50; sensors.pair_s 0 3600; model.share 0 2;
 model.switching_K 0 20; model.jump_k 3 100; model.jump_floor_K .1 50; model.bias_limit_K .1 20;
-model.drive_limit .01 .45; model.warm_up_s 0 3600; model.drift 0 .2; model.state_K_per_sqrt_s 1e-4 1;
+model.drive_limit .01 .45; model.warm_up_s 0 3600; model.state_K_per_sqrt_s 1e-4 1;
 model.drive_per_sqrt_s 1e-5 .1; model.output_K_per_sqrt_s 1e-5 1; model.reading_K .001 5;
 no_model.full_drive_s 1 3600; no_model.least_K .05 50; no_model.far_K .5 100; no_model.near_K .05 50;
 no_model.leave_K .1 50; no_model.area_K_s 1 1e5"""
