@@ -198,7 +198,7 @@ def players(trade: Trade, keep: Path, which: Sequence[str], tuned: bool) -> list
         saved = best(trade, plant, keep)
         found += [("ours", Ours(case, saved)), ("default", default)]
         if isinstance(saved, Controller):
-            found.append(("PI of tune", Ours(case, PIController.of(plant, saved.design))))
+            found.append(("PI of tune", Ours(case, PIController(plant, saved.design))))
     if "do-mpc" in which and importlib.util.find_spec("do_mpc") is not None:
         found.append(("do-mpc", DoMPC(plant, design, case.rest)))
     models = {}

@@ -291,7 +291,7 @@ def players(
         if "pi" not in without:
             # under the limits of the spec, as it was tuned: the MPC may have been given less of a drive
             wide = spec.design(controller.plant)
-            found.append(("pi", Ours(case, PIController.of(plant, wide, controller.design.loops))))
+            found.append(("pi", Ours(case, PIController(plant, wide, loops=controller.design.loops))))
         if "do-mpc" not in without and importlib.util.find_spec("do_mpc") is not None:
             found.append(("do-mpc", DoMPC(controller.plant, spec.design(controller.plant), case.rest)))
     except UserError as error:

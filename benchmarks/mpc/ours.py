@@ -50,7 +50,7 @@ class Ours:
     def __init__(self, *, blocks: int = HORIZON, current: float = 5.0) -> None:
         plant, design = plant_of(MODEL, current=current), design_of(blocks, current)
         self.optimiser = ReferenceController(plant, design).optimiser
-        self.blocks = np.asarray(self.optimiser.blocks)
+        self.blocks = np.asarray(design.blocks)
         self.plan: Array | None = None
         self.begins = np.cumsum(self.blocks) - self.blocks
         self.zero = np.zeros(3), np.zeros(1)

@@ -145,7 +145,14 @@ def _loops_at(controller: PIController, target: Array, d: Array) -> tuple[_Loops
         [loop.Kc for loop in loops],
         [loop.Ti for loop in loops],
         target[[i for _, i in controller.ends]],
-        *(kept, ahead, controller.lowest, controller.highest, controller.slew, UNCUT * model.span),
+        *(
+            kept,
+            ahead,
+            controller.drives.lowest,
+            controller.drives.highest,
+            controller.drives.slew,
+            UNCUT * model.span,
+        ),
         *(controller.integral, controller.applied),
     ]
     held = [*places, *(np.array(values, dtype=float) for values in numbers)]

@@ -16,37 +16,31 @@ from thermogrip.datasets.arrays import Array, Mask
 from thermogrip.mpc.controllers import advice
 from thermogrip.mpc.estimator.call_times import SAME, CallTimes
 from thermogrip.mpc.interface import Move, Readings, Trajectory, number, target_now
+from thermogrip.mpc.optimiser.drive_limits import DriveLimits
 from thermogrip.mpc.plant.prediction import PredictionModel
 
 
 class SampledController:
-    """A controller of drives in ``lowest`` to ``highest`` that change by at most ``slew`` a sample (n_u,)."""
+    """A controller whose drives stay within their limits."""
 
     def __init__(
         self,
         model: PredictionModel,
         controlled: tuple[str, ...],
-        drive_range: Mapping[str, tuple[float, float]],
-        slew: Array,
+        drives: DriveLimits,
         patience_s: float,
         clock: Callable[[], float],
-        safe_drive: Mapping[str, float] | None = None,
     ) -> None:
-        self.model, self.controlled, self.slew, self.clock = model, controlled, slew, clock
-        self.lowest, self.highest = np.array([drive_range[name] for name in model.drives], dtype=float).T
+        self.model, self.controlled, self.drives, self.clock = model, controlled, drives, clock
         self.times = CallTimes(model.dt)
         self._rows = [model.outputs.index(name) for name in controlled]
         self._patience_s = patience_s * (1 + SAME)
-        self._neutral = np.clip(np.zeros(model.n_u), self.lowest, self.highest)
-        # where the drives of a failing loop go
-        safe = [(safe_drive or {}).get(name, rest) for name, rest in zip(model.drives, self._neutral)]
-        self._safe = np.array(safe, dtype=float)
         self._forget()
         self._move = Move(as_drive(model.drives, self._u))
 
     def _forget(self) -> None:
         """Return to no drive and no target, every output just read."""
-        self._u = self._neutral.copy()
+        self._u = self.drives.neutral.copy()
         self._target = np.full(len(self.controlled), np.nan)
         self._unread_s = np.zeros(len(self.controlled))  # since each controlled output was read
 
@@ -57,13 +51,13 @@ class SampledController:
 
     def _applied(self, reading: Readings, otherwise: Array) -> Array:
         """Return the drives (n_u,) that a reading says were applied, else these."""
-        given = np.array([number(reading, name) for name in self.model.drives])
-        return np.where(np.isfinite(given), given, otherwise)
+        applied = np.array([number(reading, name) for name in self.model.drives])
+        return np.where(np.isfinite(applied), applied, otherwise)
 
     @property
     def safe_drives(self) -> Array:
         """Drives (n_u,) of a loop that has failed or ends."""
-        return self._safe.copy()
+        return self.drives.safe.copy()
 
     @property
     def _lost(self) -> Mask:
@@ -111,13 +105,9 @@ class SampledController:
             wrong = advice.bad_target(controlled[int(np.argmax(lost)) :])
         return np.where(lost, self._target, wanted), wrong
 
-    def _within(self, u: Array, seconds: float) -> Array:
-        """Return drives (n_u,) that are finite, in range, and within the slew limit of so many seconds; range
-        wins over slew."""
-        before = np.clip(self._u, self.lowest, self.highest)
-        slew = self.slew * (seconds / self.dt)
-        wanted = np.where(np.isfinite(u), u, self._safe)
-        return np.asarray(np.clip(np.clip(wanted, before - slew, before + slew), self.lowest, self.highest))
+    def _within(self, u: Array) -> Array:
+        """Return drives (n_u,) that are finite, in range, and within the slew limit since the last ones."""
+        return self.drives.follow(u, self._u, self.times.slew_s / self.dt)
 
     def _answer(self, status: str, why: str, started: float) -> Move:
         """Return the move of the drives in force; without any, the pump may rest."""
@@ -138,7 +128,7 @@ class SampledController:
         others are, drives parked."""
         lost = unread_s > self._patience_s
         gone = bool(lost.any())
-        names = [name for name, at in zip(self.controlled, lost if gone else unread_s > 0) if at]
+        names = [name for name, is_out in zip(self.controlled, lost if gone else unread_s > 0) if is_out]
         return advice.unseen(names, parked, float(unread_s.max()), lost=gone)
 
 
@@ -149,7 +139,7 @@ def targets_ahead(
     where targets do.  What is not from low to high is the target now (n_controlled,)."""
     if not isinstance(target, Mapping) or not any(isinstance(v, Sequence) for v in target.values()):
         return None
-    lines = [np.atleast_1d(target.get(name, each)) for name, each in zip(controlled, now)]
+    lines = [np.atleast_1d(target.get(name, target_now)) for name, target_now in zip(controlled, now)]
     ahead = np.column_stack([line[np.minimum(at, len(line) - 1)] for line in lines]).astype(float)
     return np.where((ahead >= low) & (ahead <= high), ahead, now)  # NaN is neither
 

@@ -86,8 +86,8 @@ class CompiledStep:
         _put(c.given, reading, names)
         unknown: list[str] = []
         if not isinstance(target, Mapping):
-            for at in range(len(names), len(names) + len(controlled)):
-                c.given[at] = number({"": target}, "")
+            for place in range(len(names), len(names) + len(controlled)):
+                c.given[place] = number({"": target}, "")
         else:
             now = {name: value[0] if isinstance(value, Sequence) else value for name, value in target.items()}
             _put(c.given, now, controlled, len(names))
@@ -103,14 +103,14 @@ class CompiledStep:
         if not due:
             again = self._move.advice or advice.TOO_EARLY
             return replace(self._move, advice=again, seconds=self.clock() - started)
-        said, state = "", STATUSES[int(status)]
+        words, state = "", STATUSES[int(status)]
         if code or unknown:
-            said = self._words(int(code), over, int(which), reading)
+            words = self._words(int(code), over, int(which), reading)
             if unknown and code != _Code.BAD_TARGET:
-                said = advice.bad_target(controlled, unknown[0])
+                words = advice.bad_target(controlled, unknown[0])
                 state = "infeasible" if state == "ok" else state
         applied = drive[0] if len(drive) == 1 else dict(zip(self.reference.model.drives, drive))
-        self._move = Move(applied, int(pump), state, said, self.clock() - started)
+        self._move = Move(applied, int(pump), state, words, self.clock() - started)
         return self._move
 
     def _ahead(self, target: Trajectory) -> Array | None:
@@ -118,9 +118,9 @@ class CompiledStep:
         if not isinstance(target, Mapping) or not any(isinstance(v, Sequence) for v in target.values()):
             return None
         model, controlled, begin = self.reference.model, self.reference.controlled, len(self._names)
-        asked = np.array(self.c.given[begin : begin + len(controlled)])
-        good = (asked >= model.coldest) & (asked <= model.hottest)
-        now = np.where(good, asked, self.c.view("target", asked.shape))
+        targets = np.array(self.c.given[begin : begin + len(controlled)])
+        good = (targets >= model.coldest) & (targets <= model.hottest)
+        now = np.where(good, targets, self.c.view("target", targets.shape))
         samples = np.arange(1, self.reference.optimiser.N + 1)
         return targets_ahead(target, controlled, now, samples, model.coldest, model.hottest)
 
@@ -129,9 +129,9 @@ class CompiledStep:
         reference, model = self.reference, self.reference.model
         name = model.outputs[which]
         if code in (_Code.LOST_READING, _Code.STUCK):
-            seen = np.concatenate([self.c.view("y", (model.n_y,)), reference.measured(reading)])
+            readings = np.concatenate([self.c.view("y", (model.n_y,)), reference.measured(reading)])
             names = (*model.outputs, *model.disturbances)
-            lost = [one for one, value in zip(names, seen) if not np.isfinite(value)]
+            lost = [one for one, value in zip(names, readings) if not np.isfinite(value)]
             return advice.lost_readings(lost, stuck=code == _Code.STUCK)
         if code in (_Code.SENSOR_OFFSET, _Code.WORLD_CHANGED):
             stays = self.c.view("stays", (model.n_y,))
@@ -145,8 +145,8 @@ class CompiledStep:
             return advice.out_of_reach(name, wanted, self.c.view("nearest", (1,))[0])
         if code == _Code.BAD_TARGET:
             begin = len(self._names)
-            asked = self.c.given[begin : begin + len(reference.controlled)]
-            good = [model.coldest <= value <= model.hottest for value in asked]
+            targets = self.c.given[begin : begin + len(reference.controlled)]
+            good = [model.coldest <= value <= model.hottest for value in targets]
             return advice.bad_target(reference.controlled[good.index(False) :])
         words: dict[int, Callable[[], str]] = {
             _Code.STALE: lambda: advice.STALE,

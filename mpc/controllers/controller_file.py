@@ -58,6 +58,6 @@ def read_parts(path: str | Path, *, model: Model | None = None) -> Parts:
             if not isinstance(content.get(key), dict):
                 raise UserError(f"{key} is missing", hint="tune the controller again")
         equations = content["plant"].get("model")
-        own = isinstance(equations, dict) and equations.get("kind") == "own"
-        plant = Plant.from_dict(content["plant"], model=model if own else None)
+        of_user = isinstance(equations, dict) and equations.get("kind") == "own"
+        plant = Plant.from_dict(content["plant"], model=model if of_user else None)
         return Parts(kind, plant, Design.from_dict(content["design"]), content["notes"])

@@ -119,9 +119,9 @@ def _as_library(controller: Controller, files: dict[str, str]) -> dict[str, str]
     wide = '#if __SIZEOF_DOUBLE__ < 8\n#error "this board\'s double has 4 bytes"\n#endif\n'
     library = {"library.properties": "".join(f"{key}={value}\n" for key, value in lines.items())}
     library |= {"README.md": files["README.md"], "examples/loop/loop.ino": c_source("loop.ino")}
-    parts = {name: files[name] for name in files if name.startswith("tg_")}
-    parts["tg_config.h"] = parts["tg_config.h"].replace("typedef", wide + "\ntypedef", 1)
-    return library | {f"src/{name}": content for name, content in parts.items()}
+    sources = {name: files[name] for name in files if name.startswith("tg_")}
+    sources["tg_config.h"] = sources["tg_config.h"].replace("typedef", wide + "\ntypedef", 1)
+    return library | {f"src/{name}": content for name, content in sources.items()}
 
 
 def _one_line(text: str) -> str:
@@ -192,22 +192,22 @@ def _random_loop(controller: Controller, samples: int, seed: int, progress: Prog
     twin = ReferenceController(controller.plant, replace(controller.design, deadline_s=1.0), clock=clock)
     model, rng, played = twin.model, np.random.default_rng(seed), list[_Sample]()
     low, high = _range_of(controller)
-    span = twin.highest - twin.lowest
+    span = twin.drives.highest - twin.drives.lowest
     rows = [model.outputs.index(name) for name in twin.controlled]
-    for at in range(samples):
-        begins = at % _LOOP == 0
+    for k in range(samples):
+        begins = k % _LOOP == 0
         if begins:
             level = rng.uniform(low, high) + 0.02 * (high - low) * rng.normal(size=model.n_y)
             d = model.undisturbed(twin.design.ambient) + 2 * model.close_d * rng.normal(size=model.n_d)
             x = model.rest(level, d)
             # from next to settled to far away, so that the drive is at its limits in some loops
-            far = 10 ** rng.uniform(-3.0, 0.0) * (high - low)
-            applied = twin.safe_drives + far / (high - low) * rng.uniform(-0.5, 0.5, model.n_u) * span
+            distance = 10 ** rng.uniform(-3.0, 0.0) * (high - low)
+            applied = twin.safe_drives + distance / (high - low) * rng.uniform(-0.5, 0.5, model.n_u) * span
         if begins or rng.random() < _NEWS:
-            target = level[rows] + far * rng.normal(size=len(rows))
+            target = level[rows] + distance * rng.normal(size=len(rows))
         if rng.random() < _NEWS:  # out of range, now and then
-            applied = rng.uniform(twin.lowest - 0.1 * span, twin.highest + 0.1 * span)
-        y = model.output(x) + 0.01 * far * rng.normal(size=model.n_y)
+            applied = rng.uniform(twin.drives.lowest - 0.1 * span, twin.drives.highest + 0.1 * span)
+        y = model.output(x) + 0.01 * distance * rng.normal(size=model.n_y)
         y[rng.random(model.n_y) < _NEWS] = np.nan
         late = bool(rng.random() < _NEWS)
         clock.step = 60.0 if late else 0.0
@@ -218,15 +218,15 @@ def _random_loop(controller: Controller, samples: int, seed: int, progress: Prog
         move = twin.step(reading, dict(zip(twin.controlled, target)))
         drive = np.array(move.drives(model.drives))
         ahead = np.zeros((0, model.n_u)) if twin.plan is None else twin.plan
-        least = np.maximum(twin.lowest, applied - twin.slew)
-        most = np.minimum(twin.highest, applied + twin.slew)
+        least = np.maximum(twin.drives.lowest, applied - twin.drives.slew)
+        most = np.minimum(twin.drives.highest, applied + twin.drives.slew)
         free = bool(np.all((drive > least + 1e-9) & (drive < most - 1e-9)))
         numbers = np.concatenate([[begins, late], y, d, applied, target])
         line = " ".join(float(number).hex() for number in numbers)
         played.append(_Sample(line, move.status, np.concatenate([drive[None], ahead]) / model.span, free))
         x, applied = model.next_state(x, drive, d), drive
-        if progress is not None and at % 100 == 0:
-            progress(at / samples, "samples")
+        if progress is not None and k % 100 == 0:
+            progress(k / samples, "samples")
     return played
 
 
@@ -265,7 +265,7 @@ def _answers(export: Export, played: list[_Sample], sanitize: bool) -> tuple[tup
 def _same_answers(plain: list[str], sanitized: list[str]) -> None:
     for one, two in zip(plain, sanitized, strict=True):
         ours, theirs = one.split(), two.split()
-        drives, others = (np.array([float.fromhex(word) for word in part[1:]]) for part in (ours, theirs))
+        drives, others = (np.array([float.fromhex(word) for word in words[1:]]) for words in (ours, theirs))
         if ours[0] != theirs[0] or not np.allclose(drives, others, rtol=_TOLERANCE, atol=_TOLERANCE):
             raise UserError(
                 "the export answers otherwise under the sanitizers", hint="report it: it must not"

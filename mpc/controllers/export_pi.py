@@ -51,15 +51,15 @@ def export_pi(controller: PIController, folder: str | Path) -> Export:
 
 def _config(controller: PIController) -> str:
     """Return the header with the numbers of the loops, in the order of the controlled outputs."""
-    model, at = controller.model, {i: k for k, (_, i) in enumerate(controller.ends)}
-    loops = [controller.loops[at[i]] for i in range(len(controller.controlled))]
+    model, loop_of = controller.model, {i: k for k, (_, i) in enumerate(controller.ends)}
+    loops = [controller.loops[loop_of[i]] for i in range(len(controller.controlled))]
     arrays: dict[str, ArrayLike] = {
         "Kc": [loop.Kc for loop in loops],
         "Ti": [loop.Ti for loop in loops],
         "setpoint": [loop.setpoint for loop in loops],
-        "lowest": controller.lowest,
-        "highest": controller.highest,
-        "slew": controller.slew,
+        "lowest": controller.drives.lowest,
+        "highest": controller.drives.highest,
+        "slew": controller.drives.slew,
         "safe": controller.safe_drives,
         "uncut": UNCUT * model.span,
     }
@@ -82,7 +82,7 @@ def _config(controller: PIController) -> str:
 
 def _readme(controller: PIController) -> str:
     drives = controller.model.drives
-    ends = zip(drives, controller.lowest.tolist(), controller.highest.tolist())
+    ends = zip(drives, controller.drives.lowest.tolist(), controller.drives.highest.tolist())
     count = len(controller.controlled)
     return c_source("README_pi.md.in").format(
         outputs=", ".join(markdown(name) for name in controller.controlled),
@@ -120,8 +120,8 @@ def check_pi(
         ).stdout.splitlines()
         flash = sum(int(word) for word in sizes[1].split()[:2]) if len(sizes) > 1 else 0
         loops = ctypes.CDLL(str(library))
-        found = _differences(loops, controller, states, seed, progress)
-    difference, free, same = found.T
+        compared = _differences(loops, controller, states, seed, progress)
+    difference, free, same = compared.T
     n_c, n_u = len(controller.controlled), controller.model.n_u
     return Agreement(
         states=states,
@@ -157,13 +157,13 @@ def _differences(
     n_c, n_u = len(controlled), model.n_u
     state = (real * (4 * n_c + n_u))()
     low, high = np.array([controller.plant.valid.get(name, (15.0, 60.0)) for name in controlled]).T
-    python = PIController.of(controller.plant, controller.design)
-    found, target = np.zeros((states, 3)), 0.5 * (low + high)
-    for at in range(states):
+    python = PIController(controller.plant, controller.design)
+    compared, target = np.zeros((states, 3)), 0.5 * (low + high)
+    for k in range(states):
         y = rng.uniform(low, high) * np.where(rng.random(n_c) < _LOST, np.nan, 1.0)
-        if at % _RUN == 0:
+        if k % _RUN == 0:
             python.times.reset()
-            u = rng.uniform(python.lowest, python.highest)
+            u = rng.uniform(python.drives.lowest, python.drives.highest)
             python.reset(dict(zip(controlled, y)) | dict(zip(model.drives, u)))
             library.tg_pi_reset(state, (real * n_c)(*y), (real * n_u)(*u))
         if rng.random() < _LOST:
@@ -171,9 +171,9 @@ def _differences(
         move = python.step(dict(zip(controlled, y)), dict(zip(controlled, target)))
         status = library.tg_pi_step(state, (real * n_c)(*y), (real * n_c)(*target))
         ours, theirs = np.array(move.drives(model.drives)), np.array(state[4 * n_c :])
-        limited = np.any((ours <= python.lowest) | (ours >= python.highest))
+        limited = np.any((ours <= python.drives.lowest) | (ours >= python.drives.highest))
         same = STATUSES[status] == move.status
-        found[at] = np.max(np.abs(ours - theirs) / model.span), not limited, same
-        if progress is not None and at % 100 == 0:
-            progress(at / states, "samples")
-    return found
+        compared[k] = np.max(np.abs(ours - theirs) / model.span), not limited, same
+        if progress is not None and k % 100 == 0:
+            progress(k / states, "samples")
+    return compared

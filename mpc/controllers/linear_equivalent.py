@@ -24,7 +24,7 @@ from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.errors import UserError
 
 if TYPE_CHECKING:
-    from thermogrip.mpc.optimiser.rti import ControllerParts, Optimiser
+    from thermogrip.mpc.optimiser.rti import ControllerParts
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,26 +39,20 @@ class LinearLaw:
     outputs: tuple[str, ...]
     states: tuple[str, ...]
     dt: float  # sample time [s]
-    n_y: int  # the first so many inputs are readings
-    forgets: Array  # (n_z, n_z) how an error of the estimate goes on, F (I - L H)
 
 
-def linear_move(
-    controller: ControllerParts, optimiser: Optimiser | None = None
-) -> tuple[Array, Array, Array]:
+def linear_move(controller: ControllerParts) -> tuple[Array, Array, Array]:
     """Return H of the QP and the plan's gains on the free response and on the drive before, as
-    :meth:`thermogrip.mpc.optimiser.rti.Optimiser.linear_gains`, by default of the controller's own optimiser,
-    linearised where the plant settles without drive, or where it rests if it settles nowhere."""
-    model, design = controller.model, controller.design
-    optimiser = controller.optimiser if optimiser is None else optimiser
-    rest, u, d = model.at_rest(design.ambient)
+    :meth:`thermogrip.mpc.optimiser.rti.Optimiser.linear_gains`, linearised where the plant settles without
+    drive, or where it rests if it settles nowhere."""
+    model, design, optimiser = controller.model, controller.design, controller.optimiser
+    x_rest, u, d = model.at_rest(design.ambient)
     x = model.steady_state(u, d)
-    x = rest if not np.isfinite(x).all() else x
+    x = x_rest if not np.isfinite(x).all() else x
     plan = np.repeat(u[None, :], optimiser.n_b, axis=0)
     _, G = model.trajectory(x, plan, d, design.blocks)
     flat = G.reshape(optimiser.N, model.n_y, -1) * np.tile(model.span, optimiser.n_b)
-    rows = [model.outputs.index(name) for name in design.controlled]
-    return optimiser.linear_gains(flat, rows)
+    return optimiser.linear_gains(flat)
 
 
 def linear_law(controller: ControllerParts) -> LinearLaw:
@@ -68,10 +62,10 @@ def linear_law(controller: ControllerParts) -> LinearLaw:
     n_z, L = len(F), controller.observer.settled_gain(F)
     rows = [model.outputs.index(name) for name in controller.design.controlled]
     on_z, on_r, on_d, on_last = (gain[:n_u] for gain in plan_gains(controller))
-    kept = np.eye(n_z) - L @ H
-    to_drive = np.hstack([on_z @ kept, on_last])
+    uncorrected = np.eye(n_z) - L @ H
+    to_drive = np.hstack([on_z @ uncorrected, on_last])
     straight = np.hstack([on_z @ L, on_r, on_d])
-    after = np.hstack([F @ kept, np.zeros((n_z, model.n_u))])
+    after = np.hstack([F @ uncorrected, np.zeros((n_z, model.n_u))])
     into_z = np.hstack([F @ L, np.zeros((n_z, len(rows))), E])
     targets = tuple(f"target_{name}" for name in controller.design.controlled)
     return LinearLaw(
@@ -83,8 +77,6 @@ def linear_law(controller: ControllerParts) -> LinearLaw:
         outputs=model.drives,
         states=(*(f"z{k}" for k in range(n_z)), *(f"last_{name}" for name in model.drives)),
         dt=model.dt,
-        n_y=model.n_y,
-        forgets=F @ kept,
     )
 
 
@@ -95,7 +87,7 @@ def augmented(controller: ControllerParts) -> tuple[Array, Array, Array, Array]:
     n_w = chosen.n_w
     into = B @ (chosen.on_drive * model.span[:, None]) + E @ chosen.on_disturbance
     F = np.block([[A, into], [np.zeros((n_w, model.n_x)), np.eye(n_w)]])
-    B, E = (np.vstack([part, np.zeros((n_w, part.shape[1]))]) for part in (B, E))
+    B, E = (np.vstack([matrix, np.zeros((n_w, matrix.shape[1]))]) for matrix in (B, E))
     return F, B, E, np.hstack([model.C, chosen.on_output])
 
 
@@ -104,11 +96,11 @@ def plan_gains(controller: ControllerParts) -> tuple[Array, Array, Array, Array]
     _, on_free, on_last = linear_move(controller)
     F, _, E, H = augmented(controller)
     H = H[[controller.model.outputs.index(name) for name in controller.design.controlled]]
-    by_z, by_d, power, held = [], [], np.eye(len(F)), np.zeros_like(E)
+    by_z, by_d, power, by_held_d = [], [], np.eye(len(F)), np.zeros_like(E)
     for _ in range(sum(controller.design.blocks)):
-        held, power = F @ held + E, F @ power
+        by_held_d, power = F @ by_held_d + E, F @ power
         by_z.append(H @ power)
-        by_d.append(H @ held)
+        by_d.append(H @ by_held_d)
     same = np.tile(np.eye(len(H)), (len(by_z), 1))
     return on_free @ np.vstack(by_z), -on_free @ same, on_free @ np.vstack(by_d), on_last
 

@@ -1,8 +1,8 @@
 r"""What somebody beside a loop may say of it: it swings, a sensor has stopped, or its plant is another.
 
-A controller controls; a monitor is fed what was read, asked and moved, outside of the step and its deadline,
-whatever the law, and has a filter of its own.  Its words name a load where one would look the same, and are
-taken back when their evidence goes.
+A monitor is fed what was read, asked and moved, outside of the step and its deadline, whatever the law, and
+has a filter of its own.  Its words name a load where one would look the same, and are taken back when their
+evidence goes.
 
 **Settling.**  Of the first-order plant with gain K, lag T and apparent delay L that its step response is, the
 loop of a PI has the poles of
@@ -14,17 +14,14 @@ the PI by Skogestad's rule.
 
 **Limits.**  Where a drive is within 1 % of its range of its limit, on the side to which the error drives it,
 the plant has nothing but its own lag.  On the way to a rest at or beyond the target the distance falls by
-1 - exp(-1) in T, or by 28 % where the lag is three times the model's; one of which three quarters are left
+1 - exp(-1) in T, or by 28 % where the lag is three times the model's; one of which three quarters remain
 after L + T is held by nothing.  One that has grown after 2 L, and for as long as the loop takes to arrive, is
 driven by another plant or a load.
 
 **Another plant.**  A drive whose estimated bias is beyond 30 % of its range, or an output's beyond a third of
-a jump (:mod:`thermogrip.mpc.estimator.reading_checks`), for as long as the loop takes to arrive: a draw is
-over by then.  Where the plant has a posterior, :mod:`thermogrip.mpc.estimator.structure_monitor` says what
-its model lacks.  Which drive does another share than before, and which reading should have moved,
-:mod:`thermogrip.mpc.estimator.fault_monitors` says of any plant.
-
-**Swings.**  :mod:`thermogrip.mpc.estimator.oscillation`.
+a jump, for as long as the loop takes to arrive: a draw is over by then.  Besides,
+:mod:`thermogrip.mpc.estimator.structure_monitor`, :mod:`thermogrip.mpc.estimator.fault_monitors` and
+:mod:`thermogrip.mpc.estimator.oscillation`.
 """
 
 from __future__ import annotations
@@ -63,8 +60,8 @@ class _Answer(NamedTuple):
 
 @lru_cache(maxsize=64)
 def _answer(plant: Plant, drive: str, output: str, dt: float) -> _Answer:
-    found = step_response(plant, drive, output)
-    return _Answer(found.gain, max(found.delay, dt), found.lag)
+    response = step_response(plant, drive, output)
+    return _Answer(response.gain, max(response.delay, dt), response.lag)
 
 
 def settling_time(gain: float, delay: float, lag: float, Kc: float, Ti: float) -> float:
@@ -111,8 +108,10 @@ class LoopMonitor:
         self._drives = [model.drives.index(p.drive) for p in self.loops]
         answers = [_answer(plant, p.drive, p.output, model.dt) for p in self.loops]
         spans = model.span[self._drives].tolist()
-        found = zip(answers, spans, self.loops)
-        self._promised = np.array([settling_time(a.gain / s, *a[1:], p.Kc, p.Ti) for a, s, p in found])
+        answers_of_loops = zip(answers, spans, self.loops)
+        self._promised = np.array(
+            [settling_time(a.gain / s, *a[1:], p.Kc, p.Ti) for a, s, p in answers_of_loops]
+        )
         low, high = np.array([design.drive_range[p.drive] for p in self.loops], dtype=float).reshape(n, 2).T
         self._low, self._high = low + _AT_LIMIT * (high - low), high - _AT_LIMIT * (high - low)
         self._side = np.sign([p.Kc for p in self.loops])
@@ -165,8 +164,8 @@ class LoopMonitor:
         d = np.where(np.isfinite(d), d, self.model.undisturbed(self.observer.ambient))
         u = np.array(move.drives(self.model.drives), dtype=float)
         applied = u if self._u is None else self._u
-        told = np.array([number(reading, name) for name in self.model.drives])
-        applied = np.where(np.isfinite(told), told, applied)
+        read_drives = np.array([number(reading, name) for name in self.model.drives])
+        applied = np.where(np.isfinite(read_drives), read_drives, applied)
         wanted = target_now(target)
         by_name = wanted if isinstance(wanted, Mapping) else dict.fromkeys(self.controlled, wanted)
         goals = [number(by_name, p.output) for p in self.loops]
@@ -205,20 +204,20 @@ class LoopMonitor:
         if np.any(target != self._target):
             self._restart()
             self._target = target.copy()
-        error, near = target - y, self._near
+        error, band = target - y, self._near
         swings = self.swings.note(-np.sign(error) * np.maximum(np.abs(error) - self._zone, 0.0), seconds)
         begun = np.where(np.isfinite(self._error), self._error, error)
         self._error = np.where(np.isfinite(error), begun + _REMEMBER * (error - begun), begun)
         limited = self._limits(u, seconds)
         off, names = np.abs(self._error), self.names
-        away = limited & (off > self._begun + near)
+        away = limited & (off > self._begun + band)
         self._away_s = np.where(away, self._away_s + seconds, 0.0)
         self._strange_s = self._strange_s + seconds if strange else 0.0
         if self.stuck.said:
             return self.stuck.said
         for which in (self._away_s > self._promised, limited & self._stalled):
             if which.any():
-                k = int(np.argmax(np.where(which, off / near, 0.0)))
+                k = int(np.argmax(np.where(which, off / band, 0.0)))
                 does = f"stays {off[k]:.2g} off its target"
                 does = "goes away from its target" if away[k] and not self._stalled[k] else does
                 why = "a load, or another plant than the model"

@@ -174,11 +174,11 @@ class Controller(Shown):
         ...     Controller.load(path).dt
         5.0
         """
-        found = load_controller(path, model=model)
-        if not isinstance(found, Controller):
+        controller = load_controller(path, model=model)
+        if not isinstance(controller, Controller):
             hint = "thermogrip.mpc.load_controller reads every kind"
             raise UserError("holds a PI, not an MPC", file=path, hint=hint)
-        return found
+        return controller
 
     def to_control(self) -> Any:
         """Return the controller without its limits as a python-control ``StateSpace`` from readings,
@@ -298,6 +298,6 @@ def load_controller(path: str | Path, *, model: Model | None = None) -> Controll
     """
     # numbers each of which may be can leave no gain or no estimate together
     with reading("its numbers make no controller", file=path, hint="tune the controller again"):
-        parts = read_parts(path, model=model)
-        kind = PIController.of if parts.kind == "PI" else Controller
-        return kind(parts.plant, parts.design, notes=parts.notes)
+        content = read_parts(path, model=model)
+        kind = PIController if content.kind == "PI" else Controller
+        return kind(content.plant, content.design, notes=content.notes)

@@ -29,17 +29,10 @@ import numpy as np
 from thermogrip.datasets.arrays import Array
 from thermogrip.mpc.controllers.base import SampledController
 from thermogrip.mpc.controllers.controller_file import Parts
-from thermogrip.mpc.design.design import (
-    Design,
-    PILoop,
-    check_design,
-    default_controlled,
-    default_design,
-    pair_loops,
-)
-from thermogrip.mpc.estimator.call_times import SAME
+from thermogrip.mpc.design.design import Design, PILoop, check_design, default_design
 from thermogrip.mpc.interface import Move, Readings, Trajectory
 from thermogrip.mpc.native.shared_constants import UNCUT
+from thermogrip.mpc.optimiser.drive_limits import DriveLimits
 from thermogrip.mpc.plant.prediction import ROOM, PredictionModel, holding_drive, prediction_model
 
 if TYPE_CHECKING:
@@ -53,26 +46,18 @@ class PIController(SampledController):
     Parameters
     ----------
     plant : Plant
-        Gives the holding drive and the ranges.
-    dt : float, optional
-        Sample time [s].
+        Gives the holding drive.
+    design : Design, optional
+        Its loops, limits and patience; by default that of
+        :func:`thermogrip.mpc.design.design.default_design`.
     loops : tuple of PILoop, optional
-        By default :func:`pair_loops`.
-    controlled : tuple of str, optional
-        By default :func:`default_controlled`.
-    drive_range : dict of str to (float, float), optional
-        Narrower ranges of the drives, in their units.
-    slew_per_s : dict of str to float, optional
-        Largest change of a drive [units per s]; an eighth of its range where absent.
-    patience_s : float, optional
-        How long the drive of a loop is held without a reading [s], by default 10 s and at least 5 samples, as
-        :func:`thermogrip.mpc.design.design.default_design` has it.
-    clock : callable, optional
-        Where step times come from [s].
-    safe_drive : dict of str to float, optional
-        Where drives go without readings, in their units; 0 where absent.
+        In place of the design's.
     notes : dict, optional
         What the tuner found, kept in the file.
+    clock : callable, optional
+        Where step times come from [s].
+    **changes
+        Any field of the default design.
 
     Examples
     --------
@@ -90,80 +75,25 @@ class PIController(SampledController):
     def __init__(
         self,
         plant: Plant,
+        design: Design | None = None,
         *,
-        dt: float | None = None,
         loops: tuple[PILoop, ...] | None = None,
-        controlled: tuple[str, ...] | None = None,
-        drive_range: Mapping[str, tuple[float, float]] | None = None,
-        slew_per_s: Mapping[str, float] | None = None,
-        patience_s: float | None = None,
-        clock: Callable[[], float] = time.perf_counter,
-        safe_drive: Mapping[str, float] | None = None,
         notes: Mapping[str, Any] | None = None,
+        clock: Callable[[], float] = time.perf_counter,
+        **changes: Any,
     ) -> None:
-        model = PredictionModel(plant) if dt is None else prediction_model(plant, dt)
-        ranges = dict(zip(model.drives, zip(model.lowest.tolist(), model.highest.tolist())))
-        slews = dict(zip(model.drives, (0.125 * model.span).tolist())) | dict(slew_per_s or {})
-        super().__init__(
-            model,
-            default_controlled(plant) if controlled is None else controlled,
-            ranges | dict(drive_range or {}),
-            model.dt * np.array([slews[name] for name in model.drives]),
-            max(10.0, 5 * model.dt) if patience_s is None else patience_s,
-            clock,
-            safe_drive,
-        )
-        self.plant, self.notes = plant, dict(notes or {})
-        self.loops = pair_loops(plant, self.controlled) if loops is None else loops
-        self._design: Design | None = None
+        design = default_design(plant, **changes) if design is None else design
+        self.design = check_design(design if loops is None else replace(design, loops=loops), plant)
+        model = prediction_model(plant, design.dt)
+        limits = DriveLimits.of(model, design.drive_range, design.slew_per_s, design.safe_drive)
+        super().__init__(model, design.controlled, limits, design.patience_s, clock)
+        self.plant, self.notes, self.loops = plant, dict(notes or {}), self.design.loops
         # of each loop its drive and its controlled output, counted from 0
         self.ends = [(model.drives.index(p.drive), self.controlled.index(p.output)) for p in self.loops]
         self.integral, self._begun = np.zeros(len(self.loops)), np.full(len(self.controlled), np.nan)
         self._room, self._usual_d = np.full(model.n_d, np.nan), model.undisturbed(ROOM)
         #: An MPC of the same plant and drives in C, in whose library trials of these loops can run.
         self.c: CompiledController | None = None
-
-    @classmethod
-    def of(
-        cls,
-        plant: Plant,
-        design: Design,
-        loops: tuple[PILoop, ...] | None = None,
-        *,
-        notes: Mapping[str, Any] | None = None,
-    ) -> PIController:
-        """Return the PI loops of a design, or others, under its limits."""
-        design = check_design(design if loops is None else replace(design, loops=loops), plant)
-        made = cls(
-            plant,
-            dt=design.dt,
-            loops=design.loops,
-            controlled=design.controlled,
-            drive_range=design.drive_range,
-            slew_per_s=design.slew_per_s,
-            patience_s=design.patience_s,
-            safe_drive=design.safe_drive,
-            notes=notes,
-        )
-        made._design = design
-        return made
-
-    @property
-    def design(self) -> Design:
-        """What it is beside its plant; of what no PI has, the plant's default."""
-        if self._design is None:
-            ranges = dict(zip(self.model.drives, zip(self.lowest.tolist(), self.highest.tolist())))
-            self._design = default_design(
-                self.plant,
-                controlled=self.controlled,
-                dt=self.dt,
-                loops=self.loops,
-                drive_range=ranges,
-                slew_per_s=dict(zip(self.model.drives, (self.slew / self.dt).tolist())),
-                safe_drive=dict(zip(self.model.drives, self._safe.tolist())),
-                patience_s=self._patience_s / (1 + SAME),
-            )
-        return self._design
 
     def save(self, path: str | Path) -> Path:
         """Write the controller with its plant as JSON and return the path;
@@ -180,10 +110,10 @@ class PIController(SampledController):
         self._target = self._begun = y[self._rows]
         self._room = np.full(self.model.n_d, np.nan)
         if np.isfinite(self._target).all():  # what the feed-forward leaves of the drive that holds this
-            held = self._held(self._target, np.where(np.isfinite(room), room, self._usual_d))
-            rest = self._applied(reading, held)
+            holding = self._held(self._target, np.where(np.isfinite(room), room, self._usual_d))
+            applied = self._applied(reading, holding)
             self.integral = np.array(
-                [rest[j] - p.feedforward * held[j] for p, (j, _) in zip(self.loops, self.ends)]
+                [applied[j] - p.feedforward * holding[j] for p, (j, _) in zip(self.loops, self.ends)]
             )
         self.times.reset()
 
@@ -203,12 +133,12 @@ class PIController(SampledController):
         if usable.any():
             d = np.where(np.isfinite(self._room), self._room, self._usual_d)
             self._u = self.propose(y, wanted, d, seconds=self.times.slew_s)
-            lost = [name for name, seen in zip(self.controlled, usable) if not seen]
+            lost = [name for name, is_usable in zip(self.controlled, usable) if not is_usable]
             status, advice = "ok", wrong
             if lost:
                 status, advice = "fallback_plan", f"{', '.join(lost)}: no usable reading, the others go on"
         elif self._lost.all():
-            self._u = self._within(self._safe, self.times.slew_s)
+            self._u = self._within(self.drives.safe)
             status, advice = "off", wrong or "reading lost: drive to zero"
         return self._answer(status, advice, started)
 
@@ -218,19 +148,19 @@ class PIController(SampledController):
         seconds = self.dt if seconds is None else seconds
         error = target - y
         self._begun = np.where(np.isfinite(self._begun), self._begun, y)
-        ahead, kept = self.terms(target, d)
+        ahead, without_setpoint = self.terms(target, d)
         v = ahead.copy()
-        for at, (loop, (j, i)) in enumerate(zip(self.loops, self.ends)):
+        for k, (loop, (j, i)) in enumerate(zip(self.loops, self.ends)):
             if np.isfinite(error[i]):
-                v[j] = ahead[j] + loop.Kc * (error[i] - kept[at]) + self.integral[at]
+                v[j] = ahead[j] + loop.Kc * (error[i] - without_setpoint[k]) + self.integral[k]
             else:
-                v[j] = self._safe[j] if self._lost[i] else self._u[j]
-        u = self._within(v, seconds)
-        for at, (loop, (j, i)) in enumerate(zip(self.loops, self.ends)):
+                v[j] = self.drives.safe[j] if self._lost[i] else self._u[j]
+        u = self.drives.follow(v, self._u, seconds / self.dt)
+        for k, (loop, (j, i)) in enumerate(zip(self.loops, self.ends)):
             if np.isfinite(error[i]):
                 inward = (u[j] - v[j]) * loop.Kc * error[i] > 0
                 if inward or abs(u[j] - v[j]) <= UNCUT * self.model.span[j]:
-                    self.integral[at] += seconds * loop.Kc / loop.Ti * error[i]
+                    self.integral[k] += seconds * loop.Kc / loop.Ti * error[i]
         return u
 
     def terms(self, target: Array, d: Array) -> tuple[Array, Array]:
@@ -239,10 +169,10 @@ class PIController(SampledController):
         ahead = self._feedforward(target, d).copy()
         for loop, (j, _) in zip(self.loops, self.ends):
             ahead[j] *= loop.feedforward
-        kept = [
+        without_setpoint = [
             (1 - loop.setpoint) * (target[i] - self._begun[i]) for loop, (_, i) in zip(self.loops, self.ends)
         ]
-        return ahead, np.array(kept)
+        return ahead, np.array(without_setpoint)
 
     @property
     def applied(self) -> Array:
@@ -258,8 +188,8 @@ class PIController(SampledController):
         drives u (n_u,): a bumpless take-over."""
         self._u, self._begun = np.asarray(u, dtype=float), target
         ahead, error = self._feedforward(target, d), target - y
-        for at, (loop, (j, i)) in enumerate(zip(self.loops, self.ends)):
-            self.integral[at] = self._u[j] - loop.feedforward * ahead[j] - loop.Kc * error[i]
+        for k, (loop, (j, i)) in enumerate(zip(self.loops, self.ends)):
+            self.integral[k] = self._u[j] - loop.feedforward * ahead[j] - loop.Kc * error[i]
 
     def _feedforward(self, target: Array, d: Array) -> Array:
         """Return the drives that hold the target, where a loop uses them."""
@@ -270,9 +200,7 @@ class PIController(SampledController):
     def _held(self, target: Array, d: Array) -> Array:
         """Return the drives that hold the target; worked out once for a target and half a degree of room."""
         wanted, room = tuple(np.round(target, 2).tolist()), self.model.rounded_d(d)
-        return np.asarray(
-            np.clip(held_drive(self.model, self.controlled, wanted, room), self.lowest, self.highest)
-        )
+        return np.asarray(self.drives.cut(held_drive(self.model, self.controlled, wanted, room)))
 
 
 @lru_cache(maxsize=1024)
@@ -280,5 +208,5 @@ def held_drive(
     model: PredictionModel, controlled: tuple[str, ...], target: tuple[float, ...], d: tuple[float, ...]
 ) -> Array:
     """Return the drives that hold a target, zero where none does; a search asks for the same ones again."""
-    found = holding_drive(model, controlled, target, d)
-    return found.u if np.isfinite(found.y).all() else np.zeros(model.n_u)
+    holding = holding_drive(model, controlled, target, d)
+    return holding.u if np.isfinite(holding.y).all() else np.zeros(model.n_u)

@@ -1,42 +1,33 @@
 r"""The model-predictive controller's step in Python, written to be read: what the C is compared with.
 
 Each sample: advance the estimate under the drive that was applied, correct it with the reading, improve
-the plan (:mod:`thermogrip.mpc.optimiser.rti`), answer with its first move.  The reading of a lost sensor is
-left out; the room's temperature is fed forward as measured.
-
-A loop must never be left without an answer, so every failure has a next best one, and the status says which:
+the plan (:mod:`thermogrip.mpc.optimiser.rti`), answer with its first move.  A loop must never be left without
+an answer, so every failure has a next best one, and the status says which:
 
 * ``ok``: the optimiser's move;
 * ``late``: the deadline passed, so the last plan goes on (the PI, where there is none);
-* ``infeasible``: what was asked cannot be (a target that is no number or out of reach, a limit that must
-  break, an applied drive out of range); the move is the nearest that can be;
+* ``infeasible``: a target that is no number or out of reach, a limit that must break, an applied drive out
+  of range; the move is the nearest that can be;
 * ``fallback_plan``: no usable reading, or the solver failed; the last plan goes on, for ``patience_s``.  Of
   several controlled outputs one may be lost: the optimiser goes on, for ``patience_s`` with the model in
   place of the reading, then without that output, and the drive that is there for it goes to rest;
-* ``fallback_pi``: the plan has run out; PI on the reading, taken over without a bump (and without
-  feed-forward: the drive that is taken over has it);
+* ``fallback_pi``: the plan has run out; PI on the reading, taken over without a bump;
 * ``off``: no reading to act on, or the pump is off; the drive goes to zero.
 
+Whatever the status, a drive is finite, inside its range, and within the slew limit of the one before.
 Where mean innovations exceed 3 standard deviations, the weight of moves is multiplied by their third, up
 to 30 times: a gain that is off by 30 % does not swing.
 
-What a loop shows beyond one sample, an output that swings or does not arrive, another plant than the model,
-:class:`thermogrip.mpc.controllers.loop_monitor.LoopMonitor` watches from beside it.
-
-Whatever the status, a drive is finite, inside its range, and within the slew limit of the one before.  What
-cannot be a reading is found by :mod:`thermogrip.mpc.estimator.reading_checks`.
-
-It may be called at any rate (:mod:`thermogrip.mpc.estimator.call_times`).  Estimate and plan go on by the
-seconds that passed, fractions of a sample included, and the slew limit counts from the last move.  Before a
-move is due the last one is held, with its status; called more seldom than its sample time, it answers with
-the mean of the plan over the time until it is likely to be called again.
+It may be called at any rate (:mod:`thermogrip.mpc.estimator.call_times`): before a move is due the last one
+is held, with its status; called more seldom than its sample time, it answers with the mean of the plan over
+the time until it is likely to be called again.
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -59,6 +50,35 @@ if TYPE_CHECKING:
     from thermogrip.sysid.plant.plant import Plant
 
 
+@dataclass
+class _Follows:
+    """What the drives follow."""
+
+    plan: Array | None = None  # (N, n_u), as it was made ``age_s`` ago
+    age_s: float = 0.0
+    on_pi: bool = False  # whether the PI has taken over
+    iterations: int = 0  # of the program, in the last step
+
+
+@dataclass
+class _Approach:
+    """From where the controlled outputs come to their targets."""
+
+    side: Array  # (n_controlled,) +1 from below, -1 from above, 0 neither
+    ramped: Array  # (n_controlled,) where targets are that may only ramp, NaN before the first
+
+
+@dataclass
+class _Past:
+    """What was read last, NaN where it could not be used."""
+
+    y: Array  # (n_y,)
+    d: Array  # (n_d,) the last good ones
+    x: Array  # (n_x,) where the estimate then stood
+    fresh: bool = True  # whether nothing was read since the start
+    silent_s: float = 0.0  # that nobody called, where it was too long to know the past
+
+
 class ReferenceController(SampledController):
     """The controller of a plant and a design whose step runs in Python; ``clock`` gives step times [s]."""
 
@@ -66,23 +86,24 @@ class ReferenceController(SampledController):
         self, plant: Plant, design: Design, *, clock: Callable[[], float] = time.perf_counter
     ) -> None:
         model = prediction_model(plant, design.dt)
-        slew = design.dt * np.array([design.slew_per_s[name] for name in model.drives])
-        super().__init__(
-            *(model, design.controlled, design.drive_range, slew, design.patience_s, clock),
-            design.safe_drive,
-        )
-        self.design = design
-        self.observer = design.observer(model)
         self.optimiser = Optimiser(model, design)
-        self.pi = PIController.of(plant, design, tuple(replace(p, feedforward=0.0) for p in design.loops))
+        super().__init__(model, design.controlled, self.optimiser.drives, design.patience_s, clock)
+        self.observer = design.observer(model)
+        self.pi = PIController(plant, design, loops=tuple(replace(p, feedforward=0.0) for p in design.loops))
         self.monitor = ReadingMonitor(model.n_y, spike=model.spike)
         self.reach = Reach(self.optimiser, self.observer)
-        self.last_iterations = 0  # of the program, in the last step
-        self._in_force: Array
-        self._plan: Array | None  # (N, n_u), as it was made ``_age_s`` ago
-        self._ramped: Array  # where targets are that may only ramp, NaN before the first
         lost = np.full(model.n_y, np.nan)
         self._start(lost, model.undisturbed(design.ambient), self.observer.reset)
+
+    @property
+    def design(self) -> Design:
+        """What it is made of."""
+        return self.optimiser.design
+
+    @property
+    def last_iterations(self) -> int:
+        """Changes of the program's active set in the last step."""
+        return self._follows.iterations
 
     @property
     def disturbance(self) -> DisturbanceModel:
@@ -92,28 +113,30 @@ class ReferenceController(SampledController):
     @property
     def plan(self) -> Array | None:
         """The plan that is still ahead, (N, n_u)."""
-        return None if self._plan is None else shifted(self._plan, self._age_s / self.dt)
+        return (
+            None if self._follows.plan is None else shifted(self._follows.plan, self._follows.age_s / self.dt)
+        )
 
     def reset(self, reading: Readings, *, in_room: bool = False) -> None:
         """Forget the past, see :meth:`thermogrip.mpc.controllers.mpc.Controller.reset`; ``in_room`` with the
         plant linearised in its room, as C has it."""
         begin = self.observer.reset_in_room if in_room else self.observer.reset
         self._start(*self._read(reading), begin)
-        self._u = self._in_force = self._applied(reading, self._u)
+        self._u = self._applied(reading, self._u)
         self.pi.reset(reading)
         self.times.reset()
 
     def step(self, reading: Readings, target: Trajectory) -> Move:
         """Return the move for this sample; see :meth:`thermogrip.mpc.controllers.mpc.Controller.step`."""
         started = self.clock()
-        self.last_iterations = 0
+        self._follows.iterations = 0
         self.times.call(reading)
         y, d = self._read(reading)
         if self.times.stale:
             y = np.full(self.model.n_y, np.nan)
         if is_off([name for name in self.model.model.switches if name not in self.model.drives], reading):
             return self._pause(y, d, target, started)
-        applied = self._applied(reading, self._in_force)
+        applied = self._applied(reading, self._u)
         self._pass(self.times.seconds, applied)
         if not self.times.due:
             self._refine(y)
@@ -121,7 +144,7 @@ class ReferenceController(SampledController):
         event = self._absorb(y, d, applied) or (advice.STALE if self.times.stale else "")
         wanted, wrong = self._wanted(target)
         if not np.array_equal(wanted, self._target):
-            self._side = self._sides(wanted)
+            self._approach.side = self._sides(wanted)
         self._target = wanted
         samples = np.arange(1, self.optimiser.N + 1)
         ahead = targets_ahead(
@@ -134,58 +157,51 @@ class ReferenceController(SampledController):
             lasting = event or lasting
         if wrong and status == "ok":
             status = "infeasible"
-        self._u = self._in_force = self._within(u, self.times.slew_s)
+        self._u = self._within(u)
         return self._answer(status, wrong or lasting or event, started)
 
     def _start(self, y: Array, d: Array, begin: Callable[[Array, Array], None]) -> None:
         """Forget the past at readings y, disturbances d; the estimate is begun by one of the observer's two
         ways: in the middle of a loop there is no time for the better one."""
-        self._d = np.where(np.isfinite(d), d, self.model.undisturbed(self.design.ambient))
-        begin(y, self._d)
+        d = np.where(np.isfinite(d), d, self.model.undisturbed(self.design.ambient))
+        begin(y, d)
         self._forget()
-        self._in_force = self._u
-        self._side = np.zeros(len(self._rows))
-        self._plan = None
-        self._age_s = 0.0  # since the plan was made
-        self._ramped = np.full(len(self._rows), np.nan)
-        self._silent_s = 0.0  # that nobody called, where it was too long to know the past
-        self._y = y
-        self._seen = self.observer.now  # where the estimate stood after the last reading
-        self._fresh = True
-        self._on_pi = False
+        self._follows = _Follows()
+        self._approach = _Approach(np.zeros(len(self._rows)), np.full(len(self._rows), np.nan))
+        self._past = _Past(y, d, self.observer.now)
         self.monitor.forget(y)
         self.reach.forget()
         self.optimiser.forget()
 
     def _pass(self, seconds: float, applied: Array) -> None:
         """Let the estimate and the plan go on by so many seconds under the drives that were applied."""
-        if self._fresh:
+        if self._past.fresh:
             return  # it begins with this reading
         if seconds > RESTART_S + self.dt:
             # until a reading comes to start again from, no more is predicted than a silence that would count
-            self._silent_s, seconds = seconds, RESTART_S
-        self.observer.advance(seconds, applied, self._d)
-        self._age_s += seconds
+            self._past.silent_s, seconds = seconds, RESTART_S
+        self.observer.advance(seconds, applied, self._past.d)
+        self._follows.age_s += seconds
 
     def _absorb(self, y: Array, d: Array, applied: Array) -> str:
         """Correct the estimate with this reading; return what the operator should know."""
-        elapsed, silent = self.times.waited_s, self._silent_s
+        elapsed, silent = self.times.waited_s, self._past.silent_s
         if silent and np.isfinite(y).any():
-            u, target, side = self._u, self._target, self._side
-            self._start(y, np.where(np.isfinite(d), d, self._d), self.observer.reset_in_room)
-            self._u, self._in_force, self._fresh = u, applied, False
-            self._target, self._side, self._y = target, side, y
+            u, target, side = self._u, self._target, self._approach.side
+            self._start(y, np.where(np.isfinite(d), d, self._past.d), self.observer.reset_in_room)
+            self._u, self._past.fresh = u, False
+            self._target, self._approach.side, self._past.y = target, side, y
             return advice.silence(silent)
-        if not self._fresh:
-            self.observer.look(self._d)
-            self.monitor.expect(self.model.C @ (self.observer.now - self._seen))
-        self._fresh = False
+        if not self._past.fresh:
+            self.observer.look(self._past.d)
+            self.monitor.expect(self.model.C @ (self.observer.now - self._past.x))
+        self._past.fresh = False
         self._u = applied  # the slew limit counts from what was really applied
-        self._d = np.where(np.isfinite(d), d, self._d)
+        self._past.d = np.where(np.isfinite(d), d, self._past.d)
         y, stays = self.monitor.screen(y, self.observer.reading())
         jumped = self._accept_jump(y, stays) if stays.any() else ""
         self.observer.update(y)
-        self._y, self._seen = y, self.observer.now
+        self._past.y, self._past.x = y, self.observer.now
         lost = [name for name, value in zip(self.model.outputs, y) if not np.isfinite(value)]
         lost += [name for name, value in zip(self.model.disturbances, d) if not np.isfinite(value)]
         self._unread_s = np.where(np.isfinite(y[self._rows]), 0.0, self._unread_s + elapsed)
@@ -193,12 +209,12 @@ class ReferenceController(SampledController):
 
     def _refine(self, y: Array) -> None:
         """Correct the estimate with a reading that comes before a move is due."""
-        if self._fresh or not np.isfinite(y).any():
+        if self._past.fresh or not np.isfinite(y).any():
             return
-        self.observer.look(self._d)
-        self.monitor.expect(self.model.C @ (self.observer.now - self._seen))
+        self.observer.look(self._past.d)
+        self.monitor.expect(self.model.C @ (self.observer.now - self._past.x))
         self.observer.refine(self.monitor.screen_between(y, self.observer.reading()))
-        self._seen = self.observer.now
+        self._past.x = self.observer.now
 
     def _accept_jump(self, y: Array, stays: Mask) -> str:
         """Take a jump that stays for an offset of its sensor, or for another world; return what it was."""
@@ -207,7 +223,7 @@ class ReferenceController(SampledController):
         if offset:
             self.observer.set_offsets(y, stays)
         else:
-            self.observer.reset_in_room(y, self._d)
+            self.observer.reset_in_room(y, self._past.d)
         return advice.jump(names, offset=offset)
 
     def _sides(self, wanted: Array) -> Array:
@@ -216,11 +232,11 @@ class ReferenceController(SampledController):
 
     def _pause(self, y: Array, d: Array, target: Trajectory, started: float) -> Move:
         """Take the drive back while no water moves its heat; the estimate starts again afterwards."""
-        u = self._within(self._neutral, self.times.slew_s)
+        u = self._within(self.drives.neutral)
         wanted, _ = self._wanted(target)
-        self._start(y, np.where(np.isfinite(d), d, self._d), self.observer.reset_in_room)
-        self._u = self._in_force = u
-        self._target, self._side = wanted, self._sides(wanted)
+        self._start(y, np.where(np.isfinite(d), d, self._past.d), self.observer.reset_in_room)
+        self._u = u
+        self._target, self._approach.side = wanted, self._sides(wanted)
         stands = advice.pump_off(self.model.model.switches)
         # without a pump that is asked for nobody would switch it on again
         self._move = replace(self._answer("off", stands, started), pump=1)
@@ -233,39 +249,39 @@ class ReferenceController(SampledController):
     def _decide(self, wanted: Array, ahead: Array | None, started: float) -> tuple[Array, str, str]:
         """Return the drives, the status and the advice: optimiser, else plan, else PI, else off."""
         if not np.isfinite(wanted).all():
-            return self._safe, "off", advice.no_target(safe=bool(self.design.safe_drive))
+            return self.drives.safe, "off", advice.no_target(safe=bool(self.design.safe_drive))
         if (self._unread_s > 0).all():
             return self._without_readings()
         if self.clock() - started >= self.design.deadline_s:
             return self._fall_back("late", advice.TOO_LATE)
-        low, high = self.optimiser.lowest - 1e-9, self.optimiser.highest + 1e-9
+        low, high = self.drives.lowest - 1e-9, self.drives.highest + 1e-9
         outside = bool(np.any((self._u < low) | (self._u > high)))
         try:
             outcome = self._optimise(wanted, ahead)
         except (np.linalg.LinAlgError, ArithmeticError):
             return self._fall_back("fallback_plan", advice.solver("not finite"))
-        self.last_iterations = outcome.iterations
+        self._follows.iterations = outcome.iterations
         self.observer.hold_drives(outcome.authority < WEAK)
         if outcome.status == "time limit":
             return self._fall_back("late", advice.TOO_LATE)
         if outcome.status != "solved":
             status = "infeasible" if outcome.status == "infeasible" else "fallback_plan"
             return self._fall_back(status, advice.solver(outcome.status))
-        self._plan = np.repeat(outcome.plan, self.design.blocks, axis=0)
-        self._age_s, self._on_pi = 0.0, False
+        self._follows.plan = np.repeat(outcome.plan, self.design.blocks, axis=0)
+        self._follows.age_s, self._follows.on_pi = 0.0, False
         if outside:
-            return self._first_of(self._plan), "infeasible", advice.OUT_OF_RANGE
-        return (self._first_of(self._plan), *self._judge(outcome, wanted, started))
+            return self._first_of(self._follows.plan), "infeasible", advice.OUT_OF_RANGE
+        return (self._first_of(self._follows.plan), *self._judge(outcome, wanted, started))
 
     def _judge(self, outcome: Outcome, wanted: Array, started: float) -> tuple[str, str]:
         """Return the status and the advice of a plan that was found."""
-        end, zone = outcome.y[-1, self._rows], self.optimiser.zone
+        end, zone = outcome.y[-1, self._rows], self.optimiser.weights.zone
         missed = self.reach.missed(
             self.observer,
             self._u,
-            self._d,
+            self._past.d,
             target=np.where(zone > 0, np.clip(end, wanted - zone, wanted + zone), wanted),
-            side=self._side,
+            side=self._approach.side,
             ahead=end,
             seen=self._unread_s == 0,
         )
@@ -275,8 +291,8 @@ class ReferenceController(SampledController):
         if outcome.broken:
             units = dict(zip(self.model.outputs, self.model.unit.tolist()))
             name, over = max(outcome.broken.items(), key=lambda item: item[1] / units[item[0]])
-            far = over > BREAKS_FAR * units[name]
-            return "infeasible" if far else "ok", advice.limit_breaks(name, over)
+            breaks_far = over > BREAKS_FAR * units[name]
+            return "infeasible" if breaks_far else "ok", advice.limit_breaks(name, over)
         if self.clock() - started > self.design.deadline_s:
             return "late", advice.TOO_LATE
         if (self._unread_s > 0).any():
@@ -286,41 +302,41 @@ class ReferenceController(SampledController):
     def say_unseen(self, unread_s: Array) -> str:
         """Return what is said where controlled outputs were not read for so long (n_controlled,)."""
         lost = unread_s > self._patience_s
-        parked = [name for name, at in zip(self.model.drives, self.optimiser.pair) if lost[at]]
+        parked = [name for name, pair in zip(self.model.drives, self.optimiser.pair) if lost[pair]]
         return self._unseen(parked, unread_s)
 
     def _optimise(self, wanted: Array, ahead: Array | None) -> Outcome:
-        last = np.clip(self._u, self.optimiser.lowest, self.optimiser.highest)
+        last = self.drives.cut(self._u)
         observer = self.observer
-        d = self._d + observer.disturbance_bias
+        d = self._past.d + observer.disturbance_bias
         guess, biases = self._guess(wanted, last), (observer.output_bias, observer.drive_bias)
         caution = min(max(1.0, float(np.max(np.abs(observer.innovation))) / CAUTION), MOST_CAUTION)
         slew_s = self.times.slew_s
         sample = Sample(
-            observer.now, last, guess, d, wanted, self._side, *biases, slew_s, self._lost, caution
+            observer.now, last, guess, d, wanted, self._approach.side, *biases, slew_s, self._lost, caution
         )
         return self._converged(sample._replace(ahead=ahead))
 
     def _converged(self, sample: Sample) -> Outcome:
         """Return what one program gives, or as many as the design asks for until the plan stays."""
-        found, changes = self.optimiser.solve(sample), 0
+        outcome, changes = self.optimiser.solve(sample), 0
         for _ in range(1, self.design.iterations if self.model.affine is None else 1):
-            moved = np.abs(found.plan - sample.guess) > STAYS * self.model.span
-            if found.status != "solved" or not moved.any():
+            moved = np.abs(outcome.plan - sample.guess) > STAYS * self.model.span
+            if outcome.status != "solved" or not moved.any():
                 break
-            sample, changes = sample._replace(guess=found.plan), changes + found.iterations
-            found = self.optimiser.solve(sample)
-        return replace(found, iterations=found.iterations + changes)
+            sample, changes = sample._replace(guess=outcome.plan), changes + outcome.iterations
+            outcome = self.optimiser.solve(sample)
+        return replace(outcome, iterations=outcome.iterations + changes)
 
     def _ramp(self, wanted: Array, ahead: Array | None) -> tuple[Array, Array | None]:
         """Return the targets now (n_controlled,), of those that may only ramp a sample further on the way,
         and what is ahead (N, n_controlled) from there."""
         rates = np.array([self.design.ramp_per_s.get(name, np.inf) for name in self.controlled])
-        shown = self._y[self._rows]
-        begun = np.where(np.isfinite(self._ramped), self._ramped, shown)
+        shown = self._past.y[self._rows]
+        begun = np.where(np.isfinite(self._approach.ramped), self._approach.ramped, shown)
         reach = rates * self.times.waited_s
         now = np.where(np.isfinite(begun), np.clip(wanted, begun - reach, begun + reach), wanted)
-        self._ramped = now
+        self._approach.ramped = now
         later = np.arange(1, self.optimiser.N + 1)[:, None] * rates * self.dt
         if ahead is None and np.array_equal(now, wanted):
             return now, None
@@ -340,23 +356,23 @@ class ReferenceController(SampledController):
         if not self._lost.all():
             plan = self._young_plan()
             return self._u if plan is None else self._first_of(plan), "fallback_plan", ""
-        self._plan = None
-        return self._safe, "off", advice.blind(self._unread_s.min())
+        self._follows.plan = None
+        return self.drives.safe, "off", advice.blind(self._unread_s.min())
 
     def _young_plan(self) -> Array | None:
-        return None if self._on_pi or self._age_s > self._patience_s else self.plan
+        return None if self._follows.on_pi or self._follows.age_s > self._patience_s else self.plan
 
     def _fall_back(self, status: str, why: str) -> tuple[Array, str, str]:
         """Follow the plan while it is young; then PI, then off."""
         plan = self._young_plan()
         if plan is not None:
             return self._first_of(plan), status, why
-        y = self._y[self._rows]
+        y = self._past.y[self._rows]
         if not self.pi.loops or not np.isfinite(y).all():
-            return self._safe, "off", why
-        if not self._on_pi:
-            self.pi.follow(self._u, y, self._target, self._d)
-        self._on_pi = True
-        self.pi.hold(np.clip(self._u, self.optimiser.lowest, self.optimiser.highest))
-        u = self.pi.propose(y, self._target, self._d, seconds=self.times.slew_s)
+            return self.drives.safe, "off", why
+        if not self._follows.on_pi:
+            self.pi.follow(self._u, y, self._target, self._past.d)
+        self._follows.on_pi = True
+        self.pi.hold(self.drives.cut(self._u))
+        u = self.pi.propose(y, self._target, self._past.d, seconds=self.times.slew_s)
         return u, "fallback_pi" if status == "fallback_plan" else status, why

@@ -113,8 +113,8 @@ class TopicLoop:
         for name in (*self._readings, *self._targets):
             column = self._columns[name]
             if column.topic == topic:
-                told = Message(topic, self._type(name), seconds, message, {})
-                self._heard[name] = _Heard(column_value(told, column, name, "topics.toml"), seconds)
+                heard_message = Message(topic, self._type(name), seconds, message, {})
+                self._heard[name] = _Heard(column_value(heard_message, column, name, "topics.toml"), seconds)
 
     def tick(self, seconds: float) -> dict[str, float]:
         """Return what is published at this time of the node's clock [s], a number by topic."""
@@ -178,25 +178,29 @@ def replay_bag(loop: TopicLoop, bag: str | Path, out: str | Path) -> int:
     """
     types = dict(loop.publications)
     answered = [(seconds, answer) for seconds, answer in _ticks(loop, bag) if answer]
-    said = ((topic, types[topic], at, value) for at, answer in answered for topic, value in answer.items())
-    write_bag(out, said)
+    messages = (
+        (topic, types[topic], seconds_of, value)
+        for seconds_of, answer in answered
+        for topic, value in answer.items()
+    )
+    write_bag(out, messages)
     return len(answered)
 
 
 def _ticks(loop: TopicLoop, bag: str | Path) -> Iterator[tuple[float, dict[str, float]]]:
     """Yield the time of each tick [s] and what the loop then answers."""
-    topics, at = {topic for topic, _ in loop.subscriptions}, 0
+    topics, due_message = {topic for topic, _ in loop.subscriptions}, 0
     heard = [message for message in bag_messages(bag) if message.topic in topics]
     if not heard:
         raise UserError("has none of the loop's topics", file=bag, hint="correct topics.toml")
     loop.reset()
     for k in count():
         due = heard[0].time + k * loop.dt
-        while at < len(heard) and heard[at].time <= due:
-            loop.hear(heard[at].topic, heard[at].content, heard[at].time)
-            at += 1
+        while due_message < len(heard) and heard[due_message].time <= due:
+            loop.hear(heard[due_message].topic, heard[due_message].content, heard[due_message].time)
+            due_message += 1
         yield due, loop.tick(due)
-        if at == len(heard):
+        if due_message == len(heard):
             return
 
 
@@ -217,6 +221,6 @@ def _topics_of(controller: Controller | PIController) -> str:
         unit = units.get(name.removeprefix(TARGET), "1")
         kind = _OF_NODE.get(name, _NUMBER)
         column = Column(f"/thermogrip/{name}", "data", unit, role, kind)
-        said = [f'{key} = "{value}"' for key, value in vars(column).items()]
-        lines += ["", f"[columns.{name}]", *said]
+        entries = [f'{key} = "{value}"' for key, value in vars(column).items()]
+        lines += ["", f"[columns.{name}]", *entries]
     return "\n".join(lines) + "\n"

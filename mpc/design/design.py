@@ -168,7 +168,7 @@ def _check_names(design: Design, plant: Plant) -> None:
         "the plant has no drive {}",
         "{} is not regulated",
     )
-    known: dict[str, tuple[Sequence[str] | Mapping[str, Any], str]] = {
+    accepted: dict[str, tuple[Sequence[str] | Mapping[str, Any], str]] = {
         "controlled": (plant.outputs, no_output),
         "limits": (plant.outputs, no_output),
         "drive_range": (drives, no_drive),
@@ -180,7 +180,7 @@ def _check_names(design: Design, plant: Plant) -> None:
         "ramp_per_s": (design.controlled, not_regulated),
         "hard": (design.limits, "{} has no limits"),
     }
-    for key, (names, problem) in known.items():
+    for key, (names, problem) in accepted.items():
         for name in getattr(design, key):
             _refuse(name not in names, f"{key}: {problem.format(name)}")
     for name in design.controlled:
@@ -188,11 +188,11 @@ def _check_names(design: Design, plant: Plant) -> None:
     for name in drives:
         missing = name not in design.drive_range or name not in design.slew_per_s
         _refuse(missing, f"drive_range, slew_per_s: nothing for drive {name}")
-    for at, loop in enumerate(design.loops):
+    for k, loop in enumerate(design.loops):
         pair = f"loops: {loop.output} by {loop.drive} is"
         no_pair = loop.drive not in drives or loop.output not in design.controlled
         _refuse(no_pair, f"{pair} no pair of a regulated output and a drive")
-        twice = any(loop.drive == other.drive or loop.output == other.output for other in design.loops[:at])
+        twice = any(loop.drive == other.drive or loop.output == other.output for other in design.loops[:k])
         _refuse(twice, f"{pair} there twice")
 
 
@@ -223,7 +223,7 @@ def problem_of(error: ValidationError) -> str:
     """Return the first thing that pydantic found wrong, behind the key where it is."""
     # of a value with several forms, what is wrong within one says more than that it is not another
     first = min(error.errors(), key=lambda found: found["type"].endswith("_type"))
-    key = ".".join(str(part) for part in first["loc"] if not str(part).startswith(_TAGS))
+    key = ".".join(str(step) for step in first["loc"] if not str(step).startswith(_TAGS))
     text = first["msg"].removeprefix("Value error, ")
     if first["type"] in ("extra_forbidden", "unexpected_keyword_argument"):
         text = "no such key"
@@ -344,17 +344,17 @@ def default_noise(plant: Plant, controlled: Sequence[str], dt: float) -> Observe
     for name, span in zip(model.drives, model.span.tolist()):
         answers = [step_response(plant, name, output) for output in controlled]
         gains = np.array([answer.gain for answer in answers]) / units
-        at = int(np.argmax(np.abs(np.nan_to_num(gains))))
-        rate, delay = abs(answers[at].gain) / answers[at].lag, answers[at].delay
+        strongest = int(np.argmax(np.abs(np.nan_to_num(gains))))
+        rate, delay = abs(answers[strongest].gain) / answers[strongest].lag, answers[strongest].delay
         # a model without a delay does not say how soon its plant answers: then by its lag
-        theta = dt + (delay if delay > _SEEN * plant.dt else answers[at].lag)
-        known = reading_noise(plant, controlled[at])
-        noise = NOISE * units[at] if known is None else known
+        theta = dt + (delay if delay > _SEEN * plant.dt else answers[strongest].lag)
+        reading_sd = reading_noise(plant, controlled[strongest])
+        noise = NOISE * units[strongest] if reading_sd is None else reading_sd
         sooner = noise * dt**0.5 / (rate * theta**2) if rate > 0 else 0.0
         if record is None and delay <= _SEEN * plant.dt:
             sooner = DRIFT  # nothing says more
-        seen = record.input.get(name, 0.0) / span if record else 0.0
-        drifts[name] = float(np.nan_to_num(max(seen, sooner), nan=DRIFT, posinf=DRIFT))
+        logged_drift = record.input.get(name, 0.0) / span if record else 0.0
+        drifts[name] = float(np.nan_to_num(max(logged_drift, sooner), nan=DRIFT, posinf=DRIFT))
     output = _OUTPUT_DRIFT / dt**0.5
     return ObserverNoise(record.state if record else ObserverNoise.state, drifts, output)
 
@@ -363,8 +363,8 @@ def _slew(plant: Plant, name: str, dt: float, span: float) -> float:
     """Return the largest change of a drive [its unit per s]: what its logs show, else an eighth of its range;
     never more than its range in a sample."""
     record = plant.scores.innovations
-    seen = record.fastest.get(name, 0.0) if record else 0.0
-    return min(max(seen, 0.125 * span), span / dt)
+    fastest = record.fastest.get(name, 0.0) if record else 0.0
+    return min(max(fastest, 0.125 * span), span / dt)
 
 
 def _noise_of(noise: Mapping[str, Any], drives: Iterable[str]) -> dict[str, Any]:
@@ -419,9 +419,9 @@ def default_design(
             )
         low, high = plant.valid.get(name, (-np.inf, np.inf))
         if high - low < _COARSE:
-            seen = f"{name} moves by {high - low:.2g} {plant.units.get(name, 'degC')} in the logs"
+            moves = f"{name} moves by {high - low:.2g} {plant.units.get(name, 'degC')} in the logs"
             raise UserError(
-                f"{seen}, and a controller counts tenths of a unit",
+                f"{moves}, and a controller counts tenths of a unit",
                 hint="log it in a smaller unit: cm instead of m",
             )
     dt = max(1, round((sample_time(plant) if dt is None else dt) / plant.dt)) * plant.dt

@@ -133,35 +133,38 @@ class Spec(BaseModel):
         for start, target in self.steps:
             if abs(start - target) <= self.band_degC:
                 raise ValueError(f"steps: {start:g} -> {target:g} stays inside the band")
-            for name, own in (self.settling or {}).items():
-                if abs(start - target) <= (own.band_degC or 0.0):
+            for name, settling in (self.settling or {}).items():
+                if abs(start - target) <= (settling.band_degC or 0.0):
                     raise ValueError(f"steps: {start:g} -> {target:g} stays inside the band of {name}")
         if isinstance(self.output, list) and len(set(self.output)) < len(self.output):
             raise ValueError("output: names one twice")
-        times = {f"settling of {name}": own.within_s or 0.0 for name, own in (self.settling or {}).items()}
+        times = {
+            f"settling of {name}": settling.within_s or 0.0
+            for name, settling in (self.settling or {}).items()
+        }
         if "settle_within_s" in self.model_fields_set:
             times["settle_within_s"] = self.settle_within_s
         for key, seconds in times.items():
             if seconds > self.hold_s:
-                seen = f"longer than each step is simulated (hold_s, {self.hold_s:g} s)"
-                raise ValueError(f"{key}: {seconds:g} s is {seen}")
+                too_long = f"longer than each step is simulated (hold_s, {self.hold_s:g} s)"
+                raise ValueError(f"{key}: {seconds:g} s is {too_long}")
         return self
 
     def asked(self, output: str) -> Asked:
         """Return what is asked of an output, which is what is asked of all where nothing is its own."""
-        own = (self.settling or {}).get(output, Settling())
+        of_output = (self.settling or {}).get(output, Settling())
         return Asked(
-            own.within_s or self.settle_within_s,
-            own.band_degC or self.band_degC,
-            own.overshoot_degC or self.overshoot_degC,
-            own.bias_degC or self.bias_degC,
-            own.within_s or 0.0,
+            of_output.within_s or self.settle_within_s,
+            of_output.band_degC or self.band_degC,
+            of_output.overshoot_degC or self.overshoot_degC,
+            of_output.bias_degC or self.bias_degC,
+            of_output.within_s or 0.0,
         )
 
     @property
     def ramps(self) -> bool:
         """Whether a target may ramp."""
-        return bool(self.ramp_per_s) or any(own.within_s for own in (self.settling or {}).values())
+        return bool(self.ramp_per_s) or any(settling.within_s for settling in (self.settling or {}).values())
 
     def way(self, step: tuple[float, float], output: str) -> float:
         """Return how far a step leads an output until it is in its band [degC]."""
@@ -177,8 +180,8 @@ class Spec(BaseModel):
             return cls()
         times = _own_times(plant)
         while times:
-            seen = [plant.valid.get(name, (0.0, 0.0)) for name in times]
-            low, high = max(ends[0] for ends in seen), min(ends[1] for ends in seen)
+            logged = [plant.valid.get(name, (0.0, 0.0)) for name in times]
+            low, high = max(ends[0] for ends in logged), min(ends[1] for ends in logged)
             if high - low > _LEAST_SEEN:
                 break
             times.popitem()
@@ -226,15 +229,15 @@ class Spec(BaseModel):
     def surroundings_in_words(self, plant: Plant) -> str:
         """Return what measured disturbances are taken for in the trials, and where nobody reads them; empty
         where the room's temperature is the only one."""
-        plant, said = self.widened(plant), []
+        plant, sentences = self.widened(plant), []
         usual = plant.undisturbed(self.ambient_degC).tolist()
         for name, value in zip(plant.disturbances, usual, strict=True):
             whence = "the middle of the logs" if name in plant.valid else "the plant does not say what it was"
             whence = "the logs' median" if name in plant.nominal else whence
             whence = "the spec" if name in (self.disturbances or {}) else whence
             if not plant.is_room(name) or whence == "the spec":
-                said.append(f"{name} is taken as {value if np.isfinite(value) else 0.0:.4g} ({whence})")
-        return "; ".join(said)
+                sentences.append(f"{name} is taken as {value if np.isfinite(value) else 0.0:.4g} ({whence})")
+        return "; ".join(sentences)
 
     def design(self, plant: Plant, **changes: Any) -> Design:
         """Return the plant's default design under this spec; a key that does not fit it is a UserError."""
@@ -267,8 +270,8 @@ class Spec(BaseModel):
                 if half > most:
                     narrow = f"{half:g} about {name} is wider than {key}, {most:g}"
                     raise UserError(f"zones: {narrow}", hint="steps are judged by it: widen it too")
-        given = self.weights or {}
-        counted = {name: given.get(name, 1.0) * design.weights.get(name, 1.0) for name in design.controlled}
+        weights = self.weights or {}
+        counted = {name: weights.get(name, 1.0) * design.weights.get(name, 1.0) for name in design.controlled}
         values["weights"] = {name: weight for name, weight in counted.items() if weight != 1.0}
         values |= {"zones": dict(self.zones or {}), "hard": tuple(self.hard or ())}
         values["iterations"] = self.iterations
@@ -303,11 +306,11 @@ def _check_sample(spec: Spec, plant: Plant) -> None:
         return
     _check_length(spec, spec.sample_time_s)
     steps = spec.sample_time_s / plant.dt
-    near = max(1, round(steps)) * plant.dt
-    if abs(near - spec.sample_time_s) > 1e-6 * near:
+    nearest_s = max(1, round(steps)) * plant.dt
+    if abs(nearest_s - spec.sample_time_s) > 1e-6 * nearest_s:
         wrong = f"{spec.sample_time_s:g} s is no multiple of the plant's step of {plant.dt:g} s"
         raise UserError(
-            f"sample_time_s: {wrong}", hint=f"write {near:g}, or identify the plant from a faster log"
+            f"sample_time_s: {wrong}", hint=f"write {nearest_s:g}, or identify the plant from a faster log"
         )
 
 
@@ -322,13 +325,13 @@ def _check_length(spec: Spec, dt: float) -> None:
 
 def _check_settling(spec: Spec, controlled: tuple[str, ...], ramps: Mapping[str, float]) -> None:
     """Refuse what is asked of an output that has no target, or sooner than its ramp is there."""
-    for name, own in (spec.settling or {}).items():
+    for name, settling in (spec.settling or {}).items():
         if name not in controlled:
             hint = known_names(name, controlled, "these are: {}")
             raise UserError(f"settling: {name} is not regulated", hint=hint)
         takes = max(spec.way(step, name) for step in spec.steps) / ramps.get(name, np.inf)
-        if own.within_s is not None and takes > own.within_s:
-            late = f"{name} is asked within {own.within_s:g} s, and its ramp_per_s takes {takes:g} s"
+        if settling.within_s is not None and takes > settling.within_s:
+            late = f"{name} is asked within {settling.within_s:g} s, and its ramp_per_s takes {takes:g} s"
             raise UserError(f"settling: {late}", hint="leave out one: within_s makes a ramp itself")
 
 

@@ -142,7 +142,7 @@ class StuckMonitor:
 
     def note(self, observer: Observer, y: Array, u: Array, d: Array) -> None:
         """Note readings y (n_y,) after drives u (n_u,) and measured disturbances d (n_d,)."""
-        model, found = observer.model, observer.disturbance
+        model, disturbance = observer.model, observer.disturbance
         self.said = ""
         for i, name in enumerate(self.outputs):
             run = self._runs[i]
@@ -150,11 +150,11 @@ class StuckMonitor:
                 begin, start = float(model.output(observer.now)[i]), observer.now.copy()
                 self._runs[i] = begin, start, start, u.copy(), observer.w.copy()
                 continue
-            begin, x, still, held, w = run
-            on_drive, on_d = found.on_drive @ w * model.span, found.on_disturbance @ w
+            begin, x, still, held_drive, w = run
+            on_drive, on_d = disturbance.on_drive @ w * model.span, disturbance.on_disturbance @ w
             x = model.next_state(x, u + on_drive, d + on_d)
-            still = model.next_state(still, held + on_drive, d + on_d)
-            self._runs[i] = begin, x, still, held, w
+            still = model.next_state(still, held_drive + on_drive, d + on_d)
+            self._runs[i] = begin, x, still, held_drive, w
             moved = float(model.output(x)[i]) - begin
             by_drive = float((model.output(x) - model.output(still))[i])
             if min(abs(moved), abs(by_drive)) > SHARE * float(model.spike[i]):

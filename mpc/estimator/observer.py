@@ -165,8 +165,8 @@ def resting_state_in_room(model: PredictionModel, ambient: float, unit: tuple[fl
     usual = model.usual(ambient)
     level = float(np.mean(usual[model.warm]))
     y = np.where(model.warm, level, usual)
-    rest = resting_state(model, x, v, y, d, unit=np.array(unit))
-    return replace(rest, x=rest.x + (ambient - level) * rest.by_level)
+    resting = resting_state(model, x, v, y, d, unit=np.array(unit))
+    return replace(resting, x=resting.x + (ambient - level) * resting.by_level)
 
 
 _REPEATS, _SAME = 5, 1e-3  # of the start on a nonlinear plant, and when it is still [units]
@@ -210,8 +210,10 @@ class ObserverNoise:
 def reading_noise(plant: Plant, output: str) -> float | None:
     """Return the standard deviation of a reading, as the plant's record has it."""
     scores = plant.scores
-    found = (scores.innovations.reading if scores.innovations else {}) or scores.reading_sd or plant.noise
-    return found.get(output)
+    readings_sd = (
+        (scores.innovations.reading if scores.innovations else {}) or scores.reading_sd or plant.noise
+    )
+    return readings_sd.get(output)
 
 
 def detectability_margin(
@@ -230,8 +232,8 @@ def detectability_margin(
     scale = np.ones(n_w) if scale is None else scale
     poles, vectors = np.linalg.eig(A)
     slow = np.abs(poles) >= 1 - 1e-9
-    seen = np.linalg.norm(C @ vectors[:, slow], axis=0) if slow.any() else np.ones(1)
-    if np.any(seen < 1e-9):
+    seen_of_slow = np.linalg.norm(C @ vectors[:, slow], axis=0) if slow.any() else np.ones(1)
+    if np.any(seen_of_slow < 1e-9):
         return 0.0  # a mode that does not die out and cannot be seen
     if slow.any():
         whole = np.block([[A - np.eye(n_x), into_state * scale], [C, into_output * scale]])
@@ -264,9 +266,9 @@ def choose_disturbances(
         trial = _matrices(model, [*chosen, entry])
         scale = np.array([0.01 if kind == "input" else 1.0 for kind, _ in [*chosen, entry]])
         into_state = B @ (trial[0] * model.span[:, None]) + E @ trial[1]
-        found = detectability_margin(A, model.C, into_state, trial[2], scale=scale)
-        if found > least:
-            chosen, margin = [*chosen, entry], found
+        trial_margin = detectability_margin(A, model.C, into_state, trial[2], scale=scale)
+        if trial_margin > least:
+            chosen, margin = [*chosen, entry], trial_margin
     if len(chosen) < len(controlled):
         from thermogrip.sysid.plant.plant import said_not_good
 
@@ -277,28 +279,28 @@ def choose_disturbances(
         )
     on_drive, on_disturbance, on_output = _matrices(model, chosen)
     names = {"input": model.drives, "output": model.outputs, "disturbance": model.disturbances}
-    labels = tuple(f"{kind} {names[kind][at]}" for kind, at in chosen)
+    labels = tuple(f"{kind} {names[kind][row]}" for kind, row in chosen)
     return DisturbanceModel(labels, on_drive, on_disturbance, on_output, margin)
 
 
 def _in_order(model: PredictionModel, controlled: tuple[str, ...]) -> list[tuple[str, int]]:
     first = [i for i, name in enumerate(model.outputs) if name in controlled]
-    rest = [i for i in range(model.n_y) if i not in first]
+    uncontrolled = [i for i in range(model.n_y) if i not in first]
     order = [("input", j) for j in range(model.n_u)]
-    order += [("output", i) for i in first + rest]
+    order += [("output", i) for i in first + uncontrolled]
     return order + [("disturbance", k) for k in range(model.n_d)]
 
 
 def _matrices(model: PredictionModel, entries: list[tuple[str, int]]) -> tuple[Array, Array, Array]:
     n_w = len(entries)
-    found = {
+    matrices = {
         "input": np.zeros((model.n_u, n_w)),
         "disturbance": np.zeros((model.n_d, n_w)),
         "output": np.zeros((model.n_y, n_w)),
     }
-    for column, (kind, at) in enumerate(entries):
-        found[kind][at, column] = 1.0
-    return found["input"], found["disturbance"], found["output"]
+    for column, (kind, row) in enumerate(entries):
+        matrices[kind][row, column] = 1.0
+    return matrices["input"], matrices["disturbance"], matrices["output"]
 
 
 class Observer:
@@ -323,23 +325,23 @@ class Observer:
         plant = model.plant
         self.offset = np.array([float(plant.offsets.get(name, 0.0)) for name in model.outputs])
         usual = NOISE * model.unit
-        known = [self.noise.reading.get(name, reading_noise(plant, name)) for name in model.outputs]
-        self.R = np.where([sd is None for sd in known], usual, [sd or 0.0 for sd in known]) ** 2
+        reading_sds = [self.noise.reading.get(name, reading_noise(plant, name)) for name in model.outputs]
+        self.R = np.where([sd is None for sd in reading_sds], usual, [sd or 0.0 for sd in reading_sds]) ** 2
         self._H = np.hstack([model.C, disturbance.on_output])
         # a state's own unit: its spread, seen against the spread of the outputs
         spread = np.sqrt(np.maximum(np.diag(np.atleast_2d(plant.model.spread)), 1e-12))
-        seen = np.sqrt(np.einsum("ij,j,ij->i", model.C, spread**2, model.C)).max()
-        self.unit = spread / max(float(seen), 1e-12)
+        output_spread = np.sqrt(np.einsum("ij,j,ij->i", model.C, spread**2, model.C)).max()
+        self.unit = spread / max(float(output_spread), 1e-12)
         self.is_drive = disturbance.on_drive.any(axis=0)
         drives = np.array([self.noise.drive.get(name, DRIFT) for name in model.drives])
         # the unit of an output's bias is the output's, that of a measured disturbance's its own
-        own = np.where(disturbance.on_output.any(axis=0), disturbance.on_output.T @ model.unit, 1.0)
-        drift = np.where(self.is_drive, disturbance.on_drive.T @ drives, self.noise.output * own)
+        bias_unit = np.where(disturbance.on_output.any(axis=0), disturbance.on_output.T @ model.unit, 1.0)
+        drift = np.where(self.is_drive, disturbance.on_drive.T @ drives, self.noise.output * bias_unit)
         self.Q = np.concatenate([(self.noise.state * self.unit) ** 2, drift**2]) * model.dt
         self.x = np.zeros(model.n_x)
         self.w = np.zeros(disturbance.n_w)
         self.found_offset = np.zeros(model.n_y)
-        self.P0 = np.where(self.is_drive, 0.03, OFFSET * own) ** 2
+        self.P0 = np.where(self.is_drive, 0.03, OFFSET * bias_unit) ** 2
         # a sensor without an offset among the disturbance states is read as loosely, once
         self.fixed: Mask = np.asarray(~disturbance.on_output.any(axis=1))
         self.R_start = self.R + np.where(self.fixed, (OFFSET * model.unit) ** 2, 0.0)
@@ -357,24 +359,24 @@ class Observer:
     def reset(self, y: Array, d: Array) -> None:
         """Start at rest at reading y (n_y,), NaN where a sensor is lost; see the module's theory."""
         model, level = self.model, self._level(y, d)
-        own = np.where(np.isfinite(y), y - self.offset, model.usual(self.ambient))
-        rests = np.where(model.warm, level, own)
+        levels = np.where(np.isfinite(y), y - self.offset, model.usual(self.ambient))
+        rests = np.where(model.warm, level, levels)
         x, v = model.rest(rests, d), model.neutral
         for _ in range(_REPEATS):
-            rest = resting_state(model, x, v, rests, d, unit=self._step_unit)
-            self._begin(rest.x, rest.P, y)
+            resting = resting_state(model, x, v, rests, d, unit=self._step_unit)
+            self._begin(resting.x, resting.P, y)
             moved = np.max(np.abs(self.x - x) / self.unit)
             x = self.x
-            v = np.clip(rest.past_drive(x), model.lowest, model.highest)
+            v = np.clip(resting.past_drive(x), model.lowest, model.highest)
             if not moved > _SAME:
                 break
 
     def reset_in_room(self, y: Array, d: Array) -> None:
         """Start as :meth:`reset`, with the plant linearised where all rests in the room: what the C does."""
-        rest = self.rest_in_room()
-        x = rest.x + rest.by_level * (self._level(y, d) - self.ambient)
-        x = x + rest.by_d @ (d - self.model.undisturbed(self.ambient))
-        self._begin(x, rest.P, y)
+        resting = self.rest_in_room()
+        x = resting.x + resting.by_level * (self._level(y, d) - self.ambient)
+        x = x + resting.by_d @ (d - self.model.undisturbed(self.ambient))
+        self._begin(x, resting.P, y)
 
     @property
     def _step_unit(self) -> Array:
@@ -382,8 +384,8 @@ class Observer:
         return np.asarray(self.unit * self.model.unit.max())
 
     def _level(self, y: Array, d: Array) -> float:
-        known = np.isfinite(y) & self.model.warm
-        return float(np.mean((y - self.offset)[known])) if known.any() else self.model.room(d)
+        read_warm = np.isfinite(y) & self.model.warm
+        return float(np.mean((y - self.offset)[read_warm])) if read_warm.any() else self.model.room(d)
 
     def rest_in_room(self) -> RestingState:
         """Return where the plant may rest, linearised where all is as warm as the room."""
@@ -409,8 +411,8 @@ class Observer:
 
     def set_offsets(self, y: Array, which: Mask) -> None:
         """Take what a reading (n_y,) differs by for offsets of the sensors ``which`` (n_y,)."""
-        seen = which & np.isfinite(y)
-        self.found_offset = self.found_offset + np.where(seen, np.nan_to_num(y) - self.reading(), 0.0)
+        is_read = which & np.isfinite(y)
+        self.found_offset = self.found_offset + np.where(is_read, np.nan_to_num(y) - self.reading(), 0.0)
 
     def _on_sample(self) -> None:
         # seconds since x, and the drives summed over them
@@ -468,19 +470,19 @@ class Observer:
     def _correct(self, y: Array, R: Array, *, remember: float = 0.0) -> Array:
         """Correct the estimate with a reading whose variances are R (n_y,), but for states that are held."""
         innovation = y - self.reading()
-        seen = np.flatnonzero(np.isfinite(y))
-        if seen.size:
-            H = self._H[seen] @ self._way if self._share else self._H[seen]
+        read = np.flatnonzero(np.isfinite(y))
+        if read.size:
+            H = self._H[read] @ self._way if self._share else self._H[read]
             PH = self._P @ H.T
-            S = H @ PH + np.diag(R[seen])
+            S = H @ PH + np.diag(R[read])
             gain = np.linalg.solve(S, PH.T).T
             mean = self.innovation.copy()
-            mean[seen] += remember * (innovation[seen] / np.sqrt(np.diag(S)) - mean[seen])
+            mean[read] += remember * (innovation[read] / np.sqrt(np.diag(S)) - mean[read])
             self.innovation = mean
             gain[np.asarray(self._held, dtype=bool)] = 0.0  # C holds whole numbers
-            left = np.eye(self._P.shape[0]) - gain @ H  # Joseph's form: right for any gain
-            self._P = left @ self._P @ left.T + (gain * R[seen]) @ gain.T
-            self._change(gain @ innovation[seen])
+            uncorrected = np.eye(self._P.shape[0]) - gain @ H  # Joseph's form: right for any gain
+            self._P = uncorrected @ self._P @ uncorrected.T + (gain * R[read]) @ gain.T
+            self._change(gain @ innovation[read])
         return np.asarray(innovation)
 
     def _noise(self, share: float) -> Array:
@@ -505,13 +507,13 @@ class Observer:
 
     def advance(self, seconds: float, u: Array, d: Array) -> None:
         """Let so many seconds pass under drives u (n_u,) and disturbances d (n_d,)."""
-        dt, left = self.model.dt, seconds
-        while self._into + left >= dt * (1 - SAME):
-            rest = dt - self._into
-            mean = u if self._into <= SAME * dt else (self._dose + rest * u) / dt
+        dt, remaining_s = self.model.dt, seconds
+        while self._into + remaining_s >= dt * (1 - SAME):
+            to_sample_s = dt - self._into
+            mean = u if self._into <= SAME * dt else (self._dose + to_sample_s * u) / dt
             self.predict(mean, d)
-            left -= rest
-        self._into, self._dose = self._into + left, self._dose + left * u
+            remaining_s -= to_sample_s
+        self._into, self._dose = self._into + remaining_s, self._dose + remaining_s * u
 
     def look(self, d: Array) -> None:
         """Look where :meth:`advance` has come to, between two samples: readings are compared there."""
@@ -528,9 +530,11 @@ class Observer:
 
     def _sample(self, u: Array, d: Array) -> tuple[Array, Array]:
         """Return the state a sample later, and the Jacobian of the filter's states."""
-        n_x, found = self.model.n_x, self.disturbance
+        n_x, disturbance = self.model.n_x, self.disturbance
         after, A, B, E = self.model.linearise(self.x, u + self.drive_bias, d + self.disturbance_bias)
         step = np.eye(self._n)
         step[:n_x, :n_x] = A
-        step[:n_x, n_x:] = B @ (found.on_drive * self.model.span[:, None]) + E @ found.on_disturbance
+        step[:n_x, n_x:] = (
+            B @ (disturbance.on_drive * self.model.span[:, None]) + E @ disturbance.on_disturbance
+        )
         return after, step

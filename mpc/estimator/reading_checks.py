@@ -100,9 +100,9 @@ def follows(observer: Observer, controlled: tuple[str, ...]) -> str:
         do = "does" if len(controlled) == 1 else "do"
         return f"{', '.join(controlled)} {do} not follow the drive: {pump or 'is it another plant'}?"
     off = np.abs(observer.output_bias - observer.offset)
-    far = off / (SHARE * observer.model.spike)
-    if np.any(far >= 1.0):
-        name = observer.model.outputs[int(np.argmax(far))]
+    share_of_limit = off / (SHARE * observer.model.spike)
+    if np.any(share_of_limit >= 1.0):
+        name = observer.model.outputs[int(np.argmax(share_of_limit))]
         return f"{name} is far from the model: {pump}{', ' * bool(pump)}is the sensor in place?"
     return ""
 

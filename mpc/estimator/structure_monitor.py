@@ -1,32 +1,30 @@
 r"""Whether the last minute of closed loop is the model's: a bank of one-parameter alternatives.
 
-Over a window of 7.5 apparent delays (a minute on the gripper) the model is run on the drives that were really
+Over a window of 7.5 apparent delays (a minute on the gripper) the model is run on the drives that were
 applied.  Its state z at the start, the biases w, the plant's free parameters theta and each drive's gain are
-unknown, with the spread that an honest plant has,
+unknown, with the spread that an honest plant has about the filter's z_s and w_s,
 
     z ~ N(z_s, 1 degC in its unit),    w ~ N(w_s, P_0 + w_s^2),
     theta ~ N(theta, posterior),       gain ~ N(1, 0.2^2),
 
-z_s and w_s being the filter's; a sensor may drift by 0.1 degC in a window.  Two Gauss-Newton steps find the
-most likely of them.  Linearised there, the readings are y ~ N(y_0, V) with V = R + J J', J in these standard
-deviations, and what the model lacks adds a column a of its own to J, with a parameter that is nothing but for
-what nobody would call another structure (``_Alternative.tolerated``).  Freed one at a time it is
+and a sensor may drift by 0.1 degC.  Two Gauss-Newton steps find the most likely of them.  Linearised there,
+the readings are y ~ N(y_0, V) with V = R + J J', J in these standard deviations, and what the model lacks
+adds a column a of its own, with a parameter that is nothing but for what nobody would call another structure
+(``_Alternative.tolerated``).  Freed one at a time it is
 
     s = a' V^-1 r / a' V^-1 a  +-  (a' V^-1 a)^-1/2,      z = s / sqrt(sd^2 + tolerated^2),
 
 whose square is twice the logarithm of the generalised likelihood ratio [1]_, and N(0, 1) where the plant is a
-draw of its posterior.  The alternatives, with D the apparent delay of an output and y(t) what the model has,
+draw of its posterior.  The alternatives, with D the apparent delay of an output and y(t) what the model has:
 
 * y(t - s): a delay that is longer, or shorter; y through a lag: a slower sensor;
 * a share s of y through a lag of 6 D: a second mass, which takes up its heat later;
 * u(t - s), a drive that acts later, or sooner; one that does nothing within s of none: a dead zone.
 
-The plant is reported not to be the model at z >= 5, or where r' V^-1 r exceeds 4 a reading, whatever the
-alternative: 1 is what an honest plant has, 4 allows for readings twice as noisy as the model says.  A report
-stays until a window that would have shown it as well (its sd at most twice that of then) has z < 2.
-
-It needs a posterior: a plant without one does not say which numbers it may honestly have.  A window is of
-calls at the sample time, with drive biases below 30 % of the range; another sample starts a new one.
+The plant is reported at z >= 5, or where r' V^-1 r exceeds 4 a reading, whatever the alternative: 1 is what
+an honest plant has, 4 allows for readings twice as noisy as the model says.  A report stays until a window
+that would have shown it as well (its sd at most twice that of then) has z < 2.  A plant without a posterior
+is not watched.  A window is of calls at the sample time, with drive biases below 30 % of the range.
 
 References
 ----------
@@ -125,7 +123,9 @@ class StructureMonitor:
             return
         self._delays = apparent_delays(plant, model.drives, tuple(controlled), model.dt)
         self.window = max(_FEWEST, round(_DELAYS * max(self._delays) / model.dt))
-        self.bank = [each for name, D in zip(controlled, self._delays) for each in _of_output(name, D)]
+        self.bank = [
+            alternative for name, D in zip(controlled, self._delays) for alternative in _of_output(name, D)
+        ]
         self._share_late = min(1.0, max(self._delays) / 8 / model.dt)
         for name in model.drives:
             words = f"{name} acts {{1}} than in the model by {{0}} s"
@@ -161,20 +161,23 @@ class StructureMonitor:
         self._count += 1
         enough = max(_FEWEST, _ENOUGH * self.window)
         if self._count >= enough and self._count % max(1, self.window // 6) == 0:
-            found = self.misfit(observer)
-            if found is not None:
-                self._report(found)
+            misfit = self.misfit(observer)
+            if misfit is not None:
+                self._report(misfit)
 
     def _report(self, found: Misfit) -> None:
         side = np.where([one.two_sided for one in self.bank], np.sign(found.size), 1.0)
-        z, own = side * found.z, 3 * len(self._rows)
+        z, of_outputs = side * found.z, 3 * len(self._rows)
         # what an output shows is named before what drives do, and a drive only with what it may do
-        named = [at < own or abs(found.size[at]) * one.unit < one.most for at, one in enumerate(self.bank)]
-        named = named[:own] if np.max(z[:own]) >= REPORTED else named
-        at = int(np.argmax(np.where(named, (side * found.size / found.sd)[: len(named)], -np.inf)))
+        named = [
+            worst < of_outputs or abs(found.size[worst]) * one.unit < one.most
+            for worst, one in enumerate(self.bank)
+        ]
+        named = named[:of_outputs] if np.max(z[:of_outputs]) >= REPORTED else named
+        worst = int(np.argmax(np.where(named, (side * found.size / found.sd)[: len(named)], -np.inf)))
         if np.max(z) >= REPORTED or found.chi >= MISFIT:
-            self.said = f"{self.bank[at].reported(float(found.size[at]))}: {_MEND}"
-            self._at, self._sd = at, float(found.sd[at])
+            self.said = f"{self.bank[worst].reported(float(found.size[worst]))}: {_MEND}"
+            self._at, self._sd = worst, float(found.sd[worst])
         elif self.said and found.sd[self._at] <= 2 * self._sd and z[self._at] < TAKEN_BACK:
             self.said = ""
         self.denies = not self.said
@@ -182,10 +185,10 @@ class StructureMonitor:
     def misfit(self, observer: Observer) -> Misfit | None:
         """Return what the last window says; None where the model's run over it is not finite."""
         rows = list(self._history)[-(2 * self.window + 1) :]
-        found = self._fitted(observer, rows[-self.window :])
-        if found is None:
+        fit = self._fitted(observer, rows[-self.window :])
+        if fit is None:
             return None
-        return self._tested(found, self._structures(found, rows))
+        return self._tested(fit, self._structures(fit, rows))
 
     def _fitted(self, observer: Observer, rows: Sequence[_Row]) -> _Fitted | None:
         """Return the most likely run of the model over rows; None where it is not finite."""
@@ -196,30 +199,30 @@ class StructureMonitor:
         u, d, y = (np.array([getattr(row, name) for row in rows]) for name in ("u", "d", "y"))
         n_x, n_w, n_t = model.n_x, len(first.w), spread.shape[1]
         scale = np.concatenate([_STATE * observer.unit, np.sqrt(observer.P0 + first.w**2)])
-        offset, found = observer.offset + observer.found_offset, observer.disturbance
+        offset, disturbance = observer.offset + observer.found_offset, observer.disturbance
 
         def run(z: Array, drives: Array) -> Array:
             """Return the outputs (B, N sub + 1, n_y) of unknowns z (B, m) under drives (B|1, N, n_u)."""
             xw = np.concatenate([first.x, first.w]) + z[:, : n_x + n_w] * scale
-            x, w, rest = xw[:, :n_x], xw[:, n_x:], z[:, n_x + n_w :]
-            pushed = drives * (1 + _GAIN * rest[:, None, n_t:])
+            x, w, plant_numbers = xw[:, :n_x], xw[:, n_x:], z[:, n_x + n_w :]
+            pushed = drives * (1 + _GAIN * plant_numbers[:, None, n_t:])
             fine = np.repeat(
-                model.inputs(pushed + (w @ found.on_drive.T * model.span)[:, None]), model.sub, axis=1
+                model.inputs(pushed + (w @ disturbance.on_drive.T * model.span)[:, None]), model.sub, axis=1
             )
-            held = np.repeat(d + (w @ found.on_disturbance.T)[:, None], model.sub, axis=1)
-            parameters = _numbers(self.plant, rest[:, :n_t] @ spread.T)
-            y, _ = model.model.rollout(x, fine, held, parameters, model.dt / model.sub)
-            return np.asarray(np.asarray(y) + (w @ found.on_output.T)[:, None] + offset)
+            measured = np.repeat(d + (w @ disturbance.on_disturbance.T)[:, None], model.sub, axis=1)
+            parameters = _numbers(self.plant, plant_numbers[:, :n_t] @ spread.T)
+            y, _ = model.model.rollout(x, fine, measured, parameters, model.dt / model.sub)
+            return np.asarray(np.asarray(y) + (w @ disturbance.on_output.T)[:, None] + offset)
 
         m = n_x + n_w + n_t + model.n_u
         z, weight = np.zeros(m), np.where(np.isfinite(y), 1 / np.sqrt(observer.R), 0.0)
-        seen, tried = np.nan_to_num(y), np.vstack([np.zeros(m), _TRIED * np.eye(m)])
+        readings, tried = np.nan_to_num(y), np.vstack([np.zeros(m), _TRIED * np.eye(m)])
         with np.errstate(all="ignore"):  # a run that diverges is found below
             for _ in range(_STEPS):
                 shown = run(z + tried, u[None])
                 at_rows = shown[:, model.sub :: model.sub]
                 J = ((at_rows[1:] - at_rows[0]) * weight / _TRIED).reshape(m, -1)
-                r = ((seen - at_rows[0]) * weight).ravel() + z @ J
+                r = ((readings - at_rows[0]) * weight).ravel() + z @ J
                 if not (np.abs(J).max() < _SOLVABLE and np.abs(r).max() < _SOLVABLE):
                     return None
                 last, z = z, np.linalg.solve(J @ J.T + np.eye(m), J @ r)
@@ -229,9 +232,9 @@ class StructureMonitor:
         """Return what each alternative of the bank adds to the readings (n, N, n_y), by its unit."""
         model, u = self.model, found.drives
         before, first = rows[: -self.window], rows[-self.window :][0]
-        each = np.eye(model.n_u)[:, None]
-        late = u + each * self._share_late * (np.vstack([first.u, u[:-1]]) - u)
-        cut = np.sign(u) * np.maximum(np.abs(u) - each * _ZONE * model.span, 0.0)
+        per_drive = np.eye(model.n_u)[:, None]
+        late = u + per_drive * self._share_late * (np.vstack([first.u, u[:-1]]) - u)
+        cut = np.sign(u) * np.maximum(np.abs(u) - per_drive * _ZONE * model.span, 0.0)
         drives = np.concatenate([late, cut])
         with np.errstate(all="ignore"):
             other = found.run(np.repeat(found.z[None], 2 * model.n_u, axis=0), drives)
@@ -264,8 +267,8 @@ class StructureMonitor:
         """Return what a fit says of the bank's alternatives, which add a (k, N, n_y)."""
         n_y, weight = self.model.n_y, found.weight
         drift = _DRIFT * np.linspace(0.0, 1.0, len(weight))[:, None] * np.eye(n_y)[:, None]
-        known = np.vstack([found.J, (drift * weight).reshape(n_y, -1)])
-        return _tested(self.bank, known, (a * weight).reshape(len(a), -1), found.r)
+        nuisance = np.vstack([found.J, (drift * weight).reshape(n_y, -1)])
+        return _tested(self.bank, nuisance, (a * weight).reshape(len(a), -1), found.r)
 
 
 def _tested(bank: Sequence[_Alternative], J: Array, a: Array, r: Array) -> Misfit:
@@ -273,9 +276,9 @@ def _tested(bank: Sequence[_Alternative], J: Array, a: Array, r: Array) -> Misfi
     J (m, n) are the unknowns'."""
     tolerated = np.array([one.tolerated for one in bank])
     granted = np.array([one.granted for one in bank])
-    known = np.vstack([J, (tolerated[:, None] * a)[granted]])
-    K = np.linalg.inv(known @ known.T + np.eye(len(known)))
-    by_r, by_a = (v - v @ known.T @ K @ known for v in (r, a))  # times V^-1
+    tolerated_rows = np.vstack([J, (tolerated[:, None] * a)[granted]])
+    K = np.linalg.inv(tolerated_rows @ tolerated_rows.T + np.eye(len(tolerated_rows)))
+    by_r, by_a = (v - v @ tolerated_rows.T @ K @ tolerated_rows for v in (r, a))  # times V^-1
     q: Array = np.maximum(np.sum(a * by_a, axis=1), 1e-12)
     size = a @ by_r / q
     z = size / np.sqrt(1 / q + np.where(granted, 0.0, tolerated**2))

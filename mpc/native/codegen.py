@@ -1,37 +1,26 @@
 r"""A model's step as plain C99: what depends on parameters, drives, state and direction, each once.
 
-CasADi holds the equations as a list of instructions.  Each instruction depends on
-
-    1. the parameters alone          (conductances, the factors of an implicit step)
-    2. the drives, too               (what a constant drive makes of the step)
-    3. the state, too                (the step itself, its partial derivatives)
-    4. the direction, too            (the tangent, linear in the direction)
-
-and is written into the first function that knows all it needs:
+CasADi holds the equations as a list of instructions.  Each is written into the first function that knows all
+it needs, the parameters, the drives, the state, or the direction of a tangent:
 
     prepare(p -> k),    hold(u, k -> h),    step(x, u, d, k, h -> x+),
     partials(x, u, d, k, h -> x+, m),    tangent(m, k, h, sx -> sx+)
 
 and the last with a direction of the drives, su, and of the disturbances, sd, too.  ``hold`` does as much of
 it as ``step`` reads, ``hold_slopes`` all; ``next`` is hold and step.  Both run over the drives of n blocks,
-at most four, entry i of block c at [4 i + c], so that a compiler may take four at once: a Peltier's are one
-long chain of products.
+at most four, entry i of block c at [4 i + c], and ``tangent`` over n groups of four directions, entry i of
+direction c at [c / 4][i][c % 4]: a compiler takes four at once.
 
-``tangent`` runs over many directions, n groups of four side by side, each group's numbers behind those of the
-last: entry i of direction c at [c / 4][i][c % 4].  Of the loop over the four a compiler makes vector
-instructions.  A dense Jacobian of an implicit step takes ten times the work of the step for every sample; a
-dozen tangents that share their partial derivatives take two or three.  Where the Jacobian is sparse and
-the other way about, its non-zeros are the partial derivatives and the tangent is their product with the
-direction.  A step that is linear in state and disturbances while the drives stand still, as that of a Peltier
+A dense Jacobian of an implicit step takes ten times the work of the step for every sample; a dozen tangents
+that share their partial derivatives take two or three.  Where the Jacobian is sparse it is the other way
+about.  A step that is linear in state and disturbances while the drives stand still, as that of a Peltier
 element is, x+ = A(u) x + E(u) d + a(u), can be written in that form, row by row: a plan of ten blocks then
 takes ten times the work of A, not as many times as there are samples.  Of all these forms the shortest is
-written.
+written.  Rows of many constants, as of a black box of 20 states, are tables that loops run over: unrolled, a
+step of 60 states is half a megabyte.
 
-Rows of many constants, as of a black box of 20 states, are tables that loops run over: unrolled, a step of 60
-states is half a megabyte.
-
-A quotient by something known earlier becomes a product with its reciprocal.  Nothing here is CasADi's own C:
-the code needs ``math.h`` and nothing else.
+A quotient by something known earlier becomes a product with its reciprocal.  The code needs ``math.h`` and
+nothing else.
 """
 
 from __future__ import annotations
@@ -150,8 +139,8 @@ class _Table:
         """Return the arrays in C."""
         if not self.rows:
             return []
-        parts = {"slope_" + of: values.ravel() for of, values in self.slopes.items() if values.size}
-        lines = [_array("double", name, values) for name, values in (parts | {"added": self.added}).items()]
+        arrays = {"slope_" + of: values.ravel() for of, values in self.slopes.items() if values.size}
+        lines = [_array("double", name, values) for name, values in (arrays | {"added": self.added}).items()]
         return [_array("int", "table", np.array(self.rows)), *lines]
 
     def step(self) -> list[str]:
@@ -187,7 +176,7 @@ class _Table:
 def _array(kind: str, name: str, values: Array) -> str:
     """Return a constant array in C."""
     texts = [repr(value) for value in values.tolist()]
-    rows = [", ".join(texts[at : at + 5]) for at in range(0, len(texts), 5)]
+    rows = [", ".join(texts[first : first + 5]) for first in range(0, len(texts), 5)]
     return f"static const {kind} {name}[{len(texts)}] = {{\n    " + ",\n    ".join(rows) + "};\n"
 
 
@@ -212,20 +201,20 @@ class ModelCode:
 
     def constants(self, p: Sequence[float]) -> list[float]:
         """Return what ``prepare`` leaves behind for parameters p, without a compiler."""
-        found: dict[int, float] = {}
-        kept: dict[int, float] = {}
-        for at, value in enumerate(self.line.values):
+        numbers: dict[int, float] = {}
+        constants: dict[int, float] = {}
+        for number, value in enumerate(self.line.values):
             if value.stage > 1:
                 continue
             if value.what == "OP_CONST":
-                found[at] = value.number
+                numbers[number] = value.number
             elif value.what == "OP_INPUT":
-                found[at] = float(p[int(value.number)])
+                numbers[number] = float(p[int(value.number)])
             else:
-                found[at] = float(_OPERATIONS[value.what][1](*(found[use] for use in value.uses)))
+                numbers[number] = float(_OPERATIONS[value.what][1](*(numbers[use] for use in value.uses)))
             if value.place.startswith("k["):
-                kept[int(value.place[2:-1])] = found[at]
-        return [kept[entry] for entry in range(self.n_k)]
+                constants[int(value.place[2:-1])] = numbers[number]
+        return [constants[entry] for entry in range(self.n_k)]
 
 
 def write_model(model: Model, drives: Sequence[int], h: float) -> ModelCode:
@@ -244,8 +233,8 @@ def _graphs(model: Model, drives: Sequence[int], h: float) -> tuple[_Table, list
     p, x, u, d = (ca.SX.sym(letter, n) for letter, n in zip("pxud", sizes))
     sx, su, sd = (ca.SX.sym("s" + letter, n) for letter, n in zip("xud", sizes[1:]))
     full = [ca.SX(1.0)] * len(model.inputs)
-    for at, value in zip(drives, ca.vertsplit(u), strict=True):
-        full[at] = value
+    for place, value in zip(drives, ca.vertsplit(u), strict=True):
+        full[place] = value
     lists = [ca.vertsplit(item) if item.numel() else [] for item in (x, d, p)]
     after = ca.vertcat(*model.step(lists[0], full, lists[1], lists[2], h))
     table = _tabulate(after, x, u, d)
@@ -258,36 +247,36 @@ def _graphs(model: Model, drives: Sequence[int], h: float) -> tuple[_Table, list
     rows = [after[i] if bent[i] else straight[i] for i in range(model.n_x)]
     rewritten = ca.vertcat(*rows)
     steps = [after] if all(bent) else [after, rewritten]
-    found = []
+    functions = []
     for step in steps:
         A, B, E = (ca.jacobian(step, item) for item in (x, u, d))
-        parts = [ca.mtimes(each, by) for each, by in zip((A, B, E), along)]
-        tangents = [parts[0], parts[0] + parts[1], parts[0] + parts[1] + parts[2]]
+        products = [ca.mtimes(product_of, by) for product_of, by in zip((A, B, E), along)]
+        tangents = [products[0], products[0] + products[1], products[0] + products[1] + products[2]]
         others = [ca.jtimes(step, ca.vertcat(*(x, u, d)[:n]), ca.vertcat(*along[:n])) for n in range(1, 4)]
         for three in (tangents, others):
             results = ca.cse([ca.densify(item) for item in (step, *three)])
-            found.append(ca.Function("model", [p, x, u, d, *along], results))
-    return table, found
+            functions.append(ca.Function("model", [p, x, u, d, *along], results))
+    return table, functions
 
 
 def _tabulate(after: Any, x: Any, u: Any, d: Any) -> _Table:
     """Return the rows of a step whose slopes are many constants."""
     import casadi as ca
 
-    given, n_x, n_u = ca.vertcat(x, u, d), x.numel(), u.numel()
-    slopes = ca.jacobian(after, given)
+    arguments, n_x, n_u = ca.vertcat(x, u, d), x.numel(), u.numel()
+    slopes = ca.jacobian(after, arguments)
     count = slopes.sparsity().T.colind()
     long = [i for i in range(n_x) if count[i + 1] - count[i] >= _LONG]
-    if long and any(bent := ca.which_depends(after, given, 2, True)):
+    if long and any(bent := ca.which_depends(after, arguments, 2, True)):
         long = [i for i in long if not bent[i]]
-    added = ca.substitute(after, given, ca.DM.zeros(given.numel(), 1))
+    added = ca.substitute(after, arguments, ca.DM.zeros(arguments.numel(), 1))
     long = [i for i in long if not ca.symvar(ca.vertcat(slopes[i, :].T, added[i]))]
     if sum(count[i + 1] - count[i] for i in long) < _MANY:
         long = []
-    dense = np.array(ca.DM(ca.evalf(ca.densify(slopes[long, :])))).reshape(len(long), given.numel())
-    parts = np.split(dense, [n_x, n_x + n_u], axis=1)
+    dense = np.array(ca.DM(ca.evalf(ca.densify(slopes[long, :])))).reshape(len(long), arguments.numel())
+    slope_parts = np.split(dense, [n_x, n_x + n_u], axis=1)
     level = np.array(ca.DM(ca.evalf(ca.densify(added[long])))).ravel()
-    return _Table(long, dict(zip("xud", parts, strict=True)), level)
+    return _Table(long, dict(zip("xud", slope_parts, strict=True)), level)
 
 
 def _straight(function: Any) -> _Line:
@@ -298,25 +287,25 @@ def _straight(function: Any) -> _Line:
     inputs = ("p[{}]", "x[{}]", "u[{}]", "d[{}]", "sx[{} + c]", "su[{} + c]", "sd[{} + c]")
     stages = (_PARAMETERS, _STATE, _DRIVES, _STATE, *(_DIRECTION,) * 3)
     line = _Line([], [{} for _ in range(function.n_out())], function.numel_in(2), function.numel_in(3))
-    at: dict[int, int] = {}  # place in CasADi's work vector -> value
+    value_at: dict[int, int] = {}  # place in CasADi's work vector -> value
     for number in range(function.n_instructions()):
-        what = names[function.instruction_id(number)]
+        operation = names[function.instruction_id(number)]
         into, out_of = function.instruction_output(number), function.instruction_input(number)
-        if what == "OP_OUTPUT":
-            line.outputs[into[0]][into[1]] = at[out_of[0]]
+        if operation == "OP_OUTPUT":
+            line.outputs[into[0]][into[1]] = value_at[out_of[0]]
             continue
-        if what == "OP_INPUT":
+        if operation == "OP_INPUT":
             source, entry = out_of
             place = 4 * entry if stages[source] == _DIRECTION else entry
-            value = _Value(what, inputs[source].format(place), (), stages[source], entry)
-        elif what == "OP_CONST":
+            value = _Value(operation, inputs[source].format(place), (), stages[source], entry)
+        elif operation == "OP_CONST":
             constant = float(function.instruction_constant(number))
-            value = _Value(what, f"({constant!r})", (), 0, constant)
+            value = _Value(operation, f"({constant!r})", (), 0, constant)
         else:
-            uses = tuple(at[place] for place in out_of)
-            value = _operation(line, what, uses)
+            uses = tuple(value_at[place] for place in out_of)
+            value = _operation(line, operation, uses)
         line.values.append(value)
-        at[into[0]] = len(line.values) - 1
+        value_at[into[0]] = len(line.values) - 1
     return line
 
 
@@ -336,13 +325,13 @@ def _operation(line: _Line, what: str, uses: tuple[int, ...]) -> _Value:
 
 
 def _needed(line: _Line, roots: Sequence[int]) -> set[int]:
-    found, left = set(), list(roots)
-    while left:
-        at = left.pop()
-        if at not in found:
-            found.add(at)
-            left.extend(line.values[at].uses)
-    return found
+    needed, waiting = set(), list(roots)
+    while waiting:
+        number = waiting.pop()
+        if number not in needed:
+            needed.add(number)
+            waiting.extend(line.values[number].uses)
+    return needed
 
 
 def _work(line: _Line) -> float:
@@ -351,7 +340,7 @@ def _work(line: _Line) -> float:
     step, tangent = (_needed(line, list(line.outputs[n].values())) for n in (0, 1))
 
     def count(found: set[int], stage: int) -> float:
-        made = (line.values[at] for at in found if line.values[at].uses)
+        made = (line.values[number] for number in found if line.values[number].uses)
         return float(sum(_SLOW.get(value.what, 1) for value in made if value.stage == stage))
 
     both = step | tangent
@@ -360,14 +349,14 @@ def _work(line: _Line) -> float:
 
 
 def _write(line: _Line, table: _Table) -> ModelCode:
-    outputs = [[pair for pair in found.items() if pair[0] not in table.rows] for found in line.outputs]
-    roots = [[at for _, at in found] for found in outputs]
-    everything = _needed(line, [at for part in roots for at in part])
+    outputs = [[pair for pair in entries.items() if pair[0] not in table.rows] for entries in line.outputs]
+    roots = [[number for _, number in entries] for entries in outputs]
+    everything = _needed(line, [number for name in roots for number in name])
     k = _hand_over(line, everything, _PARAMETERS, "k")
     # what a step reads comes first
     h = _hand_over(line, everything, _DRIVES, "h", first=_needed(line, roots[0]))
     m = _hand_over(line, everything, _STATE, "m")
-    read = [at for at in h if at in _needed(line, roots[0])]
+    read = [number for number in h if number in _needed(line, roots[0])]
     into = {
         "k": [f"k[{entry}] = {{}};" for entry in range(len(k))],
         "h": [f"h[{4 * entry}] = {{}};" for entry in range(len(h))],
@@ -375,7 +364,7 @@ def _write(line: _Line, table: _Table) -> ModelCode:
         "xn": [f"xn[{entry}] = {{}};" for entry, _ in outputs[0]],
     }
     out = [[f"out[{4 * entry} + c] = {{}};" for entry, _ in outputs[n]] for n in (1, 2, 3)]
-    parts = {
+    bodies = {
         "prepare": _body(line, _PARAMETERS, k, into["k"]),
         "hold": _over_drives(_body(line, _DRIVES, read, into["h"][: len(read)]), line.n_u),
         "hold_slopes": _over_drives(_body(line, _DRIVES, h, into["h"]), line.n_u),
@@ -394,18 +383,18 @@ def _write(line: _Line, table: _Table) -> ModelCode:
     n_x = len(line.outputs[0])
     sizes = {"sx": n_x, "su": line.n_u, "sd": line.n_d, "out": n_x}
     along = {"tangent": "x", "tangent_u": "xu", "tangent_d": "xud"}
-    for part, lines in parts.items():
-        head = _HEADS[part]
+    for name, lines in bodies.items():
+        head = _HEADS[name]
         arguments = [item.split()[-1].lstrip("*") for item in head[head.index("(") + 1 : -1].split(",")]
-        more = table.tangent(along[part]) if part in along else []
+        more = table.tangent(along[name]) if name in along else []
         body = "\n".join([*lines, *more])
         unused = [f"    (void){item};" for item in arguments if not re.search(rf"\b{item}\b", body)]
-        if part.startswith("tangent"):
+        if name.startswith("tangent"):
             unused = [text for text in unused if text != "    (void)n;"]
             moving = [item for item in arguments if item in sizes]
             lines = _over_groups(lines, more, moving, sizes)
         source.append("\n".join([head, "{", *unused, *lines, "}", ""]))
-    heads = [_HEADS[part].replace(" restrict ", " ").replace("*restrict ", "*") for part in parts]
+    heads = [_HEADS[name].replace(" restrict ", " ").replace("*restrict ", "*") for name in bodies]
     header = ";\n".join([*heads, ""])  # C++ has no such word, and to C it is the same declaration
     return ModelCode("\n".join(source), header, len(k), len(h), len(m), line)
 
@@ -436,24 +425,28 @@ def _hand_over(
     read = {use for at in later for use in line.values[at].uses}
     if stage < _STATE:  # what is a result of the step is none of the tangent's business
         read |= {at for found in line.outputs for at in found.values()}
-    kept = sorted((at for at in read if line.values[at].stage == stage), key=lambda at: (at not in first, at))
-    for entry, at in enumerate(kept):
+    handed_over = sorted(
+        (at for at in read if line.values[at].stage == stage), key=lambda at: (at not in first, at)
+    )
+    for entry, at in enumerate(handed_over):
         line.values[at].place = f"{letter}[{4 * entry if letter == 'h' else entry}]"
-    return kept
+    return handed_over
 
 
 def _body(line: _Line, stage: int, roots: Sequence[int], stores: Sequence[str]) -> list[str]:
     """Return the statements of a stage that lead to these values, and then their stores."""
     values, written, names = line.values, [], {}
     order = sorted(_needed(line, roots))
-    for at in order:
-        value = values[at]
+    for number in order:
+        value = values[number]
         if value.stage < stage and value.stage > 0:
-            names[at] = value.place
+            names[number] = value.place
         elif not value.uses:
-            names[at] = value.text
+            names[number] = value.text
         elif value.stage == 0 or value.stage == stage:
-            names[at] = f"v{at}"
+            names[number] = f"v{number}"
             text = value.text.format(*(names[use] for use in value.uses))
-            written.append(f"    const double v{at} = {text};")
-    return written + ["    " + store.format(names[at]) for store, at in zip(stores, roots, strict=True)]
+            written.append(f"    const double v{number} = {text};")
+    return written + [
+        "    " + store.format(names[number]) for store, number in zip(stores, roots, strict=True)
+    ]

@@ -239,7 +239,7 @@ def initialiser(sizes: Sizes, numbers: dict[str, Any]) -> str:
     for name, (whole, shape, _) in _FIELDS.items():
         values = _padded(sizes, name, numbers[name]).ravel().tolist() if shape else [numbers[name]]
         texts = [str(int(v)) if whole else repr(float(v)) for v in values] or ["0"]
-        rows = [", ".join(texts[at : at + 6]) for at in range(0, len(texts), 6)]
+        rows = [", ".join(texts[first : first + 6]) for first in range(0, len(texts), 6)]
         joined = ",\n        ".join(rows)
         lines.append(f"    .{name} = {{{joined}}}," if shape else f"    .{name} = {joined},")
     return "\n".join(lines)
@@ -249,23 +249,21 @@ def numbers_of(controller: ControllerParts, k: Array) -> dict[str, Any]:
     """Return every number of the table for a controller; ``k`` is what ``prepare`` gave."""
     model, design, optimiser = controller.model, controller.design, controller.optimiser
     observer, disturbance, loops = controller.observer, controller.disturbance, design.loops
-    rest = observer.rest_in_room()
+    resting = observer.rest_in_room()
     rows = [model.outputs.index(name) for name in (*design.controlled, *design.limits)]
     limits = np.array(list(design.limits.values()), dtype=float).reshape(-1, 2)
     same_names = (
         (model, "sub dt span C spike unit coldest hottest least_d most_d warm"),
-        (
-            design,
-            "iterations blocks track terminal move drive price overshoot patience_s ambient",
-        ),
-        (
-            optimiser,
-            "weight pair strongest seen reach lowest highest slew neutral safe at_rest dear zone energy",
-        ),
+        (design, "iterations blocks track terminal move drive price overshoot patience_s ambient"),
+        (optimiser, "pair reach"),
+        (optimiser.drives, "lowest highest slew neutral safe"),
+        (optimiser.weights, "dear zone"),
+        (optimiser.at_rest, "strongest seen"),
         (observer, "fixed offset R Q P0 R_start"),
         (disturbance, "on_drive on_disturbance on_output"),
     )
-    return {name: getattr(part, name) for part, names in same_names for name in names.split()} | {
+    settled = optimiser.at_rest.settled
+    return {name: getattr(source, name) for source, names in same_names for name in names.split()} | {
         "n_b": len(design.blocks),
         "N": sum(design.blocks),
         "n_c": len(design.controlled),
@@ -284,14 +282,17 @@ def numbers_of(controller: ControllerParts, k: Array) -> dict[str, Any]:
         "read_to": [model.n_x - int(np.argmax(row[::-1] != 0)) if row.any() else 0 for row in model.C],
         "limit_low": limits[:, 0],
         "limit_high": limits[:, 1],
-        "settled_gain": np.zeros(model.n_u) if optimiser.settled_gain is None else optimiser.settled_gain,
+        "weight": optimiser.weights.output,
+        "energy": [design.energy_price.get(name, 0.0) for name in model.drives],
+        "at_rest": optimiser.at_rest.response,
+        "settled_gain": np.zeros(model.n_u) if settled is None else settled,
         **{name: [getattr(loop, name) for loop in loops] for name in ("Kc", "Ti", "setpoint")},
         "k": k,
         "y0": model.output(np.zeros(model.n_x)),
-        "rest": rest.x,
-        "rest_level": rest.by_level,
-        "rest_d": rest.by_d,
-        "P_rest": rest.P,
+        "rest": resting.x,
+        "rest_level": resting.by_level,
+        "rest_d": resting.by_d,
+        "P_rest": resting.P,
         **_free_response(model, design, rows),
         **_settled(model, disturbance),
     }
@@ -305,9 +306,10 @@ def _free_response(model: PredictionModel, design: Design, rows: list[int]) -> d
     _, _, E, added = model.affine
     by_x, by_rest, _ = model.response(design.blocks)
     by_none = by_rest @ added + model.output(np.zeros(model.n_x))
-    parts = {"by_x": by_x, "by_d": by_rest @ E, "by_none": by_none}
+    responses = {"by_x": by_x, "by_d": by_rest @ E, "by_none": by_none}
     return {
-        name: part[:, rows].reshape(len(part) * len(rows), *part.shape[2:]) for name, part in parts.items()
+        name: response[:, rows].reshape(len(response) * len(rows), *response.shape[2:])
+        for name, response in responses.items()
     }
 
 
@@ -327,7 +329,7 @@ def _settled(model: PredictionModel, disturbance: DisturbanceModel) -> dict[str,
 
 def _padded(sizes: Sizes, name: str, values: Any) -> Array:
     """Return the values in an array of the field's size; what is beyond them is 0."""
-    given = np.asarray(values, dtype=float)
+    array = np.asarray(values, dtype=float)
     full = np.zeros(sizes.shape(name))
-    full[tuple(slice(0, n) for n in given.shape)] = given
+    full[tuple(slice(0, n) for n in array.shape)] = array
     return full

@@ -249,9 +249,9 @@ class CompiledTruth:
 
     def at(self, x: Array, offset: Array) -> tuple[_Truth, Any]:
         """Return the C struct at state x (n_x,) behind sensors of offset (n_y,), and what it points to."""
-        held = (np.array(x, dtype=float), np.zeros(len(x)), self._k, self._C, self._level + offset)
+        arrays = (np.array(x, dtype=float), np.zeros(len(x)), self._k, self._C, self._level + offset)
         after = ctypes.cast(self._library.tg_model_next, ctypes.c_void_p)
-        return _Truth(after, len(x), *(address(values) for values in held)), held
+        return _Truth(after, len(x), *(address(values) for values in arrays)), arrays
 
 
 def address(values: NDArray[Any]) -> ctypes.c_void_p:

@@ -102,8 +102,8 @@ class CondensedQP:
         if A.shape != (self.soft.size, f.size):
             raise ValueError(f"A is {A.shape}, not {(self.soft.size, f.size)}")
         room = upper - lower
-        known = _is_finite(f) and (self._is_same(H, A) or (_is_finite(H) and _is_finite(A)))
-        if not known or np.isnan(room).any():
+        is_finite = _is_finite(f) and (self._is_same(H, A) or (_is_finite(H) and _is_finite(A)))
+        if not is_finite or np.isnan(room).any():
             return self._failed("not finite", f.size)
         if ((room < 0) & self._hard).any():
             return self._failed("infeasible", f.size)

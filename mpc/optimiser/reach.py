@@ -7,29 +7,24 @@ Newton's method for the state and least squares inside the ranges for the drives
     x_s+ = x_s + (I - A)^-1 (f(x_s, u_s) - x_s + B z),    min_z |r - y(x_s+)|^2,    u_s+ = u_s + z in range.
 
 An output 1 degC beyond its target counts what it costs the optimiser, one beyond its limits a hundred times.
-Where the gain fades (a Peltier element), the range ends where the optimiser ends it.  A linear plant needs
-one such step.  Where the plant integrates there may be no answer, and then the model says nothing.
+Where the plant integrates there may be no answer, and then the model says nothing.
 
 **How sure it is.**  The biases are estimates with covariance P_w, so the steady outputs have the variance
 
     sigma^2 = J P_w J',    J = C (I - A)^-1 [B W_u + E W_d] + W_y.
 
 P_w is right while the innovations are white: sigma is multiplied by the mean normalised innovation of the
-last samples, in its own standard deviations, where that is above 1 (while a large bias is being learnt it is
-10 and more).  Misses beyond a tenth of an output's unit (:func:`thermogrip.mpc.plant.prediction.unit_of`)
-then sum up as in Page's test,
+last samples, in its own standard deviations, where that is above 1.  Misses beyond a tenth of an output's
+unit (:func:`thermogrip.mpc.plant.prediction.unit_of`) then sum up as in Page's test,
 
     S+ = max(0, S + min((miss - unit / 10) / sigma, 2) - 1/2),    unreachable at S >= 3:
 
-two samples where the target is out of reach by 2 sigma, more where it is by less.
+two samples where the target is out of reach by 2 sigma, more where it is by less.  A target more than a tenth
+of a unit beyond its output's own limits is reported at once.
 
-**The design's answer.**  A target that lies more than a tenth of a unit beyond its output's own limits is
-reported at once: those are known.
-
-A target is asked about until five samples in a row say that it can be held, then no more until it moves:
-that a load takes it out of reach later, :mod:`thermogrip.mpc.controllers.loop_monitor` says.  Where no steady
-state is found after the answer was that it cannot (near an optimum Newton's method may not converge), that
-answer is kept until the plan ends at the target.
+A target is asked about until five samples in a row say that it can be held, then no more until it moves.
+Where no steady state is found after the answer was that it cannot (near an optimum Newton's method may not
+converge), that answer is kept until the plan ends at the target.
 """
 
 from __future__ import annotations
@@ -66,8 +61,8 @@ class Reach:
         self._rows = [model.outputs.index(name) for name in design.controlled]
         self._limited = [model.outputs.index(name) for name in design.limits]
         self._limits = np.array(list(design.limits.values()), dtype=float).reshape(-1, 2).T
-        own = [design.limits.get(name, (-np.inf, np.inf)) for name in design.controlled]
-        self._own = np.array(own, dtype=float).T
+        own_limits = [design.limits.get(name, (-np.inf, np.inf)) for name in design.controlled]
+        self._own = np.array(own_limits, dtype=float).T
         self._beyond = np.sqrt(design.price * (FIRST + 1.0) / design.track)  # weight beyond a target
         self.forget()
 
@@ -102,14 +97,14 @@ class Reach:
         unit = self.model.unit[self._rows]
         limit, lost = unit * (CAN if self._unreachable else CANNOT), False
         if np.any(seen & (np.abs(target - ahead) > limit)):
-            held, J = self._held(observer, u, d + observer.disturbance_bias, target, side, seen)
-            lost = held is target and self._sum >= MISS_ALARM  # none was found
+            reached, J = self._held(observer, u, d + observer.disturbance_bias, target, side, seen)
+            lost = reached is target and self._sum >= MISS_ALARM  # none was found
         else:
-            held, J = target, np.zeros((len(target), observer.w.size))
+            reached, J = target, np.zeros((len(target), observer.w.size))
         w_at = slice(self.model.n_x, self.model.n_x + observer.w.size)
         P = observer.estimate()["P"][w_at, w_at]
         sd = np.maximum(np.sqrt(np.einsum("ij,jk,ik->i", J, P, J)), LEAST_SD * unit)
-        miss = np.where(seen, np.abs(target - held), 0.0)
+        miss = np.where(seen, np.abs(target - reached), 0.0)
         scaled = (miss - CANNOT * unit) / (sd * max(1.0, observer.innovation_bias))
         if not lost:
             step = float(np.clip(scaled.max(), -1, MISS_CLIP)) - MISS_ALLOWANCE
@@ -125,7 +120,7 @@ class Reach:
         if not self._unreachable:
             return None
         if out.any():
-            ends = np.where(miss > limit, held, target)
+            ends = np.where(miss > limit, reached, target)
             ends = np.where(barred & ~(np.abs(target - ends) > np.abs(target - allowed)), allowed, ends)
             self._worst = int(np.argmax(np.where(out, np.abs(target - ends), -1.0)))
             self._value = float(ends[self._worst])
@@ -137,14 +132,13 @@ class Reach:
         """Return the controlled outputs nearest to the targets, and their derivatives by the biases w; the
         targets and zeros where no steady state is found."""
         model, rows, optimiser = self.model, self._rows, self._optimiser
-        bias, drive_bias, found = observer.output_bias, observer.drive_bias, observer.disturbance
-        lowest, highest = optimiser.lowest, optimiser.highest
+        bias, drive_bias, disturbance = observer.output_bias, observer.drive_bias, observer.disturbance
         x_s, u_s = (observer.now, u) if self._x is None else (self._x, self._u)
-        u_s, self._x = np.clip(u_s, lowest, highest), None
+        u_s, self._x = optimiser.drives.cut(u_s), None
         nothing = target, np.zeros((len(target), observer.w.size))
         for _ in range(STEADY_STEPS):
             after, A, B, E = model.linearise(x_s, u_s + drive_bias, d)
-            by_w = B @ (found.on_drive * model.span[:, None]) + E @ found.on_disturbance
+            by_w = B @ (disturbance.on_drive * model.span[:, None]) + E @ disturbance.on_disturbance
             try:
                 by = np.linalg.solve(
                     np.eye(model.n_x) - A, np.column_stack([after - x_s, B * model.span, by_w])
@@ -163,7 +157,7 @@ class Reach:
             moved = max(np.max(np.abs(by[:, 0])) / model.unit.max(), np.max(np.abs(z)))
             if moved < CONVERGED:
                 self._x, self._u = x_s, u_s
-                return (y + G @ z)[rows], (model.C @ by[:, 1 + model.n_u :] + found.on_output)[rows]
+                return (y + G @ z)[rows], (model.C @ by[:, 1 + model.n_u :] + disturbance.on_output)[rows]
         return nothing
 
     def _nearest(
@@ -171,7 +165,7 @@ class Reach:
     ) -> Array:
         """Return the change z (n_u,) of the drives, in ranges, that brings the outputs y nearest."""
         rows, limited = self._rows, self._limited
-        near, near_limit = CAN * self.model.unit[rows], CAN * self.model.unit[limited]
+        allowed, near_limit = CAN * self.model.unit[rows], CAN * self.model.unit[limited]
         weight = np.where(seen, 1.0, 0.0)
         over = np.zeros(len(limited))  # +1 where the upper limit is in force, -1 the lower
         z = np.zeros(len(low))
@@ -180,13 +174,13 @@ class Reach:
             e = np.concatenate(
                 [weight * (target - y[rows]), BEYOND_LIMIT * np.abs(over) * (ends - y[limited])]
             )
-            own = np.concatenate(
+            weighted_gains = np.concatenate(
                 [weight[:, None] * G[rows], (BEYOND_LIMIT * np.abs(over))[:, None] * G[limited]]
             )
-            z = _least_squares_in_box(own, e, low, high)
+            z = _least_squares_in_box(weighted_gains, e, low, high)
             new = y + G @ z
             before = weight, over
-            weight = np.where(seen & (side * (new[rows] - target) > near), self._beyond, weight)
+            weight = np.where(seen & (side * (new[rows] - target) > allowed), self._beyond, weight)
             over = np.where(new[limited] > self._limits[1] + near_limit, 1.0, over)
             over = np.where(new[limited] < self._limits[0] - near_limit, -1.0, over)
             if np.array_equal(weight, before[0]) and np.array_equal(over, before[1]):
@@ -195,11 +189,11 @@ class Reach:
 
     def _range(self, G: Array, u: Array, drive_bias: Array) -> tuple[Array, Array]:
         """Return the ends (n_u,) of the drives: no further than the optimiser goes where a gain fades."""
-        optimiser, neutral = self._optimiser, self.model.neutral
-        if optimiser.settled_gain is None:
-            return optimiser.lowest, optimiser.highest
-        gain = G[np.array(self._rows)[optimiser.strongest], np.arange(len(u))]
-        return optimiser.faded_range(u - neutral, drive_bias, gain / optimiser.settled_gain, neutral)
+        drives, at_rest, neutral = self._optimiser.drives, self._optimiser.at_rest, self.model.neutral
+        if at_rest.settled is None:
+            return drives.lowest, drives.highest
+        gain = G[np.array(self._rows)[at_rest.strongest], np.arange(len(u))]
+        return self._optimiser.faded_range(u - neutral, drive_bias, gain / at_rest.settled, neutral)
 
 
 def _least_squares_in_box(G: Array, e: Array, low: Array, high: Array) -> Array:
@@ -210,8 +204,8 @@ def _least_squares_in_box(G: Array, e: Array, low: Array, high: Array) -> Array:
     for _ in range(SWEEPS):
         moved = 0.0
         for j, (row, (lowest, highest)) in enumerate(zip(H, ends)):
-            left = f[j] - sum(map(mul, row, z))
-            best = min(max(z[j] + left / (row[j] + least), lowest), highest)
+            gradient = f[j] - sum(map(mul, row, z))
+            best = min(max(z[j] + gradient / (row[j] + least), lowest), highest)
             moved, z[j] = max(moved, abs(best - z[j])), best
         if moved < 1e-9:
             break

@@ -47,6 +47,7 @@ from numpy.typing import NDArray
 from thermogrip.datasets.arrays import Array, Mask
 from thermogrip.mpc.design.design import Design
 from thermogrip.mpc.estimator.observer import DisturbanceModel, Observer
+from thermogrip.mpc.optimiser.drive_limits import DriveLimits
 from thermogrip.mpc.optimiser.qp import CondensedQP
 from thermogrip.mpc.plant.along_plan import AlongPlan
 from thermogrip.mpc.plant.prediction import PredictionModel
@@ -97,280 +98,299 @@ class Outcome:
     authority: Array
 
 
+@dataclass(frozen=True, eq=False)
+class Weights:
+    """What counts how much; n unknowns are the block values of all drives."""
+
+    output: Array  # (n_controlled,) times that the squared error of each output counts
+    sample: Array  # (N,) weight of each sample
+    zone: Array  # (n_controlled,) half width about a target within which nothing counts, 0: none
+    drive: Array  # (n,) of a squared drive
+    energy: Array  # (n,) of a drive
+    dear: Array  # (n_limited,) price of a unit beyond each limit
+
+    @classmethod
+    def of(cls, model: PredictionModel, design: Design) -> Weights:
+        """Return those of a design."""
+        lengths = np.array(design.blocks, dtype=float)
+        sample = np.full(sum(design.blocks), design.track)
+        sample[-1] += design.terminal
+        energy = np.array([design.energy_price.get(name, 0.0) for name in model.drives])
+        dear = [_DEAR if name in design.hard else 1.0 for name in design.limits]
+        return cls(
+            output=np.array([design.weights.get(name, 1.0) for name in design.controlled]),
+            sample=sample,
+            zone=np.array([design.zones.get(name, 0.0) for name in design.controlled]),
+            drive=design.drive * np.repeat(lengths, model.n_u),
+            energy=np.outer(lengths, energy).ravel(),
+            dear=design.price * np.array(dear),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class RestGains:
+    """How the controlled outputs answer to drives at rest, in the drives' ranges."""
+
+    strongest: NDArray[np.int_]  # (n_u,) which controlled output each drive moves most
+    response: Array  # (n_b, n_u) of that output to each block, summed over time
+    # (n_b, n_u) whether the horizon shows the response of a drive whose gain may fade or turn over
+    seen: Mask
+    # (n_u,) steady gain of that output; None where a drive moves nothing or the plant does not settle
+    settled: Array | None
+
+    @classmethod
+    def of(cls, model: PredictionModel, design: Design) -> RestGains:
+        """Return those of a plant at rest in the design's room."""
+        rows = np.array([model.outputs.index(name) for name in design.controlled])
+        x, u, d = model.at_rest(design.ambient)
+        _, G = model.trajectory(x, np.repeat(u[None, :], len(design.blocks), axis=0), d, design.blocks)
+        strongest = np.argmax(np.abs(G[:, rows].sum(axis=(0, 2))), axis=0)
+        response = _strongest_response(G * model.span, rows[strongest])
+        is_seen = np.abs(response) > 0.02 * np.max(np.abs(response), axis=0)
+        # of a drive that is no loop's and serves a limit, what it does to a target may fade or turn over
+        paired = {loop.drive for loop in design.loops}
+        is_seen &= np.array([name in paired or not (paired and design.limits) for name in model.drives])
+        _, A, B, _ = model.linearise(x, u, d)
+        try:
+            gain = model.C @ np.linalg.solve(np.eye(model.n_x) - A, B * model.span)
+        except np.linalg.LinAlgError:
+            return cls(strongest, response, is_seen, None)
+        settled = gain[rows[strongest], np.arange(model.n_u)]
+        moves = np.isfinite(settled).all() and np.all(np.abs(settled) > 1e-9)
+        return cls(strongest, response, is_seen, settled if moves else None)
+
+
+def _strongest_response(G: Array, rows: NDArray[np.int_]) -> Array:
+    """Return the responses (n_b, n_u), summed over time, of each drive's output in ``rows`` (n_u,), of
+    G (N, n_y, n_b, n_u)."""
+    return np.stack([G[:, row, :, j].sum(axis=0) for j, row in enumerate(rows)], axis=1)
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """What one program is about, beside its prediction."""
+
+    last: Array  # (n_u,) drives that are applied now
+    target: Array  # (1 or N, n_controlled)
+    side: Array  # (n_controlled,)
+    counted: list[int]  # controlled outputs that cost anything
+    parked: list[int]  # drives that go to rest
+    more: float = 0.0  # samples, by which the slew limit of the first move is longer than one
+    caution: float = 1.0  # times that the weight of moves counts
+
+
 class Optimiser:
     """Builds and solves the QP of a design."""
 
     def __init__(self, model: PredictionModel, design: Design) -> None:
         self.model, self.design = model, design
-        self.blocks = design.blocks
         self.n_b, self.N = len(design.blocks), sum(design.blocks)
+        self.drives = DriveLimits.of(model, design.drive_range, design.slew_per_s, design.safe_drive)
+        self.weights, self.at_rest = Weights.of(model, design), RestGains.of(model, design)
+        # controlled output that each drive is there for: its PI loop's, else what it moves most
+        self.pair = np.array(self.at_rest.strongest)
+        for loop in design.loops:
+            self.pair[model.drives.index(loop.drive)] = design.controlled.index(loop.output)
         self._rows = [model.outputs.index(name) for name in design.controlled]
-        self._limited = [model.outputs.index(name) for name in design.limits]
-        self._limits = np.array(list(design.limits.values()), dtype=float).reshape(-1, 2)
-        n = self.n_b * model.n_u
+        self._limits = [(model.outputs.index(name), *ends) for name, ends in design.limits.items()]
         self._spans = np.tile(model.span, self.n_b)  # of each unknown
-        self.differences = np.kron(np.eye(self.n_b) - np.eye(self.n_b, k=-1), np.eye(model.n_u))
-        self._moves = self.differences.T @ self.differences
-        self._hard = np.vstack([np.eye(n), self.differences])
-        self.weight = np.array([design.weights.get(name, 1.0) for name in design.controlled])
-        self._of_row = dict(zip(self._rows, self.weight))
-        self._weight = np.full(self.N, design.track)  # of each sample
-        self._weight[-1] += design.terminal
-        self._lengths = np.array(self.blocks, dtype=float)
-        lengths = np.repeat(self._lengths, model.n_u)
-        self._drive_cost = design.drive * lengths
-        self._fixed = 2 * (design.move * self._moves + np.diag(self._drive_cost))
-        ranges = np.array([design.drive_range[name] for name in model.drives])
-        self.lowest, self.highest = ranges.T
-        low, high = (np.broadcast_to(end, (self.n_b, model.n_u)) for end in ranges.T)
-        self._whole = low, high
-        self.slew = design.dt * np.array([design.slew_per_s[name] for name in model.drives])
         # a later block may differ by what the slew allows between the middles of the two
-        middles = np.cumsum(self.blocks) - 0.5 * np.array(self.blocks) + 0.5
-        gaps = np.concatenate([[1.0], np.diff(middles)])
-        self.reach = np.cumsum(gaps)
-        self.slews = (gaps[:, None] * self.slew).ravel()
-        self._slew_shares = self.slews / self._spans
-        self._solves, self._move = 0, design.move
+        middles = np.cumsum(design.blocks) - 0.5 * np.array(design.blocks) + 0.5
+        self._gaps = np.concatenate([[1.0], np.diff(middles)])
+        self._differences = np.kron(np.eye(self.n_b) - np.eye(self.n_b, k=-1), np.eye(model.n_u))
+        self.qp = self._program()
+        self._solves = 0
         # of a linear plant: G in the drives' ranges, the rows of the program, and H for what counts
         self._G: Array | None = None
         self._A: Array | None = None
         self._kept: tuple[Any, Array, list[Array]] | None = None
-        self._seen_rows, self._parked = list(range(len(self._rows))), list[int]()
-        self.neutral = np.clip(np.zeros(model.n_u), self.lowest, self.highest)
-        safe = [design.safe_drive.get(name, rest) for name, rest in zip(model.drives, self.neutral)]
-        self.safe = np.array(safe, dtype=float)
-        self.zone = np.array([design.zones.get(name, 0.0) for name in design.controlled])
-        self.energy = np.array([design.energy_price.get(name, 0.0) for name in model.drives])
-        # what energy costs, by unknown, in ranges of the drives
-        self._energy_cost = (self._lengths[:, None] * self.energy).ravel()
-        self.at_rest = self._response_at_rest()
-        self.pair = self._pairs()
-        self.settled_gain = self._settled_gain()
-        self.seen = np.abs(self.at_rest) > 0.02 * np.max(np.abs(self.at_rest), axis=0)
-        # of a drive that is no loop's and serves a limit, what it does to a target may fade or turn over
-        paired = {loop.drive for loop in design.loops}
-        guarded = [name in paired or not (paired and design.limits) for name in model.drives]
-        self.seen &= np.array(guarded)
-        self._per_rest = np.where(self.seen, self.at_rest, 1.0)
-        # price of a unit beyond each soft row, of each controlled output and each limit
-        dear = [_DEAR if name in design.hard else 1.0 for name in design.limits]
-        self.dear = design.price * np.array(dear)
-        zoned, by_zone = self.zone[:, None] > 0, self.weight[:, None] * self._weight
-        own, limited = np.where(zoned, by_zone, design.price), np.repeat(self.dear, self.N)
-        first = np.where(zoned, by_zone, FIRST * design.price)
-        prices = np.concatenate([np.full(2 * n, design.price), own.ravel(), limited])
-        self.qp = CondensedQP(
+
+    @property
+    def reach(self) -> Array:
+        """Samples of slew (n_b,) from now to the middle of each block."""
+        return np.cumsum(self._gaps)
+
+    def _program(self) -> CondensedQP:
+        """Return the program: ranges and slews, then of each controlled and limited output its samples."""
+        design, weights, n = self.design, self.weights, self._differences.shape[0]
+        zoned, by_zone = weights.zone[:, None] > 0, weights.output[:, None] * weights.sample
+        limited = np.repeat(weights.dear, self.N)
+        controlled = np.where(zoned, by_zone, design.price).ravel()
+        first = np.where(zoned, by_zone, FIRST * design.price).ravel()
+        prices = np.concatenate([np.full(2 * n, design.price), controlled, limited])
+        return CondensedQP(
             soft=np.arange(prices.size) >= 2 * n,
-            linear=np.concatenate([np.full(2 * n, design.price), first.ravel(), FIRST * limited]),
+            linear=np.concatenate([np.full(2 * n, design.price), first, FIRST * limited]),
             quadratic=2 * prices,
             time_limit_s=max(design.deadline_s, 1e-3),
         )
 
     @cached_property
     def _along(self) -> AlongPlan | None:
-        return self.model.along(self.blocks, self.model.span)
+        return self.model.along(self.design.blocks, self.model.span)
 
     def solve(self, sample: Sample) -> Outcome:
         """Improve a plan."""
-        x, last, guess, d, now, side, bias, drive_bias, slew_s, lost, caution, ahead = sample
-        self._move = caution * self.design.move
-        model, n_u = self.model, self.model.n_u
-        # in samples, by how much more or less than in one the first move may go
-        more = 0.0 if slew_s is None else slew_s / self.design.dt - 1.0
-        self._seen_rows = [at for at in range(len(self._rows)) if lost is None or not lost[at]]
-        self._parked = [j for j in range(n_u) if lost is not None and lost[self.pair[j]]]
-        target = now[None] if ahead is None else ahead  # (1 or N, n_controlled)
-        if lost is not None:
-            side = np.where(lost, 0.0, side)
-        if ahead is not None:  # nothing is beyond a target that moves
-            side = np.zeros(len(now))
-        guess = self._park(guess, last, more)
-        linear = model.affine is not None
-        y0, G = self._linearised(x, guess + drive_bias, d)
-        authority = np.ones((self.n_b, n_u)) if linear else self._authority(G)
-        y0 = y0 + bias
-        free = y0 - G @ (guess / model.span).ravel()  # the response without any plan
-        H, f = self._cost(G, free, target, last)
-        ends = self._range(guess, drive_bias, authority, last, more)
-        A, lower, upper = self._constraints(G, free, target, side, last, ends, more)
+        model, problem = self.model, self._problem(sample)
+        x, d, bias, drive_bias = sample.x, sample.d, sample.bias, sample.drive_bias
+        guess = self._park(sample.guess, problem)
+        y_guess, G = self._linearised(x, guess + drive_bias, d)
+        authority = self._authority(G)
+        y_guess = y_guess + bias
+        free = y_guess - G @ (guess / model.span).ravel()  # the response without any plan
+        H, f = self._cost(G, free, problem)
+        ends = self._range(guess, drive_bias, authority, problem)
+        A, lower, upper = self._constraints(G, free, ends, problem)
         answer = self.qp.solve(H, f, A, lower, upper)
-        plan = self._park((answer.x * self._spans).reshape(self.n_b, n_u), last, more)
+        plan = self._park((answer.x * self._spans).reshape(guess.shape), problem)
         if not answer.solved:
-            return Outcome(plan, y0, answer.status, {}, answer.iterations, authority[0])
-        if linear:
+            return Outcome(plan, y_guess, answer.status, {}, answer.iterations, authority[0])
+        if model.affine is not None:
             y = free + G @ (plan / model.span).ravel()
-            return Outcome(plan, y, "solved", self._broken(y), answer.iterations, authority[0])
-
-        def predicted(plans: Array) -> Array:
-            return self._simulate(x, plans + drive_bias, d) + bias
-
-        def merit(plans: Array, y: Array) -> Array:
-            return self._merit(plans, y, target, side, last)
-
-        plan, y = self._best(plan, guess, y0, last, more, predicted, merit)
+        else:
+            plan, y = self._best(
+                plan, guess, y_guess, lambda plans: self._simulate(x, plans + drive_bias, d) + bias, problem
+            )
         return Outcome(plan, y, "solved", self._broken(y), answer.iterations, authority[0])
+
+    def _problem(self, sample: Sample) -> Problem:
+        """Return what a sample asks for; nothing is beyond a target that moves, or that is lost."""
+        lost = np.zeros(len(self._rows), dtype=bool) if sample.lost is None else sample.lost
+        moves = sample.ahead is not None
+        return Problem(
+            last=sample.last,
+            target=sample.target[None] if sample.ahead is None else sample.ahead,
+            side=np.where(lost | moves, 0.0, sample.side),
+            counted=np.flatnonzero(~lost).tolist(),
+            parked=np.flatnonzero(lost[self.pair]).tolist(),
+            more=0.0 if sample.slew_s is None else sample.slew_s / self.design.dt - 1.0,
+            caution=sample.caution,
+        )
 
     def _linearised(self, x: Array, plan: Array, d: Array) -> tuple[Array, Array]:
         """Return the outputs along a plan, and G (N, n_y, n) by drives in their ranges."""
         if self._along is not None:
             y, G = self._along.trajectory(x, plan, d)
             return y, G.reshape(self.N, self.model.n_y, -1)
-        y, G = self.model.trajectory(x, plan, d, self.blocks)
+        y, G = self.model.trajectory(x, plan, d, self.design.blocks)
         if self._G is None or self.model.affine is None:
             self._G = G.reshape(self.N, self.model.n_y, -1) * self._spans
         return y, self._G
 
-    def _pairs(self) -> NDArray[np.int_]:
-        """Return which controlled output each drive is there for: its PI loop's, else what it moves most."""
-        pair = np.array(self.strongest)
-        for loop in self.design.loops:
-            pair[self.model.drives.index(loop.drive)] = self.design.controlled.index(loop.output)
-        return pair
+    def _slewed(self, ends: Array, problem: Problem) -> Array:
+        """Return plans (..., n_b, n_u) that go to these ends as fast as the slew allows."""
+        reach = (self.reach[:, None] + problem.more) * self.drives.slew
+        return np.asarray(np.clip(ends, problem.last - reach, problem.last + reach))
 
-    def _park(self, plans: Array, last: Array, more: float) -> Array:
-        """Return plans (..., n_b, n_u) whose parked drives go to rest as fast as the slew allows."""
-        if not self._parked:
+    def _park(self, plans: Array, problem: Problem) -> Array:
+        """Return plans (..., n_b, n_u) whose parked drives go to rest."""
+        if not problem.parked:
             return plans
-        reach = (self.reach[:, None] + more) * self.slew
-        path = np.clip(self.safe, last - reach, last + reach)
         plans = np.array(plans)
-        plans[..., self._parked] = path[:, self._parked]
+        plans[..., problem.parked] = self._slewed(self.drives.safe, problem)[:, problem.parked]
         return plans
 
+    def _ramps(self, problem: Problem) -> Array:
+        """Return plans (2, n_b, n_u) that take the drives back: to none, and to the other end; where that is
+        none, to the far one."""
+        drives = self.drives
+        up = drives.lowest == drives.neutral
+        up |= (problem.last <= drives.neutral) & (drives.highest > drives.neutral)
+        ends = np.stack([drives.neutral, np.where(up, drives.highest, drives.lowest)])
+        return self._park(self._slewed(ends[:, None, :], problem), problem)
+
     def _best(
-        self,
-        plan: Array,
-        guess: Array,
-        y_guess: Array,
-        last: Array,
-        more: float,
-        predicted: Callable[[Array], Array],
-        merit: Callable[[Array, Array], Array],
+        self, plan: Array, guess: Array, y_guess: Array, predicted: Callable[[Array], Array], problem: Problem
     ) -> tuple[Array, Array]:
         """Return the QP's plan, or one that the nonlinear simulation finds better, with its outputs."""
         self._solves += 1
         y = predicted(plan[None])
-        at_guess, cost = merit(np.stack([guess, plan]), np.stack([y_guess, y[0]]))
+        at_guess, cost = self._merit(np.stack([guess, plan]), np.stack([y_guess, y[0]]), problem)
         others = np.zeros((0, *plan.shape))
         if cost > at_guess:
             others = guess + np.array(SHARES)[:, None, None] * (plan - guess)
         if self._solves % LOOK_AROUND == 1:
-            others = np.concatenate([others, self._park(self._ramps(last, more), last, more)])
+            others = np.concatenate([others, self._ramps(problem)])
         if not len(others):
             return plan, y[0]
         y_others = predicted(others)
-        costs = BARELY * merit(others, y_others)
+        costs = BARELY * self._merit(others, y_others, problem)
         best = int(np.argmin(costs))
         return (others[best], y_others[best]) if costs[best] < cost else (plan, y[0])
 
-    def _response(self, G: Array) -> Array:
-        """Return the response (n_b, n_u) to each block, summed over time, of the output moved most."""
-        G = G.reshape(self.N, self.model.n_y, self.n_b, self.model.n_u)
-        found = np.empty(G.shape[2:])
-        for j, at in enumerate(self.strongest):
-            np.add.reduce(G[:, self._rows[at], :, j], axis=0, out=found[:, j])
-        return found
-
-    def _response_at_rest(self) -> Array:
-        """Set which output each drive moves most; return the response at rest (n_b, n_u) of that one."""
-        model = self.model
-        x, u, room = model.at_rest(self.design.ambient)
-        plan = np.repeat(u[None, :], self.n_b, axis=0)
-        _, G = model.trajectory(x, plan, room, self.blocks)
-        self.strongest = np.argmax(np.abs(G[:, self._rows].sum(axis=(0, 2))), axis=0)
-        return self._response(G * model.span)
-
-    def _settled_gain(self) -> Array | None:
-        """Return the steady gain (n_u,) of the output that each drive moves most, at rest [degC a range];
-        None where a drive moves nothing or the plant does not settle."""
-        model, (x, u, d) = self.model, self.model.at_rest(self.design.ambient)
-        _, A, B, _ = model.linearise(x, u, d)
-        try:
-            gain = model.C @ np.linalg.solve(np.eye(model.n_x) - A, B * model.span)
-        except np.linalg.LinAlgError:
-            return None
-        gain = gain[np.array(self._rows)[self.strongest], np.arange(model.n_u)]
-        return gain if np.isfinite(gain).all() and np.all(np.abs(gain) > 1e-9) else None
-
     def _authority(self, G: Array) -> Array:
         """Return each block's response over that at rest, (n_b, n_u); 1 where the horizon hides it."""
-        return np.where(self.seen, self._response(G) / self._per_rest, 1.0)
+        if self.model.affine is not None:
+            return np.ones((self.n_b, self.model.n_u))
+        G = G.reshape(self.N, self.model.n_y, self.n_b, self.model.n_u)
+        response = _strongest_response(G, np.array(self._rows)[self.at_rest.strongest])
+        share = np.ones(response.shape)
+        return np.divide(response, self.at_rest.response, out=share, where=self.at_rest.seen)
 
     def _range(
-        self, guess: Array, drive_bias: Array, authority: Array, last: Array, more: float
+        self, guess: Array, drive_bias: Array, authority: Array, problem: Problem
     ) -> tuple[Array, Array]:
         """Return the range (n_b, n_u) of each block: no further than where its gain will have faded."""
-        if (authority < 1 - FADING).any():
-            away, held = guess - self.neutral, last - self.neutral
-            reach = (self.reach[:, None] + more) * self.slew
-            least = np.where(away * held > 0, np.abs(held) - reach, 0.0)  # what the slew allows
-            low, high = self.faded_range(away, drive_bias, authority, self.neutral, least)
-        else:
-            low, high = self._whole
-        if not self._parked:
+        drives = self.drives
+        away, last_away = guess - drives.neutral, problem.last - drives.neutral
+        reach = (self.reach[:, None] + problem.more) * drives.slew
+        least = np.where(away * last_away > 0, np.abs(last_away) - reach, 0.0)  # what the slew allows
+        ends = self.faded_range(away, drive_bias, authority, drives.neutral, least)
+        low, high = (np.broadcast_to(end, guess.shape) for end in ends)
+        if not problem.parked:
             return low, high
         little = np.zeros(self.model.n_u)
-        little[self._parked] = LITTLE * self.model.span[self._parked]
-        return self._park(low, last, more) - little, self._park(high, last, more) + little
+        little[problem.parked] = LITTLE * self.model.span[problem.parked]
+        return self._park(low, problem) - little, self._park(high, problem) + little
 
     def faded_range(
-        self, away: Array, bias: Array, left: Array, neutral: Array, least: Array | float = 0.0
+        self, away: Array, bias: Array, share: Array, neutral: Array, least: Array | float = 0.0
     ) -> tuple[Array, Array]:
-        """Return the ends of drives ``away`` from neutral, where what is ``left`` of their gain at rest
-        will have faded; never nearer than the ``least`` distance."""
-        if not (left < 1 - FADING).any():
-            return self.lowest, self.highest
-        best = np.abs(away + bias) / np.maximum(1 - left, FADING)  # where the gain is nothing
-        end = np.abs(np.where(away < 0, self.lowest, self.highest) - neutral)
+        """Return the ends of drives ``away`` from neutral, of whose gain at rest a ``share`` remains, where
+        it will have faded; never nearer than the ``least`` distance."""
+        lowest, highest = self.drives.lowest, self.drives.highest
+        fades = share < 1 - FADING
+        if not fades.any():
+            return lowest, highest
+        best = np.abs(away + bias) / np.maximum(1 - share, FADING)  # where the gain is nothing
+        end = np.abs(np.where(away < 0, lowest, highest) - neutral)
         room = np.maximum(best * allowed_share(end, best, self.model.span), least)
-        low = np.where((left < 1 - FADING) & (away < 0), neutral - room, self.lowest)
-        high = np.where((left < 1 - FADING) & (away > 0), neutral + room, self.highest)
-        return np.maximum(low, self.lowest), np.minimum(high, self.highest)
+        low = np.where(fades & (away < 0), neutral - room, lowest)
+        high = np.where(fades & (away > 0), neutral + room, highest)
+        return np.maximum(low, lowest), np.minimum(high, highest)
 
     def _simulate(self, x: Array, plans: Array, d: Array) -> Array:
         """Return the outputs (B, N, n_y) of plans (B, n_b, n_u)."""
         if self._along is not None:
             return self._along.outputs(x, plans, d)
         states = np.repeat(x[None, :], len(plans), axis=0)
-        y, _ = self.model.run(states, np.repeat(plans, self.blocks, axis=1), d)
+        y, _ = self.model.run(states, np.repeat(plans, self.design.blocks, axis=1), d)
         return y[:, 1:]
 
-    def _ramps(self, last: Array, more: float) -> Array:
-        """Return plans (2, n_b, n_u) that take the drives back: to none, and to the other end; where that is
-        none, to the far one."""
-        neutral, up = self.neutral, self.lowest == self.neutral
-        up |= (last <= neutral) & (self.highest > neutral)
-        ends = np.stack([neutral, np.where(up, self.highest, self.lowest)])[:, None, :]
-        reach = ((self.reach[:, None] + more) * self.slew)[None]
-        return np.asarray(np.clip(ends, last - reach, last + reach))
-
-    def _merit(self, plans: Array, y: Array, target: Array, side: Array, last: Array) -> Array:
+    def _merit(self, plans: Array, y: Array, problem: Problem) -> Array:
         """Return the cost (B,) of plans (B, n_b, n_u) whose outputs y (B, N, n_y) were simulated."""
-        design, n_u = self.design, self.model.n_u
+        design, weights, n_u = self.design, self.weights, self.model.n_u
         shares = plans.reshape(len(plans), -1) / self._spans
         moves = shares.copy()
         moves[:, n_u:] -= shares[:, :-n_u]
-        moves[:, :n_u] -= last / self.model.span
-        squared = np.sum(moves * moves, axis=1)
-        cost = self._move * squared + (shares * shares) @ self._drive_cost
-        cost += shares @ self._energy_cost
-        over: list[tuple[float, Array]] = []
-        for at in self._seen_rows:
-            error = y[:, :, self._rows[at]] - target[:, at]
-            if self.zone[at]:
-                slack = np.maximum(0.0, np.abs(error) - self.zone[at])
-                cost += self.weight[at] * ((slack + slack**2) @ self._weight)
+        moves[:, :n_u] -= problem.last / self.model.span
+        cost = problem.caution * design.move * np.sum(moves * moves, axis=1)
+        cost += (shares * shares) @ weights.drive + shares @ weights.energy
+        beyond: list[tuple[float, Array]] = []
+        for i in problem.counted:
+            error = y[:, :, self._rows[i]] - problem.target[:, i]
+            if weights.zone[i]:
+                slack = np.maximum(0.0, np.abs(error) - weights.zone[i])
+                cost += weights.output[i] * ((slack + slack**2) @ weights.sample)
                 continue
-            cost += self.weight[at] * ((error * error) @ self._weight)
-            if side[at]:
-                over.append((design.price, side[at] * error - design.overshoot))
-        for at, row in enumerate(self._limited):
-            low, high = self._limits[at].tolist()
-            over.append((self.dear[at], np.maximum(low - y[:, :, row], y[:, :, row] - high)))
-        for price, beyond in over:
-            if not beyond.max() <= 0.0:
-                slack = np.maximum(0.0, beyond)
+            cost += weights.output[i] * ((error * error) @ weights.sample)
+            if problem.side[i]:
+                beyond.append((design.price, problem.side[i] * error - design.overshoot))
+        for dear, (row, low, high) in zip(weights.dear, self._limits):
+            beyond.append((dear, np.maximum(low - y[:, :, row], y[:, :, row] - high)))
+        for price, excess in beyond:
+            if not excess.max() <= 0.0:
+                slack = np.maximum(0.0, excess)
                 cost += price * (FIRST * slack.sum(axis=1) + np.einsum("ij,ij->i", slack, slack))
         return np.asarray(cost)
 
@@ -378,90 +398,80 @@ class Optimiser:
         """Start afresh: the ramps are tried at the first solve."""
         self._solves = 0
 
-    def linear_gains(self, G: Array, rows: list[int]) -> tuple[Array, Array, Array]:
+    def linear_gains(self, G: Array) -> tuple[Array, Array, Array]:
         """Return H (n, n), and the unconstrained plan's gains on the free response (n, N n_controlled),
         sample by sample, and on the last drive (n, n_u).
 
         G (N, n_y, n) is the response to the plan in fractions of the drives' ranges; the first n_u rows of a
         gain are the first move.
         """
-        n_u, span = self.model.n_u, np.tile(self.model.span, self.n_b)
-        H, weighted = self._hessian(G, rows)
+        n_u, span = self.model.n_u, self._spans
+        H, weighted = self._hessian(G, range(len(self._rows)), 1.0)
         linear = np.stack(weighted, axis=2)
         before = np.zeros((H.shape[0], n_u))
         before[:n_u] = np.diag(1 / self.model.span)
-        last = 2 * self.design.move * self.differences.T @ before
+        last = 2 * self.design.move * self._differences.T @ before
         on_free = -span[:, None] * np.linalg.solve(H, linear.reshape(H.shape[0], -1))
         return H, on_free, span[:, None] * np.linalg.solve(H, last)
 
-    def _hessian(self, G: Array, rows: Sequence[int]) -> tuple[Array, list[Array]]:
-        """Return H, and by output the response (n, N) of each sample times twice its weight."""
-        H = self._fixed.copy()
-        weighted = [G[:, row, :].T * (2 * self._of_row[row] * self._weight) for row in rows]
-        for row, part in zip(rows, weighted):
-            H += part @ G[:, row, :]
+    def _hessian(self, G: Array, outputs: Sequence[int], caution: float) -> tuple[Array, list[Array]]:
+        """Return H, and by controlled output the response (n, N) of each sample times twice its weight."""
+        moves = caution * self.design.move * (self._differences.T @ self._differences)
+        H = 2 * (moves + np.diag(self.weights.drive))
+        weighted = []
+        for i in outputs:
+            response = G[:, self._rows[i], :]
+            weighted.append(response.T * (2 * self.weights.output[i] * self.weights.sample))
+            H += weighted[-1] @ response
         return H, weighted
 
-    def _cost(self, G: Array, free: Array, target: Array, last: Array) -> tuple[Array, Array]:
-        tracked = [at for at in self._seen_rows if not self.zone[at]]
-        rows = [self._rows[at] for at in tracked]
-        key = tuple(rows), self._move
+    def _cost(self, G: Array, free: Array, problem: Problem) -> tuple[Array, Array]:
+        tracked = [i for i in problem.counted if not self.weights.zone[i]]
+        key = tracked, problem.caution
         if self._kept is None or self._kept[0] != key or self.model.affine is None:
-            H, weighted = self._hessian(G, rows)
-            if self._move != self.design.move:
-                H += 2 * (self._move - self.design.move) * self._moves
-            self._kept = key, H, weighted
+            self._kept = key, *self._hessian(G, tracked, problem.caution)
         _, H, weighted = self._kept
-        f = self._energy_cost.copy()
-        for at, row, part in zip(tracked, rows, weighted):
-            f += part @ (free[:, row] - target[:, at])
-        f[: self.model.n_u] -= 2 * self._move * (last / self.model.span)
+        f = self.weights.energy.copy()
+        for i, by_error in zip(tracked, weighted):
+            f += by_error @ (free[:, self._rows[i]] - problem.target[:, i])
+        f[: self.model.n_u] -= 2 * problem.caution * self.design.move * (problem.last / self.model.span)
         return H, f
 
     def _constraints(
-        self,
-        G: Array,
-        free: Array,
-        target: Array,
-        side: Array,
-        last: Array,
-        ends: tuple[Array, Array],
-        more: float,
+        self, G: Array, free: Array, ends: tuple[Array, Array], problem: Problem
     ) -> tuple[Array, Array, Array]:
-        n, n_u, N = self.n_b * self.model.n_u, self.model.n_u, self.N
-        soft = self._rows + self._limited
-        if self._A is None:
-            self._A = np.concatenate([self._hard, *(G[:, row] for row in soft)])
-        elif self.model.affine is None:
-            self._A[2 * n :][: len(soft) * N].reshape(len(soft), N, n)[...] = G[:, soft].transpose(1, 0, 2)
-        lower, upper = np.empty(len(self._A)), np.empty(len(self._A))
-        lower[:n], upper[:n] = ends[0].ravel() / self._spans, ends[1].ravel() / self._spans
-        first, before = slice(n, n + n_u), last / self.model.span
-        reach = self._slew_shares[:n_u] + more * self.slew / self.model.span
-        lower[n : 2 * n], upper[n : 2 * n] = -self._slew_shares, self._slew_shares
-        lower[first], upper[first] = before - reach, before + reach
-        rows = slice(2 * n, 2 * n + N)
-        for at, row in enumerate(self._rows):
-            far, down, up = self.design.overshoot, side[at] < 0, side[at] > 0
-            if self.zone[at]:
-                far, down = self.zone[at], at in self._seen_rows
-                up = down
-            left = target[:, at] - free[:, row]
-            lower[rows], upper[rows] = left - far if down else -np.inf, left + far if up else np.inf
-            rows = slice(rows.stop, rows.stop + N)
-        for at, row in enumerate(self._limited):
-            lower[rows], upper[rows] = self._limits[at, :, None] - free[:, row]
-            rows = slice(rows.stop, rows.stop + N)
-        return self._A, lower, upper
+        """Return the rows A of the program and their bounds."""
+        n, n_u = len(self._spans), self.model.n_u
+        soft = [*self._rows, *(row for row, _, _ in self._limits)]
+        if self._A is None or self.model.affine is None:
+            rows = G[:, soft].transpose(1, 0, 2).reshape(-1, n)
+            self._A = np.concatenate([np.eye(n), self._differences, rows])
+        slew = (self._gaps[:, None] * self.drives.slew).ravel() / self._spans
+        slew[:n_u] += problem.more * self.drives.slew / self.model.span
+        before = np.zeros(n)
+        before[:n_u] = problem.last / self.model.span
+        lower = [ends[0].ravel() / self._spans, before - slew]
+        upper = [ends[1].ravel() / self._spans, before + slew]
+        for i, row in enumerate(self._rows):
+            error, zone = problem.target[:, i] - free[:, row], self.weights.zone[i]
+            allowed = zone or self.design.overshoot
+            counts = i in problem.counted
+            none = np.full(self.N, np.inf)
+            lower.append(error - allowed if (counts if zone else problem.side[i] < 0) else -none)
+            upper.append(error + allowed if (counts if zone else problem.side[i] > 0) else none)
+        for row, low, high in self._limits:
+            lower.append(low - free[:, row])
+            upper.append(high - free[:, row])
+        return self._A, np.concatenate(lower), np.concatenate(upper)
 
     def _broken(self, y: Array) -> dict[str, float]:
-        found = {}
-        for at, (name, row) in enumerate(zip(self.design.limits, self._limited)):
-            low, high = self._limits[at].tolist()
-            over = float(max(low - y[:, row].min(), y[:, row].max() - high))
-            if over > BREAKS * self.model.unit[row]:
-                found[name] = over
-        return found
+        """Return by how much limits will be broken, where it is worth a word."""
+        broken = {}
+        for name, (row, low, high) in zip(self.design.limits, self._limits):
+            excess = float(max(low - y[:, row].min(), y[:, row].max() - high))
+            if excess > BREAKS * self.model.unit[row]:
+                broken[name] = excess
+        return broken
 
 
 def allowed_share(end: Array, best: Array, span: Array) -> Array:

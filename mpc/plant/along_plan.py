@@ -65,8 +65,10 @@ class AlongPlan:
     def outputs(self, x: Array, plans: Array, d: Array) -> Array:
         """Return the outputs (B, N, n_y) of plans (B, n_b, n_u)."""
         if len(plans) > _PLANS:
-            parts = [self.outputs(x, plans[at : at + _PLANS], d) for at in range(0, len(plans), _PLANS)]
-            return np.concatenate(parts)
+            batches = [
+                self.outputs(x, plans[first : first + _PLANS], d) for first in range(0, len(plans), _PLANS)
+            ]
+            return np.concatenate(batches)
         members, batch = slice(len(plans)), self._plans
         self._run(batch, members, x, plans[:, self._block], d)
         return batch.y[members, self._sub :: self._sub, : self._sizes[2]].copy()

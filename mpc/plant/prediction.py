@@ -2,11 +2,10 @@ r"""The plant at the controller's sample time: prediction, linearisation along a
 
 A plant is x+ = f(x, u, d; p) at its native step.  A controller moves every dt = n native steps with u
 held, so one sample is f composed n times, or fewer times at a longer step where that changes the prediction
-by less than a hundredth of an output's unit (:func:`unit_of`).  Delay needs no special case: it is in the
-model's states (the water in the tubes), and so in the prediction.
+by less than a hundredth of an output's unit (:func:`unit_of`).  Delay is in the model's states.
 
-The optimiser needs the predicted outputs and how they answer to the plan.  With the plan held over blocks,
-u_k = v_b for k in block b, the outputs are linearised **along the predicted trajectory** [1]_:
+With the plan held over blocks, u_k = v_b for k in block b, the outputs are linearised **along the predicted
+trajectory** [1]_:
 
     y(v) ~ y(v0) + G (v - v0),    G = dy/dv at v0, by stages y_k = h(x_k), x_k+1 = f(x_k, u_k).
 
@@ -14,14 +13,9 @@ Linearising there, not at the current state, is what keeps a Peltier drive safe:
 more current heats, dT/du changes sign along the plan, and a controller that froze the sign drives into the
 wrong side.
 
-The derivatives are CasADi's, exact, of the model's own step: its instructions for the step and its tangent
-become machine code that runs a direction for each block and drive in one batch. A step with instructions
-that have no such code (a branch) is linearised sample by sample, S+ = A S + B, by CasADi itself. Of a step
-that is linear in state, drives and disturbances together the derivatives never change: they are made once.
-
-**Steady states.**  There x = f(x, u, d), so the outputs are a function y(u) of the drives.  For a Peltier
-element it is a parabola in the cooling direction: pumped heat grows with the current, Joule heat with its
-square.  What lies beyond the optimum, or beyond the range of the drive, cannot be held.
+The derivatives are CasADi's, exact: its instructions for the step and its tangent become machine code that
+runs a direction for each block and drive in one batch. A step with instructions that have no such code (a
+branch) is linearised sample by sample, S+ = A S + B, by CasADi itself. Of a linear step they are made once.
 
 References
 ----------
@@ -133,9 +127,9 @@ class PredictionModel:
         seen = np.array([plant.valid.get(name, (0.0, 0.0)) for name in self.disturbances], dtype=float)
         self.seen_d = seen.reshape(-1, 2)
         low, high = self.seen_d.T
-        far = np.where(high > low, _FAR * (high - low), _ANY)
-        self.least_d = np.where(self.rooms, self.coldest, low - far)
-        self.most_d = np.where(self.rooms, self.hottest, high + far)
+        width_allowed = np.where(high > low, _FAR * (high - low), _ANY)
+        self.least_d = np.where(self.rooms, self.coldest, low - width_allowed)
+        self.most_d = np.where(self.rooms, self.hottest, high + width_allowed)
         some = np.where(high > low, high - low, np.maximum(1.0, np.abs(high)))
         self.close_d = np.where(self.rooms, 0.5, _CLOSE * some)
         wanted = sample_time(plant) if dt is None else float(dt)
@@ -148,18 +142,18 @@ class PredictionModel:
         """Return into how few steps a sample may be cut with a full swing of the drives within a hundredth of
         the outputs' units: an implicit network is as good for control at four times its own step, and a
         controller's time goes into these."""
-        own = self.sub
+        native_steps = self.sub
         d = self.undisturbed(ROOM)
         x = self.rest(self.usual(ROOM), d)[None, :]
         plan = np.repeat(np.stack([self.highest, self.lowest]), 30, axis=0)[None]
         exact, _ = self.run(x, plan, d)
-        for steps in range(1, own):
-            if own % steps == 0:
+        for steps in range(1, native_steps):
+            if native_steps % steps == 0:
                 self.sub = steps
                 if np.max(np.abs(self.run(x, plan, d)[0] - exact) / self.unit) < _STEP_ERROR:
                     return steps
-        self.sub = own
-        return own
+        self.sub = native_steps
+        return native_steps
 
     def inputs(self, u: ArrayLike) -> Array:
         """Return the model's input vector for drives of shape (..., n_u), switches on."""
@@ -178,7 +172,7 @@ class PredictionModel:
         where no log was there, amid what the logs showed."""
         d, y, v = self.undisturbed(ambient), self.usual(ambient), self.neutral
         if np.any(y != ambient):
-            logs = [self.plant.valid.get(name, (rest, rest)) for name, rest in zip(self.drives, v)]
+            logs = [self.plant.valid.get(name, (neutral, neutral)) for name, neutral in zip(self.drives, v)]
             v = np.clip(np.mean(np.array(logs, dtype=float), axis=1), self.lowest, self.highest)
         x = self.model.rest(y, self.inputs(v), d, self.p)
         return np.asarray(x, dtype=np.float64), v, d
@@ -192,8 +186,8 @@ class PredictionModel:
         """Return outputs (n_y,) that are as warm as the room [degC], or the middle of what the logs showed of
         those that never were."""
         low, high = self._seen.T
-        far = _NEAR * self.unit
-        away = (ambient < low - far) | (ambient > high + far)
+        margin = _NEAR * self.unit
+        away = (ambient < low - margin) | (ambient > high + margin)
         return np.asarray(np.mean(np.where(away, self._seen.T, ambient), axis=0), dtype=np.float64)
 
     def output(self, x: ArrayLike) -> Array:
@@ -206,9 +200,9 @@ class PredictionModel:
         outputs (B, N + 1, n_y) from the start on, and last states (B, n_x)."""
         fine = self.inputs(u) if self.sub == 1 else np.repeat(self.inputs(u), self.sub, axis=1)
         d = np.repeat(d, self.sub, axis=1) if d.ndim == 3 else np.atleast_2d(d)[:, None, :]
-        held = np.ascontiguousarray(np.broadcast_to(d, (d.shape[0], fine.shape[1], d.shape[2])))
+        d_of_steps = np.ascontiguousarray(np.broadcast_to(d, (d.shape[0], fine.shape[1], d.shape[2])))
         y, x_end = self.model.rollout(
-            np.ascontiguousarray(x), fine, held, self.p[None, :], self.dt / self.sub
+            np.ascontiguousarray(x), fine, d_of_steps, self.p[None, :], self.dt / self.sub
         )
         return np.asarray(y)[:, :: self.sub], np.asarray(x_end)
 
@@ -301,9 +295,9 @@ class PredictionModel:
         # a block's answer is the sum of what its samples do
         steps = np.concatenate([np.zeros((1, *impulse[0].shape)), np.cumsum(impulse, axis=0)])
         G, first = np.zeros((len(impulse), self.n_y, len(blocks), self.n_u)), 0
-        for at, length in enumerate(blocks):
+        for block, length in enumerate(blocks):
             for k in range(first, len(impulse)):
-                G[k, :, at] = steps[k - first + 1] - steps[max(0, k - first + 1 - length)]
+                G[k, :, block] = steps[k - first + 1] - steps[max(0, k - first + 1 - length)]
             first += length
         self._responses[blocks] = Response(np.stack(by_x), np.stack(by_rest), G)
         return self._responses[blocks]
@@ -365,8 +359,8 @@ class PredictionModel:
     def room(self, d: ArrayLike) -> float:
         """Return the room's temperature [degC] as the first measured disturbance that is one gives it, 25
         where it does not."""
-        known = np.asarray(d, float).reshape(-1)[self.rooms][:1]
-        return float(known[0]) if np.isfinite(known).any() else ROOM
+        room_read = np.asarray(d, float).reshape(-1)[self.rooms][:1]
+        return float(room_read[0]) if np.isfinite(room_read).any() else ROOM
 
     def rounded_d(self, d: Array) -> tuple[float, ...]:
         """Return measured disturbances (n_d,) to the step within which what holds a target is the same."""
@@ -387,8 +381,8 @@ def _step(model: PredictionModel, symbols: list[Any]) -> list[Any]:
 
     x, u, d = (ca.vertsplit(item) if item.numel() else [] for item in symbols)
     full = [ca.SX(1.0)] * len(model.model.inputs)
-    for at, value in zip(model.drive_index, u, strict=True):
-        full[at] = value
+    for place, value in zip(model.drive_index, u, strict=True):
+        full[place] = value
     return list(model.model.step(x, full, d, model.p.tolist(), model.dt / model.sub))
 
 
@@ -426,7 +420,7 @@ class _TangentSteps:
     def advance(self, x: Values, u: Values, d: Values, c: Values, kept: Values, h: Any) -> list[Any]:
         """Return the state after the step, then its direction, by CasADi's instructions one by one."""
         halves = [(values[: len(values) // 2], values[len(values) // 2 :]) for values in (x, u, d)]
-        given = [half[0] for half in halves] + [half[1] for half in halves]
+        inputs = [half[0] for half in halves] + [half[1] for half in halves]
         function, work = self._function, dict[int, Any]()
         results: list[list[Any]] = [[0.0] * len(halves[0][0]) for _ in range(2)]
         for k in range(function.n_instructions()):
@@ -435,7 +429,7 @@ class _TangentSteps:
             if name == "OP_OUTPUT":
                 results[into[0]][into[1]] = work[out_of[0]]
             elif name == "OP_INPUT":
-                work[into[0]] = given[out_of[0]][out_of[1]]
+                work[into[0]] = inputs[out_of[0]][out_of[1]]
             elif name == "OP_CONST":
                 work[into[0]] = float(function.instruction_constant(k))
             else:
@@ -447,9 +441,9 @@ class _TangentSteps:
         half = len(x) // 2
         rows = [(level, x[:half]) for level in self._level], [(0.0, x[half:]) for _ in self._level]
         return [
-            level + sum(gain * value for gain, value in zip(row, part, strict=True) if gain)
-            for found in rows
-            for row, (level, part) in zip(self._C, found, strict=True)
+            level + sum(gain * value for gain, value in zip(row, states, strict=True) if gain)
+            for part_rows in rows
+            for row, (level, states) in zip(self._C, part_rows, strict=True)
         ]
 
 
@@ -509,10 +503,10 @@ def step_response(
     most, and read gain, delay and lag off it."""
     model = PredictionModel(plant, dt=plant.dt)
     j, i = model.drives.index(drive), model.outputs.index(output)
-    rest, start, d = model.at_rest(ambient)
+    x_rest, start, d = model.at_rest(ambient)
     step = np.zeros(model.n_u)
     step[j] = (0.05 if start[j] + 0.05 * model.span[j] <= model.highest[j] else -0.05) * model.span[j]
-    x = np.repeat(rest[None, :], 2, axis=0)
+    x = np.repeat(x_rest[None, :], 2, axis=0)
     time, answer, seconds = [np.zeros(1)], [np.zeros(1)], max(60.0, 100 * plant.dt)
     while True:
         n = round(seconds / plant.dt)
@@ -526,11 +520,11 @@ def step_response(
             break
         seconds = t[-1]
     gain = float(response[-1])
-    at = int(np.argmax(slope * np.sign(gain)))  # what first goes the other way is part of the delay
-    steepest = float(slope[at])
+    steepest_at = int(np.argmax(slope * np.sign(gain)))  # what first goes the other way is part of the delay
+    steepest = float(slope[steepest_at])
     if gain == 0 or steepest == 0:
         return StepResponse(0.0, float("inf"), float("inf"), t, response)
-    delay = max(0.0, float(t[at] - response[at] / steepest))
+    delay = max(0.0, float(t[steepest_at] - response[steepest_at] / steepest))
     return StepResponse(gain, delay, abs(gain / steepest), t, response)
 
 
@@ -544,11 +538,11 @@ def apparent_delays(
 ) -> tuple[float, ...]:
     """Return the apparent delay [s] of each controlled output behind the drive that moves it most, of one
     sample ``dt`` [s] to :data:`LONGEST_DELAY`."""
-    found = []
+    delays = []
     for of in controlled:
         best = max((step_response(plant, name, of) for name in drives), key=lambda one: abs(one.gain))
-        found.append(float(np.clip(best.delay, dt, LONGEST_DELAY * dt)))
-    return tuple(found)
+        delays.append(float(np.clip(best.delay, dt, LONGEST_DELAY * dt)))
+    return tuple(delays)
 
 
 def sample_time(plant: Plant) -> float:
@@ -559,7 +553,7 @@ def sample_time(plant: Plant) -> float:
     a 40th of the time in which a full drive leads through all that the logs showed.  Never below the plant's
     own step.
     """
-    found = []
+    sample_times = []
     for output in plant.model.outputs:
         answers = [step_response(plant, drive, output) for drive in drive_names(plant)]
         best = max(answers, key=lambda answer: abs(answer.gain))
@@ -567,8 +561,8 @@ def sample_time(plant: Plant) -> float:
             low, high = plant.valid.get(output, (-np.inf, np.inf))
             through = best.lag * (high - low) / abs(best.gain)
             short = through / 40 if through < best.lag / 20 else min(best.lag, 4000.0) / 400
-            found.append(max(best.delay / 4, short))
-    wanted = max(found) if found else plant.dt
+            sample_times.append(max(best.delay / 4, short))
+    wanted = max(sample_times) if sample_times else plant.dt
     grid = np.array([m * 10.0**e for e in range(-3, 3) for m in (1, 2, 5)])
     nice = float(grid[int(np.argmin(np.abs(np.log(grid / wanted))))])
     return max(1, round(nice / plant.dt)) * plant.dt
@@ -616,16 +610,16 @@ def holding_drive(
     starts = [low + share * (high - low) for share in (0.1, 0.3, 0.5, 0.7, 0.9)]
     # a small weight of the drive itself picks the smaller of two that hold the same temperature
     costs = [float(np.sum(miss(start) ** 2) + 1e-2 * np.sum(start**2)) for start in starts]
-    found = least_squares(
+    solution = least_squares(
         miss, starts[int(np.argmin(costs))], bounds=(low, high), diff_step=[1e-3] * model.n_u, xtol=1e-10
     )
-    u = found.x * model.span
+    u = solution.x * model.span
     y = model.steady_output(u, d)
     if not np.isfinite(y).all():
         x, u = _balance(model, rows, wanted, d)
         y = model.output(x)
         return Holding(u, y, float(np.max(np.abs(np.where(np.isfinite(y[rows]), y[rows] - wanted, 1e3)))))
-    return Holding(u, y, float(np.max(np.abs(miss(found.x)))))
+    return Holding(u, y, float(np.max(np.abs(miss(solution.x)))))
 
 
 _HELD = 0.25  # of an output's unit: a start that drives miss by less is held
@@ -639,8 +633,8 @@ def held_start(
     [degC] for good, and these drives (n_u,); where none do, that of a plant which is as warm all over, and
     None. Shared: read it."""
     wanted = np.full(len(controlled), start)
-    held = holding_drive(model, controlled, wanted, d)
-    x, u, miss = model.steady_state(held.u, d), held.u, held.miss
+    holding = holding_drive(model, controlled, wanted, d)
+    x, u, miss = model.steady_state(holding.u, d), holding.u, holding.miss
     if not np.isfinite(x).all():  # an integrator
         x, u = _balance(model, [model.outputs.index(name) for name in controlled], wanted, np.array(d))
         miss = miss if np.all((model.lowest <= u) & (u <= model.highest)) else np.inf
@@ -675,13 +669,13 @@ def steady_curve(
     grid = np.linspace(model.lowest[j], model.highest[j], n)
     neutral = model.neutral
     y = np.empty(n)
-    for at, value in enumerate(grid):
+    for k, value in enumerate(grid):
         u = neutral.copy()
         u[j] = value
-        y[at] = model.steady_output(u, d)[i]
+        y[k] = model.steady_output(u, d)[i]
     sign = np.sign(np.diff(y))
     usual = sign[np.argmin(np.abs(0.5 * (grid[1:] + grid[:-1]) - neutral[j]))]
-    turns = tuple(float(grid[at + 1]) for at in np.flatnonzero(sign[1:] * sign[:-1] < 0))
+    turns = tuple(float(grid[k + 1]) for k in np.flatnonzero(sign[1:] * sign[:-1] < 0))
     below = [turn for turn in turns if turn < neutral[j]]
     above = [turn for turn in turns if turn > neutral[j]]
     rising = (max(below, default=float(grid[0])), min(above, default=float(grid[-1])))

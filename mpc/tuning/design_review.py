@@ -197,7 +197,7 @@ def _settled(result: StepResult) -> bool:
 def _again(controller: Reviewed) -> Reviewed:
     """Return the same controller for trials, which has not run."""
     if isinstance(controller, PIController):
-        return PIController.of(controller.plant, controller.design)
+        return PIController(controller.plant, controller.design)
     return Controller(controller.plant, as_tried(controller.design, controller.plant))
 
 

@@ -360,7 +360,7 @@ class Bench:
     def made(self, kind: str, design: Design) -> Controller | PIController:
         """Return a controller whose trials run in C where there is one."""
         if kind == "PI":
-            loops = PIController.of(self.plant, design)
+            loops = PIController(self.plant, design)
             loops.c = self._c
             return loops
         return Controller(self.plant, as_tried(design, self.plant))
@@ -539,7 +539,7 @@ def _final(
     best = candidates[kept]
     design = bench.design(best.controller, best.parameters)
     if best.controller == "PI":
-        return PIController.of(bench.plant, design, notes=notes)
+        return PIController(bench.plant, design, notes=notes)
     if "PI" in candidates:
         design = replace(design, loops=bench.design("PI", candidates["PI"].parameters).loops)
     return Controller(bench.plant, design, notes=notes)

@@ -222,7 +222,7 @@ class Autotune:
         plant = self.found.plant
         plant.save(self.folder / "plant.json")
         design = default_design(plant, controlled=tuple(self._targets(plant)))
-        PIController.of(plant, design).save(self.folder / "controller.json")
+        PIController(plant, design).save(self.folder / "controller.json")
         self.say(self.found.verdict)
 
     def _targets(self, plant: Plant) -> dict[str, float]:

@@ -40,7 +40,7 @@ def test_a_controller_starts_from_the_drive_that_its_first_reading_has(tank, nam
     design = default_design(tank, dt=2.0, slew_per_s={"drive": 0.05})
     made = {
         "mpc": lambda: Controller(tank, design),
-        "pi": lambda: PIController.of(tank, design, design.loops),
+        "pi": lambda: PIController(tank, design),
     }[name]()
     reading = {"t_tank": 30.2, "t_surface": 30.0, "t_ambient": 25.0}
     made.reset(reading | {"drive": 0.4})

@@ -164,7 +164,7 @@ def test_trials_run_amid_it_and_every_controller_settles_without_offset(case):
     assert shown == pytest.approx(case.nominal, abs=0.03 * (case.logs[1] - case.logs[0]))
     for regulator in (
         Controller(plant, design),
-        PIController.of(plant, design, design.loops),
+        PIController(plant, design),
     ):
         run = trial(regulator, plant, spec, Trial(*case.steps[0], 0))
         (segment,) = run.segments
@@ -218,13 +218,13 @@ def test_a_reading_far_from_any_temperature_counts(case):
     plant, spec = case.plant(), case.spec()
     controller = ReferenceController(plant, spec.design(plant))
     controller.reset({"t": 25.0, "t_out": 15.0, case.name: case.logs[1]})
-    assert controller._d.tolist() == [15.0, case.logs[1]]
+    assert controller._past.d.tolist() == [15.0, case.logs[1]]
     controller.step({"t": 25.0, "t_out": 15.0, case.name: case.logs[0]}, 26.0)
-    assert controller._d.tolist() == [15.0, case.logs[0]]
+    assert controller._past.d.tolist() == [15.0, case.logs[0]]
     controller.step({"t": 25.0, "t_out": 300.0, case.name: -9999.0}, 26.0)  # broken wires
-    assert controller._d.tolist() == [15.0, case.logs[0]]
+    assert controller._past.d.tolist() == [15.0, case.logs[0]]
     # what a PI looks up for a target is another one where the disturbance is
-    loops = [PIController.of(plant, controller.design, controller.design.loops)]
+    loops = [PIController(plant, controller.design)]
     for d in (case.logs[0], case.nominal):
         assert loops[0]._held(np.array([30.0]), np.array([15.0, d])) == pytest.approx(
             np.clip(case.held(30.0, d), 0.0, 100.0), abs=1.0
@@ -350,12 +350,14 @@ def test_a_drive_that_serves_a_limit_alone_is_not_held_to_its_gain_on_a_target()
     controller = mixed(limits={"t": (10.0, 50.0)})
     drives = list(controller.model.drives)
     assert [loop.drive for loop in controller.design.loops] == ["inflow"]
-    seen = controller.optimiser.seen
+    seen = controller.optimiser.at_rest.seen
     assert seen[:, drives.index("inflow")].any()
     assert not seen[:, drives.index("heat")].any()
     # a plan that is improved until it stays needs it too: beyond an optimum it would go to and fro
-    np.testing.assert_array_equal(mixed(limits={"t": (10.0, 50.0)}, iterations=3).optimiser.seen, seen)
+    np.testing.assert_array_equal(
+        mixed(limits={"t": (10.0, 50.0)}, iterations=3).optimiser.at_rest.seen, seen
+    )
     # without a limit to serve the gain is all that speaks for a drive
-    plain = mixed().optimiser
-    rest = np.abs(plain.at_rest)
+    plain = mixed().optimiser.at_rest
+    rest = np.abs(plain.response)
     np.testing.assert_array_equal(plain.seen, rest > 0.02 * rest.max(axis=0))

@@ -57,7 +57,7 @@ def test_caught_on_the_wrong_side_of_the_optimum_the_plan_comes_back(reversing_t
     controller = ReferenceController(reversing_tank, default_design(reversing_tank, dt=2.0))
     truth = Truth(reversing_tank, controller.dt, Surroundings(), 12.0, 0)
     controller.reset(truth.reading())
-    controller._plan = np.full((sum(controller.design.blocks), 1), -1.0)
+    controller._follows.plan = np.full((sum(controller.design.blocks), 1), -1.0)
     moves = [-1.0]
     for _ in range(15):
         move = controller.step({**truth.reading(), "drive": moves[-1]}, 30.0)
@@ -69,7 +69,7 @@ def test_caught_on_the_wrong_side_of_the_optimum_the_plan_comes_back(reversing_t
 def test_a_drive_bias_is_not_learnt_where_the_gain_has_turned_over(reversing_tank):
     controller = ReferenceController(reversing_tank, default_design(reversing_tank, dt=2.0))
     controller.reset({"t_tank": 20.0, "t_surface": 20.0, "t_ambient": 25.0})
-    controller._plan = np.full((sum(controller.design.blocks), 1), -0.5)
+    controller._follows.plan = np.full((sum(controller.design.blocks), 1), -0.5)
     reading = {"t_tank": 20.0, "t_surface": 20.0, "t_ambient": 25.0, "drive": -0.5}
     controller.step(reading, -10.0)
     before = controller.observer.w.copy()

@@ -8,10 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.mpc.makers import GCC, WAYS, heater, kit, make_tank, network_plant
+from tests.mpc.makers import WAYS, heater, kit, make_tank, network_plant
 from thermogrip.datasets.errors import UserError
 from thermogrip.mpc.closed_loop.simulate import ClosedLoop, Surroundings, simulate_closed_loop
-from thermogrip.mpc.closed_loop.simulate_native import compiled_loop
 from thermogrip.mpc.controllers.mpc import Controller, design_controller
 from thermogrip.mpc.controllers.reference import ReferenceController
 from thermogrip.mpc.design.design import default_design
@@ -112,18 +111,6 @@ def test_an_output_that_may_take_its_time_takes_it_and_the_other_settles_as_soon
     assert abs(t2.bias) < 0.05
     at_ease, fast = (loop.drive["q2"][:12].mean() for loop in loops)
     assert at_ease < 0.5 * fast
-
-
-@GCC
-def test_a_loop_that_takes_its_time_is_the_same_in_c(board):
-    ours = run(paced_kit(SETTLING, ReferenceController), board)
-    compiled = paced_kit(SETTLING)
-    for loop in (
-        run(compiled, board),
-        compiled_loop(compiled, board, [(40.0, 2400.0)], surroundings=QUIET, seed=3),
-    ):
-        for name in ("q1", "q2"):
-            np.testing.assert_allclose(loop.drive[name], ours.drive[name], atol=1e-6)
 
 
 def test_each_output_is_judged_by_what_is_asked_of_it():
@@ -263,27 +250,6 @@ def test_energy_of_a_drive_that_goes_both_ways_has_no_price():
 def test_what_may_rest_anywhere_is_no_linear_system():
     with pytest.raises(UserError, match="zones: a controller that may rest anywhere"):
         heater(zones={"t": 1.0}).to_control()
-
-
-WISHES = {
-    "ramp": {"ramp_per_s": {"t1": 0.04}, "limits": {"t2": (20.0, 50.0)}},
-}
-
-
-@GCC
-def test_a_loop_of_ramps_is_the_same_in_c(board):
-    """Step by step, and as a whole loop, whose first reading is at 0 s too."""
-    limits = {"limits": {"t2": (20.0, 50.0)}}
-    controller = kit(ReferenceController, ramp_per_s={"t1": 0.04}, **limits)
-    compiled = Controller(controller.model.plant, controller.design)
-    plain = run(kit(**limits), board)
-    ours = run(controller, board)
-    wholly = compiled_loop(compiled, board, [(40.0, 2400.0)], surroundings=QUIET, seed=3)
-    for loop in (run(compiled, board), wholly):
-        for name in ("q1", "q2"):
-            np.testing.assert_allclose(loop.drive[name], ours.drive[name], atol=1e-6)
-            assert np.abs(loop.drive[name] - plain.drive[name]).max() > 5.0
-        assert loop.status == ours.status
 
 
 def test_wishes_are_in_the_controllers_file(tmp_path):

@@ -150,7 +150,7 @@ def test_what_was_asked_stands_beside_the_design_by_the_names_of_their_files() -
 
 def test_the_page_of_a_pi_has_its_loops_and_no_weights() -> None:
     tank = make_tank()
-    pi = PIController.of(tank, Spec(steps=STEPS).design(tank))
+    pi = PIController(tank, Spec(steps=STEPS).design(tank))
     tuning = tuning_of(spec=Spec(steps=STEPS), controller=pi)
     found = dict(control.spec_section(tuning).parts[1].rows)
     assert list(found) == ["dt", "controlled", "drive_range", "slew_per_s", "loops"]

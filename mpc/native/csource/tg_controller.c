@@ -44,7 +44,7 @@ static void start(tg_controller *c, const double *y, const double *d)
         c->d[i] = isfinite(d[i]) ? d[i] : s->usual_d[i];
     tg_observer_reset(c, y, c->d);
     for (int j = 0; j < TG_NU; j++)
-        c->u[j] = c->in_force[j] = s->neutral[j];
+        c->u[j] = s->neutral[j];
     for (int r = 0; r < TG_NC; r++) {
         c->target[r] = c->ramped[r] = NAN;
         c->side[r] = 0.0;
@@ -235,7 +235,6 @@ static int absorb(tg_controller *c, double *y, const double *d, const double *ap
         memcpy(side, c->side, sizeof side);
         start(c, y, known);
         memcpy(c->u, u, sizeof u);
-        memcpy(c->in_force, applied, sizeof c->in_force);
         memcpy(c->target, target, sizeof target);
         memcpy(c->side, side, sizeof side);
         c->fresh = 0;
@@ -703,7 +702,7 @@ static void receive(tg_controller *c, tg_time time_s, const double *y, const dou
     for (int i = 0; i < TG_ND; i++)
         clean_d[i] = clean_measured(c->design, i, d[i]);
     for (int j = 0; j < TG_NU; j++)
-        did[j] = applied && isfinite(applied[j]) ? applied[j] : c->in_force[j];
+        did[j] = applied && isfinite(applied[j]) ? applied[j] : c->u[j];
 }
 
 /* The last move again, before the next one is due; its advice stays. */
@@ -749,7 +748,6 @@ tg_move tg_step(tg_controller *c, tg_time time_s, const double *y, const double 
         move.over = silent;
     keep_within(c, move.drive);
     memcpy(c->u, move.drive, sizeof c->u);
-    memcpy(c->in_force, move.drive, sizeof c->in_force);
     set_pump(&move);
     c->status = move.status;
     c->advice = move.advice;
@@ -772,7 +770,6 @@ tg_move tg_pause(tg_controller *c, tg_time time_s, const double *y, const double
     start(c, clean_y, clean_d);
     set_target(c, kept);
     memcpy(c->u, move.drive, sizeof c->u);
-    memcpy(c->in_force, move.drive, sizeof c->in_force);
     move.pump = 1; /* nobody would switch it on again */
     move.status = c->status = TG_OFF;
     move.advice = c->advice = TG_PUMP_OFF;

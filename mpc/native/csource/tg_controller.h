@@ -77,7 +77,7 @@ typedef struct {
     double interval_s, passed_s, since_s, assumed_s, spent_s, waited_s, slew_s;
     int repeats, stale, due;
     /* loop */
-    double d[TG_SOME(TG_ND)], y[TG_NY], u[TG_NU], in_force[TG_NU], target[TG_NC], side[TG_NC], aim[TG_NC];
+    double d[TG_SOME(TG_ND)], y[TG_NY], u[TG_NU], target[TG_NC], side[TG_NC], aim[TG_NC];
     double plan[TG_NH * TG_NU], unread_s[TG_NC], age_s, silent_s;
     double last_y[TG_NY], moved[TG_NY]; /* the newest reading, and what was expected since it changed */
     double seen[TG_NX];                 /* the state after the newest reading */

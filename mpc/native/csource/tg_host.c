@@ -60,7 +60,7 @@ void tg_host_reset(tg_controller *c, const double *given)
     tg_host_late(c, late, about);
     for (int j = 0; j < TG_NU; j++)
         if (isfinite(applied[j]))
-            c->u[j] = c->in_force[j] = applied[j];
+            c->u[j] = applied[j];
 }
 
 /* given: y, d, applied as at a reset, then time and targets; answer: drives, over, pump, status, advice, which,

@@ -30,7 +30,7 @@ def run(
 ) -> ClosedLoop:
     design = default_design(KIT, dt=4.0)
     loops = tuple(replace(loop, Kc=gain * loop.Kc) for loop in design.loops)
-    loop = RecordedController(PIController.of(KIT, design, loops), LoopMonitor(KIT, design, loops))
+    loop = RecordedController(PIController(KIT, design, loops=loops), LoopMonitor(KIT, design, loops))
     return simulate_closed_loop(loop, plant, [(target, seconds)], surroundings=surroundings)
 
 
@@ -56,7 +56,7 @@ def test_a_target_out_of_reach_is_told_of():
 def test_drives_that_push_the_other_way_are_told_of():
     turned, model = make_tank(heat=-0.11), make_tank()
     design = default_design(model, controlled=("t_tank",))
-    loop = RecordedController(PIController.of(model, design, design.loops), LoopMonitor(model, design))
+    loop = RecordedController(PIController(model, design), LoopMonitor(model, design))
     found = simulate_closed_loop(loop, turned, [(35.0, 900.0)])
     words = "; ".join(dict.fromkeys(found.advice))
     assert "t_tank goes away from its target while drive is at its limit" in words

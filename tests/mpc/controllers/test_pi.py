@@ -10,7 +10,7 @@ import pytest
 
 from tests.mpc.makers import crossed
 from thermogrip.mpc.controllers.pi import PIController, held_drive
-from thermogrip.mpc.design.design import PILoop
+from thermogrip.mpc.design.design import PILoop, default_design
 from thermogrip.mpc.plant.prediction import PredictionModel
 from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.plant import Plant
@@ -23,9 +23,16 @@ LOOPS = (
 TARGET = {"a": 30.0, "b": 29.5}  # held by 40 % of q2 and 30 % of q1 in a room of 22 degC
 
 
-def pi(**changes) -> PIController:
-    given = {"loops": LOOPS, "controlled": ("b", "a"), "slew_per_s": {"q1": 4.0}, "patience_s": 3.0}
-    made = PIController(PLANT, dt=2.0, clock=count().__next__, **given | changes)
+SLOW, WIDE = {"q1": 4.0}, {"q1": (0.0, 100.0)}
+
+
+def pi(*, loops=LOOPS, slew_per_s=SLOW, drive_range=WIDE) -> PIController:
+    limits = {
+        "slew_per_s": {"q1": 12.5, "q2": 12.5} | slew_per_s,
+        "drive_range": {"q1": (0.0, 100.0), "q2": (0.0, 100.0)} | drive_range,
+    }
+    design = default_design(PLANT, dt=2.0, controlled=("b", "a"), patience_s=3.0, loops=loops, **limits)
+    made = PIController(PLANT, design, clock=count().__next__)
     made.reset({"a": 22.0, "b": 22.0, "room": 22.0})
     return made
 
@@ -83,7 +90,7 @@ def test_patience_is_ten_seconds_or_five_samples():
         assert made._patience_s == pytest.approx(seconds * (1 + 1e-6), rel=1e-9)
     found = PIController(PLANT, controlled=("b", "a"))
     assert [(loop.drive, loop.output) for loop in found.loops] == [("q1", "b"), ("q2", "a")]
-    assert made.slew.tolist() == [50.0, 50.0]  # an eighth of the range a second
+    assert made.drives.slew.tolist() == [50.0, 50.0]  # an eighth of the range a second
 
 
 @pytest.mark.parametrize(
@@ -91,7 +98,7 @@ def test_patience_is_ten_seconds_or_five_samples():
 )
 def test_a_drive_without_a_loop_gets_what_is_fed_forward(share: float, narrow: float, q1: float):
     loop = PILoop("q2", "a", Kc=3.0, Ti=20.0, feedforward=share)
-    controller = pi(loops=(loop,), drive_range={"q1": (0.0, narrow)}, slew_per_s=None)
+    controller = pi(loops=(loop,), drive_range={"q1": (0.0, narrow)}, slew_per_s={})
     for _ in range(3):
         u = controller.propose(np.array([22.0, 29.0]), np.array([29.504, 30.0]), np.array([22.2]))
         controller.hold(u)

@@ -14,7 +14,7 @@ from thermogrip.mpc.controllers.mpc import Controller, design_controller
 from thermogrip.mpc.design.design import Design, PILoop, default_design
 from thermogrip.mpc.design.spec import Spec
 from thermogrip.mpc.optimiser.qp import QPAnswer
-from thermogrip.mpc.optimiser.rti import Optimiser, Sample, allowed_share
+from thermogrip.mpc.optimiser.rti import Optimiser, Problem, RestGains, Sample, allowed_share
 from thermogrip.mpc.plant.prediction import PredictionModel
 from thermogrip.mpc.tuning.minimum_time import full_drive_bound
 from thermogrip.sysid.models.state_space import StateSpaceModel
@@ -27,7 +27,8 @@ def lowest_allowed(optimiser, bias: float, effective: float) -> float:
     """Return the lower end for a plan at which drive and bias together are ``effective``."""
     guess = np.full((optimiser.n_b, 1), effective - bias)
     left = np.full((optimiser.n_b, 1), 1 - effective / OPTIMUM)  # of the gain, which fades in proportion
-    low, _ = optimiser._range(guess, np.array([bias]), left, np.array([effective - bias]), 0.0)
+    problem = Problem(np.array([effective - bias]), np.zeros((1, 1)), np.zeros(1), [0], [])
+    low, _ = optimiser._range(guess, np.array([bias]), left, problem)
     return float(low[-1, 0])
 
 
@@ -111,6 +112,10 @@ def optimiser() -> Optimiser:
     return Optimiser(PredictionModel(crossed("0_255")), DESIGN)
 
 
+def problem(side=(0.0, 0.0), counted=(0, 1), more: float = 0.0) -> Problem:
+    return Problem(LAST, EACH, np.array(side), list(counted), [], more)
+
+
 def outputs(plan: np.ndarray) -> np.ndarray:
     """Return a and b (6, 2) under a plan of three blocks."""
     a, b = START
@@ -144,10 +149,9 @@ def condensed(optimiser: Optimiser) -> tuple[np.ndarray, np.ndarray]:
 @pytest.mark.parametrize("side", [(0.0, 0.0), (1.0, -1.0), (-1.0, 1.0)])
 def test_the_merit_of_a_plan_is_its_cost(optimiser, side):
     y = np.stack([outputs(plan) for plan in PLANS])
-    found = optimiser._merit(PLANS, y, EACH, np.array(side), LAST)
+    found = optimiser._merit(PLANS, y, problem(side))
     np.testing.assert_allclose(found, [cost(plan, side) for plan in PLANS])
-    optimiser._seen_rows = [1]  # b is lost: it costs nothing
-    rest = optimiser._merit(PLANS, y, EACH, np.array(side), LAST)
+    rest = optimiser._merit(PLANS, y, problem(side, counted=[1]))  # b is lost: it costs nothing
     weights = np.array([1.5] * 5 + [6.5])
     off = (y[:, :, 1] - 27.0) * (side[0] or 1.0)
     over = np.maximum(0.0, off - 0.2) * bool(side[0])
@@ -156,16 +160,15 @@ def test_the_merit_of_a_plan_is_its_cost(optimiser, side):
 
 def test_the_program_costs_what_the_plan_costs_and_its_minimum_is_the_linear_law(optimiser):
     G, free = condensed(optimiser)
-    H, f = optimiser._cost(G, free, EACH, LAST)
+    H, f = optimiser._cost(G, free, problem())
     one, two = ((plan / SPAN).ravel() for plan in PLANS)
     found = 0.5 * (two @ H @ two - one @ H @ one) + f @ (two - one)
     assert found == pytest.approx(cost(PLANS[1], limits=False) - cost(PLANS[0], limits=False))
-    same, on_free, on_last = optimiser.linear_gains(G, [1, 0])
+    same, on_free, on_last = optimiser.linear_gains(G)
     np.testing.assert_allclose(same, H)
     best = on_free @ (free[:, [1, 0]] - TARGET).ravel() + on_last @ LAST
     np.testing.assert_allclose(best, -np.tile(SPAN, 3) * np.linalg.solve(H, f))
-    optimiser._seen_rows = [1]
-    H, f = optimiser._cost(G, free, EACH, LAST)
+    H, f = optimiser._cost(G, free, problem(counted=[1]))
     lost = 0.5 * (two @ H @ two - one @ H @ one) + f @ (two - one)
     weights = np.array([1.5] * 5 + [6.5])
     of_b = [weights @ (outputs(plan)[:, 1] - 27.0) ** 2 for plan in PLANS]
@@ -176,7 +179,7 @@ def test_the_program_costs_what_the_plan_costs_and_its_minimum_is_the_linear_law
 def test_the_rows_of_the_program_are_what_a_plan_has_left_to_its_limits(optimiser, side, more):
     G, free = condensed(optimiser)
     ends = np.full((3, 2), [-50.0, 0.0]), np.full((3, 2), [100.0, 80.0])
-    A, lower, upper = optimiser._constraints(G, free, EACH, np.array(side), LAST, ends, more)
+    A, lower, upper = optimiser._constraints(G, free, ends, problem(side, more=more))
     slew = np.array([1 + more, 1.5, 2.5])[:, None] * [8.0, 20.0]  # between the middles of the blocks
     for plan in PLANS:
         y, change = outputs(plan), np.diff(plan, axis=0, prepend=LAST[None])
@@ -197,28 +200,6 @@ def test_the_rows_of_the_program_are_what_a_plan_has_left_to_its_limits(optimise
     assert (set(qp.quadratic), qp.time_limit_s) == ({14.0}, 1e-3)
 
 
-def test_what_a_limit_will_be_broken_by_is_reported_beyond_a_tenth(optimiser):
-    y = np.full((6, 2), 20.0)
-    for a, broken in ((28.09, {}), (28.3, {"a": 0.3}), (15.91, {}), (15.5, {"a": 0.5})):
-        y[2, 0] = a
-        assert optimiser._broken(y) == pytest.approx(broken)
-
-
-@pytest.mark.parametrize(
-    ("more", "q1"), [(0.0, [32.0, 20.0, 0.0]), (0.5, [28.0, 16.0, 0.0]), (-0.5, [36.0, 24.0, 4.0])]
-)
-def test_ramps_take_the_drives_back_to_none_and_to_the_other_end(optimiser, more, q1):
-    back, across = optimiser._ramps(np.array([40.0, 0.0]), more)
-    assert back.tolist() == [[v, 0.0] for v in q1]
-    reach = np.array([1.0, 2.5, 5.0]) + more
-    assert across[:, 0].tolist() == (40.0 - 8.0 * reach).tolist()
-    assert across[:, 1].tolist() == np.minimum(20.0 * reach, 80.0).tolist()
-    optimiser._parked = [0]
-    parked = optimiser._park(PLANS, np.array([40.0, 0.0]), more)
-    assert parked[:, :, 0].tolist() == [q1, q1]
-    assert parked[:, :, 1].tolist() == PLANS[:, :, 1].tolist()
-
-
 @pytest.mark.parametrize(
     ("end", "share"), [(0.5, 0.85), (0.9, 0.9), (1.0, 1.0), (1.05, 0.9), (1.075, 0.85), (9.0, 0.85)]
 )
@@ -227,62 +208,15 @@ def test_the_share_of_the_way_to_an_optimum(end, share):
     assert allowed_share(np.array([end]), np.zeros(1), SPAN[:1]) == 0.85
 
 
-def test_the_range_ends_where_the_gain_will_have_faded_but_no_sooner_than_the_slew_allows(optimiser):
-    last, authority = np.array([60.0, 30.0]), np.full((3, 2), 0.5)
-    authority[:, 1] = 0.7  # of the gain: not less than what is foreseen
-    low, high = optimiser._range(np.full((3, 2), 20.0), np.array([5.0, 9.0]), authority, last, 0.0)
-    # optimum at 25 / 0.5 = 50 and 85 % of it; the slew takes 60 to 52, 40 and 20
-    assert high.tolist() == [[52.0, 80.0], [42.5, 80.0], [42.5, 80.0]]
-    assert low.tolist() == [[-50.0, 0.0]] * 3
-    high = optimiser._range(np.full((3, 2), 20.0), np.array([5.0, 9.0]), authority, last, 1.0)[1]
-    assert high[:, 0].tolist() == [44.0, 42.5, 42.5]
-    low, high = optimiser._range(np.full((3, 2), -20.0), np.array([5.0, 9.0]), authority, last, 0.0)
-    assert low[:, 0].tolist() == [-25.5] * 3  # 15 / 0.5 = 30, and heating now allows no more of cooling
-    assert high[:, 0].tolist() == [100.0] * 3
-    above = Optimiser(optimiser.model, replace(DESIGN, drive_range={"q1": (10.0, 100.0), "q2": (0.0, 80.0)}))
-    high = above._range(np.full((3, 2), 30.0), np.array([5.0, 9.0]), authority, last, 0.0)[1]
-    assert high[:, 0].tolist() == [52.5] * 3  # the same, counted from rest at 10
-    optimiser._parked = [0]
-    low, high = optimiser._range(np.full((3, 2), 20.0), np.zeros(2), authority, last, 0.0)
-    np.testing.assert_allclose(low[:, 0], [52.0 - 1e-5, 40.0 - 1e-5, 20.0 - 1e-5], rtol=1e-12)
-    np.testing.assert_allclose(high[:, 0], [52.0 + 1e-5, 40.0 + 1e-5, 20.0 + 1e-5], rtol=1e-12)
-    assert high[:, 1].tolist() == [80.0] * 3
-
-
-def test_gains_at_rest_and_what_is_left_of_them(optimiser):
-    np.testing.assert_allclose(optimiser.settled_gain, [25.0, 51.0])  # b by q1, a by q2, over their ranges
-    assert (optimiser.strongest.tolist(), optimiser.pair.tolist()) == ([0, 1], [0, 1])
+def test_gains_at_rest(optimiser):
+    at_rest = optimiser.at_rest
+    np.testing.assert_allclose(at_rest.settled, [25.0, 51.0])  # b by q1, a by q2, over their ranges
+    assert (at_rest.strongest.tolist(), optimiser.pair.tolist()) == ([0, 1], [0, 1])
     G, _ = condensed(optimiser)
     sums = G.sum(axis=0).reshape(2, 3, 2)
-    np.testing.assert_allclose(optimiser.at_rest, np.stack([sums[1, :, 0], sums[0, :, 1]], axis=1))
-    np.testing.assert_allclose(optimiser._authority(0.6 * G), np.full((3, 2), 0.6))
-    optimiser.seen[1, 0] = False
-    assert optimiser._authority(0.6 * G)[:2, 0].tolist() == [pytest.approx(0.6), 1.0]
+    np.testing.assert_allclose(at_rest.response, np.stack([sums[1, :, 0], sums[0, :, 1]], axis=1))
     loops = (PILoop("q2", "b", Kc=1.0, Ti=1.0), PILoop("q1", "a", Kc=1.0, Ti=1.0))
     assert Optimiser(optimiser.model, replace(DESIGN, loops=loops)).pair.tolist() == [1, 0]
-
-
-def test_a_plan_is_taken_part_of_the_way_where_whole_it_costs_more_than_the_guess(optimiser):
-    """Of a cost c(first move of q1): the plan's is 50, the guess's 10; 0 and -22 are the ramps'."""
-    plan, guess = np.full((3, 2), 50.0), np.full((3, 2), 10.0)
-    last = np.array([-30.0, 0.0])  # from which a ramp goes to -22
-
-    def best(costs: dict[float, float]) -> float:
-        found, y = optimiser._best(
-            plan, guess, guess[:, :1], last, 0.0, lambda plans: 2 * plans[:, :, :1],
-            lambda plans, y: np.array([costs.get(v, 99.0) for v in plans[:, 0, 0]]),
-        )  # fmt: skip
-        assert (y == 2 * found[:, :1]).all()
-        return float(found[0, 0])
-
-    assert best({50.0: 9.0, 10.0: 9.1, -22.0: 9.0 / 1.03}) == -22.0  # the ramps, at the first solve
-    assert best({50.0: 9.0, 10.0: 9.0, -22.0: 1.0, 30.0: 1.0}) == 50.0
-    for share, first in ((0.5, 30.0), (0.25, 20.0), (0.1, 14.0), (0.0, 10.0)):
-        assert best({50.0: 11.0, 10.0: 10.5, 10 + 40 * share: 10.5}) == first, share
-    ramps = {50.0: 9.0, 10.0: 9.1, -22.0: 1.0}  # again five solves later
-    assert [best(ramps) for _ in range(5)] == [50.0] * 4 + [-22.0]
-    optimiser.forget()
-    assert best({50.0: 9.0, 10.0: 9.1, -22.0: 9.0 / 1.01}) == 50.0  # hardly better
 
 
 def test_a_solve_predicts_what_its_plan_does_and_parks_what_is_lost(optimiser):
@@ -313,18 +247,7 @@ def test_a_plant_that_settles_nowhere_or_is_not_moved_has_no_settled_gain(a, b):
     model = StateSpaceModel(("q",), (), ("t",), A=[[a]], B=[[b]], C=[[1.0]], dt=2.0)
     plant = Plant(model, {}, dt=2.0, units={"q": "1", "t": "degC"}, valid={"q": (0.0, 1.0)})
     design = Design(2.0, ("t",), (1, 1), {"q": (0.0, 1.0)}, {"q": 1.0})
-    assert Optimiser(PredictionModel(plant), design).settled_gain is None
-
-
-def test_the_bias_of_a_drive_counts_where_the_range_is_looked_for(optimiser, monkeypatch):
-    asked, find = [], optimiser._range
-    monkeypatch.setattr(optimiser, "_range", lambda *given: asked.append(given) or find(*given))
-    given = {"target": TARGET, "side": np.zeros(2), "bias": BIAS, "drive_bias": np.array([3.0, -5.0])}
-    for slew_s, more in ((5.0, 1.5), (None, 0.0)):
-        optimiser.solve(Sample(START, LAST, PLANS[0], np.array([ROOM]), **given, slew_s=slew_s))
-        wanted = (PLANS[0], [3.0, -5.0], np.ones((3, 2)), LAST, more)
-        for value, want in zip(asked.pop(), wanted, strict=True):
-            np.testing.assert_allclose(value, want, rtol=1e-9)
+    assert RestGains.of(PredictionModel(plant), design).settled is None
 
 
 def test_caution_counts_as_so_many_times_the_weight_of_moves():

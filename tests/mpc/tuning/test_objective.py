@@ -90,7 +90,7 @@ def test_a_load_without_noise_is_seen_and_met_without_any_before(tank):
 def test_c_meets_a_load_as_python_does(tank):
     design = as_tried(SPEC.design(tank), tank)
     case = Case(36.0, 36.0, 0, load=Load("drive", -0.2), seconds=200.0)
-    loops = PIController.of(tank, design)
+    loops = PIController(tank, design)
     controller = Controller(tank, design)
     loops.c = controller.c
     for made in (controller, loops):
