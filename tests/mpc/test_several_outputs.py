@@ -153,7 +153,8 @@ def test_one_lost_sensor_is_one_lost_loop(furnace_plant):
 
 @pytest.mark.parametrize(("patience_s", "samples"), [(None, 5), (20.0, 2)])
 def test_one_lost_sensor_of_two_leaves_the_other_loop_of_a_pi_controller(furnace_plant, patience_s, samples):
-    controller = PIController(furnace_plant, dt=10.0, controlled=CONTROLLED, patience_s=patience_s)
+    patience = {} if patience_s is None else {"patience_s": patience_s}
+    controller = PIController(furnace_plant, dt=10.0, controlled=CONTROLLED, **patience)
     truth = furnace()
     controller.reset(truth.reading())
     moves, _ = run(controller, truth, 40.0, 2000.0)
