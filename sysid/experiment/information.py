@@ -82,7 +82,7 @@ class ReadingError:
     phi: float  # by how much the logs of the fit disagreed beyond ``numbers``
     offset: Array  # (n_y,), spread of the outputs' offsets over logs
     bias: Array  # (n_d,), spread of the measured disturbances' biases over logs
-    own: Array  # (n_free,), spread of theta over logs; 0 for what all logs share
+    parameter_sd: Array  # (n_free,), spread of theta over logs; 0 for what all logs share
     terms: tuple[Response, ...]  # that may be discrepancy, each of the size that the fit learnt
     pull: Array  # U, (n_free, n_term), contribution of each term to the score of the fit
     stretches: int  # of the logs of the fit
@@ -106,8 +106,10 @@ class ReadingError:
         """Return W (n, n_term), of singular values up to 1."""
         if not self.terms:
             return np.zeros((len(root), 0))
-        left, size, right = np.linalg.svd(np.linalg.solve(before, root.T @ self.pull), full_matrices=False)
-        return np.asarray((left * np.minimum(size, 1.0)) @ right)
+        left_vectors, size, right_vectors = np.linalg.svd(
+            np.linalg.solve(before, root.T @ self.pull), full_matrices=False
+        )
+        return np.asarray((left_vectors * np.minimum(size, 1.0)) @ right_vectors)
 
     def _added(self, new: Experiment) -> tuple[Array, Array, Array]:
         """Return A and V (n, n) and G (n, n_term) of the experiment."""
@@ -126,9 +128,9 @@ class ReadingError:
         block = Block.of(bins[:n].transpose(1, 2, 0), range(n_y))
         noise = self.merge**2 * np.tensordot(block.covariance(self.numbers), block.products, axes=3)
         begin = n + q + len(new.effects)  # of the start
-        own, start = whole[:, n + q : begin], whole[:, begin:]
-        left = self._start_error(bins[begin:], new.warm_up)
-        spread = noise + own @ own.T + start @ left @ start.T
+        effect_pull, start_pull = whole[:, n + q : begin], whole[:, begin:]
+        start_error = self._start_error(bins[begin:], new.warm_up)
+        spread = noise + effect_pull @ effect_pull.T + start_pull @ start_error @ start_pull.T
         return whole[:n, :n], self.phi * spread, whole[:, n : n + q]
 
     def _start_error(self, bins: Array, warm_up: float) -> Array:
@@ -242,8 +244,8 @@ class ExperimentForecast:
     def _effects(self, error: ReadingError, change: Array) -> tuple[Array, Array]:
         """Return what may be the new log's own, (n_effect, N, n_y), and its start, each at one spread."""
         n, n_d = len(self.plant.free), self._d.size
-        own = error.own > 0
-        parameters = change[:n][own] * (error.own / self._steps)[own, None, None]
+        varies = error.parameter_sd > 0
+        parameters = change[:n][varies] * (error.parameter_sd / self._steps)[varies, None, None]
         biases = change[n : n + n_d] * error.bias[:, None, None] / _WARMER
         return np.concatenate([parameters, biases]), change[n + n_d :] / _ASIDE
 
@@ -256,25 +258,27 @@ class ExperimentForecast:
 
     def _lagged(self, error: ReadingError, u: Array, run: Array) -> Array:
         """Return the lagged signal of each term that the model may lack, (n_term, N)."""
-        given = signals(self.plant.model, u, np.repeat(self._d[None], len(u), axis=0), run)
-        return np.array([term.lagged(given, self.dt)[1:] for term in error.terms]).reshape(-1, len(u))
+        inputs_and_states = signals(self.plant.model, u, np.repeat(self._d[None], len(u), axis=0), run)
+        return np.array([term.lagged(inputs_and_states, self.dt)[1:] for term in error.terms]).reshape(
+            -1, len(u)
+        )
 
     def _inside(self, y: Array, margin: float) -> bool:
         warm = [k for k, name in enumerate(self.plant.outputs) if _is_celsius(self.plant, name)]
         if not np.isfinite(y).all():
             return False
-        seen = y[:, :, warm]
-        return not seen.size or bool(
-            seen.min() >= self.lowest + margin and seen.max() <= self.highest - margin
+        temperatures = y[:, :, warm]
+        return not temperatures.size or bool(
+            temperatures.min() >= self.lowest + margin and temperatures.max() <= self.highest - margin
         )
 
     def _run(self, u: Array, p: Array, x0: Array, d: Array) -> Array:
-        held = (
+        disturbances = (
             np.repeat(d[:, None], len(u), axis=1)
             if np.ptp(d, axis=0).any()
             else np.tile(d[:1], (1, len(u), 1))
         )
-        y, _ = self.plant.model.rollout(x0, u[None], held, p, self.dt)
+        y, _ = self.plant.model.rollout(x0, u[None], disturbances, p, self.dt)
         return np.asarray(y)
 
     @property
@@ -312,8 +316,8 @@ class ExperimentForecast:
         error model asks for it each disturbance."""
         theta = np.vstack([self.plant.theta, self.plant.theta + np.diag(self._steps)])
         rows = np.repeat(self.plant.p[None], len(theta), axis=0)
-        at = [self.plant.model.parameters.index(name) for name in self.plant.free]
-        rows[:, at] = np.array([self.plant.natural(row) for row in theta])
+        columns = [self.plant.model.parameters.index(name) for name in self.plant.free]
+        rows[:, columns] = np.array([self.plant.natural(row) for row in theta])
         first = self._rest(rows[0])
         begin = [first, *(first if self._known else self._rest(row) for row in rows[1:])]
         d = np.repeat(self._d[None], len(rows), axis=0)
@@ -365,17 +369,17 @@ def reading_noise(plant: Plant) -> tuple[Array, Array]:
     if not np.all(sd > 0):
         lost = ", ".join(np.array(plant.outputs)[~(sd > 0)])
         raise UserError(f"the plant has no sensor error for {lost}", hint="identify it again")
-    seen = plant.scores.independent_s
+    measured_s = plant.scores.independent_s
     bin_s = plant.scores.average_s or plant.dt
     guess = plant.model.independent if isinstance(plant.model, GreyModel) else _INDEPENDENT
-    seconds = np.array([max(float(seen.get(name, guess)), bin_s) for name in plant.outputs])
+    seconds = np.array([max(float(measured_s.get(name, guess)), bin_s) for name in plant.outputs])
     return sd, seconds
 
 
 def interval_widths(plant: Plant, covariance: Array, level: float = 0.9) -> dict[str, float]:
     """Return the width of each free parameter's central interval, in natural units, at a covariance."""
-    at = replace(plant, covariance=covariance, samples=None)
-    return {name: high - low for name, (low, high) in at.intervals(level).items()}
+    expected = replace(plant, covariance=covariance, samples=None)
+    return {name: high - low for name, (low, high) in expected.intervals(level).items()}
 
 
 def _sensor_sd(plant: Plant) -> dict[str, float]:

@@ -124,13 +124,13 @@ def optimal_schedule(
 
     within, _ = _shrunk(frame, bits, cells, _HALVINGS)
     best_found = frame.inputs(within, coarse=False)
-    kept = [u for u in (*pool, best_found) if len(u) == frame.n and fine.stays(u)]
-    if not kept:
+    allowed = [u for u in (*pool, best_found) if len(u) == frame.n and fine.stays(u)]
+    if not allowed:
         raise UserError(
             f"no schedule keeps the plant and {fine.n_draws} draws of it from {lowest:g} to {highest:g} degC",
             hint="widen --lowest and --highest",
         )
-    best = kept[int(np.argmax([fine.bits(u) for u in kept]))]
+    best = allowed[int(np.argmax([fine.bits(u) for u in allowed]))]
     report(1.0, "found")
     time = plant.dt * np.arange(frame.n)
     columns = {name: (best[:, k], plant.units.get(name, "1"), "input") for k, name in enumerate(plant.inputs)}
@@ -163,9 +163,9 @@ class _Frame:
         ends = [(0.0, 1.0) if s else ranges[name] for name, s in zip(plant.inputs, switch)]
         low, high = np.array(ends, dtype=float).T
         self.still = np.where(switch, 1.0, np.clip(0.0, low, high))
-        held = np.array([name in hold for name in plant.inputs])
-        self.low, self.high = np.where(held, self.still, low), np.where(held, self.still, high)
-        self.switch: Mask = switch & ~held
+        is_held = np.array([name in hold for name in plant.inputs])
+        self.low, self.high = np.where(is_held, self.still, low), np.where(is_held, self.still, high)
+        self.switch: Mask = switch & ~is_held
         if not np.any(self.low < self.high):
             raise UserError("no input has a range to move in", hint="give limits that differ")
         # cells that change as one, by input
@@ -173,12 +173,12 @@ class _Frame:
 
     def inputs(self, cells: Array, *, coarse: bool) -> Array:
         """Return the inputs (N, n_u) of cells (n_cell, n_u), on the search's step or on the plant's."""
-        each, rest = (1, -(-self.rest // self.ratio)) if coarse else (self.ratio, self.rest)
+        steps_each, rest_steps = (1, -(-self.rest // self.ratio)) if coarse else (self.ratio, self.rest)
         n = -(-self.n // self.ratio) if coarse else self.n
-        held = np.repeat(cells, self.cell * each, axis=0)
-        u = np.vstack([np.tile(self.still, (rest, 1)), held])[:n]
+        rows = np.repeat(cells, self.cell * steps_each, axis=0)
+        u = np.vstack([np.tile(self.still, (rest_steps, 1)), rows])[:n]
         if np.isfinite(self.slew):
-            most = self.slew * self.dt / each * np.where(self.switch, np.inf, self.high - self.low)
+            most = self.slew * self.dt / steps_each * np.where(self.switch, np.inf, self.high - self.low)
             for k in range(1, len(u)):
                 u[k] = u[k - 1] + np.clip(u[k] - u[k - 1], -most, most)
         return u
@@ -186,8 +186,8 @@ class _Frame:
     def to_cells(self, u: Array) -> Array:
         """Return the cells (n_cell, n_u) nearest to inputs on the plant's step."""
         width = self.ratio * self.cell
-        at = np.minimum(self.rest + width * np.arange(self.n_cell) + width // 2, len(u) - 1)
-        cells = np.clip(np.where(self.switch, np.round(u[at]), u[at]), self.low, self.high)
+        middles = np.minimum(self.rest + width * np.arange(self.n_cell) + width // 2, len(u) - 1)
+        cells = np.clip(np.where(self.switch, np.round(u[middles]), u[middles]), self.low, self.high)
         first = (np.arange(self.n_cell)[:, None] // self.together) * self.together
         return np.take_along_axis(cells, first, axis=0)
 

@@ -81,15 +81,15 @@ def excite(
             hint=f"take {(REST + 20 * tau_fast) / 60:.1f} min or more",
         )
     time = dt * np.arange(round(seconds / dt))
-    rest = int(np.ceil(REST / dt))
-    n = time.size - rest
+    rest_rows = int(np.ceil(REST / dt))
+    n = time.size - rest_rows
     if kind == "prbs":
         shape = prbs(n, hold=max(1, round(tau_fast / dt)), seed=seed)
     elif kind == "multisine":
         shape = multisine(n, slowest=2 * np.pi * tau_slow / dt, fastest=np.pi * tau_fast / dt, seed=seed)
     else:
         shape = staircase(n, hold=3 * tau_slow / dt, seed=seed)
-    drive = (low + high) / 2 + (high - low) / 2 * np.concatenate([np.zeros(rest), shape])
+    drive = (low + high) / 2 + (high - low) / 2 * np.concatenate([np.zeros(rest_rows), shape])
     columns = {"drive": (drive, "1", "input"), "pump": (np.ones(time.size), "1", "input")}
     return make_log(time, columns, name=f"{kind} schedule")
 
@@ -100,12 +100,12 @@ def prbs(n: int, *, hold: int, seed: int = 0) -> Array:
     from scipy.signal import max_len_seq  # slow to import, and the other schedules do without
 
     bits = max(3, min(10, int(np.floor(np.log2(max(n / hold, 7) + 1)))))
-    found, _ = max_len_seq(bits, state=[0] * (bits - 1) + [1], taps=_TAPS[bits])
-    sequence = np.where(found, 1.0, -1.0)
+    register, _ = max_len_seq(bits, state=[0] * (bits - 1) + [1], taps=_TAPS[bits])
+    sequence = np.where(register, 1.0, -1.0)
     # golden steps: whichever seeds several inputs have, they begin far apart and hardly correlate
     begin = round(seed * 0.6180339887498949 * len(sequence)) % len(sequence)
-    held = np.repeat(np.roll(sequence, -begin), hold)
-    return np.asarray(np.tile(held, -(-n // held.size))[:n])
+    rows = np.repeat(np.roll(sequence, -begin), hold)
+    return np.asarray(np.tile(rows, -(-n // rows.size))[:n])
 
 
 def multisine(n: int, *, slowest: float, fastest: float, seed: int = 0) -> Array:

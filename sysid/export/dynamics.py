@@ -52,7 +52,7 @@ class Estimate(NamedTuple):
 class Dynamics:
     """How a plant responds to small changes about an operating point."""
 
-    near: LinearPlant  # the discrete linear plant, with its operating point and the names of its signals
+    linear: LinearPlant  # the discrete linear plant, with its operating point and the names of its signals
     # the same of other plants that agree with the logs; empty where the plant has no uncertainty
     draws: tuple[LinearPlant, ...]
     # (n_w,), standard deviation of the gain of each input between runs [1, of the gain], 0 where the logs
@@ -64,13 +64,13 @@ class Dynamics:
     @property
     def dt(self) -> float:
         """Step [s]."""
-        assert self.near.dt is not None
-        return self.near.dt
+        assert self.linear.dt is not None
+        return self.linear.dt
 
     @property
     def poles(self) -> NDArray[np.complex128]:
         """Continuous equivalents [1/s] of the poles that are no delay, the slowest first."""
-        return poles_of(self.near)
+        return poles_of(self.linear)
 
     @property
     def time_constants(self) -> Array:
@@ -86,11 +86,11 @@ class Dynamics:
     @property
     def dead_time(self) -> Array:
         """Seconds from an input until each output begins to move, (n_y, n_w); ``nan`` where it never does."""
-        near, reach, seen = self.near, self.near.B, []
-        for _ in range(len(near.A)):
-            seen.append(np.abs(near.C @ reach))
-            reach = near.A @ reach
-        size = np.array(seen)
+        linear, reach, impulse = self.linear, self.linear.B, []
+        for _ in range(len(linear.A)):
+            impulse.append(np.abs(linear.C @ reach))
+            reach = linear.A @ reach
+        size = np.array(impulse)
         moved = size > _NOTHING * size.max(axis=(0, 2), keepdims=True)
         return np.where(moved.any(axis=0), moved.argmax(axis=0) * self.dt, np.nan)
 
@@ -98,10 +98,10 @@ class Dynamics:
     def rise_time(self) -> Array:
         """Seconds until a step has moved each output by 63 % of its gain, (n_y, n_w); ``nan``: never."""
         steps = self._steps(2000)
-        rise = _rise(self.near, steps, 2000)
+        rise = _rise(self.linear, steps, 2000)
         share = rise / np.where(rise[-1] == 0, np.nan, rise[-1])
-        there = share >= _RISEN
-        return np.where(there.any(axis=0), there.argmax(axis=0) * steps * self.dt, np.nan)
+        risen = share >= _RISEN
+        return np.where(risen.any(axis=0), risen.argmax(axis=0) * steps * self.dt, np.nan)
 
     def step_response(self, n: int = 300) -> tuple[Array, Estimate]:
         """Return times (n + 1,) [s], to five of the slowest time constants, and the response (n + 1, n_y,
@@ -133,9 +133,9 @@ class Dynamics:
         """Return a record for each pair of an input and an output: gain with interval, times [s], unit."""
         gain, dead, rise = self.gain, self.dead_time, self.rise_time
         out = []
-        for j, name in enumerate(self.near.inputs):
-            for i, output in enumerate(self.near.outputs):
-                numbers = (float(part[i, j]) for part in (*gain, dead, rise))
+        for j, name in enumerate(self.linear.inputs):
+            for i, output in enumerate(self.linear.outputs):
+                numbers = (float(quantity[i, j]) for quantity in (*gain, dead, rise))
                 value, low, high, late, risen = (v if np.isfinite(v) else None for v in numbers)
                 out.append(
                     {
@@ -153,15 +153,15 @@ class Dynamics:
 
     def to_dict(self) -> dict[str, Any]:
         """Return poles, gains, responses and the operating point as plain JSON."""
-        near = self.near
+        linear = self.linear
         time, step = self.step_response(_SHOWN)
         omega, magnitude, phase = self.frequency_response(_SHOWN)
         return {
             "level": self.level,
             "draws": len(self.draws),
             "gain_sd_between_runs": float(self.gain_sd.max(initial=0.0)),
-            "operating_point": dict(zip(near.inputs, near.w.tolist())),
-            "at_rest": dict(zip(near.outputs, near.y.tolist())),
+            "operating_point": dict(zip(linear.inputs, linear.w.tolist())),
+            "at_rest": dict(zip(linear.outputs, linear.y.tolist())),
             "poles": [{"re": float(s.real), "im": float(s.imag)} for s in self.poles],
             "time_constants_s": [float(tau) if np.isfinite(tau) else None for tau in self.time_constants],
             "gains": self.rows(),
@@ -175,11 +175,11 @@ class Dynamics:
     def _pairs(self, parts: Mapping[str, Estimate]) -> list[dict[str, Any]]:
         """Return a record for each pair of an input and an output: courses with their intervals, if any."""
         out = []
-        for (j, name), (i, output) in product(enumerate(self.near.inputs), enumerate(self.near.outputs)):
+        for (j, name), (i, output) in product(enumerate(self.linear.inputs), enumerate(self.linear.outputs)):
             pair: dict[str, Any] = {"input": name, "output": output}
-            for what, estimate in parts.items():
+            for quantity, estimate in parts.items():
                 for end, course in estimate._asdict().items():
-                    key = what if what and end == "value" else f"{what}_{end}".strip("_")
+                    key = quantity if quantity and end == "value" else f"{quantity}_{end}".strip("_")
                     pair[key] = course[:, i, j].tolist() if np.isfinite(course).all() else None
             out.append(pair)
         return out
@@ -195,7 +195,7 @@ class Dynamics:
 
     def _estimate(self, of: Callable[[LinearPlant], Array], gain_sd: Array | None = None) -> Estimate:
         """Return a quantity whose last axis is that of the inputs, with its interval."""
-        value = np.asarray(of(self.near))
+        value = np.asarray(of(self.linear))
         if len(self.draws) < _FEWEST:  # a plant that cannot be drawn is less certain, not more
             return Estimate(value, *np.full((2, *value.shape), np.nan))
         variance = np.mean([(of(other) - value) ** 2 for other in self.draws], axis=0)
@@ -271,15 +271,15 @@ def plant_dynamics(
     def about(k: int) -> LinearPlant:
         return linearise_plant(plant.draw(k), inputs=u, disturbances=d, dt=plant.dt)
 
-    near, others = about(0), []
+    linear, others = about(0), []
     for k in range(1, (draws if plant.uncertain else 0) + 1):
         try:
             others.append(about(k))
         except UserError:  # a draw that does not settle there has no gain
             continue
     few = 0 < len(plant.logs) < SEVERAL
-    spread = np.array([RUN_GAIN_SD if few and name in plant.inputs else 0.0 for name in near.inputs])
-    return Dynamics(near, tuple(others), spread, dict(plant.units), level)
+    spread = np.array([RUN_GAIN_SD if few and name in plant.inputs else 0.0 for name in linear.inputs])
+    return Dynamics(linear, tuple(others), spread, dict(plant.units), level)
 
 
 def usual_point(

@@ -116,8 +116,8 @@ def _best_trial(
 ) -> _Trial:
     """Return the best of several damped steps, straight and bent."""
     gradient, normal = J.T @ r, J.T @ J
-    held = ((z <= low) & (gradient > 0)) | ((z >= high) & (gradient < 0))
-    free = np.flatnonzero(~held)
+    on_bound = ((z <= low) & (gradient > 0)) | ((z >= high) & (gradient < 0))
+    free = np.flatnonzero(~on_bound)
     if free.size == 0:
         return _Trial(z, np.inf, damping)
     size, axes = np.linalg.eigh(normal[np.ix_(free, free)])
@@ -138,8 +138,8 @@ def _best_trial(
     bend[longer] = 0.0
     trials = np.clip(np.concatenate([z + step, z + step + bend / 2]), low, high)
     cost = (_bounded(residuals(trials)) ** 2).sum(axis=1)
-    at = int(np.argmin(cost))
-    return _Trial(trials[at], float(cost[at]), float(damping * _DAMPINGS[at % len(_DAMPINGS)]))
+    best = int(np.argmin(cost))
+    return _Trial(trials[best], float(cost[best]), float(damping * _DAMPINGS[best % len(_DAMPINGS)]))
 
 
 def _bounded(r: Array) -> Array:
@@ -208,8 +208,15 @@ def fit_network(
     report(0.0, "preparing the model")
     signals = (*model.inputs, *model.disturbances, *model.outputs)
     rows = [rows_of(log, model.inputs, model.outputs, model.disturbances) for log in logs]
-    seen = dict(zip(signals, np.concatenate([np.hstack([each.u, each.d, each.y]) for each in rows]).T))
-    spread = {name: float(np.nanstd(seen[name])) for name in model.outputs}
+    logged = dict(
+        zip(
+            signals,
+            np.concatenate(
+                [np.hstack([signals_of_log.u, signals_of_log.d, signals_of_log.y]) for signals_of_log in rows]
+            ).T,
+        )
+    )
+    spread = {name: float(np.nanstd(logged[name])) for name in model.outputs}
     runs = partial(free_runs, logs)
     model = model.prepared(runs, spread)
     average = model.average if average is None else average
@@ -234,8 +241,8 @@ def fit_network(
         reading_excess=reading_excess(rows, model.outputs, problem.average),
         seconds=round(time.perf_counter() - began, 2),
     )
-    valid = {name: (float(np.nanmin(values)), float(np.nanmax(values))) for name, values in seen.items()}
-    plant = plant.with_medians({name: seen[name] for name in model.disturbances})
+    valid = {name: (float(np.nanmin(values)), float(np.nanmax(values))) for name, values in logged.items()}
+    plant = plant.with_medians({name: logged[name] for name in model.disturbances})
     report(1.0, "fitted")
     return replace(plant, valid=valid, fitted_to=fit_record.fit_logs(logs), scores=scores)
 
@@ -307,8 +314,8 @@ def _as_plant(problem: Problem, solution: Solution, tau: Array) -> Plant:
     offsets |= dict(zip(model.disturbances, np.mean([s.d_offset for s in first], axis=0).tolist()))
     scores = fit_record.PlantScores(
         in_sample_rmse={
-            log: {name: round(_rms([s[k] for s in parts]), 4) for k, name in enumerate(model.outputs)}
-            for log, parts in zip(problem.names, errors)
+            log: {name: round(_rms([s[k] for s in errors_of_log]), 4) for k, name in enumerate(model.outputs)}
+            for log, errors_of_log in zip(problem.names, errors)
         },
         identifiability=identifiability,
         cost=round(solution.cost, 3),
@@ -358,18 +365,18 @@ def _verdict(problem: Problem, solution: Solution, identifiability: fit_record.I
         f"{name} {r * sd:.2f} {problem.plant.units.get(name, 'degC')}"
         for name, r, sd in zip(problem.model.outputs, rms, problem.sd)
     )
-    parts = [f"in-sample error {errors}"]
+    clauses = [f"in-sample error {errors}"]
     if not solution.converged:
-        parts.append("the fit ran out of iterations")
+        clauses.append("the fit ran out of iterations")
     if max(rms) > _STUCK:
-        parts.append("it does not explain the logs, do not use it")
+        clauses.append("it does not explain the logs, do not use it")
     if not identifiability.identifiable:
-        parts.append(f"not practically identifiable: {identifiability.weakest}")
+        clauses.append(f"not practically identifiable: {identifiability.weakest}")
     if identifiability.on_bound:
-        parts.append(f"on bounds: {', '.join(identifiability.on_bound)}")
+        clauses.append(f"on bounds: {', '.join(identifiability.on_bound)}")
     if identifiability.prior_only:
-        parts.append(f"known from the prior only: {', '.join(identifiability.prior_only)}")
-    return "; ".join(parts)
+        clauses.append(f"known from the prior only: {', '.join(identifiability.prior_only)}")
+    return "; ".join(clauses)
 
 
 def free_runs(logs: Sequence[Log], model: GreyModel, p: Array) -> list[tuple[str, Array]]:

@@ -67,15 +67,15 @@ class TradeOff(NamedTuple):
 
 def trade_offs(names: Sequence[str], covariance: Array) -> list[TradeOff]:
     """Return the trade-offs at a covariance (n, n) on the scale of the priors, the closest first."""
-    sd, found = np.sqrt(np.diag(covariance)), []
+    sd, pairs = np.sqrt(np.diag(covariance)), []
     for i, j in combinations(range(len(names)), 2):
         r = float(covariance[i, j] / (sd[i] * sd[j]))
         if abs(r) >= _TRADE:
             together = float(np.sqrt(max(sd[i] ** 2 + sd[j] ** 2 - 2 * abs(r) * sd[i] * sd[j], 0.0)))
-            each = float(min(sd[i], sd[j]))
-            if together < each:
-                found.append(TradeOff(names[i], names[j], round(r, 3), together, each))
-    return sorted(found, key=lambda pair: pair.sd_together / pair.sd_each)
+            smaller_sd = float(min(sd[i], sd[j]))
+            if together < smaller_sd:
+                pairs.append(TradeOff(names[i], names[j], round(r, 3), together, smaller_sd))
+    return sorted(pairs, key=lambda pair: pair.sd_together / pair.sd_each)
 
 
 def identifiability_report(plant: Plant) -> list[str]:
@@ -123,15 +123,15 @@ def _trade_in_words(plant: Plant, pair: TradeOff) -> str:
     first, second, correlation, *sds = pair
     logs, alike = [plant.scales.get(name) == "log" for name in (first, second)], correlation > 0
     if all(logs):
-        what = "ratio" if alike else "product"
+        combination = "ratio" if alike else "product"
     elif any(logs):
-        what = "combination"
+        combination = "combination"
     else:
-        what = "difference" if alike else "sum"
-    together, each = (_width(sd, all(logs)) for sd in sds)
+        combination = "difference" if alike else "sum"
+    together_width, each_width = (_width(sd, all(logs)) for sd in sds)
     return (
-        f"{first} and {second} trade off (correlation {correlation:.2f}): their {what} is known "
-        f"to {together}, each by itself to {each} at best; measure one or fix it"
+        f"{first} and {second} trade off (correlation {correlation:.2f}): their {combination} is known "
+        f"to {together_width}, each by itself to {each_width} at best; measure one or fix it"
     )
 
 

@@ -61,10 +61,10 @@ class Block:
         """Take the columns (n, n_y, q) of a stretch by time; the last is reading less model."""
         waves = dct(columns, axis=0, norm="ortho")
         edges = _bands(len(columns))
-        parts = [
+        band_products = [
             np.einsum("fja,fkb->jkab", waves[a:b], waves[a:b], optimize=True) for a, b in pairwise(edges)
         ]
-        return cls(len(columns), tuple(outputs), np.array(parts))
+        return cls(len(columns), tuple(outputs), np.array(band_products))
 
     @property
     def sizes(self) -> Array:
@@ -84,7 +84,7 @@ class LogData:
     blocks: tuple[Block, ...]
     # of each column (parameters, then effects) the index of its sd; -1: a parameter, or an effect of known sd
     kind: NDArray[np.int64]
-    own: int  # number of effects
+    n_effects: int
 
 
 @dataclass(frozen=True)
@@ -115,9 +115,11 @@ class ErrorModel:
     def in_time(self, n: int) -> Array:
         """Return the covariance (n, n_y, n, n_y) of n bins in a row."""
         lags = np.abs(np.subtract.outer(np.arange(n), np.arange(n)))
-        parts = [(np.eye(n), np.diag(np.square(self.white)))]
-        parts += [(np.exp(-lags / tau), together) for tau, together in zip(self.tau, self._together())]
-        return np.asarray(sum(np.einsum("st,jk->sjtk", over, each) for over, each in parts))
+        terms = [(np.eye(n), np.diag(np.square(self.white)))]
+        terms += [(np.exp(-lags / tau), together) for tau, together in zip(self.tau, self._together())]
+        return np.asarray(
+            sum(np.einsum("st,jk->sjtk", in_time, between_outputs) for in_time, between_outputs in terms)
+        )
 
     def _together(self) -> list[Array]:
         """Return the covariance (n_y, n_y) of the outputs by slow error."""
@@ -130,12 +132,12 @@ class ErrorModel:
 
     def describe(self, outputs: Sequence[str], bin_s: float, units: Sequence[tuple[float, str]]) -> str:
         """Return the numbers in words; ``bin_s`` [s] is the width of a bin, ``units`` what 1 is worth."""
-        parts = []
+        slow_errors = []
         for tau, sd, correlation in zip(self.tau, self.sd, self.correlation):
-            each = ", ".join(f"{name} {a * x:.2g} {unit}" for name, a, (x, unit) in zip(outputs, sd, units))
+            sds = ", ".join(f"{name} {a * x:.2g} {unit}" for name, a, (x, unit) in zip(outputs, sd, units))
             also = f", correlation {correlation:.2f}" if len(outputs) > 1 else ""
-            parts.append(f"{each} over {tau * bin_s:.0f} s{also}")
-        return "model error " + "; ".join(parts)
+            slow_errors.append(f"{sds} over {tau * bin_s:.0f} s{also}")
+        return "model error " + "; ".join(slow_errors)
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,27 +146,27 @@ class Information:
 
     mean: Array  # (n,), posterior mean of z
     covariance: Array  # (n, n)
-    own: list[tuple[Array, Array]]  # by log
+    effects: list[tuple[Array, Array]]  # mean and covariance of each log's own
     joint: list[Array]  # posterior covariance of z and the log's effects
     log_likelihood: float  # with all of them integrated out, up to a constant
 
 
 def information(numbers: ErrorModel, logs: Sequence[LogData], ref: Array) -> Information:
     """Return the posterior with these numbers, linearised at ``ref`` (n,)."""
-    parts = [_one_log(numbers, log, ref) for log in logs]
-    by_log, pull = np.array([p.h for p in parts]), np.array([p.g for p in parts])
+    log_terms = [_one_log(numbers, log, ref) for log in logs]
+    by_log, pull = np.array([p.h for p in log_terms]), np.array([p.g for p in log_terms])
     whole = np.eye(pull.shape[1]) + by_log.sum(axis=0)
     covariance = np.linalg.inv(whole)
     mean = covariance @ pull.sum(axis=0)
-    total = sum(p.value for p in parts) + 0.5 * float(pull.sum(axis=0) @ mean)
+    total = sum(p.value for p in log_terms) + 0.5 * float(pull.sum(axis=0) @ mean)
     total -= 0.5 * float(np.linalg.slogdet(whole)[1])
-    own, joint = [], []
-    for part in parts:
-        follows = -part.inner @ part.mixed  # how an effect follows a parameter
-        corner = part.inner + follows @ covariance @ follows.T
-        own.append((part.mean + follows @ mean, corner))
+    effects, joint = [], []
+    for term in log_terms:
+        follows = -term.inner @ term.mixed  # how an effect follows a parameter
+        corner = term.inner + follows @ covariance @ follows.T
+        effects.append((term.mean + follows @ mean, corner))
         joint.append(np.block([[covariance, covariance @ follows.T], [follows @ covariance, corner]]))
-    return Information(mean, covariance, own, joint, total)
+    return Information(mean, covariance, effects, joint, total)
 
 
 def learn_error_model(logs: Sequence[LogData], ref: Array, *, width: Sequence[float]) -> ErrorModel:
@@ -180,10 +182,10 @@ def learn_error_model(logs: Sequence[LogData], ref: Array, *, width: Sequence[fl
         return 0.5 * float(v @ v) - value, v - sd * slope
 
     start, limits = np.zeros(mean.size), [(-4.0, 4.0)] * mean.size
-    found = minimize(
+    optimum = minimize(
         cost, start, jac=True, method="L-BFGS-B", bounds=limits, options={"maxiter": 60, "ftol": 1e-6}
     )
-    return _unpack(mean + sd * found.x, n_y, n_kind)
+    return _unpack(mean + sd * optimum.x, n_y, n_kind)
 
 
 @dataclass(frozen=True, eq=False)
@@ -206,7 +208,7 @@ def _columns(numbers: ErrorModel, log: LogData, ref: Array) -> Array:
 
 
 def _one_log(numbers: ErrorModel, log: LogData, ref: Array) -> _OneLog:
-    take, n = _columns(numbers, log, ref), len(log.kind) - log.own
+    take, n = _columns(numbers, log, ref), len(log.kind) - log.n_effects
     products, value = np.zeros(take.shape), 0.0
     for block in log.blocks:
         S = block.covariance(numbers)
@@ -214,8 +216,8 @@ def _one_log(numbers: ErrorModel, log: LogData, ref: Array) -> _OneLog:
         value -= 0.5 * float(block.sizes @ np.linalg.slogdet(S)[1])
     products = take.T @ products @ take
     value -= 0.5 * float(products[-1, -1])
-    own, right = products[n:-1, n:-1], products[:-1, -1]
-    local = np.eye(log.own) + own
+    effect_products, right = products[n:-1, n:-1], products[:-1, -1]
+    local = np.eye(log.n_effects) + effect_products
     inner, mixed = np.asarray(np.linalg.inv(local)), products[n:-1, :n]
     mean = np.asarray(inner @ right[n:])
     value += 0.5 * float(right[n:] @ mean) - 0.5 * float(np.linalg.slogdet(local)[1])
@@ -226,22 +228,22 @@ def _one_log(numbers: ErrorModel, log: LogData, ref: Array) -> _OneLog:
 def _evidence(v: Array, logs: Sequence[LogData], ref: Array, n_y: int, n_kind: int) -> tuple[float, Array]:
     """Return the likelihood with everything integrated out, and its slope in v."""
     numbers = _unpack(v, n_y, n_kind)
-    found = information(numbers, logs, ref)
+    posterior = information(numbers, logs, ref)
     slope = np.zeros(v.size)
     by_kind = np.zeros(n_kind + 1)
-    n = found.mean.size
-    np.add.at(by_kind, logs[0].kind[:n], found.mean**2 + np.diag(found.covariance) - 1)
-    for log, joint, (own, spread) in zip(logs, found.joint, found.own):
-        np.add.at(by_kind, log.kind[n:], own**2 + np.diag(spread) - 1)
-        left = np.concatenate([-found.mean, -own, [1.0]])  # the residual less its explanation
+    n = posterior.mean.size
+    np.add.at(by_kind, logs[0].kind[:n], posterior.mean**2 + np.diag(posterior.covariance) - 1)
+    for log, joint, (effects, spread) in zip(logs, posterior.joint, posterior.effects):
+        np.add.at(by_kind, log.kind[n:], effects**2 + np.diag(spread) - 1)
+        unexplained = np.concatenate([-posterior.mean, -effects, [1.0]])  # the residual less its explanation
         take = _columns(numbers, log, ref)
-        uncertain = np.outer(left, left)
+        uncertain = np.outer(unexplained, unexplained)
         uncertain[:-1, :-1] += joint
         uncertain = take @ uncertain @ take.T
         for block in log.blocks:
             slope += _slopes(v, numbers, block, uncertain)
     slope[v.size - n_kind :] = by_kind[:n_kind]
-    return found.log_likelihood, slope
+    return posterior.log_likelihood, slope
 
 
 def _slopes(v: Array, numbers: ErrorModel, block: Block, uncertain: Array) -> Array:
@@ -256,12 +258,12 @@ def _slopes(v: Array, numbers: ErrorModel, block: Block, uncertain: Array) -> Ar
     diagonal = both[:, range(n_y), range(n_y)].sum(axis=0)
     out[N_SLOW : N_SLOW + n_y] = 2 * diagonal * np.square(numbers.white)
     weights = band_weights(block.n)
-    for m, part in enumerate(numbers.slow(block.n)):
+    for m, slow in enumerate(numbers.slow(block.n)):
         tau, decay = numbers.tau[m], np.exp(-lag / numbers.tau[m])
-        share = both * part
+        share = both * slow
         out[m] = float((share.sum(axis=(1, 2)) * (weights @ (decay * lag / tau)) / (weights @ decay)).sum())
-        at = N_SLOW + n_y * (1 + m)
-        out[at : at + n_y] = 2 * share.sum(axis=(0, 2))
+        first_sd = N_SLOW + n_y * (1 + m)
+        out[first_sd : first_sd + n_y] = 2 * share.sum(axis=(0, 2))
         if n_y > 1:
             k = N_SLOW + n_y * (1 + N_SLOW) + m
             across = float(share.sum() - share[:, range(n_y), range(n_y)].sum())

@@ -84,8 +84,8 @@ class RandomizedMap:
         by_log = problem.by_log(self.z, central=True)
         self._fitted = np.concatenate([r for r, _ in by_log])
         span, size, turn = np.linalg.svd(np.vstack([J for _, J in by_log]), full_matrices=False)
-        seen = size > _UNSEEN * size.max(initial=0.0)
-        self._span, size, turn = span[:, seen], size[seen], turn[seen]
+        moves_runs = size > _UNSEEN * size.max(initial=0.0)
+        self._span, size, turn = span[:, moves_runs], size[moves_runs], turn[moves_runs]
         along = turn / size[:, None]
         error = along @ uncertainty.spread @ along.T  # S^-1 R V R' S^-1, about the error's covariance along Q
         value, axes = np.linalg.eigh((error + error.T) / 2)
@@ -109,22 +109,22 @@ class RandomizedMap:
         whole[:, list(columns)] = z
         out = np.full(len(z), -np.inf)
         inside = np.all((whole >= self.low) & (whole <= self.high), axis=1)
-        at = whole[inside]
-        if not len(at):
+        points = whole[inside]
+        if not len(points):
             return out
         if not others.size:
-            out[inside] = -self._gradient(at)[1]
+            out[inside] = -self._gradient(points)[1]
             return out
         H = np.eye(self.z.size) + self.information
         factor = cho_factor(H[np.ix_(others, others)], lower=True)
-        tied = H[others][:, list(columns)] @ (at - self.z)[:, list(columns)].T
-        at[:, others] = at[:, others] - cho_solve(factor, tied).T
-        at = np.clip(at, self.low, self.high)
-        step = cho_solve(factor, self._gradient(at)[0][:, others].T).T
-        at[:, others] = np.clip(at[:, others] - step, self.low[others], self.high[others])
-        gradient, cost = self._gradient(at)
-        left = gradient[:, others]
-        out[inside] = -cost + 0.5 * np.einsum("ki,ik->k", left, cho_solve(factor, left.T))
+        tied = H[others][:, list(columns)] @ (points - self.z)[:, list(columns)].T
+        points[:, others] = points[:, others] - cho_solve(factor, tied).T
+        points = np.clip(points, self.low, self.high)
+        step = cho_solve(factor, self._gradient(points)[0][:, others].T).T
+        points[:, others] = np.clip(points[:, others] - step, self.low[others], self.high[others])
+        gradient, cost = self._gradient(points)
+        other_gradient = gradient[:, others]
+        out[inside] = -cost + 0.5 * np.einsum("ki,ik->k", other_gradient, cho_solve(factor, other_gradient.T))
         return out
 
     def draws(
@@ -153,9 +153,9 @@ class RandomizedMap:
                 trial = z.copy()
                 trial[:, moving] += self._steps(z[:, moving], gradient, hessian, damping, moving)
                 trial = np.clip(trial, self.low, self.high)
-                found = self._cost(trial, xi, noise)
-                better = found < cost
-                z[better], cost[better] = trial[better], found[better]
+                trial_cost = self._cost(trial, xi, noise)
+                better = trial_cost < cost
+                z[better], cost[better] = trial[better], trial_cost[better]
                 damping = np.clip(np.where(better, damping / 10, damping * 10), 1e-8, 1e8)
                 if better.all():
                     break
@@ -171,18 +171,20 @@ class RandomizedMap:
 
     def _cost(self, z: Array, xi: Array, noise: Array) -> Array:
         """Return half the objective (n,), infinite where a run blew up."""
-        along, rest = self._moved(z)
+        along, off_span = self._moved(z)
         with np.errstate(over="ignore", invalid="ignore"):
-            squares = ((along - noise) ** 2).sum(axis=1) + (rest**2).sum(axis=1)
-        found = 0.5 * ((z - self.z - xi) ** 2).sum(axis=1) + 0.5 * squares
-        return np.where(np.isfinite(found), found, np.inf)
+            squares = ((along - noise) ** 2).sum(axis=1) + (off_span**2).sum(axis=1)
+        cost = 0.5 * ((z - self.z - xi) ** 2).sum(axis=1) + 0.5 * squares
+        return np.where(np.isfinite(cost), cost, np.inf)
 
     def _gradient(self, z: Array) -> tuple[Array, Array]:
         """Return g (n, n_free), with the slopes of the fit, and -ln p (n,); what blew up has no pull."""
-        along, rest = self._moved(z)
+        along, off_span = self._moved(z)
         with np.errstate(over="ignore", invalid="ignore"):
             gradient = z - self.z + along @ self._pull.T
-            cost = 0.5 * (((z - self.z) ** 2).sum(axis=1) + (along**2).sum(axis=1) + (rest**2).sum(axis=1))
+            cost = 0.5 * (
+                ((z - self.z) ** 2).sum(axis=1) + (along**2).sum(axis=1) + (off_span**2).sum(axis=1)
+            )
         finite = np.isfinite(cost) & np.isfinite(gradient).all(axis=1)
         return np.where(finite[:, None], gradient, 0.0), np.where(finite, cost, np.inf)
 
@@ -190,18 +192,20 @@ class RandomizedMap:
         """Return gradient (n, n_moving) and Gauss-Newton Hessian (n, n_moving, n_moving)."""
         if len(z) > _TOGETHER:
             blocks = [slice(k, k + _TOGETHER) for k in range(0, len(z), _TOGETHER)]
-            parts = [self._slopes(z[at], xi[at], noise[at], moving) for at in blocks]
-            return np.concatenate([g for g, _ in parts]), np.concatenate([h for _, h in parts])
+            slopes_by_block = [self._slopes(z[rows], xi[rows], noise[rows], moving) for rows in blocks]
+            return np.concatenate([g for g, _ in slopes_by_block]), np.concatenate(
+                [h for _, h in slopes_by_block]
+            )
         n, d = len(z), moving.size
         sign = np.where(z[:, moving] + _STEP > self.high[moving], -1.0, 1.0)
         ahead = z[:, None] + _STEP * sign[:, :, None] * np.eye(self.z.size)[moving]
         around = np.concatenate([z[:, None], ahead], axis=1).reshape(-1, self.z.size)
         gradient, hessian = (z - self.z - xi)[:, moving], np.tile(np.eye(d), (n, 1, 1))
-        along, rest = self._moved(around)
-        for part, less in ((along, noise), (rest, np.zeros((1, 1)))):
-            runs = part.reshape(n, d + 1, -1)
+        along, off_span = self._moved(around)
+        for moves, perturbation in ((along, noise), (off_span, np.zeros((1, 1)))):
+            runs = moves.reshape(n, d + 1, -1)
             slopes = (runs[:, 1:] - runs[:, :1]) / (_STEP * sign[:, :, None])
-            gradient = gradient + np.einsum("kim,km->ki", slopes, runs[:, 0] - less)
+            gradient = gradient + np.einsum("kim,km->ki", slopes, runs[:, 0] - perturbation)
             hessian = hessian + slopes @ slopes.transpose(0, 2, 1)
         return gradient, hessian
 
@@ -213,8 +217,8 @@ class RandomizedMap:
         out = np.zeros_like(gradient)
         for k, (g, h, lam) in enumerate(zip(gradient, hessian, damping)):
             free = np.flatnonzero(~stuck[k])
-            part = h[np.ix_(free, free)]
-            step = -np.linalg.solve(part + lam * np.diag(np.diag(part)), g[free])
+            free_hessian = h[np.ix_(free, free)]
+            step = -np.linalg.solve(free_hessian + lam * np.diag(np.diag(free_hessian)), g[free])
             out[k, free] = step * min(1.0, _LONGEST / max(float(np.abs(step).max(initial=0.0)), 1e-300))
         return out
 
@@ -309,8 +313,8 @@ def _autocorrelation(steps: Array) -> Array:
     from emcee.autocorr import integrated_time
 
     with np.errstate(invalid="ignore"):
-        found = np.asarray(integrated_time(steps, tol=0, quiet=True), dtype=float)
-    return np.asarray(np.maximum(np.where(np.isfinite(found), found, len(steps)), 1.0))
+        times = np.asarray(integrated_time(steps, tol=0, quiet=True), dtype=float)
+    return np.asarray(np.maximum(np.where(np.isfinite(times), times, len(steps)), 1.0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -429,8 +433,8 @@ def sample_posterior(
         progress=lambda f, w: report(0.1 + 0.85 * f, w),
     )
     report(0.95, "completing the samples")
-    kept = chain.kept(n_samples)
-    whole = target.draws(len(kept), seed=seed, held=kept, columns=sampled, iterations=5)
+    sampled_z = chain.kept(n_samples)
+    whole = target.draws(len(sampled_z), seed=seed, held=sampled_z, columns=sampled, iterations=5)
     record = _record(plant, problem, z, sampled, chain, whole, uncertainty)
     report(1.0, record.verdict)
     sampling = Sampling(record.verdict, record.converged, record.likelihood, record.tau)
@@ -454,8 +458,8 @@ def with_draws(
     if intervals is not None and intervals.numbers is not None and problem.names == tuple(plant.logs):
         numbers = ErrorModel.of(intervals.numbers)  # the fit has learnt it already
     target = RandomizedMap(problem, z, score_covariance(problem, z, numbers=numbers))
-    at = [problem.model.parameters.index(name) for name in plant.free]
-    drawn = problem.parameters(target.draws(n, seed=seed, progress=progress))[:, at]
+    free_columns = [problem.model.parameters.index(name) for name in plant.free]
+    drawn = problem.parameters(target.draws(n, seed=seed, progress=progress))[:, free_columns]
     return replace(plant, samples=drawn)
 
 
@@ -508,12 +512,12 @@ def _record(
 ) -> Posterior:
     """Return the record, in natural units."""
     names = tuple(plant.free[i] for i in sampled)
-    at = [problem.model.parameters.index(name) for name in plant.free]
+    free_columns = [problem.model.parameters.index(name) for name in plant.free]
     full = np.tile(z, (*chain.steps.shape[:2], 1))
     full[..., list(sampled)] = chain.steps
-    steps = problem.parameters(full.reshape(-1, z.size))[:, [at[i] for i in sampled]]
+    steps = problem.parameters(full.reshape(-1, z.size))[:, [free_columns[i] for i in sampled]]
     drawn = replace(chain, steps=steps.reshape(chain.steps.shape))
-    samples = problem.parameters(whole)[:, at]
+    samples = problem.parameters(whole)[:, free_columns]
     low, mid, high = np.quantile(samples, [0.05, 0.5, 0.95], axis=0)
     length = len(chain.steps) / float(np.max(chain.tau))
     verdict = f"{'converged' if chain.converged else 'not converged'}: {length:.0f} autocorrelation times"

@@ -51,7 +51,7 @@ class _Starts:
 
     z: Array | None = None
     last: list[list[Start]] = field(default_factory=list)
-    held: list[list[Start]] = field(default_factory=list)
+    linearised: list[list[Start]] = field(default_factory=list)
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,8 +122,8 @@ class Problem:
 
     def errors(self, z: Array) -> list[list[list[Array]]]:
         """Return the model's errors by log, stretch and output (bins in order of time)."""
-        found = self._bin_errors(self.parameters(z[None]), self.start(z))
-        return [[[error[0] for error in stretch] for stretch in log] for log in found]
+        errors_by_log = self._bin_errors(self.parameters(z[None]), self.start(z))
+        return [[[error[0] for error in stretch] for stretch in log] for log in errors_by_log]
 
     def _bin_errors(self, p: Array, starts: Sequence[Sequence[Start]]) -> Iterator[list[list[Array]]]:
         """Yield each log's errors (k, m) by stretch and output, at parameters p (k, n_p)."""
@@ -136,9 +136,9 @@ class Problem:
 
     def linearise(self, z: Array) -> tuple[Array, Array]:
         """Return residuals (m + n,) and Jacobian (m + n, n), the prior's rows last."""
-        parts = self.by_log(z)
-        residual = np.concatenate([*(r for r, _ in parts), z])
-        return residual, np.vstack([*(J for _, J in parts), np.eye(len(z))])
+        log_rows = self.by_log(z)
+        residual = np.concatenate([*(r for r, _ in log_rows), z])
+        return residual, np.vstack([*(J for _, J in log_rows), np.eye(len(z))])
 
     def by_log(self, z: Array, *, central: bool = False) -> list[tuple[Array, Array]]:
         """Return residual (m,) and Jacobian (m, n) of each log, without the prior, by ``central`` differences
@@ -162,8 +162,8 @@ class Problem:
 
     def _kept(self, z: Array | None) -> list[list[Start]]:
         if z is not None:
-            self._starts.held = self.start(z)
-        return self._starts.held
+            self._starts.linearised = self.start(z)
+        return self._starts.linearised
 
     def warm_up(self, at: int) -> float:
         """Return the seconds at the beginning of a log from which its start is estimated."""
@@ -213,19 +213,19 @@ def make_problem(model: GreyModel, logs: Sequence[Log], *, average: float, indep
     average = max(average, *(float(np.median(np.diff(log["time"].values))) for log in logs))
     plant = prior_plant(model)
     steps = max(1, round(average / plant.dt))
-    parts = []
+    prepared_logs = []
     for log in logs:
         stretches = cut_stretches(plant, log)
         bins = [_bins(stretch, plant.dt, steps) for stretch in stretches]
         if not any(mean.size for cells in bins for mean in cells.means):
             raise UserError("has no reading to fit", file=log_name(log), hint="leave it out")
-        parts.append((stretches, bins))
+        prepared_logs.append((stretches, bins))
     free = tuple(i for i, spec in enumerate(model.specs.values()) if not spec.fixed)
     sd = np.array([model.sensor_sd[name] for name in model.outputs])
     tau = np.full(len(sd), max(1.0, independent / (steps * plant.dt)))
     return Problem(
         plant,
-        tuple(parts),
+        tuple(prepared_logs),
         tuple(map(log_name, logs)),
         free,
         steps * plant.dt,
@@ -246,18 +246,21 @@ def _bins(stretch: Stretch, dt: float, steps: int) -> _Bins:
     """Return the averaging operators of one stretch; a bin without readings is left out."""
     n_grid = len(stretch.u) + 1
     place = np.clip(stretch.time / dt, 0.0, n_grid - 1)
-    left = np.minimum(place.astype(int), n_grid - 2)
-    share, cell = place - left, np.minimum(place.astype(int), n_grid - 2) // steps
+    cell_before = np.minimum(place.astype(int), n_grid - 2)
+    share, cell = place - cell_before, np.minimum(place.astype(int), n_grid - 2) // steps
     operators: list[sparse.csr_matrix] = []
     means: list[Array] = []
     places: list[NDArray[np.int64]] = []
     for k in range(stretch.y.shape[1]):
-        known = np.flatnonzero(np.isfinite(stretch.y[:, k]))
-        filled, where, count = np.unique(cell[known], return_inverse=True, return_counts=True)
+        read_rows = np.flatnonzero(np.isfinite(stretch.y[:, k]))
+        filled, where, count = np.unique(cell[read_rows], return_inverse=True, return_counts=True)
         weight = 1.0 / count[where]
-        entries = np.concatenate([weight * (1 - share[known]), weight * share[known]])
-        at = (np.tile(where, 2), np.concatenate([left[known], left[known] + 1]))
-        operators.append(sparse.csr_matrix((entries, at), shape=(filled.size, n_grid)))
-        means.append(np.bincount(where, weight * stretch.y[known, k], filled.size).astype(float))
+        entries = np.concatenate([weight * (1 - share[read_rows]), weight * share[read_rows]])
+        row_and_column = (
+            np.tile(where, 2),
+            np.concatenate([cell_before[read_rows], cell_before[read_rows] + 1]),
+        )
+        operators.append(sparse.csr_matrix((entries, row_and_column), shape=(filled.size, n_grid)))
+        means.append(np.bincount(where, weight * stretch.y[read_rows, k], filled.size).astype(float))
         places.append(filled)
     return _Bins(tuple(operators), tuple(means), tuple(places))

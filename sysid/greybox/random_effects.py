@@ -64,14 +64,18 @@ class Response:
 
 def discrepancy_responses(problem: Problem, runs: Sequence[Sequence[Array]]) -> list[tuple[Response, Parts]]:
     """Return the responses with s = 1, and each by log, stretch and output in the units of the readings."""
-    given = [
+    inputs_and_states = [
         [signals(problem.model, stretch.u, stretch.d, run) for stretch, run in zip(stretches, of_log)]
         for (stretches, _), of_log in zip(problem.logs, runs)
     ]
-    names = [name for name in given[0][0] if not _is_twin(name, given)]
+    names = [name for name in inputs_and_states[0][0] if not _is_twin(name, inputs_and_states)]
     rms = _SIZE / np.sqrt(len(names) * len(_LAGS))
-    out = [_of_rms(problem, given, name, lag * problem.average, rms) for name in names for lag in _LAGS]
-    return [(one, parts) for one, parts in out if any(p.any() for log in parts for k in log for p in k)]
+    out = [
+        _of_rms(problem, inputs_and_states, name, lag * problem.average, rms)
+        for name in names
+        for lag in _LAGS
+    ]
+    return [(one, means) for one, means in out if any(p.any() for log in means for k in log for p in k)]
 
 
 def signals(model: Model, u: Array, d: Array, run: Array) -> dict[str, Array]:
@@ -95,29 +99,31 @@ def _of_rms(
     means = [
         [
             [operator @ slow for operator in cells.operators]
-            for cells, slow in zip(bins, (plain.lagged(part, problem.plant.dt) for part in of_log))
+            for cells, slow in zip(bins, (plain.lagged(driving, problem.plant.dt) for driving in of_log))
         ]
         for of_log, (_, bins) in zip(given, problem.logs)
     ]
-    squares = [float(np.mean(part**2)) for log in means for stretch in log for part in stretch if part.size]
+    squares = [
+        float(np.mean(driving**2)) for log in means for stretch in log for driving in stretch if driving.size
+    ]
     size = float(np.sqrt(np.mean(squares))) if squares else 0.0
     factor = rms * problem.sd / size if size > 1e-9 else np.zeros(len(problem.sd))
-    parts = [[[f * part for f, part in zip(factor, stretch)] for stretch in log] for log in means]
-    return Response(name, lag, factor, size), parts
+    moves = [[[f * driving for f, driving in zip(factor, stretch)] for stretch in log] for log in means]
+    return Response(name, lag, factor, size), moves
 
 
 def _is_twin(name: str, given: Sequence[Sequence[Mapping[str, Array]]]) -> bool:
     """Say whether this is the size of an input that is never negative."""
     if not name.startswith("|"):
         return False
-    return all(np.array_equal(part[name], part[name[1:-1]]) for of_log in given for part in of_log)
+    return all(np.array_equal(stretch[name], stretch[name[1:-1]]) for of_log in given for stretch in of_log)
 
 
 @dataclass(frozen=True, eq=False)
 class WarmUp:
     """The first bins of a log, and what its start does to them."""
 
-    at: tuple[int, ...]  # where these columns stand among the effects of the log
+    effects: tuple[int, ...]  # places of these columns among the effects of the log
     columns: Array  # (n, n_y, k), change of the bins at one prior sd, in units of the fit's residuals
     outputs: tuple[int, ...]  # which outputs they are
     noise: Array  # (n_y,), r of a bin, in these units
@@ -159,7 +165,7 @@ class Linearised:
     n_responses: int  # the first of ``kinds`` are of the model discrepancy
     n_shared: int  # columns that logs share: parameters, then responses
     # of each effect of a log: name (empty for its start), stated sd, value that the start already contains
-    own: list[list[tuple[str, float, float]]]
+    effects: list[list[tuple[str, float, float]]]
     bin_s: float  # width of a bin [s]
     responses: list[Response]  # in the order of their columns
     warm: list[WarmUp | None]  # of each log whose start was estimated from its first bins
@@ -172,7 +178,7 @@ class _Column:
     name: str
     stated: float
     base: float  # value that the start already contains
-    parts: list[list[Array]]
+    moves: list[list[Array]]
 
 
 def linearise_logs(
@@ -181,34 +187,36 @@ def linearise_logs(
     """Return residuals, sensitivities and effects of each log at ``z``."""
     starts, p = problem.start(z), problem.parameters(z[None])
     merge = _merge(problem)
-    runs = [_runs(problem, at, p, begin) for at, begin in enumerate(starts)]
+    runs = [_runs(problem, log_index, p, begin) for log_index, begin in enumerate(starts)]
     discrepancy = discrepancy_responses(problem, runs)
     signals_of = list(dict.fromkeys(f"term {response.signal}" for response, _ in discrepancy))
     shared = [-1] * z.size + [signals_of.index(f"term {response.signal}") for response, _ in discrepancy]
     logs: list[LogData] = []
-    own: list[list[_Column]] = []
+    effects_of_logs: list[list[_Column]] = []
     warm: list[WarmUp | None] = []
-    for at, (r, jacobian) in enumerate(by_log):
-        rows, slopes = _by_stretch(problem, at, -r[:, None]), _by_stretch(problem, at, jacobian)
-        effects = _effects(problem, at, p, starts[at], slopes)
-        alike = [_scaled(problem, parts[at]) for _, parts in discrepancy]
+    for log_index, (r, jacobian) in enumerate(by_log):
+        rows, slopes = _by_stretch(problem, log_index, -r[:, None]), _by_stretch(problem, log_index, jacobian)
+        effects = _effects(problem, log_index, p, starts[log_index], slopes)
+        alike = [_scaled(problem, moves[log_index]) for _, moves in discrepancy]
         blocks: list[list[Block]] = [[] for _ in range(pieces)]
         for k in range(len(rows)):
-            columns = [*(parts[k] for parts in alike), *(c.parts[k] for c in effects)]
-            cut = _blocks(problem, at, k, merge, pieces, slopes[k], columns, rows[k])
+            columns = [*(moves[k] for moves in alike), *(c.moves[k] for c in effects)]
+            cut = _blocks(problem, log_index, k, merge, pieces, slopes[k], columns, rows[k])
             for piece, block in zip(blocks, cut):
                 piece.append(block)
         kind = np.array(shared + [-1] * len(effects), dtype=np.int64)
-        first = _warm_up(problem, at, starts[at][0], merge, effects)
-        for part in blocks:
-            if part:
-                own.append(effects)
+        first = _warm_up(problem, log_index, starts[log_index][0], merge, effects)
+        for blocks_of_piece in blocks:
+            if blocks_of_piece:
+                effects_of_logs.append(effects)
                 warm.append(first)
-                logs.append(LogData(problem.names[at], tuple(part), kind.copy(), len(effects)))
-    kinds = [*signals_of, *dict.fromkeys(c.name for log in own for c in log if c.name)]
-    for log, effects in zip(logs, own):
+                logs.append(
+                    LogData(problem.names[log_index], tuple(blocks_of_piece), kind.copy(), len(effects))
+                )
+    kinds = [*signals_of, *dict.fromkeys(c.name for log in effects_of_logs for c in log if c.name)]
+    for log, effects in zip(logs, effects_of_logs):
         log.kind[len(shared) :] = [kinds.index(c.name) if c.name else -1 for c in effects]
-    stated = [[(c.name, c.stated, c.base) for c in log] for log in own]
+    stated = [[(c.name, c.stated, c.base) for c in log] for log in effects_of_logs]
     responses, bin_s = [response for response, _ in discrepancy], merge * problem.average
     return Linearised(logs, kinds, len(signals_of), len(shared), stated, bin_s, responses, warm)
 
@@ -228,23 +236,23 @@ def _effects(
     for j, name in enumerate(plant.outputs):
         spread = min(plant.nuisance.get(name, 0.0), most)
         if spread > 0:
-            parts = [
+            moves = [
                 [np.full(mean.size, spread if k == j else 0.0) for k, mean in enumerate(cells.means)]
                 for cells in bins
             ]
-            known = float(starts[0].y_offset[j])
-            out.append(_Column(f"{_OFFSET}{name}", spread, known, _scaled(problem, parts)))
+            estimate = float(starts[0].y_offset[j])
+            out.append(_Column(f"{_OFFSET}{name}", spread, estimate, _scaled(problem, moves)))
     for j, name in enumerate(plant.disturbances):
         spread = min(plant.nuisance.get(name, 0.0), most)
         if spread > 0:
-            parts, known = _of_ambient(problem, at, p, starts, j, spread), float(starts[0].d_offset[j])
-            out.append(_Column(f"bias of {name}", spread, known, _scaled(problem, parts)))
+            moves, estimate = _of_ambient(problem, at, p, starts, j, spread), float(starts[0].d_offset[j])
+            out.append(_Column(f"bias of {name}", spread, estimate, _scaled(problem, moves)))
     specs = list(problem.model.specs.values())
     for i, place in enumerate(problem.free):
         spread = specs[place].per_log or 0.0
         if spread > 0:
-            parts = [[s[:, i] * spread / problem.width[i] for s in stretch] for stretch in slopes]
-            out.append(_Column(problem.model.parameters[place], spread, 0.0, parts))
+            moves = [[s[:, i] * spread / problem.width[i] for s in stretch] for stretch in slopes]
+            out.append(_Column(problem.model.parameters[place], spread, 0.0, moves))
     for k in range(len(stretches)):
         out += _of_start(problem, at, k, p, starts[k])
     return out
@@ -255,10 +263,10 @@ def _of_ambient(
 ) -> list[list[Array]]:
     """Return what a bias of disturbance j does to each bin: the true one is lower than the reading."""
     moved = [replace(s, d_offset=s.d_offset + spread * (np.arange(s.d_offset.size) == j)) for s in starts]
-    here, there = (_runs(problem, at, p, begin) for begin in (starts, moved))
+    measured, biased = (_runs(problem, at, p, begin) for begin in (starts, moved))
     return [
         [operator @ (b[:, k] - a[:, k]) for k, operator in enumerate(cells.operators)]
-        for a, b, cells in zip(here, there, problem.logs[at][1])
+        for a, b, cells in zip(measured, biased, problem.logs[at][1])
     ]
 
 
@@ -276,12 +284,12 @@ def _of_start(problem: Problem, at: int, k: int, p: Array, start: Start) -> list
     stacked = np.nan_to_num(np.vstack(scaled))
     modes = stacked @ np.linalg.eigh(stacked.T @ stacked)[1]
     modes = modes[:, np.abs(modes).max(axis=0, initial=0.0) > _MODE]
-    ends = np.cumsum([part.shape[0] for part in scaled])[:-1]
+    ends = np.cumsum([bins_of_output.shape[0] for bins_of_output in scaled])[:-1]
     nothing = [[np.zeros(mean.size) for mean in cells.means] for cells in bins]
     out = []
     for mode in modes.T:
-        parts = [part * sd for part, sd in zip(np.split(mode, ends), problem.sd)]
-        everywhere = _scaled(problem, [*nothing[:k], parts, *nothing[k + 1 :]])
+        moves = [bins_of_output * sd for bins_of_output, sd in zip(np.split(mode, ends), problem.sd)]
+        everywhere = _scaled(problem, [*nothing[:k], moves, *nothing[k + 1 :]])
         out.append(_Column("", 1.0, 0.0, everywhere))
     return out
 
@@ -295,7 +303,7 @@ def _warm_up(
     read = [
         i
         for i, c in enumerate(effects)
-        if (not c.name or c.name.startswith(_OFFSET)) and any(part.any() for part in c.parts[0])
+        if (not c.name or c.name.startswith(_OFFSET)) and any(moved_bins.any() for moved_bins in c.moves[0])
     ]
     seconds, bin_s = problem.warm_up(at), merge * problem.average
     n = min(max(1, round(seconds / bin_s)), _n_bins(problem, at, 0) // merge)
@@ -304,7 +312,7 @@ def _warm_up(
     if not read or not outputs:
         return None
     columns = [
-        _interpolated(places[j], np.column_stack([effects[i].parts[0][j] for i in read]), n * merge)
+        _interpolated(places[j], np.column_stack([effects[i].moves[0][j] for i in read]), n * merge)
         for j in outputs
     ]
     means = np.stack([c.reshape(n, merge, -1).mean(axis=1) for c in columns], axis=1)
@@ -324,7 +332,9 @@ def _by_stretch(problem: Problem, at: int, rows: Array) -> list[list[Array]]:
 
 def _scaled(problem: Problem, parts: list[list[Array]]) -> list[list[Array]]:
     """Return what moves the bins in the units of the fit's residuals."""
-    return [[problem.scaled(k, part[None])[0] for k, part in enumerate(stretch)] for stretch in parts]
+    return [
+        [problem.scaled(k, moved_bins[None])[0] for k, moved_bins in enumerate(stretch)] for stretch in parts
+    ]
 
 
 def _n_bins(problem: Problem, at: int, k: int) -> int:
@@ -352,12 +362,12 @@ def _blocks(
     outputs = [j for j, place in enumerate(places) if n and place.size >= _KNOWN * n]
     if not outputs or n < _LEAST * merge * pieces:
         return []
-    parts = []
+    grids = []
     for j in outputs:
         stacked = np.column_stack([slopes[j], *(column[j] for column in columns), residual[j]])
         grid = _interpolated(places[j], stacked, n)
-        parts.append(grid.reshape(-1, merge, grid.shape[1]).mean(axis=1))
-    return [Block.of(piece, outputs) for piece in np.array_split(np.stack(parts, axis=1), pieces)]
+        grids.append(grid.reshape(-1, merge, grid.shape[1]).mean(axis=1))
+    return [Block.of(piece, outputs) for piece in np.array_split(np.stack(grids, axis=1), pieces)]
 
 
 def _interpolated(place: NDArray[np.int64], values: Array, n: int) -> Array:

@@ -43,6 +43,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import digamma
@@ -60,11 +61,12 @@ _FEW, _PIECES = 3, 4  # with fewer logs, so many pieces of each stand for logs
 
 @dataclass(frozen=True, eq=False)
 class LogScores:
-    """What each log (or piece of one) adds to the score: A_l, V_l (n_log, n, n) and J_l' r_l (n_log, n)."""
+    """What each log (or piece of one) adds to the score."""
 
-    hessian: Array
-    spread: Array
-    score: Array
+    hessian: Array  # A_l (n_log, n, n)
+    spread: Array  # V_l (n_log, n, n)
+    score: Array  # J_l' r_l (n_log, n)
+    discrepancy: Array  # J_l' F_l s (n_log, n, n_term)
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,14 +106,14 @@ def score_covariance(
         raise UserError(problem_is, file=problem.names[0], hint="give a longer log, or a smaller average")
     if numbers is None or len(numbers.spread) != len(data.kinds):
         numbers = learn_error_model(data.logs, z, width=_widths(data))
-    whole, pull = _log_scores(problem, data, numbers, z.size)
-    parts = whole
+    whole = _log_scores(problem, data, numbers, z.size)
+    pull, pieces = whole.discrepancy.sum(axis=0), whole
     if len(data.logs) < _FEW:
         cut = linearise_logs(problem, z, by_log, pieces=_PIECES)
-        parts = _log_scores(problem, cut, numbers, z.size)[0] if len(cut.logs) >= _FEW else whole
+        pieces = _log_scores(problem, cut, numbers, z.size) if len(cut.logs) >= _FEW else whole
     hessian = np.eye(z.size) + whole.hessian.sum(axis=0)
     inverse = np.linalg.inv(hessian)
-    phi = common_factor(disagreement(parts, z), len(parts.score), cut=parts is not whole)
+    phi = common_factor(disagreement(pieces, z), len(pieces.score), cut=pieces is not whole)
     fixed, spread = np.eye(z.size) + pull @ pull.T, phi * whole.spread.sum(axis=0)
     covariance = _no_wider_than_prior(inverse @ (fixed + spread) @ inverse)
     by_weights = np.trace(inverse @ whole.hessian.sum(axis=0))
@@ -140,9 +142,9 @@ def disagreement(scores: LogScores, z: Array) -> Array:
     inverse, spread = np.linalg.inv(whole), np.eye(n) + scores.spread.sum(axis=0)
     for k, (v, pull) in enumerate(zip(scores.spread, pulls)):
         # summed anew: with a sensor that is stated to be exact, a difference would lose the prior's 1
-        rest = np.eye(n) + np.delete(scores.hessian, k, axis=0).sum(axis=0)
-        step = np.linalg.inv(rest) - inverse  # how the other logs move it
-        moved = np.linalg.solve(rest, pulls.sum(axis=0) - pull) - inverse @ pulls.sum(axis=0)
+        others = np.eye(n) + np.delete(scores.hessian, k, axis=0).sum(axis=0)
+        step = np.linalg.inv(others) - inverse  # how the other logs move it
+        moved = np.linalg.solve(others, pulls.sum(axis=0) - pull) - inverse @ pulls.sum(axis=0)
         expected = step @ (spread - v) @ step.T + inverse @ v @ inverse
         size = np.diag(expected)  # 0 of a parameter that no log feels: nothing disagrees
         ratios.append(np.divide(moved**2, size, out=np.ones(n), where=size > 0))
@@ -170,29 +172,43 @@ def _widths(data: Linearised) -> list[float]:
     return [_TERM_SD] * data.n_responses + [_EFFECT_SD] * (len(data.kinds) - data.n_responses)
 
 
-def _log_scores(problem: Problem, data: Linearised, numbers: ErrorModel, n: int) -> tuple[LogScores, Array]:
-    """Return what each log adds to the score, and U (n, n_term)."""
+def _log_scores(problem: Problem, data: Linearised, numbers: ErrorModel, n: int) -> LogScores:
+    """Return what each log adds to the score."""
     merge = float(round(data.bin_s / problem.average))  # residuals in one mean
-    parts = [_one_log(log, warm, merge, numbers, n, data.n_shared) for log, warm in zip(data.logs, data.warm)]
-    alike = np.sum([part[3] for part in parts], axis=0)
-    return LogScores(*(np.array([part[k] for part in parts]) for k in range(3))), alike
+    scores = [
+        _one_log(log, warm, merge, numbers, n, data.n_shared) for log, warm in zip(data.logs, data.warm)
+    ]
+    return LogScores(*(np.array(column) for column in zip(*scores)))
+
+
+class _LogScore(NamedTuple):
+    """What one log adds; the score is of reading less model, so that it pulls upwards."""
+
+    hessian: Array
+    spread: Array
+    score: Array
+    discrepancy: Array
 
 
 def _one_log(
     log: LogData, warm: WarmUp | None, merge: float, numbers: ErrorModel, n: int, n_shared: int
-) -> tuple[Array, Array, Array, Array]:
-    """Return A_l, V_l, J_l' r_l (r: reading less model, so that it pulls upwards) and J_l' F_l s."""
+) -> _LogScore:
     scale = np.append(numbers.scale(log.kind), 1.0)
     products, noise = np.zeros((scale.size, scale.size)), np.zeros((n, n))
     for block in log.blocks:
         products += merge * np.einsum("bjjac->ac", block.products)
         noise += merge**2 * np.tensordot(block.covariance(numbers), block.products[..., :n, :n], axes=3)
     products = products * scale * scale[:, None]
-    effects, own = products[:n, n_shared:-1], np.eye(log.own)
+    effects, effect_covariance = products[:n, n_shared:-1], np.eye(log.n_effects)
     if warm is not None:
-        spread = scale[n_shared:-1][list(warm.at)]
-        own[np.ix_(warm.at, warm.at)] = warm.error(numbers, spread) / np.outer(spread, spread)
-    return products[:n, :n], noise + effects @ own @ effects.T, products[:n, -1], products[:n, n:n_shared]
+        spread, place = scale[n_shared:-1][list(warm.effects)], np.ix_(warm.effects, warm.effects)
+        effect_covariance[place] = warm.error(numbers, spread) / np.outer(spread, spread)
+    return _LogScore(
+        hessian=products[:n, :n],
+        spread=noise + effects @ effect_covariance @ effects.T,
+        score=products[:n, -1],
+        discrepancy=products[:n, n:n_shared],
+    )
 
 
 def _learnt_responses(data: Linearised, numbers: ErrorModel, n: int) -> list[Response]:
@@ -205,9 +221,9 @@ def _effects(
     data: Linearised, numbers: ErrorModel, z: Array
 ) -> tuple[dict[str, dict[str, tuple[float, float]]], dict[str, float]]:
     """Return the effects of each log with their sd, and the spread of each kind."""
-    found, out = information(numbers, data.logs, z), {}
+    posterior, out = information(numbers, data.logs, z), {}
     spreads = dict.fromkeys(data.kinds[data.n_responses :], 0.0)
-    for log, names, (mean, covariance) in zip(data.logs, data.own, found.own):
+    for log, names, (mean, covariance) in zip(data.logs, data.effects, posterior.effects):
         scale = numbers.scale(log.kind[data.n_shared :])
         rows = zip(names, scale * mean, scale * np.sqrt(np.diag(covariance)))
         out[log.name] = {name: (float(base + m * s), float(d * s)) for (name, s, base), m, d in rows if name}

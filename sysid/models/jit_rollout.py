@@ -202,7 +202,9 @@ def _interp(x: Any, places: Sequence[float], values: Sequence[float]) -> Any:
     """Return a table's value: its first, and what each piece between two of its places adds."""
     wide, high = np.diff(places).tolist(), np.diff(values).tolist()
     pieces = zip(places, wide, high)
-    return values[0] + sum(h / w * _minimum(_maximum(x - at, 0.0), w) for at, w, h in pieces)
+    return values[0] + sum(
+        height / width * _minimum(_maximum(x - place, 0.0), width) for place, width, height in pieces
+    )
 
 
 _OWN: dict[Any, Callable[..., Any]] = {
@@ -379,15 +381,17 @@ class Kernel:
         rollout of each block, and what these point to besides."""
         batch, n = len(arrays[0]), arrays[1].shape[1]
         n_block = -(-batch // WIDTH)
-        own = (arrays[0][0].size, *(a[0].size if len(a) > 1 else 0 for a in arrays[1:]))
-        begin = _entries(batch, own if batch > 1 else (0,) * 4)
+        entries = (arrays[0][0].size, *(a[0].size if len(a) > 1 else 0 for a in arrays[1:]))
+        begin = _entries(batch, entries if batch > 1 else (0,) * 4)
         y = np.empty((self._n_y, n + 1, n_block * WIDTH))
         x_end = np.empty((arrays[0].shape[1], n_block * WIDTH))
-        *given, to_y, to_end, to_moved, to_begin = (a.ctypes.data for a in (*arrays, y, x_end, moved, begin))
+        *addresses, to_y, to_end, to_moved, to_begin = (
+            a.ctypes.data for a in (*arrays, y, x_end, moved, begin)
+        )
         into = [
             (to_begin + k * begin[0].nbytes, to_y + k * BYTES, to_end + k * BYTES) for k in range(n_block)
         ]
-        calls = [(*given, *places, n, n_block * WIDTH, pieces, h, to_moved) for places in into]
+        calls = [(*addresses, *places, n, n_block * WIDTH, pieces, h, to_moved) for places in into]
         return y.transpose(2, 1, 0)[:batch], x_end.T[:batch], calls, begin
 
 
@@ -462,36 +466,36 @@ class _Writer:
         self._write()
 
     def _write(self) -> None:
-        at, steps = self.at, self.equations
+        builder, steps = self.at, self.equations
         n_x, n_u, n_d, n_p = steps.sizes
         head, renew, step, done = (
             self.function.append_basic_block(name) for name in ("head", "renew", "step", "done")
         )
         c = steps.prepare(self._row(3, n_p))
         first = self._row(0, n_x)
-        rows = at.add(self.n, INTEGER(1))
-        entry = at.block
+        rows = builder.add(self.n, INTEGER(1))
+        entry = builder.block
         self.n_y = self._put(steps.read(first, c), self.y, INTEGER(0), rows)
-        at.branch(head)
+        builder.branch(head)
 
-        at.position_at_end(head)
-        begin, state = at.phi(INTEGER), [at.phi(VECTOR) for _ in first]
-        at.cbranch(at.icmp_signed("<", begin, self.n), renew, done)
+        builder.position_at_end(head)
+        begin, state = builder.phi(INTEGER), [builder.phi(VECTOR) for _ in first]
+        builder.cbranch(builder.icmp_signed("<", begin, self.n), renew, done)
 
-        at.position_at_end(renew)
-        kept = steps.renew(self._row(1, n_u, begin), c, self.h)
-        at.branch(step)
+        builder.position_at_end(renew)
+        switched = steps.renew(self._row(1, n_u, begin), c, self.h)
+        builder.branch(step)
 
-        at.position_at_end(step)
-        t, piece, x = at.phi(INTEGER), at.phi(INTEGER), [at.phi(VECTOR) for _ in first]
+        builder.position_at_end(step)
+        t, piece, x = builder.phi(INTEGER), builder.phi(INTEGER), [builder.phi(VECTOR) for _ in first]
         u, d = self._row(1, n_u, t), self._row(2, n_d, t)
-        later = steps.advance([Vector(at, item) for item in x], u, d, c, kept, self.h)
-        after, count = at.add(t, INTEGER(1)), at.add(piece, INTEGER(1))
+        later = steps.advance([Vector(builder, item) for item in x], u, d, c, switched, self.h)
+        after, count = builder.add(t, INTEGER(1)), builder.add(piece, INTEGER(1))
         self._put(steps.read(later, c), self.y, after, rows)  # the last piece has the last word
-        last = at.icmp_signed(">=", count, self.pieces if self.in_pieces else INTEGER(1))
-        moved = at.icmp_signed("!=", at.load(at.gep(self.moved, [after])), BYTE(0))
-        following = at.select(last, after, t), at.select(last, INTEGER(0), count)
-        at.cbranch(at.and_(last, moved), head, step)
+        last = builder.icmp_signed(">=", count, self.pieces if self.in_pieces else INTEGER(1))
+        moved = builder.icmp_signed("!=", builder.load(builder.gep(self.moved, [after])), BYTE(0))
+        following = builder.select(last, after, t), builder.select(last, INTEGER(0), count)
+        builder.cbranch(builder.and_(last, moved), head, step)
 
         for phi, came, value in zip([begin, *state], [INTEGER(0), *first], [after, *later], strict=True):
             phi.add_incoming(register(came), entry)
@@ -502,9 +506,9 @@ class _Writer:
             phi.add_incoming(register(came), renew)
             phi.add_incoming(register(value), step)
 
-        at.position_at_end(done)
+        builder.position_at_end(done)
         self._put(state, self.x_end, INTEGER(0), INTEGER(1))
-        at.ret_void()
+        builder.ret_void()
 
     def _places(self, array: Any, begin: Any, k: int) -> list[Any]:
         """Return where each member begins in an array."""

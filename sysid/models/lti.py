@@ -29,9 +29,9 @@ if TYPE_CHECKING:
 def evaluate_terms(terms: Sequence[str], names: Sequence[str], rows: Array) -> Array:
     """Return the products ``terms`` of the columns ``names``."""
     out = np.ones((*rows.shape[:-1], len(terms)))
-    for at, factors in enumerate(read_terms(terms, names)):
+    for column, factors in enumerate(read_terms(terms, names)):
         for index, magnitude in factors:
-            out[..., at] *= np.abs(rows[..., index]) if magnitude else rows[..., index]
+            out[..., column] *= np.abs(rows[..., index]) if magnitude else rows[..., index]
     return out
 
 
@@ -88,8 +88,8 @@ def switched_states(A: Array, switched: Mapping[str, tuple[Array, Array]], push:
     x = np.empty((n_batch, n + 1, n_x))
     x[:, 0] = x0
     for begin, end in zip([0, *edges], [*edges, n]):
-        here = A + sum((on[0, begin] * matrix for on, matrix in switched.values()), 0.0 * A)
-        x[:, begin : end + 1] = scan_states(here, push[:, begin:end], x[:, begin])
+        A_now = A + sum((on[0, begin] * matrix for on, matrix in switched.values()), 0.0 * A)
+        x[:, begin : end + 1] = scan_states(A_now, push[:, begin:end], x[:, begin])
     return x
 
 
@@ -133,15 +133,17 @@ def product_of(factors: Sequence[tuple[int, bool]], u: Values, d: Values, n_u: i
     """Return one product of inputs and disturbances in plain arithmetic (numbers or symbols)."""
     value: Any = 1.0
     for index, magnitude in factors:
-        part = u[index] if index < n_u else d[index - n_u]
-        value = value * (abs(part) if magnitude else part)
+        signal = u[index] if index < n_u else d[index - n_u]
+        value = value * (abs(signal) if magnitude else signal)
     return value
 
 
 def join_columns(u: Array, d: Array) -> Array:
     """Return u and d side by side in the last axis, batches broadcast against each other."""
     shape = np.broadcast_shapes(u.shape[:-1], d.shape[:-1])
-    return np.concatenate([np.broadcast_to(part, (*shape, part.shape[-1])) for part in (u, d)], axis=-1)
+    return np.concatenate(
+        [np.broadcast_to(columns, (*shape, columns.shape[-1])) for columns in (u, d)], axis=-1
+    )
 
 
 def whole_steps(dt: float, own: float) -> int:
@@ -167,18 +169,18 @@ def estimate_starts(
     """Return the start for each prior."""
     n_y = y.shape[1]
     first = y[np.argmax(np.isfinite(y), axis=0), np.arange(n_y)]  # NaN where a channel is lost
-    rest = model.rest(first, u.mean(axis=0), d.mean(axis=0), ())
-    known = np.isfinite(y)
-    if not known.any():
-        return np.tile(rest, (len(priors), 1)), np.zeros((len(priors), n_y))
+    x_rest = model.rest(first, u.mean(axis=0), d.mean(axis=0), ())
+    is_read = np.isfinite(y)
+    if not is_read.any():
+        return np.tile(x_rest, (len(priors), 1)), np.zeros((len(priors), n_y))
     root = covariance_root(model.spread)
-    seen = model.rollout(np.vstack([rest, rest + root.T]), u[None], d[None], (), dt)[0][:, :-1]
-    if not np.isfinite(seen).all():  # equations that diverge within the warm-up
-        return np.tile(rest, (len(priors), 1)), np.zeros((len(priors), n_y))
-    weight = np.broadcast_to(1 / scale, y.shape)[known]
-    by_state = (seen[1:] - seen[0])[:, known].T * weight[:, None]
-    by_offset = np.broadcast_to(np.eye(n_y), (len(y), n_y, n_y))[known] * (scale * weight[:, None])
-    miss = (y - seen[0])[known] * weight
+    runs = model.rollout(np.vstack([x_rest, x_rest + root.T]), u[None], d[None], (), dt)[0][:, :-1]
+    if not np.isfinite(runs).all():  # equations that diverge within the warm-up
+        return np.tile(x_rest, (len(priors), 1)), np.zeros((len(priors), n_y))
+    weight = np.broadcast_to(1 / scale, y.shape)[is_read]
+    by_state = (runs[1:] - runs[0])[:, is_read].T * weight[:, None]
+    by_offset = np.broadcast_to(np.eye(n_y), (len(y), n_y, n_y))[is_read] * (scale * weight[:, None])
+    miss = (y - runs[0])[is_read] * weight
     r, q = (np.array([getattr(prior, name) for prior in priors]) for name in ("noise", "nuisance"))
     n, n_s = len(miss), root.shape[1]
     # the prior as rows of their own: squares of a nearly unstable model's slopes would swamp it
@@ -189,4 +191,4 @@ def estimate_starts(
     orthogonal, triangle = np.linalg.qr(rows)
     right = np.einsum("bnk,n->bk", orthogonal[:, :n], miss) / r[:, None]
     z = np.linalg.solve(triangle, right[:, :, None])[:, :, 0]
-    return rest + z[:, :n_s] @ root.T, q[:, None] * scale * z[:, n_s:]
+    return x_rest + z[:, :n_s] @ root.T, q[:, None] * scale * z[:, n_s:]

@@ -193,14 +193,14 @@ def roll_rows(
 ) -> Run:
     """Do without a compiler what a compiled kernel does: the same lines on rows with one entry a member."""
     n_batch, n = len(x0), u.shape[1]
-    c, x, kept = steps.prepare(list(p.T)), list(x0.T.copy()), list[Any]()
+    c, x, switched = steps.prepare(list(p.T)), list(x0.T.copy()), list[Any]()
     u_rows, d_rows = list(u.transpose(1, 2, 0)), list(d.transpose(1, 2, 0))
     with np.errstate(all="ignore"):  # what is not finite is found afterwards
-        seen = [*steps.read(x, c)]
+        outputs = [*steps.read(x, c)]
         for t in range(n):
-            kept = steps.renew(u_rows[t], c, h) if renew is None or renew[t] else kept
+            switched = steps.renew(u_rows[t], c, h) if renew is None or renew[t] else switched
             for _ in range(pieces):
-                x = steps.advance(x, u_rows[t], d_rows[t], c, kept, h)
-            seen += steps.read(x, c)
-    y, last = ([np.broadcast_to(value, n_batch) for value in values] for values in (seen, x))
+                x = steps.advance(x, u_rows[t], d_rows[t], c, switched, h)
+            outputs += steps.read(x, c)
+    y, last = ([np.broadcast_to(value, n_batch) for value in values] for values in (outputs, x))
     return np.array(y, dtype=float).reshape(n + 1, -1, n_batch).transpose(2, 0, 1), np.array(last).T

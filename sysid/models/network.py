@@ -134,12 +134,12 @@ class ThermalSteps:
     def prepare(self, p: Values) -> list[Any]:
         """Return the coefficients: products of at most two parameters and a number."""
         c: list[Any] = []
-        for scale, left, right in self.layout.coefficients:
+        for scale, first, second in self.layout.coefficients:
             value = scale + 0.0 * p[0]
-            if left < self.n_p:
-                value = value * p[left]
-            if right < self.n_p:
-                value = value * p[right]
+            if first < self.n_p:
+                value = value * p[first]
+            if second < self.n_p:
+                value = value * p[second]
             c.append(value)
         return c
 
@@ -169,8 +169,8 @@ class ThermalSteps:
 
     def _outside(self, d: Values, c: Values) -> list[Any]:
         """Return the boundary temperatures: measured, then fixed."""
-        at, n_d = self.layout.at_fixed, self.layout.n_d
-        return [*(d[i] for i in range(n_d)), *c[at : at + self.layout.n_fixed]]
+        first_fixed, n_d = self.layout.at_fixed, self.layout.n_d
+        return [*(d[i] for i in range(n_d)), *c[first_fixed : first_fixed + self.layout.n_fixed]]
 
 
 def _conductances(u: Any, c: Any, layout: Layout) -> list[Any]:
@@ -207,21 +207,21 @@ def _heat(z: Any, u: Any, c: Any, g: Any, layout: Layout) -> list[Any]:
     for k, (i, by) in enumerate(layout.heaters):
         q[i] = q[i] + c[layout.at_heater + k] * u[by]
     for k, (face, sink, by, duty) in enumerate(layout.peltiers):
-        at = layout.at_peltier + len(PELTIER) * k
-        v = u[by] / c[at + 7] + c[at + 3]
-        v = v - 0.5 * (abs(v + c[at + 8]) - abs(v - c[at + 8]))
+        first = layout.at_peltier + len(PELTIER) * k
+        v = u[by] / c[first + 7] + c[first + 3]
+        v = v - 0.5 * (abs(v + c[first + 8]) - abs(v - c[first + 8]))
         size = abs(v)
-        up, down = c[at + 4] * 0.5 * (v + size), c[at + 5] * 0.5 * (v - size)
-        droop = c[at + 6] / DROOP_SPAN * (z[face] - z[sink])
+        up, down = c[first + 4] * 0.5 * (v + size), c[first + 5] * 0.5 * (v - size)
+        droop = c[first + 6] / DROOP_SPAN * (z[face] - z[sink])
         if duty:
-            on = c[at + 2] * (1.0 - droop)
+            on = c[first + 2] * (1.0 - droop)
             current, square = up * on, up * on * on
         else:
-            current = c[at + 2] * ((up + down) - droop * (up - down))
+            current = c[first + 2] * ((up + down) - droop * (up - down))
             square = current * current
         warm = 0.5 * (z[face] + z[sink]) - REFERENCE
-        pumped = c[at] * (1.0 + c[at + 9] * warm) * current
-        joule = 0.5 * c[at + 1] * (1.0 + c[at + 10] * warm) * square
+        pumped = c[first] * (1.0 + c[first + 9] * warm) * current
+        joule = 0.5 * c[first + 1] * (1.0 + c[first + 10] * warm) * square
         q[face] = q[face] + pumped * (z[face] + KELVIN) + joule
         q[sink] = q[sink] - pumped * (z[sink] + KELVIN) + joule
     return q
@@ -242,10 +242,10 @@ def _factors(c: Any, g: Any, gh: Any, layout: Layout) -> list[Any]:
             w[from_from] = w[from_from] + share
             w[from_to] = w[from_to] - share
     for pivot, below in zip(layout.order, layout.lower):
-        at = layout.diagonal[pivot]
-        w[at] = 1.0 / w[at]
+        diagonal = layout.diagonal[pivot]
+        w[diagonal] = 1.0 / w[diagonal]
         for entry, _, updates in below:
-            w[entry] = w[entry] * w[at]
+            w[entry] = w[entry] * w[diagonal]
             for to, by in updates:
                 w[to] = w[to] - w[entry] * w[by]
     return w
@@ -299,7 +299,7 @@ def build_layout(network: Network) -> Layout:
     states = state_names(network)
     index = {name: i for i, name in enumerate([*states, *network.disturbances, *network.boundaries])}
     links = _links(network, index)
-    parts: dict[str, list[Coefficient]] = {
+    groups: dict[str, list[Coefficient]] = {
         "capacity": _capacities(network),
         "fixed": [(1.0, (item.temperature,)) for item in network.boundaries.values()],
         "link": [link.value for link in links],
@@ -309,14 +309,14 @@ def build_layout(network: Network) -> Layout:
         "heater": [(1.0 / network.inputs[h.input].full_scale, (h.power,)) for h in network.heaters.values()],
         "peltier": [item for element in network.peltiers.values() for item in _peltier(network, element)],
     }
-    begin = dict(zip(parts, np.cumsum([0, *map(len, parts.values())]).tolist()))
+    begin = dict(zip(groups, np.cumsum([0, *map(len, groups.values())]).tolist()))
     inputs = list(network.inputs)
     return Layout(
         n_x=len(states),
         n_d=len(network.disturbances),
         n_fixed=len(network.boundaries),
-        **{f"at_{name}": at for name, at in begin.items() if name != "capacity"},
-        coefficients=tuple(_monomial(item, network) for part in parts.values() for item in part),
+        **{f"at_{name}": position for name, position in begin.items() if name != "capacity"},
+        coefficients=tuple(_monomial(item, network) for group in groups.values() for item in group),
         links=tuple((link.to, link.source, link.both, link.switch) for link in links),
         bent=tuple(k for k, link in enumerate(links) if link.bend is not None),
         radiation=tuple(_receiver(r.between, index, len(states)) for r in network.radiation.values()),
@@ -398,8 +398,8 @@ def _peltier(network: Network, element: Any) -> list[Coefficient]:
 def _monomial(item: Coefficient, network: Network) -> tuple[float, int, int]:
     scale, names = item
     places, one = list(network.parameters), len(network.parameters)  # the place of a factor 1
-    left, right = [*map(places.index, names), one, one][:2]
-    return scale, left, right
+    first, second = [*map(places.index, names), one, one][:2]
+    return scale, first, second
 
 
 def _receiver(between: list[str], index: Mapping[str, int], n_x: int) -> tuple[int, int]:
@@ -418,7 +418,7 @@ def elimination(n: int, links: list[tuple[int, int, bool]]) -> dict[str, Any]:
                 pattern[source].add(to)
     order = _minimum_degree(pattern)
     places = [(row, column) for row in range(n) for column in sorted(pattern[row])]
-    entry = {at: k for k, at in enumerate(places)}
+    entry = {place: k for k, place in enumerate(places)}
     lower, upper = _play(order, pattern, entry)
     return {
         "place": tuple(
@@ -440,18 +440,18 @@ def elimination(n: int, links: list[tuple[int, int, bool]]) -> dict[str, Any]:
 
 def _minimum_degree(pattern: list[set[int]]) -> list[int]:
     """Return the order that eliminates the state with the fewest neighbours first."""
-    near = [set() for _ in pattern]  # type: list[set[int]]
+    neighbours = [set() for _ in pattern]  # type: list[set[int]]
     for i, row in enumerate(pattern):
         for j in row - {i}:
-            near[i].add(j)
-            near[j].add(i)
-    order, left = [], set(range(len(pattern)))
-    while left:
-        pivot = min(left, key=lambda i: (len(near[i]), i))
-        left.remove(pivot)
+            neighbours[i].add(j)
+            neighbours[j].add(i)
+    order, remaining = [], set(range(len(pattern)))
+    while remaining:
+        pivot = min(remaining, key=lambda i: (len(neighbours[i]), i))
+        remaining.remove(pivot)
         order.append(pivot)
-        for i in near[pivot]:
-            near[i] = (near[i] | near[pivot]) - {i, pivot}
+        for i in neighbours[pivot]:
+            neighbours[i] = (neighbours[i] | neighbours[pivot]) - {i, pivot}
     return order
 
 
@@ -542,17 +542,17 @@ class NetworkModel(Described):
         low, high = low / full, high / full
         z = np.concatenate([np.full(self.n_x, level), np.clip(u[moved] / full, low, high)])
         z, ahead = np.tile(z, (len(p), 1)), 1e-4 * np.eye(len(z))
-        left = np.arange(len(p))  # each until it has settled by itself, whoever is beside it
+        unsettled = np.arange(len(p))  # each until it has settled by itself, whoever is beside it
         for _ in range(8):  # bilinear and T^4 at most: Gauss-Newton settles in three or four
-            at = z[left]
-            around = np.concatenate([at[:, None], at[:, None] + ahead], axis=1)
-            rows = self._rest_residuals(around, y, u, d, p[left], moved, full)
+            z_now = z[unsettled]
+            around = np.concatenate([z_now[:, None], z_now[:, None] + ahead], axis=1)
+            rows = self._rest_residuals(around, y, u, d, p[unsettled], moved, full)
             slopes = (rows[:, 1:] - rows[:, :1]).transpose(0, 2, 1) / 1e-4
-            move = _bounded_moves(slopes, rows[:, 0], at[:, self.n_x :], low, high)
-            z[left] = at + move
-            z[left, self.n_x :] = np.clip(z[left, self.n_x :], low, high)
-            left = left[~(np.abs(move).max(axis=1) < 1e-6)]
-            if not left.size:
+            move = _bounded_moves(slopes, rows[:, 0], z_now[:, self.n_x :], low, high)
+            z[unsettled] = z_now + move
+            z[unsettled, self.n_x :] = np.clip(z[unsettled, self.n_x :], low, high)
+            unsettled = unsettled[~(np.abs(move).max(axis=1) < 1e-6)]
+            if not unsettled.size:
                 break
         return np.asarray(z[:, : self.n_x])
 
@@ -564,18 +564,18 @@ class NetworkModel(Described):
         x, v = z[..., : self.n_x], z[..., self.n_x :]
         states = list(np.moveaxis(x, -1, 0))
         inputs: list[Any] = list(u)
-        for at, i in enumerate(moved):
-            inputs[i] = v[..., at] * full[at]
+        for share, i in enumerate(moved):
+            inputs[i] = v[..., share] * full[share]
         flow = self.flows(states, inputs, list(d), list(p.T[:, :, None]))
-        known = np.isfinite(y)
+        is_read = np.isfinite(y)
         read = np.stack(self.output(states, ()), axis=-1)
-        parts = [
+        residuals = [
             np.stack(flow, axis=-1),
-            _SENSOR_WEIGHT * (read - y)[..., known],
+            _SENSOR_WEIGHT * (read - y)[..., is_read],
             _INPUT_WEIGHT * (v - u[moved] / full),
             _LEVEL_WEIGHT * (x - np.nanmean(y)),
         ]
-        return np.concatenate(parts, axis=-1)
+        return np.concatenate(residuals, axis=-1)
 
     def rollout(self, x0: ArrayLike, u: ArrayLike, d: ArrayLike, p: ArrayLike, dt: float) -> Run:
         """Simulate a batch."""
@@ -655,8 +655,8 @@ def _bounded_moves(jacobian: Array, residual: Array, v: Array, low: Array, high:
     for k in np.flatnonzero(outside.any(axis=1)):
         move, beyond = moves[k], np.append(np.zeros(first, dtype=bool), outside[k])
         move[first:] = np.clip(wanted[k], low, high) - v[k]
-        left = residual[k] + jacobian[k][:, beyond] @ move[beyond]
-        move[~beyond] = np.linalg.lstsq(jacobian[k][:, ~beyond], -left, rcond=None)[0]
+        remaining = residual[k] + jacobian[k][:, beyond] @ move[beyond]
+        move[~beyond] = np.linalg.lstsq(jacobian[k][:, ~beyond], -remaining, rcond=None)[0]
     return np.asarray(moves)
 
 

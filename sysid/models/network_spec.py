@@ -296,7 +296,7 @@ def network_from_dict(content: Mapping[str, Any], *, file: str | None = None) ->
         network = Network.model_validate(dict(content))
     except ValidationError as error:
         first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"])
+        where = ".".join(str(key) for key in first["loc"])
         text = first["msg"].removeprefix("Value error, ")
         raise UserError(f"{where}: {text}", file=file, hint="see 'thermogrip init network'") from error
     for problem, hint in _faults(network):
@@ -331,12 +331,12 @@ def _faults(network: Network) -> Iterator[tuple[str, str]]:
 
 
 def _name_faults(network: Network) -> Iterator[tuple[str, str]]:
-    seen: dict[str, str] = {}
+    group_of: dict[str, str] = {}
     for group in ("inputs", "disturbances", "outputs", "nodes", "boundaries", "pipes"):
         for name in getattr(network, group):
-            if name in seen:
-                yield f"{group}.{name}: the name is in {seen[name]} too", "give each its own name"
-            seen[name] = group
+            if name in group_of:
+                yield f"{group}.{name}: the name is in {group_of[name]} too", "give each its own name"
+            group_of[name] = group
 
 
 #: Where elements name something: table, keys, and of what; a place is a node, a disturbance or a boundary.
@@ -360,21 +360,21 @@ def _references(network: Network) -> Iterator[tuple[str, str, list[str]]]:
     for group, keys, kind in _REFERENCES:
         for name, element in getattr(network, group).items():
             for key in keys:
-                found = getattr(element, {"from": "source", "to": "target"}.get(key, key))
-                if found is not None:
-                    yield f"{group}.{name}.{key}", kind, found if isinstance(found, list) else [found]
+                named = getattr(element, {"from": "source", "to": "target"}.get(key, key))
+                if named is not None:
+                    yield f"{group}.{name}.{key}", kind, named if isinstance(named, list) else [named]
 
 
 def _reference_faults(network: Network) -> Iterator[tuple[str, str]]:
     outside = [*network.disturbances, *network.boundaries]
     switches = [name for name, item in network.inputs.items() if item.switch]
-    known = {"place": [*network.nodes, *outside], "node": [*network.nodes], "switch": switches}
-    known["input"] = [*network.inputs]
+    candidates = {"place": [*network.nodes, *outside], "node": [*network.nodes], "switch": switches}
+    candidates["input"] = [*network.inputs]
     for where, kind, names in _references(network):
         for name in names:
-            if name not in known[kind]:
-                what = "node" if kind == "place" else kind
-                yield f"{where}: no {what} {name!r}", known_names(name, known[kind], "there are {}")
+            if name not in candidates[kind]:
+                lacking = "node" if kind == "place" else kind
+                yield f"{where}: no {lacking} {name!r}", known_names(name, candidates[kind], "there are {}")
         if len(names) == 2 and (names[0] == names[1] or set(names) <= set(outside)):
             yield f"{where}: joins {names[0]} and {names[1]}", "join two places, one of them a node"
 

@@ -124,10 +124,10 @@ class NeuralModel(BlackBox):
         w = np.clip(w, -self.reach, self.reach)
         n_u, members, n = len(self.inputs), len(self.A), self.A.shape[1]
         moved = [i for i in range(n_u) if self.inputs[i] not in self.switches]
-        known = np.flatnonzero(np.isfinite(y))
-        free = [i for i in range(n) if i not in known] + [n + i for i in moved]
+        is_read = np.flatnonzero(np.isfinite(y))
+        free = [i for i in range(n) if i not in is_read] + [n + i for i in moved]
         z = np.tile(np.concatenate([np.zeros(n), w]), (members, 1))
-        z[:, known] = y[known]
+        z[:, is_read] = y[is_read]
         weight = np.where(np.array(free) < n, 1e-4, 1e-2)
 
         def misfit(z: Array) -> Array:
@@ -137,10 +137,10 @@ class NeuralModel(BlackBox):
         for _ in range(12 if free else 0):
             miss = misfit(z)
             slopes = np.empty((*miss.shape, len(free)))
-            for at, column in enumerate(free):
+            for slope, column in enumerate(free):
                 beside = z.copy()
                 beside[:, column] += 1e-5
-                slopes[:, :, at] = (misfit(beside) - miss) / 1e-5
+                slopes[:, :, slope] = (misfit(beside) - miss) / 1e-5
             step = np.stack([np.linalg.lstsq(J, -r, rcond=None)[0] for J, r in zip(slopes, miss)])
             z[:, free] += np.clip(step, -1.0, 1.0)
         return np.asarray(z[:, :n]).ravel()
@@ -156,7 +156,7 @@ class NeuralModel(BlackBox):
             run_outputs(self.A, weights, self.b.shape[1], x0[rows], w, *rails)
             for rows, w in zip(together, drives)
         ]
-        y, x_end = runs[0] if len(runs) == 1 else (np.concatenate(parts) for parts in zip(*runs))
+        y, x_end = runs[0] if len(runs) == 1 else (np.concatenate(results) for results in zip(*runs))
         y = y[:, ::times]
         y *= self.y_size
         y += self.y_middle
@@ -180,8 +180,8 @@ class NeuralModel(BlackBox):
         times = max(1, round(dt / self.dt))  # the step of a gap may differ a little from the model's
         w = np.ascontiguousarray(np.repeat(w, times, axis=1))
         members = len(self.A)
-        parts = (self.B, self.c, self.V, self.W, self.U, self.b)
-        weights = np.hstack([part.reshape(members, -1) for part in parts])
+        matrices = (self.B, self.c, self.V, self.W, self.U, self.b)
+        weights = np.hstack([matrix.reshape(members, -1) for matrix in matrices])
         rails = (self.low - self.y_middle) / self.y_size, (self.high - self.y_middle) / self.y_size
         return list(w), times, weights, rails
 

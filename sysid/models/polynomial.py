@@ -124,7 +124,7 @@ class SindyModel(BlackBox):
     def equations(self) -> tuple[str, ...]:
         """Return one equation per output as text, in natural units."""
         past = ["" if lag == 0 else f"[k-{lag}]" for lag in range(self.memory)]
-        names = [f"{name}{at}" for at in past for name in self.outputs]
+        names = [f"{name}{lag_suffix}" for lag_suffix in past for name in self.outputs]
         names += [*self.inputs, *self.disturbances]
         return tuple(
             f"{name}[k+1] = {_text(row, self.exponents, names)}"
@@ -171,10 +171,10 @@ def _products(factors: NDArray[np.int_], x: Array) -> Array:
 
 
 def _text(row: Array, exponents: NDArray[np.int_], names: Sequence[str]) -> str:
-    parts = []
+    products = []
     for value, powers in zip(row, exponents):
         if value == 0:
             continue
         factors = [n if p == 1 else f"{n}^{p}" for n, p in zip(names, powers.tolist()) if p]
-        parts.append(" ".join([f"{value:.4g}", *factors]))
-    return " + ".join(parts).replace("+ -", "- ") or "0"
+        products.append(" ".join([f"{value:.4g}", *factors]))
+    return " + ".join(products).replace("+ -", "- ") or "0"

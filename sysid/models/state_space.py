@@ -120,7 +120,9 @@ class StateSpaceModel(BlackBox):
         now = [x[i] for i in range(self.n_x)]
         for _ in range(whole_steps(dt, self.dt)):
             now = [
-                _dot(self.A[i], now) + push[i] + sum(u[at] * _dot(matrix[i], now) for at, matrix in switched)
+                _dot(self.A[i], now)
+                + push[i]
+                + sum(u[input_index] * _dot(matrix[i], now) for input_index, matrix in switched)
                 for i in range(self.n_x)
             ]
         return now
@@ -145,9 +147,9 @@ class StateSpaceModel(BlackBox):
             ]
         )
         right = np.concatenate([push / scale, np.zeros(n_v + self.n_x)])
-        known = np.isfinite(y)
-        fixed = np.hstack([self.C[known], np.zeros((int(known.sum()), n_v))])
-        return constrained_lstsq(rows, right, fixed, (y - self.y0)[known])[: self.n_x]
+        is_read = np.isfinite(y)
+        fixed = np.hstack([self.C[is_read], np.zeros((int(is_read.sum()), n_v))])
+        return constrained_lstsq(rows, right, fixed, (y - self.y0)[is_read])[: self.n_x]
 
     def rollout(self, x0: ArrayLike, u: ArrayLike, d: ArrayLike, p: ArrayLike, dt: float) -> Run:
         """Simulate a batch, so many rows at a time that their states have :data:`_AT_ONCE` numbers."""
@@ -158,8 +160,8 @@ class StateSpaceModel(BlackBox):
             return x @ self.C.T + self.y0, x[:, -1]
         y = np.empty((len(x_end), u.shape[1] + 1, len(self.outputs)))
         for begin in range(0, u.shape[1], rows):
-            part = slice(begin, begin + rows)
-            x = self.states(x_end, u[:, part], d[:, part], dt)
+            block = slice(begin, begin + rows)
+            x = self.states(x_end, u[:, block], d[:, block], dt)
             y[:, begin : begin + x.shape[1]] = x @ self.C.T + self.y0
             x_end = x[:, -1]
         return y, x_end

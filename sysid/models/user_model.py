@@ -116,9 +116,9 @@ class OwnCode:
         self.limits = self._limits()
         self.dt = self._seconds("dt") or 1.0
         self.average, self.warmup = self._seconds("average"), self._seconds("warmup")
-        for what in ("outputs", "states", "parameters"):
-            if not getattr(self, what):
-                raise self.fault(f"has no {what}", hint=_REQUIRED[what])
+        for table in ("outputs", "states", "parameters"):
+            if not getattr(self, table):
+                raise self.fault(f"has no {table}", hint=_REQUIRED[table])
         self.X, self.U = _tuple("states", self.states), _tuple("inputs", self.inputs)
         self.D, self.P = _tuple("disturbances", self.disturbances), _tuple("parameters", self.parameters)
         self.Y = _tuple("outputs", self.outputs)
@@ -182,26 +182,26 @@ class OwnCode:
         """Return the line about an exception inside the user's function."""
         frames = [f for f in traceback.extract_tb(error.__traceback__) if f.filename == self.file]
         line = frames[-1].lineno if frames else None
-        said, hint = f"{type(error).__name__}: {error}", f"correct {what}"
+        problem, hint = f"{type(error).__name__}: {error}", f"correct {what}"
         fields = getattr(error.obj, "_fields", None) if isinstance(error, AttributeError) else None
         if isinstance(error, AttributeError) and fields is not None:
             group = type(error.obj).__name__
-            said = f"{error.name!r} is not among its {group}"
+            problem = f"{error.name!r} is not among its {group}"
             hint = f"they are {', '.join(fields)}" if fields else f"it has no {group}"
         elif isinstance(error, ValueError) and "truth value" in str(error):
-            said, hint = "an if about many values at once", "choose with np.where or np.maximum"
-        return self.fault(f"fails in {what}: {said}", line=line, hint=hint)
+            problem, hint = "an if about many values at once", "choose with np.where or np.maximum"
+        return self.fault(f"fails in {what}: {problem}", line=line, hint=hint)
 
     def _check_attributes(self) -> None:
         """Refuse a class that lacks something or seems to misspell it."""
         for name, example in _REQUIRED.items():
             if not hasattr(self.made, name):
                 raise self.fault(f"lacks {name}", hint=f"write {example}")
-        known = (*_REQUIRED, *_OPTIONAL)
+        attributes = (*_REQUIRED, *_OPTIONAL)
         for name in vars(type(self.made)):
-            near = difflib.get_close_matches(name, _OPTIONAL, n=1, cutoff=0.8)
-            if near and name not in known and not hasattr(self.made, near[0]):
-                raise self.fault(f"has {name!r}, which nothing reads", hint=f"call it {near[0]!r}")
+            close = difflib.get_close_matches(name, _OPTIONAL, n=1, cutoff=0.8)
+            if close and name not in attributes and not hasattr(self.made, close[0]):
+                raise self.fault(f"has {name!r}, which nothing reads", hint=f"call it {close[0]!r}")
         if not callable(self.made.rhs):
             raise self.fault("has an rhs that is not a function", hint=f"write {_REQUIRED['rhs']}")
 
@@ -223,9 +223,9 @@ class OwnCode:
                 out[name] = kind.model_validate(content)
             except ValidationError as error:
                 first = error.errors()[0]
-                key = ".".join(str(part) for part in first["loc"])
-                said = first["msg"].removeprefix("Value error, ")
-                raise self.fault(f"{what} {name}{': ' + key if key else ''}: {said}") from error
+                key = ".".join(str(key_part) for key_part in first["loc"])
+                problem = first["msg"].removeprefix("Value error, ")
+                raise self.fault(f"{what} {name}{': ' + key if key else ''}: {problem}") from error
         return out
 
     def _limits(self) -> dict[str, tuple[float, float]]:
@@ -373,7 +373,7 @@ def compile_steps(code: OwnCode) -> tuple[Kernel | None, str]:
 
 def still(code: OwnCode, y: Array, u: Array, d: Array, p: Array, *, sd: Array, seconds: float) -> Array:
     """Return the state (n_x,) at rest; it may be not finite where the class's functions are not."""
-    n_x, known = len(code.states), np.isfinite(y)
+    n_x, is_read = len(code.states), np.isfinite(y)
     scale = np.array(list(code.states.values()))
     ranges = [item.range for item in code.inputs.values()]
     wide = np.array([ends[1] - ends[0] if ends else 1.0 for ends in ranges])
@@ -384,7 +384,7 @@ def still(code: OwnCode, y: Array, u: Array, d: Array, p: Array, *, sd: Array, s
         x, v = z[:n_x] * scale, np.where(moved, z[n_x:] * wide, u)
         flow = seconds * np.array(code.rhs(list(x), list(v), list(d), list(p)), dtype=float)
         read = np.array(code.output(list(x), list(p)), dtype=float)
-        miss = (_SENSOR_WEIGHT * (read - y) / sd)[known]
+        miss = (_SENSOR_WEIGHT * (read - y) / sd)[is_read]
         return np.concatenate([flow / scale, miss, _INPUT_WEIGHT * (z[n_x:] - u / wide)])
 
     limits = [code.limits.get(name, (-np.inf, np.inf)) for name in code.states]
@@ -422,8 +422,8 @@ class OwnModel(Described):
         code = self.code
         super().__init__(code)
         self.states, self.n_x = tuple(code.states), len(code.states)
-        found = dict(self.sd or {})
-        self.sensor_sd = {name: item.sd or found.get(name, 1.0) for name, item in code.outputs.items()}
+        learnt_sd = dict(self.sd or {})
+        self.sensor_sd = {name: item.sd or learnt_sd.get(name, 1.0) for name, item in code.outputs.items()}
         self.average, self.warmup = code.average or 5 * self.dt, code.warmup or 50 * self.dt
         self.independent = 4 * self.average
         # no output defines a scale: a log that starts at rest is not recognised as such
@@ -456,11 +456,11 @@ class OwnModel(Described):
                 "no output has a reading to start from", hint="give a log whose first rows are read"
             )
         with np.errstate(all="ignore"):
-            own = self.code.rest(list(y), list(u), list(d), list(p))
+            class_rest = self.code.rest(list(y), list(u), list(d), list(p))
             x = (
                 still(self.code, y, u, d, p, sd=self._sensors, seconds=self.warmup)
-                if own is None
-                else np.array(own, dtype=float)
+                if class_rest is None
+                else np.array(class_rest, dtype=float)
             )
         if not np.isfinite(x).all():
             lost = self.states[int(np.flatnonzero(~np.isfinite(x))[0])]
@@ -482,11 +482,11 @@ class OwnModel(Described):
         that is so already."""
         sd = {name: _SENSOR_SHARE * (spread[name] or 1.0) for name in self.outputs}
         model = replace(self, sd=sd)
-        at = self.prior if p is None else np.asarray(p, dtype=float)
-        runs, n = free_runs(model, at), model.pieces
+        p_tried = self.prior if p is None else np.asarray(p, dtype=float)
+        runs, n = free_runs(model, p_tried), model.pieces
         while n <= _MOST_PIECES:
             finer = replace(model, pieces=2 * n)
-            again = free_runs(finer, at)
+            again = free_runs(finer, p_tried)
             if model._agree(runs, again):
                 return self if (self.pieces, self.sd) == (n, sd) else model
             model, runs, n = finer, again, 2 * n

@@ -200,10 +200,13 @@ def _settled(plant: PlantData, u: Array, d: Array) -> Array:
     with np.errstate(all="ignore"):
         for _ in range(60):
             A, _ = _discrete(plant, x, u, d, [])
-            left = np.eye(x.size) - A
-            if not np.isfinite(left).all() or np.linalg.svd(left, compute_uv=False)[-1] < _INTEGRATES:
+            I_minus_A = np.eye(x.size) - A
+            if (
+                not np.isfinite(I_minus_A).all()
+                or np.linalg.svd(I_minus_A, compute_uv=False)[-1] < _INTEGRATES
+            ):
                 break
-            move = np.linalg.solve(left, _next(plant, x[None], u[None], d[None])[0] - x)
+            move = np.linalg.solve(I_minus_A, _next(plant, x[None], u[None], d[None])[0] - x)
             x = np.asarray(x + np.clip(move, -100.0, 100.0))
             if np.max(np.abs(move)) < 1e-7 * max(1.0, float(np.abs(x).max())):
                 return x
@@ -226,13 +229,13 @@ def _matrices(
     function: Callable[[Array, Array, Array], Array], x: Array, u: Array, d: Array, moved: Sequence[int]
 ) -> tuple[Array, Array]:
     """Return derivatives of function(x, u, d) by x, and by the moved inputs and the disturbances."""
-    at, n_x, n_u = np.concatenate([x, u, d]), x.size, u.size
+    point, n_x, n_u = np.concatenate([x, u, d]), x.size, u.size
     columns = [*range(n_x), *(n_x + k for k in moved), *(n_x + n_u + k for k in range(d.size))]
 
     def joined(z: Array) -> Array:
         return function(z[:, :n_x], z[:, n_x : n_x + n_u], z[:, n_x + n_u :])
 
-    both = _differences(joined, at, columns)
+    both = _differences(joined, point, columns)
     return both[:, :n_x], both[:, n_x:]
 
 
@@ -329,9 +332,9 @@ def to_control(
     >>> system.input_labels, system.output_labels, bool(max(system.poles().real) < 0)
     (['q1', 'q2'], ['t1', 't2'], True)
     """
-    near = linearise_plant(plant, inputs=inputs, disturbances=disturbances, state=state, dt=dt)
-    D = np.zeros((len(near.outputs), len(near.inputs)))
-    return control_system(near, (near.A, near.B, near.C, D, near.dt or 0), near.name)
+    linear = linearise_plant(plant, inputs=inputs, disturbances=disturbances, state=state, dt=dt)
+    D = np.zeros((len(linear.outputs), len(linear.inputs)))
+    return control_system(linear, (linear.A, linear.B, linear.C, D, linear.dt or 0), linear.name)
 
 
 def control_system(labels: Any, numbers: Sequence[Any], name: str) -> Any:
@@ -343,7 +346,7 @@ def control_system(labels: Any, numbers: Sequence[Any], name: str) -> Any:
         raise UserError("control is not installed", hint=hint) from error
     return control.StateSpace(
         *numbers,
-        **{what: list(getattr(labels, what)) for what in ("inputs", "outputs", "states")},
+        **{group: list(getattr(labels, group)) for group in ("inputs", "outputs", "states")},
         name=name,
         remove_useless_states=False,
     )
@@ -376,11 +379,11 @@ def to_scipy(
     """
     from scipy import signal
 
-    near: LinearPlant = linearise_plant(plant, inputs=inputs, disturbances=disturbances, state=state, dt=dt)
-    D = np.zeros((len(near.outputs), len(near.inputs)))
+    linear: LinearPlant = linearise_plant(plant, inputs=inputs, disturbances=disturbances, state=state, dt=dt)
+    D = np.zeros((len(linear.outputs), len(linear.inputs)))
     if dt is None:
-        return signal.StateSpace(near.A, near.B, near.C, D)
-    return signal.StateSpace(near.A, near.B, near.C, D, dt=dt)
+        return signal.StateSpace(linear.A, linear.B, linear.C, D)
+    return signal.StateSpace(linear.A, linear.B, linear.C, D, dt=dt)
 
 
 def to_casadi(plant: PlantData, *, dt: float | None = None) -> Any:

@@ -150,8 +150,8 @@ class Grid:
     def ranges(self) -> dict[str, tuple[float, float]]:
         """Return the least and greatest value of each signal."""
         out: dict[str, tuple[float, float]] = {}
-        for part, labels in (("u", self.inputs), ("d", self.disturbances), ("y", self.outputs)):
-            rows = np.concatenate([getattr(segment, part) for segment in self.segments])
+        for field_name, labels in (("u", self.inputs), ("d", self.disturbances), ("y", self.outputs)):
+            rows = np.concatenate([getattr(segment, field_name) for segment in self.segments])
             out |= {
                 n: (float(np.nanmin(rows[:, i])), float(np.nanmax(rows[:, i]))) for i, n in enumerate(labels)
             }
@@ -173,14 +173,19 @@ def make_grid(
         raise UserError("no log to identify from", hint="give at least one")
     u, y, d = signals(logs, inputs=inputs, outputs=outputs, disturbances=disturbances)
     rows = [rows_of(log, u, y, d) for log in logs]
-    rows = [each.from_row_on() for each in rows] if ends else rows
-    native = float(np.median([each.step for each in rows]))
+    rows = [rows_of_log.from_row_on() for rows_of_log in rows] if ends else rows
+    native = float(np.median([rows_of_log.step for rows_of_log in rows]))
     step, why = _chosen_step(rows, y, native) if average is None else (float(average), "asked for")
     if step < native * 0.999:
         raise UserError(
             f"averaging over {step:g} s is shorter than the sample time {native:g} s", hint="average longer"
         )
-    segments = [part for each in rows for part in _segments(each, step, native) if len(part.time) >= min_rows]
+    segments = [
+        segment
+        for rows_of_log in rows
+        for segment in _segments(rows_of_log, step, native)
+        if len(segment.time) >= min_rows
+    ]
     if not segments:
         raise UserError(
             f"the logs are too short: no stretch has {min_rows} rows of {step:g} s",
@@ -188,7 +193,7 @@ def make_grid(
             hint="give a longer log or average less",
         )
     units = {name: str(logs[0][name].attrs.get("units", "1")) for name in (*u, *d, *y)}
-    moves = np.concatenate([each.u for each in rows]).T
+    moves = np.concatenate([rows_of_log.u for rows_of_log in rows]).T
     switches = tuple(n for n, on in zip(u, moves) if units[n] == "1" and np.isin(on, (0.0, 1.0)).all())
     switches = () if len(switches) == len(u) else switches  # a heater that is only on or off is what drives
     return Grid(u, d, y, switches, step, tuple(segments), native, units, why, ends)
@@ -218,8 +223,8 @@ def cut_stretches(plant: PlantData, log: Log, *, gaps: str = "mend") -> list[Str
         else:
             command[:] = np.trunc(command / step + 1e-9 * np.sign(command)) * step
     rows = replace(rows, after=()) if gaps == "hold" else rows
-    found = _stretches(rows, step=plant.dt, steps=steps, smooth=plant.model.smooth)
-    return [replace(stretch, time=stretch.time + middle) for stretch in found]
+    stretches = _stretches(rows, step=plant.dt, steps=steps, smooth=plant.model.smooth)
+    return [replace(stretch, time=stretch.time + middle) for stretch in stretches]
 
 
 def _stretches(
@@ -227,26 +232,29 @@ def _stretches(
 ) -> Iterator[Stretch]:
     """Yield stretches of two rows or more on a grid of ``step`` [s], ``steps(length [s])`` each."""
     for begin, end in pairwise([0, *rows.after, rows.time.size]):
-        part, t = slice(begin, end), rows.time[begin:end]
+        in_stretch, t = slice(begin, end), rows.time[begin:end]
         n = steps(t[-1] - t[0])
         if n < 1:
             continue
         edges = t[0] + step * np.arange(n + 1)
-        held = held_means(t, rows.u[part], edges)
+        input_means = held_means(t, rows.u[in_stretch], edges)
         if smooth is None:
-            beside = held_means(t, rows.d[part], edges)
+            disturbance_means = held_means(t, rows.d[in_stretch], edges)
         else:
-            beside = _smooth(t, rows.d[part], edges, smooth)
+            disturbance_means = _smooth(t, rows.d[in_stretch], edges, smooth)
         gap = min(float(t[0] - rows.time[begin - 1]), _LONGEST_GAP * step) if begin else 0.0
-        yield Stretch(part, t - t[0], rows.y[part], held, beside, gap, rows.log)
+        yield Stretch(in_stretch, t - t[0], rows.y[in_stretch], input_means, disturbance_means, gap, rows.log)
 
 
 def at_rows(stretch: Stretch, run: Array, dt: float) -> Array:
     """Interpolate a run (B, N + 1, n_y) on the grid to the stretch's rows: (B, n, n_y)."""
     place = np.clip(stretch.time / dt, 0.0, run.shape[1] - 1)
-    left = np.minimum(place.astype(int), run.shape[1] - 2)
-    share = (place - left)[None, :, None]
-    out, after = run[:, left], run[:, left + 1]  # in place: a run may be long, and a batch large
+    cell_before = np.minimum(place.astype(int), run.shape[1] - 2)
+    share = (place - cell_before)[None, :, None]
+    out, after = (
+        run[:, cell_before],
+        run[:, cell_before + 1],
+    )  # in place: a run may be long, and a batch large
     out *= 1 - share
     after *= share
     out += after
@@ -257,8 +265,8 @@ def bridge(y: Array) -> Array:
     """Return readings (n, n_y) whose inner holes of up to :data:`BRIDGED` rows lie on a line."""
     out = y.copy()
     for i in range(y.shape[1]):
-        known = np.flatnonzero(np.isfinite(y[:, i]))
-        for before, after in pairwise(known.tolist()):
+        read_rows = np.flatnonzero(np.isfinite(y[:, i]))
+        for before, after in pairwise(read_rows.tolist()):
             if after - before <= BRIDGED + 1:
                 out[before : after + 1, i] = np.linspace(y[before, i], y[after, i], after - before + 1)
     return out
@@ -348,9 +356,11 @@ def dominant_time(logs: Sequence[Rows]) -> float:
     longest = max(float(np.ptp(rows.time)) for rows in logs)
     native = max(rows.step for rows in logs)
     steps = [max(step, native) for step in (longest / 400, longest / 150)]
-    parts = [(part, step) for step in steps for rows in logs for part in _segments(rows, step, native)]
-    found = [time for part, step in parts for time in _first_order_times(part, step)]
-    return float(np.median(found)) if found else longest / 20
+    segments = [
+        (segment, step) for step in steps for rows in logs for segment in _segments(rows, step, native)
+    ]
+    time_constants = [time for segment, step in segments for time in _first_order_times(segment, step)]
+    return float(np.median(time_constants)) if time_constants else longest / 20
 
 
 def _chosen_step(logs: Sequence[Rows], outputs: Sequence[str], native: float) -> tuple[float, str]:
@@ -384,14 +394,14 @@ def _segments(rows: Rows, step: float, native: float) -> list[Segment]:
         return n if n > 1 else 0
 
     out = []
-    own = abs(step - native) < 1e-6 * native
-    for part in _stretches(rows, step=step, steps=steps):
-        t = rows.time[part.rows]
-        if own and np.ptp(np.diff(t)) < 0.02 * native:  # the samples stand as they are
-            out.append(Segment(t, part.y, rows.u[part.rows], rows.d[part.rows], part.log))
+    is_native = abs(step - native) < 1e-6 * native
+    for stretch in _stretches(rows, step=step, steps=steps):
+        t = rows.time[stretch.rows]
+        if is_native and np.ptp(np.diff(t)) < 0.02 * native:  # the samples stand as they are
+            out.append(Segment(t, stretch.y, rows.u[stretch.rows], rows.d[stretch.rows], stretch.log))
         else:
-            grid = t[0] + step * np.arange(len(part.u))
-            out.append(Segment(grid, _line_mean(t, part.y, grid, step), part.u, part.d, part.log))
+            grid = t[0] + step * np.arange(len(stretch.u))
+            out.append(Segment(grid, _line_mean(t, stretch.y, grid, step), stretch.u, stretch.d, stretch.log))
     return out
 
 
@@ -410,8 +420,8 @@ def _smooth(time: Array, values: Array, edges: Array, seconds: float) -> Array:
     half = max(seconds, edges[1] - edges[0]) / 2
     low, high = np.maximum(middle - half, edges[0]), np.minimum(middle + half, edges[-1])
     ends, place = np.unique(np.concatenate([low, high]), return_inverse=True)
-    parts = held_means(time, values, ends) * np.diff(ends)[:, None]
-    area = np.vstack([np.zeros(parts.shape[1]), np.cumsum(parts, axis=0)])[place]
+    integrals = held_means(time, values, ends) * np.diff(ends)[:, None]
+    area = np.vstack([np.zeros(integrals.shape[1]), np.cumsum(integrals, axis=0)])[place]
     return np.asarray((area[len(low) :] - area[: len(low)]) / (high - low)[:, None])
 
 
@@ -419,8 +429,8 @@ def _line_mean(t: Array, values: Array, grid: Array, step: float) -> Array:
     """Mean over [t_k - step/2, t_k + step/2] of the line through the finite samples, NaN without any."""
     out = np.full((grid.size, values.shape[1]), np.nan)
     for i in range(values.shape[1]):
-        known = np.isfinite(values[:, i])
-        s, v = t[known], values[known, i]
+        is_read = np.isfinite(values[:, i])
+        s, v = t[is_read], values[is_read, i]
         if s.size < 2:
             continue
         half = np.minimum(step / 2, np.maximum(np.minimum(grid - s[0], s[-1] - grid), 0))
@@ -517,32 +527,36 @@ def moved_beside(model: Signals, log: Log) -> list[str]:
 def match_logs(model: Signals, logs: Logs, *, keep_others: bool = False) -> tuple[list[Log], list[str]]:
     """Return logs in the model's roles and units (one that fits is returned itself), and what was converted
     or taken as 0, a line a column."""
-    known, said = roles_of(model), dict[str, None]()
-    logs = as_logs(logs, known=known)
-    for at, log in enumerate(logs):
+    role_of, conversions = roles_of(model), dict[str, None]()
+    logs = as_logs(logs, known=role_of)
+    for index, log in enumerate(logs):
         for name in inputs_off(model, log):
             unit = model.units.get(name, "1")
             attrs = {"units": unit, "role": "input"}
-            logs[at] = logs[at].assign({name: ("time", np.zeros(log.sizes["time"]), attrs)})
-            said[f"{name}: no such column, taken as 0{'' if unit == '1' else f' {unit}'} throughout"] = None
+            logs[index] = logs[index].assign({name: ("time", np.zeros(log.sizes["time"]), attrs)})
+            conversions[
+                f"{name}: no such column, taken as 0{'' if unit == '1' else f' {unit}'} throughout"
+            ] = None
     matched = list(logs)
-    largest = {name: _largest([column(log, name) for log in logs]) for name in known}
-    for at, log in enumerate(logs):
+    largest = {name: _largest([column(log, name) for log in logs]) for name in role_of}
+    for index, log in enumerate(logs):
         changed = {}
-        for name in known:
-            found = _converted(model, name, log[name].attrs.get("units", "1"), largest[name], log_name(log))
-            if found is not None:
-                changed[name] = column(log, name) * found[0]
-                said[found[1]] = None
+        for name in role_of:
+            conversion = _converted(
+                model, name, log[name].attrs.get("units", "1"), largest[name], log_name(log)
+            )
+            if conversion is not None:
+                changed[name] = column(log, name) * conversion[0]
+                conversions[conversion[1]] = None
         roles = {str(n): str(item.attrs.get("role")) if keep_others else "other" for n, item in log.items()}
-        roles |= known
+        roles |= role_of
         if changed or any(item.attrs.get("role") != roles[str(n)] for n, item in log.items()):
-            matched[at] = log.copy()
+            matched[index] = log.copy()
             for name, role in roles.items():
                 attrs = log[name].attrs | {"role": role}
                 attrs |= {"units": model.units[name]} if name in changed else {}
-                matched[at][name] = ("time", changed.get(name, log[name].values), attrs)
-    return matched, list(said)
+                matched[index][name] = ("time", changed.get(name, log[name].values), attrs)
+    return matched, list(conversions)
 
 
 def _converted(model: Signals, name: str, unit: str, largest: float, log: str) -> tuple[float, str] | None:

@@ -186,11 +186,11 @@ class Plant(Shown, plant_data.PlantData):
             with np.errstate(over="ignore", invalid="ignore"):  # a run that diverges is infinite, an answer
                 starts = find_starts(self, self.p, stretches, warmup)
                 runs = predict(self.model, self.dt, self.p[None], stretches, starts)
-                at = [at_rows(stretch, run, self.dt)[0] for stretch, run in zip(stretches, runs)]
+                run_at_rows = [at_rows(stretch, run, self.dt)[0] for stretch, run in zip(stretches, runs)]
         except np.linalg.LinAlgError as error:
             hint = "identify the plant again"
             raise UserError("the plant's run is not finite", file=stretches[0].log, hint=hint) from error
-        return np.concatenate(at), starts
+        return np.concatenate(run_at_rows), starts
 
     def to_dict(self, *, draws: int | None = None) -> dict[str, Any]:
         """Return the whole plant as plain JSON, with so many posterior samples, evenly spread; with all where
@@ -201,8 +201,8 @@ class Plant(Shown, plant_data.PlantData):
         } | plant_data.plain_content(self)
         if self.samples is not None:
             content["draws"] = plant_data.thin(self.samples, draws).tolist()
-        kept: dict[str, Any] = json.loads(json.dumps(content, allow_nan=False))  # tuples become lists
-        return kept
+        plain: dict[str, Any] = json.loads(json.dumps(content, allow_nan=False))  # tuples become lists
+        return plain
 
     @classmethod
     def from_dict(cls, content: Mapping[str, Any], *, model: Model | None = None) -> Plant:
@@ -288,6 +288,6 @@ def _load_model(content: Mapping[str, Any], *, code: Model | None = None) -> Mod
     if code is not None and (kind != code.kind or not hasattr(code, "restored")):
         raise UserError(f"its model ({kind}) needs no class", hint="leave the class out")
     module, name = _MODELS[kind]
-    kept: Any = getattr(import_module(f"thermogrip.sysid.models.{module}"), name) if code is None else code
-    model: Model = kept.from_dict(content) if code is None else kept.restored(content)
+    reader: Any = getattr(import_module(f"thermogrip.sysid.models.{module}"), name) if code is None else code
+    model: Model = reader.from_dict(content) if code is None else reader.restored(content)
     return model

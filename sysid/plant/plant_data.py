@@ -109,12 +109,12 @@ class PlantData:
         """Return the measured disturbances (n_d,) where nobody reads them: ``nominal``, else ``ambient``
         [degC] for the room's temperature and the middle of the logs for another; NaN where none of these is
         known of what is no temperature."""
-        found = []
+        levels = []
         for name in self.disturbances:
             temperature = self.units.get(name, "degC") == "degC"
             otherwise = float(np.mean(self.valid.get(name, (ambient if temperature else np.nan,) * 2)))
-            found.append(self.nominal.get(name, ambient if self.is_room(name) else otherwise))
-        return np.array(found, dtype=np.float64)
+            levels.append(self.nominal.get(name, ambient if self.is_room(name) else otherwise))
+        return np.array(levels, dtype=np.float64)
 
     def with_medians(self, seen: Mapping[str, Array]) -> Self:
         """Return the plant with the medians of measured disturbances (n,) by name for nominal values, but for
@@ -334,10 +334,10 @@ def _numbers(
 def _covariance(content: Mapping[str, Any]) -> Array | None:
     if content["covariance"] is None:
         return None
-    found = array_within(content, "covariance", MOST_NUMBER)
-    if found.ndim != 2 or (np.diag(found) < 0).any():
+    covariance = array_within(content, "covariance", MOST_NUMBER)
+    if covariance.ndim != 2 or (np.diag(covariance) < 0).any():
         raise ValueError("covariance has a negative variance")
-    return found
+    return covariance
 
 
 def _valid(content: Mapping[str, Sequence[float | None]]) -> dict[str, tuple[float, float]]:

@@ -87,12 +87,12 @@ def predict(
     parameters."""
     out: list[Array] = []
     x_end = np.empty((len(p), model.n_x))
-    for at, (stretch, start) in enumerate(zip(stretches, starts)):
+    for index, (stretch, start) in enumerate(zip(stretches, starts)):
         d = stretch.d - start.d_offset
-        if at == 0:
+        if index == 0:
             x0 = _begin(model, p, stretch, start)
         else:
-            u_gap, d_gap, dt_gap = _through_gap(stretches[at - 1], stretch, start, [start.change], dt)
+            u_gap, d_gap, dt_gap = _through_gap(stretches[index - 1], stretch, start, [start.change], dt)
             x0 = model.rollout(x_end, u_gap, d_gap, p, dt_gap)[1] + start.shift
         y, x_end = model.rollout(x0, stretch.u[None], d[None], p, dt)
         out.append(y + start.offset(dt * np.arange(y.shape[1], dtype=np.float64)))
@@ -118,9 +118,9 @@ def _first_reading(stretch: Stretch, seconds: float = 2.0) -> Array:
     early = stretch.y[stretch.time <= seconds]
     out = np.full(stretch.y.shape[1], np.nan)
     for k in range(out.size):
-        known = early[np.isfinite(early[:, k]), k]
-        if known.size:
-            out[k] = known.mean()
+        readings = early[np.isfinite(early[:, k]), k]
+        if readings.size:
+            out[k] = readings.mean()
         else:
             later = stretch.y[np.isfinite(stretch.y[:, k]), k]
             out[k] = later[0] if later.size and stretch.time[np.isfinite(stretch.y[:, k])][0] < 60 else np.nan
@@ -177,14 +177,17 @@ def _corrected(
         residual, response = _warm(plant, p, stretch, start, start.x0[None], warmup)
         blocks = [response @ root]
         blocks.append(np.concatenate([np.diag(free / noise) for noise in _noise(plant, stretch, warmup)]))
-        known = np.isfinite(residual[0])
-        A, r = np.hstack(blocks)[known], residual[0][known]
+        is_read = np.isfinite(residual[0])
+        A, r = np.hstack(blocks)[is_read], residual[0][is_read]
         # the prior is about the first guess, so what was moved before counts
         beside = np.divide(start.y_offset - pooled, free, out=np.zeros(len(free)), where=free > 0)
         moved = np.concatenate([along.T @ start.shift, beside])
         # min |A s - r|^2 + |s + moved|^2 within the directions that the few rows of A see
-        axes, seen = np.linalg.qr(A.T)
-        rows, right = np.vstack([seen.T, np.eye(len(seen))]), np.append(r + A @ moved, np.zeros(len(seen)))
+        axes, triangle = np.linalg.qr(A.T)
+        rows, right = (
+            np.vstack([triangle.T, np.eye(len(triangle))]),
+            np.append(r + A @ moved, np.zeros(len(triangle))),
+        )
         step = axes @ np.linalg.lstsq(rows, right, rcond=None)[0] - moved
         shift = root @ step[: plant.model.n_x]
         start = replace(
@@ -210,17 +213,17 @@ def _after_gap(
     u, d, dt = _through_gap(before, stretch, start, times, plant.dt)
     propagated = plant.model.rollout(np.repeat(runs[1], len(times), axis=0), u, d, p[None], dt)[1]
     zero, warm = np.zeros(plant.model.n_x), start.warm - before.time[-1] - stretch.gap
-    here = replace(start, level=None, shift=zero, warm=warm)
-    residual, response = _warm(plant, p, stretch, here, propagated, warmup)
-    known = np.isfinite(residual[0])
-    spread = response[known] @ plant.model.spread @ response[known].T + np.eye(int(known.sum()))
-    cost = np.einsum("bi,bi->b", residual[:, known] @ np.linalg.inv(spread), residual[:, known])
+    start_after = replace(start, level=None, shift=zero, warm=warm)
+    residual, response = _warm(plant, p, stretch, start_after, propagated, warmup)
+    is_read = np.isfinite(residual[0])
+    spread = response[is_read] @ plant.model.spread @ response[is_read].T + np.eye(int(is_read.sum()))
+    cost = np.einsum("bi,bi->b", residual[:, is_read] @ np.linalg.inv(spread), residual[:, is_read])
     best = int(np.argmin(cost))
     how = f"propagated through a gap of {stretch.gap:.1f} s"
     if not same:
         how += f"; the input is taken to have changed {times[best]:.1f} s into it"
-    here = replace(here, x0=propagated[best], change=times[best], how=how)
-    return _corrected(plant, p, stretch, here, warmup, offsets=False)
+    start_after = replace(start_after, x0=propagated[best], change=times[best], how=how)
+    return _corrected(plant, p, stretch, start_after, warmup, offsets=False)
 
 
 def _through_gap(
@@ -233,8 +236,8 @@ def _through_gap(
     width = edges[1] - edges[0]
     share = np.clip((np.asarray(times)[:, None] - edges[:-1]) / width, 0.0, 1.0)[:, :, None]
     u = share * before.u[-1] + (1 - share) * after.u[0]
-    part = ((np.arange(n) + 0.5) / n)[:, None]
-    d = (1 - part) * before.d[-1] + part * after.d[0] - start.d_offset
+    share_of_gap = ((np.arange(n) + 0.5) / n)[:, None]
+    d = (1 - share_of_gap) * before.d[-1] + share_of_gap * after.d[0] - start.d_offset
     return u, d[None], float(width)
 
 
@@ -260,9 +263,9 @@ def _binned(stretch: Stretch, dt: float, n: int, warmup: float) -> Array:
     cell = np.minimum(np.round(stretch.time[early] / dt).astype(int), n)
     out = np.full((n + 1, stretch.y.shape[1]), np.nan)
     for k in range(out.shape[1]):
-        known = np.isfinite(stretch.y[early, k])
-        count = np.bincount(cell[known], minlength=n + 1)
-        total = np.bincount(cell[known], weights=stretch.y[early, k][known], minlength=n + 1)
+        is_read = np.isfinite(stretch.y[early, k])
+        count = np.bincount(cell[is_read], minlength=n + 1)
+        total = np.bincount(cell[is_read], weights=stretch.y[early, k][is_read], minlength=n + 1)
         out[count > 0, k] = total[count > 0] / count[count > 0]
     return out
 

@@ -189,7 +189,7 @@ def gain_table(found: Dynamics) -> Cells:
 
 def time_constant_words(found: Dynamics) -> str:
     """Return the operating point, the time constants and what the intervals are of, in a sentence."""
-    linear = found.near
+    linear = found.linear
     point = ", ".join(
         f"{name} {w:.3g}{_spaced(found.units.get(name, '1'))}" for name, w in zip(linear.inputs, linear.w)
     )

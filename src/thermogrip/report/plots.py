@@ -120,7 +120,7 @@ def models_figure(rows: Sequence[Row]) -> Figure:
 
 def step_response_chart(found: Dynamics) -> Chart:
     """Return the response of each output, a panel each, to a unit step of each input, a column each."""
-    outputs, inputs = found.near.outputs, found.near.inputs
+    outputs, inputs = found.linear.outputs, found.linear.inputs
     time, step = found.step_response()
     units = {name: found.units.get(name, "1") for name in (*outputs, *inputs)}
 
@@ -140,7 +140,7 @@ def step_response_chart(found: Dynamics) -> Chart:
 
 def bode_chart(found: Dynamics) -> Chart:
     """Return magnitude and phase from each input, a column each, to every output, a line each."""
-    outputs, inputs = found.near.outputs, found.near.inputs
+    outputs, inputs = found.linear.outputs, found.linear.inputs
     omega, magnitude, phase = found.frequency_response()
     least = 1e-4 * magnitude.value.max(axis=(0, 1))  # of each input: the scale has no zero
     turned = type(phase)(*(np.where(magnitude.value < least, np.nan, part) for part in phase))

@@ -41,7 +41,7 @@ def learnt(**change: Any) -> ReadingError:
         "numbers": WHITE, "hessian": np.array([[400.0]]), "unit": np.array([0.5]),
         "sensor": np.array([0.2]),
         "bin_s": 2.0, "merge": 2.0, "phi": 1.5, "offset": np.array([0.1]), "bias": np.zeros(0),
-        "own": np.zeros(1), "stretches": 3, "pull": np.array([[80.0]]),
+        "parameter_sd": np.zeros(1), "stretches": 3, "pull": np.array([[80.0]]),
         "terms": (Response("q", 20.0, np.array([0.25]), 2.0),),
     }  # fmt: skip
     return ReadingError(**(content | change))
@@ -131,7 +131,7 @@ def test_what_a_fit_has_learnt_is_taken_from_its_record(gripper: Plant):
         4,
     )
     assert (found.offset.tolist(), found.bias.tolist()) == ([0.3, 0.0], [0.4])
-    assert found.own.tolist() == [0.5] + [0.0] * (n - 1)
+    assert found.parameter_sd.tolist() == [0.5] + [0.0] * (n - 1)
     assert found.sensor.tolist() == [plant.model.sensor_sd[name] for name in plant.outputs]
     assert (found.pull.shape, found.hessian.shape) == ((n, 1), (n, n))
     (got,) = found.terms

@@ -112,7 +112,7 @@ def test_disturbances_have_a_gain_without_the_spread_between_runs():
         room, {}, dt=1.0, units=units, refits=(room,) * 8, logs=("a",), valid={"t_room": (10.0, 20.0)}
     )
     found = plant_dynamics(plant)
-    assert found.near.inputs == ("u", "t_room")
+    assert found.linear.inputs == ("u", "t_room")
     assert found.to_dict()["operating_point"] == {"u": 0.0, "t_room": 15.0}
     assert [row["unit"] for row in found.rows()] == ["K", "1"]
     np.testing.assert_allclose(found.gain.value, [[2.0, 1.0]], rtol=1e-6)

@@ -93,7 +93,7 @@ def test_effects_go_with_the_parameters_that_explain_them_too():
     mean = covariance @ X.T @ y / 0.25
     stated = information(numbers, logs, ref)
     np.testing.assert_allclose((stated.mean, stated.covariance[0]), (mean[:1], covariance[0, :1]), rtol=1e-9)
-    for k, ((own, spread), joint) in enumerate(zip(stated.own, stated.joint)):
+    for k, ((own, spread), joint) in enumerate(zip(stated.effects, stated.joint)):
         at = [0, 1 + k]
         np.testing.assert_allclose((own[0], spread[0, 0]), (mean[1 + k], covariance[1 + k, 1 + k]), rtol=1e-9)
         np.testing.assert_allclose(joint, covariance[np.ix_(at, at)], rtol=1e-9)

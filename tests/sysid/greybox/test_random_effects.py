@@ -96,8 +96,8 @@ def test_fits_know_their_starts_as_well_as_they_say():
     least, most, prior = (
         np.einsum("tjk,kl,tjl->tj", first.columns, left, first.columns) * sd**2
         for left in (
-            *(first.error(numbers, s * np.ones(len(first.at))) for s in (0, 1)),
-            np.eye(len(first.at)),
+            *(first.error(numbers, s * np.ones(len(first.effects))) for s in (0, 1)),
+            np.eye(len(first.effects)),
         )
     )
     seen = np.var(errors, axis=0)[: len(most)]
@@ -209,7 +209,7 @@ def test_the_first_bins_of_a_log_say_how_it_began():
     ]
     start = SimpleNamespace(level=None)
     found = random_effects._warm_up(problem, 0, start, 2, [others[1], lead, others[2], others[0]])
-    assert (found.at, found.outputs) == ((1, 3), (0, 1))
+    assert (found.effects, found.outputs) == ((1, 3), (0, 1))
     np.testing.assert_allclose(found.columns[:, 0], [[0.5, 1.0], [2.5, 1.0]])
     np.testing.assert_allclose(found.columns[:, 1, 0], [3.0, (4 + 0.25 + 4 + 0.5) / 2], atol=1e-9)
     np.testing.assert_allclose(found.noise, np.sqrt(20 / 3 / 8) / np.array([2.0, 3.0]))
@@ -228,7 +228,7 @@ def test_a_start_after_a_gap_is_three_times_less_certain_than_the_first():
     problem = make_problem(model, [make_log(t, columns)], average=5.0, independent=5.0)
     z = np.zeros(len(problem.free))
     start, p = problem.start(z)[0][0], problem.parameters(z[None])
-    before, after = (random_effects._of_start(problem, 0, k, p, start)[-1].parts for k in (0, 1))
+    before, after = (random_effects._of_start(problem, 0, k, p, start)[-1].moves for k in (0, 1))
     for j in range(len(model.outputs)):
         assert not before[1][j].any()
         assert not after[0][j].any()

@@ -34,6 +34,7 @@ from thermogrip.sysid.plant.plant import Plant
 
 N, N_Z, N_TERM, N_OWN = 60, 3, 2, 2
 OUTPUTS = ((0, 1), (0, 1), (1,))
+NO_TERMS = np.zeros((0, 0, 0))
 
 
 def some_logs() -> tuple[list[np.ndarray], list[LogData]]:
@@ -131,7 +132,7 @@ def test_a_parameter_that_no_log_feels_disagrees_with_none():
     felt = np.zeros((3, 2, 2))
     felt[:, 0, 0] = 10.0
     pull = np.array([[2.0, 0.0], [-2.0, 0.0], [0.0, 0.0]])
-    q = disagreement(LogScores(felt, felt * 0.4, pull), np.zeros(2))
+    q = disagreement(LogScores(felt, felt * 0.4, pull, NO_TERMS), np.zeros(2))
     assert q[0] == pytest.approx(0.96, abs=0.01)  # as without it
     assert q[1] == 1.0
 
@@ -167,7 +168,7 @@ def by_hand(
     """Return P, the sum of V and each log's part, of bins whose errors are white."""
     hessian = np.array([J.T @ J for _, J in by_log])
     score = np.array([-J.T @ r for r, J in by_log])  # reading less model pulls upwards
-    scores = LogScores(hessian, w**2 * hessian, score)
+    scores = LogScores(hessian, w**2 * hessian, score, NO_TERMS)
     return np.eye(2) + hessian.sum(axis=0), w**2 * hessian.sum(axis=0), scores
 
 
@@ -270,7 +271,7 @@ def test_logs_agree_by_how_far_leaving_each_out_moves_the_estimate(n_log: int):
     J = rng.normal(size=(n_log, 9, 3))
     A = np.einsum("lij,lik->ljk", J, J)
     W = rng.normal(size=(n_log, 5, 3))
-    scores = LogScores(A, np.einsum("lij,lik->ljk", W, W), 3.0 * rng.normal(size=(n_log, 3)))
+    scores = LogScores(A, np.einsum("lij,lik->ljk", W, W), 3.0 * rng.normal(size=(n_log, 3)), NO_TERMS)
     z = rng.normal(size=3)
     np.testing.assert_allclose(disagreement(scores, z), left_out(scores, z), rtol=1e-9)
 

@@ -64,7 +64,7 @@ def test_a_network_is_identified_from_a_log_of_another_plant_of_its_kind(name):
         assert score.rmse < 1.2 * sd, f"{output}: {score.rmse:.3g} with noise of {sd:g}"
     point = {u: 0.5 * sum(ends) for u, ends in LOGS[name][3].items()}
     want, found = (plant_dynamics(p, inputs=point, draws=0) for p in (truth, fitted))
-    heaters = [want.near.inputs.index(u) for u in want.near.inputs if u in truth.inputs]
+    heaters = [want.linear.inputs.index(u) for u in want.linear.inputs if u in truth.inputs]
     np.testing.assert_allclose(found.gain.value[:, heaters], want.gain.value[:, heaters], rtol=0.1)
 
 
@@ -84,5 +84,5 @@ def test_every_network_settles_where_its_kind_does():
     }  # fmt: skip
     assert set(rest) == set(builtin_networks())
     for name, (low, high) in rest.items():
-        settled = plant_dynamics(plant_from_prior(load_network(name)), draws=0).near.y
+        settled = plant_dynamics(plant_from_prior(load_network(name)), draws=0).linear.y
         assert np.all((low < settled) & (settled < high)), f"{name} settles at {settled}"
