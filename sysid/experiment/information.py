@@ -54,7 +54,20 @@ from thermogrip.sysid.models.model import GreyModel
 from thermogrip.sysid.models.network import NetworkModel
 from thermogrip.sysid.plant.plant import Plant
 
-_TINY = 1e-9  # keeps the score's covariance invertible in directions without information
+
+@dataclass(frozen=True)
+class ForecastSettings:
+    """Steps and counts of a forecast."""
+
+    least_score: float = 1e-9  # keeps the score's covariance invertible in directions without information
+    difference_step: float = 1e-3  # of a parameter's sd
+    disturbance_step: float = 0.1  # in its unit, for differences
+    start_step: float = 0.1  # of its spread, for differences
+    independent_s: float = 60.0  # per independent reading where no fit has measured it
+    tries: int = 40  # draws until one can be simulated
+
+
+FORECAST = ForecastSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +107,7 @@ class ReadingError:
         after, shared = before + hessian, self._shared(before, root)
         alone = np.eye(len(root)) - shared @ shared.T
         both = (before @ shared + pull) * self._resized(new.lagged)
-        score = before @ alone @ before + both @ both.T + spread + _TINY * np.eye(len(root))
+        score = before @ alone @ before + both @ both.T + spread + FORECAST.least_score * np.eye(len(root))
         return np.asarray(after @ np.linalg.solve(score, after))
 
     def _resized(self, lagged: Array) -> Array:
@@ -169,11 +182,6 @@ def learnt_error(plant: Plant) -> ReadingError | None:
 
 ROOM = 25.0  # degC
 DRAWS = 8  # of the parameters, that keep the limits too
-_STEP = 1e-3  # of a parameter's sd, for differences
-_WARMER = 0.1  # of a disturbance, for differences
-_ASIDE = 0.1  # of its spread, that a start is moved for differences
-_INDEPENDENT = 60.0  # [s] per independent reading where no fit has measured it
-_TRIES = 40  # draws until one can be simulated
 
 
 class ExperimentForecast:
@@ -246,8 +254,8 @@ class ExperimentForecast:
         n, n_d = len(self.plant.free), self._d.size
         varies = error.parameter_sd > 0
         parameters = change[:n][varies] * (error.parameter_sd / self._steps)[varies, None, None]
-        biases = change[n : n + n_d] * error.bias[:, None, None] / _WARMER
-        return np.concatenate([parameters, biases]), change[n + n_d :] / _ASIDE
+        biases = change[n : n + n_d] * error.bias[:, None, None] / FORECAST.disturbance_step
+        return np.concatenate([parameters, biases]), change[n + n_d :] / FORECAST.start_step
 
     def _warm_up(self, rows: int) -> float:
         """Return the seconds from which a fit would estimate the start, 0 where it knows it or does not."""
@@ -305,7 +313,7 @@ class ExperimentForecast:
     @cached_property
     def _steps(self) -> Array:
         """Signed steps of theta (n_free,), away from a bound that is near."""
-        size = _STEP * np.sqrt(np.maximum(np.diag(self._root @ self._root.T), 1e-20))
+        size = FORECAST.difference_step * np.sqrt(np.maximum(np.diag(self._root @ self._root.T), 1e-20))
         theta = self.plant.theta + size
         free = [self.plant.bounds.get(name, (-np.inf, np.inf))[1] for name in self.plant.free]
         return np.where(self.plant.natural(theta) > np.array(free), -size, size)
@@ -322,11 +330,16 @@ class ExperimentForecast:
         begin = [first, *(first if self._known else self._rest(row) for row in rows[1:])]
         d = np.repeat(self._d[None], len(rows), axis=0)
         if self._error is not None:  # the start stays: a log at rest has seen the room
-            aside = _ASIDE * _spread_root(self.plant).T if self.starts else np.zeros((0, first.size))
+            aside = (
+                FORECAST.start_step * _spread_root(self.plant).T if self.starts else np.zeros((0, first.size))
+            )
             n = self._d.size
             rows = np.vstack([rows, np.repeat(rows[:1], n + len(aside), axis=0)])
             begin += [first] * n + list(first + aside)
-            warmer, same = self._d + _WARMER * np.eye(n), np.repeat(self._d[None], len(aside), axis=0)
+            warmer, same = (
+                self._d + FORECAST.disturbance_step * np.eye(n),
+                np.repeat(self._d[None], len(aside), axis=0),
+            )
             d = np.vstack([d, warmer, same])
         return rows, np.array(begin), d
 
@@ -334,7 +347,7 @@ class ExperimentForecast:
     def _cautious(self) -> tuple[Array, Array, Array]:
         """Parameters, starts and disturbances of the plant and of its draws."""
         rows, k = [self.plant.p], 0
-        while len(rows) <= self.n_draws and k < _TRIES + self.n_draws:
+        while len(rows) <= self.n_draws and k < FORECAST.tries + self.n_draws:
             k += 1
             rows.append(self.plant.draw(k).p)
         d = np.repeat(self._d[None], len(rows), axis=0)
@@ -371,7 +384,7 @@ def reading_noise(plant: Plant) -> tuple[Array, Array]:
         raise UserError(f"the plant has no sensor error for {lost}", hint="identify it again")
     measured_s = plant.scores.independent_s
     bin_s = plant.scores.average_s or plant.dt
-    guess = plant.model.independent if isinstance(plant.model, GreyModel) else _INDEPENDENT
+    guess = plant.model.independent if isinstance(plant.model, GreyModel) else FORECAST.independent_s
     seconds = np.array([max(float(measured_s.get(name, guess)), bin_s) for name in plant.outputs])
     return sd, seconds
 

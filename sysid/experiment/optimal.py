@@ -32,11 +32,21 @@ from thermogrip.sysid.experiment.schedules import REST
 from thermogrip.sysid.plant.plant import Plant
 
 EVALUATIONS = 1500
-SWITCH_HOLD = 30.0  # [s] in each position: a pump is not made to stutter
-_CELLS = 240  # at most, of the search
-_STEPS = 800  # of a simulation in the search, about
-_MARGIN = 0.2  # [K] inside the limits while the step is coarse
-_HALVINGS, _HALVINGS_OF_SEARCH = 10, 5  # of a schedule that leaves the limits: to 0.1 and 3 %
+
+
+@dataclass(frozen=True)
+class SearchSettings:
+    """The grid and the margins of the search."""
+
+    most_cells: int = 240  # of a schedule
+    steps: int = 800  # of a simulation, about
+    margin: float = 0.2  # [K] inside the limits while the step is coarse
+    halvings: int = 10  # of a schedule that leaves the limits: to 0.1 %
+    coarse_halvings: int = 5  # of the ones to begin with: to 3 %
+    switch_hold_s: float = 30.0  # in each position: a pump is not made to stutter
+
+
+SEARCH = SearchSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,7 +132,7 @@ def optimal_schedule(
     def bits(cells: Array) -> float:
         return fine.evaluate(frame.inputs(cells, coarse=False))
 
-    within, _ = _shrunk(frame, bits, cells, _HALVINGS)
+    within, _ = _shrunk(frame, bits, cells, SEARCH.halvings)
     best_found = frame.inputs(within, coarse=False)
     allowed = [u for u in (*pool, best_found) if len(u) == frame.n and fine.stays(u)]
     if not allowed:
@@ -154,8 +164,8 @@ class _Frame:
         if self.n < self.rest + 10:
             least = (self.rest + 10) * plant.dt / 60
             raise UserError(f"{minutes:g} min are too short", hint=f"take {least:.1f}")
-        cell = max(shortest, 60.0 * minutes / _CELLS, plant.dt)
-        self.ratio = max(1, min(self.n // _STEPS, int(cell / plant.dt / 2)))  # of the plant in a step
+        cell = max(shortest, 60.0 * minutes / SEARCH.most_cells, plant.dt)
+        self.ratio = max(1, min(self.n // SEARCH.steps, int(cell / plant.dt / 2)))  # of the plant in a step
         self.dt = self.ratio * plant.dt  # of the search [s]
         self.cell = max(1, round(cell / self.dt))  # steps of the search in a cell
         self.n_cell = max(1, -(-(self.n - self.rest) // (self.ratio * self.cell)))
@@ -169,7 +179,9 @@ class _Frame:
         if not np.any(self.low < self.high):
             raise UserError("no input has a range to move in", hint="give limits that differ")
         # cells that change as one, by input
-        self.together = np.where(self.switch, max(1, int(np.ceil(SWITCH_HOLD / (self.cell * self.dt)))), 1)
+        self.together = np.where(
+            self.switch, max(1, int(np.ceil(SEARCH.switch_hold_s / (self.cell * self.dt)))), 1
+        )
 
     def inputs(self, cells: Array, *, coarse: bool) -> Array:
         """Return the inputs (N, n_u) of cells (n_cell, n_u), on the search's step or on the plant's."""
@@ -203,13 +215,13 @@ def _search(
     """Return the best cells found."""
 
     def evaluate(cells: Array) -> float:
-        return forecast.evaluate(frame.inputs(cells, coarse=True), margin=_MARGIN)
+        return forecast.evaluate(frame.inputs(cells, coarse=True), margin=SEARCH.margin)
 
     rng = np.random.default_rng(seed)
     pool = [*pool, *_plain_shapes(frame)]
     best, gain = np.tile(frame.still, (frame.n_cell, 1)), -np.inf
     for cells in [best, *pool]:
-        shrunk, value = _shrunk(frame, evaluate, cells, _HALVINGS_OF_SEARCH)
+        shrunk, value = _shrunk(frame, evaluate, cells, SEARCH.coarse_halvings)
         if value > gain:
             best, gain = shrunk, value
     for k in range(evaluations):

@@ -31,12 +31,21 @@ from thermogrip.sysid.plant.linearise import LinearPlant, composed, linearise_pl
 if TYPE_CHECKING:
     from thermogrip.sysid.plant.plant import Plant
 
-_DELAY = 1e-6  # modulus of a discrete pole that is part of a delay
-_ROUNDING = 1e-9  # of the largest entry of A
-_NOTHING = 1e-6  # of the largest coefficient of an impulse response: before it is dead time
-_LONG = 5.0  # slowest time constants that a step response shows
-_FEWEST = 8  # draws of an interval
-_SHOWN = 60  # points of a response in JSON
+
+@dataclass(frozen=True)
+class ResponseSettings:
+    """What is seen of a response."""
+
+    delay: float = 1e-6  # modulus of a discrete pole that is part of a delay
+    rounding: float = 1e-9  # of the largest entry of A
+    dead: float = 1e-6  # of the largest coefficient of an impulse response: before it is dead time
+    length: float = 5.0  # slowest time constants that a step response shows
+    least_draws: int = 8  # of an interval
+    points: int = 60  # of a response in JSON
+
+
+RESPONSE = ResponseSettings()
+
 _RISEN = 1 - np.exp(-1)
 
 
@@ -91,7 +100,7 @@ class Dynamics:
             impulse.append(np.abs(linear.C @ reach))
             reach = linear.A @ reach
         size = np.array(impulse)
-        moved = size > _NOTHING * size.max(axis=(0, 2), keepdims=True)
+        moved = size > RESPONSE.dead * size.max(axis=(0, 2), keepdims=True)
         return np.where(moved.any(axis=0), moved.argmax(axis=0) * self.dt, np.nan)
 
     @property
@@ -154,8 +163,8 @@ class Dynamics:
     def to_dict(self) -> dict[str, Any]:
         """Return poles, gains, responses and the operating point as plain JSON."""
         linear = self.linear
-        time, step = self.step_response(_SHOWN)
-        omega, magnitude, phase = self.frequency_response(_SHOWN)
+        time, step = self.step_response(RESPONSE.points)
+        omega, magnitude, phase = self.frequency_response(RESPONSE.points)
         return {
             "level": self.level,
             "draws": len(self.draws),
@@ -191,12 +200,12 @@ class Dynamics:
 
     def _steps(self, n: int) -> int:
         """Return how many steps of the plant lie between n points of a step response."""
-        return max(1, round(_LONG * self._slowest / (n * self.dt)))
+        return max(1, round(RESPONSE.length * self._slowest / (n * self.dt)))
 
     def _estimate(self, of: Callable[[LinearPlant], Array], gain_sd: Array | None = None) -> Estimate:
         """Return a quantity whose last axis is that of the inputs, with its interval."""
         value = np.asarray(of(self.linear))
-        if len(self.draws) < _FEWEST:  # a plant that cannot be drawn is less certain, not more
+        if len(self.draws) < RESPONSE.least_draws:  # a plant that cannot be drawn is less certain, not more
             return Estimate(value, *np.full((2, *value.shape), np.nan))
         variance = np.mean([(of(other) - value) ** 2 for other in self.draws], axis=0)
         sd = np.sqrt(variance + ((self.gain_sd if gain_sd is None else gain_sd) * value) ** 2)
@@ -207,9 +216,9 @@ class Dynamics:
 def poles_of(near: LinearPlant) -> NDArray[np.complex128]:
     """Return the continuous equivalents [1/s] of the poles that are no delay, the slowest first."""
     A = near.A  # rounding of a difference in a delay of n steps makes a pole of its n-th root
-    z = np.linalg.eigvals(np.where(np.abs(A) > _ROUNDING * np.abs(A).max(), A, 0.0)).astype(complex)
+    z = np.linalg.eigvals(np.where(np.abs(A) > RESPONSE.rounding * np.abs(A).max(), A, 0.0)).astype(complex)
     assert near.dt is not None
-    s = np.log(z[np.abs(z) > _DELAY]) / near.dt
+    s = np.log(z[np.abs(z) > RESPONSE.delay]) / near.dt
     return np.asarray(s[np.argsort(-s.real, kind="stable")])
 
 

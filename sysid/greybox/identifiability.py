@@ -14,6 +14,7 @@ s_1 s_2.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from itertools import combinations
 from statistics import NormalDist
 from typing import NamedTuple
@@ -25,13 +26,23 @@ from thermogrip.sysid.models.network import NetworkModel
 from thermogrip.sysid.plant.fit_record import Identifiability
 from thermogrip.sysid.plant.plant import Plant
 
-_EXACT = 1e-11  # eigenvalue of the scaled Hessian below which a direction changes no output
-_FLAT = 1e-4  # eigenvalue of the scaled Hessian below which a direction is hardly identifiable
-_TRADE = 0.9  # correlation from which two parameters are reported to trade off
-_MOST_PAIRS = 6
-_MANY_ON_BOUNDS = 3  # from so many on, all have one cause
-_ODD_REACH = 20.0  # times full scale, or a share of it: an input that is logged in another unit
-_PRIOR_ONLY = 0.9  # posterior sd over prior sd from which a parameter is known from the prior only
+
+@dataclass(frozen=True)
+class ReportSettings:
+    """From when a parameter or a pair of them is reported."""
+
+    unmoved_eigenvalue: float = 1e-11  # of the scaled Hessian: below it a direction changes no output
+    flat_eigenvalue: float = 1e-4  # of the scaled Hessian: below it a direction is barely identifiable
+    trade_off_correlation: float = 0.9  # from which two parameters are known together only
+    n_pairs: int = 6  # that are reported, the closest first
+    many_on_bounds: int = 3  # parameters, which have one cause
+    odd_reach: float = 20.0  # times full scale, or a share of it: an input that is logged in another unit
+    prior_only_sd: float = (
+        0.9  # posterior sd over prior sd from which a parameter is known from the prior only
+    )
+
+
+REPORT = ReportSettings()
 
 
 def weakest_direction(jacobian: Array, names: Sequence[str]) -> tuple[float, float, str]:
@@ -70,7 +81,7 @@ def trade_offs(names: Sequence[str], covariance: Array) -> list[TradeOff]:
     sd, pairs = np.sqrt(np.diag(covariance)), []
     for i, j in combinations(range(len(names)), 2):
         r = float(covariance[i, j] / (sd[i] * sd[j]))
-        if abs(r) >= _TRADE:
+        if abs(r) >= REPORT.trade_off_correlation:
             together = float(np.sqrt(max(sd[i] ** 2 + sd[j] ** 2 - 2 * abs(r) * sd[i] * sd[j], 0.0)))
             smaller_sd = float(min(sd[i], sd[j]))
             if together < smaller_sd:
@@ -94,7 +105,7 @@ def identifiability_report(plant: Plant) -> list[str]:
     if report.prior_only:
         lines.append(f"known from the prior only: {', '.join(report.prior_only)}")
     pairs = trade_offs(plant.free, np.asarray(plant.covariance))
-    return lines + [_trade_in_words(plant, pair) for pair in pairs[:_MOST_PAIRS]]
+    return lines + [_trade_in_words(plant, pair) for pair in pairs[: REPORT.n_pairs]]
 
 
 def _cause_of_bound(plant: Plant, name: str, on_bounds: int) -> str:
@@ -103,17 +114,17 @@ def _cause_of_bound(plant: Plant, name: str, on_bounds: int) -> str:
         network = plant.model.network
         stated = [(item.input, item.power) for item in network.heaters.values()]
         stated += [(item.input, item.current) for item in network.peltiers.values()]
-        driven = [drive for drive, which in stated if which == name or on_bounds >= _MANY_ON_BOUNDS]
+        driven = [drive for drive, which in stated if which == name or on_bounds >= REPORT.many_on_bounds]
         for drive in dict.fromkeys(driven):
             full, unit = network.inputs[drive].full_scale, network.inputs[drive].unit
             reach = max(abs(end) for end in plant.valid.get(drive, (full, full)))
-            if not full / _ODD_REACH < reach < full * _ODD_REACH:
+            if not full / REPORT.odd_reach < reach < full * REPORT.odd_reach:
                 shown = "" if unit == "1" else f" {unit}"
                 return (
                     f"{drive} reaches {reach:g}{shown} in the logs and its full scale, at which powers and "
                     f"currents are stated, is {full:g}{shown}; check its unit, range or full_scale"
                 )
-    if on_bounds >= _MANY_ON_BOUNDS:
+    if on_bounds >= REPORT.many_on_bounds:
         return "several are, so check unit, full scale and sign of the inputs, and what is not modelled"
     return "its prior is off, or it makes up for something that is not modelled; widen the prior, or fix it"
 
@@ -154,9 +165,11 @@ def describe(
         condition=condition,
         spectrum=[float(f"{max(value, 0.0):.3g}") for value in values],
         weakest=words,
-        flat=[_in_words(axis, names) for value, axis in zip(values, axes.T) if value < _FLAT],
-        identifiable=bool(least > _EXACT),
-        prior_only=[name for name, s in zip(names, sd) if s > _PRIOR_ONLY],
+        flat=[
+            _in_words(axis, names) for value, axis in zip(values, axes.T) if value < REPORT.flat_eigenvalue
+        ],
+        identifiable=bool(least > REPORT.unmoved_eigenvalue),
+        prior_only=[name for name, s in zip(names, sd) if s > REPORT.prior_only_sd],
         on_bound=dict(on_bound),
         widening={name: round(float(w), 3) for name, w in zip(names, widening)},
     )

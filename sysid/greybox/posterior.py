@@ -67,11 +67,23 @@ from thermogrip.sysid.plant.fit_record import Sampling
 from thermogrip.sysid.plant.log_grid import match_logs, roles_of
 from thermogrip.sysid.plant.plant import Plant
 
-_STEP = 1e-4  # of z, for differences
-_TOGETHER = 12  # draws whose slopes are taken at once: the runs of more do not fit a cache
-_LONGEST = 1.0  # prior sd that one step may move a parameter
-_FLOOR = 1e-3  # of A: the least that V may be in any direction
-_UNSEEN = 1e-9  # of the largest slope: what moves the runs by less is lost in the differences
+
+@dataclass(frozen=True)
+class DrawSettings:
+    """Numbers of the draws and of the chain."""
+
+    difference_step: float = 1e-4  # of z
+    draws_at_once: int = 12  # whose slopes are taken: the runs of more do not fit a cache
+    longest_step: float = 1.0  # prior sd that one step may move a parameter
+    least_error: float = 1e-3  # of A: the least that V may be in any direction
+    unseen_slope: float = 1e-9  # of the largest one: what moves the runs by less is lost in the differences
+    proposal_freedom: float = 6.0  # of the t: a tail
+    proposal_width: float = 1.25  # the factor s
+    check_steps: int = 50  # of the chain, between two looks at its length
+    n_sampled: int = 6  # parameters: a chain of emcee's walkers slows down with each more
+
+
+DRAW = DrawSettings()
 
 
 class RandomizedMap:
@@ -84,12 +96,12 @@ class RandomizedMap:
         by_log = problem.by_log(self.z, central=True)
         self._fitted = np.concatenate([r for r, _ in by_log])
         span, size, turn = np.linalg.svd(np.vstack([J for _, J in by_log]), full_matrices=False)
-        moves_runs = size > _UNSEEN * size.max(initial=0.0)
+        moves_runs = size > DRAW.unseen_slope * size.max(initial=0.0)
         self._span, size, turn = span[:, moves_runs], size[moves_runs], turn[moves_runs]
         along = turn / size[:, None]
         error = along @ uncertainty.spread @ along.T  # S^-1 R V R' S^-1, about the error's covariance along Q
         value, axes = np.linalg.eigh((error + error.T) / 2)
-        root = axes.T / np.sqrt(np.maximum(value, 0.0) + _FLOOR)[:, None]
+        root = axes.T / np.sqrt(np.maximum(value, 0.0) + DRAW.least_error)[:, None]
         self._root = np.linalg.qr(root)[1]  # K = root' root, and no rounding makes it indefinite
         self._root *= np.where(np.diag(self._root) < 0, -1.0, 1.0)[:, None]
         self._pull = turn.T * size @ self._root.T  # J'Q K^(1/2)'
@@ -190,21 +202,21 @@ class RandomizedMap:
 
     def _slopes(self, z: Array, xi: Array, noise: Array, moving: NDArray[np.int_]) -> tuple[Array, Array]:
         """Return gradient (n, n_moving) and Gauss-Newton Hessian (n, n_moving, n_moving)."""
-        if len(z) > _TOGETHER:
-            blocks = [slice(k, k + _TOGETHER) for k in range(0, len(z), _TOGETHER)]
+        if len(z) > DRAW.draws_at_once:
+            blocks = [slice(k, k + DRAW.draws_at_once) for k in range(0, len(z), DRAW.draws_at_once)]
             slopes_by_block = [self._slopes(z[rows], xi[rows], noise[rows], moving) for rows in blocks]
             return np.concatenate([g for g, _ in slopes_by_block]), np.concatenate(
                 [h for _, h in slopes_by_block]
             )
         n, d = len(z), moving.size
-        sign = np.where(z[:, moving] + _STEP > self.high[moving], -1.0, 1.0)
-        ahead = z[:, None] + _STEP * sign[:, :, None] * np.eye(self.z.size)[moving]
+        sign = np.where(z[:, moving] + DRAW.difference_step > self.high[moving], -1.0, 1.0)
+        ahead = z[:, None] + DRAW.difference_step * sign[:, :, None] * np.eye(self.z.size)[moving]
         around = np.concatenate([z[:, None], ahead], axis=1).reshape(-1, self.z.size)
         gradient, hessian = (z - self.z - xi)[:, moving], np.tile(np.eye(d), (n, 1, 1))
         along, off_span = self._moved(around)
         for moves, perturbation in ((along, noise), (off_span, np.zeros((1, 1)))):
             runs = moves.reshape(n, d + 1, -1)
-            slopes = (runs[:, 1:] - runs[:, :1]) / (_STEP * sign[:, :, None])
+            slopes = (runs[:, 1:] - runs[:, :1]) / (DRAW.difference_step * sign[:, :, None])
             gradient = gradient + np.einsum("kim,km->ki", slopes, runs[:, 0] - perturbation)
             hessian = hessian + slopes @ slopes.transpose(0, 2, 1)
         return gradient, hessian
@@ -219,14 +231,13 @@ class RandomizedMap:
             free = np.flatnonzero(~stuck[k])
             free_hessian = h[np.ix_(free, free)]
             step = -np.linalg.solve(free_hessian + lam * np.diag(np.diag(free_hessian)), g[free])
-            out[k, free] = step * min(1.0, _LONGEST / max(float(np.abs(step).max(initial=0.0)), 1e-300))
+            out[k, free] = step * min(
+                1.0, DRAW.longest_step / max(float(np.abs(step).max(initial=0.0)), 1e-300)
+            )
         return out
 
 
 LENGTH = 50  # autocorrelation times that make a chain long enough
-_DOF, _WIDER = 6.0, 1.25  # of the proposals: a tail, and the factor s
-_CHECK_EVERY = 50
-_SAMPLED = 6  # parameters: a chain of emcee's walkers slows down with each more
 
 
 @dataclass(frozen=True, eq=False)
@@ -273,7 +284,7 @@ def run_chain(
     tau = np.full(n_dim, np.nan)
     for _ in sampler.sample(state, iterations=max_steps, skip_initial_state_check=True):
         n_step = sampler.iteration
-        if n_step % _CHECK_EVERY == 0 or n_step == max_steps:
+        if n_step % DRAW.check_steps == 0 or n_step == max_steps:
             tau = _autocorrelation(sampler.get_chain())
             slowest = float(np.max(tau))
             if progress is not None:
@@ -292,15 +303,20 @@ def run_chain(
 
 def _proposals(mean: Array, covariance: Array) -> Callable[..., tuple[Array, Array]]:
     """Return the function of (points (n, n_dim), random) to new points and ln t(old) - ln t(new)."""
-    root = _WIDER * np.linalg.cholesky(covariance)
+    root = DRAW.proposal_width * np.linalg.cholesky(covariance)
 
     def log_t(x: Array) -> Array:
         squares = (np.linalg.solve(root, (x - mean).T) ** 2).sum(axis=0)
-        return np.asarray(-0.5 * (_DOF + mean.size) * np.log1p(squares / _DOF))
+        return np.asarray(
+            -0.5 * (DRAW.proposal_freedom + mean.size) * np.log1p(squares / DRAW.proposal_freedom)
+        )
 
     def propose(points: Array, random: np.random.RandomState) -> tuple[Array, Array]:
         normal = random.standard_normal(points.shape)
-        drawn = normal * np.sqrt(_DOF / random.chisquare(_DOF, len(points)))[:, None]
+        drawn = (
+            normal
+            * np.sqrt(DRAW.proposal_freedom / random.chisquare(DRAW.proposal_freedom, len(points)))[:, None]
+        )
         new = mean + drawn @ root.T
         return new, log_t(points) - log_t(new)
 
@@ -481,7 +497,7 @@ def fit_problem(plant: Plant, logs: Sequence[Log]) -> Problem:
 def _choose(plant: Plant, free: Sequence[str] | None, spread: Array) -> list[int]:
     """Return which free parameters are sampled."""
     if free is None:
-        return sorted(np.argsort(np.diag(spread))[:_SAMPLED].tolist())
+        return sorted(np.argsort(np.diag(spread))[: DRAW.n_sampled].tolist())
     for name in free:
         if name not in plant.free:
             raise UserError(f"{name!r} is not a free parameter", hint=known_names(name, plant.free))

@@ -43,8 +43,22 @@ from thermogrip.sysid.plant.simulation import READING_EVERY, Start, predict
 
 Parts = list[list[list[Array]]]  # by log, stretch and output
 
-_LAGS = (2.0, 8.0, 32.0)  # [bins]
-_SIZE = 0.5  # rms of all responses together with s = 1, in sd of a bin
+
+@dataclass(frozen=True)
+class EffectSettings:
+    """Sizes and lengths of effects."""
+
+    lags: tuple[float, ...] = (2.0, 8.0, 32.0)  # of the responses [bins]
+    discrepancy_rms: float = 0.5  # of all responses together with s = 1, in sd of a bin
+    measured_offset_sd: float = 0.05  # [K] what a start at rest leaves unknown: rounding, a room not uniform
+    start_after_gap: float = 3.0  # times as uncertain as the first start: its input's change is timed
+    most_bins: int = 400  # of a stretch; more are averaged
+    least_read: float = 0.5  # of a stretch's bins, that an output must have
+    least_mode: float = 0.02  # sd of a bin: a start that moves no bin by more is left out
+    least_bins: int = 3  # of a stretch, or of a piece of one
+
+
+EFFECTS = EffectSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,11 +83,11 @@ def discrepancy_responses(problem: Problem, runs: Sequence[Sequence[Array]]) -> 
         for (stretches, _), of_log in zip(problem.logs, runs)
     ]
     names = [name for name in inputs_and_states[0][0] if not _is_twin(name, inputs_and_states)]
-    rms = _SIZE / np.sqrt(len(names) * len(_LAGS))
+    rms = EFFECTS.discrepancy_rms / np.sqrt(len(names) * len(EFFECTS.lags))
     out = [
         _of_rms(problem, inputs_and_states, name, lag * problem.average, rms)
         for name in names
-        for lag in _LAGS
+        for lag in EFFECTS.lags
     ]
     return [(one, means) for one, means in out if any(p.any() for log in means for k in log for p in k)]
 
@@ -145,15 +159,7 @@ def warm_noise(seconds: float, bin_s: float) -> float:
     return float(np.sqrt(seconds / (1 + seconds / READING_EVERY) / bin_s))
 
 
-_MEASURED = 0.05  # [K] what a start at rest leaves unknown of an offset: rounding, drift, a room not uniform
-_AFTER_GAP = (
-    3.0  # the start after a gap is this much less certain than the first; its input's change is timed
-)
-_MOST_BINS = 400  # of a stretch; more are averaged
-_KNOWN = 0.5  # share of a stretch's bins that an output must have
-_MODE = 0.02  # in sd of a bin: a start that moves no bin by more is left out
 _OFFSET = "offset of "
-_LEAST = 3  # bins of a stretch, or of a piece of one
 
 
 @dataclass(frozen=True, eq=False)
@@ -231,7 +237,7 @@ def _effects(
 ) -> list[_Column]:
     """Return everything that is the log's own."""
     plant, (stretches, bins) = problem.plant, problem.logs[at]
-    most = _MEASURED if starts[0].level is not None else np.inf
+    most = EFFECTS.measured_offset_sd if starts[0].level is not None else np.inf
     out = []
     for j, name in enumerate(plant.outputs):
         spread = min(plant.nuisance.get(name, 0.0), most)
@@ -274,7 +280,7 @@ def _of_start(problem: Problem, at: int, k: int, p: Array, start: Start) -> list
     """Return what an uncertain start of stretch k does, where it matters, without a name."""
     stretches, bins = problem.logs[at]
     size, axes = np.linalg.eigh(problem.model.spread)
-    root = axes * np.sqrt(np.maximum(size, 0.0)) * (1.0 if k == 0 else _AFTER_GAP)
+    root = axes * np.sqrt(np.maximum(size, 0.0)) * (1.0 if k == 0 else EFFECTS.start_after_gap)
     # a tenth of a spread: a state near a limit must not cross it
     x0 = np.vstack([start.x0, start.x0 + 0.1 * root.T])
     d = stretches[k].d - start.d_offset
@@ -283,7 +289,7 @@ def _of_start(problem: Problem, at: int, k: int, p: Array, start: Start) -> list
     scaled = [o @ change[:, :, j].T / problem.sd[j] for j, o in enumerate(bins[k].operators)]
     stacked = np.nan_to_num(np.vstack(scaled))
     modes = stacked @ np.linalg.eigh(stacked.T @ stacked)[1]
-    modes = modes[:, np.abs(modes).max(axis=0, initial=0.0) > _MODE]
+    modes = modes[:, np.abs(modes).max(axis=0, initial=0.0) > EFFECTS.least_mode]
     ends = np.cumsum([bins_of_output.shape[0] for bins_of_output in scaled])[:-1]
     nothing = [[np.zeros(mean.size) for mean in cells.means] for cells in bins]
     out = []
@@ -308,7 +314,7 @@ def _warm_up(
     seconds, bin_s = problem.warm_up(at), merge * problem.average
     n = min(max(1, round(seconds / bin_s)), _n_bins(problem, at, 0) // merge)
     places = problem.logs[at][1][0].places
-    outputs = [j for j, place in enumerate(places) if n and place.size >= _KNOWN * n * merge]
+    outputs = [j for j, place in enumerate(places) if n and place.size >= EFFECTS.least_read * n * merge]
     if not read or not outputs:
         return None
     columns = [
@@ -344,7 +350,7 @@ def _n_bins(problem: Problem, at: int, k: int) -> int:
 def _merge(problem: Problem) -> int:
     """Return how many bins are averaged to one."""
     longest = max(_n_bins(problem, at, k) for at, (s, _) in enumerate(problem.logs) for k in range(len(s)))
-    return max(1, int(np.ceil(longest / _MOST_BINS)))
+    return max(1, int(np.ceil(longest / EFFECTS.most_bins)))
 
 
 def _blocks(
@@ -359,8 +365,8 @@ def _blocks(
 ) -> list[Block]:
     """Return the pieces of stretch k of a log on a regular grid of bins; none where it is too short."""
     places, n = problem.logs[at][1][k].places, _n_bins(problem, at, k) // merge * merge
-    outputs = [j for j, place in enumerate(places) if n and place.size >= _KNOWN * n]
-    if not outputs or n < _LEAST * merge * pieces:
+    outputs = [j for j, place in enumerate(places) if n and place.size >= EFFECTS.least_read * n]
+    if not outputs or n < EFFECTS.least_bins * merge * pieces:
         return []
     grids = []
     for j in outputs:

@@ -54,9 +54,19 @@ from thermogrip.sysid.greybox.noise_model import ErrorModel, LogData, informatio
 from thermogrip.sysid.greybox.problem import Problem
 from thermogrip.sysid.greybox.random_effects import Linearised, Response, WarmUp, linearise_logs
 
-_TERM_SD, _EFFECT_SD = 1.5, 0.7  # prior sd of ln s: of a response, of a random effect
-_BINS = 10  # to learn an error from
-_FEW, _PIECES = 3, 4  # with fewer logs, so many pieces of each stand for logs
+
+@dataclass(frozen=True)
+class ErrorPriors:
+    """What is taken for known of the errors, and how many logs and bins say more."""
+
+    discrepancy_sd: float = 1.5  # of ln s of a response
+    effect_sd: float = 0.7  # of ln s of a random effect
+    least_bins: int = 10  # to learn an error from
+    least_logs: int = 3  # whose disagreement says something
+    pieces: int = 4  # of each log that stand for logs where there are fewer
+
+
+PRIORS = ErrorPriors()
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,16 +111,16 @@ def score_covariance(
     """Return the uncertainty of the least-squares fit ``z``."""
     by_log = problem.by_log(z, central=True) if by_log is None else by_log
     data = linearise_logs(problem, z, by_log)
-    if sum(block.n for log in data.logs for block in log.blocks) < _BINS:
-        problem_is = f"too short: fewer than {_BINS} means of {problem.average:g} s"
+    if sum(block.n for log in data.logs for block in log.blocks) < PRIORS.least_bins:
+        problem_is = f"too short: fewer than {PRIORS.least_bins} means of {problem.average:g} s"
         raise UserError(problem_is, file=problem.names[0], hint="give a longer log, or a smaller average")
     if numbers is None or len(numbers.spread) != len(data.kinds):
         numbers = learn_error_model(data.logs, z, width=_widths(data))
     whole = _log_scores(problem, data, numbers, z.size)
     pull, pieces = whole.discrepancy.sum(axis=0), whole
-    if len(data.logs) < _FEW:
-        cut = linearise_logs(problem, z, by_log, pieces=_PIECES)
-        pieces = _log_scores(problem, cut, numbers, z.size) if len(cut.logs) >= _FEW else whole
+    if len(data.logs) < PRIORS.least_logs:
+        cut = linearise_logs(problem, z, by_log, pieces=PRIORS.pieces)
+        pieces = _log_scores(problem, cut, numbers, z.size) if len(cut.logs) >= PRIORS.least_logs else whole
     hessian = np.eye(z.size) + whole.hessian.sum(axis=0)
     inverse = np.linalg.inv(hessian)
     phi = common_factor(disagreement(pieces, z), len(pieces.score), cut=pieces is not whole)
@@ -135,7 +145,7 @@ def score_covariance(
 def disagreement(scores: LogScores, z: Array) -> Array:
     """Return q_i (n_free,); ones where there are fewer than three logs, from which nothing can be learnt."""
     n_log, n = scores.score.shape
-    if n_log < _FEW:
+    if n_log < PRIORS.least_logs:
         return np.ones(n)
     pulls = scores.score + scores.hessian @ z  # about z = 0
     whole, ratios = np.eye(n) + scores.hessian.sum(axis=0), []
@@ -153,7 +163,7 @@ def disagreement(scores: LogScores, z: Array) -> Array:
 
 def common_factor(q: Array, n_log: int, *, cut: bool = False) -> float:
     """Return phi of the q_i (n_free,) of ``n_log`` logs; ``cut``: these are quarters of fewer logs."""
-    if n_log < _FEW:
+    if n_log < PRIORS.least_logs:
         return 1.0
     freedom = n_log - 1
     expected_log = digamma(freedom / 2) - np.log(freedom / 2)  # of ln chi^2 / freedom
@@ -169,7 +179,9 @@ def _no_wider_than_prior(covariance: Array) -> Array:
 
 def _widths(data: Linearised) -> list[float]:
     """Return the prior sd of ln s of each kind."""
-    return [_TERM_SD] * data.n_responses + [_EFFECT_SD] * (len(data.kinds) - data.n_responses)
+    return [PRIORS.discrepancy_sd] * data.n_responses + [PRIORS.effect_sd] * (
+        len(data.kinds) - data.n_responses
+    )
 
 
 def _log_scores(problem: Problem, data: Linearised, numbers: ErrorModel, n: int) -> LogScores:

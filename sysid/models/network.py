@@ -476,7 +476,16 @@ def _play(order: list[int], pattern: list[set[int]], entry: dict[tuple[int, int]
     return lower, upper
 
 
-_SENSOR_WEIGHT, _INPUT_WEIGHT, _LEVEL_WEIGHT = 1e2, 1e-3, 1e-6
+@dataclass(frozen=True)
+class RestWeights:
+    """Weights of the state at rest: readings are nearly exact, input and level tie-breakers."""
+
+    sensor: float = 1e2
+    input: float = 1e-3
+    level: float = 1e-6
+
+
+REST = RestWeights()
 
 
 class NetworkModel(Described):
@@ -571,9 +580,9 @@ class NetworkModel(Described):
         read = np.stack(self.output(states, ()), axis=-1)
         residuals = [
             np.stack(flow, axis=-1),
-            _SENSOR_WEIGHT * (read - y)[..., is_read],
-            _INPUT_WEIGHT * (v - u[moved] / full),
-            _LEVEL_WEIGHT * (x - np.nanmean(y)),
+            REST.sensor * (read - y)[..., is_read],
+            REST.input * (v - u[moved] / full),
+            REST.level * (x - np.nanmean(y)),
         ]
         return np.concatenate(residuals, axis=-1)
 

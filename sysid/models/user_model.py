@@ -313,10 +313,18 @@ def _tuple(what: str, names: Mapping[str, Any]) -> Callable[..., Any]:
     return namedtuple(what, list(names))
 
 
-_SENSOR_WEIGHT, _INPUT_WEIGHT = 1e2, 1e-2
-_STEP_ERROR = 0.1  # of a sensor's sd (rms), between n pieces and 2 n
-_MOST_PIECES = 256
-_SENSOR_SHARE = 0.02  # of an output's spread in the logs, where the class states no sd
+@dataclass(frozen=True)
+class OwnSettings:
+    """Accuracy of a user's class, and the weights of its state at rest."""
+
+    sensor_weight: float = 1e2  # readings are nearly exact
+    input_weight: float = 1e-2  # the input is a tie-breaker
+    step_error: float = 0.1  # of a sensor's sd (rms), between n pieces and 2 n
+    most_pieces: int = 256  # of a step
+    sensor_sd: float = 0.02  # of an output's spread in the logs, where the class states no sd
+
+
+OWN = OwnSettings()
 
 
 @dataclass(frozen=True)
@@ -384,8 +392,8 @@ def still(code: OwnCode, y: Array, u: Array, d: Array, p: Array, *, sd: Array, s
         x, v = z[:n_x] * scale, np.where(moved, z[n_x:] * wide, u)
         flow = seconds * np.array(code.rhs(list(x), list(v), list(d), list(p)), dtype=float)
         read = np.array(code.output(list(x), list(p)), dtype=float)
-        miss = (_SENSOR_WEIGHT * (read - y) / sd)[is_read]
-        return np.concatenate([flow / scale, miss, _INPUT_WEIGHT * (z[n_x:] - u / wide)])
+        miss = (OWN.sensor_weight * (read - y) / sd)[is_read]
+        return np.concatenate([flow / scale, miss, OWN.input_weight * (z[n_x:] - u / wide)])
 
     limits = [code.limits.get(name, (-np.inf, np.inf)) for name in code.states]
     ends = np.array([*limits, *((ends or (-np.inf, np.inf)) for ends in ranges)], dtype=float)
@@ -480,11 +488,11 @@ class OwnModel(Described):
     def prepared(self, free_runs: FreeRuns, spread: Mapping[str, float], p: Array | None = None) -> OwnModel:
         """Return the model with steps short enough for these logs and its sensors' sd known, itself where all
         that is so already."""
-        sd = {name: _SENSOR_SHARE * (spread[name] or 1.0) for name in self.outputs}
+        sd = {name: OWN.sensor_sd * (spread[name] or 1.0) for name in self.outputs}
         model = replace(self, sd=sd)
         p_tried = self.prior if p is None else np.asarray(p, dtype=float)
         runs, n = free_runs(model, p_tried), model.pieces
-        while n <= _MOST_PIECES:
+        while n <= OWN.most_pieces:
             finer = replace(model, pieces=2 * n)
             again = free_runs(finer, p_tried)
             if model._agree(runs, again):
@@ -492,7 +500,7 @@ class OwnModel(Described):
             model, runs, n = finer, again, 2 * n
         if not all(np.isfinite(run).all() for _, run in runs):
             raise model._not_finite(runs)
-        problem = f"changes too fast for {_MOST_PIECES} Runge-Kutta steps in dt = {self.dt:g} s"
+        problem = f"changes too fast for {OWN.most_pieces} Runge-Kutta steps in dt = {self.dt:g} s"
         raise self.code.fault(problem, hint="give a smaller dt, or treat what is that fast as at rest")
 
     def to_dict(self) -> dict[str, Any]:
@@ -543,7 +551,7 @@ class OwnModel(Described):
         with np.errstate(all="ignore"):
             change = [np.abs(a - b) / self._sensors for (_, a), (_, b) in zip(runs, finer)]
             rms, most = [np.sqrt((c**2).mean()) for c in change], [c.max() for c in change]
-        return bool(np.max(rms) < _STEP_ERROR and np.max(most) < 1)  # NaN is not less
+        return bool(np.max(rms) < OWN.step_error and np.max(most) < 1)  # NaN is not less
 
     def _not_finite(self, runs: Sequence[tuple[str, Array]]) -> UserError:
         """Return the error that names the log and the first state that is lost."""

@@ -40,10 +40,19 @@ if TYPE_CHECKING:
     from thermogrip.sysid.plant.plant_data import PlantData
 
 ROOM = 25.0  # degC, where no temperature of the room is given
-_NUDGE = 1e-3
-_GROWS = 1e-6  # of the modulus of a pole beyond one, that rounding does not explain
-_INTEGRATES = 1e-10  # of 1 - A, below which a state stays wherever it is put
-_DELAY = 1e-8  # modulus of a discrete pole that represents a delay
+
+
+@dataclass(frozen=True)
+class LinearSettings:
+    """Steps and tolerances of a linearisation."""
+
+    difference_step: float = 1e-3  # of the larger of 1 and the value: exact for what is bilinear
+    growth: float = 1e-6  # of the modulus of a pole beyond one, that rounding does not explain
+    integrator: float = 1e-10  # of 1 - A, below which a state stays wherever it is put
+    delay: float = 1e-8  # modulus of a discrete pole that represents a delay
+
+
+LINEAR = LinearSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,7 +133,7 @@ def linearise_plant(
     moved = [k for k, name in enumerate(plant.inputs) if name not in plant.model.switches]
     A, B = _discrete(plant, x, u, d, moved)
     size = np.abs(np.linalg.eigvals(A))
-    if size.max() > 1 + _GROWS:
+    if size.max() > 1 + LINEAR.growth:
         seconds = plant.dt / np.log(size.max())
         raise UserError(
             f"the plant runs away at this point (it grows e-fold in {seconds:.3g} s)",
@@ -203,7 +212,7 @@ def _settled(plant: PlantData, u: Array, d: Array) -> Array:
             I_minus_A = np.eye(x.size) - A
             if (
                 not np.isfinite(I_minus_A).all()
-                or np.linalg.svd(I_minus_A, compute_uv=False)[-1] < _INTEGRATES
+                or np.linalg.svd(I_minus_A, compute_uv=False)[-1] < LINEAR.integrator
             ):
                 break
             move = np.linalg.solve(I_minus_A, _next(plant, x[None], u[None], d[None])[0] - x)
@@ -217,7 +226,7 @@ def _settled(plant: PlantData, u: Array, d: Array) -> Array:
 
 def _differences(function: Callable[[Array], Array], at: Array, columns: Sequence[int]) -> Array:
     """Return d function / d at[columns], (n, n_column), from one batch of central differences."""
-    size = _NUDGE * np.maximum(1.0, np.abs(at[list(columns)]))
+    size = LINEAR.difference_step * np.maximum(1.0, np.abs(at[list(columns)]))
     ahead = np.zeros((len(columns), at.size))
     ahead[np.arange(len(columns)), list(columns)] = size
     values = function(np.vstack([at + ahead, at - ahead]))
@@ -268,7 +277,7 @@ def _continuous(
     if rate is not None:
         return _matrices(rate, x, u, d, moved)
     poles = np.linalg.eigvals(A)
-    if np.abs(poles).min() < _DELAY or np.any((np.abs(poles.imag) < 1e-9) & (poles.real <= 0)):
+    if np.abs(poles).min() < LINEAR.delay or np.any((np.abs(poles.imag) < 1e-9) & (poles.real <= 0)):
         raise UserError(
             "the black box has a delay or a pole below zero, which no continuous model has",
             hint=f"export it at its own step, dt={plant.dt:g}",

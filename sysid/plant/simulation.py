@@ -38,11 +38,21 @@ if TYPE_CHECKING:
     from thermogrip.sysid.plant.plant_data import PlantData
 
 AFTER_GAP = 60.0  # [s] unscored after a gap
-AT_REST = 1.0  # [K] between any two sensors of a rig at rest
-AT_REST_FOR = 5.0  # [s] at most, for the drive may move the rig at once
-_LEAST_NOISE = 1e-6  # of a plant that was fitted to readings without any, in their unit
-_CHANGES = 4_000_000  # steps of all the runs that look for the change within a gap
-_ROUNDING = 1e-8  # of the largest sd of the state: eigenvalues of a covariance are known to 1e-16 of it
+
+
+@dataclass(frozen=True)
+class StartSettings:
+    """When a log is at rest, and how a start is looked for."""
+
+    rest_band: float = 1.0  # [K] between any two sensors of a rig at rest
+    rest_s: float = 5.0  # at most, for the drive may move the rig at once
+    least_noise: float = 1e-6  # of a plant that was fitted to readings without any, in their unit
+    change_steps: int = 4_000_000  # of all the runs that look for the change within a gap
+    rounding: float = 1e-8  # of the largest sd of the state: eigenvalues are known to 1e-16 of it
+
+
+START = StartSettings()
+
 READING_EVERY = 10.0  # [s] between independent readings of a warm-up
 
 
@@ -153,13 +163,13 @@ def _level(plant: PlantData, stretch: Stretch, warmup: float) -> tuple[float, Ar
     """Return (T0, mean readings, mean ambients) of a start at rest, None where it is not one."""
     if plant.reference is None or not plant.disturbances:
         return None
-    seconds = min(warmup, AT_REST_FOR)
+    seconds = min(warmup, START.rest_s)
     early = stretch.time <= seconds
     if not np.isfinite(stretch.y[early]).any(axis=0).all():
         return None
     y = np.nanmean(stretch.y[early], axis=0)
     d = stretch.d[: max(1, round(seconds / plant.dt))].mean(axis=0)
-    if np.ptp(np.concatenate([y, d])) > AT_REST:
+    if np.ptp(np.concatenate([y, d])) > START.rest_band:
         return None
     return float(y[plant.outputs.index(plant.reference)]), y, d
 
@@ -172,7 +182,7 @@ def _corrected(
     free = np.array([plant.nuisance.get(name, 0.0) for name in plant.outputs]) * float(offsets)
     root = symmetric_root(plant.model.spread)
     size = np.linalg.norm(root, axis=0)  # its columns are orthogonal
-    along = np.divide(root, size**2, out=np.zeros_like(root), where=size > _ROUNDING * size.max())
+    along = np.divide(root, size**2, out=np.zeros_like(root), where=size > START.rounding * size.max())
     for _ in range(2):
         residual, response = _warm(plant, p, stretch, start, start.x0[None], warmup)
         blocks = [response @ root]
@@ -207,7 +217,7 @@ def _after_gap(
         start.x0[None], before.u[None], before.d[None] - start.d_offset, p[None], plant.dt
     )
     same = np.array_equal(before.u[-1], stretch.u[0])
-    most = max(2, _CHANGES // max(1, round(stretch.gap / plant.dt)))
+    most = max(2, START.change_steps // max(1, round(stretch.gap / plant.dt)))
     count = min(int(np.ceil(2 * stretch.gap)) + 1, most)
     times = [0.0] if same else np.linspace(0.0, stretch.gap, count).tolist()
     u, d, dt = _through_gap(before, stretch, start, times, plant.dt)
@@ -273,6 +283,6 @@ def _binned(stretch: Stretch, dt: float, n: int, warmup: float) -> Array:
 def _noise(plant: PlantData, stretch: Stretch, warmup: float) -> Array:
     """Return the sd (n + 1, n_y) to give each bin of the warm-up: together one reading per 10 s."""
     n = min(len(stretch.u), max(1, int(np.ceil(warmup / plant.dt - 1e-9))))
-    sd = np.array([max(plant.noise.get(name, 0.1), _LEAST_NOISE) for name in plant.outputs])
+    sd = np.array([max(plant.noise.get(name, 0.1), START.least_noise) for name in plant.outputs])
     readings = 1 + n * plant.dt / READING_EVERY
     return np.tile(sd * np.sqrt((n + 1) / min(readings, n + 1)), (n + 1, 1))

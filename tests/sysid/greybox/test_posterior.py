@@ -521,7 +521,7 @@ def test_draws_tell_how_far_they_are(
     assert np.asarray(drawn.samples).shape == (2, 2)
     assert np.asarray(with_draws(fitted[0], fit_problem(*fitted)).samples).shape == (24, 2)
     told.clear()
-    monkeypatch.setattr(posterior, "_CHECK_EVERY", 2)
+    monkeypatch.setattr(posterior, "DRAW", replace(posterior.DRAW, check_steps=2))
     sample_posterior(*fitted, max_steps=4, n_samples=3, progress=progress)
     assert [what for _, what in told][:2] == ["averaging the logs", "learning the model error"]
     assert told[-2] == (0.95, "completing the samples")
