@@ -9,7 +9,6 @@ where they are flat.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -19,17 +18,9 @@ from thermogrip.sysid.data.data_quality import reading_excess
 from thermogrip.sysid.plant.fit_record import fit_logs
 from thermogrip.sysid.plant.log_grid import MOVED, quantum, rows_of
 
-
-@dataclass(frozen=True)
-class RestSettings:
-    """When a log begins with its move."""
-
-    early_rows: int = 10  # more of them before the move are a rest of their own
-    added_rows: int = 50  # of rest
-    flat_sd: float = 6.0  # of the readings' noise: ten of them differ by more once in a thousand times
-
-
-REST_BEFORE = RestSettings()
+_EARLY = 10  # rows: more of them before the move are a rest of their own
+_ADDED = 50  # rows
+_FLAT = 6.0  # sd of the readings' noise: ten of them differ by more once in a thousand times
 
 
 def with_rest(
@@ -52,7 +43,7 @@ def with_rest(
         np.flatnonzero(np.any(np.abs(np.diff(inputs_of_log, axis=0)) > least, axis=1)) + 1
         for inputs_of_log in u
     ]
-    if not any(map(len, moved)) or any(rows[-1] > REST_BEFORE.early_rows for rows in moved if len(rows)):
+    if not any(map(len, moved)) or any(rows[-1] > _EARLY for rows in moved if len(rows)):
         return list(logs), []
     out, notes = [], []
     for log, rows in zip(logs, moved):
@@ -62,8 +53,7 @@ def with_rest(
         out.append(_begun_earlier(log, at_rest))
         notes.append(
             f"{log_name(log)}: begins with the only move of an input; taken to have rested at its first "
-            f"readings before ({REST_BEFORE.added_rows} rows of that are in the fit): record a minute of "
-            "rest to make sure"
+            f"readings before ({_ADDED} rows of that are in the fit): record a minute of rest to make sure"
         )
     return out, notes
 
@@ -75,7 +65,7 @@ def _first_readings(log: Log, outputs: Sequence[str], n: int) -> dict[str, float
     means = {}
     for name, y in zip(outputs, whole.T):
         first: Array = y[:n][np.isfinite(y[:n])]
-        if not first.size or np.ptp(first) > max(1.01 * quantum(y), REST_BEFORE.flat_sd * noise[name]):
+        if not first.size or np.ptp(first) > max(1.01 * quantum(y), _FLAT * noise[name]):
             return {}
         means[name] = float(first.mean())
     return means
@@ -85,9 +75,9 @@ def _begun_earlier(log: Log, readings: dict[str, float]) -> Log:
     """Return the log with its first row held before it, and these readings."""
     time = np.asarray(log["time"].values, dtype=float)
     step = float(np.median(np.diff(time)))
-    longer = log.isel(time=np.r_[np.zeros(REST_BEFORE.added_rows, dtype=int), : len(time)])
-    before = time[0] - step * np.arange(REST_BEFORE.added_rows, 0, -1)
+    longer = log.isel(time=np.r_[np.zeros(_ADDED, dtype=int), : len(time)])
+    before = time[0] - step * np.arange(_ADDED, 0, -1)
     longer = longer.assign_coords(time=("time", np.r_[before, time], log["time"].attrs))
     for name, value in readings.items():
-        longer[name] = longer[name].copy(data=np.r_[np.full(REST_BEFORE.added_rows, value), log[name].values])
+        longer[name] = longer[name].copy(data=np.r_[np.full(_ADDED, value), log[name].values])
     return longer.assign_attrs(sha256=fit_logs([log])[0].sha256)

@@ -327,7 +327,7 @@ def test_a_parameter_is_known_as_well_as_half_its_interval_is_wide() -> None:
 def test_a_pair_of_poles_is_said_once_with_its_period() -> None:
     poles = np.array([-0.05 + 0.5j, -0.05 - 0.5j, -1.0])
     found = SimpleNamespace(
-        near=SimpleNamespace(inputs=("q",), w=(0.5,)), units={"q": "W"}, poles=poles, draws=(), level=0.9,
+        linear=SimpleNamespace(inputs=("q",), w=(0.5,)), units={"q": "W"}, poles=poles, draws=(), level=0.9,
         time_constants=-1 / poles.real, gain=SimpleNamespace(low=np.array([np.nan])),
     )  # fmt: skip
     assert "time constants 20 s (period 12.6 s), 1 s; no intervals" in plant.time_constant_words(found)

@@ -248,7 +248,7 @@ def test_each_figure_shows_what_it_should_in_the_colours_widths_and_units_of_the
 def test_a_phase_is_drawn_with_its_band_where_its_magnitude_is_on_the_axis() -> None:
     size = np.array([1.0, 1e-3, 1e-6])[:, None, None]
     found = SimpleNamespace(
-        near=SimpleNamespace(outputs=("y",), inputs=("u",)),
+        linear=SimpleNamespace(outputs=("y",), inputs=("u",)),
         frequency_response=lambda: (
             np.array([0.1, 1.0, 10.0]),
             Estimate(size, 0.9 * size, 1.1 * size),
