@@ -29,7 +29,9 @@ if TYPE_CHECKING:
 # after Okabe and Ito: eight colours that are distinct under every kind of colour-vision deficiency
 PALETTE = ("#1f5fa8", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#8a5a00")
 DASHES = ("-", "--", ":", "-.")
-INK, SOFT, SHADE = "#1d2733", "#8795a3", "#e6eaef"  # of targets, of limits, of what is not scored
+INK = "#1d2733"  # of targets
+SOFT = "#8795a3"  # of limits
+SHADE = "#e6eaef"  # of what is not scored
 _STILL = 400  # points of a curve on paper
 
 

@@ -42,10 +42,21 @@ _STEP = re.compile(r"(?i)ts|dt|delta_?t|sampl(e|ing)_?(time|period|interval)")
 _COUNTER = re.compile(r"(?i)x|n|k|i|no|nr|id|index|idx|samples?|rows?|steps?|count(er)?|unnamed.*")
 _TIME_WORDS = {"ms": 1e-3, "milli": 1e-3, "us": 1e-6, "micro": 1e-6, "minute": 60.0, "hour": 3600.0}
 EPOCH = (946684800.0, 4102444800.0)  # s since 1970 of the years 2000 and 2100
-_MONOTONE = 0.9  # share of a clock's steps that do not run backward, and that are nearly even
-_EVEN = 0.2  # of their median, by which nearly even steps differ
-_COUNTS_APART, _MICROSECONDS_APART = 20.0, 1e5  # see the module's text
-_PIECE_ROWS = 20  # of a part of a log that stands alone
+
+
+@dataclass(frozen=True)
+class ClockSettings:
+    """Limits of the rules."""
+
+    monotone_share: float = 0.9  # of a clock's steps that do not run backward, and that are nearly even
+    evenness: float = 0.2  # of their median, by which nearly even steps differ: loops of a board jitter so
+    counts_apart: float = 20.0  # of a board's counter: 50 rows a second in ms, which no plant here needs
+    microseconds_apart: float = 1e5  # 100 ms in us, or 100 s in ms
+    piece_rows: int = 20  # of a part of a log that stands alone
+    days_apart: float = 1 / 24  # rows of a plant are closer than an hour, seconds so late in a day are not
+
+
+_SETTINGS = ClockSettings()
 _ELAPSED = " as minutes and seconds"  # how times of two numbers are taken that begin at 00:00 or pass 23
 _MONTH_NAMES = ("jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec")
 _MONTHS = {month: str(number) for number, month in enumerate(_MONTH_NAMES, 1)}
@@ -72,7 +83,6 @@ _DATES = (
     _Counts(86400.0, -25569 * 86400.0, "a spreadsheet"),  # since 30 December 1899
     _Counts(86400.0, -719529 * 86400.0, "MATLAB"),  # datenum
 )
-_DAYS_APART = 1 / 24  # days: a plant's rows are closer than an hour, which seconds so late in a day never are
 
 
 @dataclass(frozen=True)
@@ -110,11 +120,11 @@ def clock_of(table: Table, read: Mapping[str, tuple[str, str, float]], dt: float
 def _behaves_as_clock(header: str, read: tuple[str, str, float], values: Floats) -> bool:
     """Tell whether a column that is not named as a time rises in nearly even steps, as only a clock does."""
     steps = np.diff(_unwrapped(values, np.arange(values.size))[0])
-    enough = 4 if re.fullmatch(r"c1", header) or _COUNTER.fullmatch(header) else _PIECE_ROWS
+    enough = 4 if re.fullmatch(r"c1", header) or _COUNTER.fullmatch(header) else _SETTINGS.piece_rows
     if read[1] not in _TIME_UNITS or steps.size < enough or not np.all(steps > 0):
         return False
     usual = float(np.median(steps))
-    return bool(np.mean(np.abs(steps - usual) <= _EVEN * usual) >= _MONOTONE)
+    return bool(np.mean(np.abs(steps - usual) <= _SETTINGS.evenness * usual) >= _SETTINGS.monotone_share)
 
 
 def _of_text(header: str, table: Table) -> Clock | None:
@@ -140,7 +150,9 @@ def _of_numbers(header: str, table: Table, read: tuple[str, str, float]) -> Cloc
     counts, notes = _unwrapped(counts, table.lines)
     finite = counts[np.isfinite(counts)]
     stated = name == "time" and unit != "1"
-    rising = finite.size > 1 and np.mean(np.diff(finite) >= 0) >= _MONOTONE and np.ptp(finite) > 0
+    rising = (
+        finite.size > 1 and np.mean(np.diff(finite) >= 0) >= _SETTINGS.monotone_share and np.ptp(finite) > 0
+    )
     if not (stated or rising):
         return None
     meant = _what_counts_mean(name, finite, wrapped=bool(notes)) if unit == "1" else _Counts(scale)
@@ -165,9 +177,9 @@ def _what_counts_mean(name: str, counts: Floats, *, wrapped: bool) -> _Counts:
     steps = np.diff(counts)
     usual = float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
     whole = bool(np.all(counts == np.rint(counts)))
-    likely = (date for date in _DATES if not date.calendar or (not whole and usual <= _DAYS_APART))
+    likely = (date for date in _DATES if not date.calendar or (not whole and usual <= _SETTINGS.days_apart))
     dates = next((date for date in likely if date.has(float(counts[0]))), None)
-    of_board = whole and usual >= _COUNTS_APART and not np.all(steps % 60 == 0)
+    of_board = whole and usual >= _SETTINGS.counts_apart and not np.all(steps % 60 == 0)
     if word is not None and (dates is None or dates.seconds == 1.0):  # a board's counter may be as large
         return _Counts(word)
     if dates is not None and dates.calendar:
@@ -176,11 +188,11 @@ def _what_counts_mean(name: str, counts: Floats, *, wrapped: bool) -> _Counts:
     if dates is not None and not (dates.seconds == 1.0 and of_board):
         return dates
     if not of_board:
-        minutes = whole and usual >= _COUNTS_APART
+        minutes = whole and usual >= _SETTINGS.counts_apart
         guess = f"{name} has no unit: taken as seconds, so that rows are {usual:g} s apart" if minutes else ""
         return _Counts(1.0, doubt=guess)
     # 32 bits of microseconds last for 72 minutes, of milliseconds for 50 days
-    fine = usual >= _MICROSECONDS_APART or (wrapped and counts[-1] > 2**32)
+    fine = usual >= _SETTINGS.microseconds_apart or (wrapped and counts[-1] > 2**32)
     scale, unit = (1e-6, "microseconds") if fine else (1e-3, "milliseconds")
     doubt = f"{name} has no unit: taken as {unit}, so that rows are {usual * scale:g} s apart"
     return _Counts(scale, doubt=doubt)
@@ -211,8 +223,12 @@ def _in_pieces(seconds: Floats, lines: NDArray[np.int64]) -> tuple[Floats, list[
     if not back.size:
         return seconds, []
     usual = float(np.nanmedian(np.diff(seconds)))
-    begins = seconds[0] + max(GAP_SECONDS, _PIECE_ROWS * usual)  # a board begins where it began before
-    whole = [piece.size >= _PIECE_ROWS and piece[1] - piece[0] <= GAP_STEPS * usual for piece in pieces]
+    begins = seconds[0] + max(
+        GAP_SECONDS, _SETTINGS.piece_rows * usual
+    )  # a board begins where it began before
+    whole = [
+        piece.size >= _SETTINGS.piece_rows and piece[1] - piece[0] <= GAP_STEPS * usual for piece in pieces
+    ]
     if not all(whole) or any(piece[0] > begins for piece in pieces):
         return seconds, []  # a stamp that is wrong begins no part that goes on as a clock does
     gap = 1.0 + max(GAP_SECONDS, GAP_STEPS * usual)
@@ -240,7 +256,7 @@ def read_clock(cells: Sequence[str]) -> tuple[Floats, str] | None:
     import pandas as pd
 
     fields = pd.Series(list(cells), dtype=object).str.strip().str.extract(STAMP)
-    if fields[[1, 4]].isna().all(axis=1).mean() > 1 - _MONOTONE:
+    if fields[[1, 4]].isna().all(axis=1).mean() > 1 - _SETTINGS.monotone_share:
         return None
 
     def numbers(key: int) -> Floats:
@@ -260,18 +276,18 @@ def read_clock(cells: Sequence[str]) -> tuple[Floats, str] | None:
         steps = np.diff(of_day, prepend=of_day[0])
         return of_day + 86400.0 * np.cumsum(np.nan_to_num(steps) < -43200), ""
     fields[2] = fields[2].str.lower().map(_MONTHS).fillna(fields[2])
-    first, middle, last = numbers(1), numbers(2), numbers(3)
-    note = ""
-    if np.nanmax(first) > 31:
-        year, month, day = first, middle, last
-    elif np.nanmax(middle) > 12 or (np.nanmax(first) <= 12 and "/" in str(cells[0])):
-        month, day, year = first, middle, last
-        note = "" if np.nanmax(middle) > 12 else " (taken as month/day)"
-    else:
-        day, month, year = first, middle, last
-    year = np.where(year < 100, year + 2000, year)
+    triples = [numbers(key) for key in (1, 2, 3)]
+    first, middle, _ = (float(np.nanmax(values)) for values in triples)
+    order, note = ("day", "month", "year"), ""
+    if first > 31:
+        order = ("year", "month", "day")
+    elif middle > 12 or (first <= 12 and "/" in str(cells[0])):
+        order = ("month", "day", "year")
+        note = "" if middle > 12 else " (taken as month/day)"
+    date = dict(zip(order, triples))
+    year = np.where(date["year"] < 100, date["year"] + 2000, date["year"])
     year[(year < 1900) | (year > 2200)] = np.nan  # beyond what pandas counts in nanoseconds
-    dates = pd.to_datetime(pd.DataFrame({"year": year, "month": month, "day": day}), errors="coerce")
+    dates = pd.to_datetime(pd.DataFrame(date | {"year": year}), errors="coerce")
     days = (dates - pd.Timestamp(0)) / pd.Timedelta(days=1)
     return np.asarray(days, dtype=float) * 86400.0 + of_day, note
 

@@ -59,7 +59,9 @@ class UserError(ValueError):
         column: str | None = None,
         hint: str | None = None,
     ) -> None:
-        self.problem, self.file, self.row, self.column, self.hint = problem, file, row, column, hint
+        self.problem, self.hint = problem, hint
+        self.file = file
+        self.row, self.column = row, column
         places = (("", file), ("row ", row), ("column ", column))
         where = ", ".join(filter(None, (f"{word}{place}" for word, place in places if place is not None)))
         text = f"{where}: {problem}" if where else problem

@@ -109,7 +109,8 @@ class Unpacker:
     readers would unpack chunks whole, which grow 255 times (lz4) or many thousand times (zstd, bz2)."""
 
     def __init__(self, file: str | Path) -> None:
-        self._file, self._packed, self._found = file, Path(file).stat().st_size, 0
+        self._file, self._found = file, 0
+        self._packed = Path(file).stat().st_size
 
     def __call__(self, packing: str, data: bytes) -> bytes:
         """Return what ``data``, packed with bz2, lz4 or zstd, holds; KeyError if it is with another."""

@@ -126,7 +126,8 @@ def read_log(
     t_tank: converted from K to degC
     """
     if not isinstance(path, str | Path):
-        file, start, stop = Path("DataFrame"), -np.inf, np.inf
+        file = Path("DataFrame")
+        start, stop = -np.inf, np.inf
         if columns is not None:
             raise UserError("has names of its own", file=file, hint="rename its columns")
         table = frame_table(path, str(file))
@@ -140,7 +141,8 @@ def read_log(
     if table.meta.get("schema") not in (None, "thermogrip.log"):
         raise UserError(f"holds a {table.meta['schema']}, not a log", file=file, hint="give a log")
     read = _convert(table, dt)
-    data, units, time, repairs = read.values, read.units, read.clock.seconds, read.repairs
+    data, units = read.values, read.units
+    time, repairs = read.clock.seconds, read.repairs
     sha256 = hash_columns({"time": time, **data})
     if not data:
         content = "a time column and nothing else" if read.clock.columns else "no column of numbers"
@@ -257,7 +259,8 @@ def _read_netcdf_table(path: str | Path) -> Table:
     if "time" not in data.dims or "time" not in data.variables:
         problem = "no time axis"
         raise UserError(problem, file=path, hint="give it a dimension and a variable 'time' in seconds")
-    numbers, attrs, not_over_time = {}, {}, []
+    numbers, attrs = {}, {}
+    not_over_time = []
     for key in ["time", *data.data_vars]:
         name, variable = str(key), data[key]
         if variable.dims != ("time",):
@@ -339,7 +342,8 @@ def _convert(table: Table, dt: float | None) -> _Columns:
 def _states_as_columns(table: Table, clock: Clock) -> Table:
     """Return a table with a column of 0 and 1 for each word of columns that have a few, but for the one of
     rest: ``off``, ``idle``, else the most frequent."""
-    numbers, text, notes = dict(table.numbers), dict(table.text), []
+    numbers, text = dict(table.numbers), dict(table.text)
+    notes = []
     for header in [header for header in table.text if header not in clock.columns]:
         counts = Counter(cell for cell in text[header] if cell)
         if not 2 <= len(counts) <= MOST_STATES or counts.total() < 5 * len(counts):

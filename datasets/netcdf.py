@@ -62,7 +62,8 @@ def _not_damaged(path: str | Path) -> AbstractContextManager[None]:
 def check_hdf5(opened: Any, path: str | Path) -> None:
     """Refuse an open ``h5py.File`` that declares more than it may hold, or data that stand in other files."""
     h5py = import_module("h5py")
-    packed, declared, members = Path(path).stat().st_size, 0, 0
+    packed = Path(path).stat().st_size
+    declared = members = 0
     groups = [opened]
     while groups:
         group = groups.pop()

@@ -132,7 +132,8 @@ def _done(
 def _on_processes(
     function: Callable[[_Item], _Result], todo: list[_Item], n: int
 ) -> Generator[tuple[int, _Result], None, None]:
-    remaining, deaths, pool = dict(enumerate(todo)), 0, _processes(n)
+    remaining, pool = dict(enumerate(todo)), _processes(n)
+    deaths = 0
     while remaining:
         futures: dict[Future[_Result], int] = {}
         try:

@@ -1,4 +1,4 @@
-"""Cuts, gaps and averages of logs.
+"""Cuts, gaps and held means of logs.
 
 An input is applied from its row until the next (zero-order hold), so its mean over a cell [a, b) is an
 integral of a staircase.  With t_i the rows and U(t) the integral of the held input up to t, which is
@@ -6,14 +6,11 @@ piecewise linear,
 
     mean over [a, b) = (U(b) - U(a)) / (b - a)
 
-exactly, whatever the jitter of the rows.  Outputs are samples: their mean is over the samples in the cell
-that are there.  Averaging is what makes a coarse converter (the 0.4 degC of a hobby board) usable in a fit.
+exactly, whatever the jitter of the rows.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from itertools import pairwise
 from typing import TypeAlias
 
 import numpy as np
@@ -21,12 +18,11 @@ from numpy.typing import NDArray
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.repair import gap_rows
-from thermogrip.datasets.schema import Log, columns, log_name, make_log, names
+from thermogrip.datasets.schema import Log, log_name
 
 Floats: TypeAlias = NDArray[np.float64]
-_Blocks: TypeAlias = tuple[Floats, Floats]
 
-# where the blocks of an averaged log start anew [s]: with long blocks the step alone no longer shows a gap
+# where the blocks of a log that version 0.2 averaged start anew [s]: long blocks hide a gap
 _AFTER_GAP = "after_gap"
 
 
@@ -46,6 +42,7 @@ def cut(log: Log, start: float = -np.inf, stop: float = np.inf) -> Log:
 
     Examples
     --------
+    >>> from thermogrip.datasets.schema import make_log
     >>> log = make_log([0.0, 1.0, 2.0, 3.0], {"pump": ([0, 1, 1, 0], "1", "input")})
     >>> cut(log, 1.0, 3.0)["time"].values
     array([1., 2.])
@@ -66,92 +63,6 @@ def gaps(log: Log, longer_than: float = 10.0) -> list[tuple[int, float, float]]:
     begins = [float(t) for t in str(log.attrs.get(_AFTER_GAP, "")).split()]
     gap_starts = np.union1d(gap_rows(time, longer_than), np.flatnonzero(np.isin(time[1:], begins)))
     return [(int(row), float(time[row]), float(time[row + 1])) for row in gap_starts]
-
-
-def average(log: Log, seconds: float) -> Log:
-    """Return the log in blocks.
-
-    A block's time is its start.  Inputs and disturbances are averaged as held, so a block's input is the one
-    applied until the next block; outputs and others are the mean of the samples present (NaN where there is
-    none), so they belong to the middle of the block.  The blocks start anew after each gap: no block mixes
-    what was before with what came after.
-
-    Parameters
-    ----------
-    log : Log
-    seconds : float
-        Length of a block [s].
-
-    Raises
-    ------
-    UserError
-        If the blocks are shorter than the median step or fewer than two are filled.
-
-    Examples
-    --------
-    >>> pump, t = [0, 1, 1, 0], [20.0, 20.2, 20.4, np.nan]
-    >>> log = make_log([0.0, 0.5, 1.0, 1.5], {"pump": (pump, "1", "input"), "t": (t, "degC", "output")})
-    >>> average(log, 1.0)["t"].values, average(log, 1.0)["pump"].values
-    (array([20.1, 20.4]), array([0.5, 0.5]))
-    """
-    held_names = names(log, "input") + names(log, "disturbance")
-    wanted = tuple(str(key) for key in log.data_vars)
-    is_held = np.array([name in held_names for name in wanted], dtype=bool)
-    after = [column_place + 1 for column_place, _, _ in gaps(log)]
-    segments = block_means(
-        log["time"].values, columns(log, wanted), is_held, seconds=seconds, after=after, log=log_name(log)
-    )
-    begins, means = np.concatenate([t for t, _ in segments]), np.concatenate([v for _, v in segments])
-    variables = {
-        name: (means[:, column_place], log[name].attrs["units"], log[name].attrs["role"])
-        for column_place, name in enumerate(wanted)
-    }
-    repairs = [line for line in str(log.attrs.get("repairs", "")).splitlines() if line]
-    repairs.append(f"averaged over {seconds:g} s")
-    log = make_log(begins, variables, name=log_name(log), repairs=repairs)
-    log.attrs["averaged_s"] = seconds  # a free run compares with the middle of a block, not with its start
-    if len(segments) > 1:
-        log.attrs[_AFTER_GAP] = " ".join(repr(float(t[0])) for t, _ in segments[1:])
-    return log
-
-
-def block_means(
-    time: Floats, values: Floats, held: NDArray[np.bool_], *, seconds: float, after: Sequence[int], log: str
-) -> list[_Blocks]:
-    """Return starts (n_block,) and means (n_block, n) of blocks, as :func:`average` makes them, of each part;
-    ``held`` (n,) says which of the values (n_time, n) are held, ``after`` which rows begin anew after a
-    gap."""
-    step = float(np.median(np.diff(time)))
-    if not seconds >= step * (1 - 1e-9):
-        problem = f"cannot average over {seconds:g} s: the rows are {step:g} s apart"
-        raise UserError(problem, file=log, hint="choose a longer block")
-    segments = [
-        _blocks(time[a:b], values[a:b], held, seconds=seconds, step=step)
-        for a, b in pairwise([0, *after, time.size])
-    ]
-    if (n := sum(begins.size for begins, _ in segments)) < 2:
-        problem = f"{n} block of {seconds:g} s is not a log"
-        raise UserError(problem, file=log, hint="choose a shorter block")
-    return segments
-
-
-def _blocks(
-    time: Floats, values: Floats, is_held: NDArray[np.bool_], *, seconds: float, step: float
-) -> _Blocks:
-    """Return the starts (n_block,) and means (n_block, n_variables) of the filled blocks of one stretch."""
-    # rows a rounding error before an edge belong behind it: 3 * 0.1 > 0.3
-    block = np.floor((time - time[0]) / seconds + 1e-9).astype(np.int64)
-    filled, where = np.unique(block, return_inverse=True)
-    edges = time[0] + seconds * np.arange(int(block[-1]) + 2)
-    edges[-1] = min(edges[-1], time[-1] + step)  # the last row is held for one step, not for the whole block
-    means = np.empty((filled.size, values.shape[1]))
-    means[:, is_held] = held_means(time, values[:, is_held], edges)[filled]
-    for sampled in np.flatnonzero(~is_held):
-        finite = np.isfinite(values[:, sampled])
-        count = np.bincount(where[finite], minlength=filled.size)
-        total = np.bincount(where[finite], weights=values[finite, sampled], minlength=filled.size)
-        means[:, sampled] = np.where(count > 0, total / np.maximum(count, 1), np.nan)
-    return edges[filled], means
 
 
 def held_means(time: Floats, values: Floats, edges: Floats) -> Floats:

@@ -71,12 +71,25 @@ _NEVER_MOVES, _COUNTS_ROWS = "it never moves", "it counts rows or time"
 BY_UNIT = "its unit is degC"
 FOLLOWS = "its course follows"
 FOLLOWED = "settles at its levels, as at a set point"
-_HELD_SHARE, _HELD_SIZE = 0.5, 0.05  # of rows with a move; of the range that its median has, at least
-_FEW = 20  # rows: too few to distinguish chance from rule
-_COUNTS = 0.9  # of the rows have the same step
-_SHOWS = 5  # moves of two columns, by which they may be one signal
-_EXACT, _ROUNDED = 1e-6, 0.05  # of a column's range; of its standard deviation, that rounding takes at most
-_LAGS, _STRONG, _MOST_ROWS = (2, 6), 10.0, 20_000
+
+
+@dataclass(frozen=True)
+class RoleSettings:
+    """Limits of the rules; 38 of 40 kinds of logs are right and 2 asked with them (benchmarks/hostile)."""
+
+    held_share: float = 0.5  # of rows with a move at most, of a column that is held
+    held_size: float = 0.05  # of its range, that the median of its moves has at least: beyond noise
+    fewest_rows: int = 20  # of fewer, chance looks like a rule
+    counter_share: float = 0.9  # of the rows of a counter have the same step
+    fewest_moves: int = 5  # of two columns that may be one signal: fewer moves agree by chance
+    exact: float = 1e-6  # of a column's range: beyond the rounding of files
+    rounding_share: float = 0.05  # of its standard deviation, that rounding takes at most
+    lags: tuple[int, ...] = (2, 6)  # rows; see the module's text
+    strong_gain: float = 10.0  # of the criterion: "very strong" evidence (Kass and Raftery 1995)
+    most_rows: int = 20_000  # that are looked at, for time
+
+
+_SETTINGS = RoleSettings()
 
 
 @dataclass(frozen=True)
@@ -150,7 +163,7 @@ def assign_roles(
     evidence: dict[str, tuple[str, str]] = {}  # of the data alone
     if columns is not None:  # what is beyond all use is no reading, and its squares are none either
         columns = {n: np.where(np.abs(v) <= MOST_NUMBER, v, np.nan) for n, v in columns.items()}
-        if all(len(values) >= _FEW for values in columns.values()):
+        if all(len(values) >= _SETTINGS.fewest_rows for values in columns.values()):
             guesses |= _copies(columns, guesses, units)
             guesses |= _unlike_inputs(columns, guesses, [n for n, role in stated.items() if role == "input"])
         guesses |= _controllers(guesses, units)
@@ -208,7 +221,7 @@ def roles_of_data(
         steps, rows = np.diff(values), max(values.size, 1)
         if not steps.any():
             out[name] = "other", _NEVER_MOVES
-        elif rows >= _FEW and _mostly_even(steps):
+        elif rows >= _SETTINGS.fewest_rows and _mostly_even(steps):
             out[name] = "other", _COUNTS_ROWS
         elif _is_held(values):
             out[name] = "input", f"it is held between {np.count_nonzero(steps)} moves in {rows} rows"
@@ -218,7 +231,7 @@ def roles_of_data(
     open_, net = [n for n in names if n not in roles], dict(zip(names, (gain - gain.T).sum(axis=1)))
     for name in open_:
         help_ = gain[:, names.index(name)]
-        if help_.max() > _STRONG:
+        if help_.max() > _SETTINGS.strong_gain:
             out[name] = "output", f"{FOLLOWS} {names[int(help_.argmax())]}"
     roles |= {name: role for name, (role, _) in out.items()}
     has_held_input = any(roles.get(n) == "input" and _is_held(columns[n]) for n in names)
@@ -273,7 +286,7 @@ def _doubts(
 def _helps_beside(columns: Mapping[str, Floats], name: str, output: str, inputs: Sequence[str]) -> bool:
     """Tell whether the past of a column helps to predict an output beside that of the inputs and its own."""
     reading, *others = _scaled([columns[n] for n in (output, name, *inputs)])
-    return all(_gain(reading, others[0], others[1:], lags) > _STRONG for lags in _LAGS)
+    return all(_gain(reading, others[0], others[1:], lags) > _SETTINGS.strong_gain for lags in _SETTINGS.lags)
 
 
 def _heated_rooms(
@@ -294,7 +307,7 @@ def _heated_rooms(
         if not (alone or re.search(r"(^|_)room(_|$)", words)):
             continue
         gain = _predictive_gain([columns[name], *(columns[drive] for drive in drives)])
-        if gain[1:, 0].max() > _STRONG:
+        if gain[1:, 0].max() > _SETTINGS.strong_gain:
             drive = drives[int(gain[1:, 0].argmax())]
             out[name] = "output", f"it follows the drive {drive}, as no surroundings do"
     return out
@@ -321,7 +334,7 @@ def _followed(
         gains = _predictive_gain(
             [columns[reading], *(columns[n] for n in drives if n not in (goal, reading))]
         )
-        if gains[1:, 0].max(initial=0.0) > _STRONG:
+        if gains[1:, 0].max(initial=0.0) > _SETTINGS.strong_gain:
             out[goal] = "other", f"{reading} {FOLLOWED}"
             if guesses.get(reading, ("", ""))[1] == NO_CLUE:
                 out[reading] = "output", f"it settles at the levels of {goal}"
@@ -332,12 +345,14 @@ def _comes_to(reading: Floats, goal: Floats) -> bool:
     """Tell whether most of the levels that a goal is held at, three at least, are those that a reading has in
     the last half of each hold."""
     bounds = [0, *(np.flatnonzero(np.diff(goal)) + 1), goal.size]
-    holds = [(goal[a], reading[(a + b) // 2 : b]) for a, b in pairwise(bounds) if b - a >= _FEW]
+    holds = [
+        (goal[a], reading[(a + b) // 2 : b]) for a, b in pairwise(bounds) if b - a >= _SETTINGS.fewest_rows
+    ]
     pairs = [
         (level, np.median(second_half)) for level, second_half in holds if np.isfinite(second_half).all()
     ]
     levels = np.array([level for level, _ in pairs])
-    off = [abs(level - value) <= _HELD_SIZE * np.ptp(levels) for level, value in pairs]
+    off = [abs(level - value) <= _SETTINGS.held_size * np.ptp(levels) for level, value in pairs]
     return np.unique(levels).size >= 3 and float(np.mean(off)) > 0.5
 
 
@@ -367,11 +382,13 @@ def _is_moved(columns: Mapping[str, Floats], name: str, drives: Sequence[str]) -
     """Tell whether the past of a drive helps to predict a column, row by row or in means over many rows, as
     long as the column is not stuck."""
     is_sound = np.isfinite(drop_stuck(name, columns[name], [columns[n] for n in drives])[0])
-    if is_sound.sum() < _FEW:
+    if is_sound.sum() < _SETTINGS.fewest_rows:
         return True  # nothing of it speaks against
     some = [columns[n][is_sound] for n in (name, *drives)]
     reading, *moves = _scaled(some)
-    return any(_gain(reading, drive, (), lags) > _STRONG for drive in moves for lags in _LAGS)
+    return any(
+        _gain(reading, drive, (), lags) > _SETTINGS.strong_gain for drive in moves for lags in _SETTINGS.lags
+    )
 
 
 def _words(name: str) -> str:
@@ -381,15 +398,15 @@ def _words(name: str) -> str:
 
 def _mostly_even(steps: Floats) -> bool:
     usual = np.median(steps)
-    return bool(np.mean(np.abs(steps - usual) < _EXACT * np.abs(usual)) >= _COUNTS)
+    return bool(np.mean(np.abs(steps - usual) < _SETTINGS.exact * np.abs(usual)) >= _SETTINGS.counter_share)
 
 
 def _is_held(values: Floats) -> bool:
     """Tell whether a column moves in few rows, and then far, as what a person or a relay sets does."""
     finite = values[np.isfinite(values)]
     moves = np.abs(np.diff(finite))
-    rarely_moves = 0 < np.count_nonzero(moves) <= _HELD_SHARE * finite.size
-    return bool(rarely_moves and np.median(moves[moves > 0]) >= _HELD_SIZE * np.ptp(finite))
+    rarely_moves = 0 < np.count_nonzero(moves) <= _SETTINGS.held_share * finite.size
+    return bool(rarely_moves and np.median(moves[moves > 0]) >= _SETTINGS.held_size * np.ptp(finite))
 
 
 def _unlike_inputs(
@@ -401,7 +418,7 @@ def _unlike_inputs(
     likely = [n for n, (role, why) in guesses.items() if role == "input" or why == NO_CLUE]
     held_input = next((name for name in (*stated, *likely) if _is_held(columns[name])), None)
     finite = {name: columns[name][np.isfinite(columns[name])] for name in by_unit}
-    moving = [n for n, v in finite.items() if np.count_nonzero(np.diff(v)) > _HELD_SHARE * len(v)]
+    moving = [n for n, v in finite.items() if np.count_nonzero(np.diff(v)) > _SETTINGS.held_share * len(v)]
     why = f"it moves in most rows, and {held_input} is held between its moves, as inputs are"
     return dict.fromkeys(moving if held_input else (), ("other", why))
 
@@ -414,7 +431,7 @@ def _copies(
     Of two copies the one with a clue, else the first, stays.  What is read is no copy of what is driven:
     under a proportional controller the two are multiples of each other.
     """
-    moving = {n: v[:_MOST_ROWS] for n, v in columns.items() if np.ptp(v) > 0}  # of lost values none
+    moving = {n: v[: _SETTINGS.most_rows] for n, v in columns.items() if np.ptp(v) > 0}  # of lost values none
     out: dict[str, tuple[str, str]] = {}
     order = sorted(moving, key=lambda n: (n in guesses) + (guesses.get(n, ("", ""))[1] == NO_CLUE))
     for place, name in enumerate(order):
@@ -451,14 +468,14 @@ def _one_signal(one: Floats, other: Floats) -> bool:
 
 def _explains(y: Floats, *some: Floats) -> bool:
     """Tell whether a column is a sum of multiples of others but for rounding; of few moves nobody can."""
-    if min(np.count_nonzero(np.diff(v)) for v in (y, some[-1])) < _SHOWS:
+    if min(np.count_nonzero(np.diff(v)) for v in (y, some[-1])) < _SETTINGS.fewest_moves:
         return False
     x = np.column_stack([np.ones(y.size), *some])
     moves = np.abs(np.diff(y))
-    least = max(_EXACT * float(np.ptp(y)), float(moves[moves > 0].min(initial=np.inf)))
+    least = max(_SETTINGS.exact * float(np.ptp(y)), float(moves[moves > 0].min(initial=np.inf)))
     for rows in (slice(0, 200), slice(None)):
         residual = y[rows] - x[rows] @ np.linalg.lstsq(x[rows], y[rows], rcond=None)[0]
-        if np.abs(residual).max() > least or residual.std() > _ROUNDED * y.std():
+        if np.abs(residual).max() > least or residual.std() > _SETTINGS.rounding_share * y.std():
             return False
     return True
 
@@ -469,14 +486,14 @@ def _predictive_gain(columns: Sequence[Floats]) -> Floats:
     gain = np.zeros((n, n))
     for j in range(n):
         for i in (i for i in range(n) if i != j):
-            gain[i, j] = min(_gain(scaled[j], scaled[i], (), lags) for lags in _LAGS)
+            gain[i, j] = min(_gain(scaled[j], scaled[i], (), lags) for lags in _SETTINGS.lags)
     return gain
 
 
 def _scaled(columns: Sequence[Floats]) -> list[Floats]:
     """Return the first rows of columns, gaps filled, of mean 0 and standard deviation 1."""
     scaled = []
-    for values in (column[:_MOST_ROWS] for column in columns):
+    for values in (column[: _SETTINGS.most_rows] for column in columns):
         rows, finite = np.arange(values.size), np.isfinite(values)
         filled = np.interp(rows, rows[finite], values[finite]) if finite.any() else np.zeros(values.size)
         scaled.append((filled - filled.mean()) / (np.std(filled) or 1.0))

@@ -222,7 +222,8 @@ def find_layout(data: bytes, file: str) -> Layout:
 def _best_separator(head: Sequence[tuple[int, str]]) -> tuple[str, int | None]:
     """Return the separator that makes most of the lines rows of numbers, and which is the first row, None
     where no line is one."""
-    best_share, best, best_first = -1.0, ",", None
+    best_share = -1.0
+    best, best_first = ",", None
     for separator in "\t;|, ":
         rows = [[] if line.startswith(_COMMENT) else _split(line, separator) for _, line in head]
         starts = [k for k in range(len(rows)) if _is_row(rows, k, separator)]
@@ -237,7 +238,8 @@ def _best_separator(head: Sequence[tuple[int, str]]) -> tuple[str, int | None]:
         fits = [len(row) == n and _values(row, separator) for row in rows[first:]]
         share = float(np.mean(fits)) if n > 1 else 0.0
         if share > best_share + 1e-9:
-            best_share, best, best_first = share, separator, first
+            best_share = share
+            best, best_first = separator, first
     return best, best_first
 
 
@@ -388,7 +390,8 @@ def _stamps_as_column(data: bytes) -> bytes:
 
 def _labelled(line: str) -> dict[str, str]:
     """Return the numbers of a line by the names beside them, and its stamp."""
-    stamp, section, last = _LINE_STAMP.match(line), "", ""
+    stamp = _LINE_STAMP.match(line)
+    section = last = ""
     cells: dict[str, str] = {}
     if stamp is not None:
         cells["time" if stamp[1] else "time_s"] = (stamp[1] or stamp[2]).replace(",", ".")
@@ -702,7 +705,8 @@ def _unpacked_matlab(raw: bytes, path: str | Path) -> bytes:
     if raw[126:128] not in (b"IM", b"MI"):
         return raw
     order: Literal["little", "big"] = "little" if raw[126:128] == b"IM" else "big"
-    out, offset, total = [raw[:128]], 128, 0
+    out = [raw[:128]]
+    offset, total = 128, 0
     while offset < len(raw):
         kind, size = (int.from_bytes(raw[offset + k : offset + k + 4], order) for k in (0, 4))
         element, offset = raw[offset : offset + 8 + size], offset + 8 + size

@@ -39,18 +39,30 @@ from thermogrip.sysid.plant.plant import Plant
 
 Verdict = Literal["ok", "warn", "fail"]
 
-_FEW_READINGS = 50  # too few to question their noise
-_HELD = 0.05  # share of rows with a move, below which an output is constant but for jumps
-_NO_NOISE = 1e-6  # of the range of an output
 
-_OWN_LAGS = (3, 6, 12, 24, 48)  # rows of an input's own past, to test it for feedback
-# Of the moves of an input the 5 % largest are a set point's.  Of the others the past of the outputs explains
-# 33 to 99 % in 20 closed loops with a set point in steps, at most 34 % (few moves, by chance) in open ones.
-_USUAL_MOVES, _EXPLAINED_BETWEEN = 0.95, 0.25
-# Median of differences over ranges: at most 0.08 in ten thermostats, 0.14 to 1 in 60 relays of any course.
-_SAME_READING, _SWITCHINGS = 0.1, 10
-_ROWS_A_WINDOW = 3  # fewer have no shares beside none, half and all
-_EVEN_WINDOWS = 0.9  # share of a relay's switchings, within a row of a whole number of windows
+@dataclass(frozen=True)
+class CheckSettings:
+    """Limits of the checks."""
+
+    fewest_readings: int = 50  # fewer say nothing of their noise
+    held_share: float = 0.05  # of rows with a move, below which an output is constant but for jumps
+    no_noise: float = 1e-6  # of the range of an output
+    own_lags: tuple[int, ...] = (3, 6, 12, 24, 48)  # rows of an input's own past, to test it for feedback
+    # Of the moves of an input the 5 % largest are a set point's.  Of the others the past of the outputs
+    # explains 33 to 99 % in 20 closed loops with a set point in steps, at most 34 % (few moves) in open ones.
+    usual_moves: float = 0.95
+    explained_between: float = 0.25
+    # Median of differences over ranges: at most 0.08 in ten thermostats, 0.14 to 1 in 60 relays of any course
+    same_reading: float = 0.1
+    fewest_switchings: int = 10
+    rows_a_window: int = 3  # fewer have no shares beside none, half and all
+    even_windows: float = 0.9  # share of a relay's switchings, within a row of a whole number of windows
+    small_drive: float = 0.05  # of an input's range: that is no drive
+    thin_minutes: float = 15.0  # below either, a side of the drive is thinly covered
+    thin_share: float = 0.15
+
+
+_SETTINGS = CheckSettings()
 
 
 @dataclass(frozen=True)
@@ -192,16 +204,20 @@ def _noise(channel: _Channel) -> Finding:
     The noise is that of third differences, of which a smooth course has little; its variance is 20 times that
     of white noise.
     """
-    values, unit, name = channel.values[np.isfinite(channel.values)], channel.unit, channel.name
+    values = channel.values[np.isfinite(channel.values)]
+    unit, name = channel.unit, channel.name
     spread, moves = float(np.ptp(values)), np.diff(values)
-    if values.size < _FEW_READINGS or not spread:
+    if values.size < _SETTINGS.fewest_readings or not spread:
         return channel.found("noise", 0.0, unit, "ok", f"{name}: too few readings to see noise")
     noise = float(np.median(np.abs(np.diff(values, 3)))) / 0.6745 / np.sqrt(20.0)
     jumps = int(np.count_nonzero(moves))
     # a coarse sensor moves by one step of its converter, to and fro
-    if jumps < _HELD * values.size and np.abs(moves).max() > 1.5 * np.abs(moves[moves != 0]).min():
+    if (
+        jumps < _SETTINGS.held_share * values.size
+        and np.abs(moves).max() > 1.5 * np.abs(moves[moves != 0]).min()
+    ):
         says = f"{name} is constant but for {jumps} jumps in {values.size} rows: is it a set point?"
-    elif noise < _NO_NOISE * spread and jumps > 0.5 * values.size:
+    elif noise < _SETTINGS.no_noise * spread and jumps > 0.5 * values.size:
         says = f"{name} has no noise: is it computed or smoothed, no reading?"
     else:
         return channel.found("noise", noise, unit, "ok", f"{name} has noise of {noise:.2g}{_unit(unit)}")
@@ -269,7 +285,7 @@ def _order(grid: Grid, which: list[int], most: int) -> int:
 def _feedback(grid: Grid, at: int, name: str, lags: int = 3) -> Finding:
     """F test: does the past of the outputs help to predict the input beyond its own past?"""
     # a smooth input is predicted by many of its own rows: with few of them, outputs that filter it would help
-    own_lags = min(_OWN_LAGS, key=lambda n: _bic(*_moves(grid, at, own=n, others=0)))
+    own_lags = min(_SETTINGS.own_lags, key=lambda n: _bic(*_moves(grid, at, own=n, others=0)))
     (X, v), (Z, _) = (_moves(grid, at, own=own_lags, others=n) for n in (0, lags))
     moves = (
         int(np.count_nonzero(np.abs(v - X[:, 0]) > 1e-9 * np.ptp(v))) if len(v) else 0
@@ -280,10 +296,10 @@ def _feedback(grid: Grid, at: int, name: str, lags: int = 3) -> Finding:
     explained, chance = _helped(X, Z, v, moves)
     closed = chance < 1e-4 and explained > 0.02
     steps = np.abs(v - X[:, 0])  # those of a set point hide what a controller does between them
-    usual = (steps > 1e-9 * np.ptp(v)) & (steps <= np.quantile(steps[steps > 0], _USUAL_MOVES))
+    usual = (steps > 1e-9 * np.ptp(v)) & (steps <= np.quantile(steps[steps > 0], _SETTINGS.usual_moves))
     if not closed and usual.sum() >= 3 * Z.shape[1]:
         explained, chance = _helped(X[usual], Z[usual], v[usual], int(usual.sum()))
-        closed = chance < 1e-4 and explained > _EXPLAINED_BETWEEN
+        closed = chance < 1e-4 and explained > _SETTINGS.explained_between
     says = (
         f"{name} follows the outputs ({100 * explained:.0f} % of its moves): recorded in closed loop; noise "
     )
@@ -307,7 +323,8 @@ def _relay_feedback(grid: Grid, at: int, name: str) -> Finding:
     Of two switchings in the same direction the difference of the readings is compared with their range
     between the two.  A clock switches so as well, once the plant has settled: its holds are all alike.
     """
-    least, switchings, lengths = np.inf, 0, set[int]()
+    least, switchings = np.inf, 0
+    lengths: set[int] = set()
     for output in range(len(grid.outputs)):
         ratios = []
         for segment in grid.segments:
@@ -317,9 +334,9 @@ def _relay_feedback(grid: Grid, at: int, name: str) -> Finding:
                 between_edges = y[first : last + 1]
                 if np.isfinite(between_edges).all() and np.ptp(between_edges) > 0:
                     ratios.append(abs(between_edges[-1] - between_edges[0]) / np.ptp(between_edges))
-        if len(ratios) >= _SWITCHINGS:
+        if len(ratios) >= _SETTINGS.fewest_switchings:
             least, switchings = min(least, float(np.median(ratios))), len(ratios)
-    closed = least <= _SAME_READING and len(lengths) > 2
+    closed = least <= _SETTINGS.same_reading and len(lengths) > 2
     says = f"no sign that {name} was driven by the outputs"
     if closed:
         says = (
@@ -332,7 +349,7 @@ def _relay_feedback(grid: Grid, at: int, name: str) -> Finding:
 def _feedback_to(name: str, at: int, grid: Grid, logs: Sequence[Log]) -> list[Finding]:
     """Return whether an input was driven by the outputs; nothing of a switch that is no relay's."""
     window = _window(logs, name)
-    if any((s.time[-1] - s.time[0]) > max(_OWN_LAGS) * window > 0 for s in grid.segments):
+    if any((s.time[-1] - s.time[0]) > max(_SETTINGS.own_lags) * window > 0 for s in grid.segments):
         first = [int(np.argmax(np.diff(column(log, name)) > 0)) + 1 for log in logs]
         begun = [log.isel(time=slice(row, None)) for log, row in zip(logs, first)]
         shares = _feedback(grid.of(begun, average=window), at, name)
@@ -350,12 +367,14 @@ def _window(logs: Sequence[Log], name: str) -> float:
         return 0.0
     on = [np.diff(log["time"].values[1:][np.diff(column(log, name)) > 0]) for log in logs]
     between = np.concatenate(on)
-    if between.size < _SWITCHINGS:
+    if between.size < _SETTINGS.fewest_switchings:
         return 0.0
     row = max(float(np.median(np.diff(log["time"].values))) for log in logs)
     window = float(np.median(between))  # two of them where the relay stays on, or off, for a whole one
     even = np.abs(between - window * np.rint(between / window)) <= row
-    return window if window > _ROWS_A_WINDOW * row and np.mean(even) >= _EVEN_WINDOWS else 0.0
+    return (
+        window if window > _SETTINGS.rows_a_window * row and np.mean(even) >= _SETTINGS.even_windows else 0.0
+    )
 
 
 def _set_points(log: Log) -> list[str]:
@@ -376,8 +395,9 @@ def _set_point(log: str, name: str) -> Finding:
 
 
 def _moves(grid: Grid, at: int, *, own: int, others: int) -> tuple[Array, Array]:
-    """Return (regressors, input) of the rows that have ``max(_OWN_LAGS)`` rows before them."""
-    first, rows, target = max(_OWN_LAGS), [], []
+    """Return (regressors, input) of the rows that have ``max(_SETTINGS.own_lags)`` rows before them."""
+    first = max(_SETTINGS.own_lags)
+    rows, target = [], []
     for segment in grid.segments:
         u, n = segment.u[:, at], len(segment.time)
         if n <= first:
@@ -430,10 +450,6 @@ def _second_differences(y: Array, steps: Array) -> Array:
     return np.asarray(squares[np.isfinite(squares)])
 
 
-_SMALL = 0.05  # of an input's range: that is no drive
-THIN_MINUTES, THIN_SHARE = 15.0, 0.15  # below either, a side of the drive is thinly covered
-
-
 @dataclass(frozen=True)
 class Evidence:
     """What the logs of a fit cover."""
@@ -471,7 +487,7 @@ def evidence(plant: Plant, logs: Sequence[Rows]) -> Evidence:
         kinds = _kinds(name, values, on_off=name in plant.model.switches)
         for kind, chosen in kinds.items():
             minutes[kind] = float(sum(seconds[mask].sum() for seconds, mask in zip(spent, chosen))) / 60
-            if minutes[kind] < min(THIN_MINUTES, THIN_SHARE * total):
+            if minutes[kind] < min(_SETTINGS.thin_minutes, _SETTINGS.thin_share * total):
                 thin.append(kind)
     ranges = {}
     u, y = (np.concatenate([getattr(rows, group) for rows in logs]) for group in ("u", "y"))
@@ -494,7 +510,7 @@ def _kinds(name: str, values: Sequence[Array], *, on_off: bool) -> dict[str, lis
     if on_off:
         return {f"{name} on": [v > 0.5 for v in values], f"{name} off": [v <= 0.5 for v in values]}
     low, high = min(float(np.nanmin(v)) for v in values), max(float(np.nanmax(v)) for v in values)
-    small = _SMALL * max(abs(low), abs(high))
+    small = _SETTINGS.small_drive * max(abs(low), abs(high))
     if low < -small:  # an input that goes both ways, such as a Peltier behind an H bridge
         return {f"{name} > 0": [v > small for v in values], f"{name} < 0": [v < -small for v in values]}
     middle = (low + high) / 2

@@ -88,7 +88,8 @@ def signal_roles(
     taken = {name: r for r, group in zip(("input", "disturbance", "output"), groups) for name in group}
     out = []
     for name in (*taken, *(n for n in units if n not in taken)):
-        role, why, guessed = taken.get(name, "left out"), "given by the log", False
+        role = taken.get(name, "left out")
+        why, guessed = "given by the log", False
         if role != "left out" and name in (lists[f"{role}s"] or ()):
             why = "named"
         elif of_network.get(name) == role and network is not None:
