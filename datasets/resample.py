@@ -1,4 +1,4 @@
-"""Cuts, gaps and held means of logs.
+"""Cuts, gaps and means of logs.
 
 An input is applied from its row until the next (zero-order hold), so its mean over a cell [a, b) is an
 integral of a staircase.  With t_i the rows and U(t) the integral of the held input up to t, which is
@@ -6,11 +6,14 @@ piecewise linear,
 
     mean over [a, b) = (U(b) - U(a)) / (b - a)
 
-exactly, whatever the jitter of the rows.
+exactly, whatever the jitter of the rows.  Outputs are samples: their mean is over the samples in the cell
+that are there.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from itertools import pairwise
 from typing import TypeAlias
 
 import numpy as np
@@ -21,6 +24,7 @@ from thermogrip.datasets.repair import gap_rows
 from thermogrip.datasets.schema import Log, log_name
 
 Floats: TypeAlias = NDArray[np.float64]
+_Blocks: TypeAlias = tuple[Floats, Floats]
 
 # where the blocks of a log that version 0.2 averaged start anew [s]: long blocks hide a gap
 _AFTER_GAP = "after_gap"
@@ -63,6 +67,48 @@ def gaps(log: Log, longer_than: float = 10.0) -> list[tuple[int, float, float]]:
     begins = [float(t) for t in str(log.attrs.get(_AFTER_GAP, "")).split()]
     gap_starts = np.union1d(gap_rows(time, longer_than), np.flatnonzero(np.isin(time[1:], begins)))
     return [(int(row), float(time[row]), float(time[row + 1])) for row in gap_starts]
+
+
+def block_means(
+    time: Floats, values: Floats, held: NDArray[np.bool_], *, seconds: float, after: Sequence[int], log: str
+) -> list[_Blocks]:
+    """Return starts (n_block,) and means (n_block, n) of blocks of so many seconds, of each part of a log.
+
+    ``held`` (n,) says which of the values (n_time, n) are inputs and disturbances, averaged as held; others
+    are means of the samples that are there (NaN where none is).  ``after`` are the rows that begin anew after
+    a gap: no block mixes what was before with what came after.
+    """
+    step = float(np.median(np.diff(time)))
+    if not seconds >= step * (1 - 1e-9):
+        problem = f"cannot average over {seconds:g} s: the rows are {step:g} s apart"
+        raise UserError(problem, file=log, hint="choose a longer block")
+    segments = [
+        _blocks(time[a:b], values[a:b], held, seconds=seconds, step=step)
+        for a, b in pairwise([0, *after, time.size])
+    ]
+    if (n := sum(begins.size for begins, _ in segments)) < 2:
+        problem = f"{n} block of {seconds:g} s is not a log"
+        raise UserError(problem, file=log, hint="choose a shorter block")
+    return segments
+
+
+def _blocks(
+    time: Floats, values: Floats, is_held: NDArray[np.bool_], *, seconds: float, step: float
+) -> _Blocks:
+    """Return the starts (n_block,) and means (n_block, n_variables) of the filled blocks of one stretch."""
+    # rows a rounding error before an edge belong behind it: 3 * 0.1 > 0.3
+    block = np.floor((time - time[0]) / seconds + 1e-9).astype(np.int64)
+    filled, where = np.unique(block, return_inverse=True)
+    edges = time[0] + seconds * np.arange(int(block[-1]) + 2)
+    edges[-1] = min(edges[-1], time[-1] + step)  # the last row is held for one step, not for the whole block
+    means = np.empty((filled.size, values.shape[1]))
+    means[:, is_held] = held_means(time, values[:, is_held], edges)[filled]
+    for sampled in np.flatnonzero(~is_held):
+        finite = np.isfinite(values[:, sampled])
+        count = np.bincount(where[finite], minlength=filled.size)
+        total = np.bincount(where[finite], weights=values[finite, sampled], minlength=filled.size)
+        means[:, sampled] = np.where(count > 0, total / np.maximum(count, 1), np.nan)
+    return edges[filled], means
 
 
 def held_means(time: Floats, values: Floats, edges: Floats) -> Floats:
