@@ -268,9 +268,7 @@ def run(
                 guard=checks,
                 clock=None if rig.port is None else clock,
                 recorder=recorder,
-                progress=watch.progress,
-                listener=watch.listen,
-                operator=watch.operator,
+                **watch.hooks,
                 **of_grasp,
             )
             folder.finish(session)
@@ -280,13 +278,21 @@ def run(
     if report is not None:
         lead = f"One session on {rig.name}: what was read, asked and answered, sample by sample."
         write_report(report, "A session", lead, session_sections(session, regulator.moves, loaded, rig.name))
+    goal = f"to {_said(wanted)} degC" if profile is None else f"along {profile.name}"
+    errors = None if profile is None else tracking_error(session.log, loaded.controlled)
+    return _answer(console, session, f"{rig.name}, {goal}", out, errors)
+
+
+def _answer(
+    console: Console, session: Session, title: str, out: Path, errors: tuple[float, float] | None
+) -> int:
+    """Print how a session went (along a profile its rms and largest error [K]); return the exit code."""
     figures = {"settle_time": session.settle_time, "overshoot": session.overshoot, "bias": session.bias}
-    head, goal = ["settled after [s]", "overshoot [K]", "bias [K]"], f"to {_said(wanted)} degC"
-    if profile is not None:
-        rms, largest = tracking_error(session.log, loaded.controlled)
-        figures, goal = {"rms_error": rms, "largest_error": largest}, f"along {profile.name}"
+    head = ["settled after [s]", "overshoot [K]", "bias [K]"]
+    if errors is not None:
+        figures = {"rms_error": errors[0], "largest_error": errors[1]}
         head = ["rms error [K]", "largest error [K]"]
-    console.table(f"{rig.name}, {goal}", ["verdict", *head], [[session.verdict, *figures.values()]])
+    console.table(title, ["verdict", *head], [[session.verdict, *figures.values()]])
     if session.advice:
         console.say(session.advice)
     console.say(f"wrote {out}")
@@ -344,9 +350,7 @@ def batch(
             files=files_of(controller=controller, plan=plan, plant=rig.twin, guard=guard, relays=rig.relays),
             output=loaded.controlled[0],
             clock=None if rig.port is None else clock,
-            progress=watch.progress,
-            listener=watch.listen,
-            operator=watch.operator,
+            **watch.hooks,
             **grasps.of_session(watch),
         )
         watch.ended(done.verdict)
@@ -402,9 +406,7 @@ def record(
                 guard=checks,
                 clock=clock,
                 recorder=recorder,
-                progress=watch.progress,
-                listener=watch.listen,
-                operator=watch.operator,
+                **watch.hooks,
             )
             folder.played(ended)
             watch.ended("tripped" if ended else "played")

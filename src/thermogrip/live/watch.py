@@ -115,6 +115,11 @@ class Watch:
         self._viewers: int | None = None  # who look at the page now; None where nobody has come yet
         self._view = _Lines(title) if not sys.stderr.isatty() else _Panel(title)
 
+    @property
+    def hooks(self) -> dict[str, Any]:
+        """What a session takes of it, by name."""
+        return {"progress": self.progress, "listener": self.listen, "operator": self.operator}
+
     def listen(self, snapshot: Snapshot) -> None:
         """Take a snapshot; returns at once."""
         self._queue.append(snapshot)

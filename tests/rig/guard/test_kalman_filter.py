@@ -173,15 +173,6 @@ def test_a_state_is_as_uncertain_as_the_fit_says_and_no_less_than_a_tenth(spread
     np.testing.assert_allclose(made._q, [0.03**2, (0.03 * unit) ** 2, 0.01**2, 0.02**2])
 
 
-def test_a_model_that_diverges_predicts_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    found = at_rest()
-    x, known = found.x.copy(), found._P.copy()
-    monkeypatch.setattr(found.model, "rollout", lambda x, u, d: (None, np.full((len(x), 2), np.inf)))
-    found.predict(2.0, np.array([40.0]), np.array([25.0]))
-    assert (found.x == x).all()
-    assert (known == found._P).all()
-
-
 def test_a_jump_is_beyond_its_deviations_and_the_floor() -> None:
     found = at_rest()
     settings_ = replace(BELIEF, jump_k=2.0, jump_floor=0.5)

@@ -3,22 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import astuple, replace
+from dataclasses import astuple
 
 import numpy as np
 import pytest
 
 from tests.rig.fault_injection.drills import drill_plants
 from tests.rig.makers import follow
-from thermogrip.rig.guard import model_checks
-from thermogrip.rig.guard.kalman_filter import Estimate, History, InputSteps, RigModel
 from thermogrip.rig.guard.model_checks import (
     Cause,
     ModelMonitor,
     Residual,
-    _hypotheses,
-    _sensor_costs,
-    _wrong_drives,
     by_danger,
     explain_window,
 )
@@ -215,19 +210,6 @@ def test_a_heater_neither_cools_nor_has_a_wrong_way_round() -> None:
     assert explained(0.0, unit="percent", full=100.0) == "the driver gives nothing"
 
 
-@pytest.mark.parametrize(
-    ("asked", "left"),
-    [(5.0, "full"), (5.1, "nothing full"), (10.0, "nothing full"), (10.1, "nothing full half"),
-     (94.9, "nothing full half"), (95.0, "nothing half")],
-)  # fmt: skip
-def test_a_fault_that_changes_at_most_a_twentieth_of_the_drive_is_no_hypothesis(
-    asked: float, left: str
-) -> None:
-    found = _wrong_drives(monitor("percent", 100.0, 2)._model, np.full((4, 1), asked))
-    words = ("nothing", "full", "half")
-    assert " ".join(next(word for word in words if word in cause.text) for cause, _ in found) == left
-
-
 def test_the_only_sensor_is_not_called_wrong_by_itself() -> None:
     assert explained(0.0, sensors=1) == "the driver gives nothing"
 
@@ -261,75 +243,6 @@ def test_a_sensor_at_the_pump_is_no_pump_whatever_its_name() -> None:
         follow(made, k * DT, {"q": 0.0}, dict(zip(("t_driver", "t_pump"), y.tolist())))
     (cause,) = explain_window(made._model, made._past, 12.0)
     assert (cause.kind, cause.subject) == ("drift", "t_pump")
-
-
-def history(readings: list[list[float]], n_y: int = 2) -> History:
-    """Return estimates a step of 1 s apart, of which the first is at rest at 0, with these readings."""
-    past = History(InputSteps(dt=1.0, start=0.0, time=0.0), 100.0)
-    for k, y in enumerate([[0.0] * n_y, *readings]):
-        past.add(Estimate(float(k), k, np.zeros(1), np.zeros(1), np.zeros(n_y), np.array(y)))
-    return past
-
-
-def test_the_cost_of_a_sensor_that_is_wrong_is_of_all_readings() -> None:
-    """Path a = k, b = 0 for 20 s; a is read 5 s late and once not at all, b is 2 K off in 3 readings."""
-    model = RigModel(integrator(outputs=("a", "b")))
-    path = np.column_stack([np.arange(21.0), np.zeros(21)])
-    rows = [[max(k - 5.0, 0.0), 2.0 if k > 17 else 0.0] for k in range(1, 21)]
-    rows[9][0] = np.nan
-    past = history(rows)
-    cost = {c.text: v for c, v in _sensor_costs(model, past, past.begin(0.0), path).items()}
-    own = 1 + 4 + 9 + 16 + 25.0 * 15  # 1 to 4 s: k^2; later 5^2, without that of 10 s
-    assert cost == {
-        "a alone is wrong": pytest.approx(12.0 + 0.15 * own),
-        "b alone is wrong": pytest.approx(own + 0.15 * 12.0),
-    }
-
-
-@pytest.mark.parametrize(
-    ("costs", "left"),
-    [({}, []), ({OTHER: 34.9}, [OTHER]), ({OTHER: 35.0}, []), ({OTHER: 10.0, WRONG: 24.9}, [OTHER, WRONG]),
-     ({OTHER: 10.0, WRONG: 25.0}, [OTHER]), ({WRONG: 5.0, OTHER: 5.0, PUMP: 5.0}, [WRONG, OTHER])],
-)  # fmt: skip
-def test_an_explanation_is_a_third_of_the_cost_and_the_next_is_named_if_alike(
-    monkeypatch: pytest.MonkeyPatch, costs: dict[Cause, float], left: list[Cause]
-) -> None:
-    """One reading of 10 K with no drive: a cost of 100, and full drive explains nothing of it."""
-    made = ModelMonitor(integrator())
-    made.reset(0.0, {"a": 0.0})
-    follow(made, 1.0, {"q": 0.0}, {"a": -10.0})
-    monkeypatch.setattr(model_checks, "_sensor_costs", lambda *given: costs)
-    assert explain_window(made._model, made._past, 1.0) == left
-
-
-def test_each_fault_begins_at_seven_parts_of_the_window_and_a_bias_holds_until_then() -> None:
-    model = RigModel(integrator(pump=True))
-    u = np.column_stack([np.full(20, 0.6), np.ones(20)])
-    causes, rows = _hypotheses(model, u, np.array([0.1]))
-    said = ("", "nothing", "full drive", "half of what is asked", "full cooling", "way round", "has stopped")
-    assert all(cause.text.endswith(words) for cause, words in zip(causes, said))
-    usual = ("driver", "the driver")
-    assert [(c.kind, c.subject, c.rarity) for c in causes[:7]] == [
-        ("model", "", 1.0), (*usual, 1.0), (*usual, 1.2), (*usual, 1.0), (*usual, 1.2),
-        ("reversed", "the module", 2.0), ("pump", "the pump", 1.0),
-    ]  # fmt: skip
-    assert len(causes) == len(rows) == 1 + 6 * 7
-    assert rows[0].tolist() == [[pytest.approx(0.7), 1.0]] * 20
-    for part, onset in enumerate((0, 5, 10, 15, 17, 18, 19)):
-        of = rows[1 + 6 * part : 7 + 6 * part]
-        assert (of[:, :onset] == rows[0][:onset]).all()
-        want = [(0.0, 1.0), (1.0, 1.0), (0.3, 1.0), (-1.0, 1.0), (-0.6, 1.0), (0.6, 0.0)]
-        assert of[:, onset:].tolist() == [[list(one)] * (20 - onset) for one in want]
-    narrow = RigModel(replace(integrator(), units={"q": "W"}, valid={"q": (-0.5, 1.0)}))
-    assert [rows[0, 0] for _, rows in _wrong_drives(narrow, np.full((4, 1), 0.8))] == [
-        0.0,
-        1.0,
-        0.4,
-        -0.5,
-        -0.5,
-    ]
-    still = np.column_stack([np.full(4, 0.6), np.full(4, 0.5)])
-    assert "the pump has stopped" not in [cause.text for cause in _hypotheses(model, still, np.zeros(1))[0]]
 
 
 # ---- what a window compares, in numbers ----
