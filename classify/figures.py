@@ -149,24 +149,10 @@ def _counted(n: float) -> str:
 
 
 def _library_lines(axis: Axes, library: Mapping[str, float]) -> None:
-    """Draw the library; lines too close for a name each have their names in a row, in the lines' order."""
+    """Draw a line with its name for each of the library's effusivities that the axis shows."""
     low, high = axis.get_xlim()
-    rows = sorted((e, name) for name, e in library.items() if low <= e <= high)
-    least, clusters = 0.028 * np.log(high / low), list[tuple[float, list[str]]]()
-    for effusivity, name in rows:
-        axis.axvline(effusivity, color=_FAINT, lw=0.8, zorder=0)
-        if clusters and np.log(effusivity / clusters[-1][0]) <= least:
-            clusters[-1][1].append(name)
-        else:
-            clusters.append((effusivity, [name]))
-    for effusivity, names in clusters:
-        axis.text(
-            effusivity,
-            1.01,
-            ", ".join(names if len(names) < 4 else [*names[:2], f"+ {len(names) - 2}"]),
-            transform=axis.get_xaxis_transform(),
-            rotation=90,
-            fontsize=6,
-            ha="center",
-            va="bottom",
-        )
+    text = {"rotation": 90, "fontsize": 6, "ha": "center", "va": "bottom"}
+    for name, effusivity in library.items():
+        if low <= effusivity <= high:
+            axis.axvline(effusivity, color=_FAINT, lw=0.8, zorder=0)
+            axis.text(effusivity, 1.01, name, transform=axis.get_xaxis_transform(), **text)

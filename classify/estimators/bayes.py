@@ -37,11 +37,10 @@ difference of 1 K. The two shrinkages, :math:`\nu_0` of the covariance and :math
 in which a grasp counts for :math:`\Delta T^2 / (\Delta T^2 + 4\,\mathrm{K}^2)`. A feature that a grasp does
 not have (a response at 40 s in one of 10 s) is marginalised, in training and after.
 
-**A second sensor** has features of its own, divided by its own difference from the object; the covariance
-has what both feel of one contact, and the error of the object's temperature moves both.  Where that is
-**unknown** the density is the mean of those at temperatures 2 K apart, up to 20 K from the room's; where its
-stated sd is more than 2 K, the mean over that normal distribution.  The mean of a **material that was not
-trained** is drawn as those of the k trained ones were, from :math:`N(\bar\mu, B)` with
+Where the object's temperature is **unknown** the density is the mean of those at temperatures 2 K apart, up
+to 20 K from the room's; where its stated sd is more than 2 K, the mean over that normal distribution.  The
+mean of a **material that was not trained** is drawn as those of the k trained ones were, from
+:math:`N(\bar\mu, B)` with
 
 .. math:: B = \frac{k + 1}{k (k - 1)} \sum_m (\mu_m - \bar\mu)(\mu_m - \bar\mu)^T,
 
@@ -102,8 +101,6 @@ class DensitySettings:
 
 DENSITY = DensitySettings()
 
-_SECOND = "second_"  # prefix of the features of a second sensor
-
 
 @dataclass(frozen=True)
 class Readings:
@@ -141,19 +138,16 @@ class FeatureReader:
         cls,
         records: Sequence[Grasps],
         labels: Labels,
-        *,
-        both: bool = False,
     ) -> tuple[FeatureReader, Readings, NDArray[np.bool_], list[str]]:
         """Return a reader of the features that most grasps of any record have, and what it reads.
 
         The mask is of grasps that can be learnt from, the list has the others in words: where features
         are normalised, grasps of unknown temperature, and materials that were only touched at the skin's own.
-        ``both``: those of a second sensor, too.
         """
         end = min(float(np.median(np.concatenate([_last(record) for record in records]))), features.FIT_END)
         names, tables = [], []
         for record in records:
-            table = _table(record, _times(record, end), both=both)
+            table = features.linear_features(record, _times(record, end))
             mostly_known = np.isfinite(table.values).mean(axis=0) > 0.5
             names += [str(f) for f in table["feature"].values[mostly_known]]
             tables.append(table)
@@ -166,13 +160,6 @@ class FeatureReader:
         reader = cls(names, any(map(features.can_normalise, records)) and bool(usable.any()), end)
         if not reader.normalise:
             usable = np.ones(labels.size, dtype=bool)
-        elif both:
-            beside = np.concatenate(
-                [features.object_difference(_sensors(record)[1][1]) for record in records]
-            )
-            if set(labels[usable]) - set(_seen(beside, labels)):
-                names = reader.names = [f for f in names if not f.startswith(_SECOND)]
-                notes.append("the second sensor is not read: its temperature was within 1 K of an object's")
         readings = [
             reader._readings(record, table.reindex(feature=names)) for record, table in zip(records, tables)
         ]
@@ -185,15 +172,14 @@ class FeatureReader:
     @classmethod
     def from_dict(cls, content: dict[str, Any]) -> FeatureReader:
         """Return the reader that :meth:`to_dict` described."""
-        if not all(name.removeprefix(_SECOND).startswith(features.KINDS) for name in content["features"]):
+        if not all(name.startswith(features.KINDS) for name in content["features"]):
             raise ValueError("features of an earlier version")
         return cls(list(content["features"]), bool(content["normalise"]), float(content["end"]))
 
     def read(self, grasps: Grasps) -> Readings:
         """Return the features of other grasps."""
         times = sorted({_time(f) for f in self.names if f.endswith("s")})
-        both = any(f.startswith(_SECOND) for f in self.names)
-        return self._readings(grasps, _table(grasps, times, both=both).sel(feature=self.names))
+        return self._readings(grasps, features.linear_features(grasps, times).sel(feature=self.names))
 
     def _readings(self, grasps: Grasps, table: xr.DataArray) -> Readings:
         y = np.asarray(table.values, dtype=float)
@@ -201,17 +187,11 @@ class FeatureReader:
         if not self.normalise:
             noise, unknown = np.zeros((*y.shape, y.shape[1])), np.full(n, np.nan)
             return Readings(y, np.ones_like(y), noise, unknown, unknown)
-        gain, noise = np.ones_like(y), np.zeros((*y.shape, y.shape[1]))
-        for prefix, sensor in _sensors(grasps):
-            columns = [k for k, f in enumerate(self.names) if f.startswith(_SECOND) == bool(prefix)]
-            names = [self.names[k].removeprefix(_SECOND) for k in columns]
-            gain[:, columns] = features.object_difference(sensor)[:, None]
-            if columns:  # a feature that nobody has is without noise
-                noise[np.ix_(range(n), columns, columns)] = np.nan_to_num(
-                    features.feature_noise(sensor, names)
-                )
+        difference = features.object_difference(grasps)
+        gain = np.repeat(difference[:, None], len(self.names), axis=1)
+        noise = np.nan_to_num(features.feature_noise(grasps, self.names))  # none where nobody has a feature
         sd = grasps["t_object_sd"].values if "t_object_sd" in grasps else np.full(n, np.nan)
-        return Readings(y, gain, noise, np.asarray(sd, dtype=float), features.object_difference(grasps))
+        return Readings(y, gain, noise, np.asarray(sd, dtype=float), difference)
 
     def check_temperatures(self, grasps: Grasps) -> None:
         """Raise UserError where a response cannot be compared for want of the difference behind it."""
@@ -235,7 +215,6 @@ class BayesClassifier(GraspClassifier):
     """
 
     learns_from_all_conditions: ClassVar[bool] = True
-    reads_both_sensors: ClassVar[bool] = True
 
     shrinkage: float | None = None  # nu_0 - d - 1 [grasps]; by default the most evident of a grid
     prior_unknown: float = 0.1  # probability of a material that is not among the candidates
@@ -245,10 +224,7 @@ class BayesClassifier(GraspClassifier):
             raise UserError(f"shrinkage must be > 0 grasps, got {self.shrinkage}")
         labels = np.concatenate(labels_of)
         two_or_more(labels, "+".join(map(log_name, records)))
-        self.sensors_ = 2 if all("t_surface_2" in record for record in records) else 1
-        self.reader_, all_read, usable, self.notes_ = FeatureReader.learn(
-            records, labels, both=self.sensors_ == 2
-        )
+        self.reader_, all_read, usable, self.notes_ = FeatureReader.learn(records, labels)
         self.feature_names_ = self.reader_.names
         self.classes_ = np.unique(labels[usable])
         self._fit_density(_rows(all_read, usable), np.searchsorted(self.classes_, labels[usable]))
@@ -355,9 +331,8 @@ class BayesClassifier(GraspClassifier):
             return out
         record, unknown, some = pick(grasps, wide), unknown[wide], _rows(read, wide)
         low, high = object_range(record).T
-        levels = np.stack([level(sensor) for _, sensor in _sensors(record)], axis=1)
-        beside = levels[:, [int(f.startswith(_SECOND)) for f in self.feature_names_]]
-        centre = np.where(unknown, (low + high) / 2, levels[:, 0] + np.where(unknown, 0.0, some.difference))
+        skin = level(record)
+        centre = np.where(unknown, (low + high) / 2, skin + np.where(unknown, 0.0, some.difference))
         half = np.where(
             unknown, (high - low) / 2, DENSITY.reach_sd * np.where(unknown, 0.0, some.t_object_sd)
         )
@@ -366,7 +341,7 @@ class BayesClassifier(GraspClassifier):
         log_w -= logsumexp(log_w, axis=1, keepdims=True)
         log_t_at = np.empty((DENSITY.nodes, *out[wide].shape))
         for k, (node, weight) in enumerate(zip(z, log_w.T)):
-            gain = np.where(some.gain == 1, 1.0, (centre + node * half)[:, None] - beside)
+            gain = np.where(some.gain == 1, 1.0, (centre + node * half - skin)[:, None])
             sd = 0.6 * half * (z[1] - z[0])  # bells that wide, so far apart, add up to a smooth density
             log_t_at[k] = weight[:, None] + self._log_t_of(replace(some, gain=gain, t_object_sd=sd))
         out[wide] = logsumexp(log_t_at, axis=0)
@@ -449,23 +424,6 @@ def _joined(parts: Sequence[Readings]) -> Readings:
     return Readings(**{key: np.concatenate([getattr(p, key) for p in parts]) for key in vars(parts[0])})
 
 
-def _sensors(grasps: Grasps) -> list[tuple[str, Grasps]]:
-    """Return the prefix of each sensor's features and the record that has its readings as ``t_surface``."""
-    if "t_surface_2" not in grasps:
-        return [("", grasps)]
-    beside = grasps.drop_vars("t_surface_2").assign(t_surface=grasps["t_surface_2"])
-    return [("", grasps), (_SECOND, beside)]
-
-
-def _table(grasps: Grasps, times: Sequence[float], *, both: bool) -> xr.DataArray:
-    """Return the features in kelvin (n, d), those of a second sensor behind those of the first."""
-    tables = []
-    for prefix, sensor in _sensors(grasps)[: 2 if both else 1]:
-        table = features.linear_features(sensor, times)
-        tables.append(table.assign_coords(feature=[f"{prefix}{f}" for f in table["feature"].values]))
-    return tables[0] if len(tables) == 1 else xr.concat(tables, "feature")
-
-
 def _times(grasps: Grasps, end: float) -> list[float]:
     """Return when a response is read of the contacts of a record [s], an ``end`` that is late among these."""
     times = [t for t in features.RESPONSE_TIMES if t <= float(grasps["time"].values[-1]) + 0.05]
@@ -473,11 +431,10 @@ def _times(grasps: Grasps, end: float) -> list[float]:
     return sorted([*times, round(end, 2)]) if end > DENSITY.own_end * before else times
 
 
-def _order(name: str) -> tuple[bool, int, float]:
-    """Return the place of a feature: by sensor, in the order of the table, responses by time."""
-    bare_name = name.removeprefix(_SECOND)
-    kind = next(i for i, prefix in enumerate(features.KINDS) if bare_name.startswith(prefix))
-    return bare_name != name, kind, _time(name) if name.endswith("s") else 0.0
+def _order(name: str) -> tuple[int, float]:
+    """Return the place of a feature: in the order of the table, responses by time."""
+    kind = next(i for i, prefix in enumerate(features.KINDS) if name.startswith(prefix))
+    return kind, _time(name) if name.endswith("s") else 0.0
 
 
 def _time(name: str) -> float:

@@ -1,6 +1,5 @@
 from thermogrip.sysid.contact.closed_forms import Impedance as Impedance
 from thermogrip.sysid.contact.closed_forms import contact_flux as contact_flux
-from thermogrip.sysid.contact.closed_forms import contact_heat as contact_heat
 from thermogrip.sysid.contact.closed_forms import contact_temperature as contact_temperature
 from thermogrip.sysid.contact.closed_forms import device_temperature as device_temperature
 from thermogrip.sysid.contact.closed_forms import half_space as half_space

@@ -37,23 +37,14 @@ domain:
 C = rho c_p L.  Two bodies meet through h_c, q(s) = dT/s / (1/h_c + Z_dev + Z_obj), and the inverse
 transform below gives fluxes and temperatures to 1e-11 of themselves for any effusivity ratio.
 
-Numerical inversion of Laplace transforms of heat conduction
-------------------------------------------------------------
-
-    f(t) = 1/(2 pi i) * integral of F(s) exp(s t) ds
-
-along a path from below to above that leaves every singularity of F on its left.  Transforms of conduction
-have theirs on the negative real axis (poles of finite bodies, branch cuts of infinite ones), so the path
-may come in from minus infinity.  On the cotangent contour
+Inversion: transforms of conduction have their singularities on the negative real axis.  On Talbot's
+cotangent contour about it
 
     s(phi) = (n / t) (-0.6122 + 0.5017 phi cot(0.6407 phi) + 0.2645 i phi),   -pi < phi < pi,
 
-the midpoint rule with n points converges as exp(-1.358 n); its constants make the discretisation and
-truncation errors fall together.  Rounding grows as exp(0.17 n), so n = 24 gives 1e-13 in double precision,
-relative to the size of f around t.  It cannot give relative accuracy where f is exponentially small, deep
-inside a body.
-
-The contour is of Talbot's kind; the tests measure its convergence rate.
+the midpoint rule with n points converges as exp(-1.358 n), which the tests measure.  Rounding grows as
+exp(0.17 n), so n = 24 gives 1e-13 in double precision, relative to the size of f around t; not where f is
+exponentially small, deep inside a body.
 
 References
 ----------
@@ -201,24 +192,6 @@ def contact_flux(
     return np.asarray(h_c * (T_obj0 - T_dev0) * erfcx(y))
 
 
-def contact_heat(
-    t: ArrayLike, *, T_dev0: float, T_obj0: float, e_dev: float, e_obj: float, h_c: float = np.inf
-) -> Array:
-    """Return the heat that the gripper has taken up [J/m^2]; parameters are those of
-    :func:`skin_temperature`.
-
-    The integral of the flux, h_c (T_obj0 - T_dev0) / H^2 (erfcx(y) - 1 + 2 y / sqrt(pi)).
-
-    >>> contact_heat([1.0, 10.0], T_dev0=23.0, T_obj0=43.0, e_dev=1.6e3, e_obj=3.64e4, h_c=500.0).round(0)
-    array([ 7990., 54795.])
-    """
-    t, y = _time_and_root(t, e_dev, e_obj, h_c)
-    series = 1 / (1 / e_dev + 1 / e_obj)
-    if np.isinf(h_c):
-        return np.asarray((T_obj0 - T_dev0) * series * 2 * np.sqrt(t / np.pi))
-    return np.asarray((T_obj0 - T_dev0) * series**2 / h_c * _excess(y))
-
-
 def sensor_temperature(
     t: ArrayLike, *, T_dev0: float, T_obj0: float, e_dev: float, e_obj: float, lag: float, h_c: float = np.inf
 ) -> Array:
@@ -356,12 +329,6 @@ def _drop(y: ArrayLike) -> Array:
     """Return 1 - erfcx(y) without cancellation."""
     y = np.asarray(y, dtype=float)
     return np.where(y < 0.5, -_series(np.minimum(y, 0.5), 1), 1 - erfcx(y))
-
-
-def _excess(y: ArrayLike) -> Array:
-    """Return erfcx(y) - 1 + 2 y / sqrt(pi) without cancellation."""
-    y = np.asarray(y, dtype=float)
-    return np.where(y < 0.5, _series(np.minimum(y, 0.5), 2), erfcx(y) - 1 + 2 * y / np.sqrt(np.pi))
 
 
 def _difference(xi: Array, y: Array) -> Array:

@@ -79,6 +79,7 @@ from thermogrip.sysid.effusivity.laplace_approximation import (
     material_hypotheses,
     nodes_for,
     predict,
+    stack_slopes,
 )
 
 if TYPE_CHECKING:
@@ -348,16 +349,8 @@ def linearise(problem: Problem, theta: Array, w: Array, spread: Spread) -> Linea
     beyond = problem.beyond(theta)
     y, by_u = jacobian(stack_of(theta), nodes, data, u, np.ones(u.shape, dtype=bool), beyond)
     k = np.zeros((*y.shape, theta.size))
-    for i, name in enumerate(SHARED_NAMES[: SHARED_NAMES.index("ln_build_up")]):
-        if name == "leak":
-            away = np.nan_to_num(data.t_ambient - u[:, LEVEL])
-            k[:, :, i] = away[:, None] * data.ramp * (data.count > 0)
-            continue
-        moved = theta.copy()
-        moved[i] += 1e-4
-        if name == "ln_first" and moved[i] > 0:  # a share is 1 at most: the difference is taken inwards
-            moved[i] = theta[i] - 1e-4
-        k[:, :, i] = (predict(stack_of(moved), nodes, data, u, beyond) - y) / (moved[i] - theta[i])
+    by_stack = stack_slopes(theta, data, u, beyond)
+    k[:, :, : by_stack.shape[2]] = by_stack
     shared = {
         "ln_build_up": by_u[:, :, BUILD_UP],
         "onset": by_u[:, :, ONSET],

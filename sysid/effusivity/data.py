@@ -370,9 +370,10 @@ def taken(noise: Whitened, at: NDArray[np.int64]) -> Whitened:
     return noise[0][at], noise[1][at]
 
 
-def whiten(data: Touches, noise: Noise) -> tuple[Array, Array]:
-    """Return W with W' W = C^-1, (n, n_bin, n_bin), zero for empty bins, and ln det(2 pi C), (n,)."""
-    chol = np.linalg.cholesky(noise_covariance(data, noise))
+def whiten(data: Touches, noise: Noise, extra: Array | float = 0.0) -> tuple[Array, Array]:
+    """Return W with W' W = C^-1, (n, n_bin, n_bin), zero for empty bins, and ln det(2 pi C), (n,); ``extra``
+    is what else C holds."""
+    chol = np.linalg.cholesky(noise_covariance(data, noise) + extra)
     has_samples = data.count > 0
     w = np.ascontiguousarray(_inverse(chol) * has_samples[:, None, :] * has_samples[:, :, None])
     diagonal = np.diagonal(chol, axis1=1, axis2=2)

@@ -53,7 +53,7 @@ _FILE_KEYS = {
 }  # fmt: skip
 WIDER = 1.5  # GripperSpread's numbers are guesses themselves: so wide, answers are right as often as stated
 NOTHING = 1e-3  # in place of a conductance of nothing, which has no logarithm
-_STACK_NAMES = SHARED_NAMES[: SHARED_NAMES.index("onset")]  # these make a Stack
+STACK_NAMES = SHARED_NAMES[: SHARED_NAMES.index("onset")]  # these make a Stack
 _ROUNDING = 1e-6  # a correlation matrix may have an eigenvalue so far below zero by rounding alone
 
 
@@ -61,13 +61,13 @@ def stack_numbers(stack: Stack) -> Array:
     """Return the numbers of a stack as they stand in theta, (14,)."""
     values = {f.name: float(getattr(stack, f.name)) for f in fields(Stack)}
     return np.array(
-        [np.log(max(values[n[3:]], NOTHING)) if n.startswith("ln_") else values[n] for n in _STACK_NAMES]
+        [np.log(max(values[n[3:]], NOTHING)) if n.startswith("ln_") else values[n] for n in STACK_NAMES]
     )
 
 
 def stack_of(theta: Array) -> Stack:
     """Return the stack that the first numbers of theta describe; ValueError where there can be none."""
-    named = zip(_STACK_NAMES, theta.tolist())
+    named = zip(STACK_NAMES, theta.tolist())
     return Stack(**{n.removeprefix("ln_"): float(np.exp(v)) if "ln_" in n else v for n, v in named})
 
 

@@ -1,12 +1,10 @@
 """Touches of one block: one object temperature, seen from two gripper temperatures.
 
-Two touches at different gripper temperatures must agree on the block: on its effusivity, its heat capacity,
-what its contact conductance has in common, and its temperature, which moves from one touch to the next
-(aluminium's by several degrees in one touch).  Under a candidate each touch is a Gaussian factor of what it
-shares with the others, by both sensors where there are two.  The factors are expanded twice, the second time
-around what the other touches say of the block's temperature: a wide prior leaves wood's open by many degrees,
-too far for one expansion.  With a free effusivity in place of a candidate, on a grid, the same algebra gives
-the joint posterior of ln e and of the block's temperature.
+Two touches must agree on the block: on its effusivity, heat capacity, what its contact conductance has in
+common, and its temperature, which moves from one touch to the next.  Under a candidate, or a free effusivity
+on a grid, each touch is a Gaussian factor of what it shares with the others, by both sensors where there are
+two.  The factors are expanded twice, the second time around what the other touches say of the block's
+temperature: a wide prior leaves wood's open by many degrees, too far for one expansion.
 
 A touch as a Gaussian factor
 ----------------------------

@@ -11,10 +11,7 @@ Each candidate's prediction and the probabilities of the candidates now are a :c
 the expected information of readings is a sum over it (:mod:`thermogrip.classify.decisions.next_touch`).
 Nothing is simulated sample by sample: it costs a few evaluations of the response per candidate.
 
-A second sensor's readings of **another touch** stand beside the first one's, one normal distribution for
-both.  They share the block's temperature, which each thermometer has 0.3 K off the other, and with it what is
-known of it; contact, build-up and onset are each sensor's own.  The second one begins as it did in the last
-touch, or with the first one where the two began within 2 K of each other.
+A second sensor is left out: it may gain more than is expected.
 """
 
 from __future__ import annotations
@@ -24,13 +21,13 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.special import logsumexp
 
 from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.materials import Material
 from thermogrip.sysid.contact.simulation import PUMP_OFF
-from thermogrip.sysid.effusivity.data import Touches, noise_covariance, touches
+from thermogrip.sysid.effusivity.data import Touches, noise_covariance
 from thermogrip.sysid.effusivity.gripper_model import GripperModel
 from thermogrip.sysid.effusivity.laplace_approximation import (
     BUILD_UP,
@@ -38,14 +35,8 @@ from thermogrip.sysid.effusivity.laplace_approximation import (
     LEVEL,
     N_NUISANCE,
     ONSET,
-    SENSORS_APART,
-    T_OBJECT,
-    Hypotheses,
-    hypotheses_of_second,
     jacobian,
-    material_hypotheses,
     nodes_for,
-    prior_of,
 )
 from thermogrip.sysid.effusivity.multi_touch import SHARED, Coupling, next_touch_prior
 
@@ -58,10 +49,7 @@ class ForecastSettings:
     """Readings to come, and how a gripper begins."""
 
     bin_s: float = 0.5  # readings to come are taken as means over this
-    regulation_sd_K: float = (
-        0.35  # how far from its set point a gripper is at contact, as simulated grasps are
-    )
-    alike_K: float = 2.0  # sensors that begin so near to each other are both set
+    regulation_sd_K: float = 0.35  # of a gripper about its set point at contact, as of simulated grasps
     first_s: float = 0.3  # before it the moment of contact matters too much for one expansion
 
 
@@ -94,53 +82,18 @@ def next_touch(
     )
     u[:, SHARED] = np.tile(x_mean, (n, 1))
     spread[:, np.array(SHARED)[:, None], SHARED] = np.tile(x_cov, (n, 1, 1))
-    y, slopes, covariance = _to_come(gripper, data, u, spread)
-    log_p = np.tile(evidence - logsumexp(evidence), (n, 1))
-    last = touches(grasps)
-    if gripper.second is not None and last.second is not None:
-        one = material_hypotheses(gripper, candidates)
-        other = Hypotheses(
-            *(np.tile(field, n) for field in hypotheses_of_second(gripper, gripper.second, one))
-        )
-        begin = last.second.level[-1]
-        level = data.level if abs(begin - last.level[-1]) < FORECAST.alike_K else np.full(n * m, begin)
-        begun = _coming(level, room, end, _sample_time(grasps))
-        prior = prior_of(gripper.second, begun, other)
-        prior.mean[:, T_OBJECT] = u[:, T_OBJECT] + gripper.second.bias - gripper.bias
-        prior.sd[:, T_OBJECT] = np.hypot(np.sqrt(spread[:, T_OBJECT, T_OBJECT]), SENSORS_APART)
-        prior.sd[:, LEVEL] = FORECAST.regulation_sd_K
-        own_spread = np.eye(N_NUISANCE) * (prior.sd**2)[:, :, None]
-        y_2, slopes_2, covariance_2 = _to_come(gripper.second, begun, prior.mean, own_spread)
-        cross = (slopes @ spread[:, :, [T_OBJECT]]) @ slopes_2[:, :, [T_OBJECT]].transpose(0, 2, 1)
-        y = np.concatenate([y, y_2], axis=1)
-        above = np.concatenate([covariance, cross], axis=2)
-        below = np.concatenate([cross.transpose(0, 2, 1), covariance_2], axis=2)
-        covariance = np.concatenate([above, below], axis=1)
-    n_reading = y.shape[1]
-    return PosteriorPredictive(log_p, y.reshape(n, m, -1), covariance.reshape(n, m, n_reading, n_reading))
-
-
-def _to_come(gripper: GripperModel, data: Touches, u: Array, spread: Array) -> tuple[Array, Array, Array]:
-    """Return mean, slopes and covariance of what a sensor will read of nuisances ``u`` (n, 7) known to
-    ``spread`` (n, 7, 7)."""
     vary = np.diagonal(spread, axis1=1, axis2=2) > 0
-    y, slopes = jacobian(
-        gripper.stack, nodes_for(data), data, u, vary, gripper.beyond(data.t, u[:, EFFUSIVITY])
-    )
+    beyond = gripper.beyond(data.t, u[:, EFFUSIVITY])
+    y, slopes = jacobian(gripper.stack, nodes_for(data), data, u, vary, beyond)
     excursion = np.abs(y[:, 1:] - data.level[:, None]).max(axis=1)
     noise = noise_covariance(replace(data, excursion=excursion), gripper.noise)
-    return y, slopes, slopes @ spread @ slopes.transpose(0, 2, 1) + noise
+    covariance = slopes @ spread @ slopes.transpose(0, 2, 1) + noise
+    log_p = np.tile(evidence - logsumexp(evidence), (n, 1))
+    return PosteriorPredictive(log_p, y.reshape(n, m, -1), covariance.reshape(n, m, *covariance.shape[1:]))
 
 
 def _sample_time(grasps: Grasps) -> float:
     return float(np.median(np.diff(np.asarray(grasps["time"].values, dtype=float))))
-
-
-def _samples(at: Array, dt: float) -> tuple[Array, NDArray[np.int64], Array]:
-    """Return the samples of means over half a second at times ``at``: times, bins, and how many a bin."""
-    per = max(1, round(FORECAST.bin_s / dt))
-    times = at[:, None] + dt * (np.arange(per) - 0.5 * (per - 1))
-    return times.ravel(), np.repeat(np.arange(at.size), per), np.full(at.size, float(per))
 
 
 def _coming(level: Array, room: float, end: float, dt: float) -> Touches:
@@ -148,7 +101,9 @@ def _coming(level: Array, room: float, end: float, dt: float) -> Touches:
     bin_times = np.concatenate(
         [[-1.0 - FORECAST.bin_s], np.arange(FORECAST.first_s + FORECAST.bin_s / 2, end, FORECAST.bin_s)]
     )
-    times, bins, count = _samples(bin_times, dt)
+    per_bin = max(1, round(FORECAST.bin_s / dt))
+    times = (bin_times[:, None] + dt * (np.arange(per_bin) - 0.5 * (per_bin - 1))).ravel()
+    bins, count = np.repeat(np.arange(bin_times.size), per_bin), np.full(bin_times.size, float(per_bin))
     n = level.size
     unknown = np.full(n, np.nan)
 

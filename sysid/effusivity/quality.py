@@ -3,23 +3,21 @@ r"""Which grasps, and which of their samples, are usable: :func:`check_grasps` d
 No contact
 ----------
 
-A grasp that is |dT| >= 10 K from its object has a skin that moves by a share of dT in any contact.  On the
-example rig's gripper the least of the library, expanded polystyrene, moves it by 1.0 % in 10 s, cork by
-3.5 %; a skin alone moves by up to 0.5 % of 20 K as its pump stops.  So a trace whose last second lies within
-0.6 % of its level before contact shows no contact: there is no effusivity in it, and no material.
+10 K or more from its object, a skin moves by a share of the difference in any contact: on the example rig's
+gripper by 1.0 % in 10 s for the least of the library, expanded polystyrene, by 3.5 % for cork; alone by up to
+0.5 % of 20 K as its pump stops.  So a trace whose last second lies within 0.6 % of its level before shows no
+contact.
 
 A skin that moves the other way, by a twentieth of the difference or more, contradicts its object's
-temperature: the number is wrong, or not in degC.  Nor is there a material in a grasp without a reading within
-its sensor's range before contact or after it.  Of touches of one block an unusable one is left out, and the
-block has rested longer before the next of them.
+temperature: the number is wrong, or not in degC.  Of touches of one block an unusable one is left out, and
+the block has rested longer before the next of them.
 
 Saturated sensors
 -----------------
 
-A skin that is pulled past the last reading of its sensor goes on moving; its trace does not.  Taken for a
-temperature such a stretch indicates a heat flow that stopped, which no contact does: a gripper and an object
-come to terms ever slower, as :math:`1 / \sqrt t` at first and exponentially in the end.  So a trace
-**saturates** at its highest or lowest reading where it stays for 2 s or more, and
+A skin that is pulled past the last reading of its sensor goes on moving; its trace does not, as if the heat
+flow had stopped.  So a trace **saturates** at its highest or lowest reading where it stays for 2 s or more,
+and
 
 - had moved by more than five of its steps in the second before it got there (an exponential that does this
   and then stays within one step for two seconds has a time constant below 0.6 s: no block has), or

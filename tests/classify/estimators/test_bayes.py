@@ -199,44 +199,6 @@ def test_the_spread_within_classes_falls_back_on_that_of_all_and_on_one() -> Non
     np.testing.assert_allclose(_within_class_sd(x, weight, classes, center), [6.5**0.5, 0.75**0.5, 1.0])
 
 
-def with_second(first: Grasps, second: Grasps) -> Grasps:
-    """The readings of another record as those of a second sensor."""
-    return first.assign(t_surface_2=(("grasp", "time"), second["t_surface"].values))
-
-
-def test_a_second_sensor_is_read_and_divided_by_its_own_difference(make_touches: Maker) -> None:
-    """Under the first, half as warm, copper and zinc are alike; the second alone tells them apart."""
-    same, other = (
-        make_touches(("iron",), each=16),
-        make_touches(("copper", "zinc"), each=8, noise=0.01, seed=3),
-    )
-    kind = other["material"].values
-    cooler = other.assign(t_surface=0.5 * (other["t_surface"] - 43.0) + 43.0)
-    both = with_second(same, cooler).assign(material=("grasp", kind))
-    model = make_classifier("bayes").fit(both)
-    assert model.feature_names_[6:] == [f"second_{name}" for name in model.feature_names_[:6]]
-    assert right(model, both) > right(make_classifier("bayes").fit(both.drop_vars("t_surface_2")), both) + 0.2
-    read = model.reader_.read(both)
-    np.testing.assert_allclose(read.gain[:, 6:].mean(), 10.0, atol=0.3)  # 43 less 33 degC
-    np.testing.assert_allclose(read.gain[:, :6].mean(), 20.0, atol=0.3)
-    assert (read.noise[:, :6, 6:] == 0).all()
-    with pytest.raises(UserError, match="has no t_surface_2"):
-        model.predict(same)
-
-
-def test_a_second_sensor_as_warm_as_an_object_is_not_read(make_touches: Maker) -> None:
-    """Of a passive sensor at the objects' temperature nothing can be divided; the fit was singular."""
-    first = make_touches(("copper", "zinc"))
-    still = make_touches(("copper", "zinc"), t_object=23.0, seed=2, noise=0.01)
-    passive = still.assign(t_surface=still["t_surface"] + 20.0)
-    model = make_classifier("bayes").fit(with_second(first, passive))
-    assert model.notes_ == ["the second sensor is not read: its temperature was within 1 K of an object's"]
-    alone = make_classifier("bayes").fit(first)
-    np.testing.assert_allclose(
-        model.predict_proba(with_second(first, passive)), alone.predict_proba(first), atol=1e-9
-    )
-
-
 def test_an_unknown_temperature_is_integrated_over_what_it_may_be(make_touches: Maker) -> None:
     model = make_classifier("bayes").fit(make_touches(MATERIALS))
     asked = pick(make_touches(MATERIALS, t_object=33.0, seed=4), [1, 9, 20]).assign(
@@ -409,14 +371,14 @@ def test_materials_that_do_not_differ_get_equal_probabilities(make_touches: Make
     assert p.max() < 0.75
 
 
-def test_a_grasp_counts_for_a_sensor_by_its_own_difference() -> None:
+def test_a_grasp_counts_for_a_feature_by_its_own_gain() -> None:
     """The second is 20 K from half of the objects and 0.05 K from the others, where noise is all it reads."""
     rng, at = np.random.default_rng(0), np.repeat([0, 1], 20)
     gain = np.column_stack([np.full(40, 20.0), np.tile([20.0, 0.05], 20)])
     y = gain * np.array([[0.6, 0.3], [0.2, 0.1]])[at] + 0.05 * rng.standard_normal((40, 2))
     noise = np.tile(0.05**2 * np.eye(2), (40, 1, 1))
     model = BayesClassifier(shrinkage=3.0)
-    model.reader_ = FeatureReader(["change_2s", "second_change_2s"], True, 10.0)
+    model.reader_ = FeatureReader(["change_2s", "change_5s"], True, 10.0)
     model.classes_ = np.array(["x", "y"])
     model._fit_density(Readings(y, gain, noise, np.full(40, 0.01), gain[:, 0]), at)
     means = model.means_ * model.scale_ + model.center_

@@ -9,7 +9,6 @@ from scipy.special import erf
 
 from thermogrip.sysid.contact.closed_forms import (
     contact_flux,
-    contact_heat,
     contact_temperature,
     device_temperature,
     half_space,
@@ -67,7 +66,7 @@ CASES = [
 
 
 @pytest.mark.parametrize(("gamma", "h_c", "t"), CASES)
-def test_skin_flux_and_heat_agree_with_an_independent_inversion(gamma, h_c, t):
+def test_skin_and_flux_agree_with_an_independent_inversion(gamma, h_c, t):
     e_dev, e_obj = 1e3, 1e3 / gamma
 
     def flux(s):
@@ -75,7 +74,6 @@ def test_skin_flux_and_heat_agree_with_an_independent_inversion(gamma, h_c, t):
 
     bodies = {"e_dev": e_dev, "e_obj": e_obj, "h_c": h_c, **UNIT}
     assert contact_flux([t], **bodies)[0] == pytest.approx(exact(flux, t), rel=1e-8)
-    assert contact_heat([t], **bodies)[0] == pytest.approx(exact(lambda s: flux(s) / s, t), rel=1e-8)
     rise = exact(lambda s: flux(s) / (e_dev * mp.sqrt(s)), t)
     assert skin_temperature([t], **bodies)[0] == pytest.approx(rise, rel=1e-8)
     fall = object_surface_temperature([t], **(bodies | {"T_dev0": -1.0, "T_obj0": 0.0}))[0]
@@ -227,9 +225,3 @@ def test_a_sensor_on_a_perfect_contact_follows_a_step():
     want = 23.0 + 20.0 * COPPER / (WATER + COPPER) * (1 - np.exp(-t / 0.8))
     np.testing.assert_allclose(sensor_temperature(t, **of), want, rtol=1e-12)
     np.testing.assert_allclose(sensor_temperature(t, h_c=1e7, **of), want, atol=2e-3)
-
-
-def test_heat_begins_at_nothing_and_is_the_integral_of_the_flux():
-    assert contact_heat([0.0], e_dev=WATER, e_obj=COPPER, h_c=800.0, **WARM)[0] == 0.0
-    perfect = contact_heat([4.0], e_dev=WATER, e_obj=COPPER, **WARM)[0]  # twice the flux times the time
-    assert perfect == pytest.approx(8.0 * contact_flux([4.0], e_dev=WATER, e_obj=COPPER, **WARM)[0])

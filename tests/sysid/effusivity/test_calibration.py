@@ -81,7 +81,7 @@ def test_the_search_goes_on_through_a_narrow_valley():
 
 
 def test_a_search_that_is_cut_short_says_so(monkeypatch):
-    monkeypatch.setattr(calibration, "_NOISE_SEARCH", 3)
+    monkeypatch.setattr(calibration, "SETTINGS", calibration.CalibrationSettings(noise_steps=3))
     with pytest.warns(RuntimeWarning, match="noise of 7 grasps ended after 3 steps before it settled"):
         calibration._least(narrow, FIRST, n_grasp=7)
 

@@ -165,7 +165,7 @@ def test_the_compiled_search_has_the_slopes_of_the_prediction(device, monkeypatc
     prior = prior_of(leaky, data, material_hypotheses(leaky, ["iron", "zinc"]))
     sd = np.where(prior.sd > 0, prior.sd, 0.3)
     whitener = whiten(data, leaky.noise)
-    monkeypatch.setattr(mode_kernel, "_MOST_STEPS", 60)
+    monkeypatch.setattr(mode_kernel, "SEARCH", mode_kernel.SearchSettings(most_steps=60))
     found = find_modes(leaky.stack, data, np.arange(data.level.size), whitener, Prior(prior.mean, sd))
     slopes = jacobian(leaky.stack, nodes_for(data), data, found.u, sd > 0)[1]
     for i in range(2):

@@ -5,17 +5,12 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import pytest
 
 from thermogrip.datasets.examples import load_example_grasps
-from thermogrip.sysid.effusivity import predictive
-from thermogrip.sysid.effusivity.data import noise_covariance, touches
+from thermogrip.sysid.effusivity.data import noise_covariance
 from thermogrip.sysid.effusivity.laplace_approximation import (
-    hypotheses_of_second,
     jacobian,
-    material_hypotheses,
     nodes_for,
-    prior_of,
 )
 from thermogrip.sysid.effusivity.multi_touch import next_touch_prior
 from thermogrip.sysid.effusivity.predictive import _coming, next_touch
@@ -59,44 +54,3 @@ def test_another_touch_reads_its_nuisances_through_the_slopes(device):
         usual.mean, next_touch(device, grasp.drop_vars("t_ambient"), names, 20.0, rest=60.0, end=10.0).mean
     )
     assert usual.mean.shape == (1, 2, 20)
-
-
-@pytest.mark.parametrize(("apart", "begins"), [(-9.0, [31.0, 31.0]), (0.5, [20.0, 35.0])])
-def test_another_touch_is_read_by_both_sensors(device, monkeypatch, apart, begins):
-    """The first one's readings as ever; the second's begin where they did, or with the first; and what moves
-    both is the block's temperature, on whose thermometers they are half a degree apart."""
-    two = replace(device, second=replace(device, bias=device.bias + 0.5))
-    grasp = load_example_grasps()["exp5_two_touch_unknown_object"].isel(grasp=[0])
-    grasp = grasp.assign(t_surface_2=grasp["t_surface"] + 40.0 - touches(grasp).level[0] + apart)
-    grasp = grasp.assign(t_surface=grasp["t_surface"] + 40.0 - touches(grasp).level[0])
-    x, spread = np.array([[31.0, 7.4, 10.4, 11.0], [30.0, 6.8, 5.9, 9.9]]), np.zeros((2, 4, 4))
-    spread[:, [0, 1, 2, 3], [0, 1, 2, 3]] = [[4.0, 0.02, 0.01, 0.0], [9.0, 0.01, 0.02, 0.01]]
-
-    def ahead(gripper, by=0.0):
-        known = (np.zeros(2), x + [by, 0.0, 0.0, 0.0], spread)
-        monkeypatch.setattr(predictive, "next_touch_prior", lambda *a, **k: known)
-        return next_touch(gripper, grasp, ["copper", "wood"], [20.0, 35.0], end=4.0)
-
-    found, alone = ahead(two), ahead(device)
-    n = alone.mean.shape[2]
-    assert found.mean.shape == (2, 2, 2 * n)
-    np.testing.assert_allclose(found.mean[:, :, :n], alone.mean, atol=1e-9)
-    np.testing.assert_allclose(found.covariance[:, :, :n, :n], alone.covariance, rtol=1e-9, atol=1e-12)
-    np.testing.assert_allclose(found.mean[:, :, n], np.repeat([begins], 2, axis=0).T, atol=1e-6)
-    slope = (ahead(two, 1e-3).mean - ahead(two, -1e-3).mean) / 2e-3
-    cross = slope[:, :, :n, None] * slope[:, :, None, n:] * spread[None, :, 0, 0, None, None]
-    assert np.abs(cross).max() > 1.0
-    np.testing.assert_allclose(found.covariance[:, :, :n, n:], cross, atol=1e-6)
-    assert np.linalg.eigvalsh(found.covariance).min() > 0
-    # the second one's block is its own, at the first one's temperature and 0.5 K, give or take 0.3
-    second = replace(device, bias=device.bias)
-    u = hypotheses_of_second(two, second, material_hypotheses(device, ["copper", "wood"]))
-    for i, level in enumerate(begins):
-        one = _coming(np.full(2, level), 21.0, 4.0, 0.1)
-        mean, sd, _ = prior_of(second, one, u)
-        mean[:, 4], sd[:, 4], sd[:, 3] = x[:, 0] + 0.5, np.sqrt(spread[:, 0, 0] + 0.09), 0.35
-        y, slopes = jacobian(device.stack, nodes_for(one), one, mean, sd > 0)
-        np.testing.assert_allclose(found.mean[i, :, n:], y, atol=0.02)  # of the drift to another room
-        drawn_noise = found.covariance[i, :, n:, n:] - (slopes * sd[:, None] ** 2) @ slopes.transpose(0, 2, 1)
-        assert np.linalg.eigvalsh(drawn_noise).min() > 0
-        assert np.abs(drawn_noise).max() < 0.1
