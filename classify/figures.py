@@ -7,7 +7,7 @@ Okabe and Ito, which differ for every kind of colour vision, and each classifier
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -151,7 +151,7 @@ def _counted(n: float) -> str:
 def _library_lines(axis: Axes, library: Mapping[str, float]) -> None:
     """Draw a line with its name for each of the library's effusivities that the axis shows."""
     low, high = axis.get_xlim()
-    text = {"rotation": 90, "fontsize": 6, "ha": "center", "va": "bottom"}
+    text: dict[str, Any] = {"rotation": 90, "fontsize": 6, "ha": "center", "va": "bottom"}
     for name, effusivity in library.items():
         if low <= effusivity <= high:
             axis.axvline(effusivity, color=_FAINT, lw=0.8, zorder=0)
