@@ -205,6 +205,8 @@ class ObserverNoise:
     drive: dict[str, Deviation] = field(default_factory=dict)  # of a drive's bias, in its ranges
     output: Deviation = 0.03  # of a bias of an output, in its unit
     reading: dict[str, Deviation] = field(default_factory=dict)  # of one reading where the plant does not say
+    # white noise of a drive on its way to the states, mean over a sample, in its ranges
+    load: dict[str, Deviation] = field(default_factory=dict)
 
 
 def reading_noise(plant: Plant, output: str) -> float | None:
@@ -338,6 +340,8 @@ class Observer:
         bias_unit = np.where(disturbance.on_output.any(axis=0), disturbance.on_output.T @ model.unit, 1.0)
         drift = np.where(self.is_drive, disturbance.on_drive.T @ drives, self.noise.output * bias_unit)
         self.Q = np.concatenate([(self.noise.state * self.unit) ** 2, drift**2]) * model.dt
+        _, _, B, _ = model.linearise(*model.at_rest(ambient))
+        self.load = B * model.span * [self.noise.load.get(name, 0.0) for name in model.drives]
         self.x = np.zeros(model.n_x)
         self.w = np.zeros(disturbance.n_w)
         self.found_offset = np.zeros(model.n_y)
@@ -450,7 +454,8 @@ class Observer:
     def settled_gain(self, step: Array) -> Array:
         """Return the gain (n_x + n_w, n_y) that the filter settles at with this Jacobian of a sample."""
         n = step.shape[0]
-        P = solve_discrete_are(step.T, self._H.T, np.diag(self.Q[:n] + 1e-12 * np.ones(n)), np.diag(self.R))
+        Q = self._noise(1.0)[:n, :n] + 1e-12 * np.eye(n)
+        P = solve_discrete_are(step.T, self._H.T, Q, np.diag(self.R))
         innovation = self._H @ P @ self._H.T + np.diag(self.R)
         return np.asarray(np.linalg.solve(innovation, self._H @ P).T)
 
@@ -486,8 +491,10 @@ class Observer:
         return np.asarray(innovation)
 
     def _noise(self, share: float) -> Array:
-        """Return the variance that a share of a sample adds to the states."""
-        return np.where(self._held, 0.0, share * self.Q)
+        """Return the covariance that a share of a sample adds to the states (n_x + n_w, n_x + n_w)."""
+        n_x, added = self.model.n_x, np.diag(np.where(self._held, 0.0, self.Q))
+        added[:n_x, :n_x] += self.load @ self.load.T
+        return share * added
 
     def _change(self, change: Array) -> None:
         """Change the states."""
@@ -501,8 +508,7 @@ class Observer:
     def predict(self, u: Array, d: Array) -> None:
         """Carry the estimate one sample on under drives u (n_u,) and disturbances d (n_d,)."""
         self.x, step = self._sample(u, d)
-        self._P = step @ self._P @ step.T
-        self._P[np.diag_indices_from(self._P)] += self._noise(1 - self._noised)
+        self._P = step @ self._P @ step.T + self._noise(1 - self._noised)
         self._on_sample()
 
     def advance(self, seconds: float, u: Array, d: Array) -> None:
@@ -521,8 +527,7 @@ class Observer:
         if share <= SAME:
             return
         after, step = self._sample(self._dose / self._into, d)
-        P = self._P
-        P[np.diag_indices_from(P)] += self._noise(share - self._noised)
+        P = self._P + self._noise(share - self._noised)
         self._P, self._share, self._noised = P, share, share
         self._ahead = (1 - share) * self.x + share * after
         self._way = (1 - share) * np.eye(len(P)) + share * step

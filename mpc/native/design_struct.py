@@ -94,6 +94,7 @@ _FIELDS: dict[str, tuple[bool, tuple[str, ...], str]] = {
     "offset": (False, ("NY",), "sensor offsets [degC]"),
     "R": (False, ("NY",), "variance of a reading"),
     "Q": (False, ("NZ",), "variance that a sample adds"),
+    "load": (False, ("NX", "NU"), "standard deviation that the white noise of each drive adds to each state"),
     "P0": (False, ("NW",), "variance of the disturbance states at rest"),
     "R_start": (False, ("NY",), "variance of a reading at rest"),
     "rest": (False, ("NX",), "state at rest where all is at `ambient` and `usual_d`"),
@@ -259,7 +260,7 @@ def numbers_of(controller: ControllerParts, k: Array) -> dict[str, Any]:
         (optimiser.drives, "lowest highest slew neutral safe"),
         (optimiser.weights, "dear zone"),
         (optimiser.at_rest, "strongest seen"),
-        (observer, "fixed offset R Q P0 R_start"),
+        (observer, "fixed offset R Q load P0 R_start"),
         (disturbance, "on_drive on_disturbance on_output"),
     )
     settled = optimiser.at_rest.settled

@@ -346,6 +346,7 @@ class Bench:
         noise = replace(
             base.noise,
             state=parameters.get("state", 1.0) * base.noise.state,
+            load={name: parameters.get("state", 1.0) * sd for name, sd in base.noise.load.items()},
             drive={name: drift * sd for name, sd in base.noise.drive.items()},
             output=drift * base.noise.output,
         )
