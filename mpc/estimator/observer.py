@@ -29,9 +29,16 @@ the bias of a drive drifts by what its logs show, and at least by so much that a
 loop can answer it: of an output that a drive of gain k / T raises at the rate k / T, and readings of noise r
 each dt, the filter of a bias that drifts by q in a second has the bandwidth
 
-    omega^2 = q k / (T r sqrt(dt)),    which is to be 1 / theta^2,    theta = delay + dt  [2]_,
+    omega^2 = q k / (T r sqrt(dt)),    which is to be 1 / theta^2 at least,    theta = delay + dt  [2]_,
 
-or lag + dt of a model that has no delay: it does not say how soon its plant can answer.
+or lag + dt of a model that has no delay: it does not say how soon its plant can answer.  Noise that is taken
+for a load is a bias of q / sqrt(omega), and moves the output for theta before that is seen, by
+
+    (k / T) theta q / sqrt(omega) = r (omega theta)^(3/2) sqrt(dt / theta),
+
+so a quiet sensor lets omega be larger.  And a load does not drift alone, it jumps: white noise on the drive's
+way to the states, as large as the drift of some theta.  It is what damps: with a bias alone all that a
+reading shows of a load comes an integration late.
 
 The filter starts from a plant at rest whose sensors are off (see below).
 Where an output has an offset among the disturbance states, that is where the start finds it, and it may

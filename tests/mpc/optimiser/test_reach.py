@@ -45,7 +45,7 @@ ROWS = {
     "far beyond an optimum": (OPTIMUM, OPTIMUM, {}, [(-20, 600)], 3, 4.5),
     "nearly an optimum": (OPTIMUM, OPTIMUM, {}, [(5, 600)], None, 0),
     "an end of the drive": (WEAK, WEAK, {}, [(42, 600)], 1, 38.7),
-    "hardly beyond an end of the drive": (WEAK, WEAK, {}, [(39.5, 600)], 20, 38.7),
+    "hardly beyond an end of the drive": (WEAK, WEAK, {}, [(39.5, 600)], 60, 38.7),
     "nearly an end of the drive": (WEAK, WEAK, {}, [(38, 600)], None, 0),
     "less power than the model's": ({"heat": 0.077}, {}, {}, [(34, 180), (38, 300)], None, 0),
 }
@@ -87,7 +87,7 @@ def test_a_target_out_of_reach_is_reported_soon_and_kept_and_no_other_is(row, ta
         assert first_said <= latest
         assert set(after[first_said:]) == {"infeasible"}
         found = re.search(r"no drive holds .* degC: (-?[0-9.]+) degC can be held", loop.advice[-1])
-        assert float(found[1]) == pytest.approx(value, abs=0.7)
+        assert float(found[1]) == pytest.approx(value, abs=1.1)
     if wanted():
         compiled = compiled_loop(Controller(plant, design), truth, schedule)
         assert compiled.status == loop.status
@@ -118,7 +118,7 @@ def test_what_is_out_of_reach_counts_in_the_unit_of_its_output(make, gain, beyon
 
 DESIGN = Design(
     dt=2.0, controlled=("b", "a"), blocks=(1, 2), drive_range={"q1": (-50.0, 100.0), "q2": (0.0, 80.0)},
-    slew_per_s={"q1": 4.0, "q2": 10.0}, limits={"a": (16.0, 28.0)},
+    slew_per_s={"q1": 4.0, "q2": 10.0}, limits={"a": (16.0, 28.0)}, price=50.0,
 )  # fmt: skip
 MODEL = PredictionModel(crossed("0_255"))
 OBSERVER = Observer(MODEL, choose_disturbances(MODEL, ("b", "a")))
