@@ -204,26 +204,26 @@ class Truth:
         self.d = np.array([around.disturbances.get(name, d[name]) for name in d], dtype=float)
         warmth = around.ambient if start is None else start
         self.x = native.rest(np.full(native.n_y, warmth), self.d)
-        held: Array | None = None
+        holding_drive: Array | None = None
         if around.held:
-            self.x, held = held_start(native, around.held, warmth, tuple(self.d.tolist()))
-        self.known = held is not None  # whether there is a drive that holds the start
+            self.x, holding_drive = held_start(native, around.held, warmth, tuple(self.d.tolist()))
+        self.known = holding_drive is not None  # whether there is a drive that holds the start
         self.moves: list[Array] = []
-        self.before = native.neutral if held is None else held
-        given = [plant.offsets.get(name, 0.0) + around.offset.get(name, 0.0) for name in native.outputs]
-        self.offset = np.array(given, dtype=float)
+        self.before = native.neutral if holding_drive is None else holding_drive
+        offsets = [plant.offsets.get(name, 0.0) + around.offset.get(name, 0.0) for name in native.outputs]
+        self.offset = np.array(offsets, dtype=float)
         self.rng = np.random.default_rng(seed)
         self.late = round(around.move_delay_s / native.dt)
         self.sees = native.dt / (native.dt + around.sensor_lag_s)  # share of a change that is shown at once
-        if held is None and (
+        if holding_drive is None and (
             self.late or around.drive_share != 1
         ):  # what was applied before counts: what holds the start
             pushed = native.neutral + np.diag(0.01 * native.span)
             plans = np.vstack([native.neutral[None], pushed])[:, None]
             _, after = native.run(np.repeat(self.x[None], len(plans), axis=0), plans, self.d)
             by_drive = (after[1:] - after[0]).T / (0.01 * native.span)
-            found = native.neutral + np.linalg.lstsq(by_drive, self.x - after[0], rcond=None)[0]
-            self.before = np.clip(found, native.lowest, native.highest)
+            drive_before = native.neutral + np.linalg.lstsq(by_drive, self.x - after[0], rcond=None)[0]
+            self.before = np.clip(drive_before, native.lowest, native.highest)
         self.stem = self.before  # what follows the drives
         self.y = [native.output(self.x) + self.offset]  # without the load
         self.time = 0.0
@@ -249,23 +249,25 @@ class Truth:
         values = self.y[-1] + noise
         if self.around.load is not None:
             values = values + self.around.load[min(len(self.y), len(self.around.load)) - 1]
-        found = dict(zip(self.model.outputs, values.tolist(), strict=True))
+        shown = dict(zip(self.model.outputs, values.tolist(), strict=True))
         for name, value in zip(self.model.disturbances, self.d, strict=True):
-            found[name] = float(value) + self.around.offset.get(name, 0.0)
-        for key, step in zip(found, self.around.steps_of(tuple(found)).tolist(), strict=True):
+            shown[name] = float(value) + self.around.offset.get(name, 0.0)
+        for key, step in zip(shown, self.around.steps_of(tuple(shown)).tolist(), strict=True):
             if step > 0:
-                found[key] = round(found[key] / step) * step
-        return {"time_s": self.time, **found}
+                shown[key] = round(shown[key] / step) * step
+        return {"time_s": self.time, **shown}
 
     def apply(self, move: Move) -> None:
         """Let one sample pass under this move."""
-        first, rest = len(self.moves) * self.sub - self.late, self.before
+        first, drive_before = len(self.moves) * self.sub - self.late, self.before
         self.moves.append(np.array(move.drives(self.model.drives), dtype=float))
-        at = np.arange(first, first + self.sub) // self.sub
-        u = np.stack([self.moves[k] if k >= 0 else rest for k in at])
+        moves_in_force = np.arange(first, first + self.sub) // self.sub
+        u = np.stack([self.moves[k] if k >= 0 else drive_before for k in moves_in_force])
         if self.around.play:
             u = self._behind_play(u)
-        y, x = self.model.run(self.x[None, :], (rest + self.around.drive_share * (u - rest))[None], self.d)
+        y, x = self.model.run(
+            self.x[None, :], (drive_before + self.around.drive_share * (u - drive_before))[None], self.d
+        )
         self.x = x[0]
         for row in y[0, 1:] + self.offset:
             self.y.append(row if self.sees == 1 else self.y[-1] + self.sees * (row - self.y[-1]))
@@ -309,11 +311,19 @@ def record_loop(
     jumps = np.abs(np.diff(scaled, axis=0, prepend=before)).sum(axis=1)
     segments = []
     for first, last in zip([0, *stops[:-1]], stops):
-        rows, part = slice(first * truth.sub, last * truth.sub + 1), slice(first, last)
+        rows, calls_of_segment = slice(first * truth.sub, last * truth.sub + 1), slice(first, last)
         for k, name in enumerate(controlled):
             output, goal = y[rows, model.outputs.index(name)], float(calls.target[first, k])
-            found = segment_of(name, fine[rows], output, goal, scaled[part], full[part], band_of(band, name))
-            segments.append(replace(found, travel=float(jumps[part].sum())))
+            segment = segment_of(
+                name,
+                fine[rows],
+                output,
+                goal,
+                scaled[calls_of_segment],
+                full[calls_of_segment],
+                band_of(band, name),
+            )
+            segments.append(replace(segment, travel=float(jumps[calls_of_segment].sum())))
     return ClosedLoop(
         time=fine,
         outputs={name: y[:, i] for i, name in enumerate(model.outputs)},
@@ -397,9 +407,9 @@ class RecordedController:
     def step(self, reading: Readings, target: Target) -> Move:
         """Return the controller's move, and keep it."""
         move = self.controller.step(reading, target)
-        said = "" if self.monitor is None else self.monitor.note(reading, move, target)
-        if said and move.status == "ok":
-            move = replace(move, status="mismatch", advice=said)
+        report = "" if self.monitor is None else self.monitor.note(reading, move, target)
+        if report and move.status == "ok":
+            move = replace(move, status="mismatch", advice=report)
         self.moves.append((float(reading.get("time_s", self.dt * len(self.moves))), move))
         return move
 
@@ -427,16 +437,16 @@ def session_loop(
     drives = {name: column(log, name)[rows] for name in drive_range}
     goal = {name: column(log, f"target_{name}")[rows] for name in targets}
     outputs = {name: column(log, name)[rows] for name in names(log, "output")}
-    by_time = {round(at, 6): move for at, move in moves}
+    by_time = {round(time_s, 6): move for time_s, move in moves}
     # a reading that was rejected was not shown to the controller: its move was held
-    answers = [by_time.get(round(float(at), 6)) for at in logged[rows]]
+    answers = [by_time.get(round(float(time_s), 6)) for time_s in logged[rows]]
     lowest, highest = np.array([drive_range[name] for name in drives], dtype=float).T
     scaled, full = drive_shares(np.stack(list(drives.values()), axis=1), lowest, highest)
     segments = []
     for name, target in goal.items():
         segment = segment_of(name, time, outputs[name], float(target[0]), scaled, full, band)
-        own: Any = (figures or {}).get(name, {})
-        segments.append(replace(segment, **own))
+        session_figures: Any = (figures or {}).get(name, {})
+        segments.append(replace(segment, **session_figures))
     return ClosedLoop(
         time=time,
         outputs=outputs,

@@ -89,8 +89,15 @@ class _Run:
         self.y = np.zeros((n * truth.sub + 1, model.n_y))
         self.reading, self.drive = np.zeros((n, model.n_y + model.n_d)), np.zeros((n, model.n_u))
         self.status = np.full(n, STATUSES.index("ok"), dtype=np.int32)
-        self.plant, held = CompiledTruth(model).at(truth.x, truth.offset)
-        self._held = (held, truth.before, truth.d, noise, quanta, offset)  # they live as long as this
+        self.plant, arrays_of_plant = CompiledTruth(model).at(truth.x, truth.offset)
+        self._held = (
+            arrays_of_plant,
+            truth.before,
+            truth.d,
+            noise,
+            quanta,
+            offset,
+        )  # they live as long as this
         places = [address(values) for values in self._held[1:]]
         self.around = _Around(truth.sub, truth.late, truth.sees, around.drive_share, *places)
 
@@ -101,7 +108,7 @@ def _run_mpc(c: CompiledController, controller: Controller, run: _Run, target: A
     observed = np.concatenate([values.ravel() for values in estimate.values()])
     c.library.tg_host_loop(
         c.state,
-        *(ctypes.byref(part) for part in (c.design, run.plant, run.around)),
+        *(ctypes.byref(struct) for struct in (c.design, run.plant, run.around)),
         len(target),
         int(told),
         *(address(values) for values in (observed, target, run.y, run.reading, run.drive, run.status)),
@@ -117,11 +124,11 @@ def _run_pi(
     d = np.array([begun[name] for name in model.disturbances])
     if not ((d >= model.least_d) & (d <= model.most_d)).all():
         return False
-    loops, held = _loops_at(controller, target, d)
-    places = [ctypes.byref(part) for part in (loops, run.plant, run.around)]
+    loops, arrays = _loops_at(controller, target, d)
+    places = [ctypes.byref(struct) for struct in (loops, run.plant, run.around)]
     written = [address(values) for values in (run.y, run.reading, run.drive)]
     done = c.library.tg_host_loop_pi(*places, len(run.status), *written)
-    del held  # it had to live until here
+    del arrays  # it had to live until here
     return bool(done)
 
 
@@ -139,14 +146,14 @@ def _loops_at(controller: PIController, target: Array, d: Array) -> tuple[_Loops
     struct points to."""
     model, loops = controller.model, controller.loops
     rows = [model.outputs.index(controller.controlled[i]) for _, i in controller.ends]
-    ahead, kept = controller.terms(target, d)
+    ahead, setpoint_share = controller.terms(target, d)
     places = [np.array(values, dtype=np.int32) for values in ([j for j, _ in controller.ends], rows)]
     numbers = [
         [loop.Kc for loop in loops],
         [loop.Ti for loop in loops],
         target[[i for _, i in controller.ends]],
         *(
-            kept,
+            setpoint_share,
             ahead,
             controller.drives.lowest,
             controller.drives.highest,
@@ -155,6 +162,6 @@ def _loops_at(controller: PIController, target: Array, d: Array) -> tuple[_Loops
         ),
         *(controller.integral, controller.applied),
     ]
-    held = [*places, *(np.array(values, dtype=float) for values in numbers)]
+    arrays = [*places, *(np.array(values, dtype=float) for values in numbers)]
     bounds = (controller.dt, model.coldest, model.hottest)
-    return _Loops(len(loops), *bounds, *(address(values) for values in held)), held
+    return _Loops(len(loops), *bounds, *(address(values) for values in arrays)), arrays

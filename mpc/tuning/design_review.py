@@ -155,10 +155,10 @@ def as_asked(controller: Reviewed, swing: tuple[float, float], draws: int) -> Ch
     asked; of targets that nobody asked for nothing fails."""
     spec, noted = _spec_of(controller, swing)
     numbers = sorted({0, *draws_of(controller.plant, draws)})
-    found = run_trials(_again(controller), controller.plant, spec, steps_on(spec, numbers))
+    results_of_all = run_trials(_again(controller), controller.plant, spec, steps_on(spec, numbers))
     words, verdicts = [], []
     for step in spec.steps:
-        results = [result for result in found if result.step == step]
+        results = [result for result in results_of_all if result.step == step]
         of_step = [_stepped(result, spec.asked(result.output), timed=noted) for result in results]
         late = [float(np.nan_to_num(result.settle_s, nan=np.inf)) for result in results]
         worst_of = max(range(len(results)), key=lambda k: (_RANK[of_step[k][1]], late[k]))
@@ -178,15 +178,15 @@ def after_loads(controller: Reviewed, swing: tuple[float, float], draws: int) ->
     loads = loads_of(plant, spec, controller.design)
     seconds = 2 * load_seconds(controller.design)
     cases = [Case(target, target, draw, load=load, seconds=seconds) for load in loads for draw in numbers]
-    found = run_trials(_again(controller), plant, spec, cases)
+    results = run_trials(_again(controller), plant, spec, cases)
     words = []
     for load in loads:
-        part = [result for result in found if result.load == load.words]
-        back = max(result.settle_s for result in part) if all(_settled(r) for r in part) else np.inf
+        of_load = [result for result in results if result.load == load.words]
+        back = max(result.settle_s for result in of_load) if all(_settled(r) for r in of_load) else np.inf
         ends = f"back in {back:.0f} s" if np.isfinite(back) else f"not back after {seconds:.0f} s"
-        words.append(f"{load.words}: {ends}, {max(result.overshoot for result in part):.2f} off at most")
+        words.append(f"{load.words}: {ends}, {max(result.overshoot for result in of_load):.2f} off at most")
     fix = "tune again: a load that stays must be met"
-    lost = not all(_settled(result) for result in found)
+    lost = not all(_settled(result) for result in results)
     return _graded("comes back after a load", "; ".join(words), fail=(lost, fix))
 
 
@@ -224,12 +224,12 @@ def lacks_structure(controller: Reviewed, swing: tuple[float, float]) -> Check:
     tried = {words: replace(usual, **changes) for words, changes in lacking(plant, spec, controlled).items()}  # type: ignore[arg-type]
     tried[play := f"play of {100 * _PLAY:g} % of each drive"] = replace(usual, play=_PLAY)
     words, verdicts, case = [], [], Case(*spec.steps[0], draw)
-    for what, around in tried.items():
+    for structure, around in tried.items():
         run = trial(_again(controller), plant, spec, case, around=around)
         for result in results_of(run, spec, case):
             ends, verdict = _stepped(result, spec.asked(result.output))
-            words.append(f"{what}: {ends}")
-            verdicts.append("warn" if verdict == "fail" and (what == play or not stated) else verdict)
+            words.append(f"{structure}: {ends}")
+            verdicts.append("warn" if verdict == "fail" and (structure == play or not stated) else verdict)
     fix = "identify on a log of the closed loop and tune again; a design that moves less bears more"
     finding = f"{case.start:g} to {case.target:g} degC, each alone: {'; '.join(words)}"
     failed = "fail" in verdicts
@@ -246,44 +246,44 @@ def _stepped(result: StepResult, asked: Asked, *, timed: bool = False) -> tuple[
     over, off = result.overshoot / asked.overshoot_degC, abs(result.bias) / asked.bias_degC
     lost = not settled and max(abs(result.bias), result.overshoot) > _FAR_BEYOND * asked.band_degC
     name = f"{result.output} " if result.output else ""
-    parts = [
+    figures = [
         f"settles in {result.settle_s:.0f} s" if settled else "never settles",
         f"overshoot {result.overshoot:.2f}",
         f"offset {result.bias:.2f}",
     ]
     gone = (late and within > 0, over > 1, off > 1)
     limits = (f"{within:g} s", f"{asked.overshoot_degC:g}", f"{asked.bias_degC:g}")
-    said = [part + f" (asked {most})" * broken for part, broken, most in zip(parts, gone, limits)]
+    sentences = [figure + f" (asked {most})" * broken for figure, broken, most in zip(figures, gone, limits)]
     verdict = "fail" if lost else "warn" if late or over > 1 or off > 1 else "pass"
-    return f"{name}{', '.join(said)}", verdict
+    return f"{name}{', '.join(sentences)}", verdict
 
 
 def reachable(controller: Reviewed, span: tuple[float, float], rooms: Sequence[float]) -> Check:
     """Each end of the wanted range [degC] must be held by a drive inside its limits, in every room [degC]."""
     design, model = controller.design, controller.model
     low, high = np.array([design.drive_range[name] for name in model.drives]).T
-    missed, near = [], []
+    missed, barely_held = [], []
     for room in rooms if model.rooms.any() else rooms[:1]:
         for target in span:
             d = model.undisturbed(room)
-            found = holding_drive(model, design.controlled, np.full(len(design.controlled), target), d)
-            outside = np.any(found.u < low - 1e-6) or np.any(found.u > high + 1e-6)
+            holding = holding_drive(model, design.controlled, np.full(len(design.controlled), target), d)
+            outside = np.any(holding.u < low - 1e-6) or np.any(holding.u > high + 1e-6)
             text = f"{target:g} degC in a room of {room:g} degC"
-            if not np.isfinite(found.y).all():
+            if not np.isfinite(holding.y).all():
                 missed.append(f"{text} (nothing comes to rest)")
-            elif found.miss > 0.05:
-                missed.append(f"{text} (misses by {found.miss:.1f} degC)")
+            elif holding.miss > 0.05:
+                missed.append(f"{text} (misses by {holding.miss:.1f} degC)")
             elif outside:
-                missed.append(f"{text} (needs a drive of {', '.join(f'{u:.2f}' for u in found.u)})")
-            elif np.any(np.minimum(found.u - low, high - found.u) < 0.03 * model.span):
-                near.append(text)
+                missed.append(f"{text} (needs a drive of {', '.join(f'{u:.2f}' for u in holding.u)})")
+            elif np.any(np.minimum(holding.u - low, high - holding.u) < 0.03 * model.span):
+                barely_held.append(text)
     name = "targets can be held in steady state"
     if missed:
         fix = "narrow the targets, widen drive_limits, or cool the heatsinks better"
         return Check(name, "fail", f"out of reach: {', '.join(missed)}", fix)
-    if near:
+    if barely_held:
         fix = "expect slow settling there, leave some drive in reserve"
-        return Check(name, "warn", f"within 3 % of the drive's limit: {', '.join(near)}", fix)
+        return Check(name, "warn", f"within 3 % of the drive's limit: {', '.join(barely_held)}", fix)
     others = zip(model.disturbances, model.undisturbed(rooms[0]).tolist(), model.rooms, strict=True)
     amid = [f"{name} of {d:.4g}" for name, d, room in others if not room]
     if model.rooms.any() or not amid:
@@ -303,7 +303,7 @@ def gain_sign(controller: Reviewed) -> Check:
     """A Peltier element cools less beyond its optimum current: dT/du changes sign there."""
     design, model = controller.design, controller.model
     name, d = "gain keeps its sign over the drive", model.undisturbed(design.ambient)
-    seen, bad = [], []
+    ranges, bad = [], []
     for drive, (low, high) in design.drive_range.items():
         curve = steady_curve(model, drive, design.controlled[0], d)
         if not np.isfinite(curve.y).any():
@@ -312,14 +312,14 @@ def gain_sign(controller: Reviewed) -> Check:
             return Check(name, "warn", finding, fix)
         least, most = (float(ends[model.drives.index(drive)]) for ends in _known(model))
         inside = [turn for turn in curve.turns if max(low, least) < turn < min(high, most)]
-        seen.append(f"{drive}: {np.nanmin(curve.y):.1f} to {np.nanmax(curve.y):.1f} degC in steady state")
+        ranges.append(f"{drive}: {np.nanmin(curve.y):.1f} to {np.nanmax(curve.y):.1f} degC in steady state")
         if inside:
             bad.append(
                 f"{drive} turns over at {', '.join(f'{turn:.2f}' for turn in inside)} of {low:g} to {high:g}"
             )
-            seen.append(f"rising from {curve.rising[0]:.2f} to {curve.rising[1]:.2f}")
+            ranges.append(f"rising from {curve.rising[0]:.2f} to {curve.rising[1]:.2f}")
     fix = "set drive_limits to the rising part, or accept it: the prediction sees the turn, a PI does not"
-    return _graded(name, "; ".join(bad + seen), warn=(bool(bad), fix))
+    return _graded(name, "; ".join(bad + ranges), warn=(bool(bad), fix))
 
 
 def limits(controller: Reviewed, span: tuple[float, float]) -> Check:
@@ -330,15 +330,15 @@ def limits(controller: Reviewed, span: tuple[float, float]) -> Check:
         return Check(name, "pass", "no limits of outputs")
     d, broken = model.undisturbed(design.ambient), []
     for target in span:
-        held = holding_drive(model, design.controlled, np.full(len(design.controlled), target), d)
+        holding = holding_drive(model, design.controlled, np.full(len(design.controlled), target), d)
         for output, (low, high) in design.limits.items():
-            value = float(held.y[model.outputs.index(output)])
+            value = float(holding.y[model.outputs.index(output)])
             if not low <= value <= high:
                 broken.append(f"{output} is {value:.1f} degC when {target:g} degC is held")
-    seen = ", ".join(f"{key} {range_text(low, high)} degC" for key, (low, high) in design.limits.items())
+    ranges = ", ".join(f"{key} {range_text(low, high)} degC" for key, (low, high) in design.limits.items())
     if broken:
-        return Check(name, "fail", f"{seen}: {'; '.join(broken)}", "widen the limits or narrow the targets")
-    return Check(name, "pass", seen)
+        return Check(name, "fail", f"{ranges}: {'; '.join(broken)}", "widen the limits or narrow the targets")
+    return Check(name, "pass", ranges)
 
 
 def range_text(low: float, high: float) -> str:
@@ -354,7 +354,7 @@ def valid_range(controller: Reviewed, span: tuple[float, float]) -> Check:
     if not all(output in valid for output in controller.controlled):
         return Check(name, "warn", "the plant does not say where its logs were", "identify it again")
     ranges = {output: valid[output] for output in controller.controlled}
-    seen = "; ".join(
+    logged = "; ".join(
         f"{output} was {low:.1f} to {high:.1f} degC in the logs" for output, (low, high) in ranges.items()
     )
     beyond = [
@@ -365,8 +365,8 @@ def valid_range(controller: Reviewed, span: tuple[float, float]) -> Check:
     ]
     if beyond:
         fix = "record a log that goes there, or treat the result with care"
-        return Check(name, "warn", f"{seen}; beyond: {', '.join(beyond)}", fix)
-    return Check(name, "pass", seen)
+        return Check(name, "warn", f"{logged}; beyond: {', '.join(beyond)}", fix)
+    return Check(name, "pass", logged)
 
 
 def _beyond(controller: Reviewed, output: str, target: float) -> bool:
@@ -391,15 +391,17 @@ def beyond_logs(
     """Return a sentence for each thing that a session will do and the plant's logs have not done: targets
     [degC] outside them, a pump that stops for ``grasps``."""
     wanted = target if isinstance(target, Mapping) else dict.fromkeys(controller.controlled, float(target))
-    said = []
+    sentences = []
     for output, value in wanted.items():
         if _beyond(controller, output, value):
             low, high = controller.plant.valid[output]
-            seen = f"{output} was {low:.1f} to {high:.1f} degC in them"
-            said.append(f"{value:g} degC lies outside the logs that the plant was identified from: {seen}")
+            logged = f"{output} was {low:.1f} to {high:.1f} degC in them"
+            sentences.append(
+                f"{value:g} degC lies outside the logs that the plant was identified from: {logged}"
+            )
     if grasps and controller.plant.valid.get("pump", (0.0, 1.0))[0] > 0:
-        said.append(
+        sentences.append(
             "the pump never stood in the logs that the plant was identified from: how its skin cools during "
             "a grasp is a guess; add a log in which it does"
         )
-    return said
+    return sentences

@@ -43,8 +43,8 @@ def full_drive_bound(
 ) -> float:
     """Return the shortest time [s] in which a step (start, target) [degC] can settle, of all controlled
     outputs or of one, whatever the controller; NaN where it cannot within ``hold_s``."""
-    asked = (output,) if output else design.controlled
-    return max(_Race(plant, design, step, spec, name).shortest_time() for name in asked)
+    outputs = (output,) if output else design.controlled
+    return max(_Race(plant, design, step, spec, name).shortest_time() for name in outputs)
 
 
 class _Race:
@@ -61,12 +61,12 @@ class _Race:
         offset = plant.offsets.get(output, 0.0) + spec.sensor_offset_degC
         self.goal = self.side * (step[1] - offset) - spec.asked(output).band_degC
         self.d = model.undisturbed(spec.ambient_degC)
-        self.x, held = held_start(model, tuple(design.controlled), step[0], tuple(self.d.tolist()))
+        self.x, holding_drive = held_start(model, tuple(design.controlled), step[0], tuple(self.d.tolist()))
         self.low, self.high = np.array([design.drive_range[name] for name in model.drives]).T
         self.slew = np.array([design.slew_per_s[name] for name in model.drives]) * design.dt
         self.neutral = np.clip(np.zeros(model.n_u), self.low, self.high)
         # the drive before the step, from which the slew counts
-        self.begun = self.neutral if held is None else np.clip(held, self.low, self.high)
+        self.begun = self.neutral if holding_drive is None else np.clip(holding_drive, self.low, self.high)
         self.n = max(2, round(spec.hold_s / design.dt))
         self.sub = max(1, round(design.dt / model.dt))
 
@@ -76,11 +76,11 @@ class _Race:
         plans = np.stack([self._ramp(share * direction) for share in _LEVELS])
         heights = self._heights(plans)
         best = int(np.lexsort((-heights.max(axis=1), self._arrivals(heights)))[0])
-        plan, at = plans[best], self._arrivals(heights)[best]
-        last = int(min(at, heights.shape[1] - 1))
+        plan, arrival = plans[best], self._arrivals(heights)[best]
+        last = int(min(arrival, heights.shape[1] - 1))
         gradient = self._gradient(plan, last)
         if best == len(_LEVELS) - 1 and np.all(gradient * direction >= -1e-9 * np.abs(gradient).max()):
-            return self._seconds(at)
+            return self._seconds(arrival)
         return self._seconds(self._climb(plan, last))
 
     def _climb(self, plan: Array, last: int) -> float:
@@ -111,7 +111,7 @@ class _Race:
         room = trust * (self.high - self.low) if np.isfinite(trust) else self.high - self.low
         low = np.maximum(self.low, plan[:used] - room).ravel()
         high = np.minimum(self.high, plan[:used] + room).ravel()
-        found = linprog(
+        optimum = linprog(
             -gradient[:used].ravel(),
             A_ub=vstack([rows, -rows]),
             b_ub=np.concatenate([slews + start, slews - start]),
@@ -119,8 +119,8 @@ class _Race:
             method="highs",
         )
         best = plan.copy()
-        if found.status == 0 and found.x is not None:
-            best[:used] = found.x.reshape(used, n_u)
+        if optimum.status == 0 and optimum.x is not None:
+            best[:used] = optimum.x.reshape(used, n_u)
             best[used:] = best[used - 1]
         return best
 
@@ -135,9 +135,9 @@ class _Race:
         """Return s dy/du (n, n_u) of the height at native sample ``last``."""
         used = max(1, min(self.n, -(-last // self.sub)))
         _, G = self.coarse.trajectory(self.x, plan[:used], self.d, [1] * used)
-        found = np.zeros_like(plan)
-        found[:used] = self.side * G[-1, self.row]
-        return found
+        gradient = np.zeros_like(plan)
+        gradient[:used] = self.side * G[-1, self.row]
+        return gradient
 
     def _ramp(self, level: Array) -> Array:
         """Return the plan (n, n_u) that goes to a level as fast as the slew allows."""

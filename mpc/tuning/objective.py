@@ -182,22 +182,22 @@ def expected(plant: Plant, spec: Spec, controlled: Sequence[str]) -> set[str]:
     doubts = ("extra_lag", "extra_delay", "lost_gain")  # in the order of lacking
     tried = [name for name in doubts if getattr(spec, name) > 0]
     words = zip(tried, lacking(plant, spec, controlled), strict=True)
-    return {said for name, said in words if getattr(spec, name) > Spec.model_fields[name].default}
+    return {structure for name, structure in words if getattr(spec, name) > Spec.model_fields[name].default}
 
 
 def loads_of(plant: Plant, spec: Spec, design: Design) -> list[Load]:
     """Return the loads that are tried, see the module's text; a drive's goes where it has more room."""
-    (start, target), found = spec.steps[0], []
+    (start, target), loads = spec.steps[0], []
     model = prediction_model(plant, plant.dt)
     d = tuple(model.undisturbed(spec.ambient_degC).tolist())
-    _, held = held_start(model, design.controlled, target, d)
+    _, holding_drive = held_start(model, design.controlled, target, d)
     for name in drive_names(plant):
         low, high = design.drive_range[name]
-        at = 0.0 if held is None else float(held[model.drives.index(name)])
-        side = 1.0 if high - at >= at - low else -1.0
-        found.append(Load(name, side * _LOAD * (high - low)))
+        drive = 0.0 if holding_drive is None else float(holding_drive[model.drives.index(name)])
+        side = 1.0 if high - drive >= drive - low else -1.0
+        loads.append(Load(name, side * _LOAD * (high - low)))
     delays = zip(design.controlled, apparent_delays(plant, design.controlled))
-    return found + [Load(name, _LOAD * (start - target), delay) for name, delay in delays]
+    return loads + [Load(name, _LOAD * (start - target), delay) for name, delay in delays]
 
 
 def load_seconds(design: Design) -> float:
@@ -210,11 +210,11 @@ def load_seconds(design: Design) -> float:
 
 def meets_spec(result: StepResult | Segment, spec: Spec) -> bool:
     """Return whether one step is as wanted."""
-    asked = spec.asked(result.output)
+    limits = spec.asked(result.output)
     return (
-        result.settle_s <= asked.within_s  # False where NaN
-        and result.overshoot <= asked.overshoot_degC
-        and abs(result.bias) <= asked.bias_degC
+        result.settle_s <= limits.within_s  # False where NaN
+        and result.overshoot <= limits.overshoot_degC
+        and abs(result.bias) <= limits.bias_degC
     )
 
 
@@ -237,10 +237,10 @@ def readings_a_move(plant: Plant, output: str, dt: float) -> float:
 
 def as_tried(design: Design, plant: Plant) -> Design:
     """Return the design of an MPC whose filter expects the mean of the readings that come between moves."""
-    known = {name: design.noise.reading.get(name, reading_noise(plant, name)) for name in plant.outputs}
+    reading_sd = {name: design.noise.reading.get(name, reading_noise(plant, name)) for name in plant.outputs}
     means = {
         name: sd / readings_a_move(plant, name, design.dt) ** 0.5
-        for name, sd in known.items()
+        for name, sd in reading_sd.items()
         if sd is not None
     }
     return replace(design, noise=replace(design.noise, reading=means))
@@ -252,7 +252,7 @@ def surroundings_of(
     """Return the room and the sensors of the trials: the controlled ones are off, the room's are, and those
     of other disturbances by a share of what the logs showed; noise is that of the logs by output, of which
     their quantum is a part, and of the mean of the readings in ``filtered_s``, where that is given."""
-    known = {name: sd for name, sd in plant.scores.reading_sd.items() if np.isfinite(sd)}
+    reading_sd = {name: sd for name, sd in plant.scores.reading_sd.items() if np.isfinite(sd)}
     stated = "noise_degC" in spec.model_fields_set
     offset = dict.fromkeys(controlled, spec.sensor_offset_degC)
     others = [name for name in plant.disturbances if not plant.is_room(name)]
@@ -262,17 +262,17 @@ def surroundings_of(
     usual = Surroundings(
         ambient=spec.ambient_degC,
         noise=spec.noise_degC,
-        noises={} if stated else known,
-        quanta=dict.fromkeys([*known, *others], 0.0),
+        noises={} if stated else reading_sd,
+        quanta=dict.fromkeys([*reading_sd, *others], 0.0),
         offset=offset,
         held=tuple(controlled),
     )
     if not filtered_s:
         return usual
     steps = usual.steps_of(plant.outputs)
-    each = np.hypot(usual.noises_of(plant.outputs), steps / np.sqrt(12))  # a quantum is even noise
+    single_sd = np.hypot(usual.noises_of(plant.outputs), steps / np.sqrt(12))  # a quantum is even noise
     counts = [readings_a_move(plant, name, filtered_s) for name in plant.outputs]
-    means = dict(zip(plant.outputs, (each / np.sqrt(counts)).tolist()))
+    means = dict(zip(plant.outputs, (single_sd / np.sqrt(counts)).tolist()))
     return replace(usual, noises=means, quanta=usual.quanta | dict.fromkeys(plant.outputs, 0.0))
 
 
@@ -288,8 +288,8 @@ def signal_of(
         added[:, model.outputs.index(load.on)] = load.size * rise
         return added
     d = model.undisturbed(ambient)
-    x, held = held_start(model, controlled, at, tuple(d.tolist()))
-    plans = np.tile(model.neutral if held is None else held, (2, n - 1, 1))
+    x, holding_drive = held_start(model, controlled, at, tuple(d.tolist()))
+    plans = np.tile(model.neutral if holding_drive is None else holding_drive, (2, n - 1, 1))
     plans[1, :, model.drives.index(load.on)] += load.size
     y, _ = model.run(np.repeat(x[None], 2, axis=0), plans, d)
     return np.asarray(y[1] - y[0])
@@ -360,7 +360,7 @@ def steps_on(spec: Spec, draws: Iterable[int], lacks: str = "") -> list[Case]:
 def results_of(run: ClosedLoop, spec: Spec, case: Case) -> list[StepResult]:
     """Return what a case came to: for each output where the spec has ``settling``, else of the worst."""
     if spec.settling:
-        return [_result(run, [part], case, part.output) for part in run.segments]
+        return [_result(run, [segment], case, segment.output) for segment in run.segments]
     return [_result(run, run.segments, case)]
 
 
@@ -429,8 +429,8 @@ def score(results: Sequence[StepResult], spec: Spec, scales: Scales, *, expects:
     for result in results:
         cost = _cost_of_load(result, spec, scales) if result.load else _cost_of_step(result, spec, scales)
         # a plant that lacks structure is run for longer than the reference was
-        known = np.inf if result.lacks else scales.moves.get(result.key, np.inf)
-        most = (spec.moves_limit or np.inf) * known
+        default_moves = np.inf if result.lacks else scales.moves.get(result.key, np.inf)
+        most = (spec.moves_limit or np.inf) * default_moves
         cost += spec.moves_weight * result.travel + _MOVES * max(0.0, result.travel / most - FREE)
         costs.setdefault((result.load, result.lacks, *result.key[:3], result.output), []).append(cost)
     steps: list[float] = []
@@ -451,15 +451,15 @@ def _spread(costs: Sequence[float]) -> float:
 
 
 def _cost_of_step(result: StepResult, spec: Spec, scales: Scales) -> float:
-    bound, asked = bound_of(scales.bounds, result), spec.asked(result.output)
-    unit = max(bound if np.isfinite(bound) else result.length_s, asked.pace_s, 1.0)
+    bound, limits = bound_of(scales.bounds, result), spec.asked(result.output)
+    unit = max(bound if np.isfinite(bound) else result.length_s, limits.pace_s, 1.0)
     # sooner than an output's own time wins nothing
-    cost = max(result.settle_s, asked.pace_s) / unit
+    cost = max(result.settle_s, limits.pace_s) / unit
     if np.isfinite(result.settle_s):
-        cost += _BIAS * max(0.0, abs(result.bias) / asked.bias_degC - FREE)
+        cost += _BIAS * max(0.0, abs(result.bias) / limits.bias_degC - FREE)
     else:
-        cost = result.length_s / unit + _ERROR * abs(result.last_error) / asked.band_degC
-    cost += _OVERSHOOT * max(0.0, result.overshoot / asked.overshoot_degC - FREE)
+        cost = result.length_s / unit + _ERROR * abs(result.last_error) / limits.band_degC
+    cost += _OVERSHOOT * max(0.0, result.overshoot / limits.overshoot_degC - FREE)
     return float(cost + spec.energy_weight * result.energy_s / unit)
 
 
@@ -472,26 +472,26 @@ def _cost_of_load(result: StepResult, spec: Spec, scales: Scales) -> float:
 
 def bounds_of(plant: Plant, design: Design, spec: Spec, draws: Sequence[int]) -> Bounds:
     """Return :func:`full_drive_bound` of every step of the spec on these draws, or the ramp's time."""
-    found: Bounds = {}
+    bounds: Bounds = {}
     for draw in draws:
         for step in spec.steps:
             if not spec.settling:
-                found[(*step, draw)] = full_drive_bound(drawn(plant, draw), design, step, spec)
+                bounds[(*step, draw)] = full_drive_bound(drawn(plant, draw), design, step, spec)
                 continue
             for name in design.controlled:
-                found[(*step, draw, name)] = full_drive_bound(drawn(plant, draw), design, step, spec, name)
-            found[(*step, draw)] = max(found[(*step, draw, name)] for name in design.controlled)
-    return ramped_bounds(found, design, spec)
+                bounds[(*step, draw, name)] = full_drive_bound(drawn(plant, draw), design, step, spec, name)
+            bounds[(*step, draw)] = max(bounds[(*step, draw, name)] for name in design.controlled)
+    return ramped_bounds(bounds, design, spec)
 
 
 def ramped_bounds(bounds: Bounds, design: Design, spec: Spec) -> Bounds:
     """Return these bounds, or when the slowest ramp brings the target of a step into the band of its end."""
-    found: Bounds = {}
+    ramped: Bounds = {}
     for key, bound in bounds.items():
         of = {name: rate for name, rate in design.ramp_per_s.items() if key[3:] in ((), (name,))}
         times = [spec.way(key[:2], name) / rate for name, rate in of.items()]
-        found[key] = float(np.maximum(bound, max(times, default=0.0)))  # NaN stays NaN
-    return found
+        ramped[key] = float(np.maximum(bound, max(times, default=0.0)))  # NaN stays NaN
+    return ramped
 
 
 #: An output that the drive can bring into its band in this share of the time that is asked of it alone goes
@@ -503,10 +503,10 @@ def paced(design: Design, spec: Spec, bounds: Bounds) -> Design:
     """Return the design with a ramp for each output that may take its time, as slow as its longest step."""
     ramps = dict(design.ramp_per_s)
     for name in design.controlled:
-        asked = spec.asked(name).pace_s
+        pace_s = spec.asked(name).pace_s
         slowest = max((bound for key, bound in bounds.items() if key[3:] == (name,)), default=np.inf)
-        if name not in ramps and slowest <= AT_EASE * asked:
-            ramps[name] = max(spec.way(step, name) for step in spec.steps) / (RAMPED * asked)
+        if name not in ramps and slowest <= AT_EASE * pace_s:
+            ramps[name] = max(spec.way(step, name) for step in spec.steps) / (RAMPED * pace_s)
     return replace(design, ramp_per_s=ramps)
 
 

@@ -128,7 +128,7 @@ def rows_of(name: str, results: Sequence[StepResult], bounds: Bounds) -> list[Ro
     for result in results:
         if not result.lacks:
             of.setdefault((result.step, result.load, result.output), []).append(result)
-    return [_row(name, part, bounds) for part in of.values()]
+    return [_row(name, of_case, bounds) for of_case in of.values()]
 
 
 def _row(name: str, part: Sequence[StepResult], bounds: Bounds) -> Row:
@@ -260,10 +260,10 @@ def tune(
         results = _compare(bench, candidates, show)
         interrupted = False
     except KeyboardInterrupt:
-        if {each.controller for each in tried} != {"MPC", "PI"}:
+        if {trial_so_far.controller for trial_so_far in tried} != {"MPC", "PI"}:
             raise
         candidates = _candidates(bench, tried)
-        results = {name: list(each.results) for name, each in candidates.items()}
+        results = {name: list(trial_so_far.results) for name, trial_so_far in candidates.items()}
         interrupted = True
     return _tuning(bench, tried, candidates, results, interrupted)
 
@@ -401,11 +401,13 @@ class Bench:
         design, results = self.design(kind, parameters), []
         for noise in range(_NOISES):
             results += self.run(kind, design, self.draws, self.seed + noise, loads=not noise)
-        found = self.score(results)
-        cost = found.total
+        parts_of_score = self.score(results)
+        cost = parts_of_score.total
         if kind == "MPC":
-            self.default = self.default or found  # which comes first
-            worse = (getattr(found, part) > (1 + _WON) * getattr(self.default, part) for part in _PARTS)
+            self.default = self.default or parts_of_score  # which comes first
+            worse = (
+                getattr(parts_of_score, name) > (1 + _WON) * getattr(self.default, name) for name in _PARTS
+            )
             cost = np.inf if any(worse) else cost
         return Trial(
             controller=kind,
@@ -468,8 +470,8 @@ def _candidates(bench: Bench, tried: Sequence[Trial]) -> dict[str, Trial]:
     """Return the default design, the best MPC and the best PI."""
     of: dict[str, list[Trial]] = {kind: [t for t in tried if t.controller == kind] for kind in ("MPC", "PI")}
     best = {kind: min(trials, key=lambda each: each.score) for kind, trials in of.items() if trials}
-    found = {"baseline": of["MPC"][0], "tuned": best["MPC"]}
-    return found | ({"PI": best["PI"]} if bench.baseline.loops else {})
+    candidates = {"baseline": of["MPC"][0], "tuned": best["MPC"]}
+    return candidates | ({"PI": best["PI"]} if bench.baseline.loops else {})
 
 
 def _compare(bench: Bench, candidates: Mapping[str, Trial], show: Progress) -> dict[str, list[StepResult]]:
@@ -490,23 +492,28 @@ def _tuning(
     interrupted: bool,
 ) -> Tuning:
     """Return what was found, with the best of the candidates for its controller."""
-    spec, parts = bench.spec, {name: bench.score(part) for name, part in results.items()}
-    scores = {name: part.total for name, part in parts.items()}
+    spec, scored = bench.spec, {name: bench.score(part) for name, part in results.items()}
+    scores = {name: part.total for name, part in scored.items()}
     unknown = unknown_to_pi(spec)
-    kept = kept_of(scores, unknown)
+    saved = kept_of(scores, unknown)
     rows = tuple(row for name, part in results.items() for row in rows_of(name, part, bench.bounds))
-    kept_rows = [row for row in rows if row.controller == kept and not row.load]
-    least = min(scores[kept], scores["tuned"])
+    kept_rows = [row for row in rows if row.controller == saved and not row.load]
+    least = min(scores[saved], scores["tuned"])
     verdict, words = verdict_of(spec, least, scores["baseline"], kept_rows)
     where = "on the search's own draws" if interrupted else "on unseen draws"
     if bench.draws == [0] and not interrupted:
         where = "under fresh noise (the plant has no uncertainty)"
-    missing = [result for result in results[kept] if result.lacks]
-    said = [best_of(kept, parts, where, unknown), words, _moved(kept_rows, rows), _lacking_words(missing)]
-    finding = " ".join(part for part in said if part)
+    missing = [result for result in results[saved] if result.lacks]
+    sentences = [
+        best_of(saved, scored, where, unknown),
+        words,
+        _moved(kept_rows, rows),
+        _lacking_words(missing),
+    ]
+    finding = " ".join(part for part in sentences if part)
     if interrupted:
         finding = f"Interrupted after {len(tried)} designs; this is the best of them. {finding}"
-    meets = all(meets_spec(result, spec) for result in bench.counting(results[kept]))
+    meets = all(meets_spec(result, spec) for result in bench.counting(results[saved]))
     notes = {
         "verdict": verdict,
         "finding": finding,
@@ -517,7 +524,7 @@ def _tuning(
         "rows": [row.to_dict() for row in rows],
         "lacking": [result.to_dict() for result in missing],
     }
-    controller = _final(bench, candidates, kept, notes)
+    controller = _final(bench, candidates, saved, notes)
     return Tuning(
         controller=controller,
         verdict=verdict,
@@ -611,9 +618,9 @@ def _beyond(row: Row, spec: Spec) -> str:
     if not np.isfinite(row.bound_s):
         return f"{step} cannot be reached at this drive; no weight changes that."
     takes = f"takes {row.settle_mean_s:.0f} s" if np.isfinite(row.settle_mean_s) else "does not settle"
-    asked = f"{spec.asked(row.output).within_s:g} s are asked"
+    limit = f"{spec.asked(row.output).within_s:g} s are asked"
     return (
-        f"{step} cannot settle under {row.bound_s:.0f} s at this drive, and {asked}; yours {takes}; "
+        f"{step} cannot settle under {row.bound_s:.0f} s at this drive, and {limit}; yours {takes}; "
         f"no weight changes that."
     )
 
@@ -633,19 +640,20 @@ def _limits(rows: Sequence[Row], spec: Spec) -> str:
 
 def _moved(kept: Sequence[Row], rows: Sequence[Row]) -> str:
     """Return how far a step moves the drives, beside the default design."""
-    own = np.mean([row.travel_mean for row in kept])
+    saved_moves = np.mean([row.travel_mean for row in kept])
     default = np.mean([row.travel_mean for row in rows if row.controller == "baseline" and not row.load])
-    return f"A step moves the drives by {own:.1f} times full drive, {default:.1f} with the default design."
+    by_default = f"{default:.1f} with the default design"
+    return f"A step moves the drives by {saved_moves:.1f} times full drive, {by_default}."
 
 
 def _lacking_words(results: Sequence[StepResult]) -> str:
     """Return what becomes of a plant that has what its model lacks."""
     sentences = []
     for words in dict.fromkeys(result.lacks for result in results):
-        part = [result for result in results if result.lacks == words]
-        settled = all(np.isfinite(result.settle_s) for result in part)
-        takes = f"settles in {max(r.settle_s for r in part):.0f} s" if settled else "does not settle"
-        sentences.append(f"with {words} it {takes}, overshoot {max(r.overshoot for r in part):.2f} K")
+        of_structure = [result for result in results if result.lacks == words]
+        settled = all(np.isfinite(result.settle_s) for result in of_structure)
+        takes = f"settles in {max(r.settle_s for r in of_structure):.0f} s" if settled else "does not settle"
+        sentences.append(f"with {words} it {takes}, overshoot {max(r.overshoot for r in of_structure):.2f} K")
     return f"Where the model lacks structure: {'; '.join(sentences)}." if sentences else ""
 
 

@@ -135,8 +135,8 @@ def test_an_export_is_compared_with_python_only_where_that_is_asked_for(
     assert answer == {"out": "c", **checked}
     if options:
         assert words_of(" ".join(rest)) == (
-            f"7 random states under the sanitizers: drives differ by at most {difference:.1e} of their range "
-            f"(5 of them at no limit), same status in 7. "
+            f"7 samples of random loops under the sanitizers: drives differ by at most {difference:.1e} of "
+            f"their range (5 of them at no limit), same status in 7. "
             "RAM of a controller 640 bytes, constants 128, flash 100, largest stack frame 50. "
             f"C and Python {'do the same' if code == 0 else 'differ'}."
         )

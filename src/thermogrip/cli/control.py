@@ -60,11 +60,11 @@ def tune(
             f"In the trials, and where nobody reads it: {taken}; 'disturbances' in the spec replaces it"
         )
     with console.progress("tune") as progress, _naming(spec, tuple(Spec.model_fields)):
-        found = search(loaded, wanted, progress=progress, seed=seed)
-    console.answer(_written(console, found, plant.name, out, report))
-    if found.interrupted:
+        tuning = search(loaded, wanted, progress=progress, seed=seed)
+    console.answer(_written(console, tuning, plant.name, out, report))
+    if tuning.interrupted:
         raise KeyboardInterrupt
-    return 0 if found.meets_spec else cli.ANSWER_IS_NO
+    return 0 if tuning.meets_spec else cli.ANSWER_IS_NO
 
 
 def _written(console: Console, found: Tuning, plant: str, out: Path, report: Path | None) -> dict[str, Any]:
@@ -177,19 +177,19 @@ def export(
     with console.progress("check") as progress:
         about: dict[str, Any] = {"states": states, "seed": seed, "progress": progress}
         if isinstance(loaded, PIController):
-            found, how = check_pi(written, loaded, **about), "samples of random readings"
+            agreement, how = check_pi(written, loaded, **about), "samples of random readings"
         else:
-            found = check_export(written, loaded, **about)
+            agreement = check_export(written, loaded, **about)
             how = "samples of random loops under the sanitizers"
     console.say(
-        f"{found.states} {how}: drives differ by at most {found.difference:.1e} "
-        f"of their range ({found.free} of them at no limit), same status in {found.same_status}. "
-        f"RAM of a controller {found.ram} bytes, constants {found.constants}, flash {found.flash}, largest "
-        f"stack frame {found.stack}."
+        f"{agreement.states} {how}: drives differ by at most {agreement.difference:.1e} "
+        f"of their range ({agreement.free} of them at no limit), same status in {agreement.same_status}. "
+        f"RAM of a controller {agreement.ram} bytes, constants {agreement.constants}, "
+        f"flash {agreement.flash}, largest stack frame {agreement.stack}."
     )
-    console.say(f"C and Python {'do the same' if found.passed else 'differ'}.")
-    console.answer({**result, **asdict(found), "passed": found.passed})
-    return 0 if found.passed else cli.ANSWER_IS_NO
+    console.say(f"C and Python {'do the same' if agreement.passed else 'differ'}.")
+    console.answer({**result, **asdict(agreement), "passed": agreement.passed})
+    return 0 if agreement.passed else cli.ANSWER_IS_NO
 
 
 def load_controller(path: Path, network: str | None) -> Controller | PIController:
