@@ -83,10 +83,15 @@ class DeviceRig(NoticeBook):
         """Return the newest sample; NaN everywhere while the device cannot be reached."""
         try:
             state = self._ask(protocol.Read())
-            return self._reading(self._now(), state)
         except PortError:
             nothing = dict.fromkeys(self.identity.sensors, float("nan"))
             return Reading(self._now(), nothing, dict.fromkeys(self.units, 0.0), 0)
+        values = {
+            name: float("nan") if isinstance(value, str) else value / 1000
+            for name, value in zip(self.identity.sensors, state.temperatures)
+        }
+        applied = {channel.name: value / 1e4 for channel, value in zip(self.identity.drives, state.drive)}
+        return Reading(self._now(), values, applied, state.pump)
 
     def apply(self, drive: Mapping[str, float], pump: int) -> None:
         """Drive from now on, for :data:`TTL_S` or until the next call; returns when the device has confirmed.
@@ -96,7 +101,7 @@ class DeviceRig(NoticeBook):
         ValueError for an unknown input or a value outside its range, RuntimeError where the rig is closed.
         """
         check_order(drive, pump, {c.name: (c.low / 1e4, c.high / 1e4) for c in self.identity.drives})
-        counts = self._counts(drive)
+        counts = tuple(round(1e4 * drive[channel.name]) for channel in self.identity.drives)
         if self.closed:
             if pump or any(counts):
                 raise RuntimeError("the rig is closed")
@@ -131,17 +136,6 @@ class DeviceRig(NoticeBook):
         self.closed = True
         self._known = None
         self.port.close()
-
-    def _counts(self, drive: Mapping[str, float]) -> tuple[int, ...]:
-        return tuple(round(1e4 * drive[channel.name]) for channel in self.identity.drives)
-
-    def _reading(self, time_s: float, content: protocol.State) -> Reading:
-        values = {
-            name: float("nan") if isinstance(value, str) else value / 1000
-            for name, value in zip(self.identity.sensors, content.temperatures)
-        }
-        applied = {channel.name: value / 1e4 for channel, value in zip(self.identity.drives, content.drive)}
-        return Reading(time_s, values, applied, content.pump)
 
     def _first_hello(self, seconds: float) -> protocol.Identity:
         """Ask for the device's identity until it answers; an Arduino takes seconds to start."""

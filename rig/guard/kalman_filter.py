@@ -149,13 +149,11 @@ class RigModel:
         self.plant = plant
         self.drives = tuple(name for name in plant.inputs if name != "pump")
         self.drive_at = np.array([plant.inputs.index(name) for name in self.drives], dtype=int)
-        self.ranges = np.array([self._range(name) for name in self.drives]).reshape(-1, 2)
+        ranges = [range_of(plant.units.get(name, "1"), plant.valid.get(name)) for name in self.drives]
+        self.ranges = np.array([ends or (-1.0, 1.0) for ends in ranges]).reshape(-1, 2)
         self.half = 0.5 * (self.ranges[:, 1] - self.ranges[:, 0])
         self.offsets = np.array([plant.offsets.get(name, 0.0) for name in plant.outputs])
         self.p = plant.p
-
-    def _range(self, name: str) -> tuple[float, float]:
-        return range_of(self.plant.units.get(name, "1"), self.plant.valid.get(name)) or (-1.0, 1.0)
 
     def biased(self, u: Array, w: Array) -> Array:
         """Return inputs (..., n_u) as the rig gets them where its drives have biases w (n_w,)."""

@@ -201,11 +201,6 @@ class Residual:
         return abs(self.measured - self.expected)
 
 
-def _recent(past: History, begin: Estimate, smooth: float) -> list[Estimate]:
-    """Return the estimates that the end of a window is the mean of."""
-    return [m for m in past.after(past.now - smooth) if m.time > begin.time]
-
-
 class ModelMonitor:
     """Follow a rig with its plant; pure: times are passed in.
 
@@ -283,7 +278,7 @@ class ModelMonitor:
             begin = past.begin(past.now - length)
             if begin is None or begin.step >= past.steps.done:
                 continue
-            recent = _recent(past, begin, s.smooth)
+            recent = [one for one in past.after(past.now - s.smooth) if one.time > begin.time]
             u, d = past.steps.rows(begin.step)
             path = model.run(begin.x[None], model.biased(u, begin.w)[None], d[None])[0]
             path = path + model.offsets + begin.b

@@ -38,7 +38,6 @@ from thermogrip.rig.session.step_test import StepTest
 
 if TYPE_CHECKING:
     from thermogrip.datasets.parallel import Progress, Workers
-    from thermogrip.mpc.controllers.pi import PIController
     from thermogrip.mpc.design.spec import Spec
     from thermogrip.mpc.interface import Move
     from thermogrip.mpc.tuning.tune import Tuning
@@ -236,16 +235,13 @@ class Autotune:
             raise UserError(problem, hint=f"these answer: {', '.join(plant.outputs)}")
         return dict(self.target)
 
-    def _pi(self) -> PIController:
-        """Return a PI of the plant as it is known now."""
+    def _loop(self) -> bool:
+        """Record a loop under the PI; False where there is no time for one."""
         from thermogrip.mpc.controllers.pi import PIController
 
         plant = self.identified.plant
-        return PIController(plant, controlled=tuple(self._targets(plant)))
-
-    def _loop(self) -> bool:
-        """Record a loop under the PI; False where there is no time for one."""
-        loop, targets = self._pi(), self._targets(self.identified.plant)
+        targets = self._targets(plant)
+        loop = PIController(plant, controlled=tuple(targets))
         slowest = max(each.Ti for each in loop.loops)
         seconds = min(self.left_s, (LOG.hold + 0.5 * LOG.bits) * slowest)
         if seconds < LOG.least_s:

@@ -50,8 +50,7 @@ class Messages:
     ['advertise', 'publish']
     """
 
-    def __init__(self, prefix: str = PREFIX) -> None:
-        self.prefix = prefix
+    def __init__(self) -> None:
         self._advertised: set[str] = set()
 
     def forget(self) -> None:
@@ -82,7 +81,7 @@ class Messages:
         return self._publish("status", "std_msgs/String", {"data": text})
 
     def _publish(self, name: str, kind: str, content: Mapping[str, Any]) -> list[str]:
-        topic, texts = f"{self.prefix}/{name}", []
+        topic, texts = f"{PREFIX}/{name}", []
         if topic not in self._advertised:
             self._advertised.add(topic)
             texts.append(_text(op="advertise", topic=topic, type=kind))
