@@ -18,7 +18,7 @@ from scipy.stats import t as student_t
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.materials import find_material, load_materials
 from thermogrip.sysid.effusivity.data import KNOTS, touches, whiten
-from thermogrip.sysid.effusivity.gripper_model import Discrepancy
+from thermogrip.sysid.effusivity.gripper_model import Discrepancy, ParameterCovariance, another_gripper
 from thermogrip.sysid.effusivity.laplace_approximation import (
     find_modes,
     fit_pairs,
@@ -291,3 +291,31 @@ def test_a_gripper_with_a_discrepancy_answers_as_unsurely_as_its_evidence(device
     (row,) = effusivity_posterior(odd, grasp)
     on_its_own = mixture_quantiles(found.weight, found.t_object, found.t_object_sd, (0.05, 0.5, 0.95))
     assert [row.t_object_p05, row.t_object, row.t_object_p95] == pytest.approx(np.array(on_its_own) - 0.8)
+
+
+def test_a_grasp_that_slips_is_read_by_what_came_before(device, files):
+    """A fifth of the way back after 4.5 s: named, and its effusivity found, by the seconds before."""
+    names, grasps = ["copper", "iron", "wood"], files["exp2_dT20"].isel(grasp=[2, 5, 10, 13])
+    time, skin = grasps["time"].values, grasps["t_surface"].values
+    rise = skin[:, -1] - skin[:, time < -0.3].mean(axis=1)
+    slipped = grasps.assign(t_surface=(("grasp", "time"), skin - 0.2 * rise[:, None] * (time > 4.5)))
+    true = [names.index(material) for material in grasps["material"].values]
+    assert material_fit(device, slipped, names).probabilities[np.arange(4), true].min() > 0.9  # it was 0.5
+    for row in effusivity_posterior(device, slipped):
+        assert np.log(row.effusivity_p95 / row.effusivity_p05) < 1.8  # it was 3.7
+
+
+def test_what_a_calibration_leaves_open_makes_answers_less_sure(device):
+    """A finger whose inner layer has 1.3 times the effusivity; and a calibration that leaves nothing open."""
+    names = ["copper", "iron", "wood"]
+    finger = replace(device, stack=replace(device.stack, e_inner=1.3 * device.stack.e_inner))
+    grasps = simulated(finger, names, n=4, t_gripper=23.0, t_object=43.0, seed=5)
+    true = np.array([names.index(material) for material in grasps["material"].values])
+    other = another_gripper(device)
+    nothing = ParameterCovariance(other.uncertainty.names, 0.0 * other.uncertainty.covariance)
+    exact, known, unsure = (
+        material_fit(gripper, grasps, names).probabilities[np.arange(true.size), true]
+        for gripper in (device, replace(device, uncertainty=nothing), other)
+    )
+    np.testing.assert_allclose(known, exact, atol=2e-3)
+    assert np.log(unsure).mean() > np.log(exact).mean() + 0.1
