@@ -140,17 +140,14 @@ class GripperSpread:
 
     def covariance(self, names: Sequence[str]) -> Array:
         """Return the covariance that another gripper adds to the estimates called ``names``, (n, n)."""
-        moved = self.directions(names)
-        return np.asarray(moved @ moved.T)
-
-    def directions(self, names: Sequence[str]) -> Array:
-        """Return how far each independent cause moves the estimates called ``names``, (n, n_cause)."""
-        columns = [
-            [source.get(name, source.get(name.split(" ")[0], 0.0)) for name in names]
-            for source in self._sources()
-        ]
-        per_block = np.diag([self.block_contact if name.startswith("ln_h ") else 0.0 for name in names])
-        return np.column_stack([np.array(columns).T, per_block[:, per_block.any(axis=0)]])
+        by_cause = np.array(
+            [
+                [source.get(name, source.get(name.split(" ")[0], 0.0)) for name in names]
+                for source in self._sources()
+            ]
+        )
+        per_block = np.diag([self.block_contact**2 * name.startswith("ln_h ") for name in names])
+        return np.asarray(by_cause.T @ by_cause + per_block)
 
     def _sources(self) -> list[dict[str, float]]:
         """Return what each independent cause moves, and how far."""

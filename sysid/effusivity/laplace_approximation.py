@@ -409,12 +409,6 @@ def widened(mode: Mode, prior: Prior, n: NDArray[np.int64], bias: float) -> Mode
     return mode._replace(u=u, covariance=covariance, log_evidence=evidence / DOUBT.evidence_counts)
 
 
-def slip_of(sd: ArrayLike) -> Array:
-    """Return how many times as far off as its ``sd`` [K] a stated temperature that is a slip may be: three,
-    no farther than one that nobody stated."""
-    return np.clip(UNKNOWN_OBJECT_SD / np.asarray(sd), 1.0, DOUBT.slip_times)
-
-
 def doubted(data: Touches, prior: Prior, mode: Mode) -> Mode:
     """Return the modes of pairs, a row of data each, where the stated temperature of an object may be off by
     more than the training's were: with a probability of 0.05 the sd about it is three times its own."""
@@ -424,7 +418,8 @@ def doubted(data: Touches, prior: Prior, mode: Mode) -> Mode:
     telling = np.isfinite(data.t_object) & (v < DOUBT.telling_share * v0) & mode.converged
     precision = np.where(telling, 1 / v - 1 / v0, 1.0)
     measured, width = x0 + (mode.u[:, T_OBJECT] - x0) / (v * precision), 1 / precision
-    wide = slip_of(np.sqrt(v0)) ** 2 * v0
+    # no farther than one that nobody stated
+    wide = np.clip(UNKNOWN_OBJECT_SD**2 / v0, 1.0, DOUBT.slip_times**2) * v0
     ratio = _log_normal(measured - x0, wide + width) - _log_normal(measured - x0, v0 + width)
     slip = np.where(telling, DOUBT.slip_prior * np.exp(np.clip(ratio, -700.0, 300.0)), 0.0)
     total = np.where(telling, 1 - DOUBT.slip_prior, 1.0) + slip

@@ -43,7 +43,7 @@ def test_a_controller_of_0_1_0_moves_the_same() -> None:
     np.testing.assert_allclose([move.drive for move in moves], EXPECTED["controller"]["drive"], atol=1e-6)
 
 
-# posterior knows that a grasp may be unlike its few training grasps, and the stated temperature of this one is 1.3 K off
+# posterior knows that a grasp may be unlike its training, and the stated temperature of this one is 1.3 K off
 @pytest.mark.parametrize(("name", "tolerance"), [("pca-lda", 1e-6), ("posterior", 0.17), ("lstm", 1e-4)])
 def test_a_classifier_of_0_1_0_answers_the_same(name: str, tolerance: float) -> None:
     row = classify_grasps(load_classifier(OLD / name), read_grasps(OLD / "run" / "grasps.csv"))[0]
