@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 from thermogrip.datasets.charts import Chart, Curve, Panel
 from thermogrip.datasets.provenance import work
 from thermogrip.report.html import (
-    MOST_NUMBERS,
+    SETTINGS,
     Commands,
     Picture,
     Plot,
@@ -168,7 +168,7 @@ def test_a_page_of_many_long_curves_stays_small() -> None:
     page = html_page("t", "l", [Section("s", parts, "v")])
     data = re.findall(r'<script type="application/json">(.*?)</script>', page, re.S)
     assert len(data) == 8
-    assert sum(map(len, data)) < 1.1 * MOST_NUMBERS * 16 / 3  # base64 of four bytes
+    assert sum(map(len, data)) < 1.1 * SETTINGS.numbers * 16 / 3  # base64 of four bytes
     assert len(page) < 3_000_000
 
 

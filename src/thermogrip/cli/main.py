@@ -23,15 +23,11 @@ from typing import Annotated
 import typer
 
 from thermogrip import __version__
+from thermogrip.cli.options import ExitCode
 from thermogrip.cli.verbs import Verb, Verbs
 from thermogrip.datasets.errors import UserError, known_names, os_fault
 from thermogrip.datasets.media import printable, without_password
 from thermogrip.datasets.provenance import work
-
-OK = 0
-BUG = 1
-USER = 2
-INTERRUPTED = 130
 
 app = typer.Typer(
     name="thermogrip",
@@ -78,29 +74,29 @@ def main(argv: Sequence[str] | None = None) -> int:
             code = app(args=words, prog_name="thermogrip", standalone_mode=False, max_content_width=width)
         sys.stdout.flush()
     except (KeyboardInterrupt, typer.Abort):
-        return _fail("stopped by Ctrl-C", INTERRUPTED)
+        return _fail("stopped by Ctrl-C", ExitCode.INTERRUPTED)
     except UserError as error:
-        return _fail(str(error), USER, debug)
+        return _fail(str(error), ExitCode.USER, debug)
     except typer.TyperException as error:
-        return _fail(_option_line(error), USER, debug)
+        return _fail(_option_line(error), ExitCode.USER, debug)
     except SystemExit:
         if type(sys.stdout).__name__ == "PacifyFlushWrapper":  # typer's, of a pipe that was closed in a verb
-            return OK
+            return ExitCode.DONE
         raise
     except OSError as error:
         if error.errno == errno.EPIPE:  # `thermogrip ... | head` is no mistake
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-            return OK
-        return _fail(str(os_fault(error, error.filename or "the system")), USER, debug)
+            return ExitCode.DONE
+        return _fail(str(os_fault(error, error.filename or "the system")), ExitCode.USER, debug)
     except Exception as error:  # the outermost edge: whatever is left is our bug
         return _fail(
             f"bug: {type(error).__name__}: {error}; run again with --debug and report the traceback",
-            BUG,
+            ExitCode.BUG,
             debug,
         )
-    if code == INTERRUPTED:  # typer makes a code of a Ctrl-C inside a verb
-        return _fail("stopped by Ctrl-C", INTERRUPTED)
-    return int(code or OK)
+    if code == ExitCode.INTERRUPTED:  # typer makes a code of a Ctrl-C inside a verb
+        return _fail("stopped by Ctrl-C", ExitCode.INTERRUPTED)
+    return int(code or ExitCode.DONE)
 
 
 def _without_passwords(words: Sequence[str]) -> list[str]:

@@ -8,6 +8,7 @@ import sys
 import tomllib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import fields, is_dataclass
+from enum import IntEnum
 from functools import cache, wraps
 from importlib import resources
 from inspect import Parameter, signature
@@ -25,8 +26,18 @@ if TYPE_CHECKING:
     from thermogrip.sysid.models.model import GreyModel
     from thermogrip.sysid.plant.plant import Plant
 
-#: Exit code of work that was done and whose answer is no.
-ANSWER_IS_NO = 3
+
+class ExitCode(IntEnum):
+    """What the process ends with."""
+
+    DONE = 0
+    BUG = 1  # ours
+    USER = 2  # the user's input is at fault
+    ANSWER_IS_NO = 3  # the work was done
+    INTERRUPTED = 130  # by Ctrl-C
+
+
+ANSWER_IS_NO = ExitCode.ANSWER_IS_NO
 #: Repairs of one file that are printed.
 SHOWN_REPAIRS = 5
 

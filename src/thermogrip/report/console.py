@@ -26,9 +26,17 @@ from thermogrip.datasets.media import printable
 if TYPE_CHECKING:
     from thermogrip.datasets.parallel import Progress
 
-_AT_ONCE = 0.5  # s
-_FORESEEABLE = 0.05  # share of the work that must be done before its time tells how long the rest will take
-_WIDTH = 100  # columns of what is written to no terminal
+
+@dataclass(frozen=True)
+class ConsoleSettings:
+    """How wide text is, and from when on a bar says the time left (judged by eye)."""
+
+    width: int = 100  # columns of what is written to no terminal
+    begun_before_s: float = 0.5  # work that reports a share sooner was begun by somebody else
+    foreseeable_share: float = 0.05  # of the work, before its time tells how long the rest will take
+
+
+SETTINGS = ConsoleSettings()
 #: Head and rows of a table.
 Cells: TypeAlias = tuple[tuple[str, ...], tuple[tuple[Any, ...], ...]]
 #: The columns of a table: their names, and what each shows of an item.
@@ -89,7 +97,7 @@ class Console:
 
 def _room() -> int:
     """Return the columns of stdout."""
-    return get_terminal_size().columns if sys.stdout.isatty() else _WIDTH
+    return get_terminal_size().columns if sys.stdout.isatty() else SETTINGS.width
 
 
 def cells(columns: Columns, items: Iterable[Any]) -> Cells:
@@ -184,9 +192,11 @@ def _lines(title: str) -> Progress:
         step = int(20 * fraction)
         spent = time.monotonic() - begin
         clear = _anew()
-        first[:] = first or [fraction if spent < _AT_ONCE else 0.0]
+        first[:] = first or [fraction if spent < SETTINGS.begun_before_s else 0.0]
         left_s = spent * (1 - fraction) / max(fraction - first[0], 1e-3)
-        is_foreseeable = fraction - first[0] > _FORESEEABLE and spent > 1 and spent + left_s > 10
+        is_foreseeable = (
+            fraction - first[0] > SETTINGS.foreseeable_share and spent > 1 and spent + left_s > 10
+        )
         remaining = f", {left_s:.0f} s left" if is_foreseeable else ""
         line = f"{title} {100 * fraction:3.0f} % {spent:4.0f} s{remaining} {printable(what)}"
         if clear:

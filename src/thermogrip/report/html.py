@@ -55,9 +55,18 @@ VERDICTS = {
     "ill": "bad",
     "changing": "bad",
 }
-#: Numbers in all charts of a page, and points in one of their curves, at most.
-MOST_NUMBERS = 200_000
-MOST_POINTS = 2400
+
+
+@dataclass(frozen=True)
+class PageSettings:
+    """How large a page may be: with these it is under 3 MB."""
+
+    numbers: int = 200_000  # in all charts of a page, at most
+    points: int = 2400  # in a curve, at most: more than a screen is wide
+    fewest_points: int = 200  # in a curve of a page of many
+
+
+SETTINGS = PageSettings()
 _SUPERSCRIPT = re.compile(r"(\$\^\{-?[0-9.]+\}\$)")
 _DOLLAR = re.compile(r"(?<!\\)\$")
 
@@ -230,8 +239,8 @@ def write_report(path: Path, title: str, lead: str, sections: Sequence[Section])
 def _points(plots: Sequence[Plot]) -> int:
     """Return the points that a curve may have, so that the page stays small."""
     sizes = [size for plot in plots for size in plot.size]
-    most = MOST_POINTS
-    while most > 200 and sum(per * min(n, most) for n, per in sizes) > MOST_NUMBERS:
+    most = SETTINGS.points
+    while most > SETTINGS.fewest_points and sum(per * min(n, most) for n, per in sizes) > SETTINGS.numbers:
         most = int(0.9 * most)
     return most
 
