@@ -231,7 +231,7 @@ def check_apart(out: str | Path, paths: Sequence[str | Path]) -> None:
                 folder = path.resolve()
                 if place.parent == folder:
                     raise UserError("is in a folder that is read", file=out, hint=hint)
-            elif place in [part.resolve() for part in grasp_file_parts(path)]:
+            elif place in [file_part.resolve() for file_part in grasp_file_parts(path)]:
                 raise UserError("is to be read and written", file=out, hint=hint)
 
 

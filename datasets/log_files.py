@@ -34,7 +34,7 @@ from thermogrip.datasets.file_names import file_format, file_stem, split_cut
 from thermogrip.datasets.limits import MOST_NUMBER
 from thermogrip.datasets.media import csv_cell
 from thermogrip.datasets.roles import Roles, assign_roles, guess_role
-from thermogrip.datasets.schema import ROLES, check_log, hash_columns, make_log
+from thermogrip.datasets.schema import check_log, hash_columns, make_log
 from thermogrip.datasets.tables import (
     Table,
     check_header,
@@ -134,54 +134,63 @@ def read_log(
     else:
         file, start, stop = split_cut(path)
         table = _one_column_a_signal(_read_table(file, columns))
-    by_role = {role: [n for n, of in (known or {}).items() if of == role] for role in ROLES}
-    of_model = [*by_role["input"], *by_role["output"], *by_role["disturbance"]]
+    of_model = [name for name, role in (known or {}).items() if role != "other"]
     named = [*(inputs or ()), *(outputs or ()), *(disturbances or ()), *of_model]
     check_header([*table.numbers, *table.text], named, str(file))
     if table.meta.get("schema") not in (None, "thermogrip.log"):
         raise UserError(f"holds a {table.meta['schema']}, not a log", file=file, hint="give a log")
     read = _convert(table, dt)
-    data, units = read.values, read.units
-    time, repairs = read.clock.seconds, read.repairs
-    sha256 = hash_columns({"time": time, **data})
-    if not data:
+    if not read.values:
         content = "a time column and nothing else" if read.clock.columns else "no column of numbers"
         raise UserError(f"has {content}", file=file, hint="add inputs and outputs")
     lists = {"inputs": inputs, "outputs": outputs, "disturbances": disturbances}
-    known_here = {name: role for name, role in (known or {}).items() if name in units}
-    in_file = {
-        name: table.attrs[header]["role"]
-        for header, name in read.names_of.items()
-        if table.attrs.get(header, {}).get("role")
-    }
-    roles = assign_roles(units, given=in_file | known_here, columns=data, file=str(file), **lists)
-    written_by_us = table.meta.get("schema") == "thermogrip.log"
-    if written_by_us:
+    roles = assign_roles(
+        read.units, given=_roles_given(table, read, known or {}), columns=read.values, file=str(file), **lists
+    )
+    if table.meta.get("schema") == "thermogrip.log":
         repairs = [line for line in table.meta.get("repairs", "").splitlines() if line]
+        log = _made(read.clock.seconds, read.values, repairs, read, roles, file)
+        log.attrs.update({k: v for k, v in table.meta.items() if k not in ("schema", "version")})
     else:
-        roles = replace(roles, doubts=(*roles.doubts, *_code_doubts(roles.of, data)))
-        time, data, findings = _repair(time, data, units, roles.of, table)
-        repairs += findings
+        roles = replace(roles, doubts=(*roles.doubts, *_code_doubts(roles.of, read.values)))
+        time, values, findings = _repair(read.clock.seconds, read.values, read.units, roles.of, table)
         if outputs is None:
-            roles = _without_half_lost(roles, time, data)
-    variables = {name: (data[name], units[name], roles.of[name]) for name in data}
-    log = make_log(time, variables, name=str(file), repairs=repairs)  # a fault found here names the file
-    log.attrs["name"] = file_stem(file)
+            roles = _without_half_lost(roles, time, values)
+        log = _made(time, values, [*read.repairs, *findings], read, roles, file)
+        log.attrs["clock_doubts"] = read.clock.doubt
+        log.attrs["role_doubts"] = "\n".join(roles.doubts)
     for header, name in read.names_of.items():
         if (words := table.attrs.get(header, {}).get("flag_meanings")) and name in log:
             log[name].attrs["flag_meanings"] = words
-    log.attrs["sha256"] = sha256
+    return _cut(log, start, stop, file) if (start, stop) != (-np.inf, np.inf) else log
+
+
+def _roles_given(table: Table, read: _Columns, known: Mapping[str, str]) -> dict[str, str]:
+    """Return the roles that the file states, and those that a model gives to its signals."""
+    in_file = {name: table.attrs.get(header, {}).get("role", "") for header, name in read.names_of.items()}
+    of_model = {name: role for name, role in known.items() if name in read.units}
+    return {name: role for name, role in in_file.items() if role} | of_model
+
+
+def _made(
+    time: Floats,
+    values: Mapping[str, Floats],
+    repairs: Sequence[str],
+    read: _Columns,
+    roles: Roles,
+    file: Path,
+) -> Log:
+    """Return the log with what is known of its file: the hash of its data, its date, and why roles are so."""
+    variables = {name: (cells, read.units[name], roles.of[name]) for name, cells in values.items()}
+    log = make_log(time, variables, name=str(file), repairs=repairs)  # a fault found here names the file
+    log.attrs["name"] = file_stem(file)
+    log.attrs["sha256"] = hash_columns({"time": read.clock.seconds, **read.values})
     finite = read.clock.seconds[np.isfinite(read.clock.seconds)]
     began = read.clock.zero + float(finite.min(initial=np.inf))
     if EPOCH[0] <= began <= EPOCH[1]:
         log.attrs["began"] = str(np.datetime64(round(began), "s")) + "Z"
     log.attrs["guesses"] = "\n".join(f"{name}: {why}" for name, why in roles.reasons.items())
-    if written_by_us:
-        log.attrs.update({k: v for k, v in table.meta.items() if k not in ("schema", "version")})
-    else:
-        log.attrs["clock_doubts"] = read.clock.doubt
-        log.attrs["role_doubts"] = "\n".join(roles.doubts)
-    return _cut(log, start, stop, file) if (start, stop) != (-np.inf, np.inf) else log
+    return log
 
 
 def as_logs(logs: Logs, *lists: Sequence[str] | None, known: Mapping[str, str] | None = None) -> list[Log]:

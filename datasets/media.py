@@ -120,6 +120,6 @@ class Shown:
         return "\n".join([type(self).__name__, *cut])
 
     def _repr_html_(self) -> str:
-        rows = ((escape(printable(f"{part}")) for part in fact) for fact in self._facts().items())
+        rows = ((escape(printable(f"{cell}")) for cell in fact) for fact in self._facts().items())
         body = "".join(f"<tr><th>{name}</th><td>{what}</td></tr>" for name, what in rows)
         return f'<table style="text-align: left"><caption>{type(self).__name__}</caption>{body}</table>'
