@@ -38,6 +38,7 @@ from scipy.optimize import least_squares
 from thermogrip.datasets.arrays import Array, Mask, Values
 from thermogrip.datasets.errors import UserError
 from thermogrip.mpc.plant.along_plan import AlongPlan, SampleDerivatives
+from thermogrip.sysid.models.model import Sizes
 
 if TYPE_CHECKING:
     from thermogrip.sysid.models.jit_rollout import Kernel
@@ -399,7 +400,7 @@ class _TangentSteps:
         results = ca.cse([ca.densify(after), ca.densify(slope)])
         self._function = ca.Function("step", [*symbols, *along], results)
         self._names = {getattr(ca, key): key for key in dir(ca) if key.startswith("OP_")}
-        self.sizes = 2 * model.n_x, 2 * model.n_u, 2 * model.n_d, 0
+        self.sizes = Sizes(2 * model.n_x, 2 * model.n_u, 2 * model.n_d, 0)
         self._C, self._level = model.C.tolist(), model.output(np.zeros(model.n_x)).tolist()
 
     @property

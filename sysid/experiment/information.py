@@ -41,6 +41,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
@@ -82,6 +83,14 @@ class Experiment:
     warm_up: float  # seconds from which a fit would estimate the start, 0 where it does not
 
 
+class _Added(NamedTuple):
+    """What an experiment adds to a fit."""
+
+    hessian: Array  # A (n, n)
+    spread: Array  # V (n, n)
+    discrepancy: Array  # G (n, n_term)
+
+
 @dataclass(frozen=True, eq=False)
 class ReadingError:
     """A fit's error model, ready for another log."""
@@ -102,12 +111,14 @@ class ReadingError:
 
     def gain(self, root: Array, new: Experiment) -> Array:
         """Return the inverse (n, n) of the covariance of the whitened parameters after an experiment."""
-        hessian, spread, pull = self._added(new)
+        added = self._added(new)
         before = root.T @ self.hessian @ root
-        after, shared = before + hessian, self._shared(before, root)
+        after, shared = before + added.hessian, self._shared(before, root)
         alone = np.eye(len(root)) - shared @ shared.T
-        both = (before @ shared + pull) * self._resized(new.lagged)
-        score = before @ alone @ before + both @ both.T + spread + FORECAST.least_score * np.eye(len(root))
+        both = (before @ shared + added.discrepancy) * self._resized(new.lagged)
+        score = (
+            before @ alone @ before + both @ both.T + added.spread + FORECAST.least_score * np.eye(len(root))
+        )
         return np.asarray(after @ np.linalg.solve(score, after))
 
     def _resized(self, lagged: Array) -> Array:
@@ -124,7 +135,7 @@ class ReadingError:
         )
         return np.asarray((left_vectors * np.minimum(size, 1.0)) @ right_vectors)
 
-    def _added(self, new: Experiment) -> tuple[Array, Array, Array]:
+    def _added(self, new: Experiment) -> _Added:
         """Return A and V (n, n) and G (n, n_term) of the experiment."""
         n, rows, n_y = new.rise.shape
         sizes = np.array([term.size for term in self.terms]).reshape(-1, n_y)
@@ -135,7 +146,7 @@ class ReadingError:
         m = max(1, round(self.bin_s / new.dt))
         n_bin, q = rows // m, len(discrepancy)
         if n_bin < 2:
-            return np.zeros((n, n)), np.zeros((n, n)), np.zeros((n, q))
+            return _Added(np.zeros((n, n)), np.zeros((n, n)), np.zeros((n, q)))
         bins = columns[:, : n_bin * m].reshape(len(columns), n_bin, m, n_y).mean(axis=2)
         whole = self.merge * bins[:n].reshape(n, -1) @ bins.reshape(len(bins), -1).T
         block = Block.of(bins[:n].transpose(1, 2, 0), range(n_y))
@@ -144,7 +155,7 @@ class ReadingError:
         effect_pull, start_pull = whole[:, n + q : begin], whole[:, begin:]
         start_error = self._start_error(bins[begin:], new.warm_up)
         spread = noise + effect_pull @ effect_pull.T + start_pull @ start_error @ start_pull.T
-        return whole[:n, :n], self.phi * spread, whole[:, n : n + q]
+        return _Added(whole[:n, :n], self.phi * spread, whole[:, n : n + q])
 
     def _start_error(self, bins: Array, warm_up: float) -> Array:
         """Return H (k, k) of offsets and start, of which these are the bins (k, n_bin, n_y)."""
@@ -161,7 +172,9 @@ def learnt_error(plant: Plant) -> ReadingError | None:
     intervals = plant.scores.intervals
     if intervals is None or intervals.numbers is None or plant.covariance is None:
         return None
-    numbers, spread, terms = intervals.numbers, intervals.spread_over_logs, intervals.terms
+    numbers = intervals.numbers
+    spread = intervals.spread_over_logs
+    terms = intervals.terms
     sensor = _sensor_sd(plant)
     return ReadingError(
         ErrorModel.of(numbers),
@@ -184,6 +197,14 @@ ROOM = 25.0  # degC
 DRAWS = 8  # of the parameters, that keep the limits too
 
 
+class Members(NamedTuple):
+    """What is simulated side by side: a plant and others beside it."""
+
+    p: Array  # (B, n_p) parameters
+    x0: Array  # (B, n_x) starts
+    d: Array  # (B, n_d) disturbances
+
+
 class ExperimentForecast:
     """A plant at rest in a room: the outputs that input schedules lead to, and the information they give."""
 
@@ -200,7 +221,9 @@ class ExperimentForecast:
     ) -> None:
         self.plant, self.dt = plant, plant.dt if dt is None else float(dt)
         self.starts = starts
-        self.lowest, self.highest, self.room = lowest, highest, room
+        self.lowest = lowest
+        self.highest = highest
+        self.room = room
         self.n_draws = draws if plant.covariance is not None or plant.samples is not None else 0
         self._d = np.array(
             [room if _is_celsius(plant, name) else _middle(plant, name) for name in plant.disturbances]
@@ -225,13 +248,12 @@ class ExperimentForecast:
 
     def evaluate(self, u: Array, *, margin: float = 0.0) -> float:
         """Return the bits of u (N, n_u), minus infinity where it leaves the limits; one batch for both."""
-        rows, begin, d = self._moved
-        careful, at_rest, room = self._cautious
-        together = (np.vstack([a, b[1:]]) for a, b in ((rows, careful), (begin, at_rest), (d, room)))
+        n_moved = len(self._moved.p)
+        together = (np.vstack([moved, drawn[1:]]) for moved, drawn in zip(self._moved, self._cautious))
         y = self._run(u, *together)
-        if not self._inside(np.vstack([y[:1], y[len(rows) :]]), margin):
+        if not self._inside(np.vstack([y[:1], y[n_moved:]]), margin):
             return -np.inf
-        return _bits(self._gain(u, y[: len(rows)]))
+        return _bits(self._gain(u, y[:n_moved]))
 
     def _gain(self, u: Array, y: Array) -> Array:
         """Return the inverse (n_free, n_free) of the covariance after an experiment, where it is 1 now, from
@@ -319,8 +341,8 @@ class ExperimentForecast:
         return np.where(self.plant.natural(theta) > np.array(free), -size, size)
 
     @cached_property
-    def _moved(self) -> tuple[Array, Array, Array]:
-        """Parameters, starts and disturbances: the plant's, each parameter moved by its step, and where an
+    def _moved(self) -> Members:
+        """The plant's, each parameter moved by its step, and where an
         error model asks for it each disturbance."""
         theta = np.vstack([self.plant.theta, self.plant.theta + np.diag(self._steps)])
         rows = np.repeat(self.plant.p[None], len(theta), axis=0)
@@ -341,17 +363,17 @@ class ExperimentForecast:
                 np.repeat(self._d[None], len(aside), axis=0),
             )
             d = np.vstack([d, warmer, same])
-        return rows, np.array(begin), d
+        return Members(rows, np.array(begin), d)
 
     @cached_property
-    def _cautious(self) -> tuple[Array, Array, Array]:
-        """Parameters, starts and disturbances of the plant and of its draws."""
+    def _cautious(self) -> Members:
+        """The plant and its draws."""
         rows, k = [self.plant.p], 0
         while len(rows) <= self.n_draws and k < FORECAST.tries + self.n_draws:
             k += 1
             rows.append(self.plant.draw(k).p)
         d = np.repeat(self._d[None], len(rows), axis=0)
-        return np.array(rows), np.array([self._rest(row) for row in rows]), d
+        return Members(np.array(rows), np.array([self._rest(row) for row in rows]), d)
 
     def _rest(self, p: Array) -> Array:
         model = self.plant.model

@@ -252,7 +252,10 @@ def _shrunk(
 ) -> tuple[Array, float]:
     """Return the cells, drawn towards rest as far as the limits ask, and their value (-inf: none keeps
     them)."""
-    value, low, high, best = evaluate(cells), 0.0, 1.0, cells
+    value = evaluate(cells)
+    low = 0.0
+    high = 1.0
+    best = cells
     if np.isfinite(value):
         return cells, value
     for _ in range(halvings):
@@ -260,7 +263,9 @@ def _shrunk(
         trial = _drawn(frame, cells, share)
         trial_value = evaluate(trial)
         if np.isfinite(trial_value):
-            low, best, value = share, trial, trial_value
+            low = share
+            best = trial
+            value = trial_value
         else:
             high = share
     return best, value
@@ -279,7 +284,9 @@ def _exchanged(frame: _Frame, cells: Array, pool: list[Array], rng: np.random.Ge
     length = unit * int(np.ceil(np.exp(rng.uniform(0.0, np.log(max(n / (2 * unit), 1.0))))))
     a = unit * int(rng.integers(-(-n // unit)))
     block = slice(a, min(a + length, n))
-    old, low, high = out[block, i], frame.low[i], frame.high[i]
+    old = out[block, i]
+    low = frame.low[i]
+    high = frame.high[i]
     move = rng.random()
     if move < 0.45 or (frame.switch[i] and move > 0.9):
         out[block, i] = _level(frame, i, rng)

@@ -57,6 +57,14 @@ class Estimate(NamedTuple):
     high: Array
 
 
+class FrequencyResponse(NamedTuple):
+    """Magnitude and phase (n, n_y, n_w) from inputs to outputs at frequencies."""
+
+    omega: Array  # (n,) [rad/s]
+    magnitude: Estimate
+    phase: Estimate  # [deg]
+
+
 @dataclass(frozen=True, eq=False)
 class Dynamics:
     """How a plant responds to small changes about an operating point."""
@@ -95,7 +103,9 @@ class Dynamics:
     @property
     def dead_time(self) -> Array:
         """Seconds from an input until each output begins to move, (n_y, n_w); ``nan`` where it never does."""
-        linear, reach, impulse = self.linear, self.linear.B, []
+        linear = self.linear
+        reach = self.linear.B
+        impulse = []
         for _ in range(len(linear.A)):
             impulse.append(np.abs(linear.C @ reach))
             reach = linear.A @ reach
@@ -119,7 +129,7 @@ class Dynamics:
         time = np.asarray(steps * self.dt * np.arange(n + 1), dtype=float)
         return time, self._estimate(lambda near: _rise(near, steps, n))
 
-    def frequency_response(self, n: int = 100) -> tuple[Array, Estimate, Estimate]:
+    def frequency_response(self, n: int = 100) -> FrequencyResponse:
         """Return frequencies (n,) [rad/s], from a tenth of the slowest pole to the step's Nyquist frequency,
         and magnitude and phase [deg] (n, n_y, n_w) from inputs to outputs."""
         omega = np.geomspace(min(0.1 / self._slowest, 0.1 / self.dt), np.pi / self.dt, n)
@@ -136,11 +146,13 @@ class Dynamics:
             )
 
         magnitude = self._estimate(lambda near: np.abs(response(near)))
-        return omega, magnitude, self._estimate(phase, np.zeros(len(self.gain_sd)))
+        return FrequencyResponse(omega, magnitude, self._estimate(phase, np.zeros(len(self.gain_sd))))
 
     def rows(self) -> list[dict[str, Any]]:
         """Return a record for each pair of an input and an output: gain with interval, times [s], unit."""
-        gain, dead, rise = self.gain, self.dead_time, self.rise_time
+        gain = self.gain
+        dead = self.dead_time
+        rise = self.rise_time
         out = []
         for j, name in enumerate(self.linear.inputs):
             for i, output in enumerate(self.linear.outputs):

@@ -101,7 +101,9 @@ def levenberg_marquardt(
                 return Solution(z, cost, residual, jacobian, iteration, True)
             damping *= 1e4
             continue
-        fall, z, damping = cost - trial.cost, trial.z, float(np.clip(trial.damping, 1e-6, 1e8))
+        fall = cost - trial.cost
+        z = trial.z
+        damping = float(np.clip(trial.damping, 1e-6, 1e8))
         residual, jacobian = linearise(z)
         cost = float(residual @ residual)
         if callback is not None:

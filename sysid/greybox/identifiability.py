@@ -45,11 +45,19 @@ class ReportSettings:
 REPORT = ReportSettings()
 
 
-def weakest_direction(jacobian: Array, names: Sequence[str]) -> tuple[float, float, str]:
+class WeakestDirection(NamedTuple):
+    """The direction in which a scaled Hessian says least."""
+
+    condition: float
+    eigenvalue: float
+    words: str
+
+
+def weakest_direction(jacobian: Array, names: Sequence[str]) -> WeakestDirection:
     """Return condition and smallest eigenvalue of the scaled Hessian, and its direction in words."""
     values, axes = _spectrum(jacobian)
     least = max(float(values[0]), 0.0)
-    return float(values[-1] / max(least, 1e-18)), least, _in_words(axes[:, 0], names)
+    return WeakestDirection(float(values[-1] / max(least, 1e-18)), least, _in_words(axes[:, 0], names))
 
 
 def _spectrum(jacobian: Array) -> tuple[Array, Array]:

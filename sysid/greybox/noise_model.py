@@ -248,7 +248,9 @@ def _evidence(v: Array, logs: Sequence[LogData], ref: Array, n_y: int, n_kind: i
 
 def _slopes(v: Array, numbers: ErrorModel, block: Block, uncertain: Array) -> Array:
     """Return one block's share of the slope in the numbers of the covariance."""
-    n_y, out, lag = len(numbers.white), np.zeros(v.size), np.arange(block.n)
+    n_y = len(numbers.white)
+    out = np.zeros(v.size)
+    lag = np.arange(block.n)
     inverse = np.linalg.inv(block.covariance(numbers))
     # sum over the band of E[(r - X zcb)(r - X zcb)'] by pair of outputs
     square = np.tensordot(block.products, uncertain, axes=2)

@@ -97,7 +97,9 @@ class RandomizedMap:
         self._fitted = np.concatenate([r for r, _ in by_log])
         span, size, turn = np.linalg.svd(np.vstack([J for _, J in by_log]), full_matrices=False)
         moves_runs = size > DRAW.unseen_slope * size.max(initial=0.0)
-        self._span, size, turn = span[:, moves_runs], size[moves_runs], turn[moves_runs]
+        self._span = span[:, moves_runs]
+        size = size[moves_runs]
+        turn = turn[moves_runs]
         along = turn / size[:, None]
         error = along @ uncertainty.spread @ along.T  # S^-1 R V R' S^-1, about the error's covariance along Q
         value, axes = np.linalg.eigh((error + error.T) / 2)

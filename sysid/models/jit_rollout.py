@@ -31,18 +31,21 @@ import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache, lru_cache
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from llvmlite import binding, ir
 from numpy.typing import NDArray
 
 from thermogrip.datasets.arrays import Array, Values
+from thermogrip.sysid.models.model import Equations
 
 #: Numbers side by side.
 WIDTH = 8
 
-DOUBLE, INTEGER, BYTE = ir.DoubleType(), ir.IntType(64), ir.IntType(8)
+DOUBLE = ir.DoubleType()
+INTEGER = ir.IntType(64)
+BYTE = ir.IntType(8)
 VECTOR = ir.VectorType(DOUBLE, WIDTH)
 BYTES = 8 * WIDTH  # of a register
 _PLACE = ir.IntType(32)
@@ -306,31 +309,6 @@ _WORTH_THREADS = 1000
 _FIRST = INTEGER(0)
 
 
-class Equations(Protocol):
-    """A model's step in three parts, on lists of numbers, of NumPy rows or of vectors."""
-
-    @property
-    def sizes(self) -> tuple[int, int, int, int]:
-        """Numbers of states, inputs, disturbances and parameters."""
-        ...
-
-    def prepare(self, p: Values) -> list[Any]:
-        """Return what depends on the parameters alone, c."""
-        ...
-
-    def renew(self, u: Values, c: Values, h: Any) -> list[Any]:
-        """Return what depends on the switches among the inputs besides, and on the step h [s]."""
-        ...
-
-    def advance(self, x: Values, u: Values, d: Values, c: Values, kept: Values, h: Any) -> list[Any]:
-        """Return the state after h seconds."""
-        ...
-
-    def read(self, x: Values, c: Values) -> list[Any]:
-        """Return the outputs."""
-        ...
-
-
 class Kernel:
     """Compiled equations."""
 
@@ -451,7 +429,9 @@ class _Writer:
 
     def __init__(self, equations: Equations, in_pieces: bool) -> None:
         numbers, whole = DOUBLE.as_pointer(), INTEGER.as_pointer()
-        self.equations, self.in_pieces, self.module = equations, in_pieces, ir.Module("kernel")
+        self.equations = equations
+        self.in_pieces = in_pieces
+        self.module = ir.Module("kernel")
         last = [INTEGER, INTEGER, INTEGER, DOUBLE, BYTE.as_pointer()]
         kind = ir.FunctionType(ir.VoidType(), [numbers] * 4 + [whole] + [numbers] * 2 + last)
         self.function = ir.Function(self.module, kind, "rollout")
@@ -487,7 +467,9 @@ class _Writer:
         builder.branch(step)
 
         builder.position_at_end(step)
-        t, piece, x = builder.phi(INTEGER), builder.phi(INTEGER), [builder.phi(VECTOR) for _ in first]
+        t = builder.phi(INTEGER)
+        piece = builder.phi(INTEGER)
+        x = [builder.phi(VECTOR) for _ in first]
         u, d = self._row(1, n_u, t), self._row(2, n_d, t)
         later = steps.advance([Vector(builder, item) for item in x], u, d, c, switched, self.h)
         after, count = builder.add(t, INTEGER(1)), builder.add(piece, INTEGER(1))

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol, Self, runtime_checkable
+from typing import Any, ClassVar, NamedTuple, Protocol, Self, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -28,8 +28,40 @@ from thermogrip.datasets.errors import reading
 from thermogrip.datasets.limits import STEP_RANGE, array_within, number_within
 from thermogrip.sysid.models.network_spec import Parameter
 
-if TYPE_CHECKING:
-    from thermogrip.sysid.models.jit_rollout import Equations
+
+class Sizes(NamedTuple):
+    """How long the lists of a model's equations are."""
+
+    n_x: int  # states
+    n_u: int  # inputs
+    n_d: int  # disturbances
+    n_p: int  # parameters
+
+
+class Equations(Protocol):
+    """A model's step in three parts, on lists of numbers, of NumPy rows or of vectors."""
+
+    @property
+    def sizes(self) -> Sizes:
+        """Numbers of states, inputs, disturbances and parameters."""
+        ...
+
+    def prepare(self, p: Values) -> list[Any]:
+        """Return what depends on the parameters alone, c."""
+        ...
+
+    def renew(self, u: Values, c: Values, h: Any) -> list[Any]:
+        """Return what depends on the switches among the inputs besides, and on the step h [s]."""
+        ...
+
+    def advance(self, x: Values, u: Values, d: Values, c: Values, kept: Values, h: Any) -> list[Any]:
+        """Return the state after h seconds."""
+        ...
+
+    def read(self, x: Values, c: Values) -> list[Any]:
+        """Return the outputs."""
+        ...
+
 
 SMOOTH = 20.0  # [s] mean of a measured ambient, for its sensor is slow and coarse
 
@@ -193,7 +225,9 @@ def roll_rows(
 ) -> Run:
     """Do without a compiler what a compiled kernel does: the same lines on rows with one entry a member."""
     n_batch, n = len(x0), u.shape[1]
-    c, x, switched = steps.prepare(list(p.T)), list(x0.T.copy()), list[Any]()
+    c = steps.prepare(list(p.T))
+    x = list(x0.T.copy())
+    switched = list[Any]()
     u_rows, d_rows = list(u.transpose(1, 2, 0)), list(d.transpose(1, 2, 0))
     with np.errstate(all="ignore"):  # what is not finite is found afterwards
         outputs = [*steps.read(x, c)]

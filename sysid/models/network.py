@@ -62,7 +62,7 @@ from numpy.typing import ArrayLike
 
 from thermogrip.datasets.arrays import Array, Run, Values
 from thermogrip.datasets.errors import UserError
-from thermogrip.sysid.models.model import SMOOTH, Described, FreeRuns
+from thermogrip.sysid.models.model import SMOOTH, Described, FreeRuns, Sizes
 from thermogrip.sysid.models.network_spec import Network, Pipe, named_network, network_from_dict
 
 if TYPE_CHECKING:
@@ -120,16 +120,16 @@ class Layout(NamedTuple):
 
 @dataclass(frozen=True)
 class ThermalSteps:
-    """The three parts of a step; see :class:`thermogrip.sysid.models.jit_rollout.Equations`."""
+    """The three parts of a step; see :class:`thermogrip.sysid.models.model.Equations`."""
 
     layout: Layout
     n_u: int  # number of inputs
     n_p: int  # of parameters
 
     @property
-    def sizes(self) -> tuple[int, int, int, int]:
+    def sizes(self) -> Sizes:
         """Numbers of states, inputs, disturbances and parameters."""
-        return self.layout.n_x, self.n_u, self.layout.n_d, self.n_p
+        return Sizes(self.layout.n_x, self.n_u, self.layout.n_d, self.n_p)
 
     def prepare(self, p: Values) -> list[Any]:
         """Return the coefficients: products of at most two parameters and a number."""
@@ -151,7 +151,9 @@ class ThermalSteps:
     def advance(self, x: Values, u: Values, d: Values, c: Values, kept: Values, h: Any) -> list[Any]:
         """Return the state one step of ``h`` [s] on."""
         layout, n_link = self.layout, len(self.layout.links)
-        g, w, outside = kept[:n_link], kept[n_link:], self._outside(d, c)
+        g = kept[:n_link]
+        w = kept[n_link:]
+        outside = self._outside(d, c)
         q = _heat([*x, *outside], u, c, g, layout)
         k = _solved(w, layout, [a / b for a, b in zip(q, c)])
         q = _heat([*(a + h * b for a, b in zip(x, k)), *outside], u, c, g, layout)
@@ -344,7 +346,9 @@ def _capacities(network: Network) -> list[Coefficient]:
 
 
 def _links(network: Network, index: Mapping[str, int]) -> list[_Link]:
-    links, n_x, inputs = list[_Link](), len(state_names(network)), list(network.inputs)
+    links = list[_Link]()
+    n_x = len(state_names(network))
+    inputs = list(network.inputs)
     for link in network.links.values():
         to, source = _receiver(link.between, index, n_x)
         switch = -1 if link.switch is None else inputs.index(link.switch)
@@ -457,7 +461,9 @@ def _minimum_degree(pattern: list[set[int]]) -> list[int]:
 
 def _play(order: list[int], pattern: list[set[int]], entry: dict[tuple[int, int], int]) -> tuple[Any, Any]:
     """Eliminate on the pattern alone; return ``lower`` and ``upper``, fill-in is added to ``entry``."""
-    lower, upper, rows = [], [], [set(row) for row in pattern]
+    lower = []
+    upper = []
+    rows = [set(row) for row in pattern]
     for position, pivot in enumerate(order):
         later = order[position + 1 :]
         right = [j for j in later if j in rows[pivot]]

@@ -51,7 +51,9 @@ Positive = Annotated[float, Field(gt=0, le=LARGEST)]
 NotNegative = Annotated[float, Field(ge=0, le=LARGEST)]
 Step = Annotated[float, Field(ge=STEP_RANGE[0], le=STEP_RANGE[1])]
 # what is compiled and simulated grows with these, the time of a fit with their square
-Few, Many, Most = Field(max_length=50), Field(max_length=200), Field(max_length=500)
+Few = Field(max_length=50)
+Many = Field(max_length=200)
+Most = Field(max_length=500)
 Two = Annotated[list[Name], Field(min_length=2, max_length=2)]
 
 

@@ -67,7 +67,9 @@ class NeuralModel(BlackBox):
         for name in (*self.arrays, *_RAILS):
             object.__setattr__(self, name, np.ascontiguousarray(getattr(self, name), dtype=float))
         members, n = self.A.shape[:2]
-        h, m, n_y = self.b.shape[1], len(self.inputs) + len(self.disturbances), len(self.outputs)
+        h = self.b.shape[1]
+        m = len(self.inputs) + len(self.disturbances)
+        n_y = len(self.outputs)
         shapes = {"A": (n, n), "B": (n, m), "c": (n,), "V": (n, h), "W": (h, n), "U": (h, m), "b": (h,)}
         for name, shape in shapes.items():
             value = getattr(self, name)
@@ -122,7 +124,9 @@ class NeuralModel(BlackBox):
         y = (np.asarray(y, dtype=float) - self.y_middle) / self.y_size
         w = (np.concatenate([np.asarray(u, float), np.asarray(d, float)]) - self.w_middle) / self.w_size
         w = np.clip(w, -self.reach, self.reach)
-        n_u, members, n = len(self.inputs), len(self.A), self.A.shape[1]
+        n_u = len(self.inputs)
+        members = len(self.A)
+        n = self.A.shape[1]
         moved = [i for i in range(n_u) if self.inputs[i] not in self.switches]
         is_read = np.flatnonzero(np.isfinite(y))
         free = [i for i in range(n) if i not in is_read] + [n + i for i in moved]

@@ -39,7 +39,9 @@ def _begins(n: int, m: int, h: int) -> tuple[int, int, int, int, int]:
 @numba.njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def _units(p: Array, x: Array, w: Array, t: Array) -> None:
     """Set t to the outputs of the units."""
-    n, m, h = x.shape[0], w.shape[0], t.shape[0]
+    n = x.shape[0]
+    m = w.shape[0]
+    h = t.shape[0]
     _, _, iW, iU, ib = _begins(n, m, h)
     for i in range(h):
         total = p[ib + i]
@@ -53,7 +55,9 @@ def _units(p: Array, x: Array, w: Array, t: Array) -> None:
 @numba.njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def _advance(A: Array, p: Array, x: Array, w: Array, t: Array, after: Array) -> None:
     """Set ``after`` to the next state, not yet clipped."""
-    n, m, h = x.shape[0], w.shape[0], t.shape[0]
+    n = x.shape[0]
+    m = w.shape[0]
+    h = t.shape[0]
     ic, iV, _, _, _ = _begins(n, m, h)
     for i in range(n):
         total = p[ic + i]
@@ -84,7 +88,9 @@ def _propagate(A: Array, p: Array, m: int, s: Array, S: Array, after: Array) -> 
 @numba.njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def _add_direct(p: Array, x: Array, w: Array, t: Array, s: Array, S: Array) -> None:
     """Add E: what each weight does to the state in this step itself."""
-    n, m, h = x.shape[0], w.shape[0], t.shape[0]
+    n = x.shape[0]
+    m = w.shape[0]
+    h = t.shape[0]
     ic, iV, iW, iU, ib = _begins(n, m, h)
     for i in range(n):
         S[i, ic + i] += 1.0
@@ -146,9 +152,15 @@ def run_with_slopes(
     A: Array, p: Array, h: int, x0: Array, w: Array, low: Array, high: Array
 ) -> tuple[Array, Array]:
     """Return the outputs (N, n_y) and their slopes (N, n_y, n_theta + n) by theta and x0, one member."""
-    n, rows, n_y, n_p = x0.shape[0], w.shape[0], low.shape[0], p.shape[0]
+    n = x0.shape[0]
+    rows = w.shape[0]
+    n_y = low.shape[0]
+    n_p = p.shape[0]
     y, slopes = np.empty((rows, n_y)), np.empty((rows, n_y, n_p + n))
-    x, after, t, s = x0.copy(), np.empty(n), np.empty(h), np.empty(h)
+    x = x0.copy()
+    after = np.empty(n)
+    t = np.empty(h)
+    s = np.empty(h)
     S, S_after = np.zeros((n, n_p + n)), np.empty((n, n_p + n))
     for i in range(n):
         S[i, n_p + i] = 1.0

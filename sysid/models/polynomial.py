@@ -92,7 +92,9 @@ class SindyModel(BlackBox):
         infinite from there on."""
         x = np.array(x0, dtype=float)
         w = join_columns(np.asarray(u, dtype=float), np.asarray(d, dtype=float))
-        n_y, rows, n_x = len(self.outputs), w.shape[1], self.n_x
+        n_y = len(self.outputs)
+        rows = w.shape[1]
+        n_x = self.n_x
         times = max(1, round(dt / self.dt))  # the step of a gap may differ a little from the model's
         powers, gains = self._by_state(w)
         factors = _factors(powers)

@@ -53,7 +53,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from thermogrip.datasets.arrays import Array, Run, Values
 from thermogrip.datasets.errors import UserError, known_names, reading
-from thermogrip.sysid.models.model import Described, FreeRuns, roll_rows
+from thermogrip.sysid.models.model import Described, FreeRuns, Sizes, roll_rows
 from thermogrip.sysid.models.network_spec import Parameter
 
 if TYPE_CHECKING:
@@ -329,15 +329,15 @@ OWN = OwnSettings()
 
 @dataclass(frozen=True)
 class OwnSteps:
-    """The steps of a class; see :class:`thermogrip.sysid.models.jit_rollout.Equations`."""
+    """The steps of a class; see :class:`thermogrip.sysid.models.model.Equations`."""
 
     code: OwnCode
 
     @property
-    def sizes(self) -> tuple[int, int, int, int]:
+    def sizes(self) -> Sizes:
         """Numbers of states, inputs, disturbances and parameters."""
         code = self.code
-        return len(code.states), len(code.inputs), len(code.disturbances), len(code.parameters)
+        return Sizes(len(code.states), len(code.inputs), len(code.disturbances), len(code.parameters))
 
     def prepare(self, p: Values) -> list[Any]:
         """Return the parameters."""
@@ -497,7 +497,9 @@ class OwnModel(Described):
             again = free_runs(finer, p_tried)
             if model._agree(runs, again):
                 return self if (self.pieces, self.sd) == (n, sd) else model
-            model, runs, n = finer, again, 2 * n
+            model = finer
+            runs = again
+            n = 2 * n
         if not all(np.isfinite(run).all() for _, run in runs):
             raise model._not_finite(runs)
         problem = f"changes too fast for {OWN.most_pieces} Runge-Kutta steps in dt = {self.dt:g} s"

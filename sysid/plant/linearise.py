@@ -238,7 +238,9 @@ def _matrices(
     function: Callable[[Array, Array, Array], Array], x: Array, u: Array, d: Array, moved: Sequence[int]
 ) -> tuple[Array, Array]:
     """Return derivatives of function(x, u, d) by x, and by the moved inputs and the disturbances."""
-    point, n_x, n_u = np.concatenate([x, u, d]), x.size, u.size
+    point = np.concatenate([x, u, d])
+    n_x = x.size
+    n_u = u.size
     columns = [*range(n_x), *(n_x + k for k in moved), *(n_x + n_u + k for k in range(d.size))]
 
     def joined(z: Array) -> Array:

@@ -30,7 +30,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -136,7 +136,9 @@ class Grid:
 
     def of(self, logs: Sequence[Log], *, average: float | None = None, ends: bool = False) -> Grid:
         """Return logs on a grid like this one, of its step or of ``average`` [s]."""
-        u, y, d = self.inputs, self.outputs, self.disturbances
+        u = self.inputs
+        y = self.outputs
+        d = self.disturbances
         return make_grid(logs, inputs=u, outputs=y, disturbances=d, average=average or self.dt, ends=ends)
 
     def having(self, segments: Sequence[Segment]) -> Grid:
@@ -283,13 +285,21 @@ def whole_readings(segments: Sequence[Segment], deep: int) -> list[Array]:
     return [segment.y if 2 * whole >= total else bridge(segment.y) for segment in segments]
 
 
+class SignalNames(NamedTuple):
+    """Names of the columns that are used."""
+
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+    disturbances: tuple[str, ...]
+
+
 def signals(
     logs: Sequence[Log],
     *,
     inputs: Sequence[str] | None = None,
     outputs: Sequence[str] | None = None,
     disturbances: Sequence[str] | None = None,
-) -> tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...]]:
+) -> SignalNames:
     """Return the names of inputs, outputs and disturbances, checked to stand in every log."""
     u, y, d = (
         tuple(names_of(logs[0], role)) if wanted is None else tuple(wanted)
@@ -323,7 +333,7 @@ def signals(
         hint += moved_before(logs[0]) if "input" in lacking else ""
         problem = " and ".join(f"no {role}" for role in lacking) + " among the columns"
         raise UserError(problem, file=log_name(logs[0]), hint=hint)
-    return u, y, d
+    return SignalNames(u, y, d)
 
 
 def moved_before(log: Log) -> str:

@@ -25,7 +25,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -118,9 +118,33 @@ def _begin(model: Model, p: Array, stretch: Stretch, start: Start) -> Array:
     return np.asarray(rests + start.shift)
 
 
-def _about_start(stretch: Stretch, start: Start) -> tuple[Array, Array, Array]:
+class _RestPoint(NamedTuple):
+    """What a state at rest refers to."""
+
+    y: Array  # readings without offsets
+    u: Array
+    d: Array  # ambients without biases
+
+
+class _LevelStart(NamedTuple):
+    """A start at rest."""
+
+    level: float  # temperature of the reference
+    y: Array  # mean readings
+    d: Array  # mean ambients
+
+
+class _GapInputs(NamedTuple):
+    """What acts through a gap, a step of ``dt`` [s] each."""
+
+    u: Array  # (n_times, N, n_u)
+    d: Array  # (1, N, n_d)
+    dt: float
+
+
+def _about_start(stretch: Stretch, start: Start) -> _RestPoint:
     """Return readings without offsets, inputs and ambients that the state at rest refers to."""
-    return _first_reading(stretch) - start.y_offset, stretch.u[0], stretch.d[0] - start.d_offset
+    return _RestPoint(_first_reading(stretch) - start.y_offset, stretch.u[0], stretch.d[0] - start.d_offset)
 
 
 def _first_reading(stretch: Stretch, seconds: float = 2.0) -> Array:
@@ -159,8 +183,8 @@ def _first_start(plant: PlantData, p: Array, stretch: Stretch, warmup: float) ->
     return Start(x0, zero, y_offset, d_offset, T0, 0.0, f"started at rest at {T0:.2f} degC")
 
 
-def _level(plant: PlantData, stretch: Stretch, warmup: float) -> tuple[float, Array, Array] | None:
-    """Return (T0, mean readings, mean ambients) of a start at rest, None where it is not one."""
+def _level(plant: PlantData, stretch: Stretch, warmup: float) -> _LevelStart | None:
+    """Return how a log starts at rest, None where it does not."""
     if plant.reference is None or not plant.disturbances:
         return None
     seconds = min(warmup, START.rest_s)
@@ -171,7 +195,7 @@ def _level(plant: PlantData, stretch: Stretch, warmup: float) -> tuple[float, Ar
     d = stretch.d[: max(1, round(seconds / plant.dt))].mean(axis=0)
     if np.ptp(np.concatenate([y, d])) > START.rest_band:
         return None
-    return float(y[plant.outputs.index(plant.reference)]), y, d
+    return _LevelStart(float(y[plant.outputs.index(plant.reference)]), y, d)
 
 
 def _corrected(
@@ -238,8 +262,8 @@ def _after_gap(
 
 def _through_gap(
     before: Stretch, after: Stretch, start: Start, times: Sequence[float], dt: float
-) -> tuple[Array, Array, float]:
-    """Return inputs (n_times, N, n_u), ambients (1, N, n_d) and step through the gap before ``after``."""
+) -> _GapInputs:
+    """Return what acts through the gap before ``after``."""
     length = after.gap - (before.u.shape[0] * dt - before.time[-1])  # the grid may end past the last row
     n = max(1, round(length / dt))
     edges = np.linspace(0.0, max(length, 1e-3), n + 1)
@@ -248,7 +272,7 @@ def _through_gap(
     u = share * before.u[-1] + (1 - share) * after.u[0]
     share_of_gap = ((np.arange(n) + 0.5) / n)[:, None]
     d = (1 - share_of_gap) * before.d[-1] + share_of_gap * after.d[0] - start.d_offset
-    return u, d[None], float(width)
+    return _GapInputs(u, d[None], float(width))
 
 
 def _warm(

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -24,7 +23,6 @@ from thermogrip.sysid.greybox.problem import Problem, make_problem
 from thermogrip.sysid.greybox.sandwich import score_covariance
 from thermogrip.sysid.models.network import NetworkModel
 from thermogrip.sysid.models.network_spec import network_from_dict
-from thermogrip.sysid.plant.fit_record import Identifiability
 from thermogrip.sysid.plant.plant import Plant
 
 
@@ -159,42 +157,6 @@ def test_a_model_that_needs_finer_steps_where_the_fit_ended_is_fitted_with_them(
     plant, straight = fit_network(Coarse(), logs), fit_network(Fine(), logs)
     assert type(plant.model) is Fine
     assert plant.values == pytest.approx(straight.values, rel=1e-3)
-
-
-@pytest.mark.parametrize(("off", "at"), [((1.0, 4.9), []), ((5.1, 1.0), [0, 1]), ((1.0, 1.0), [0, 1, 3])])
-def test_errors_are_in_sensor_sd_and_bounds_are_named_by_their_side(off: tuple[float, float], at: list[int]):
-    z = np.zeros(4)
-    z[at] = [(-1.0, 2.0, 9.0, 2.0)[k] for k in at]
-    sd = np.array([0.1, 3.0])
-    problem = SimpleNamespace(
-        sd=sd,
-        box=(np.full(4, -1.0), np.full(4, 2.0)),
-        free=(1, 2, 3, 4),
-        model=SimpleNamespace(parameters=("fixed", "a", "b", "c", "d")),
-        errors=lambda z: [[[o * s * np.array([1.0, -1.0]) for o, s in zip(off, sd)]]] * 2,
-    )
-    solution: Any = SimpleNamespace(z=z)
-    assert greybox._rms_in_sd(problem, solution) == pytest.approx(list(off))
-    ends = {0: ("a", "low"), 1: ("b", "high"), 3: ("d", "high")}
-    assert greybox._on_bound(problem, z) == dict(ends[k] for k in at)
-
-
-def test_a_fit_is_not_to_be_used_where_one_output_is_unexplained():
-    problem: Any = SimpleNamespace(
-        sd=np.array([0.1, 2.0]),
-        errors=lambda z: [[[np.full(9, 0.2), np.full(9, -12.0)]]],
-        plant=SimpleNamespace(units={"b": "W"}),
-        model=SimpleNamespace(outputs=("a", "b")),
-    )
-    solution: Any = SimpleNamespace(z=np.zeros(1), converged=True)
-    report = Identifiability(1.0, [], "C up, G down", [], False, ["lag"], {"G": "low"}, {})
-    assert greybox._verdict(problem, solution, report) == (
-        "in-sample error a 0.20 degC, b 12.00 W; it does not explain the logs, do not use it; "
-        "not practically identifiable: C up, G down; on bounds: G; known from the prior only: lag"
-    )
-    problem.errors = lambda z: [[[np.full(9, 0.2), np.full(9, -9.0)]]]
-    report = Identifiability(1.0, [], "", [], True, [], {}, {})
-    assert greybox._verdict(problem, solution, report) == "in-sample error a 0.20 degC, b 9.00 W"
 
 
 class Sharp(TwoGains):

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from thermogrip.sysid.greybox import noise_model
 from thermogrip.sysid.greybox.noise_model import Block, ErrorModel, LogData, information, learn_error_model
 
 Array = np.ndarray
@@ -97,51 +96,6 @@ def test_effects_go_with_the_parameters_that_explain_them_too():
         at = [0, 1 + k]
         np.testing.assert_allclose((own[0], spread[0, 0]), (mean[1 + k], covariance[1 + k, 1 + k]), rtol=1e-9)
         np.testing.assert_allclose(joint, covariance[np.ix_(at, at)], rtol=1e-9)
-
-
-def test_before_anything_is_learnt_correlation_times_are_short_and_a_twentieth_of_a_log():
-    rng = np.random.default_rng(3)
-    y = rng.normal(size=(400, 2)) * [1.0, 3.0] + 50.0  # a mean is no error to be learnt
-    logs = [log_of(y, (0, 1)), log_of(y[:300], (0, 1), parts=2), log_of(y[:, 1:], (1,))]
-    rms = [np.sqrt(np.sum((y[:, j] - y[:, j].mean()) ** 2) / 400) for j in (0, 1)]
-    mean, sd = noise_model._hyper_prior(logs[:1], 2)
-    numbers = noise_model._unpack(mean, 2, 0)
-    assert numbers.tau == pytest.approx((3.0, 20.0))
-    assert numbers.white == pytest.approx([0.3 * s for s in rms], rel=1e-6)
-    assert numbers.sd == tuple(pytest.approx([0.5 * s for s in rms], rel=1e-6) for _ in range(2))
-    assert sd.tolist() == [0.7, 0.7, *[1.0] * 6, 0.7, 0.7]
-    mean, _ = noise_model._hyper_prior([logs[0], logs[1], logs[1]], 2)  # longest stretches 400, 150, 150
-    assert np.exp(mean[1]) == pytest.approx(9.0)
-    first = log_of(y[:, :1], (0,))
-    assert [noise_model._n_outputs(part) for part in ([first], [first, logs[2]], [logs[2], first])] == [
-        1,
-        2,
-        2,
-    ]
-    assert noise_model._rms(logs[2:], 1) == pytest.approx(rms[1], rel=1e-6)
-    assert noise_model._rms(logs[2:], 0) == 1e-6  # which no log has
-
-
-@pytest.mark.parametrize("n_y", [2, 3, 5])
-def test_correlations_run_from_the_least_that_a_covariance_may_have_to_one(n_y: int):
-    n = 2 + 3 * n_y + 2
-    ends = []
-    for x in (-40.0, 40.0, 0.3):
-        v = np.zeros(n)
-        v[-2:] = x
-        numbers = noise_model._unpack(v, n_y, 0)
-        ends.append(numbers.correlation[0])
-        together = numbers._together()[0]
-        assert np.linalg.eigvalsh(together).min() > 0
-    assert ends[:2] == pytest.approx([-0.999 / (n_y - 1), 0.999])
-    assert -1 / (n_y - 1) < ends[2] < 1
-
-
-def test_bands_are_single_frequencies_and_then_wider_by_a_fifth():
-    edges = noise_model._bands(40)
-    assert edges[:13] == tuple(range(13))
-    assert edges[13:] == (14, 16, 19, 22, 26, 31, 37, 40)
-    assert noise_model._bands(5) == (0, 1, 2, 3, 4, 5)
 
 
 def test_the_error_is_reported_in_seconds_and_the_outputs_units():

@@ -12,8 +12,6 @@ from thermogrip.sysid.greybox.problem import Problem, make_problem, prior_plant
 from thermogrip.sysid.models.network import load_network
 from thermogrip.sysid.models.network_spec import Parameter
 
-Array = np.ndarray
-
 
 def problem_of(model: Any, *logs: Any, average: float = 4.0, **more: Any) -> Problem:
     return make_problem(model, logs, average=average, independent=60.0, **more)

@@ -6,7 +6,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from scipy import sparse
 from scipy.fft import dct
 from scipy.linalg import toeplitz
 from scipy.stats import chi2
@@ -124,118 +123,6 @@ def test_a_log_that_began_at_rest_has_no_start_to_estimate():
     assert linearise_logs(problem, z, problem.by_log(z)).warm == [None]
 
 
-def binned(*of_log):
-    """Return a problem of bins of 4 s on a grid of 1 s: which bins each output of each stretch has."""
-
-    def operator(have):
-        rows = [(np.arange(4 * b, 4 * b + 4), np.full(4, 0.25)) for b in have]
-        if not rows:
-            return sparse.csr_matrix((0, 400))
-        at, values = (np.concatenate(part) for part in zip(*rows))
-        return sparse.csr_matrix((values, (np.repeat(np.arange(len(rows)), 4), at)), shape=(len(rows), 400))
-
-    def cells(k):
-        return SimpleNamespace(operators=[operator(h) for h in k], places=[np.array(h, dtype=int) for h in k])
-
-    logs = [([None] * len(log), [cells(k) for k in log]) for log in of_log]
-    return SimpleNamespace(logs=logs, average=4.0, plant=SimpleNamespace(dt=1.0), tau=np.array([4.0, 9.0]))
-
-
-def test_bins_stand_where_their_readings_do():
-    problem = binned([[[0, 2, 5], []]], [[[1], [0, 7]], [[3], [3]]])
-    assert [random_effects._n_bins(problem, *at) for at in ((0, 0), (1, 0), (1, 1))] == [6, 8, 4]
-    assert random_effects._n_bins(binned([[[], []]]), 0, 0) == 0
-    # at most 400 bins of a stretch are taken
-    sizes = {399: 1, 400: 1, 401: 2, 800: 2, 801: 3}
-    for n, merge in sizes.items():
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(random_effects, "_n_bins", lambda p, at, k, n=n: n if (at, k) == (1, 1) else 5)
-            assert random_effects._merge(problem) == merge
-
-
-def test_lost_bins_are_drawn_through_and_held():
-    values = np.array([[1.0, 5.0], [3.0, 1.0], [9.0, 2.0]])
-    got = random_effects._interpolated(np.array([1, 3, 4]), values, 7)
-    np.testing.assert_allclose(got[:, 0], [1, 1, 2, 3, 9, 9, 9])
-    np.testing.assert_allclose(got[:, 1], [5, 5, 3, 1, 2, 2, 2])
-    whole = random_effects._interpolated(np.arange(3), values, 2)
-    np.testing.assert_array_equal(whole, values[:2])
-    np.testing.assert_allclose(random_effects._interpolated(np.array([0, 2, 3]), values, 3)[:, 0], [1, 2, 3])
-
-
-@pytest.mark.parametrize(
-    ("have", "merge", "pieces", "sizes", "outputs"),
-    [
-        ([range(9), range(9)], 1, 1, [9], (0, 1)), ([range(9), range(9)], 2, 1, [4], (0, 1)),
-        # half of the bins, of those that are merged
-        ([range(8), [0, 2, 4, 6]], 1, 1, [8], (0, 1)), ([range(8), [0, 2, 4]], 1, 1, [8], (0,)),
-        # three of a piece
-        ([range(3), []], 1, 1, [3], (0,)), ([range(2), []], 1, 1, [], ()),
-        ([range(6), []], 1, 2, [3, 3], (0,)),
-        ([range(5), []], 1, 2, [], ()), ([range(12), []], 2, 2, [3, 3], (0,)),
-        ([range(11), []], 2, 2, [], ()),
-        ([[], []], 1, 1, [], ()),
-    ],
-)  # fmt: skip
-def test_how_a_stretch_is_cut(have, merge, pieces, sizes, outputs, monkeypatch):
-    problem, seen = binned([have]), []
-    monkeypatch.setattr(
-        random_effects.Block, "of", lambda columns, which: seen.append((columns, tuple(which)))
-    )
-    slopes = [np.arange(len(h), dtype=float)[:, None] for h in have]
-    residual = [10.0 + np.array([*h], dtype=float) for h in have]
-    column = [np.full(len(h), 7.0) for h in have]
-    random_effects._blocks(problem, 0, 0, merge, pieces, slopes, [column], residual)
-    assert [len(columns) for columns, _ in seen] == sizes
-    assert all(which == outputs for _, which in seen)
-    if sizes:
-        whole = np.concatenate([columns for columns, _ in seen])
-        n = len(whole) * merge
-        np.testing.assert_allclose(whole[:, 0, 2], 10.0 + np.arange(n).reshape(-1, merge).mean(axis=1))
-        assert np.all(whole[:, :, 1] == 7.0)
-
-
-def test_the_first_bins_of_a_log_say_how_it_began():
-    """A warm-up of 20 s and bins of 8 s: two of them, of the outputs that have half,
-    by the effects that act there."""
-    given = {"warm_up": lambda at: 20.0}
-    problem = SimpleNamespace(**vars(binned([[range(10), [0, 1, 9]]], [[range(10), [9]]])) | given)
-    columns = [np.arange(10.0), np.array([2.0, 4.0, 6.0])]
-    lead = random_effects._Column("", 1.0, 0.0, [columns])
-    others = [
-        random_effects._Column("offset of t", 1.0, 0.0, [[np.ones(10), 0 * columns[1]]]),
-        random_effects._Column("bias of air", 1.0, 0.0, [columns]),
-        random_effects._Column("", 1.0, 0.0, [[0 * part for part in columns]]),
-    ]
-    start = SimpleNamespace(level=None)
-    found = random_effects._warm_up(problem, 0, start, 2, [others[1], lead, others[2], others[0]])
-    assert (found.effects, found.outputs) == ((1, 3), (0, 1))
-    np.testing.assert_allclose(found.columns[:, 0], [[0.5, 1.0], [2.5, 1.0]])
-    np.testing.assert_allclose(found.columns[:, 1, 0], [3.0, (4 + 0.25 + 4 + 0.5) / 2], atol=1e-9)
-    np.testing.assert_allclose(found.noise, np.sqrt(20 / 3 / 8) / np.array([2.0, 3.0]))
-    short = random_effects._Column("", 1.0, 0.0, [[columns[0], columns[1][:1]]])
-    lost = random_effects._warm_up(problem, 1, start, 2, [short])
-    assert lost.outputs == (0,)
-    for changed, which in (({"level": 0}, [lead]), ({"level": None}, [others[1]])):
-        assert random_effects._warm_up(problem, 0, SimpleNamespace(**changed), 2, which) is None
-
-
-def test_a_start_after_a_gap_is_three_times_less_certain_than_the_first():
-    model = load_network("tclab")
-    t = np.r_[0.0:300.0, 500.0:800.0]
-    columns = dict.fromkeys(model.inputs, (0 * t, "percent", "input"))
-    columns |= dict.fromkeys(model.outputs, (0 * t + 25.0, "degC", "output"))
-    problem = make_problem(model, [make_log(t, columns)], average=5.0, independent=5.0)
-    z = np.zeros(len(problem.free))
-    start, p = problem.start(z)[0][0], problem.parameters(z[None])
-    before, after = (random_effects._of_start(problem, 0, k, p, start)[-1].moves for k in (0, 1))
-    for j in range(len(model.outputs)):
-        assert not before[1][j].any()
-        assert not after[0][j].any()
-        np.testing.assert_allclose(np.abs(after[1][j]), 3 * np.abs(before[0][j]), rtol=2e-3)
-    assert max(np.abs(part).max() for part in before[0]) > 0.1
-
-
 def test_signals_of_the_discrepancy_are_about_the_air_or_the_mean():
     model = SimpleNamespace(inputs=("drive", "pump"), disturbances=("air",), switches=("pump",))
     u, d = np.array([[-1.0, 1.0], [2.0, 0.0]]), np.array([[20.0], [21.0]])
@@ -249,23 +136,3 @@ def test_signals_of_the_discrepancy_are_about_the_air_or_the_mean():
     model.disturbances = ()
     still = random_effects.signals(model, u, np.zeros((2, 0)), np.array([[25.0], [18.0], [23.0]]))
     assert still["v |v|"].tolist() == [9.0, -16.0]
-    assert random_effects._is_twin("|pump|", [[{"|pump|": u[:, 1], "pump": u[:, 1]}]])
-    assert not random_effects._is_twin("|drive|", [[{"|drive|": abs(u[:, 0]), "drive": u[:, 0]}]])
-    assert not random_effects._is_twin("drive", [[{}]])
-
-
-def test_responses_together_have_half_a_sensors_sd():
-    """A held input behind a lag of 2, 8 and 32 bins: three responses a signal,
-    in the units of the readings."""
-    problem = SimpleNamespace(**vars(binned([[[0, 1, 2], [4]]])) | {"sd": np.array([0.1, 0.4])})
-    given = [[{"u": np.ones(399)}]]
-    response, parts = random_effects._of_rms(problem, given, "u", 8.0, 0.25)
-    slow = 1 - np.exp(-np.arange(400) / 8.0)
-    means = [slow[:12].reshape(3, 4).mean(axis=1), slow[16:20].mean(keepdims=True)]
-    rms = np.sqrt((np.mean(means[0] ** 2) + np.mean(means[1] ** 2)) / 2)
-    assert response.rms == pytest.approx(rms)
-    np.testing.assert_allclose(response.size, 0.25 * np.array([0.1, 0.4]) / rms)
-    np.testing.assert_allclose(parts[0][0][0], 0.25 * 0.1 / rms * means[0])
-    np.testing.assert_allclose(parts[0][0][1], 0.25 * 0.4 / rms * means[1])
-    nothing, none = random_effects._of_rms(problem, [[{"u": np.zeros(399)}]], "u", 8.0, 0.25)
-    assert (nothing.size.tolist(), none[0][0][0].tolist()) == ([0.0, 0.0], [0.0] * 3)

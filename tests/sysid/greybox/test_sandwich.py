@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,7 +14,6 @@ from scipy.stats import chi2
 
 from tests.sysid.greybox.makers import TRUTH, TwoGains, a_log, heater, made
 from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.schema import Log
 from thermogrip.sysid.greybox import noise_model
 from thermogrip.sysid.greybox import sandwich as module
 from thermogrip.sysid.greybox.fit import fit_network, levenberg_marquardt
@@ -30,7 +28,6 @@ from thermogrip.sysid.greybox.sandwich import (
 )
 from thermogrip.sysid.models.network import NetworkModel
 from thermogrip.sysid.models.network_spec import network_from_dict
-from thermogrip.sysid.plant.plant import Plant
 
 N, N_Z, N_TERM, N_OWN = 60, 3, 2, 2
 OUTPUTS = ((0, 1), (0, 1), (1,))
@@ -89,13 +86,6 @@ def test_cosines_make_an_autoregressive_error_nearly_diagonal():
     assert np.repeat(S, np.diff(noise_model._bands(N))).sum() == pytest.approx(N)  # the variance is kept
     scaled = exact / np.sqrt(np.outer(np.diag(exact), np.diag(exact)))
     assert np.abs(scaled - np.eye(N)).max() < 0.25
-
-
-def problem_of(plant: Plant, logs: list[Log]) -> tuple[Problem, np.ndarray]:
-    model = heater()
-    problem = make_problem(model, logs, average=model.average, independent=model.independent)
-    problem = problem.with_tau(np.array([plant.scores.weight_s["t"] / problem.average]))
-    return problem, problem.standard(plant.values)
 
 
 @pytest.mark.slow
@@ -282,11 +272,6 @@ def test_logs_that_agree_better_than_they_should_count_with_the_model_as_one_mor
     assert common_factor(low, 5) == pytest.approx((1 + 4 * alone) / 5)
     assert common_factor(low, 5, cut=True) == 1.0  # quarters have much in common
     assert common_factor(np.full(4, 9.0), 5) > 9.0  # the mean of ln q is below the ln of its mean
-
-
-def test_a_discrepancy_is_stated_less_surely_than_an_effect_of_a_log():
-    data: Any = SimpleNamespace(n_responses=2, kinds=["term a", "term b", "offset of t"])
-    assert module._widths(data) == [1.5, 1.5, 0.7]
 
 
 def test_nine_bins_are_too_few_and_ten_are_not():
