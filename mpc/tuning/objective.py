@@ -68,15 +68,28 @@ from thermogrip.mpc.tuning.minimum_time import full_drive_bound
 if TYPE_CHECKING:
     from thermogrip.sysid.plant.plant import Plant
 
-#: How much runs that lack structure count in the score, and beyond what one counts by its logarithm.
-LACKING, LATE = 0.05, 5.0
-# what the whole allowed overshoot, bias or moves more cost, and a band of error where a trial does not settle
-_OVERSHOOT, _BIAS, _MOVES, _ERROR = 3.0, 0.5, 3.0, 0.5
-#: Of what is allowed, that costs nothing.
-FREE = 0.9
-_LOAD = 0.1  # of a drive's range, and of the first step: see the module's text
-_LOAD_TIMES = 6.0  # integral times that a load's trial lasts
-_SENSOR_OFF = 0.02  # of what the logs showed, a sensor of a disturbance that is no temperature of the room
+
+@dataclass(frozen=True)
+class CostSettings:
+    """What trials cost, and how large their loads are: see the module's text."""
+
+    lacking: float = 0.05  # of the mean of runs that lack structure
+    late: float = 5.0  # bounds beyond which such a run counts by its logarithm
+    overshoot: float = 3.0  # of the whole allowed overshoot more
+    bias: float = 0.5  # of the whole allowed bias more
+    moves: float = 3.0  # of the whole allowed moves more
+    error: float = 0.5  # of a band of error where a trial does not settle
+    free: float = 0.9  # of what is allowed, that costs nothing
+    load: float = 0.1  # of a drive's range, and of the first step
+    load_times: float = 6.0  # integral times that a load's trial lasts
+    sensor_off: float = 0.02  # of what the logs showed, a sensor of a disturbance that is not the room's
+    # an output that the drive can bring into its band in this share of the time that is asked of it alone
+    # goes gently: its target ramps, for this share of that time at most
+    at_ease: float = 0.7
+    ramped: float = 0.8
+
+
+COSTS = CostSettings()
 
 
 class Record:
@@ -195,17 +208,17 @@ def loads_of(plant: Plant, spec: Spec, design: Design) -> list[Load]:
         low, high = design.drive_range[name]
         drive = 0.0 if holding_drive is None else float(holding_drive[model.drives.index(name)])
         side = 1.0 if high - drive >= drive - low else -1.0
-        loads.append(Load(name, side * _LOAD * (high - low)))
+        loads.append(Load(name, side * COSTS.load * (high - low)))
     delays = zip(design.controlled, apparent_delays(plant, design.controlled))
-    return loads + [Load(name, _LOAD * (start - target), delay) for name, delay in delays]
+    return loads + [Load(name, COSTS.load * (start - target), delay) for name, delay in delays]
 
 
 def load_seconds(design: Design) -> float:
     """Return how long the trial of a load lasts [s], see the module's text."""
     spans = {name: high - low for name, (low, high) in design.drive_range.items()}
-    moving = max(_LOAD * span / design.slew_per_s[name] for name, span in spans.items())
+    moving = max(COSTS.load * span / design.slew_per_s[name] for name, span in spans.items())
     slowest = max((loop.Ti for loop in design.loops), default=0.0)
-    return max(_LOAD_TIMES * slowest + moving, 10 * design.dt)
+    return max(COSTS.load_times * slowest + moving, 10 * design.dt)
 
 
 def meets_spec(result: StepResult | Segment, spec: Spec) -> bool:
@@ -258,7 +271,7 @@ def surroundings_of(
     others = [name for name in plant.disturbances if not plant.is_room(name)]
     for name in plant.disturbances:
         low, high = plant.valid.get(name, (0.0, 0.0))
-        offset[name] = _SENSOR_OFF * (high - low) if name in others else 1.5 * spec.sensor_offset_degC
+        offset[name] = COSTS.sensor_off * (high - low) if name in others else 1.5 * spec.sensor_offset_degC
     usual = Surroundings(
         ambient=spec.ambient_degC,
         noise=spec.noise_degC,
@@ -431,7 +444,7 @@ def score(results: Sequence[StepResult], spec: Spec, scales: Scales, *, expects:
         # a plant that lacks structure is run for longer than the reference was
         default_moves = np.inf if result.lacks else scales.moves.get(result.key, np.inf)
         most = (spec.moves_limit or np.inf) * default_moves
-        cost += spec.moves_weight * result.travel + _MOVES * max(0.0, result.travel / most - FREE)
+        cost += spec.moves_weight * result.travel + COSTS.moves * max(0.0, result.travel / most - COSTS.free)
         costs.setdefault((result.load, result.lacks, *result.key[:3], result.output), []).append(cost)
     steps: list[float] = []
     loads: list[float] = []
@@ -439,10 +452,10 @@ def score(results: Sequence[StepResult], spec: Spec, scales: Scales, *, expects:
     planned = {"", *expects}
     for (load, lacks, *_), noises in costs.items():
         cost = float(np.mean(noises))
-        if lacks and cost > LATE:
-            cost = LATE * (1 + np.log(cost / LATE))
+        if lacks and cost > COSTS.late:
+            cost = COSTS.late * (1 + np.log(cost / COSTS.late))
         (loads if load else steps if lacks in planned else others).append(cost)
-    return Score(_spread(steps), _spread(loads), LACKING * float(np.mean(others)) if others else 0.0)
+    return Score(_spread(steps), _spread(loads), COSTS.lacking * float(np.mean(others)) if others else 0.0)
 
 
 def _spread(costs: Sequence[float]) -> float:
@@ -456,17 +469,17 @@ def _cost_of_step(result: StepResult, spec: Spec, scales: Scales) -> float:
     # sooner than an output's own time wins nothing
     cost = max(result.settle_s, limits.pace_s) / unit
     if np.isfinite(result.settle_s):
-        cost += _BIAS * max(0.0, abs(result.bias) / limits.bias_degC - FREE)
+        cost += COSTS.bias * max(0.0, abs(result.bias) / limits.bias_degC - COSTS.free)
     else:
-        cost = result.length_s / unit + _ERROR * abs(result.last_error) / limits.band_degC
-    cost += _OVERSHOOT * max(0.0, result.overshoot / limits.overshoot_degC - FREE)
+        cost = result.length_s / unit + COSTS.error * abs(result.last_error) / limits.band_degC
+    cost += COSTS.overshoot * max(0.0, result.overshoot / limits.overshoot_degC - COSTS.free)
     return float(cost + spec.energy_weight * result.energy_s / unit)
 
 
 def _cost_of_load(result: StepResult, spec: Spec, scales: Scales) -> float:
     cost = result.iae / max(scales.iae[result.key], 1e-12)
     if not np.isfinite(result.settle_s):
-        cost += _ERROR * abs(result.last_error) / spec.asked(result.output).band_degC
+        cost += COSTS.error * abs(result.last_error) / spec.asked(result.output).band_degC
     return float(cost)
 
 
@@ -494,19 +507,14 @@ def ramped_bounds(bounds: Bounds, design: Design, spec: Spec) -> Bounds:
     return ramped
 
 
-#: An output that the drive can bring into its band in this share of the time that is asked of it alone goes
-#: gently: its target ramps, for so long at most.
-AT_EASE, RAMPED = 0.7, 0.8
-
-
 def paced(design: Design, spec: Spec, bounds: Bounds) -> Design:
     """Return the design with a ramp for each output that may take its time, as slow as its longest step."""
     ramps = dict(design.ramp_per_s)
     for name in design.controlled:
         pace_s = spec.asked(name).pace_s
         slowest = max((bound for key, bound in bounds.items() if key[3:] == (name,)), default=np.inf)
-        if name not in ramps and slowest <= AT_EASE * pace_s:
-            ramps[name] = max(spec.way(step, name) for step in spec.steps) / (RAMPED * pace_s)
+        if name not in ramps and slowest <= COSTS.at_ease * pace_s:
+            ramps[name] = max(spec.way(step, name) for step in spec.steps) / (COSTS.ramped * pace_s)
     return replace(design, ramp_per_s=ramps)
 
 

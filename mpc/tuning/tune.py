@@ -74,14 +74,26 @@ from thermogrip.mpc.tuning.objective import (
 if TYPE_CHECKING:
     from thermogrip.sysid.plant.plant import Plant
 
-_WON = 0.03  # relative fall of the score that counts
-_NEAR = 1.25  # settling over bound that counts as the actuator's limit
-_CHECK_FROM = 100  # draws of the comparison, apart from those of the search
-_NOISES = 2  # in which each trial of a search is run: one noise alone moves a score by a tenth
-#: By which a search first varies each parameter.  Score over the default's on unseen draws of four plants
-#: (geometric mean): .971; subplex .982 from 2 and from 4 on; a compass search .970.
-_FIRST_FACTOR = 2.0
-_LAST_FACTOR = 1.1  # and below which it stops: a tenth more or less moves a score by less than noise does
+
+@dataclass(frozen=True)
+class SearchSettings:
+    """How designs are searched and compared."""
+
+    won: float = 0.03  # relative fall of the score that counts
+    near: float = 1.25  # settling over bound that counts as the actuator's limit
+    check_from: int = 100  # draws of the comparison, apart from those of the search
+    noises: int = 2  # in which each trial of a search is run: one noise alone moves a score by a tenth
+    # by which a search first varies each parameter.  Score over the default's on unseen draws of four plants
+    # (geometric mean): .971; subplex .982 from 2 and from 4 on; a compass search .970
+    first_factor: float = 2.0
+    last_factor: float = 1.1  # and below which it stops: a tenth of it moves a score by less than noise
+    # where each part of the work ends, in shares of its time
+    scaled: float = 0.15
+    searched: float = 0.75
+    compared: float = 0.9
+
+
+SEARCH = SearchSettings()
 #: What a search varies, as a factor of the default design or of SIMC: name, smallest, largest.
 MPC_PARAMETERS = {
     "move": (0.01, 1000.0),
@@ -94,7 +106,6 @@ PI_PARAMETERS = {"Kc": (0.2, 5.0), "Ti": (0.2, 5.0), "setpoint": (0.1, 1.0)}
 #: Of a PI whose delay is below two steps of the plant: no log shows it, SIMC's gain is the highest tried.
 PI_OF_UNSEEN_DELAY = PI_PARAMETERS | {"Kc": (0.2, 1.0), "Ti": (0.6, 5.0)}
 _PARTS = ("steps", "loads")  # of a score, in none of which a tuned MPC may be worse than the default design
-_SCALED, _SEARCHED, _COMPARED = 0.15, 0.75, 0.9  # where each part of the work ends, in shares of its time
 
 
 @dataclass(frozen=True)
@@ -275,9 +286,9 @@ class Bench:
         self.plant, self.spec, self.seed = plant, spec, seed
         self.draws = draws_of(plant, spec.search_draws)
         certain = self.draws == [0]  # no draws: the comparison takes the same plant, and fresh noise
-        self.unseen = [draw + _CHECK_FROM if draw else 0 for draw in draws_of(plant, spec.check_draws)]
+        self.unseen = [draw + SEARCH.check_from if draw else 0 for draw in draws_of(plant, spec.check_draws)]
         # a noise of the comparison is none of the search's
-        self.check_seed = seed + _NOISES if certain else seed
+        self.check_seed = seed + SEARCH.noises if certain else seed
         baseline = spec.design(plant)
         draws = sorted({*self.draws, *self.unseen})
         bounds = bounds_of(plant, baseline, spec, draws)
@@ -291,9 +302,9 @@ class Bench:
         self.load_s = load_seconds(self.baseline)
         unseen_delay = max(apparent_delays(plant, controlled)) < 2 * plant.dt
         self.pi_parameters = PI_OF_UNSEEN_DELAY if unseen_delay else PI_PARAMETERS
-        show(0.5 * _SCALED, "compiling the trials")
+        show(0.5 * SEARCH.scaled, "compiling the trials")
         self._c = Controller(plant, self.baseline).c  # in whose library trials of PI loops can run
-        show(0.7 * _SCALED, "default design and the PI by SIMC")
+        show(0.7 * SEARCH.scaled, "default design and the PI by SIMC")
         self.default: Score | None = None  # of the default design, on the search's draws
         self.lengths = self._lengths(draws)
         self.scales = self._scales()
@@ -399,14 +410,15 @@ class Bench:
     def evaluate(self, kind: str, parameters: Mapping[str, float]) -> Trial:
         """Return the trial of a design on the search's draws."""
         design, results = self.design(kind, parameters), []
-        for noise in range(_NOISES):
+        for noise in range(SEARCH.noises):
             results += self.run(kind, design, self.draws, self.seed + noise, loads=not noise)
         parts_of_score = self.score(results)
         cost = parts_of_score.total
         if kind == "MPC":
             self.default = self.default or parts_of_score  # which comes first
             worse = (
-                getattr(parts_of_score, name) > (1 + _WON) * getattr(self.default, name) for name in _PARTS
+                getattr(parts_of_score, name) > (1 + SEARCH.won) * getattr(self.default, name)
+                for name in _PARTS
             )
             cost = np.inf if any(worse) else cost
         return Trial(
@@ -429,7 +441,7 @@ def _search(bench: Bench, tried: list[Trial], show: Progress) -> None:
         best = min(tried, key=lambda each: each.score)
         share = sum(counts.values()) / (most * len(ranges))
         words = f"{kind} {counts[kind]}; best so far: {best.controller}, score {best.score:.3f}"
-        show(_SCALED + (_SEARCHED - _SCALED) * share, words)
+        show(SEARCH.scaled + (SEARCH.searched - SEARCH.scaled) * share, words)
         return tried[-1]
 
     first = {kind: evaluate(kind, dict.fromkeys(limits, 1.0)) for kind, limits in ranges.items()}
@@ -460,8 +472,8 @@ def minimise(
     search.set_min_objective(cost)
     search.set_lower_bounds(low)
     search.set_upper_bounds(high)
-    search.set_initial_step(np.full(len(names), np.log(_FIRST_FACTOR)))
-    search.set_xtol_abs(np.log(_LAST_FACTOR))
+    search.set_initial_step(np.full(len(names), np.log(SEARCH.first_factor)))
+    search.set_xtol_abs(np.log(SEARCH.last_factor))
     search.set_maxeval(most + 1)
     search.optimize(start)
 
@@ -478,7 +490,10 @@ def _compare(bench: Bench, candidates: Mapping[str, Trial], show: Progress) -> d
     """Return the results of the candidates on draws that the search has not seen."""
     results: dict[str, list[StepResult]] = {}
     for name, of in candidates.items():
-        show(_SEARCHED + (_COMPARED - _SEARCHED) * len(results) / len(candidates), f"comparison: {name}")
+        show(
+            SEARCH.searched + (SEARCH.compared - SEARCH.searched) * len(results) / len(candidates),
+            f"comparison: {name}",
+        )
         design = bench.design(of.controller, of.parameters)
         results[name] = bench.run(of.controller, design, bench.unseen, bench.check_seed)
     return results
@@ -556,7 +571,7 @@ def _final(
 def kept_of(scores: Mapping[str, float], unknown: Sequence[str] = ()) -> str:
     """Return which controller is saved: a tuned MPC only where it wins what counts against the default one, a
     PI where it knows all that the spec asks for and scores less than both."""
-    mpc = "tuned" if scores["tuned"] < (1 - _WON) * scores["baseline"] else "baseline"
+    mpc = "tuned" if scores["tuned"] < (1 - SEARCH.won) * scores["baseline"] else "baseline"
     least = min(scores["tuned"], scores["baseline"])
     return "PI" if scores.get("PI", np.inf) < least and not unknown else mpc
 
@@ -604,11 +619,11 @@ def verdict_of(spec: Spec, least: float, default: float, rows: Sequence[Row]) ->
     won = 1 - least / default
     ratio = float(np.mean([row.settle_mean_s / max(row.bound_s, 1.0) for row in rows]))
     limits = _limits(rows, spec)
-    if won > _WON:
+    if won > SEARCH.won:
         return "improved", f"Its score is {100 * won:.0f} % below the default design's. {limits}"
-    if ratio <= _NEAR:
+    if ratio <= SEARCH.near:
         return "actuator-limited", f"Tuning wins {100 * won:.1f} %: the drive is the limit. {limits}"
-    few = f"less than the {100 * _WON:.0f} % that count"
+    few = f"less than the {100 * SEARCH.won:.0f} % that count"
     return "flat", f"Tuning wins {100 * won:.1f} %, {few}. {limits}"
 
 
