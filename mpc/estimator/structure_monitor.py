@@ -50,15 +50,29 @@ if TYPE_CHECKING:
     from thermogrip.mpc.estimator.observer import Observer
     from thermogrip.sysid.plant.plant import Plant
 
-REPORTED, TAKEN_BACK, MISFIT = 5.0, 2.0, 4.0
-_DELAYS, _FEWEST = 7.5, 20  # of a window, in apparent delays; the same in samples, at least
-_ENOUGH = 0.7  # of a window, from which on it is looked at
-_STATE, _GAIN = 1.0, 0.2  # standard deviations of each state at its start [degC], and of a drive's gain
-_SOLVABLE = 1e9  # degC, or standard deviations: a run beyond diverges
-_DRIFT = 0.1  # degC of a sensor in a window
-_LAG, _SLOW, _ZONE = 0.5, 6.0, 0.02  # apparent delays, apparent delays, of a drive's range
-_TRIED = 0.3  # standard deviations, of a difference quotient
-_STEPS = 2  # of Gauss-Newton
+
+@dataclass(frozen=True)
+class StructureSettings:
+    """What a window is, what an honest plant may have, and what is reported."""
+
+    reported_z: float = 5.0  # of N(0, 1): 3e-7 by chance
+    taken_back_z: float = 2.0
+    misfit: float = 4.0  # of a reading, of which an honest plant has 1: readings twice as noisy
+    window_delays: float = 7.5  # of a window, in apparent delays: a minute on the gripper
+    fewest_samples: int = 20  # of a window
+    first_look: float = 0.7  # of a window, from which on it is looked at
+    state_sd: float = 1.0  # of each state at its start, in its unit
+    gain_sd: float = 0.2  # of a drive's gain
+    drift: float = 0.1  # degC of a sensor in a window
+    lag_delays: float = 0.5  # of a slower sensor, tried
+    second_mass_delays: float = 6.0  # lag of a second mass
+    dead_zone: float = 0.02  # of a drive's range, tried
+    difference: float = 0.3  # standard deviations, of a difference quotient
+    steps: int = 2  # of Gauss-Newton
+    diverged: float = 1e9  # degC, or standard deviations
+
+
+_SET = StructureSettings()
 _MEND = "identify the plant anew"
 
 
@@ -122,7 +136,7 @@ class StructureMonitor:
         if self.spread is None:
             return
         self._delays = apparent_delays(plant, model.drives, tuple(controlled), model.dt)
-        self.window = max(_FEWEST, round(_DELAYS * max(self._delays) / model.dt))
+        self.window = max(_SET.fewest_samples, round(_SET.window_delays * max(self._delays) / model.dt))
         self.bank = [
             alternative for name, D in zip(controlled, self._delays) for alternative in _of_output(name, D)
         ]
@@ -134,7 +148,7 @@ class StructureMonitor:
             )
         for name, span in zip(model.drives, model.span):
             words = f"{name} has a dead zone of {{0}} {plant.units.get(name, '')}".strip()
-            self.bank.append(_Alternative(words, _ZONE * float(span), 0.2 * float(span), 0.25))
+            self.bank.append(_Alternative(words, _SET.dead_zone * float(span), 0.2 * float(span), 0.25))
         self.forget()
 
     def forget(self) -> None:
@@ -159,7 +173,7 @@ class StructureMonitor:
         x, w = observer.now.copy(), observer.w.copy()
         self._history.append(_Row(x, w, observer.reading(), y, u, d))
         self._count += 1
-        enough = max(_FEWEST, _ENOUGH * self.window)
+        enough = max(_SET.fewest_samples, _SET.first_look * self.window)
         if self._count >= enough and self._count % max(1, self.window // 6) == 0:
             misfit = self.misfit(observer)
             if misfit is not None:
@@ -173,12 +187,12 @@ class StructureMonitor:
             worst < of_outputs or abs(found.size[worst]) * one.unit < one.most
             for worst, one in enumerate(self.bank)
         ]
-        named = named[:of_outputs] if np.max(z[:of_outputs]) >= REPORTED else named
+        named = named[:of_outputs] if np.max(z[:of_outputs]) >= _SET.reported_z else named
         worst = int(np.argmax(np.where(named, (side * found.size / found.sd)[: len(named)], -np.inf)))
-        if np.max(z) >= REPORTED or found.chi >= MISFIT:
+        if np.max(z) >= _SET.reported_z or found.chi >= _SET.misfit:
             self.said = f"{self.bank[worst].reported(float(found.size[worst]))}: {_MEND}"
             self._at, self._sd = worst, float(found.sd[worst])
-        elif self.said and found.sd[self._at] <= 2 * self._sd and z[self._at] < TAKEN_BACK:
+        elif self.said and found.sd[self._at] <= 2 * self._sd and z[self._at] < _SET.taken_back_z:
             self.said = ""
         self.denies = not self.said
 
@@ -193,19 +207,19 @@ class StructureMonitor:
     def _fitted(self, observer: Observer, rows: Sequence[_Row]) -> _Fitted | None:
         """Return the most likely run of the model over rows; None where it is not finite."""
         model, spread = self.model, self.spread
-        if spread is None or len(rows) < _FEWEST:
+        if spread is None or len(rows) < _SET.fewest_samples:
             return None
         first, rows = rows[0], rows[1:]
         u, d, y = (np.array([getattr(row, name) for row in rows]) for name in ("u", "d", "y"))
         n_x, n_w, n_t = model.n_x, len(first.w), spread.shape[1]
-        scale = np.concatenate([_STATE * observer.unit, np.sqrt(observer.P0 + first.w**2)])
+        scale = np.concatenate([_SET.state_sd * observer.unit, np.sqrt(observer.P0 + first.w**2)])
         offset, disturbance = observer.offset + observer.found_offset, observer.disturbance
 
         def run(z: Array, drives: Array) -> Array:
             """Return the outputs (B, N sub + 1, n_y) of unknowns z (B, m) under drives (B|1, N, n_u)."""
             xw = np.concatenate([first.x, first.w]) + z[:, : n_x + n_w] * scale
             x, w, plant_numbers = xw[:, :n_x], xw[:, n_x:], z[:, n_x + n_w :]
-            pushed = drives * (1 + _GAIN * plant_numbers[:, None, n_t:])
+            pushed = drives * (1 + _SET.gain_sd * plant_numbers[:, None, n_t:])
             fine = np.repeat(
                 model.inputs(pushed + (w @ disturbance.on_drive.T * model.span)[:, None]), model.sub, axis=1
             )
@@ -216,14 +230,14 @@ class StructureMonitor:
 
         m = n_x + n_w + n_t + model.n_u
         z, weight = np.zeros(m), np.where(np.isfinite(y), 1 / np.sqrt(observer.R), 0.0)
-        readings, tried = np.nan_to_num(y), np.vstack([np.zeros(m), _TRIED * np.eye(m)])
+        readings, tried = np.nan_to_num(y), np.vstack([np.zeros(m), _SET.difference * np.eye(m)])
         with np.errstate(all="ignore"):  # a run that diverges is found below
-            for _ in range(_STEPS):
+            for _ in range(_SET.steps):
                 shown = run(z + tried, u[None])
                 at_rows = shown[:, model.sub :: model.sub]
-                J = ((at_rows[1:] - at_rows[0]) * weight / _TRIED).reshape(m, -1)
+                J = ((at_rows[1:] - at_rows[0]) * weight / _SET.difference).reshape(m, -1)
                 r = ((readings - at_rows[0]) * weight).ravel() + z @ J
-                if not (np.abs(J).max() < _SOLVABLE and np.abs(r).max() < _SOLVABLE):
+                if not (np.abs(J).max() < _SET.diverged and np.abs(r).max() < _SET.diverged):
                     return None
                 last, z = z, np.linalg.solve(J @ J.T + np.eye(m), J @ r)
         return _Fitted(run, last, J, r, shown[0], weight, u)
@@ -234,7 +248,7 @@ class StructureMonitor:
         before, first = rows[: -self.window], rows[-self.window :][0]
         per_drive = np.eye(model.n_u)[:, None]
         late = u + per_drive * self._share_late * (np.vstack([first.u, u[:-1]]) - u)
-        cut = np.sign(u) * np.maximum(np.abs(u) - per_drive * _ZONE * model.span, 0.0)
+        cut = np.sign(u) * np.maximum(np.abs(u) - per_drive * _SET.dead_zone * model.span, 0.0)
         drives = np.concatenate([late, cut])
         with np.errstate(all="ignore"):
             other = found.run(np.repeat(found.z[None], 2 * model.n_u, axis=0), drives)
@@ -256,8 +270,11 @@ class StructureMonitor:
                 keep = np.exp(-step / lag)
                 return np.asarray(lfilter([1 - keep], [1, -keep], line, zi=[keep * line[0]])[0])
 
-            late, lagged = np.interp(t - D / 8, t, line), line + (through(_LAG * D) - line) / (8 * _LAG)
-            for changed in (late, lagged, through(_SLOW * D)):
+            late, lagged = (
+                np.interp(t - D / 8, t, line),
+                line + (through(_SET.lag_delays * D) - line) / (8 * _SET.lag_delays),
+            )
+            for changed in (late, lagged, through(_SET.second_mass_delays * D)):
                 column = np.zeros(((len(shown) - 1) // sub, model.n_y))
                 column[:, i] = (changed - line)[lead + sub :: sub]
                 made.append(column)
@@ -266,7 +283,7 @@ class StructureMonitor:
     def _tested(self, found: _Fitted, a: Array) -> Misfit:
         """Return what a fit says of the bank's alternatives, which add a (k, N, n_y)."""
         n_y, weight = self.model.n_y, found.weight
-        drift = _DRIFT * np.linspace(0.0, 1.0, len(weight))[:, None] * np.eye(n_y)[:, None]
+        drift = _SET.drift * np.linspace(0.0, 1.0, len(weight))[:, None] * np.eye(n_y)[:, None]
         nuisance = np.vstack([found.J, (drift * weight).reshape(n_y, -1)])
         return _tested(self.bank, nuisance, (a * weight).reshape(len(a), -1), found.r)
 
