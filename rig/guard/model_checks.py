@@ -272,8 +272,8 @@ class ModelMonitor:
         past = self._past
         s = self.settings
         plant = self.plant
-        switches = [at for at, name in enumerate(plant.inputs) if name in plant.model.switches]
-        found = []
+        switches = [index for index, name in enumerate(plant.inputs) if name in plant.model.switches]
+        residuals = []
         for length, floor in zip(s.windows, s.floors):
             begin = past.begin(past.now - length)
             if begin is None or begin.step >= past.steps.done:
@@ -289,8 +289,10 @@ class ModelMonitor:
                 start, measured = float(path[0, k]), float(readings[:, k].mean())
                 swing = max(float(np.ptp(path[:, k])), abs(measured - start))
                 change = float(ends[:, k].mean()) - start, measured - start
-                found.append(Residual("window", plant.outputs[k], length, *change, least + s.share * swing))
-        return found
+                residuals.append(
+                    Residual("window", plant.outputs[k], length, *change, least + s.share * swing)
+                )
+        return residuals
 
     def explain(self, alarm: Residual) -> list[Cause]:
         """Return what explains the readings of an alarm's window best; nothing where nothing does."""

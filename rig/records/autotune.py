@@ -242,7 +242,7 @@ class Autotune:
         plant = self.identified.plant
         targets = self._targets(plant)
         loop = PIController(plant, controlled=tuple(targets))
-        slowest = max(each.Ti for each in loop.loops)
+        slowest = max(loop_of_pi.Ti for loop_of_pi in loop.loops)
         seconds = min(self.left_s, (LOG.hold + 0.5 * LOG.bits) * slowest)
         if seconds < LOG.least_s:
             return False

@@ -304,8 +304,8 @@ def collect(folder: str | Path, *, name: str = "") -> Grasps:
     ticks = [np.round(one_grasp["time"].values / step).astype(int) for one_grasp in grasps]
     first, last = min(int(t[0]) for t in ticks), max(int(t[-1]) for t in ticks)
     readings = np.full((len(grasps), last - first + 1), np.nan)
-    for row, (one_grasp, at) in enumerate(zip(grasps, ticks)):
-        readings[row, at - first] = one_grasp["t_surface"].values[0]
+    for row, (one_grasp, places) in enumerate(zip(grasps, ticks)):
+        readings[row, places - first] = one_grasp["t_surface"].values[0]
     per_grasp: dict[str, list[Any]] = {}
     for key in (*GRASP_NUMBERS, *GRASP_LABELS):
         if any(key in one_grasp for one_grasp in grasps):

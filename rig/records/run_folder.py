@@ -515,12 +515,12 @@ def _whole_lines(path: Path, good: Any) -> _Whole:
     data = read_bytes(path)
     body, _, unended = data.rpartition(b"\n")
     lines = body.split(b"\n") if body or data.startswith(b"\n") else []
-    flags = [good(at, line) for at, line in enumerate(lines)]
-    last = max((at for at, ok in enumerate(flags) if ok), default=-1)
+    flags = [good(number, line) for number, line in enumerate(lines)]
+    last = max((number for number, ok in enumerate(flags) if ok), default=-1)
     lost = [
-        f"{path.name}, line {at + 1}: is damaged ({len(lines[at])} bytes); left out"
-        for at in range(last)
-        if not flags[at]
+        f"{path.name}, line {number + 1}: is damaged ({len(lines[number])} bytes); left out"
+        for number in range(last)
+        if not flags[number]
     ]
     tail = sum(len(line) + 1 for line in lines[last + 1 :]) + len(unended)
     if tail:
