@@ -9,6 +9,8 @@ from thermogrip.datasets.grasp_files import write_grasps as write_grasps
 from thermogrip.datasets.log_files import read_log as read_log
 from thermogrip.datasets.log_files import write_log as write_log
 from thermogrip.datasets.materials import find_material as find_material
+from thermogrip.datasets.public_sets import read_hold as read_hold
+from thermogrip.datasets.public_sets import read_toh as read_toh
 from thermogrip.datasets.resample import cut as cut
 from thermogrip.datasets.schema import Grasps as Grasps
 from thermogrip.datasets.schema import Log as Log
