@@ -6,28 +6,19 @@ what the plant keeps are the same for all.  Where the averaging is not prescribe
 the logs' own are tried: a coarse converter calls for the former, a delay for the latter.  The step that
 subspace models choose serves the other kinds as well as their own search (14 public logs: no choice differs).
 
-**Uncertainty: block bootstrap.**  A black box has no parameters whose prior and likelihood could be written
-down, and its errors are not white: they depend on the input where the structure is wrong, and differ from log
-to log.  The block bootstrap [1]_ needs neither.  The logs are cut into blocks that are longer than the
-correlation time of the errors, as many blocks are drawn with replacement, each with an initial state of its
-own, and the chosen structure is fitted to them.  The spread of these refits estimates how the fit would
-differ had the same rig been logged again.  Input and reading stay together in a block, so an error that
-depends on the input is drawn with it.  What no block contains (a drift over the whole log, a room that was
-never colder) is in no refit.  The structure is not chosen again: held-out free runs show how good it is.
-
-A refit whose blocks lack what one direction needs does not agree with the logs: refits whose free run over
-all logs errs more than 1.5 times as much as that of the fit are rejected.
-
-A plant much slower than a block cannot be refitted to blocks, nor one whose logs have few.  Then the readings
-are drawn, not the blocks: the free run of the fit plus its error times a random course w (dependent wild
-bootstrap [2]_) of mean 0, variance 1 and the correlation exp(-(t - s)^2 / l^2), l half a block.  That keeps
-inputs, lengths and starts, and the errors' size and correlation where they were.
+**Uncertainty: dependent wild bootstrap** [1]_.  A black box has no parameters whose prior and likelihood
+could be written down, and its errors are not white: they depend on the input where the structure is wrong.
+So the chosen structure is fitted anew to readings that might have been: the free run of the fit plus its
+error times a random course w of mean 0, variance 1 and the correlation exp(-(t - s)^2 / l^2), l longer than
+the errors are correlated.  That keeps inputs, lengths and starts, and the errors' size and correlation where
+they were.  The spread of the refits estimates how the fit would differ had the same rig been logged again;
+what the logs do not contain (a room that was never colder) is in no refit.  The structure is not chosen
+again: held-out free runs show how good it is.  Refits whose free run over all logs errs more than 1.5 times
+as much as that of the fit do not agree with the logs and are rejected.
 
 References
 ----------
-.. [1] H. R. Kuensch, "The jackknife and the bootstrap for general stationary observations", Annals of
-   Statistics 17 (1989).
-.. [2] X. Shao, "The dependent wild bootstrap", Journal of the American Statistical Association 105 (2010).
+.. [1] X. Shao, "The dependent wild bootstrap", Journal of the American Statistical Association 105 (2010).
 """
 
 from __future__ import annotations
@@ -36,7 +27,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from importlib import import_module
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -85,8 +75,8 @@ _MOST_FIXED = 20  # more poles, or steps of delay, than any record determines
 _AVERAGED = ("sindy", "neural")  # fitted at the averaged rate alone
 _MAX_ROWS = 8000  # beyond it one step alone is tried
 _FEWEST_ROWS = 160  # of means over five rows: eight blocks' worth of the shortest that is held out
-_BLOCKS, _BLOCK_ROWS = 16, 40  # blocks of the bootstrap in all, each of so many rows at least
-_FEWEST = 8  # blocks
+_MEMORIES, _MEMORY_ROWS = 32, 20  # l of the bootstrap: this part of the logs, and so many rows at least
+_SHORTEST = 160  # rows of logs that are resampled: l is an eighth
 _TRIES, _HOPELESS = 3, 8  # fits per draw; fits of which none agrees
 _AGREES = 1.5  # times the error of the fit
 
@@ -250,67 +240,56 @@ def _with_convention(
 def with_refits(
     fit: BlackBoxFit, n: int = 24, *, seed: int = 0, progress: Callable[[float, str], None] | None = None
 ) -> Plant:
-    """Return the plant with ``n`` refits to resampled blocks or errors, for :meth:`Plant.draw`.
+    """Return the plant with ``n`` refits to resampled errors, for :meth:`Plant.draw`.
 
     Raises a UserError where the logs are too short, or too few of the refits agree with them.
     """
     if fit.kind not in RESAMPLED:
         raise ValueError(f"{fit.kind} is not refitted; choose from {', '.join(RESAMPLED)}")
-    blocks = cut_into_blocks(fit.grid.segments)
+    rows = sum(len(segment.time) for segment in fit.grid.segments)
+    if rows < _SHORTEST:
+        problem = f"{rows} rows of {fit.grid.dt:g} s are too few to resample their errors"
+        raise UserError(f"{fit.kind}: {problem}", hint=f"a log of {_SHORTEST} rows has intervals")
     family: Callable[..., Mapping[Structure, Model]] = family_of(fit.kind)
     if fit.kind in _SEARCHED:  # from the denominators of refits before: a quarter of the time
         family = partial(family, searches=[])
-    rng, most = np.random.default_rng(seed), _AGREES * _error(fit, fit.choice.model)
-    said = []
-    for what, draw, fewest in (("blocks", _drawn_blocks, _FEWEST), ("errors", _drawn_errors, _FEWEST // 2)):
-        if len(blocks) < fewest:
-            short = f"{len(blocks)} blocks of {_BLOCK_ROWS} rows"
-            said.append(f"the logs are too short to resample {what}: {short}")
-            continue
-        refits: list[Model] = []
-        tried = 0
-        while len(refits) < n and tried < _TRIES * n and (refits or tried < _HOPELESS):
-            if progress is not None:
-                progress(len(refits) / n, f"{fit.kind}, refits to resampled {what}")
-            drawn = fit.grid.having(draw(fit, blocks, rng))
-            model, tried = family(drawn, only=fit.choice.structure).get(fit.choice.structure), tried + 1
-            if model is not None and _error(fit, model) <= most:
-                refits.append(model)
-        if len(refits) == n:
-            return replace(fit.plant, refits=tuple(refits))
-        said.append(f"of {tried} refits to resampled {what} only {len(refits)} agree with the logs")
-    raise UserError(f"{fit.kind}: {'; '.join(said)}", hint="a smaller structure, or longer logs")
+    rng, most, misses = np.random.default_rng(seed), _AGREES * _error(fit, fit.choice.model), _misses(fit)
+    refits: list[Model] = []
+    tried = 0
+    while len(refits) < n and tried < _TRIES * n and (refits or tried < _HOPELESS):
+        if progress is not None:
+            progress(len(refits) / n, f"{fit.kind}, refits to resampled errors")
+        drawn = fit.grid.having(
+            _resampled(fit.grid.segments, misses, max(_MEMORY_ROWS, rows // _MEMORIES), rng)
+        )
+        model, tried = family(drawn, only=fit.choice.structure).get(fit.choice.structure), tried + 1
+        if model is not None and _error(fit, model) <= most:
+            refits.append(model)
+    if len(refits) < n:
+        raise UserError(
+            f"{fit.kind}: of {tried} refits to resampled errors only {len(refits)} agree with the logs",
+            hint="a smaller structure, or longer logs",
+        )
+    return replace(fit.plant, refits=tuple(refits))
 
 
-def _drawn_blocks(fit: BlackBoxFit, blocks: Sequence[Segment], rng: np.random.Generator) -> list[Segment]:
-    return [blocks[k] for k in rng.integers(len(blocks), size=len(blocks))]
-
-
-def _drawn_errors(fit: BlackBoxFit, blocks: Sequence[Segment], rng: np.random.Generator) -> list[Segment]:
-    """Return the segments with the readings of the module's theory, of one course w for all outputs."""
+def _resampled(
+    segments: Sequence[Segment], misses: Sequence[Array], memory: float, rng: np.random.Generator
+) -> list[Segment]:
+    """Return the segments with readings of the module's theory, of one course w for all outputs, whose
+    correlation l is so many rows."""
     from scipy.ndimage import gaussian_filter1d  # half a second
 
-    grid, sigma = fit.grid, max(len(block.time) for block in blocks) / 4
-    # of unit white noise: its sd after the filter, which has the square root of w's correlation
-    size = (2 * sigma * np.sqrt(np.pi)) ** -0.5
+    # a Gaussian filter of sd sigma leaves white noise the correlation exp(-(t - s)^2 / (4 sigma^2))
+    sigma = memory / 2
+    sd = (2 * sigma * np.sqrt(np.pi)) ** -0.5  # of unit white noise after it
+    pad = int(4 * sigma)
     out = []
-    for segment, miss in zip(grid.segments, _misses(fit)):
-        pad = int(4 * sigma)
+    for segment, miss in zip(segments, misses):
         noise = rng.standard_normal(len(segment.time) + 2 * pad)
-        w = gaussian_filter1d(noise, sigma)[pad : pad + len(segment.time)] / size
+        w = gaussian_filter1d(noise, sigma)[pad : pad + len(segment.time)] / sd
         out.append(replace(segment, y=segment.y + miss - miss * w[:, None]))
     return out
-
-
-def cut_into_blocks(segments: tuple[Segment, ...]) -> list[Segment]:
-    """Return the segments in blocks of about the same number of rows; shorter segments stay whole."""
-    rows = max(_BLOCK_ROWS, sum(len(segment.time) for segment in segments) // _BLOCKS)
-    blocks: list[Segment] = []
-    for segment in segments:
-        n = len(segment.time)
-        edges = np.round(np.linspace(0, n, max(1, n // rows) + 1)).astype(int)
-        blocks += [segment.part(begin, end) for begin, end in pairwise(edges)]
-    return blocks
 
 
 def _error(fit: BlackBoxFit, model: Model) -> float:

@@ -23,8 +23,6 @@ from thermogrip.sysid.plant.plant import Plant
 from thermogrip.sysid.validation.free_run import FreeRun, free_run
 from thermogrip.sysid.validation.held_out import Searched
 from thermogrip.sysid.validation.prediction_bands import Band
-from thermogrip.sysid.validation.residual_tests import CorrelationTest, ResidualCorrelations
-from thermogrip.sysid.validation.verdict import Verdict
 
 
 @pytest.fixture(scope="module")
@@ -49,36 +47,6 @@ def test_a_good_free_run_is_green(run: tuple[Plant, Log, FreeRun]) -> None:
     )
     bare = replace(found, scores={name: replace(s, unit="1") for name, s in found.scores.items()})
     assert free_run_section(bare).verdict == section.verdict.replace(" degC", "")
-
-
-@pytest.mark.parametrize(
-    ("signal", "words"),
-    [
-        ("q", "residual correlation: t with q."),
-        ("t squared", "residual correlation: t with its own square."),
-    ],
-)
-def test_one_whose_residual_follows_something_is_not_green_and_says_what(
-    run: tuple[Plant, Log, FreeRun], signal: str, words: str
-) -> None:
-    _, _, found = run
-    follows = CorrelationTest(p=1e-6, size=0.02, significant=True)
-    alike = replace(found, residual=ResidualCorrelations({"t": {signal: follows}}, {}))
-    section = free_run_section(replace(alike, verdict=None))
-    assert section.tone == "warn"
-    assert words in section.verdict
-    small = free_run_section(alike)  # as small as was stated
-    assert small.tone == "good"
-    assert Text(words.capitalize()) in small.parts
-    for standing, cause, tone in (
-        ("better", "", "good"),
-        ("as stated", "", "good"),
-        ("no test", "seen", "plain"),
-        ("no test", "too little input", "warn"),
-        ("worse", "gain", "warn"),
-        ("another plant", "dynamics", "warn"),
-    ):
-        assert free_run_section(replace(alike, verdict=Verdict(standing, {"t": 1.0}, cause))).tone == tone
 
 
 def test_the_prior_of_a_network_stands_beside_what_was_learnt_and_a_black_box_has_none(
@@ -266,27 +234,6 @@ def test_parameters_answer_for_themselves_and_the_sampler_only_where_it_failed()
     loose = plant.parameters_section(replace(board, scores=replace(board.scores, identifiability=flat)))
     assert (loose.tone, loose.verdict) == ("warn", section.verdict)
     assert loose.parts[2] == Text("These cannot be estimated separately: a up, b up.")
-
-
-def test_the_table_of_models_has_a_column_a_log_of_what_was_held_out() -> None:
-    row = {"output": "t", "unit": "degC", "fit_percent": 90.0, "n": 50}
-    rows = [
-        SimpleNamespace(model=model, log=log, rmse=rmse, no_input_rmse=2 + rmse, held_out=held, **row)
-        for model, log, rmse, held in (
-            ("arx", "a", 0.1, True),
-            ("oe", "b", 0.2, True),
-            ("oe", "a", 0.9, False),
-        )
-    ]
-    found = SimpleNamespace(rows=rows)
-    table = plant.model_table(found)
-    assert table.head == ("model", "output", "a", "b", "unit")
-    assert table.rows == (
-        ("arx", "t", 0.1, None, "degC"),
-        ("oe", "t", None, 0.2, "degC"),
-        ("no\N{NO-BREAK SPACE}input", "t", 2.1, 2.2, "degC"),
-    )
-    assert [row[-1] for row in plant.held_out_table(found.rows)[1]] == ["held out", "held out", "in the fit"]
 
 
 def test_blocks_of_a_log_share_a_row_that_shows_each() -> None:

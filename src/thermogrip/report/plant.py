@@ -30,6 +30,7 @@ _BASELINES = (
     "Beside the free run: the best decay without input, the log's mean, and one step from each last "
     "reading (RMSE)"
 )
+_HELD_OUT = "Free-run RMSE on rows that were not fitted (blocks: of means over a step of the model)"
 _TIME_CONSTANTS = 6  # the slowest, in a sentence
 _STRUCTURES = 5  # of each kind, in the table of those searched
 
@@ -72,24 +73,6 @@ def held_out_table(errors: Sequence[Row]) -> Cells:
     return ("model", "log", "output", "RMSE", "unit", "fit [%]", "n", "no input", ""), tuple(out)
 
 
-def model_table(found: Identification) -> Table:
-    """Return the candidate models as a small table: a row a model and output, a column a log."""
-    held_out = [row for row in found.rows if row.held_out]
-    logs = list(dict.fromkeys(row.log for row in held_out))
-    rows = []
-    for model, output, unit in dict.fromkeys((row.model, row.output, row.unit) for row in held_out):
-        by_log = {row.log: row.rmse for row in held_out if (row.model, row.output) == (model, output)}
-        rows.append((model, output, *(by_log.get(log) for log in logs), unit))
-    for output, unit in dict.fromkeys((row.output, row.unit) for row in held_out):
-        baseline = {row.log: row.no_input_rmse for row in held_out if row.output == output}
-        rows.append(("no\N{NO-BREAK SPACE}input", output, *(baseline.get(log) for log in logs), unit))
-    return Table(
-        ("model", "output", *logs, "unit"),
-        tuple(rows),
-        "Free-run RMSE on rows that were not fitted (blocks: of means over a step of the model)",
-    )
-
-
 def identification_section(found: Identification) -> Section:
     """Return the section of the model comparison: verdict, every model's free run, data check."""
     checks = [
@@ -100,7 +83,7 @@ def identification_section(found: Identification) -> Section:
             plots.models_figure(found.rows),
             "Free-run error of every model on rows that it was not fitted to.",
         ),
-        model_table(found),
+        Table(*held_out_table([row for row in found.rows if row.held_out]), _HELD_OUT),
         Table(*signal_table(found), "Columns of the logs"),
         Table(
             ("log", "output", "RMSE", "unit", "fit [%]", "n"),
@@ -353,10 +336,7 @@ def free_run_section(
         clauses.append(f"{', '.join(run.no_better)} no better than a model without input")
     if run.verdict is not None:
         clauses.append(str(run.verdict))
-    reasons, follows, outputs = [], _followed(run), tuple(run.scores)
-    if follows:
-        reasons.append(f"residual correlation: {'; '.join(follows)}")
-    clauses += reasons if run.verdict is None else []  # else they are its details
+    outputs = tuple(run.scores)
     evidence: list[Any] = [
         *(
             Plot(
@@ -375,28 +355,15 @@ def free_run_section(
             "a line below reports the inputs with which they correlate.",
         ),
     ]
-    evidence += [Text(_sentence(f"{why[0].upper()}{why[1:]}")) for why in reasons if why not in clauses]
     evidence += [Text(_sentence(note)) for note in run.notes if note != str(run.verdict)]
     title = title or f"Free run: {name}" + (" (in the fit)" if seen else "")
     if run.verdict is None:
-        tone = "warn" if run.no_better or follows else "good"
+        tone = "warn" if run.no_better else "good"
     elif run.verdict.cause == "seen":  # an answer neither for the plant nor against it
         tone = "warn" if run.no_better else "plain"
     else:
         tone = "good" if run.verdict.standing in ("as stated", "better") and not run.no_better else "warn"
     return Section(title, tuple(evidence), f"{'; '.join(clauses)}.", tone)
-
-
-def _followed(run: FreeRun) -> list[str]:
-    """Return by output, in words, what its residual correlates with."""
-    from thermogrip.sysid.validation.residual_tests import SQUARED
-
-    clauses = []
-    for output, signals in run.residual.tests.items():
-        named = [signal for signal, test in signals.items() if test.significant]
-        words = ["its own square" if signal.endswith(SQUARED) else signal for signal in named]
-        clauses += [f"{output} with {' and '.join(words)}"] if words else []
-    return clauses
 
 
 def band_words(band: Band) -> str:

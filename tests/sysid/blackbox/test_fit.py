@@ -1,4 +1,4 @@
-"""Refits to resampled blocks differ as refits to new logs of the same plant would."""
+"""Refits to resampled errors differ as refits to new logs of the same plant would."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import make_log
 from thermogrip.sysid import Plant, identify
 from thermogrip.sysid.blackbox import fit as fitting
-from thermogrip.sysid.blackbox.fit import BlackBoxFit, cut_into_blocks, family_of, fit_black_box, with_refits
+from thermogrip.sysid.blackbox.fit import BlackBoxFit, family_of, fit_black_box, with_refits
 from thermogrip.sysid.blackbox.order_selection import Choice, Fold, Structure
 from thermogrip.sysid.models.lti import StartPrior
 from thermogrip.sysid.plant import log_grid
@@ -39,13 +39,12 @@ def fit_of(kind, log, **orders):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("what", "rows"), [("_drawn_blocks", 1200), ("_drawn_errors", 600)])
+@pytest.mark.parametrize("rows", [1200, 600])
 @pytest.mark.parametrize(
     ("kind", "orders"),
     [("oe", {"poles": 2, "delays": 2}), ("subspace", {"orders": 2, "rows": 15})],
 )
-def test_refits_spread_as_fits_to_new_logs_do(monkeypatch, kind, orders, what, rows):
-    monkeypatch.setattr(fitting, "_drawn_blocks", getattr(fitting, what))
+def test_refits_spread_as_fits_to_new_logs_do(kind, orders, rows):
     fitted, spread = [], []
     for seed in range(16):
         fit = fit_of(kind, lagged_log(seed, rows), **orders)
@@ -53,9 +52,9 @@ def test_refits_spread_as_fits_to_new_logs_do(monkeypatch, kind, orders, what, r
         fitted.append([fit.choice.model.gain()[0, 0], fit.choice.model.time_constants()[0]])
         spread.append([[m.gain()[0, 0] for m in drawn], [m.time_constants()[0] for m in drawn]])
     from_logs = np.std(fitted, axis=0, ddof=1)
-    from_blocks = np.sqrt(np.mean(np.var(spread, axis=2, ddof=1), axis=0))
+    from_refits = np.sqrt(np.mean(np.var(spread, axis=2, ddof=1), axis=0))
     # the sd of 16 values is known to 1/sqrt(30) = 18 %: three such either way
-    assert np.all(np.abs(np.log(from_blocks / from_logs)) < 0.55)
+    assert np.all(np.abs(np.log(from_refits / from_logs)) < 0.55)
 
 
 def curved_log(seed, n=900):
@@ -159,37 +158,22 @@ def test_an_order_or_delay_that_a_kind_cannot_have_is_refused(kind, fixed, says)
     assert fitting._of_order("arx", 20, 1).keywords == {"poles": (20,), "delays": (1,)}
 
 
-def test_blocks_hold_every_row_once():
-    grid = make_grid([lagged_log(0), lagged_log(1, 300).assign_attrs(name="b")], average=1.0)
-    blocks = cut_into_blocks(grid.segments)
-    for segment in grid.segments:
-        rows = np.concatenate([block.time for block in blocks if block.log == segment.log])
-        assert set(segment.time) <= set(rows)
-    assert sum(len(block.time) for block in blocks) == sum(len(s.time) for s in grid.segments)
-    for n, rows in ((1200, [75] * 16), (300, [43] * 6 + [42]), (79, [79])):  # a sixteenth, but 40 at least
-        blocks = cut_into_blocks((grid.segments[0].part(0, n),))
-        assert sorted((len(block.time) for block in blocks), reverse=True) == rows
-
-
 def test_short_logs_are_not_resampled_and_that_is_reported():
     log = lagged_log(0, 140, noise=0.02)
-    short = "too short to resample blocks: 3 .*; .*too short to resample errors: 3 "
-    with pytest.raises(UserError, match=short):
+    with pytest.raises(UserError, match="140 rows of 1 s are too few to resample their errors"):
         with_refits(fit_black_box("arx", [log], average=1.0))
     found = identify(log, models=["arx"], average=1.0)
     assert not found.plant.uncertain
     assert any("no draws" in note for note in found.notes)
 
 
-def test_a_plant_slower_than_its_blocks_is_refitted_to_its_errors():
+def test_a_plant_slower_than_its_errors_is_refitted():
     rng = np.random.default_rng(2)
     q, e = np.repeat(rng.random(16), 50), lfilter([0.6], [1, -0.8], rng.standard_normal(800))
-    y = lfilter([0, 0.01], [1, -1.96, 0.9604], q) + 0.02 * e  # two lags of 25 s, blocks of 50 rows
+    y = lfilter([0, 0.01], [1, -1.96, 0.9604], q) + 0.02 * e  # two lags of 25 s
     log = make_log(np.arange(800.0), {"q": (q, "1", "input"), "t": (25 + y, "degC", "output")})
-    fit, said = fit_of("oe", log, poles=2, delays=1), []
-    refits = with_refits(fit, 6, progress=lambda _, what: said.append(what)).refits
+    refits = with_refits(fit_of("oe", log, poles=2, delays=1), 6).refits
     assert len(refits) == 6
-    assert {what.rpartition(" ")[2] for what in said} == {"blocks", "errors"}
     assert abs(np.mean([m.gain()[0, 0] for m in refits]) - 25.0) < 0.5
 
 
@@ -365,19 +349,19 @@ def test_refits_that_err_more_than_half_as_much_again_are_left_out(monkeypatch, 
     errors = {0: 0.2, **{k: 0.3 if k <= agree + 1 else 0.301 for k in range(1, 99)}}
     monkeypatch.setattr(fitting, "family_of", lambda kind: family)
     monkeypatch.setattr(fitting, "_error", lambda fit, model: errors[model])
-    monkeypatch.setattr(fitting, "_drawn_errors", fitting._drawn_blocks)
+    monkeypatch.setattr(fitting, "_misses", lambda fit: [np.zeros((320, 1))])
     plant = fit_of("arx", lagged_log(0, 320), poles=1, delays=1, terms=()).plant
     choice = SimpleNamespace(structure="s", model=0)
     fit, said = BlackBoxFit("oe", plant, choice, stub_grid((320,))), []
     if agree < n:
         tried = {1: 6, 0: 8}[agree]  # as many as three a draw, or eight of which none agrees
-        with pytest.raises(UserError, match=f"oe: of {tried} refits to resampled blocks only {agree} agree"):
+        with pytest.raises(UserError, match=f"oe: of {tried} refits to resampled errors only {agree} agree"):
             with_refits(fit, n)
     else:
         found = with_refits(fit, n, progress=lambda *what: said.append(what))
         assert found.refits == tuple(range(2, n + 2))
-        assert said == [(k / n, "oe, refits to resampled blocks") for k in (0, *range(n))]
-    assert (set(made), len(made)) == ({("s", 8)}, 7 if agree == n else 2 * tried)
+        assert said == [(k / n, "oe, refits to resampled errors") for k in (0, *range(n))]
+    assert (set(made), len(made)) == ({("s", 1)}, 7 if agree == n else tried)
 
 
 @pytest.mark.parametrize("kind", ["arx", "oe", "subspace"])
