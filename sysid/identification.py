@@ -6,7 +6,7 @@ The candidates are ``arx``, ``oe``, ``subspace``, ``sindy``, ``neural`` (black b
 (physics). Each black box chooses its step and orders by free run over parts held out of the data that it is
 given (:mod:`thermogrip.sysid.blackbox.order_selection`); with ``leave_one_out`` a log that is left out has no
 part in that choice either.  What is held out is in :mod:`thermogrip.sysid.validation.held_out`, when a plant
-is called good in :mod:`thermogrip.sysid.validation.goodness`.
+is called good in :mod:`thermogrip.sysid.validation.verdict`.
 
 The plant that is returned is fitted to everything; its scores on its own logs are listed beside, marked as
 in-sample.
@@ -63,20 +63,18 @@ from thermogrip.sysid.plant.log_grid import match_logs, misfit, moved_before, si
 from thermogrip.sysid.plant.log_grid import rows_of as log_rows
 from thermogrip.sysid.plant.plant import Plant
 from thermogrip.sysid.validation.free_run import FreeRun, warm_up_of
-from thermogrip.sysid.validation.goodness import doubts_of, verdict_of
 from thermogrip.sysid.validation.held_out import (
     Case,
     Held,
     Row,
-    Searched,
     cases_of,
     fold_rows,
     relative_error,
     rows_of,
     run_held_out,
-    searched_rows,
 )
 from thermogrip.sysid.validation.prediction_bands import between_runs, expected_error, part_errors
+from thermogrip.sysid.validation.verdict import doubts_of, verdict_of
 
 if TYPE_CHECKING:
     from thermogrip.sysid.models.model import GreyModel
@@ -108,7 +106,6 @@ class Identification(Shown):
     notes: tuple[str, ...]  # candidates that could not be fitted, and why; the step of a black box, and why
     signals: tuple[SignalRole, ...] = ()  # what each column of the logs was taken for
     runs: tuple[FreeRun, ...] = ()  # of ``plant`` over each log, its residual not tested
-    searched: tuple[Searched, ...] = ()  # structures of the black boxes, by kind, the best first
     # of the chosen model fitted without them, over each log, or last part of one, that was held out, by name
     held_out_runs: Mapping[str, FreeRun] = field(default_factory=dict)
 
@@ -283,9 +280,9 @@ def _ask_for_excitation(checked: DataCheck, inputs: Sequence[str], log: Log) -> 
     failed = [finding for finding in checked.of("excitation") if finding.verdict == "fail"]
     if not failed:
         return
-    kept = [name for name in inputs if name not in {finding.channel for finding in failed}]
+    moved_inputs = [name for name in inputs if name not in {finding.channel for finding in failed}]
     hint = "move it in the experiment, or leave it out"
-    hint += f" with --inputs {','.join(kept)}" if 0 < len(kept) < len(inputs) else ""
+    hint += f" with --inputs {','.join(moved_inputs)}" if 0 < len(moved_inputs) < len(inputs) else ""
     says = "; ".join(finding.says for finding in failed)
     raise UserError(says, file=log_name(log), column=failed[0].channel, hint=hint + moved_before(log))
 
@@ -310,9 +307,9 @@ def _for_network(
     for log in logs:
         reason = misfit(network, log)
         if reason is not None:
-            what = "" if reason.column is None else f"{reason.column} "
+            column_words = "" if reason.column is None else f"{reason.column} "
             raise UserError(
-                f"the network {network.name} does not apply: {what}{reason.problem}",
+                f"the network {network.name} does not apply: {column_words}{reason.problem}",
                 file=reason.file,
                 hint=f"{reason.hint}; rename columns, or name another network (or none)",
             )
@@ -367,8 +364,8 @@ def _fit_black_boxes(
             if early is not None:
                 early(_judged(kind, fits[kind].plant, _Boxes([fits[kind]], [], fits[kind]), [], task, []))
     in_order = [fits[kind] for kind in boxes if kind in fits]
-    kept = choose_black_box(in_order, task.logs) if in_order else None
-    return _Boxes(in_order, [refused[kind] for kind in boxes if kind in refused], kept)
+    chosen = choose_black_box(in_order, task.logs) if in_order else None
+    return _Boxes(in_order, [refused[kind] for kind in boxes if kind in refused], chosen)
 
 
 def _to_beat(others: Sequence[BlackBoxFit], logs: Sequence[Log]) -> dict[str, float] | None:
@@ -456,11 +453,11 @@ def _fold_of(item: _FoldItem) -> _Fold:
     except UserError as error:
         fold.refused.append(f"{kind} without {_names(case)}: {error}")
         return fold
-    for held in case.held:
+    for held_out in case.held:
         try:
-            fold.runs[held.name] = run_held_out(plant, held, unseen=True)
+            fold.runs[held_out.name] = run_held_out(plant, held_out, unseen=True)
         except UserError as error:
-            fold.refused.append(f"{kind} without {held.name}: {error}")
+            fold.refused.append(f"{kind} without {held_out.name}: {error}")
     return fold
 
 
@@ -589,15 +586,15 @@ def _judged(
 ) -> Identification:
     """Return the plant with its scores and expected errors, and all that was found beside it."""
     # the last part of the kept black box is scored at the logs' own rows
-    parts = [row for fit in boxes.fits for row in fold_rows(fit)]
-    parts = [row for row in parts if not (boxes.kept_as(row.model) and row.log.startswith(TAIL))]
-    rows = [*parts, *_held_out_rows(folds)]
+    part_rows = [row for fit in boxes.fits for row in fold_rows(fit)]
+    part_rows = [row for row in part_rows if not (boxes.kept_as(row.model) and row.log.startswith(TAIL))]
+    rows = [*part_rows, *_held_out_rows(folds)]
     # the same warm-up as on what was held out, or errors of the start would stand beside ones without
     starts = [0.0 if task.options.leave_one_out else warm_up_of(log["time"].values) for log in task.logs]
     whole = [Held(log, log_name(log), start) for log, start in zip(task.logs, starts)]
-    runs = tuple(run_held_out(plant, held) for held in whole)
-    for held, run in zip(whole, runs):
-        rows += rows_of(kind, plant, held.name, run, held_out=False)
+    runs = tuple(run_held_out(plant, whole_log) for whole_log in whole)
+    for whole_log, run in zip(whole, runs):
+        rows += rows_of(kind, plant, whole_log.name, run, held_out=False)
     plant = _with_expected(plant, kind, rows, task.logs)
     refused = [line for fold in folds for line in fold.refused]
     # a fit without the last part that could not be run over it says nothing of another run either
@@ -619,20 +616,19 @@ def _judged(
         notes=notes,
         signals=task.signals,
         runs=runs,
-        searched=tuple(row for fit in boxes.fits for row in searched_rows(fit)),
         held_out_runs={name: run for fold in folds if fold.kind == kind for name, run in fold.runs.items()},
     )
 
 
 def _with_expected(plant: Plant, kind: str, rows: Sequence[Row], logs: Sequence[Log]) -> Plant:
     """Return the plant with its held-out scores and the error of another run."""
-    held = [
+    held_out = [
         # of a constant reading no share can be fitted, and JSON has no NaN
         HeldOut(row.log, row.output, row.rmse, float(np.nan_to_num(row.fit_percent)), row.unit, row.n)
         for row in rows
         if row.held_out and row.model == kind
     ]
-    plant = replace(plant, scores=replace(plant.scores, held_out=held))
+    plant = replace(plant, scores=replace(plant.scores, held_out=held_out))
     differs = _rms(between_runs(plant, logs))
     expected = {
         name: expected_error(part_errors(plant, name), differs.get(name, 0.0)) for name in plant.outputs

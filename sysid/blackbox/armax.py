@@ -33,21 +33,25 @@ def solve_armax(c: Array, records: output_error.Records, nb: int, delay: int) ->
     na, n_shared = len(c), len(c) + records.n_drive * nb + 1
     impulse, step = output_error.responses(c, records)
     columns, right = [], []
-    for at, (y, known) in enumerate(zip(records.y, records.known)):
+    for segment, (y, is_read) in enumerate(zip(records.y, records.known)):
         rows = np.arange(len(y))
-        whole = np.interp(rows, rows[known], y[known]) if known.any() else np.zeros(len(y))
+        whole = np.interp(rows, rows[is_read], y[is_read]) if is_read.any() else np.zeros(len(y))
         late = np.zeros((na, len(y)))
-        filtered, used = lfilter([1.0], np.append(1.0, c), whole), known.copy()
+        filtered, used = lfilter([1.0], np.append(1.0, c), whole), is_read.copy()
         for i in range(1, na + 1):
             late[i - 1, i:] = -filtered[:-i]
-            used[i:] &= known[:-i]
-        X = np.vstack([late, output_error.columns_of(c, records, at, nb, delay, impulse, step, lost=True)])
+            used[i:] &= is_read[:-i]
+        X = np.vstack(
+            [late, output_error.columns_of(c, records, segment, nb, delay, impulse, step, lost=True)]
+        )
         columns.append(X * used)
         right.append(filtered * used)
     shared, first = output_error.least_squares(
         [X[n_shared:] for X in columns], [X[:n_shared] for X in columns], right
     )
-    misses = [y - shared @ X[:n_shared] - own @ X[n_shared:] for y, X, own in zip(right, columns, first)]
+    misses = [
+        y - shared @ X[:n_shared] - initial @ X[n_shared:] for y, X, initial in zip(right, columns, first)
+    ]
     cost = float(sum(miss @ miss for miss in misses))
     return output_error.Solution(c, cost, shared, first, [-miss for miss in misses], misses, columns)
 

@@ -128,9 +128,9 @@ def _solve(
     n_y, n_w = len(grid.outputs), len(grid.inputs) + len(grid.disturbances) + len(terms)
     solution = np.zeros((regression.gram.shape[0], n_y))
     for output in range(n_y):
-        own = _columns(orders, regression.deep, n_y, n_w, output)
-        gram, cross = regression.gram[np.ix_(own, own)], regression.cross[own, output]
-        solution[own, output] = np.linalg.lstsq(gram, cross, rcond=1e-13)[0] / regression.size[own]
+        columns = _columns(orders, regression.deep, n_y, n_w, output)
+        gram, cross = regression.gram[np.ix_(columns, columns)], regression.cross[columns, output]
+        solution[columns, output] = np.linalg.lstsq(gram, cross, rcond=1e-13)[0] / regression.size[columns]
     lags = solution[:-1].T
     A = [lags[:, i * n_y : (i + 1) * n_y] for i in range(orders.poles)]
     first = regression.deep * n_y
@@ -152,8 +152,8 @@ def _at_rest(grid: Grid, terms: tuple[str, ...], orders: _Orders) -> list[Array]
 
 def _columns(orders: _Orders, deep: int, n_y: int, n_w: int, output: int) -> list[int]:
     """Return the columns of the full regression that this structure uses for one output."""
-    seen = range(n_y) if orders.coupled else [output]
-    past_y = [lag * n_y + j for lag in range(orders.poles) for j in seen]
+    outputs = range(n_y) if orders.coupled else [output]
+    past_y = [lag * n_y + j for lag in range(orders.poles) for j in outputs]
     first = deep * n_y
     late = range(orders.delay - 1, orders.delay + orders.poles - 1)
     return [*past_y, *(first + lag * n_w + j for lag in late for j in range(n_w)), first + deep * n_w]
@@ -174,5 +174,5 @@ def _realise(
         low = len(A) * n_y
         push[low : low + n_w] = np.eye(n_w)
         matrix[low + n_w :, low : n - n_w] = np.eye((m - 1) * n_w)
-    parts = matrix, push, np.eye(n_y, n), np.concatenate([c, np.zeros(n - n_y)])
-    return as_state_space(grid, *parts, terms=terms, origin="arx")
+    matrices = matrix, push, np.eye(n_y, n), np.concatenate([c, np.zeros(n - n_y)])
+    return as_state_space(grid, *matrices, terms=terms, origin="arx")

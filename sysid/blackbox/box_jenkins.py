@@ -35,19 +35,19 @@ ROUNDS = 2
 
 def with_noise(found: Filter, records: Records) -> Filter:
     """Return the filter fitted again with autoregressive noise; as it is where its errors are white."""
-    nb, rows = found.b.shape[1], sum(int(known.sum()) for known in records.known)
+    nb, rows = found.b.shape[1], sum(int(is_read.sum()) for is_read in records.known)
     found, misses = fit_rest(found, records)
     for _ in range(ROUNDS):
         D = autoregression(misses, records.known)
         if len(D) == 1 or min(map(len, records.y)) < 2 * len(D):
             break
         white = records.filtered(D)
-        whole = sum(int(known.sum()) for known in white.known)
+        whole = sum(int(is_read.sum()) for is_read in white.known)
         start = solve(found.a, white, nb, found.delay) if whole > rows / 2 else None  # few were lost
         if start is None:
             break
-        at = partial(solve, records=white, nb=nb, delay=found.delay)
-        better = refine(start, white, at).filter(white, nb, found.delay)
+        solve_at = partial(solve, records=white, nb=nb, delay=found.delay)
+        better = refine(start, white, solve_at).filter(white, nb, found.delay)
         found, misses = fit_rest(better, records)
     return found
 
@@ -62,10 +62,10 @@ def autoregression(errors: Sequence[Array], known: Sequence[NDArray[np.bool_]]) 
     for p in lags[1:] if r[0] > 0 else ():
         # a trace more variance: errors that are all alike have a singular matrix
         d = solve_toeplitz(np.append((1 + 1e-9) * r[0], r[1:p]), r[1 : p + 1])
-        left = 1.0 - float(d @ r[1 : p + 1]) / r[0]
-        if left <= 0.0:  # covariances of a record with gaps need not be those of any process
+        remaining = 1.0 - float(d @ r[1 : p + 1]) / r[0]
+        if remaining <= 0.0:  # covariances of a record with gaps need not be those of any process
             break
-        criterion = np.log(left) + p * np.log(n) / n
+        criterion = np.log(remaining) + p * np.log(n) / n
         if criterion < best:
             best, D = criterion, np.append(1.0, -d)
     return D
@@ -83,8 +83,8 @@ class NoiseSearch(Search):
 
     def __call__(self, records: Records, na: int, nb: int, delay: int) -> Filter | None:
         """Return the best stable filter of this structure."""
-        found = super().__call__(records, na, nb, delay)
-        return None if found is None else with_noise(found, records)
+        fitted = super().__call__(records, na, nb, delay)
+        return None if fitted is None else with_noise(fitted, records)
 
 
 bj_family = partial(oe_family, search=NoiseSearch)

@@ -320,8 +320,8 @@ def _plant(grid: Grid, choice: Choice, logs: Sequence[Log]) -> Plant:
     # a simulation counts one independent reading in 10 s, the choice counted every row
     independent = min(1 + rows * grid.dt / READING_EVERY, rows + 1) / (rows + 1)
     noise, nuisance = prior.noise * scale * np.sqrt(independent), prior.nuisance * scale
-    own = [rows_of(log, (), grid.outputs, ()) for log in logs]
-    excess = reading_excess(own, grid.outputs, grid.dt)
+    log_rows = [rows_of(log, (), grid.outputs, ()) for log in logs]
+    excess = reading_excess(log_rows, grid.outputs, grid.dt)
     by_part = np.hypot(choice.rmse, [excess[name] for name in grid.outputs])  # of readings, not of means
     rmse = np.sqrt(np.mean(by_part**2, axis=0))
     scores = PlantScores(
@@ -329,10 +329,10 @@ def _plant(grid: Grid, choice: Choice, logs: Sequence[Log]) -> Plant:
         average_s=grid.dt,
         average_why=grid.why,
         reading_excess=excess,
-        reading_sd=reading_excess(own, grid.outputs, np.inf),
+        reading_sd=reading_excess(log_rows, grid.outputs, np.inf),
         folds=[fold.label for fold in choice.folds],
         held_out_rmse={name: float(v) for name, v in zip(grid.outputs, rmse)},
-        held_out_by_part={name: part.tolist() for name, part in zip(grid.outputs, by_part.T)},
+        held_out_by_part={name: errors.tolist() for name, errors in zip(grid.outputs, by_part.T)},
     )
     plant = Plant(
         choice.model,

@@ -10,22 +10,16 @@ segments, are then fitted by Levenberg-Marquardt with exact sensitivities
 s the error of the linear fit in units of the spread and rho = :data:`RIDGE`.  Each segment has an initial
 state of its own.  Several members start from different random W, U, b.
 
-**Ensemble disagreement.**  A descent may end in a poor minimum: the quarter that fits its own data worst is
-left out.  A member may fit the data and still diverge from the others elsewhere: the rest run over the
-training inputs in reverse order, which needs no readings, and the three quarters nearest to their median are
-kept.  On
-held-out stretches the mean of those errs less than that of half or of all.
+**The mean of members of all sizes.**  A descent may end in a poor minimum: the quarter that fits its own data
+worst is left out.  A member may fit the data and still diverge from the others elsewhere: the rest run over
+the training inputs in reverse order, and the three quarters nearest to their median are kept.  Single sizes
+differ from fold to fold by luck, their mean by less; in the one-standard-error rule it counts as no larger
+than the smallest.
 
-**All sizes.**  The model is the mean of members of all sizes.  Where readings are few, single sizes differ
-from fold to fold by luck, and their mean by less; in the one-standard-error rule it counts as no larger than
-the smallest.
-
-**How many.**  On held-out thirds and quarters of a two-tank record, and on fresh records of simulated ones,
-the error of the mean of 6, 12, 18, 24, 30 and 36 trained members of all sizes was 0.340, 0.311, 0.297,
-0.288, 0.285 and 0.282 V: nearly 0.270 + 0.42/n, and with other random starts it moved by 0.04 V (one sd,
-n = 36).  So the last fit trains :data:`TOGETHER` times as many members as each fold.  Twelve a fold are
-enough to choose by: with 36 the acidity of a stirred tank errs by 0.79 on its other half as well, with six
-by 1.09.
+**How many.**  On held-out parts of a two-tank record the error of the mean of n trained members was nearly
+0.270 + 0.42/n V for n = 6 to 36.  So the last fit trains :data:`TOGETHER` times as many members as each fold.
+Twelve a fold are enough to choose by: with 36 the acidity of a stirred tank errs by 0.79 on its other half as
+well, with six by 1.09.
 """
 
 from __future__ import annotations
@@ -85,12 +79,12 @@ class _Member:
 
     def padded(self, n: int, h: int) -> _Member:
         """Return the same model with more states and units, which do nothing."""
-        own, h0 = len(self.A), self.h
-        m = (len(self.weights) - own - 2 * own * h0 - h0) // (own + h0)
-        before = [(own, m), (own,), (own, h0), (h0, own), (h0, m), (h0,)]
+        states, h0 = len(self.A), self.h
+        m = (len(self.weights) - states - 2 * states * h0 - h0) // (states + h0)
+        before = [(states, m), (states,), (states, h0), (h0, states), (h0, m), (h0,)]
         after = [(n, m), (n,), (n, h), (h, n), (h, m), (h,)]
-        parts = np.split(self.weights, np.cumsum([int(np.prod(shape)) for shape in before])[:-1])
-        grown = [_grown(part.reshape(old), new).ravel() for part, old, new in zip(parts, before, after)]
+        weights = np.split(self.weights, np.cumsum([int(np.prod(shape)) for shape in before])[:-1])
+        grown = [_grown(weight.reshape(old), new).ravel() for weight, old, new in zip(weights, before, after)]
         starts = _grown(self.x0, (len(self.x0), n))
         return _Member(_grown(self.A, (n, n)), np.concatenate(grown), starts, h, self.miss)
 
@@ -211,9 +205,9 @@ def _averaged(grid: Grid, data: _Data, members: Sequence[_Member]) -> NeuralMode
     fitting = np.argsort([some.miss for some in members], kind="stable")[: int(np.ceil(KEPT * len(members)))]
     members = [members[k] for k in np.sort(fitting)]
     n, h = max(len(some.A) for some in members), max(some.h for some in members)
-    kept = _nearest_to_median(data, [some.padded(n, h) for some in members], h)
-    model = _as_model(grid, data, [members[k].padded(n, h) for k in kept], h)
-    return _with_spread(model, grid, np.stack([members[k].padded(n, h).x0 for k in kept]))
+    nearest = _nearest_to_median(data, [some.padded(n, h) for some in members], h)
+    model = _as_model(grid, data, [members[k].padded(n, h) for k in nearest], h)
+    return _with_spread(model, grid, np.stack([members[k].padded(n, h).x0 for k in nearest]))
 
 
 def _train(data: _Data, linear: _Linear, h: int, *, seed: int) -> _Member:
@@ -227,28 +221,31 @@ def _train(data: _Data, linear: _Linear, h: int, *, seed: int) -> _Member:
     theta = np.concatenate([linear.B.ravel(), linear.c, np.zeros(n * h), random, b])
     n_p, n_linear = len(theta), n * m + n
     z0 = np.concatenate([theta, *linear.x0])
-    known = [np.isfinite(y) for y in data.y]
+    is_read = [np.isfinite(y) for y in data.y]
     stiff = np.concatenate([np.ones(n_linear), np.full(n_p - n_linear, RIDGE), np.full(len(z0) - n_p, 1e-4)])
     stiff, centre = np.sqrt(stiff), z0.copy()
     centre[n_linear:n_p] = 0.0
 
     def residuals(z: Array, size: float) -> Array:
         A, weights = np.tile(linear.A, (len(z), 1, 1)), np.ascontiguousarray(z[:, :n_p])
-        parts = [stiff * (z - centre)]
-        for at, (y, w) in enumerate(zip(data.y, data.w)):
-            x0 = np.ascontiguousarray(z[:, n_p + at * n : n_p + (at + 1) * n])
+        rows_of_residuals = [stiff * (z - centre)]
+        for segment, (y, w) in enumerate(zip(data.y, data.w)):
+            x0 = np.ascontiguousarray(z[:, n_p + segment * n : n_p + (segment + 1) * n])
             x = run_states(A, weights, h, x0, w, data.low, data.high)[:, :-1, : y.shape[1]]
-            parts.append((x - y)[:, known[at]] / size)
-        return np.concatenate(parts, axis=1)
+            rows_of_residuals.append((x - y)[:, is_read[segment]] / size)
+        return np.concatenate(rows_of_residuals, axis=1)
 
     def linearise(z: Array, size: float) -> tuple[Array, Array]:
         rows, slopes = [stiff * (z - centre)], [np.diag(stiff)]
-        for at, (y, w) in enumerate(zip(data.y, data.w)):
-            own = slice(n_p + at * n, n_p + (at + 1) * n)
-            v, S = run_with_slopes(linear.A, z[:n_p], h, z[own], w, data.low, data.high)
-            J = np.zeros((int(known[at].sum()), len(z)))
-            J[:, :n_p], J[:, own] = S[known[at]][:, :n_p] / size, S[known[at]][:, n_p:] / size
-            rows.append((v - y)[known[at]] / size)
+        for segment, (y, w) in enumerate(zip(data.y, data.w)):
+            start_columns = slice(n_p + segment * n, n_p + (segment + 1) * n)
+            v, S = run_with_slopes(linear.A, z[:n_p], h, z[start_columns], w, data.low, data.high)
+            J = np.zeros((int(is_read[segment].sum()), len(z)))
+            J[:, :n_p], J[:, start_columns] = (
+                S[is_read[segment]][:, :n_p] / size,
+                S[is_read[segment]][:, n_p:] / size,
+            )
+            rows.append((v - y)[is_read[segment]] / size)
             slopes.append(J)
         return np.concatenate(rows), np.concatenate(slopes)
 
@@ -272,14 +269,14 @@ def _descend(
             tried = damping * np.array([0.1, 1.0, 10.0])
             steps = [cho_solve(cho_factor(normal + v * np.eye(len(z)), lower=True), slope) for v in tried]
             costs = (residuals(z - np.stack(steps)) ** 2).sum(axis=1)
-            at = int(np.nanargmin(costs))
-            if costs[at] < cost:
+            best = int(np.nanargmin(costs))
+            if costs[best] < cost:
                 break
             damping *= 100.0
-        if not costs[at] < cost:
+        if not costs[best] < cost:
             return z
-        z, damping = z - steps[at], max(float(tried[at]), 1e-6)
-        if cost - costs[at] < 2e-3 * cost:
+        z, damping = z - steps[best], max(float(tried[best]), 1e-6)
+        if cost - costs[best] < 2e-3 * cost:
             return z
     return z
 
@@ -311,7 +308,9 @@ def _as_model(grid: Grid, data: _Data, members: Sequence[_Member], h: int) -> Ne
     shapes = {"B": (n, m), "c": (n,), "V": (n, h), "W": (h, n), "U": (h, m), "b": (h,)}
     ends = np.cumsum([int(np.prod(shape)) for shape in shapes.values()])
     shaped = zip(shapes.items(), np.split(weights, ends[:-1], axis=1))
-    parts: dict[str, Any] = {name: part.reshape(count, *shape) for (name, shape), part in shaped}
+    weights_by_name: dict[str, Any] = {
+        name: weight.reshape(count, *shape) for (name, shape), weight in shaped
+    }
     return NeuralModel(
         grid.inputs,
         grid.disturbances,
@@ -319,7 +318,7 @@ def _as_model(grid: Grid, data: _Data, members: Sequence[_Member], h: int) -> Ne
         grid.switches,
         grid.dt,
         A=np.stack([some.A for some in members]),
-        **parts,
+        **weights_by_name,
         y_middle=data.y_middle,
         y_size=data.y_size,
         w_middle=data.w_middle,
@@ -332,6 +331,6 @@ def _as_model(grid: Grid, data: _Data, members: Sequence[_Member], h: int) -> Ne
 
 def _with_spread(model: NeuralModel, grid: Grid, starts: Array) -> NeuralModel:
     """Return the model with the covariance of its states over the training data; starts (K, n_segment, n)."""
-    rows = [model.states(starts[:, at], s.u, s.d, grid.dt) for at, s in enumerate(grid.segments)]
+    rows = [model.states(starts[:, segment], s.u, s.d, grid.dt) for segment, s in enumerate(grid.segments)]
     spread = np.atleast_2d(np.cov(np.concatenate(rows).T))
     return replace(model, spread=spread + 1e-8 * np.trace(spread) * np.eye(model.n_x))

@@ -1,16 +1,15 @@
 """Order selection by free run on held-out parts.
 
 One-step error cannot choose a model: on a slow plant the last reading alone predicts the next one well,
-input or not. Every structure is therefore fitted on part of the training data and *simulated* over the
-rest. With three or more logs each log is held out in turn: a run from its start.  Of one or two logs
+input or not. Every structure is therefore fitted on part of the data and *simulated* over the rest. With
+three or more logs each log is held out in turn: a run from its start.  Of one or two logs
 
 * each of four consecutive blocks is: the readings of a short warm-up set the state, the others are scored,
   and the second half is run once more from a warm-up of its own;
-* and the last 30 percent of each log, run from the start of the log.  A block is shorter than another run
-  would be: what grows slowly, the drift of an integrator or of a pole that is a little too slow, shows here.
+* and the last 30 percent of each log, run from the start of the log: a block is too short to show the drift
+  of an integrator or of a pole that is a little too slow.
 
-A part that alone moves an input (the only one that stops the pump, the one with the step) is not held out:
-a model fitted to the others cannot know that input.
+A part that alone moves an input is not held out: a model fitted to the others cannot know that input.
 
 **The one-standard-error rule.** With e_sf the error of structure s on part f and b the best structure, the
 smallest structure is taken for which
@@ -127,17 +126,17 @@ def folds(grid: Grid, *, blocks: int = _BLOCKS) -> list[Fold]:
     else:
         parts = [*_blocks(grid, blocks), _last_parts(grid)]
     range_of = np.ptp(np.concatenate([segment.u for segment in grid.segments]), axis=0)
-    known = [part for part in parts if _moves_all(part[1], than=part[2], least=MOVED * range_of)]
-    kept = known if len(known) >= 2 else parts
-    return [Fold(label, grid.having(rest), tuple(runs)) for label, rest, runs in kept]
+    excited = [part for part in parts if _moves_all(part[1], than=part[2], least=MOVED * range_of)]
+    used = excited if len(excited) >= 2 else parts
+    return [Fold(label, grid.having(training), tuple(runs)) for label, training, runs in used]
 
 
 _Part: TypeAlias = "tuple[str, list[Segment], list[Run]]"  # what is held out, the rest, what is run
 
 
 def _whole_log(grid: Grid, name: str) -> _Part:
-    rest = [segment for segment in grid.segments if segment.log != name]
-    return name, rest, [Run(segment) for segment in grid.segments if segment.log == name]
+    training = [segment for segment in grid.segments if segment.log != name]
+    return name, training, [Run(segment) for segment in grid.segments if segment.log == name]
 
 
 def _blocks(grid: Grid, blocks: int) -> list[_Part]:
@@ -151,24 +150,26 @@ def _blocks(grid: Grid, blocks: int) -> list[_Part]:
     edges = [round(total * block / blocks) for block in range(blocks + 1)]
     parts: list[_Part] = []
     for at, (first, last) in enumerate(pairwise(edges)):
-        held, rest = _split(grid.segments, first, last)
-        halves = [segment.part(len(segment.time) // 2, len(segment.time)) for segment in held]
-        parts.append((f"block {at + 1} of {blocks}", rest, [Run(segment) for segment in (*held, *halves)]))
+        inside, outside = _split(grid.segments, first, last)
+        halves = [segment.part(len(segment.time) // 2, len(segment.time)) for segment in inside]
+        parts.append(
+            (f"block {at + 1} of {blocks}", outside, [Run(segment) for segment in (*inside, *halves)])
+        )
     return parts
 
 
 def _last_parts(grid: Grid) -> _Part:
     """Return the last part of each log, to be run from the log's start."""
-    rest: list[Segment] = []
+    training: list[Segment] = []
     runs: list[Run] = []
     for log in grid.logs:
         segments = [segment for segment in grid.segments if segment.log == log]
         begin, end = segments[0].time[0], segments[-1].time[-1]
         for segment in segments:
-            at = int(np.searchsorted(segment.time, begin + (1 - HELD_OUT_SHARE) * (end - begin)))
-            rest += [segment.part(0, at)] if at >= FEWEST else []
-            runs += [Run(segment, at)] if at < len(segment.time) else []
-    return f"{TAIL}{' and '.join(grid.logs)}", rest, runs
+            cut = int(np.searchsorted(segment.time, begin + (1 - HELD_OUT_SHARE) * (end - begin)))
+            training += [segment.part(0, cut)] if cut >= FEWEST else []
+            runs += [Run(segment, cut)] if cut < len(segment.time) else []
+    return f"{TAIL}{' and '.join(grid.logs)}", training, runs
 
 
 def priors_of(grid: Grid) -> tuple[StartPrior, ...]:
@@ -197,12 +198,12 @@ def free_run_errors(
     total, count = np.zeros((len(priors), len(scale))), np.zeros(len(scale))
     for segment, scored_from in runs:
         first = max(warmup, scored_from)
-        known = np.isfinite(segment.y[first:])
+        is_read = np.isfinite(segment.y[first:])
         miss = free_run_misses(model, segment, dt=dt, scale=scale, warmup=warmup, priors=priors)[:, first:]
-        if not np.isfinite(miss[:, known]).all():
+        if not np.isfinite(miss[:, is_read]).all():
             return refused
-        total += np.sum(np.where(known, miss, 0.0) ** 2, axis=1)
-        count += known.sum(axis=0)
+        total += np.sum(np.where(is_read, miss, 0.0) ** 2, axis=1)
+        count += is_read.sum(axis=0)
     return np.sqrt(total / count) if count.all() else refused
 
 
@@ -213,13 +214,13 @@ def free_run_misses(
     memory = np.array([prior.memory for prior in priors])[:, None]
     # the memory has no part in the start
     shares = list(dict.fromkeys(replace(prior, memory=np.inf) for prior in priors))
-    at = [shares.index(replace(prior, memory=np.inf)) for prior in priors]
+    share_of_prior = [shares.index(replace(prior, memory=np.inf)) for prior in priors]
     head = (segment.y[:warmup], segment.u[:warmup], segment.d[:warmup])
     x0, offset = estimate_starts(model, *head, dt=dt, scale=scale, priors=shares)
-    seen, _ = model.rollout(x0, segment.u[None], segment.d[None], (), dt)
+    outputs, _ = model.rollout(x0, segment.u[None], segment.d[None], (), dt)
     rows = np.maximum(np.arange(len(segment.y)) - warmup / 2, 0.0)  # after the middle of the warm-up
     lasts = np.exp(-rows * dt / memory)[:, :, None]
-    return np.asarray((seen[:, :-1] - segment.y)[at] + offset[at, None] * lasts)
+    return np.asarray((outputs[:, :-1] - segment.y)[share_of_prior] + offset[share_of_prior, None] * lasts)
 
 
 def choose(
@@ -237,7 +238,7 @@ def choose(
     scored = _score(grid, family, cases, warmup, progress, beat or {})
     structure, fitted = _first_sound(grid, family, scored, warmup)
     errors = scored[structure]
-    table = {each: item.mean for each, item in scored.items()}
+    table = {structure_of_table: item.mean for structure_of_table, item in scored.items()}
     return Choice(structure, errors.prior, table, tuple(cases), errors.rmse, warmup, fitted)
 
 
@@ -309,7 +310,11 @@ def _give_up_hopeless(
     if len(wanted) < len(labels) or len(labels) < 2:
         return
     best = min(
-        float(np.mean([np.log(np.min(np.mean(each / scale, axis=1)) / w) for each, w in zip(column, wanted)]))
+        float(
+            np.mean(
+                [np.log(np.min(np.mean(by_prior / scale, axis=1)) / w) for by_prior, w in zip(column, wanted)]
+            )
+        )
         for column in errors.values()
     )
     if best > np.log(_HOPELESS):
@@ -358,7 +363,7 @@ def default_terms(grid: Grid) -> tuple[tuple[str, ...], ...]:
     heat)."""
     u = np.concatenate([segment.u for segment in grid.segments])
     signed = [n for i, n in enumerate(grid.inputs) if u[:, i].min() < 0 < u[:, i].max()]
-    curved = [n for n, each in zip(grid.inputs, u.T) if n not in signed and _shows_curvature(each)]
+    curved = [n for n, values in zip(grid.inputs, u.T) if n not in signed and _shows_curvature(values)]
     products = tuple(f"|{n}|" for n in signed) or tuple(f"{n}*{n}" for n in curved)
     return ((), products) if products else ((),)
 
@@ -374,8 +379,10 @@ def as_state_space(
     """Return x+ = A x + W w + c, y = C x as a model of the grid's signals; W (n_x, n_drive)."""
     labels = grid.inputs, grid.disturbances, grid.outputs
     B, E, F = np.split(W, np.cumsum([len(grid.inputs), len(grid.disturbances)]), axis=1)
-    parts = {"A": A, "B": B, "C": C, "E": E, "F": F, "c": c} | more
-    return StateSpaceModel(*labels, **parts, dt=grid.dt, switches=grid.switches, terms=terms, origin=origin)
+    matrices = {"A": A, "B": B, "C": C, "E": E, "F": F, "c": c} | more
+    return StateSpaceModel(
+        *labels, **matrices, dt=grid.dt, switches=grid.switches, terms=terms, origin=origin
+    )
 
 
 def with_spread(model: StateSpaceModel, grid: Grid, starts: Sequence[Array]) -> StateSpaceModel:
@@ -405,27 +412,27 @@ def smallest_near_the_best(
     usable = {item: error for item, error in table.items() if np.isfinite(error).all()}
     logs = {item: np.log(np.maximum(error, 1e-12)) for item, error in usable.items()}
     best = min(logs, key=lambda item: float(logs[item].mean()))
-    near = [item for item in logs if item == best or excess_within_noise(logs[item] - logs[best], most)]
-    return min(near, key=lambda item: (size(item), float(logs[item].mean())))
+    near_best = [item for item in logs if item == best or excess_within_noise(logs[item] - logs[best], most)]
+    return min(near_best, key=lambda item: (size(item), float(logs[item].mean())))
 
 
 def _moves_all(rest: Sequence[Segment], *, than: Sequence[Run], least: Array) -> bool:
     """Return whether the rest moves every input that these runs move by more than ``least``."""
     if not rest or not than:
         return False
-    own = np.concatenate([run.segment.u[run.scored_from :] for run in than])
+    held_out_inputs = np.concatenate([run.segment.u[run.scored_from :] for run in than])
     others = np.concatenate([segment.u for segment in rest])
-    return not np.any((np.ptp(own, axis=0) > least) & (np.ptp(others, axis=0) <= least))
+    return not np.any((np.ptp(held_out_inputs, axis=0) > least) & (np.ptp(others, axis=0) <= least))
 
 
 def _split(segments: Sequence[Segment], first: int, last: int) -> tuple[list[Segment], list[Segment]]:
     """Cut the rows first to last, counted over all segments, out of the segments."""
-    inside, outside, at = [], [], 0
+    inside, outside, first_row = [], [], 0
     for segment in segments:
         n = len(segment.time)
-        a, b = np.clip([first - at, last - at], 0, n)
+        a, b = np.clip([first - first_row, last - first_row], 0, n)
         if b > a:
             inside.append(segment.part(int(a), int(b)))
         outside += [segment.part(i, j) for i, j in ((0, int(a)), (int(b), n)) if j - i >= 20]
-        at += n
+        first_row += n
     return inside, outside

@@ -18,16 +18,13 @@ output v
 
     dv/da_i = - q^-i v / A(q)
 
-is a shift of one filtered row as well. So an iteration costs one ``scipy.signal.lfilter`` of few rows and
-one QR of them, however many lags there are.  Shifts are nearly alike where poles are slow: normal equations
-would leave costs that depend on rounding, and with them where the steps end.
+is a shift of one filtered row as well.  Shifts are nearly alike where poles are slow: normal equations would
+leave costs that depend on rounding, hence a QR.
 
-**Many structures, few searches.** The first structure of each denominator order starts from the ARX fit
-and, because that is biased towards fast poles, from real poles at several time constants between the step
-and the length of the data and from the order below with one fast pole more; all go a few steps, and the best
-two to the end. Every other structure of that order starts from its own ARX fit and from the refined
-denominators found so far, and the best of them is refined: a denominator that suits one delay is a few steps
-from that of another.
+**Many structures, few searches.** The first structure of each denominator order starts from the ARX fit,
+from real poles at several time constants and from the order below with one fast pole more; all go a few
+steps, and the best two to the end. Every other structure of that order starts from its own ARX fit and from
+the denominators found so far: one that suits one delay is a few steps from that of another.
 """
 
 from __future__ import annotations
@@ -98,16 +95,18 @@ class Solution:
 
     def slopes(self, records: Records) -> tuple[Array, Array]:
         """Return T and t of |T da - t|^2, the cost with the linear columns projected out of dv/da."""
-        na, parts = len(self.a), []
-        for v, miss, X, known in zip(self.outputs, self.misses, self.columns, records.known):
+        na, rows = len(self.a), []
+        for v, miss, X, is_read in zip(self.outputs, self.misses, self.columns, records.known):
             filtered = lfilter([1.0], np.append(1.0, self.a), v)
             J = np.zeros((na, len(v)))
             for i in range(1, na + 1):
                 J[i - 1, i:] = -filtered[:-i]
-            parts.append(np.vstack([X[len(self.shared) :], X[: len(self.shared)], J * known, miss]))
-        whole, _ = _triangles(parts, na)
-        at = len(self.shared)
-        return whole[at : at + na, at : at + na], whole[at : at + na, -1]
+            rows.append(np.vstack([X[len(self.shared) :], X[: len(self.shared)], J * is_read, miss]))
+        whole, _ = _triangles(rows, na)
+        first_own = len(self.shared)
+        return whole[first_own : first_own + na, first_own : first_own + na], whole[
+            first_own : first_own + na, -1
+        ]
 
     def filter(self, records: Records, nb: int, delay: int) -> Filter:
         """Return the filter of these numbers."""
@@ -122,17 +121,17 @@ def solve(a: Array, records: Records, nb: int, delay: int) -> Solution | None:
     n_shared = records.n_drive * nb + 1
     impulse, step = responses(a, records)
     segments = range(len(records.y))
-    columns = [columns_of(a, records, at, nb, delay, impulse, step) for at in segments]
-    right = [np.where(known, y, 0.0) for known, y in zip(records.known, records.y)]
+    columns = [columns_of(a, records, segment, nb, delay, impulse, step) for segment in segments]
+    right = [np.where(is_read, y, 0.0) for is_read, y in zip(records.known, records.y)]
     shared, first = least_squares([X[n_shared:] for X in columns], [X[:n_shared] for X in columns], right)
     outputs, misses = [], []
-    for at, known in enumerate(records.known):
+    for segment, is_read in enumerate(records.known):
         # where a reading is lost the columns are empty, yet the model runs on
-        whole = columns[at]
-        if not known.all():
-            whole = columns_of(a, records, at, nb, delay, impulse, step, lost=True)
-        outputs.append(shared @ whole[:n_shared] + first[at] @ whole[n_shared:])
-        misses.append(np.where(known, records.y[at] - outputs[-1], 0.0))
+        whole = columns[segment]
+        if not is_read.all():
+            whole = columns_of(a, records, segment, nb, delay, impulse, step, lost=True)
+        outputs.append(shared @ whole[:n_shared] + first[segment] @ whole[n_shared:])
+        misses.append(np.where(is_read, records.y[segment] - outputs[-1], 0.0))
     cost = float(sum(miss @ miss for miss in misses))
     return Solution(a, cost, shared, first, outputs, misses, columns)
 
@@ -165,9 +164,11 @@ def _triangles(parts: Sequence[Array], na: int) -> tuple[Array, list[Array]]:
     The parts are transposed, (na + n_rest, n).  Normal equations would square the condition, and columns
     that are shifts of one another are nearly dependent.
     """
-    own = [_triangle(part.T) for part in parts]
-    rest = [R[na:, na:] for R in own]
-    return (rest[0] if len(rest) == 1 else _triangle(np.concatenate(rest))), own
+    triangles = [_triangle(rows.T) for rows in parts]
+    shared_triangles = [R[na:, na:] for R in triangles]
+    return (
+        shared_triangles[0] if len(shared_triangles) == 1 else _triangle(np.concatenate(shared_triangles))
+    ), triangles
 
 
 def _triangle(rows: Array) -> Array:
@@ -185,9 +186,9 @@ def least_squares(
     na, n_own = len(own[0]), len(own) * len(own[0])
     whole, by_part = _triangles([np.vstack(trio) for trio in zip(own, shared, right)], na)
     R = np.zeros((n_own + len(whole) - 1, n_own + len(whole)))
-    for at, part in enumerate(by_part):
-        rows = slice(at * na, (at + 1) * na)
-        R[rows, rows], R[rows, n_own:] = part[:na, :na], part[:na, na:]
+    for place, triangle in enumerate(by_part):
+        rows = slice(place * na, (place + 1) * na)
+        R[rows, rows], R[rows, n_own:] = triangle[:na, :na], triangle[:na, na:]
     R[n_own:, n_own:] = whole[:-1]
     size = order_selection.column_sizes(np.sqrt((R[:, :-1] ** 2).sum(axis=0)))
     weights = np.linalg.lstsq(R[:, :-1] / size, R[:, -1], rcond=DEPENDENT)[0] / size
@@ -230,12 +231,12 @@ def fit_rest(found: Filter, records: Records) -> tuple[Filter, list[Array]]:
     end = n_drive * nb
     impulse, step = responses(a, records)
     columns, right = [], []
-    for at, known in enumerate(records.known):
-        X = columns_of(a, records, at, nb, found.delay, impulse, step)
+    for segment, is_read in enumerate(records.known):
+        X = columns_of(a, records, segment, nb, found.delay, impulse, step)
         columns.append(X[end:])
-        right.append(np.where(known, records.y[at], 0.0) - found.b.reshape(-1) @ X[:end])
+        right.append(np.where(is_read, records.y[segment], 0.0) - found.b.reshape(-1) @ X[:end])
     shared, first = least_squares([X[1:] for X in columns], [X[:1] for X in columns], right)
-    misses = [y - shared @ X[:1] - own @ X[1:] for y, X, own in zip(right, columns, first)]
+    misses = [y - shared @ X[:1] - initial @ X[1:] for y, X, initial in zip(right, columns, first)]
     return Filter(a, found.b, float(shared[0]), found.delay, first), misses
 
 
@@ -262,7 +263,7 @@ def columns_of(
     lost: bool = False,
 ) -> Array:
     """Return the filtered columns of a segment as rows (n_drive nb + 1 + na, n), 0 at lost readings."""
-    moves, known = records.moves[at], records.known[at]
+    moves, is_read = records.moves[at], records.known[at]
     n_drive, n = moves.shape
     na, end = len(a), n_drive * nb
     filtered = lfilter([1.0], np.append(1.0, a), moves, axis=1)
@@ -274,8 +275,8 @@ def columns_of(
     X[end] = step[:n]
     for row in range(min(na, n)):
         X[end + 1 + row, row:] = impulse[: n - row]
-    if not lost and not known.all():
-        X *= known
+    if not lost and not is_read.all():
+        X *= is_read
     return X
 
 
@@ -286,12 +287,12 @@ def _real_poles(tau: float, na: int) -> Array:
 
 def is_stable(a: Array) -> bool:
     """Return whether all roots lie inside of the unit circle (Schur-Cohn: every reflection is below one)."""
-    left = [value / (1 - 1e-7) ** i for i, value in enumerate(a.tolist(), start=1)]
-    while left:
-        last = left.pop()
+    coefficients = [value / (1 - 1e-7) ** i for i, value in enumerate(a.tolist(), start=1)]
+    while coefficients:
+        last = coefficients.pop()
         if not abs(last) < 1:
             return False
-        left = [(x - last * y) / (1 - last * last) for x, y in zip(left, left[::-1])]
+        coefficients = [(x - last * y) / (1 - last * last) for x, y in zip(coefficients, coefficients[::-1])]
     return True
 
 
@@ -321,9 +322,11 @@ def oe_family(
             structure = order_selection.Structure(label, size)
             if only not in (None, structure):
                 continue
-            found = [each(part, na, nb, nk) for each, part in zip(searches, records)]
-            filters = [each for each in found if each is not None]
-            if len(filters) == len(found):
+            fitted = [
+                search_of_output(record, na, nb, nk) for search_of_output, record in zip(searches, records)
+            ]
+            filters = [search_of_output for search_of_output in fitted if search_of_output is not None]
+            if len(filters) == len(fitted):
                 out[structure] = assemble(grid, filters, products, origin=kind.origin)
     return out
 
@@ -337,32 +340,34 @@ def assemble(
     of pure shift in front of the numerator, so that delays are states.
     """
     A, W, c, C = [], [], [], []
-    for each in filters:
-        na, (n_drive, nb) = len(each.a), each.b.shape
-        n = max(na, each.delay - 1 + nb)
+    for filter_of_output in filters:
+        na, (n_drive, nb) = len(filter_of_output.a), filter_of_output.b.shape
+        n = max(na, filter_of_output.delay - 1 + nb)
         block = np.diag(np.ones(n - 1), 1)
-        block[:na, 0] -= each.a
+        block[:na, 0] -= filter_of_output.a
         push = np.zeros((n, n_drive))
-        push[each.delay - 1 : each.delay - 1 + nb] = each.b.T
+        push[filter_of_output.delay - 1 : filter_of_output.delay - 1 + nb] = filter_of_output.b.T
         A.append(block)
         W.append(push)
-        c.append(np.concatenate([[each.constant], np.zeros(n - 1)]))
+        c.append(np.concatenate([[filter_of_output.constant], np.zeros(n - 1)]))
         C.append(np.eye(1, n))
-    parts = block_diag(*A), np.vstack(W), block_diag(*C), np.concatenate(c)
-    model = order_selection.as_state_space(grid, *parts, terms=terms, origin=origin)
-    starts = [_first_states(filters, w[0], at) for at, w in enumerate(order_selection.drives(grid, terms))]
+    matrices = block_diag(*A), np.vstack(W), block_diag(*C), np.concatenate(c)
+    model = order_selection.as_state_space(grid, *matrices, terms=terms, origin=origin)
+    starts = [
+        _first_states(filters, w[0], segment) for segment, w in enumerate(order_selection.drives(grid, terms))
+    ]
     return order_selection.with_spread(model, grid, starts)
 
 
 def _first_states(filters: Sequence[Filter], held: Array, segment: int) -> Array:
     """Return the state at a segment's first row, before which the drives ``held`` stood."""
     out = []
-    for each in filters:
-        na, (_, nb) = len(each.a), each.b.shape
-        x = np.zeros(max(na, each.delay - 1 + nb))
-        x[:na] += each.first[segment]
-        x[0] += each.constant
-        for lag, gain in enumerate(each.b.T @ held, start=each.delay):
+    for filter_of_output in filters:
+        na, (_, nb) = len(filter_of_output.a), filter_of_output.b.shape
+        x = np.zeros(max(na, filter_of_output.delay - 1 + nb))
+        x[:na] += filter_of_output.first[segment]
+        x[0] += filter_of_output.constant
+        for lag, gain in enumerate(filter_of_output.b.T @ held, start=filter_of_output.delay):
             x[:lag] += gain  # a drive so many rows back still acts on the rows before its lag
         out.append(x)
     return np.concatenate(out)
@@ -393,18 +398,18 @@ class Search:
     def _search(
         self, records: Records, na: int, nb: int, delay: int, at: Callable[[Array], Solution | None]
     ) -> Solution | None:
-        known = self._found.get(na, [])
-        starts = known or self.starts(records, na)
+        denominators = self._found.get(na, [])
+        starts = denominators or self.starts(records, na)
         regressed = arx_start(records, na, nb, delay)
         if regressed is not None:
             starts = [regressed, *starts]
         solved = [some for some in map(at, starts) if some is not None]
         if not solved:
             return None
-        if not known:  # the start of the least cost need not lead to it
+        if not denominators:  # the start of the least cost need not lead to it
             solved = [refine(some, records, at, FEW) for some in solved]
         cost = attrgetter("cost")
         solved.sort(key=cost)
-        best = min((refine(some, records, at) for some in solved[: 1 if known else 2]), key=cost)
-        self._found[na] = [best.a, *known][:2]
+        best = min((refine(some, records, at) for some in solved[: 1 if denominators else 2]), key=cost)
+        self._found[na] = [best.a, *denominators][:2]
         return best

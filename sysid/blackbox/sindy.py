@@ -57,13 +57,13 @@ def sindy_family(
     for degree, memory in product(degrees, memories):
         n_term = comb(memory * n_y + outside + degree, degree)
         wanted: dict[Structure, tuple[float, int]] = {}
-        for width, (at, threshold) in product(widths, enumerate(sorted(thresholds))):
+        for width, (rank, threshold) in product(widths, enumerate(sorted(thresholds))):
             if width and memory > 1:
                 continue
             # the same on every fold, however many terms survive there: all terms, less for each threshold
             label = f"degree {degree}, memory {memory}, threshold {threshold:g}"
             label += f", weak over {width} rows" if width else ""
-            structure = Structure(label, max(1, n_y * n_term - at))
+            structure = Structure(label, max(1, n_y * n_term - rank))
             if only in (None, structure):
                 wanted[structure] = threshold, width
         terms = _features(grid, degree, memory) if wanted else None
@@ -94,8 +94,8 @@ def _features(grid: Grid, degree: int, memory: int) -> _Features | None:
     z, middle, size = _scaled(x, w)
     library = pysindy.PolynomialLibrary(degree=degree)
     theta = np.asarray(library.fit_transform(np.concatenate(z)), dtype=float)
-    parts = np.split(theta, np.cumsum([len(part) for part in z])[:-1])
-    return _Features(parts, move, np.asarray(library.powers_, dtype=int), middle, size, memory)
+    runs = np.split(theta, np.cumsum([len(run) for run in z])[:-1])
+    return _Features(runs, move, np.asarray(library.powers_, dtype=int), middle, size, memory)
 
 
 def _fit(grid: Grid, terms: _Features, threshold: float, width: int) -> SindyModel | None:
@@ -124,15 +124,15 @@ def _bumped(terms: _Features, width: int) -> tuple[Array, Array]:
     """Return terms and increments, summed with bumps of ``width`` rows that overlap by three quarters."""
     if not width:
         return np.concatenate(terms.theta), np.concatenate(terms.move)
-    at = (np.arange(width) + 0.5) / width * 2 - 1
-    bump = (1 - at**2) ** 2
+    place = (np.arange(width) + 0.5) / width * 2 - 1
+    bump = (1 - place**2) ** 2
     bump /= np.linalg.norm(bump)
     out = []
-    for parts in (terms.theta, terms.move):
-        long = [part for part in parts if len(part) >= width]
-        views = [np.lib.stride_tricks.sliding_window_view(part, width, axis=0) for part in long]
+    for runs in (terms.theta, terms.move):
+        long = [rows for rows in runs if len(rows) >= width]
+        views = [np.lib.stride_tricks.sliding_window_view(rows, width, axis=0) for rows in long]
         sums = [view[:: max(1, width // 4)] @ bump for view in views]
-        out.append(np.concatenate(sums) if sums else np.empty((0, parts[0].shape[1])))
+        out.append(np.concatenate(sums) if sums else np.empty((0, runs[0].shape[1])))
     return out[0], out[1]
 
 
@@ -149,15 +149,15 @@ def _bounded(grid: Grid, exponents: NDArray[np.int_], natural: Array, memory: in
         first = segment.y[np.argmax(np.isfinite(segment.y), axis=0), np.arange(len(grid.outputs))]
         starts.append(model.rest(first, (), (), ()))
     u, d = (  # all segments at once, the shorter ones with their last row held
-        np.stack([part[np.minimum(np.arange(longest), len(part) - 1)] for part in parts])
-        for parts in ([s.u for s in grid.segments], [s.d for s in grid.segments])
+        np.stack([signal[np.minimum(np.arange(longest), len(signal) - 1)] for signal in signals])
+        for signals in ([s.u for s in grid.segments], [s.d for s in grid.segments])
     )
     runs, _ = model.rollout(np.stack(starts), u, d, (), grid.dt)
     for run, segment in zip(runs, grid.segments):
-        seen = run[: len(segment.time) + 1]
-        if not np.isfinite(seen).all():
+        outputs = run[: len(segment.time) + 1]
+        if not np.isfinite(outputs).all():
             return None
-        states.append(np.hstack([seen[memory - 1 - lag : len(seen) - lag] for lag in range(memory)]))
+        states.append(np.hstack([outputs[memory - 1 - lag : len(outputs) - lag] for lag in range(memory)]))
     spread = np.atleast_2d(np.cov(np.concatenate(states).T))
     return replace(model, spread=spread + 1e-8 * max(np.trace(spread), 1e-12) * np.eye(model.n_x))
 
@@ -179,8 +179,8 @@ def _trajectories(grid: Grid, memory: int) -> tuple[list[Array], list[Array], li
 
 
 def _whole(segment: Segment) -> list[tuple[int, int]]:
-    known = np.isfinite(segment.y).all(axis=1)
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], known, [False]]).astype(int)))
+    is_read = np.isfinite(segment.y).all(axis=1)
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], is_read, [False]]).astype(int)))
     return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
 
 
@@ -198,16 +198,16 @@ def _natural(powers: NDArray[np.int_], coefficients: Array, middle: Array, size:
         tuple(row): np.zeros(len(coefficients)) for row in powers.tolist()
     }
     for row, column in zip(powers, coefficients.T):
-        parts: dict[tuple[int, ...], float] = {(0,) * len(row): 1.0}
+        product_terms: dict[tuple[int, ...], float] = {(0,) * len(row): 1.0}
         for variable, power in enumerate(row):
             for _ in range(power):
                 bigger: dict[tuple[int, ...], float] = {}
-                for key, value in parts.items():
+                for key, value in product_terms.items():
                     up = tuple(k + (i == variable) for i, k in enumerate(key))
                     bigger[up] = bigger.get(up, 0.0) + value / size[variable]
                     bigger[key] = bigger.get(key, 0.0) - value * middle[variable] / size[variable]
-                parts = bigger
-        for key, value in parts.items():
+                product_terms = bigger
+        for key, value in product_terms.items():
             expanded[key] = expanded[key] + value * column
     keys = list(expanded)
     return np.array(keys, dtype=int), np.stack([expanded[key] for key in keys], axis=1)

@@ -23,15 +23,11 @@ output linearly, so they are a least-squares fit of the free run, not of one ste
     Y_f = Gamma_K L Z_p + H_K W_f + G_K Y_f + E,        Gamma L = (I - G_K)^-1 Gamma_K L,
 
 H_K and G_K strictly lower triangular.  The e of a row depends on none of what it is regressed on, even where
-w was fed back from y, so every row is a regression of its own; PO-MOESP and CVA take the future drives for
-independent of the noise, and are biased by feedback.  (The paper goes on with A_K and K, which asks the past
-to be longer than any memory; solved for Gamma, a short one does.)  A drive that acts on its own row's reading
-is one that ends at its row (``Grid.ends``), which the folds choose.
+w was fed back from y; PO-MOESP and CVA take the future drives for independent of the noise, and are biased by
+feedback.  (The paper goes on with A_K and K, which asks the past to be longer than any memory.)
 
 Several logs are side by side in the Hankel matrices; a window that touches a gap or a lost reading is left
-out.
-
-**Lost readings.** Where less than half of the windows are whole, short holes are lines in the Hankel matrices
+out. Where less than half of the windows are whole, short holes are lines
 (:func:`thermogrip.sysid.plant.log_grid.whole_readings`); B, E and the rest are fitted to what was read alone.
 """
 
@@ -72,7 +68,7 @@ def subspace_family(
     """Return a model for each order, number of block rows f and weighting that the data allow; where absent,
     ``rows`` are 3, 5, 8, 15 and 30 as far as the data allow (2 where they allow none), and ``terms`` none and
     the magnitudes of signed inputs, or else the squares of others."""
-    found: dict[Structure, StateSpaceModel] = {}
+    models: dict[Structure, StateSpaceModel] = {}
     longest = max(len(segment.time) for segment in grid.segments)
     sets = default_terms(grid) if terms is None else terms
     n_drive, n_y = len(grid.inputs) + len(grid.disturbances), len(grid.outputs)
@@ -87,8 +83,8 @@ def subspace_family(
             if n < f or (f == 2 and n <= n_y)
         }
         wanted = {of: name for of, name in names.items() if only in (None, name)}
-        found |= {wanted[of]: model for of, model in _realised(grid, wanted, some).items()}
-    return found
+        models |= {wanted[of]: model for of, model in _realised(grid, wanted, some).items()}
+    return models
 
 
 def _columns(f: int, n_drive: int, n_y: int) -> int:
@@ -130,8 +126,8 @@ def extended_observability(L32: Array, L33: Array, *, n_y: int, weighting: str) 
         weight = back = np.eye(L32.shape[0])
     else:
         raise ValueError(f"weighting must be 'moesp' or 'cva', got {weighting!r}")
-    left, values, _ = np.linalg.svd(weight @ L32, full_matrices=False)
-    return back @ (left * np.sqrt(values)), values
+    left_vectors, values, _ = np.linalg.svd(weight @ L32, full_matrices=False)
+    return back @ (left_vectors * np.sqrt(values)), values
 
 
 def fit_inputs(grid: Grid, A: Array, C: Array, terms: tuple[str, ...] = ()) -> StateSpaceModel:
@@ -145,15 +141,15 @@ def fit_inputs(grid: Grid, A: Array, C: Array, terms: tuple[str, ...] = ()) -> S
     n_shared = n * (len(centre) + 1)
     n_all = n_shared + n * len(grid.segments)
     blocks, targets = [], []
-    for at, (segment, drive) in enumerate(zip(grid.segments, w)):
+    for place, (segment, drive) in enumerate(zip(grid.segments, w)):
         columns = _unit_responses(drive - centre, A, C)  # (n_shared + n, N, n_y)
         block = np.zeros((*segment.y.shape, n_all))
         block[:, :, :n_shared] = np.moveaxis(columns[:n_shared], 0, 2)
-        block[:, :, n_shared + at * n : n_shared + (at + 1) * n] = np.moveaxis(columns[n_shared:], 0, 2)
-        known = np.isfinite(segment.y)
+        block[:, :, n_shared + place * n : n_shared + (place + 1) * n] = np.moveaxis(columns[n_shared:], 0, 2)
+        is_read = np.isfinite(segment.y)
         block /= scale[None, :, None]
-        blocks.append(block[known])
-        targets.append(((segment.y - y0) / scale)[known])
+        blocks.append(block[is_read])
+        targets.append(((segment.y - y0) / scale)[is_read])
     gram, right = np.concatenate(blocks), np.concatenate(targets)
     size = np.linalg.norm(gram, axis=0)
     size[size < 1e-9 * size.max()] = 1.0  # of an input that never moves only rounding would be scaled up
@@ -202,8 +198,10 @@ def _triangle(grid: Grid, f: int, terms: tuple[str, ...]) -> Array | None:
     whole = np.concatenate(signals)
     mean, size = np.nanmean(whole, axis=0), np.nanstd(whole, axis=0)
     n_w = whole.shape[1] - len(grid.outputs)
-    parts = [_windows((z - mean) / np.where(size > 0, size, 1.0), n_w, f) for z in signals if len(z) > 2 * f]
-    stacked = np.concatenate(parts) if parts else np.empty((0, 0))
+    windows = [
+        _windows((z - mean) / np.where(size > 0, size, 1.0), n_w, f) for z in signals if len(z) > 2 * f
+    ]
+    stacked = np.concatenate(windows) if windows else np.empty((0, 0))
     if stacked.shape[0] < 1.5 * stacked.shape[1] or not stacked.size:
         return None
     return np.asarray(np.linalg.qr(stacked, mode="r"))
@@ -214,11 +212,14 @@ def _factorise(triangle: Array, f: int, n_y: int) -> tuple[Array, Array]:
     # the triangle has the same inner products; of an input that hardly moves columns are dependent, and the
     # directions that a QR gives those are rounding
     future, past, ahead = _parts(triangle, f, n_y)
-    known = _span(future)
-    past, ahead = past - known @ (known.T @ past), ahead - known @ (known.T @ ahead)
+    future_basis = _span(future)
+    past, ahead = (
+        past - future_basis @ (future_basis.T @ past),
+        ahead - future_basis @ (future_basis.T @ ahead),
+    )
     state = _span(past)
-    seen = state.T @ ahead
-    return seen.T, (ahead - state @ seen).T
+    projected = state.T @ ahead
+    return projected.T, (ahead - state @ projected).T
 
 
 def _parts(triangle: Array, f: int, n_y: int) -> tuple[Array, Array, Array]:
@@ -233,20 +234,25 @@ def predictor_observability(triangle: Array, f: int, n_y: int) -> Array:
     n_w, n_z = (future.shape[1] - 1) // f, past.shape[1]
     by_past, by_readings = np.zeros((f * n_y, n_z)), np.eye(f * n_y)
     for row in range(f):
-        known = np.hstack([past, ahead[:, : row * n_y], future[:, : row * n_w], future[:, -1:]])
-        at = slice(row * n_y, (row + 1) * n_y)
-        weights = np.linalg.lstsq(known, ahead[:, at], rcond=DEPENDENT)[0].T
-        by_past[at], by_readings[at, : row * n_y] = weights[:, :n_z], -weights[:, n_z : n_z + row * n_y]
+        regressors = np.hstack([past, ahead[:, : row * n_y], future[:, : row * n_w], future[:, -1:]])
+        row_outputs = slice(row * n_y, (row + 1) * n_y)
+        weights = np.linalg.lstsq(regressors, ahead[:, row_outputs], rcond=DEPENDENT)[0].T
+        by_past[row_outputs], by_readings[row_outputs, : row * n_y] = (
+            weights[:, :n_z],
+            -weights[:, n_z : n_z + row * n_y],
+        )
     constant = future[:, -1:]
     apart = past - constant @ (constant.T @ past) / (constant.T @ constant)
-    left, values, _ = np.linalg.svd(np.linalg.solve(by_readings, by_past) @ apart.T, full_matrices=False)
-    return np.asarray(left * np.sqrt(values))
+    left_vectors, values, _ = np.linalg.svd(
+        np.linalg.solve(by_readings, by_past) @ apart.T, full_matrices=False
+    )
+    return np.asarray(left_vectors * np.sqrt(values))
 
 
 def _span(columns: Array) -> Array:
     """Return an orthonormal basis of the columns, without what only rounding spans."""
-    left, size, _ = np.linalg.svd(columns, full_matrices=False)
-    return np.asarray(left[:, size > DEPENDENT * size.max(initial=0.0)])
+    left_vectors, size, _ = np.linalg.svd(columns, full_matrices=False)
+    return np.asarray(left_vectors[:, size > DEPENDENT * size.max(initial=0.0)])
 
 
 def _windows(z: Array, n_w: int, f: int) -> Array:
@@ -255,14 +261,14 @@ def _windows(z: Array, n_w: int, f: int) -> Array:
     view = np.moveaxis(view, 2, 1)
     count = view.shape[0]
     past, future = view[:, :f], view[:, f:]
-    parts = [
+    blocks = [
         future[:, :, :n_w].reshape(count, -1),
         np.ones((count, 1)),
         past[:, :, :n_w].reshape(count, -1),
         past[:, :, n_w:].reshape(count, -1),
         future[:, :, n_w:].reshape(count, -1),
     ]
-    rows = np.hstack(parts)
+    rows = np.hstack(blocks)
     return np.asarray(rows[np.isfinite(rows).all(axis=1)])
 
 

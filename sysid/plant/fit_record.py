@@ -169,15 +169,15 @@ class PlantScores:
         """Return what :meth:`to_json` wrote; keys that it does not know are left out."""
         from pydantic import TypeAdapter, ValidationError
 
-        known = dict(content)
-        if isinstance(known.get("identifiability"), Mapping):
-            report = dict(known["identifiability"])
-            known["identifiability"] = report | {"identifiable": report.get("told")}
+        fields = dict(content)
+        if isinstance(fields.get("identifiability"), Mapping):
+            report = dict(fields["identifiability"])
+            fields["identifiability"] = report | {"identifiable": report.get("told")}
         try:
-            return TypeAdapter(cls).validate_python(known)
+            return TypeAdapter(cls).validate_python(fields)
         except ValidationError as error:
             first = error.errors()[0]
-            where = ".".join(str(part) for part in ("scores", *first["loc"]))
+            where = ".".join(str(key) for key in ("scores", *first["loc"]))
             raise ValueError(f"{where}: {first['msg']}") from error
 
 
@@ -197,26 +197,26 @@ def fit_logs(logs: Sequence[Log]) -> tuple[FitLog, ...]:
     another name is the same data."""
     from thermogrip.datasets.schema import hash_columns, log_name
 
-    found = []
+    fitted = []
     for log in logs:
         time = log["time"].values
-        known = log.attrs.get("sha256") or hash_columns(
+        sha256 = log.attrs.get("sha256") or hash_columns(
             {"time": time} | {str(name): log[name].values for name in log}
         )
-        found.append(FitLog(log_name(log), str(known), float(time[0]), float(time[-1])))
-    return tuple(found)
+        fitted.append(FitLog(log_name(log), str(sha256), float(time[0]), float(time[-1])))
+    return tuple(fitted)
 
 
 def said_of_fit(fitted_to: Sequence[FitLog], seen: FitLog) -> list[str]:
     """Return a line for each log of the fit that holds rows of the one that is ``seen``."""
-    start, stop, said = seen.start_s, seen.stop_s, []
+    start, stop, lines = seen.start_s, seen.stop_s, []
     for used in fitted_to:
         first, last = max(start, used.start_s), min(stop, used.stop_s)
         if used.sha256 != seen.sha256 or not first < last:
             continue
         whole = (first, last) == (start, stop)
-        what = "all of it is" if whole else f"{first:g} to {last:g} s of {start:g} to {stop:g} s are"
+        overlap = "all of it is" if whole else f"{first:g} to {last:g} s of {start:g} to {stop:g} s are"
         name = "" if used.name == seen.name else f" (as {used.name})"
         meaning = "the scores say how well the plant is fitted, not how well it predicts"
-        said.append(f"{what} in the fit{name}: {'' if whole else 'there '}{meaning}")
-    return said
+        lines.append(f"{overlap} in the fit{name}: {'' if whole else 'there '}{meaning}")
+    return lines

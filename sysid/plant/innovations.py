@@ -44,21 +44,21 @@ def innovation_noise(plant: PlantData, logs: Sequence[Log]) -> InnovationNoise |
     """Return the noise of a plant, and the fastest moves of its inputs, in logs of its fit; None where no
     filter settles, or a reading's noise is not known to begin with."""
     outputs, model = plant.outputs, plant.model
-    known = plant.noise | plant.scores.reading_sd
-    sd = np.array([known.get(name, 0.0) for name in outputs])
-    stretches = _as_long([part for log in logs for part in cut_stretches(plant, log)])
-    moves = np.ptp(np.concatenate([part.u for part in stretches]), axis=0) if stretches else []
+    reading_sd = plant.noise | plant.scores.reading_sd
+    sd = np.array([reading_sd.get(name, 0.0) for name in outputs])
+    stretches = _as_long([stretch for log in logs for stretch in cut_stretches(plant, log)])
+    moves = np.ptp(np.concatenate([stretch.u for stretch in stretches]), axis=0) if stretches else []
     graded = [j for j, move in enumerate(moves) if move > 0 and plant.inputs[j] not in model.switches]
     if not (np.all(sd > 0) and graded):
         return None
     try:
         with np.errstate(all="ignore"):  # a filter that diverges is the least likely one
-            found = _most_likely(plant, stretches, sd, graded)
+            estimate = _most_likely(plant, stretches, sd, graded)
     except np.linalg.LinAlgError:
         return None
-    if found is None:
+    if estimate is None:
         return None
-    state, reading, inputs = found
+    state, reading, inputs = estimate
     names = [plant.inputs[j] for j in graded]
     return InnovationNoise(
         state=state,
@@ -80,12 +80,12 @@ def _fastest(logs: Sequence[Log], name: str) -> float:
 
 def _as_long(stretches: Sequence[Stretch]) -> list[Stretch]:
     """Return the first stretches, as many as are needed."""
-    kept, steps = [], 0
+    taken, steps = [], 0
     for stretch in stretches:
         if steps < _MOST_STEPS:
-            kept.append(stretch)
+            taken.append(stretch)
         steps += len(stretch.u)
-    return kept
+    return taken
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,11 +120,11 @@ class _Filter:
         """Return the sum of e' S^-1 e by gain, and of how many innovations."""
         model, n_x, inverse = self.plant.model, self.plant.model.n_x, np.linalg.inv(spreads)
         squares, count = np.zeros(len(gains)), 0
-        for part in stretches:
-            readings = _on_grid(part, self.plant.dt) - self.offset
+        for stretch in stretches:
+            readings = _on_grid(stretch, self.plant.dt) - self.offset
             z = np.zeros((len(gains), self.F.shape[0]))
             first = np.where(np.isfinite(readings[0]), readings[0], self.middle - self.offset)
-            z[:, :n_x] = model.rest(first, part.u[0], part.d[0], self.plant.p)
+            z[:, :n_x] = model.rest(first, stretch.u[0], stretch.d[0], self.plant.p)
             for k, y in enumerate(readings):
                 if np.isfinite(y).all():
                     e = y - (z @ self.H.T + self.level)
@@ -132,18 +132,18 @@ class _Filter:
                         squares += np.einsum("bi,bij,bj->b", e, inverse, e)
                         count += 1
                     z = z + np.einsum("bij,bj->bi", gains, e)
-                u = np.repeat(part.u[k][None], len(z), axis=0)
+                u = np.repeat(stretch.u[k][None], len(z), axis=0)
                 u[:, self.graded] += z[:, n_x:]
-                z = np.hstack([_step(self.plant, z[:, :n_x], u, part.d[k]), z[:, n_x:]])
+                z = np.hstack([_step(self.plant, z[:, :n_x], u, stretch.d[k]), z[:, n_x:]])
         return squares, count
 
 
 def _step(plant: PlantData, x: Array, u: Array, d: Array) -> Array:
     """Return states (B, n_x) a step later under inputs (B, n_u)."""
-    held = np.ascontiguousarray(np.broadcast_to(d, (len(x), 1, d.size)))
+    disturbance = np.ascontiguousarray(np.broadcast_to(d, (len(x), 1, d.size)))
     numbers = np.repeat(plant.p[None], len(x), axis=0)
     x, u = np.ascontiguousarray(x), np.ascontiguousarray(u[:, None])
-    return np.asarray(plant.model.rollout(x, u, held, numbers, plant.dt)[1])
+    return np.asarray(plant.model.rollout(x, u, disturbance, numbers, plant.dt)[1])
 
 
 def _filter_of(plant: PlantData, stretches: Sequence[Stretch], graded: list[int]) -> _Filter | None:
@@ -154,7 +154,7 @@ def _filter_of(plant: PlantData, stretches: Sequence[Stretch], graded: list[int]
     C = np.array([model.output(row, p.tolist()) for row in np.eye(n_x).tolist()]).T - level[:, None]
     spread = np.sqrt(np.maximum(np.diag(np.atleast_2d(model.spread)), 1e-12))
     unit = spread / np.sqrt(np.einsum("ij,j,ij->i", C, spread**2, C)).max()
-    u, d, y = (np.concatenate([getattr(part, key) for part in stretches]) for key in "udy")
+    u, d, y = (np.concatenate([getattr(stretch, key) for stretch in stretches]) for key in "udy")
     size, middle, u0, d0 = np.ptp(u, axis=0)[graded], np.nanmean(y, axis=0), u.mean(axis=0), d.mean(axis=0)
     x0 = np.asarray(model.rest(middle - offset, u0, d0, p), dtype=float)
     tried = 1e-3 * np.concatenate([unit, size])

@@ -21,8 +21,7 @@ from thermogrip.sysid.plant.fit_record import HELD_OUT_SHARE, TAIL
 from thermogrip.sysid.plant.plant import Plant
 from thermogrip.sysid.validation.free_run import FreeRun, free_run, no_input_baseline, warm_up_of
 from thermogrip.sysid.validation.prediction_bands import check_ensemble
-
-SHOWN = 12  # structures of a kind
+from thermogrip.sysid.validation.verdict import network_name
 
 
 @dataclass(frozen=True)
@@ -56,32 +55,25 @@ class Case(NamedTuple):
     held: list[Held]
 
 
-@dataclass(frozen=True)
-class Searched:
-    """A structure of a black box (orders, delay) that was compared over the folds."""
-
-    model: str  # kind of the candidate
-    structure: str
-    error: float  # geometric mean over the folds of RMSE over the outputs' spread
-    folds: tuple[float, ...]  # the same by fold
-    kept: bool  # whether it represents its kind
-
-
 def cases_of(logs: Sequence[Log], leave_one_out: bool) -> list[Case]:
     """Return what is held out: each log in turn, or the last part of all."""
     if len({log_name(log) for log in logs}) < len(logs):
         raise UserError("two logs have the same name", hint="give each file its own name")
     if leave_one_out:
         return [
-            Case([log for log in logs if log is not held], [Held(held, log_name(held), 0.0)]) for held in logs
+            Case(
+                [log for log in logs if log is not logs_held_out],
+                [Held(logs_held_out, log_name(logs_held_out), 0.0)],
+            )
+            for logs_held_out in logs
         ]
     case = Case([], [])
     for log in logs:
         time = log["time"].values
-        at = int(np.searchsorted(time, time[0] + (1 - HELD_OUT_SHARE) * (time[-1] - time[0])))
-        case.train.append(log.isel(time=slice(0, at)))
+        cut = int(np.searchsorted(time, time[0] + (1 - HELD_OUT_SHARE) * (time[-1] - time[0])))
+        case.train.append(log.isel(time=slice(0, cut)))
         # run from the log's start: there its state is known
-        case.held.append(Held(log, f"{TAIL}{log_name(log)}", float(time[at] - time[0])))
+        case.held.append(Held(log, f"{TAIL}{log_name(log)}", float(time[cut] - time[0])))
     return [case]
 
 
@@ -112,7 +104,10 @@ def fold_rows(fit: BlackBoxFit) -> list[Row]:
     for fold, by_output in zip(fit.choice.folds, np.transpose([*fit.plant.scores.held_out_by_part.values()])):
         for k, (output, rmse) in enumerate(zip(fit.grid.outputs, by_output.tolist())):
             firsts = [max(fit.choice.warmup, run.scored_from) for run in fold.runs]
-            scored = [(run.segment.time[at:], run.segment.y[at:, k]) for run, at in zip(fold.runs, firsts)]
+            scored = [
+                (run.segment.time[first_scored:], run.segment.y[first_scored:, k])
+                for run, first_scored in zip(fold.runs, firsts)
+            ]
             scored = [(t, y) for t, y in scored if np.isfinite(y).any()]
             y = np.concatenate([y for _, y in scored])
             idle = np.concatenate([y - no_input_baseline(t, y) for t, y in scored])
@@ -124,22 +119,6 @@ def fold_rows(fit: BlackBoxFit) -> list[Row]:
     return rows
 
 
-def searched_rows(fit: BlackBoxFit) -> list[Searched]:
-    """Return the structures of a kind that are usable on every fold, the best first, at most ``SHOWN``."""
-    chosen, error_of = fit.choice.structure, fit.choice.error_of
-    rows = [
-        Searched(fit.kind, each.label, error_of(each), tuple(errors.tolist()), each == chosen)
-        for each, errors in fit.choice.errors.items()
-        if np.isfinite(errors).all()
-    ]
-    rows.sort(key=lambda row: row.error)
-    return [row for at, row in enumerate(rows) if at < SHOWN or row.kept]
-
-
 def relative_error(row: Row) -> float:
     """Return the error over that of a model without input."""
     return row.rmse / max(row.no_input_rmse, 1e-12)
-
-
-def network_name(plant: Plant) -> str:
-    return str(getattr(plant.model, "name", ""))

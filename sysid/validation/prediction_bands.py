@@ -12,9 +12,9 @@ one part that is unlike all others (a tank that overflows once) makes a band of 
 wide everywhere else.
 
 *What differs between runs* (supply voltage, air about the plant, a sensor that was glued anew) is in the
-errors of whole logs that were held out, so in those of a plant of three logs or more. One or two logs cannot
-show it, and parts of one log share it. Then the gain of the inputs varies from run to run by g ~ N(0,
-:data:`~thermogrip.sysid.plant.fit_record.RUN_GAIN_SD`^2), which adds
+errors of whole logs that were held out. A plant of one or two logs cannot show it. Then the gain of the
+inputs varies from run to run by g ~ N(0, :data:`~thermogrip.sysid.plant.fit_record.RUN_GAIN_SD`^2), so that
+one adds
 
     (v(u) - v(u - g (u - u_0)))^2,        u_0 the value nearest to 0 in the logs of the fit:
 
@@ -38,22 +38,18 @@ one reading where that was of means (:func:`thermogrip.sysid.data.data_quality.r
 
 **A run unlike the fit.** A black box knows nothing of where it has not been. Two things are added to its
 variance, both 0 on a run like those of the fit: the part of v that lies beyond the range of the readings of
-the fit (it may be wrong altogether: losses curve, supplies saturate), and by how much the readings of the
-warm-up lie beyond it (another room, to which the model does not know the way).  A gain that depends on the
-size of the moves was a third: two runs of one protocol differ by a third in that size, by chance, and the
-term made their bands 5 to 8 times as wide as their errors.
+the fit (losses curve, supplies saturate), and by how much the readings of the warm-up lie beyond it (another
+room, to which the model does not know the way).  A gain that depends on the size of the moves was no use:
+two runs of one protocol differ by a third in that size, by chance.
 
 **Ensemble disagreement.** The members of a :class:`~thermogrip.sysid.models.neural.NeuralModel` were fitted
-to the same rows from different random weights, so they agree where the data constrain them. On other drives
-and temperatures one member settles in a state of its own and another does not. The standard deviation s of
-the members about their mean over a run, beside the spread S of the output in the data of the fit, depends
-on the drives alone, so a run may be refused before its readings are used:
+to the same rows from different random weights, so they agree where the data constrain them. The standard
+deviation s of the members about their mean over a run, beside the spread S of the output in the data of the
+fit, depends on the drives alone, so a run is refused before its readings are used where
 
-    s <= :data:`MOST_DISAGREEMENT` S        or the run is refused.
+    s > :data:`MOST_DISAGREEMENT` S.
 
-The mean errs by about as much as its members differ, since they share what the data left open; a model
-without input errs by about S, and one that errs by half of that is not called good
-(:mod:`thermogrip.sysid.identification`).
+The mean errs by about as much as its members differ; a model that errs by half of S is not called good.
 """
 
 from __future__ import annotations
@@ -111,9 +107,9 @@ def expected_error(errors: Sequence[float], gain_effect: float) -> ExpectedError
     squares = PRIOR_PARTS * (2 * PRIOR_SPREAD) ** 2 + float(np.sum((logs - middle) ** 2))
     scale = float(np.sqrt(squares / freedom * (1 + 1 / n)))
     ranks = (np.arange(_RANKS) + 0.5) / _RANKS
-    parts = np.exp(middle + scale * stdtrit(freedom, ranks))
+    part_squares = np.exp(middle + scale * stdtrit(freedom, ranks))
     gains = (gain_effect * ndtri(0.5 + ranks / 2)) ** 2
-    low, high = np.sqrt(np.quantile(parts[:, None] + gains, (0.05, 0.95))).tolist()
+    low, high = np.sqrt(np.quantile(part_squares[:, None] + gains, (0.05, 0.95))).tolist()
     return ExpectedError(float(np.hypot(np.exp(middle / 2), MEDIAN * gain_effect)), low, high)
 
 
@@ -142,30 +138,32 @@ def free_run_band(
     scored = np.asarray(simulated["scored"].values) > 0
     half, inside, expected, likely = {}, {}, {}, {}
     other_run, unlike = between_runs(plant, [log]), unlike_fit(plant, log, simulated, warmup)
-    far, compared = False, bool(plant.scores.held_out or plant.scores.held_out_rmse)
-    for at, name in enumerate(plant.outputs):
-        parts, variance = part_errors(plant, name), variances[:, at]
-        own = expected_error(parts, 0.0).rmse
+    is_unlike, compared = False, bool(plant.scores.held_out or plant.scores.held_out_rmse)
+    for column_index, name in enumerate(plant.outputs):
+        errors, variance = part_errors(plant, name), variances[:, column_index]
+        error_of_parts = expected_error(errors, 0.0).rmse
         effect = (MEDIAN * other_run.get(name, np.zeros(1))) ** 2
         explained = variance.mean() if compared else 0.0  # errors of a fit have no part of its draws
-        seen = variance + max(own**2 - explained, 0.0) + (effect + effect.mean()) / 2  # gain, and level
+        like_fit = (
+            variance + max(error_of_parts**2 - explained, 0.0) + (effect + effect.mean()) / 2
+        )  # gain, and level
         added = unlike.get(name, 0.0) ** 2
-        half[name] = wide * np.sqrt(seen + added)
-        far = far or bool(np.mean(added) > _UNLIKE * np.mean(seen))
-        size = np.mean((seen + added)[scored]) if scored.any() else np.nan
+        half[name] = wide * np.sqrt(like_fit + added)
+        is_unlike = is_unlike or bool(np.mean(added) > _UNLIKE * np.mean(like_fit))
+        size = np.mean((like_fit + added)[scored]) if scored.any() else np.nan
         expected[name] = float(np.sqrt(size))
         other = np.hypot(other_run.get(name, np.zeros(1)), unlike.get(name, np.zeros(1)) / MEDIAN)
-        ends = expected_error(parts, float(np.sqrt(np.mean(other**2))))
-        rest = np.sqrt(max(size - ends.rmse**2, 0.0))  # what draws say beyond it
-        likely[name] = float(np.hypot(ends.low, rest)), float(np.hypot(ends.high, rest))
+        ends = expected_error(errors, float(np.sqrt(np.mean(other**2))))
+        beyond = np.sqrt(max(size - ends.rmse**2, 0.0))  # what draws say beyond it
+        likely[name] = float(np.hypot(ends.low, beyond)), float(np.hypot(ends.high, beyond))
         miss = np.abs(column(log, name) - column(simulated, name))
-        known = scored & np.isfinite(miss)
-        inside[name] = float(np.mean(miss[known] <= half[name][known])) if known.any() else float("nan")
+        is_read = scored & np.isfinite(miss)
+        inside[name] = float(np.mean(miss[is_read] <= half[name][is_read])) if is_read.any() else float("nan")
     words = "the errors of free runs over parts held out of it" if compared else "the error of the fit"
     if other_run:
         words += f" and a gain that varies by {100 * RUN_GAIN_SD:.0f} % from run to run (assumed: "
         words += f"{'one log' if len(plant.logs) == 1 else 'two logs'} cannot show it)"
-    if far:
+    if is_unlike:
         words += ", wider because this run is unlike the fit (range of the readings)"
     return Band(level, half, inside, taken, words, expected, likely)
 
@@ -174,13 +172,13 @@ def part_errors(plant: Plant, name: str) -> list[float]:
     """Return the errors of an output over the parts that were held out: of a plant of several logs whole
     logs, where it has them; of a fit that was not compared that of the fit, as an error of readings."""
     scores = plant.scores
-    held = [each for each in scores.held_out if each.output == name]
-    whole = [each for each in held if not each.log.startswith(TAIL)]
+    held_out = [score for score in scores.held_out if score.output == name]
+    whole = [score for score in held_out if not score.log.startswith(TAIL)]
     if len(plant.logs) >= SEVERAL and whole:
-        held = whole
-    parts = [each.rmse for each in held] or scores.held_out_by_part.get(name, [])
-    parts = parts or [error for each, error in scores.held_out_rmse.items() if each == name]
-    return parts or [float(np.hypot(plant.noise.get(name, 0.0), scores.reading_excess.get(name, 0.0)))]
+        held_out = whole
+    errors = [score.rmse for score in held_out] or scores.held_out_by_part.get(name, [])
+    errors = errors or [error for score, error in scores.held_out_rmse.items() if score == name]
+    return errors or [float(np.hypot(plant.noise.get(name, 0.0), scores.reading_excess.get(name, 0.0)))]
 
 
 def unlike_fit(plant: Plant, log: Log, simulated: Log, warmup: float) -> dict[str, Array]:
@@ -252,20 +250,20 @@ def effect_of_run(plant: Plant, error: Array, log: Log) -> InputEffect | None:
     spread = np.array([np.nanstd(column(log, name)) for name in plant.outputs])
     spread = np.where(spread > 0, spread, 1.0)
     with np.errstate(over="ignore", invalid="ignore"):  # a run that diverged has no gain
-        known = np.isfinite(error) & (np.maximum(np.abs(at_once), np.abs(error)) < _DIVERGED * spread)
-    if not known.any():
+        is_finite = np.isfinite(error) & (np.maximum(np.abs(at_once), np.abs(error)) < _DIVERGED * spread)
+    if not is_finite.any():
         return None
-    scaled_error = np.where(known, error / spread, 0.0)
+    scaled_error = np.where(is_finite, error / spread, 0.0)
     step, seconds = float(log["time"].diff("time").median()), float(log["time"][-1] - log["time"][0])
     best: tuple[float, float, float, Array] | None = None
     for lag_s in (0.0, *(seconds * share for share in _LATER)):
         keep = np.exp(-step / lag_s) if lag_s else 0.0
         effect = lfilter([1 - keep], [1, -keep], np.where(np.isfinite(at_once), at_once, 0.0), axis=0)
-        size = np.where(known, effect / spread, 0.0)
+        size = np.where(is_finite, effect / spread, 0.0)
         gain = float(np.sum(size * scaled_error) / max(np.sum(size**2), 1e-300))
         squares = float(np.sum((scaled_error - gain * size) ** 2))
         if best is None or squares < best[0]:
-            best = squares, gain, lag_s, np.where(known, error - gain * effect, np.nan)
+            best = squares, gain, lag_s, np.where(is_finite, error - gain * effect, np.nan)
     assert best is not None
     squares, gain, lag_s, remaining = best
     if abs(gain) <= 2 * RUN_GAIN_SD or squares > 0.5 * np.sum(scaled_error**2):
@@ -289,8 +287,10 @@ def ensemble_disagreement(plant: Plant, log: Log, *, warmup: float = 5.0) -> dic
     for stretch, start in zip(stretches, find_starts(plant, plant.p, stretches, warmup)):
         x_end = start.x0
         for begin in range(0, len(stretch.u), rows):
-            part = slice(begin, begin + rows)
-            x = model.states(x_end, stretch.u[part], stretch.d[part] - start.d_offset, plant.dt)
+            rows_at_once = slice(begin, begin + rows)
+            x = model.states(
+                x_end, stretch.u[rows_at_once], stretch.d[rows_at_once] - start.d_offset, plant.dt
+            )
             fresh = x if begin == 0 else x[1:]
             members = fresh.reshape(len(fresh), *model.A.shape[:2])[:, :, :n_y]
             variance += members.var(axis=1).sum(axis=0)

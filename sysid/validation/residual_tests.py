@@ -205,14 +205,14 @@ def residual_correlations(
 
 def _residual(read: Array, run: Array, scored: Mask) -> Array | None:
     """Return readings less free run (rows, n_y), NaN where not scored; None where nothing can be tested."""
-    known = np.isfinite(read) & scored[:, None]
-    if not known.any(axis=0).all() or not np.isfinite(run[scored]).all():
+    is_scored = np.isfinite(read) & scored[:, None]
+    if not is_scored.any(axis=0).all() or not np.isfinite(run[scored]).all():
         return None
-    size = np.array([np.ptp(y[k]) for y, k in zip(read.T, known.T)])
-    most = np.array([np.abs(y - v)[k].max() for y, v, k in zip(read.T, run.T, known.T)])
+    size = np.array([np.ptp(y[k]) for y, k in zip(read.T, is_scored.T)])
+    most = np.array([np.abs(y - v)[k].max() for y, v, k in zip(read.T, run.T, is_scored.T)])
     if np.any(most > 1e6 * size) or np.any(most < 1e-9 * size):  # it diverged, or it made the log
         return None
-    return np.where(known, read - run, np.nan)
+    return np.where(is_scored, read - run, np.nan)
 
 
 def _blocks_of_rows(plant: Plant, stretches: Sequence[Stretch]) -> tuple[NDArray[np.int_], float]:
@@ -258,7 +258,7 @@ def _start_changes(
     directions = (axes * np.sqrt(np.maximum(variances, 0.0))).T
     blocks = [np.unique(block[rows]) for rows in read.T]
     columns = [np.zeros((len(numbers), len(stretches) * n_x)) for numbers in blocks]
-    for at, (stretch, start) in enumerate(zip(stretches, find_starts(plant, plant.p, stretches, warmup))):
+    for index, (stretch, start) in enumerate(zip(stretches, find_starts(plant, plant.p, stretches, warmup))):
         u, d = stretch.u[None], (stretch.d - start.d_offset)[None]
         together = max(1, _SETTINGS.runs_at_once // (len(stretch.u) * n_y))
         for begin in range(0, n_x, together):
@@ -268,7 +268,7 @@ def _start_changes(
                 runs = plant.model.rollout(np.vstack([start.x0, moved]), u, d, plant.p[None], plant.dt)[0]
                 change = 10.0 * at_rows(stretch, runs[1:] - runs[0], plant.dt)
             change[~np.isfinite(change).all(axis=(1, 2))] = 0.0
-            first = at * n_x + begin
+            first = index * n_x + begin
             for j, numbers in enumerate(blocks):
                 inside = np.isin(numbers, block[stretch.rows])
                 means = _block_means(change[:, :, j].T, block[stretch.rows], read[stretch.rows, j])
@@ -328,9 +328,11 @@ class _Null:
 
     def start_share(self) -> float:
         """Return the share of the squared residual that is due to starts."""
-        rest = self.residual - self.starts @ (self.starts.T @ (self.inverse @ self.residual))
+        without_start = self.residual - self.starts @ (self.starts.T @ (self.inverse @ self.residual))
         # of the squares of rows, which are 1 in the mean; means over blocks have less noise
-        return max(0.0, float(self.residual @ self.residual - rest @ rest) / len(rest))
+        return max(
+            0.0, float(self.residual @ self.residual - without_start @ without_start) / len(without_start)
+        )
 
     def test(self, x: Array, rms: float) -> CorrelationTest:
         """Test the residual against a signal x (n, n_lag)."""
@@ -357,12 +359,12 @@ def learn_noise(block: NDArray[np.int_], residual: Array, columns: Array) -> Arr
 
     def cost(z: Array) -> tuple[float, Array]:
         """Return -ln of likelihood and prior, and its slopes."""
-        parts = variances(z)
-        V = right + np.einsum("k,kij->ij", parts, kernels)
+        sizes = variances(z)
+        V = right + np.einsum("k,kij->ij", sizes, kernels)
         inverse, (_, log_det) = np.linalg.inv(V), np.linalg.slogdet(V)
         explained = inverse @ residual
         slope = [np.sum(inverse * kernel) - explained @ kernel @ explained for kernel in kernels]
-        slopes = _SETTINGS.noise_log_sd * parts * np.array(slope) + z
+        slopes = _SETTINGS.noise_log_sd * sizes * np.array(slope) + z
         return 0.5 * float(log_det + residual @ explained + z @ z), slopes
 
     start = np.zeros(len(kernels))

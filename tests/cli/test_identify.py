@@ -32,7 +32,7 @@ from thermogrip.sysid.plant.linearise import linearise_plant
 from thermogrip.sysid.plant.log_grid import roles_of
 from thermogrip.sysid.plant.plant import Plant
 from thermogrip.sysid.validation.free_run import Score
-from thermogrip.sysid.validation.held_out import Row, Searched
+from thermogrip.sysid.validation.held_out import Row
 from thermogrip.sysid.validation.prediction_bands import Band
 from thermogrip.sysid.validation.verdict import Standing, Verdict
 
@@ -63,7 +63,6 @@ def found_of(model: str = "network", **changes: Any) -> SimpleNamespace:
         "verdict": "it is good", "data_check": SimpleNamespace(findings=findings),
         "evidence": Covered(3.0), "notes": ("arx: slow",),
         "signals": (SignalRole("q1", "percent", "input", "its unit", True),),
-        "searched": (Searched("arx", "na 1, nb 1, delay 1", 0.25, (0.2, 0.3125), True),),
         "expected": {"t1": ExpectedError(0.4, 0.2, 0.9)},
     }  # fmt: skip
     return SimpleNamespace(**found | changes)
@@ -204,10 +203,6 @@ def test_the_answer_of_identify_is_what_was_found(room: SimpleNamespace) -> None
         },
         "intervals_90": {name: list(ends) for name, ends in BOARD.intervals(0.9).items()},
         "identifiability": ["U is identifiable"], "posterior": None,
-        "searched": [
-            {"model": "arx", "structure": "na 1, nb 1, delay 1", "error": 0.25, "folds": [0.2, 0.3125],
-             "kept": True}
-        ],
         "notes": ["arx: slow"], "doubts": [], "out": "p.json", "dynamics": DYNAMICS.to_dict(),
         "repairs": {"log a": ["one row dropped", "two rows swapped"]},
     }  # fmt: skip

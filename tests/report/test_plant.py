@@ -21,7 +21,6 @@ from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.fit_record import Identifiability
 from thermogrip.sysid.plant.plant import Plant
 from thermogrip.sysid.validation.free_run import FreeRun, free_run
-from thermogrip.sysid.validation.held_out import Searched
 from thermogrip.sysid.validation.prediction_bands import Band
 
 
@@ -129,10 +128,6 @@ def identified(good: bool = True) -> SimpleNamespace:
     return SimpleNamespace(
         rows=rows, data_check=checked, good=good, verdict="oe is best", notes=("arx failed",),
         model="oe", signals=(), runs=(), held_out_runs={},
-        searched=(
-            *(Searched("arx", f"na {k}", 0.25, (0.2, 0.3125), k == 7) for k in range(1, 9)),
-            Searched("subspace", "order 1", 0.5, (0.5, 0.5), True),
-        ),
     )  # fmt: skip
 
 
@@ -148,17 +143,13 @@ def test_an_identification_has_its_tables_and_verdict(good: bool, tone: str) -> 
         "oe, fitted on everything, on its own logs",
     ]
     assert tables[2].rows == (("b", "t", 0.5, "degC", 90.0, 50),)
-    assert tables[-2].rows == (("warn", "gaps", "a", "t", "a gap"),)
-    assert tables[-1].head == ("model", "structure", "mean", "fold 1", "fold 2", "")
-    # the best five of each kind, and the one that was kept
-    assert [row[1] for row in tables[-1].rows] == ["na 1", "na 2", "na 3", "na 4", "na 5", "na 7", "order 1"]
-    assert tables[-1].rows[5] == ("arx", "na 7", 0.25, 0.2, 0.3125, "kept")
+    assert tables[-1].rows == (("warn", "gaps", "a", "t", "a gap"),)
     texts = [part for part in section.parts if isinstance(part, Text)]
     assert texts == [Text("arx failed.")]
     clean = identified()
     clean.data_check.findings = clean.data_check.findings[:1]
     captions = [part.caption for part in plant.identification_section(clean).parts if isinstance(part, Table)]
-    assert captions == [table.caption for table in (*tables[:3], tables[-1])]
+    assert captions == [table.caption for table in tables[:3]]
 
 
 @pytest.mark.usefixtures("no_figures")

@@ -126,8 +126,10 @@ def identify(
     logs, wanted_network = _read(read, wanted_network, shipped=a_network)
     repairs = _repaired(console, logs)
     have = dict.fromkeys(map(str, logs[0].data_vars), "")  # what a word means may be written otherwise
-    known = [None if words is None else tuple(find_column(w, have) for w in words) for words in roles]
-    roles = known[0], known[1], known[2]
+    columns_by_role = [
+        None if words is None else tuple(find_column(w, have) for w in words) for words in roles
+    ]
+    roles = columns_by_role[0], columns_by_role[1], columns_by_role[2]
     from thermogrip.datasets.parallel import sub_progress
     from thermogrip.report.html import write_report
     from thermogrip.report.plant import identification_sections
@@ -135,7 +137,7 @@ def identify(
 
     record, lost = None, NO_POSTERIOR
     with console.progress("identify") as progress:
-        found = fit_models(
+        identified = fit_models(
             logs,
             wanted_network,
             *roles,
@@ -150,11 +152,11 @@ def identify(
             progress=sub_progress(progress, 0.0, 0.6 if posterior else 1.0),
             early=None if network else partial(_write_early, console, out),
         )
-        plant = found.plant
-        if network and wanted_network is not None and all(row.model != "network" for row in found.rows):
-            why = next((note for note in found.notes if note.startswith("network")), "it was not fitted")
+        plant = identified.plant
+        if network and wanted_network is not None and all(row.model != "network" for row in identified.rows):
+            why = next((note for note in identified.notes if note.startswith("network")), "it was not fitted")
             raise UserError(f"--network {network}: {why}", hint="write --network none to do without")
-        if posterior and found.model == "network":
+        if posterior and identified.model == "network":
             plant, record, lost = _sampled(
                 plant, logs, out, seed, sub_progress(progress, 0.6, 1.0, "posterior")
             )
@@ -162,9 +164,9 @@ def identify(
     dynamics, nothing = _dynamics(plant)
     if report is not None:
         lead = f"From {', '.join(log.attrs['name'] for log in logs)}."
-        sections = identification_sections(found, logs, plant, record, dynamics)
+        sections = identification_sections(identified, logs, plant, record, dynamics)
         write_report(report, "Identification", lead, sections)
-    _show_identified(console, found, plant, dynamics)
+    _show_identified(console, identified, plant, dynamics)
     if dynamics is None:
         console.say(nothing)
     if posterior:
@@ -174,15 +176,15 @@ def identify(
     if slow:
         console.warn(f"{plant.model.kind} model not compiled, and so slower: {slow}")
     more = {"dynamics": None if dynamics is None else dynamics.to_dict(), "repairs": repairs}
-    console.answer(_identified(found, plant, record, out) | more)
-    for doubt in found.doubts:
+    console.answer(_identified(identified, plant, record, out) | more)
+    for doubt in identified.doubts:
         console.warn(f"in doubt: {doubt}")
     if posterior and (record is None or not record.converged):
         return cli.ANSWER_IS_NO
-    if found.good:
+    if identified.good:
         return cli.Done("good")
-    guessed = any(s.guessed for s in found.signals) or any(log.attrs.get("clock_doubts") for log in logs)
-    stated = _stating(found, paths, out, dt, logs) if found.doubts and guessed else ""
+    guessed = any(s.guessed for s in identified.signals) or any(log.attrs.get("clock_doubts") for log in logs)
+    stated = _stating(identified, paths, out, dt, logs) if identified.doubts and guessed else ""
     return cli.Done("not good", cli.ANSWER_IS_NO, stated)
 
 
@@ -213,12 +215,12 @@ def _read(
     from thermogrip.sysid.plant.log_grid import roles_of
 
     logs = read() if network is None else read(known=roles_of(network))
-    found = network
+    matching = network
     if network is None and shipped:
-        found = shipped_network(logs)
+        matching = shipped_network(logs)
     elif isinstance(network, NetworkModel):
-        found = in_columns(network, logs[0])
-    return (logs if found is network or found is None else read(known=roles_of(found))), found
+        matching = in_columns(network, logs[0])
+    return (logs if matching is network or matching is None else read(known=roles_of(matching))), matching
 
 
 def _sampled(
@@ -247,12 +249,12 @@ def _write_early(console: Console, out: Path, found: Identification) -> None:
 
 def _repaired(console: Console, logs: Sequence[Log]) -> dict[str, list[str]]:
     """Return what was repaired while the logs were read, by the log's name, and warn of it."""
-    found = {}
+    repairs = {}
     for log in logs:
-        found[log.attrs["name"]] = [line for line in str(log.attrs.get("repairs", "")).splitlines() if line]
-        for line in found[log.attrs["name"]]:
+        repairs[log.attrs["name"]] = [line for line in str(log.attrs.get("repairs", "")).splitlines() if line]
+        for line in repairs[log.attrs["name"]]:
             console.warn(f"{log.attrs['name']}: {line}")
-    return found
+    return repairs
 
 
 def _dynamics(plant: Plant) -> tuple[Dynamics | None, str]:
@@ -322,7 +324,6 @@ def _identified(found: Identification, plant: Plant, record: Posterior | None, o
         "intervals_90": plant.intervals(0.9),
         "identifiability": identifiability_report(plant),
         "posterior": sampled,
-        "searched": found.searched,
         "notes": found.notes,
         "out": out,
     }
@@ -379,7 +380,7 @@ def validate(
             runs.append(free_run(loaded, log, warmup=seconds, score_from=first, average=average))
     bands = [run.band() for run in runs]
     if report is not None:
-        sections = [free_run_section(*each) for each in zip(runs, bands)]
+        sections = [free_run_section(*pair) for pair in zip(runs, bands)]
         since = ", ".join(dict.fromkeys(f"{first:g} s" for _, first in starts))
         lead = f"Inputs in, outputs out, nothing fed back; scored from {since} on."
         write_report(report, f"Free runs of {plant.name}", lead, sections)
@@ -390,22 +391,22 @@ def validate(
             console.say(f"{log.attrs['name']}: {note}")
     answers = [run_answer(log.attrs["name"], run, band) for log, run, band in zip(logs, runs, bands)]
     console.answer({"logs": answers, "repairs": repairs})
-    found = [_urgency(run.verdict) for run in runs if run.verdict is not None]
-    if said_not_good(loaded.verdict) and set(found) & {"as stated", "better", "seen"}:
+    urgencies = [_urgency(run.verdict) for run in runs if run.verdict is not None]
+    if said_not_good(loaded.verdict) and set(urgencies) & {"as stated", "better", "seen"}:
         console.say(
             f"{plant.name}: identify did not call it good, and a run as was stated does not change that"
         )
-        found = ["worse" if each in ("as stated", "better") else "no test" for each in found]
-    what = next((each for each in _URGENT if each in found), "")
-    code = cli.ANSWER_IS_NO if what in ("worse", "another plant", "start") else 0
-    if what != "start":
-        return cli.Done(what, code)
+        urgencies = ["worse" if pair in ("as stated", "better") else "no test" for pair in urgencies]
+    most_urgent = next((pair for pair in _URGENT if pair in urgencies), "")
+    code = cli.ANSWER_IS_NO if most_urgent in ("worse", "another plant", "start") else 0
+    if most_urgent != "start":
+        return cli.Done(most_urgent, code)
     from thermogrip.sysid.validation.free_run import start_seconds
 
     seconds = min(start_seconds(loaded, log) for log in logs)
     more = ["--warmup", f"{seconds:g}", "--score-from", f"{seconds:g}"]
     command = shlex.join(["validate", str(plant), *map(str, paths), *more])
-    return cli.Done(what, code, printable(command))
+    return cli.Done(most_urgent, code, printable(command))
 
 
 def _starts(
@@ -537,17 +538,17 @@ def linearise(
         {name: value for name, value in named.items() if name not in loaded.disturbances},
         {name: value for name, value in named.items() if name in loaded.disturbances},
     )
-    found = plant_dynamics(loaded, inputs=u, disturbances=d)
-    console.table(f"Gains at rest of {plant.name}", *gain_table(found))
-    console.say(time_constant_words(found))
+    dynamics = plant_dynamics(loaded, inputs=u, disturbances=d)
+    console.table(f"Gains at rest of {plant.name}", *gain_table(dynamics))
+    console.say(time_constant_words(dynamics))
     if report is not None:
         write_report(
             report,
             f"Linear model of {plant.name}",
             "Small changes about an operating point.",
-            [dynamics_section(found)],
+            [dynamics_section(dynamics)],
         )
-    answer = found.to_dict()
+    answer = dynamics.to_dict()
     if out is not None:
         save_linear(linearise_plant(loaded, inputs=u, disturbances=d, dt=dt), out)
         console.say(f"wrote {out}")

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from thermogrip.sysid.identification import Identification
     from thermogrip.sysid.plant.plant import Plant
     from thermogrip.sysid.validation import Band, FreeRun
-    from thermogrip.sysid.validation.held_out import Row, Searched
+    from thermogrip.sysid.validation.held_out import Row
 
 _BASELINES = (
     "Beside the free run: the best decay without input, the log's mean, and one step from each last "
@@ -32,7 +32,6 @@ _BASELINES = (
 )
 _HELD_OUT = "Free-run RMSE on rows that were not fitted (blocks: of means over a step of the model)"
 _TIME_CONSTANTS = 6  # the slowest, in a sentence
-_STRUCTURES = 5  # of each kind, in the table of those searched
 
 
 def run_table(runs: Sequence[FreeRun]) -> Cells:
@@ -96,25 +95,8 @@ def identification_section(found: Identification) -> Section:
     if checks:
         evidence.append(Table(("verdict", "check", "log", "channel", "finding"), tuple(checks), "Data check"))
     evidence += [Text(_sentence(note)) for note in found.notes]
-    if found.searched:
-        evidence.append(_structure_table(found.searched))
     tone = "good" if found.good else "warn"
     return Section("Which plant is behind the logs?", tuple(evidence), _sentence(found.verdict), tone)
-
-
-def _structure_table(searched: Sequence[Searched]) -> Table:
-    """Return the best structures of each kind, and the one that was kept, with their errors by fold."""
-    head = ("model", "structure", "mean", *(f"fold {k + 1}" for k in range(len(searched[0].folds))), "")
-    rows: list[tuple[Any, ...]] = []
-    for kind in dict.fromkeys(candidate.model for candidate in searched):
-        of_kind = [candidate for candidate in searched if candidate.model == kind]
-        rows += [
-            (kind, candidate.structure, candidate.error, *candidate.folds, "kept" if candidate.kept else "")
-            for place, candidate in enumerate(of_kind)
-            if place < _STRUCTURES or candidate.kept
-        ]
-    title = "Structures searched: RMSE over outputs' spread; kept: an average or the smallest near the best"
-    return Table(head, tuple(rows), title)
 
 
 def identification_sections(
