@@ -64,7 +64,7 @@ MISTAKES = {
     "excite --kind optimal --minutes 5 --plant plant.json --hold pmup --out s.csv": "did you mean 'pump'?",
     "tune plant.json --spec typo.toml --out c.json": "did you mean 'band_degC'?",
     "run controller.json --target 38 --twin plant.json --guard loose.toml --out r": "key; write stale_s",
-    "validate plant.json bare.csv": "time_s,drive,pump,t_tank,t_surface,t_ambient (-: left out)",
+    "validate plant.json bare.csv": "time_s,drive,pump,t_ambient,t_tank,t_surface (-: left out)",
     # files
     "validate plnt.json log.csv": "did you mean 'plant.json'?",
     "identify long.csv": "did you mean 'long.csv.xz'?",

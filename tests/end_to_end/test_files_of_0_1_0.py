@@ -88,7 +88,7 @@ def test_what_init_of_0_1_0_wrote_is_read_but_for_the_guard() -> None:
     assert sorted(load_network(OLD / "network.toml").parameters) == EXPECTED["network"]
     spec = read_spec(OLD / "spec.toml")
     assert {name: getattr(spec, name) for name in EXPECTED["spec"]} == EXPECTED["spec"]
-    with pytest.raises(UserError, match=r"no_model\.window_s: no such key; `thermogrip init guard` shows"):
+    with pytest.raises(UserError, match=r"model\.drift: no such key; `thermogrip init guard` shows"):
         read_guard(OLD / "guard.toml")
     assert read_topic_map(OLD / "topics.toml").columns
 
