@@ -81,7 +81,7 @@ def confusion_figure(comparison: Comparison, condition: str = POOLED) -> Figure:
 
 
 def reliability_figure(comparison: Comparison, condition: str = POOLED) -> Figure:
-    """Draw accuracy against confidence of each classifier, with intervals, and how many grasps are where."""
+    """Draw accuracy against confidence of each classifier, with intervals and the grasps in each bin."""
     count = len(comparison.classifiers)
     figure, axes = panels(
         2, count, size=(2.4 * count, 3.2), heights=(3, 1), sharex="col", sharey="row", ticks=7
@@ -137,13 +137,13 @@ def _confusion(axis: Axes, names: list[str], counts: NDArray[np.float64]) -> Non
     for (i, j), n in np.ndenumerate(counts):
         if n > 0:
             ink = "white" if share[i, j] > 0.55 else _INK
-            axis.text(j, i, _counted(float(n)), ha="center", va="center", fontsize=7, color=ink)
+            axis.text(j, i, _count_words(float(n)), ha="center", va="center", fontsize=7, color=ink)
     axis.set_xticks(range(len(names)), names, rotation=45, ha="right", fontsize=7)
     axis.set_yticks(range(len(names)), names, fontsize=7)
     axis.grid(False)
 
 
-def _counted(n: float) -> str:
+def _count_words(n: float) -> str:
     """Return a count, or a mean of counts with as many digits as one reads."""
     return f"{n:.0f}" if n == round(n) else f"{n:.1f}" if n > 1 else f"{n:.2g}"
 

@@ -33,12 +33,12 @@ from thermogrip.datasets.units import to_record_unit
 Floats = NDArray[np.float64]
 
 _TIME_UNITS = ("1", "s", "ms", "min")
-_TIME = re.compile(
+_TIME_NAME = re.compile(
     r"(?i)((elapsed|rel|relative|abs|unix|epoch|utc|local|system|log|sample|test|run|date|last)_?)*"
     r"(time|timestamp|time_stamp|date|zeit|uhrzeit|datum|tijd|seconds?|secs?|millis|milliseconds|micros|minutes"
     r"|hours|x_value|epoch|clock|uptime|changed|updated|t|ts|ms|us)(_(utc|local|stamp|elapsed|abs|rel))?"
 )
-_STEP = re.compile(r"(?i)ts|dt|delta_?t|sampl(e|ing)_?(time|period|interval)")
+_STEP_NAME = re.compile(r"(?i)ts|dt|delta_?t|sampl(e|ing)_?(time|period|interval)")
 _COUNTER = re.compile(r"(?i)x|n|k|i|no|nr|id|index|idx|samples?|rows?|steps?|count(er)?|unnamed.*")
 _TIME_WORDS = {"ms": 1e-3, "milli": 1e-3, "us": 1e-6, "micro": 1e-6, "minute": 60.0, "hour": 3600.0}
 EPOCH = (946684800.0, 4102444800.0)  # s since 1970 of the years 2000 and 2100
@@ -56,7 +56,7 @@ class ClockSettings:
     days_apart: float = 1 / 24  # rows of a plant are closer than an hour, seconds so late in a day are not
 
 
-_SETTINGS = ClockSettings()
+_CLOCK = ClockSettings()
 _ELAPSED = " as minutes and seconds"  # how times of two numbers are taken that begin at 00:00 or pass 23
 _MONTH_NAMES = ("jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec")
 _MONTHS = {month: str(number) for number, month in enumerate(_MONTH_NAMES, 1)}
@@ -91,7 +91,7 @@ class Clock:
 
     seconds: Floats  # (n_row,), NaN where a row has none
     columns: frozenset[str]  # the headers that it was read from, or stands in place of
-    notes: tuple[str, ...] = ()  # what was taken for it and what was mended, a line each
+    notes: tuple[str, ...] = ()  # what was taken for it and what was repaired, a line each
     zero: float = np.nan  # of ``seconds`` on the file's own clock [s]; NaN where it has none
     doubt: str = ""  # what is a guess, and how to state it
 
@@ -99,7 +99,7 @@ class Clock:
 def clock_of(table: Table, read: Mapping[str, tuple[str, str, float]], dt: float | None) -> Clock:
     """Return the clock of a table; ``read`` is name, unit and factor by header, ``dt`` the step that the user
     states [s]."""
-    named = [h for h, (name, unit, _) in read.items() if unit in _TIME_UNITS and _TIME.fullmatch(name)]
+    named = [h for h, (name, unit, _) in read.items() if unit in _TIME_UNITS and _TIME_NAME.fullmatch(name)]
     # a clock that starts again with each cycle comes after one that does not
     back = {h for h in named if h in table.numbers and (np.diff(table.numbers[h]) < 0).any()}
     named.sort(key=lambda header: (header in back, read[header][0] != "time"))
@@ -120,11 +120,11 @@ def clock_of(table: Table, read: Mapping[str, tuple[str, str, float]], dt: float
 def _behaves_as_clock(header: str, read: tuple[str, str, float], values: Floats) -> bool:
     """Tell whether a column that is not named as a time rises in nearly even steps, as only a clock does."""
     steps = np.diff(_unwrapped(values, np.arange(values.size))[0])
-    enough = 4 if re.fullmatch(r"c1", header) or _COUNTER.fullmatch(header) else _SETTINGS.piece_rows
+    enough = 4 if re.fullmatch(r"c1", header) or _COUNTER.fullmatch(header) else _CLOCK.piece_rows
     if read[1] not in _TIME_UNITS or steps.size < enough or not np.all(steps > 0):
         return False
     usual = float(np.median(steps))
-    return bool(np.mean(np.abs(steps - usual) <= _SETTINGS.evenness * usual) >= _SETTINGS.monotone_share)
+    return bool(np.mean(np.abs(steps - usual) <= _CLOCK.evenness * usual) >= _CLOCK.monotone_share)
 
 
 def _of_text(header: str, table: Table) -> Clock | None:
@@ -150,9 +150,7 @@ def _of_numbers(header: str, table: Table, read: tuple[str, str, float]) -> Cloc
     counts, notes = _unwrapped(counts, table.lines)
     finite = counts[np.isfinite(counts)]
     stated = name == "time" and unit != "1"
-    rising = (
-        finite.size > 1 and np.mean(np.diff(finite) >= 0) >= _SETTINGS.monotone_share and np.ptp(finite) > 0
-    )
+    rising = finite.size > 1 and np.mean(np.diff(finite) >= 0) >= _CLOCK.monotone_share and np.ptp(finite) > 0
     if not (stated or rising):
         return None
     meant = _what_counts_mean(name, finite, wrapped=bool(notes)) if unit == "1" else _Counts(scale)
@@ -164,7 +162,7 @@ def _of_numbers(header: str, table: Table, read: tuple[str, str, float]) -> Cloc
         return Clock(seconds, frozenset([header]), (*converted, *notes, *restarts), 0.0)
     taken = f"{header} is taken as the time in {unit if unit != '1' else 's'}"
     factor = "" if scale == 1 else f", times {scale:g}"
-    if _TIME.fullmatch(name) is None and unit == "1" and not doubt:
+    if _TIME_NAME.fullmatch(name) is None and unit == "1" and not doubt:
         step = float(np.median(np.diff(finite)))
         doubt = f"{header} is taken as the time, its rows {step:g} s apart"
     note = f"time: {taken}{factor}" + ("; --dt S sets another step" if doubt else "")
@@ -177,9 +175,9 @@ def _what_counts_mean(name: str, counts: Floats, *, wrapped: bool) -> _Counts:
     steps = np.diff(counts)
     usual = float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
     whole = bool(np.all(counts == np.rint(counts)))
-    likely = (date for date in _DATES if not date.calendar or (not whole and usual <= _SETTINGS.days_apart))
+    likely = (date for date in _DATES if not date.calendar or (not whole and usual <= _CLOCK.days_apart))
     dates = next((date for date in likely if date.has(float(counts[0]))), None)
-    of_board = whole and usual >= _SETTINGS.counts_apart and not np.all(steps % 60 == 0)
+    of_board = whole and usual >= _CLOCK.counts_apart and not np.all(steps % 60 == 0)
     if word is not None and (dates is None or dates.seconds == 1.0):  # a board's counter may be as large
         return _Counts(word)
     if dates is not None and dates.calendar:
@@ -188,11 +186,11 @@ def _what_counts_mean(name: str, counts: Floats, *, wrapped: bool) -> _Counts:
     if dates is not None and not (dates.seconds == 1.0 and of_board):
         return dates
     if not of_board:
-        minutes = whole and usual >= _SETTINGS.counts_apart
+        minutes = whole and usual >= _CLOCK.counts_apart
         guess = f"{name} has no unit: taken as seconds, so that rows are {usual:g} s apart" if minutes else ""
         return _Counts(1.0, doubt=guess)
     # 32 bits of microseconds last for 72 minutes, of milliseconds for 50 days
-    fine = usual >= _SETTINGS.microseconds_apart or (wrapped and counts[-1] > 2**32)
+    fine = usual >= _CLOCK.microseconds_apart or (wrapped and counts[-1] > 2**32)
     scale, unit = (1e-6, "microseconds") if fine else (1e-3, "milliseconds")
     doubt = f"{name} has no unit: taken as {unit}, so that rows are {usual * scale:g} s apart"
     return _Counts(scale, doubt=doubt)
@@ -223,12 +221,8 @@ def _in_pieces(seconds: Floats, lines: NDArray[np.int64]) -> tuple[Floats, list[
     if not back.size:
         return seconds, []
     usual = float(np.nanmedian(np.diff(seconds)))
-    begins = seconds[0] + max(
-        GAP_SECONDS, _SETTINGS.piece_rows * usual
-    )  # a board begins where it began before
-    whole = [
-        piece.size >= _SETTINGS.piece_rows and piece[1] - piece[0] <= GAP_STEPS * usual for piece in pieces
-    ]
+    begins = seconds[0] + max(GAP_SECONDS, _CLOCK.piece_rows * usual)  # a board begins where it began before
+    whole = [piece.size >= _CLOCK.piece_rows and piece[1] - piece[0] <= GAP_STEPS * usual for piece in pieces]
     if not all(whole) or any(piece[0] > begins for piece in pieces):
         return seconds, []  # a stamp that is wrong begins no part that goes on as a clock does
     gap = 1.0 + max(GAP_SECONDS, GAP_STEPS * usual)
@@ -241,7 +235,9 @@ def _in_pieces(seconds: Floats, lines: NDArray[np.int64]) -> tuple[Floats, list[
 
 def _of_rows(table: Table, read: Mapping[str, tuple[str, str, float]]) -> Clock:
     """Return a clock that counts rows, by a step that stands in the file or of 1 s."""
-    steps = {h: np.unique(v[np.isfinite(v)]) for h, v in table.numbers.items() if _STEP.fullmatch(read[h][0])}
+    steps = {
+        h: np.unique(v[np.isfinite(v)]) for h, v in table.numbers.items() if _STEP_NAME.fullmatch(read[h][0])
+    }
     stated = {header: float(v[0]) for header, v in steps.items() if v.size == 1 and v[0] > 0}
     beside = "dt" in table.meta  # a file may have it beside its columns
     step = next(iter(stated.values()), float(table.meta.get("dt", 1.0)))
@@ -256,7 +252,7 @@ def read_clock(cells: Sequence[str]) -> tuple[Floats, str] | None:
     import pandas as pd
 
     fields = pd.Series(list(cells), dtype=object).str.strip().str.extract(STAMP)
-    if fields[[1, 4]].isna().all(axis=1).mean() > 1 - _SETTINGS.monotone_share:
+    if fields[[1, 4]].isna().all(axis=1).mean() > 1 - _CLOCK.monotone_share:
         return None
 
     def numbers(key: int) -> Floats:

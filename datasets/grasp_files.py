@@ -55,7 +55,7 @@ _FROM_META = {"t_object_nominal": "t_object", "t_gripper_set": "t_gripper"}
 #: Names in the meta file of what a record calls otherwise.
 META_NAMES = {ours: theirs for theirs, ours in _FROM_META.items()}
 _ENDINGS = (".csv", ".csv.gz", ".csv.xz")
-_CHANNELS = ("time", "t_surface")  # how the columns of a sample begin that are numbers
+_SAMPLE_COLUMNS = ("time", "t_surface")  # how the columns of a sample begin that are numbers
 
 
 @dataclass(frozen=True)
@@ -99,7 +99,7 @@ def read_grasps(path: str | Path, *, name: str | None = None) -> Grasps:
     """
     kind = file_format(path)
     if kind == "netcdf":
-        return _whole(_of_dataset(open_netcdf(path), path, name), path)
+        return _with_level_before(_of_dataset(open_netcdf(path), path, name), path)
     if kind == "parquet":
         samples = read_parquet_table(path, text=_is_text, tolerated=0.0)
         return _of_tables(samples, None, name or file_stem(path))
@@ -109,7 +109,7 @@ def read_grasps(path: str | Path, *, name: str | None = None) -> Grasps:
     return _of_tables(samples, read_csv_table(_meta_path(path), text=_is_text), name or file_stem(path))
 
 
-def _whole(grasps: Grasps, path: str | Path) -> Grasps:
+def _with_level_before(grasps: Grasps, path: str | Path) -> Grasps:
     """Return grasps with their level before contact; UserError where one has no sample on either side."""
     grasps = with_lead_in(grasps)
     time, finite = grasps["time"].values, np.isfinite(grasps["t_surface"].values)
@@ -250,7 +250,7 @@ def _in_folder(folder: Path) -> list[Path]:
 
 def _is_text(header: str) -> bool:
     """Tell whether a column of grasps is left as text: its name is that of no number."""
-    return not header.startswith(_CHANNELS) and _name_of_fact(header)[0] not in GRASP_NUMBERS
+    return not header.startswith(_SAMPLE_COLUMNS) and _name_of_fact(header)[0] not in GRASP_NUMBERS
 
 
 def _samples_of(table: Table, facts: Table | None) -> _Samples:
@@ -261,7 +261,7 @@ def _samples_of(table: Table, facts: Table | None) -> _Samples:
         problem = "no column grasp_id"
         raise UserError(problem, file=path, hint="a grasp file has grasp_id,time_s,t_surface_degC")
     channels, repairs = {}, list(table.notes)
-    for header in (header for header in table.numbers if header.startswith(_CHANNELS)):
+    for header in (header for header in table.numbers if header.startswith(_SAMPLE_COLUMNS)):
         name, unit = split_header(header, file=str(path))
         channels[name], after = to_record_unit(table.numbers[header], unit)
         if name.startswith("t_surface") and after != "degC":
@@ -281,7 +281,9 @@ def _samples_of(table: Table, facts: Table | None) -> _Samples:
     if "" in ids:
         row = int(table.lines[ids.index("")])
         raise UserError("is empty", file=path, row=row, column="grasp_id", hint="name the grasp")
-    others = [h for h in (*table.text, *table.numbers) if not h.startswith((*_CHANNELS, "grasp_id", "pump"))]
+    others = [
+        h for h in (*table.text, *table.numbers) if not h.startswith((*_SAMPLE_COLUMNS, "grasp_id", "pump"))
+    ]
     if others and facts is not None:
         repairs.append(f"not used: {', '.join(others)}")
     skin_channels = {
@@ -402,7 +404,7 @@ def _facts_of(table: Table, rows: Sequence[int]) -> tuple[dict[str, Any], list[s
             facts[name] = numbers[[*rows]]
         elif name in GRASP_LABELS:
             facts[name] = [table.text[header][row] for row in rows]
-        elif name != "grasp_id" and not header.startswith((*_CHANNELS, "pump")):
+        elif name != "grasp_id" and not header.startswith((*_SAMPLE_COLUMNS, "pump")):
             unknown.append(header)
     return facts, unknown
 
@@ -472,7 +474,7 @@ def _of_tables(table: Table, meta: Table | None, name: str) -> Grasps:
     except UserError as error:  # which knows the record's name alone
         raise UserError(error.problem, file=table.file, column=error.column, hint=error.hint) from error
     grasps.attrs["repairs"] = "\n".join(samples.repairs)
-    return _whole(grasps, table.file)
+    return _with_level_before(grasps, table.file)
 
 
 def _of_dataset(data: xr.Dataset, path: str | Path, called: str | None = None) -> Grasps:

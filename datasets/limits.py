@@ -36,7 +36,7 @@ STEP_RANGE, LARGEST = (1e-3, 86400.0), 1e12
 
 _BYTES = 2 << 30
 _MB = 1 << 20
-_GROWTH = 200  # times the packed size
+_LARGEST_EXPANSION = 200  # times the packed size
 _FLOOR = 8 << 20  # bytes that any packed file may unpack to
 
 
@@ -46,8 +46,8 @@ def most_bytes(share: int = 1) -> int:
 
 
 def most_unpacked(packed: int) -> int:
-    """Return how many bytes may come out of a file of ``packed`` bytes."""
-    return most_bytes() if _chosen() else min(most_bytes(), max(_FLOOR, _GROWTH * packed))
+    """Return the bytes that may come out of a file of ``packed`` bytes."""
+    return most_bytes() if _chosen() else min(most_bytes(), max(_FLOOR, _LARGEST_EXPANSION * packed))
 
 
 def check_source(path: str | Path) -> int:

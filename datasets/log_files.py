@@ -501,16 +501,16 @@ def _cut(log: Log, start: float, stop: float, file: Path) -> Log:
     from thermogrip.datasets.resample import cut  # it loads xarray
 
     log_part = cut(log, start, stop)
-    log_part.attrs["name"] = f"{log.attrs['name']}@{_end(start)}:{_end(stop) or 'end'}"
+    log_part.attrs["name"] = f"{log.attrs['name']}@{_second_text(start)}:{_second_text(stop) or 'end'}"
     repairs = [line for line in str(log.attrs["repairs"]).splitlines() if line]
-    first = f"{_end(start)} s" if np.isfinite(start) else "the start"
-    last = f"{_end(stop)} s" if np.isfinite(stop) else "the end"
+    first = f"{_second_text(start)} s" if np.isfinite(start) else "the start"
+    last = f"{_second_text(stop)} s" if np.isfinite(stop) else "the end"
     repairs.append(f"taken from {first} to {last}; the lines above speak of the whole log")
     log_part.attrs["repairs"] = "\n".join(repairs if len(repairs) > 1 else [repairs[0].split(";")[0]])
     return log_part
 
 
-def _end(value: float) -> str:
+def _second_text(value: float) -> str:
     return f"{value:.10g}" if np.isfinite(value) else ""
 
 

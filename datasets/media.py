@@ -32,7 +32,7 @@ _CONTROL = re.compile(
 )
 _USER = re.compile(r"(?<=://)[^/@\s]+(?=@)")
 _FORMULA = re.compile(r"'*[=+\-@\t].")
-_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|[+-]?(inf|nan)", re.ASCII)
+_FLOAT_TEXT = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|[+-]?(inf|nan)", re.ASCII)
 _MARKDOWN = re.compile(r"[\\`\[\]<>|*#!]")
 
 
@@ -55,7 +55,7 @@ def csv_cell(cell: object) -> object:
     if not isinstance(cell, str):
         return cell
     text = printable(cell).replace("\n", "\\n")
-    return "'" + text if _FORMULA.match(text) and not _NUMBER.fullmatch(text) else text
+    return "'" + text if _FORMULA.match(text) and not _FLOAT_TEXT.fullmatch(text) else text
 
 
 def from_csv(cell: str) -> str:

@@ -23,7 +23,7 @@ from thermogrip.datasets.units import UNITS, any_unit, to_record_unit
 if TYPE_CHECKING:
     import xarray as xr
 
-_ADDED = ("Conventions", "title", "source")  # to files of versions up to 0.2
+_OLD_ATTRIBUTES = ("Conventions", "title", "source")  # to files of versions up to 0.2
 _MOST_MEMBERS = 4096  # of a file
 _PART = 16 << 20  # bytes of text that are looked at in one piece
 
@@ -158,5 +158,5 @@ def _of_versions(data: xr.Dataset) -> xr.Dataset:
         names = data["grasp_id"].values.astype(str)
         data = data.drop_vars("grasp_id").assign_coords(grasp=("grasp", names))
     if str(data.attrs.get("schema", "")).startswith("thermogrip."):
-        data.attrs = {key: value for key, value in data.attrs.items() if key not in _ADDED}
+        data.attrs = {key: value for key, value in data.attrs.items() if key not in _OLD_ATTRIBUTES}
     return data

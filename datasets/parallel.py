@@ -31,7 +31,7 @@ from thermogrip import __version__
 from thermogrip.datasets.errors import UserError, as_user_error
 
 Progress: TypeAlias = Callable[[float, str], None]
-#: How many local processes, or the address of a Dask scheduler.
+#: Number of local processes, or the address of a Dask scheduler.
 Workers: TypeAlias = int | str
 
 _CONNECT_S = 10  # a scheduler of the same network answers within one

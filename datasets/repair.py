@@ -18,7 +18,7 @@ both stay.  In rows of a minute or more a plant moves and comes back by itself: 
 all other samples as well, by more than their range.
 
 What a sensor writes when it has no reading (:data:`SENSOR_CODES`) is lost, in whatever number of rows, where
-it is entered and left by jumps of more than five times what the other rows hardly ever move (their 99 %
+it is entered and left by jumps of more than five times what the other rows rarely move (their 99 %
 quantile): a kettle that passes 85 degC does not jump there.
 
 A reading that repeats itself bit by bit while the inputs move is **stuck**, and lost as well.  With M the
@@ -201,7 +201,7 @@ def _rows_beyond_jumps(values: Floats, rows: NDArray[np.bool_]) -> NDArray[np.bo
     # without a move it is no reading: it is held between levels, and the code may be one of them
     if values.size < SPIKE_WINDOW or not rows.any() or rows.all() or not usual.any():
         return np.zeros(values.size, dtype=bool)
-    # a column that hardly ever moves does so by its steps
+    # a column that rarely moves does so by its steps
     least = _CODE_JUMP * max(float(np.quantile(usual, 0.99)), float(usual[usual > 0].min()))
     between, beyond_jumps = rows[1:] ^ rows[:-1], rows.copy()
     edges = np.flatnonzero(np.diff(rows.astype(int), prepend=0, append=0))

@@ -83,7 +83,7 @@ def block_means(
         problem = f"cannot average over {seconds:g} s: the rows are {step:g} s apart"
         raise UserError(problem, file=log, hint="choose a longer block")
     segments = [
-        _blocks(time[a:b], values[a:b], held, seconds=seconds, step=step)
+        _filled_blocks(time[a:b], values[a:b], held, seconds=seconds, step=step)
         for a, b in pairwise([0, *after, time.size])
     ]
     if (n := sum(begins.size for begins, _ in segments)) < 2:
@@ -92,7 +92,7 @@ def block_means(
     return segments
 
 
-def _blocks(
+def _filled_blocks(
     time: Floats, values: Floats, is_held: NDArray[np.bool_], *, seconds: float, step: float
 ) -> _Blocks:
     """Return the starts (n_block,) and means (n_block, n_variables) of the filled blocks of one stretch."""

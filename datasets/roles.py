@@ -12,7 +12,7 @@ RSS_j of j on its own past, RSS_ij with that of i beside it (Granger 1969); beyo
 
 A column is left out as a copy of another only where the two are one signal within their steps: each is a
 multiple of the other and a constant, over more than two levels.  Of two states every pair would be.  Two
-inputs that always move together cannot be told apart by any fit: one stays and stands for both.
+inputs that always move together cannot be told apart by any fit: one stays for both.
 
 Physics decides between the rest.  What a reading comes to and stays at, level after level, while another
 column drives it, is its set point.  No drive moves the weather: a temperature that none helps to predict, row
@@ -89,7 +89,7 @@ class RoleSettings:
     most_rows: int = 20_000  # that are looked at, for time
 
 
-_SETTINGS = RoleSettings()
+_ROLES = RoleSettings()
 
 
 @dataclass(frozen=True)
@@ -104,7 +104,7 @@ class Roles:
 def is_room_temperature(name: str, unit: str) -> bool:
     """Tell whether a measured disturbance is the temperature of the surroundings: no other quantity, and not
     that of what flows in."""
-    return unit == "degC" and not _INFLOW.search(_words(name))
+    return unit == "degC" and not _INFLOW.search(_name_words(name))
 
 
 def guess_role(name: str, unit: str) -> str:
@@ -114,7 +114,7 @@ def guess_role(name: str, unit: str) -> str:
 
 def explain_role(name: str, unit: str) -> tuple[str, str]:
     """Return the role that a name and a unit suggest, and why: names come first, then units."""
-    words, celsius = _words(name), unit == "degC"
+    words, celsius = _name_words(name), unit == "degC"
     set_drive = _SET_DRIVE.search(words) and unit in _OF_DRIVES
     rows = (
         (_SETPOINT.search(words) and not set_drive, "other", IS_SET_POINT),
@@ -163,11 +163,11 @@ def assign_roles(
     evidence: dict[str, tuple[str, str]] = {}  # of the data alone
     if columns is not None:  # what is beyond all use is no reading, and its squares are none either
         columns = {n: np.where(np.abs(v) <= MOST_NUMBER, v, np.nan) for n, v in columns.items()}
-        if all(len(values) >= _SETTINGS.fewest_rows for values in columns.values()):
-            guesses |= _copies(columns, guesses, units)
+        if all(len(values) >= _ROLES.fewest_rows for values in columns.values()):
+            guesses |= _copied_columns(columns, guesses, units)
             guesses |= _unlike_inputs(columns, guesses, [n for n, role in stated.items() if role == "input"])
         guesses |= _controllers(guesses, units)
-        evidence |= _followed(columns, guesses)
+        evidence |= _followed_levels(columns, guesses)
         guesses |= evidence
         fixed = {name: role for name, (role, why) in guesses.items() if why != NO_CLUE} | stated
         if not {"input", "output"} <= {*fixed.values()}:
@@ -194,7 +194,7 @@ def _controllers(
     """Return the columns that are what a controller calls them, where a set point shows that it does: what it
     reads, what it drives, and its terms."""
     by_name = {name.lower(): name for name in guesses}
-    if not any(_SETPOINT.search(_words(name)) for name in units):
+    if not any(_SETPOINT.search(_name_words(name)) for name in units):
         return {}
     of_controller = "beside a set point it is the controller's:"
     out: dict[str, tuple[str, str]] = {}
@@ -221,7 +221,7 @@ def roles_of_data(
         steps, rows = np.diff(values), max(values.size, 1)
         if not steps.any():
             out[name] = "other", _NEVER_MOVES
-        elif rows >= _SETTINGS.fewest_rows and _mostly_even(steps):
+        elif rows >= _ROLES.fewest_rows and _mostly_even(steps):
             out[name] = "other", _COUNTS_ROWS
         elif _is_held(values):
             out[name] = "input", f"it is held between {np.count_nonzero(steps)} moves in {rows} rows"
@@ -231,7 +231,7 @@ def roles_of_data(
     open_, net = [n for n in names if n not in roles], dict(zip(names, (gain - gain.T).sum(axis=1)))
     for name in open_:
         help_ = gain[:, names.index(name)]
-        if help_.max() > _SETTINGS.strong_gain:
+        if help_.max() > _ROLES.strong_gain:
             out[name] = "output", f"{FOLLOWS} {names[int(help_.argmax())]}"
     roles |= {name: role for name, (role, _) in out.items()}
     has_held_input = any(roles.get(n) == "input" and _is_held(columns[n]) for n in names)
@@ -285,8 +285,8 @@ def _doubts(
 
 def _helps_beside(columns: Mapping[str, Floats], name: str, output: str, inputs: Sequence[str]) -> bool:
     """Tell whether the past of a column helps to predict an output beside that of the inputs and its own."""
-    reading, *others = _scaled([columns[n] for n in (output, name, *inputs)])
-    return all(_gain(reading, others[0], others[1:], lags) > _SETTINGS.strong_gain for lags in _SETTINGS.lags)
+    reading, *others = _standardised([columns[n] for n in (output, name, *inputs)])
+    return all(_gain(reading, others[0], others[1:], lags) > _ROLES.strong_gain for lags in _ROLES.lags)
 
 
 def _heated_rooms(
@@ -301,19 +301,19 @@ def _heated_rooms(
     alone = "output" not in roles.values()
     out = {}
     for name, (role, _) in guesses.items():
-        words = _words(name)
+        words = _name_words(name)
         if role != "disturbance" or _OUTDOORS.search(words) or not _ROOM.search(words) or not drives:
             continue
         if not (alone or re.search(r"(^|_)room(_|$)", words)):
             continue
         gain = _predictive_gain([columns[name], *(columns[drive] for drive in drives)])
-        if gain[1:, 0].max() > _SETTINGS.strong_gain:
+        if gain[1:, 0].max() > _ROLES.strong_gain:
             drive = drives[int(gain[1:, 0].argmax())]
             out[name] = "output", f"it follows the drive {drive}, as no surroundings do"
     return out
 
 
-def _followed(
+def _followed_levels(
     columns: Mapping[str, Floats], guesses: Mapping[str, tuple[str, str]]
 ) -> dict[str, tuple[str, str]]:
     """Return the held columns whose levels a reading comes to while another column drives it, as set points,
@@ -334,7 +334,7 @@ def _followed(
         gains = _predictive_gain(
             [columns[reading], *(columns[n] for n in drives if n not in (goal, reading))]
         )
-        if gains[1:, 0].max(initial=0.0) > _SETTINGS.strong_gain:
+        if gains[1:, 0].max(initial=0.0) > _ROLES.strong_gain:
             out[goal] = "other", f"{reading} {FOLLOWED}"
             if guesses.get(reading, ("", ""))[1] == NO_CLUE:
                 out[reading] = "output", f"it settles at the levels of {goal}"
@@ -345,14 +345,12 @@ def _comes_to(reading: Floats, goal: Floats) -> bool:
     """Tell whether most of the levels that a goal is held at, three at least, are those that a reading has in
     the last half of each hold."""
     bounds = [0, *(np.flatnonzero(np.diff(goal)) + 1), goal.size]
-    holds = [
-        (goal[a], reading[(a + b) // 2 : b]) for a, b in pairwise(bounds) if b - a >= _SETTINGS.fewest_rows
-    ]
+    holds = [(goal[a], reading[(a + b) // 2 : b]) for a, b in pairwise(bounds) if b - a >= _ROLES.fewest_rows]
     pairs = [
         (level, np.median(second_half)) for level, second_half in holds if np.isfinite(second_half).all()
     ]
     levels = np.array([level for level, _ in pairs])
-    off = [abs(level - value) <= _SETTINGS.held_size * np.ptp(levels) for level, value in pairs]
+    off = [abs(level - value) <= _ROLES.held_size * np.ptp(levels) for level, value in pairs]
     return np.unique(levels).size >= 3 and float(np.mean(off)) > 0.5
 
 
@@ -382,31 +380,31 @@ def _is_moved(columns: Mapping[str, Floats], name: str, drives: Sequence[str]) -
     """Tell whether the past of a drive helps to predict a column, row by row or in means over many rows, as
     long as the column is not stuck."""
     is_sound = np.isfinite(drop_stuck(name, columns[name], [columns[n] for n in drives])[0])
-    if is_sound.sum() < _SETTINGS.fewest_rows:
+    if is_sound.sum() < _ROLES.fewest_rows:
         return True  # nothing of it speaks against
     some = [columns[n][is_sound] for n in (name, *drives)]
-    reading, *moves = _scaled(some)
+    reading, *moves = _standardised(some)
     return any(
-        _gain(reading, drive, (), lags) > _SETTINGS.strong_gain for drive in moves for lags in _SETTINGS.lags
+        _gain(reading, drive, (), lags) > _ROLES.strong_gain for drive in moves for lags in _ROLES.lags
     )
 
 
-def _words(name: str) -> str:
+def _name_words(name: str) -> str:
     """Return a name in lower case with its words apart: ``BeerSet`` as ``beer_set``."""
     return re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", name).lower()
 
 
 def _mostly_even(steps: Floats) -> bool:
     usual = np.median(steps)
-    return bool(np.mean(np.abs(steps - usual) < _SETTINGS.exact * np.abs(usual)) >= _SETTINGS.counter_share)
+    return bool(np.mean(np.abs(steps - usual) < _ROLES.exact * np.abs(usual)) >= _ROLES.counter_share)
 
 
 def _is_held(values: Floats) -> bool:
     """Tell whether a column moves in few rows, and then far, as what a person or a relay sets does."""
     finite = values[np.isfinite(values)]
     moves = np.abs(np.diff(finite))
-    rarely_moves = 0 < np.count_nonzero(moves) <= _SETTINGS.held_share * finite.size
-    return bool(rarely_moves and np.median(moves[moves > 0]) >= _SETTINGS.held_size * np.ptp(finite))
+    rarely_moves = 0 < np.count_nonzero(moves) <= _ROLES.held_share * finite.size
+    return bool(rarely_moves and np.median(moves[moves > 0]) >= _ROLES.held_size * np.ptp(finite))
 
 
 def _unlike_inputs(
@@ -418,12 +416,12 @@ def _unlike_inputs(
     likely = [n for n, (role, why) in guesses.items() if role == "input" or why == NO_CLUE]
     held_input = next((name for name in (*stated, *likely) if _is_held(columns[name])), None)
     finite = {name: columns[name][np.isfinite(columns[name])] for name in by_unit}
-    moving = [n for n, v in finite.items() if np.count_nonzero(np.diff(v)) > _SETTINGS.held_share * len(v)]
+    moving = [n for n, v in finite.items() if np.count_nonzero(np.diff(v)) > _ROLES.held_share * len(v)]
     why = f"it moves in most rows, and {held_input} is held between its moves, as inputs are"
     return dict.fromkeys(moving if held_input else (), ("other", why))
 
 
-def _copies(
+def _copied_columns(
     columns: Mapping[str, Floats], guesses: Mapping[str, tuple[str, str]], units: Mapping[str, str]
 ) -> dict[str, tuple[str, str]]:
     """Return the columns that are one signal with another, or a set point less a reading, and of what.
@@ -431,7 +429,7 @@ def _copies(
     Of two copies the one with a clue, else the first, stays.  What is read is no copy of what is driven:
     under a proportional controller the two are multiples of each other.
     """
-    moving = {n: v[: _SETTINGS.most_rows] for n, v in columns.items() if np.ptp(v) > 0}  # of lost values none
+    moving = {n: v[: _ROLES.most_rows] for n, v in columns.items() if np.ptp(v) > 0}  # of lost values none
     out: dict[str, tuple[str, str]] = {}
     order = sorted(moving, key=lambda n: (n in guesses) + (guesses.get(n, ("", ""))[1] == NO_CLUE))
     for place, name in enumerate(order):
@@ -452,7 +450,7 @@ def _copies(
             break
         if name in out or why != NO_CLUE:
             continue
-        goals = [n for n in moving if n != name and (_SETPOINT.search(_words(n)) or _is_held(moving[n]))]
+        goals = [n for n in moving if n != name and (_SETPOINT.search(_name_words(n)) or _is_held(moving[n]))]
         goals = [n for n in goals if not _one_signal(values, moving[n])]
         pairs = ((g, n) for g in goals for n in order[:place] if n not in (*goals, *out))
         both = next(((g, n) for g, n in pairs if _explains(values, moving[g], moving[n])), None)
@@ -468,32 +466,32 @@ def _one_signal(one: Floats, other: Floats) -> bool:
 
 def _explains(y: Floats, *some: Floats) -> bool:
     """Tell whether a column is a sum of multiples of others but for rounding; of few moves nobody can."""
-    if min(np.count_nonzero(np.diff(v)) for v in (y, some[-1])) < _SETTINGS.fewest_moves:
+    if min(np.count_nonzero(np.diff(v)) for v in (y, some[-1])) < _ROLES.fewest_moves:
         return False
     x = np.column_stack([np.ones(y.size), *some])
     moves = np.abs(np.diff(y))
-    least = max(_SETTINGS.exact * float(np.ptp(y)), float(moves[moves > 0].min(initial=np.inf)))
+    least = max(_ROLES.exact * float(np.ptp(y)), float(moves[moves > 0].min(initial=np.inf)))
     for rows in (slice(0, 200), slice(None)):
         residual = y[rows] - x[rows] @ np.linalg.lstsq(x[rows], y[rows], rcond=None)[0]
-        if np.abs(residual).max() > least or residual.std() > _SETTINGS.rounding_share * y.std():
+        if np.abs(residual).max() > least or residual.std() > _ROLES.rounding_share * y.std():
             return False
     return True
 
 
 def _predictive_gain(columns: Sequence[Floats]) -> Floats:
     """Return G (n, n) of the module's theory, the least over the lags; row i helps column j."""
-    n, scaled = len(columns), _scaled(columns)
+    n, scaled = len(columns), _standardised(columns)
     gain = np.zeros((n, n))
     for j in range(n):
         for i in (i for i in range(n) if i != j):
-            gain[i, j] = min(_gain(scaled[j], scaled[i], (), lags) for lags in _SETTINGS.lags)
+            gain[i, j] = min(_gain(scaled[j], scaled[i], (), lags) for lags in _ROLES.lags)
     return gain
 
 
-def _scaled(columns: Sequence[Floats]) -> list[Floats]:
+def _standardised(columns: Sequence[Floats]) -> list[Floats]:
     """Return the first rows of columns, gaps filled, of mean 0 and standard deviation 1."""
     scaled = []
-    for values in (column[: _SETTINGS.most_rows] for column in columns):
+    for values in (column[: _ROLES.most_rows] for column in columns):
         rows, finite = np.arange(values.size), np.isfinite(values)
         filled = np.interp(rows, rows[finite], values[finite]) if finite.any() else np.zeros(values.size)
         scaled.append((filled - filled.mean()) / (np.std(filled) or 1.0))

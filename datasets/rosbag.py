@@ -47,7 +47,7 @@ Floats = NDArray[np.float64]
 _UNPACK = "unpack it, or write it anew with `ros2 bag convert`, not compressed as a file"
 _STORED = (".mcap", ".db3")  # what a ROS 2 bag is made of
 _NO_NUMBER = (KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError)
-_NUMBERS = {"temperature": "degC", "data": ""}  # the one field of a message without a map, and its unit
+_SINGLE_FIELDS = {"temperature": "degC", "data": ""}  # the one field of a message without a map, and its unit
 
 
 @dataclass(frozen=True)
@@ -126,14 +126,14 @@ def read_rosbag_table(path: str | Path, topics: TopicMap | None = None) -> Table
     for message in _messages(file, notes):
         type_of_topic[message.topic] = message.type
         if wanted is None:
-            _guess(message, columns, file)
+            _guess_column(message, columns, file)
         for name, column in columns.items():
             if column.topic == message.topic:
                 times, values = series.setdefault(name, ([], []))
                 times.append(_stamped(message, stamp, file))
-                values.append(_number(message, column, name, file))
+                values.append(_message_number(message, column, name, file))
     _check_found(columns, series, type_of_topic, file)
-    return _table(file, columns, series, "" if wanted is None else wanted.clock, notes)
+    return _bag_table(file, columns, series, "" if wanted is None else wanted.clock, notes)
 
 
 def bag_messages(path: str | Path) -> list[Message]:
@@ -143,7 +143,7 @@ def bag_messages(path: str | Path) -> list[Message]:
 
 def column_value(message: Message, column: Column, name: str, source: str | Path) -> float:
     """Return the number that a message has for a column, in the unit of the records."""
-    value = np.array([_number(message, column, name, Path(source))])
+    value = np.array([_message_number(message, column, name, Path(source))])
     return float(to_record_unit(value, column.unit)[0][0])
 
 
@@ -177,7 +177,7 @@ def bag_parts(folder: str | Path) -> list[Path]:
     listed = place / "metadata.yaml"
     if not listed.is_file():
         return sorted(path for path in place.iterdir() if path.suffix.lower() in _STORED)
-    names = _listed(listed)
+    names = _files_in_metadata(listed)
     hint = "copy the whole bag again"
     if not names:
         raise UserError("names no file of a bag", file=listed, hint=hint)
@@ -189,7 +189,7 @@ def bag_parts(folder: str | Path) -> list[Path]:
     return [place / name for name in names]
 
 
-def _listed(path: Path) -> list[str]:
+def _files_in_metadata(path: Path) -> list[str]:
     """Return the files that the metadata of a bag name, without their folders."""
     _need("rosbags", path)
     from ruamel.yaml import YAML
@@ -214,18 +214,18 @@ def _map_beside(file: Path) -> TopicMap | None:
     return None
 
 
-def _guess(message: Message, columns: dict[str, Column], file: Path) -> None:
+def _guess_column(message: Message, columns: dict[str, Column], file: Path) -> None:
     """Add a column for a topic that is seen for the first time and has one number."""
     if any(column.topic == message.topic for column in columns.values()):
         return
-    number_field = next((f for f in _NUMBERS if _has(message.content, f)), "")
+    number_field = next((f for f in _SINGLE_FIELDS if _has(message.content, f)), "")
     field = "value" if message.attrs.get("units") else number_field
     try:
         float(_field(message.content, field))
     except _NO_NUMBER:
         return
     name = message.topic.strip("/").replace("/", "_")
-    unit = message.attrs.get("units") or _NUMBERS.get(field, "")
+    unit = message.attrs.get("units") or _SINGLE_FIELDS.get(field, "")
     if not unit:
         name, unit = split_header(name, file=str(file))
     if name in columns:
@@ -252,7 +252,7 @@ def _field(content: Any, path: str) -> Any:
     return content
 
 
-def _number(message: Message, column: Column, name: str, file: Path) -> float:
+def _message_number(message: Message, column: Column, name: str, file: Path) -> float:
     try:
         return float(_field(message.content, column.field))
     except _NO_NUMBER as error:
@@ -292,14 +292,14 @@ def _check_found(
         raise UserError(problem, file=file, hint="write a topic map (`thermogrip init topics`)")
 
 
-def _table(
+def _bag_table(
     file: Path,
     columns: Mapping[str, Column],
     series: Mapping[str, tuple[list[float], list[float]]],
     clock: str,
     notes: list[str],
 ) -> Table:
-    sorted_series = {name: _in_order(*pair) for name, pair in series.items()}
+    sorted_series = {name: _by_time(*pair) for name, pair in series.items()}
     units = {name: to_record_unit(v, columns[name].unit)[1] for name, (_, v) in sorted_series.items()}
     roles = {name: column.role or guess_role(name, units[name]) for name, column in columns.items()}
     if not clock:
@@ -319,7 +319,7 @@ def _table(
     return Table(str(file), numbers, {}, np.arange(1, axis.size + 1), attrs, {}, tuple(notes))
 
 
-def _in_order(times: list[float], values: list[float]) -> tuple[Floats, Floats]:
+def _by_time(times: list[float], values: list[float]) -> tuple[Floats, Floats]:
     t, v = np.asarray(times, dtype=float), np.asarray(values, dtype=float)
     order = np.argsort(t, kind="stable")
     return t[order], v[order]

@@ -27,7 +27,7 @@ def by_grasp(
 ) -> Iterator[Split]:
     """Return random splits with so many training units of each material; the others are the test."""
     material, unit = label_values(grasps, "material"), unit_names(grasps)
-    _whole(grasps, material, "material")
+    _check_touch_groups(grasps, material, "material")
     classes = {m: np.unique(unit[material == m]) for m in dict.fromkeys(material.tolist()) if m}
     if not classes:
         raise UserError("no grasp has a material", file=log_name(grasps), hint="give the column material")
@@ -50,7 +50,7 @@ def by_grasp(
 def shipped(grasps: Grasps) -> Split:
     """Return the split in the record's own ``split``, train or test; other words there are in neither."""
     split = label_values(grasps, "split")
-    _whole(grasps, split, "split")
+    _check_touch_groups(grasps, split, "split")
     train, test = np.flatnonzero(split == "train"), np.flatnonzero(split == "test")
     if not train.size or not test.size:
         problem = f"column split gives {train.size} training and {test.size} test grasps"
@@ -58,7 +58,7 @@ def shipped(grasps: Grasps) -> Split:
     return train, test
 
 
-def _whole(grasps: Grasps, label: NDArray[np.str_], name: str) -> None:
+def _check_touch_groups(grasps: Grasps, label: NDArray[np.str_], name: str) -> None:
     """Refuse a touch group whose touches differ in the label that is split by."""
     groups = label_values(grasps, "touch_group")
     for group in np.unique(groups[groups != ""]):

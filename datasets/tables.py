@@ -44,7 +44,7 @@ MOST_COLUMNS = 4096  # of a table; one of thermogrip has twelve
 _NULLS = frozenset(
     ["", "nan", "NaN", "NAN", "NA", "na", "N/A", "null", "NULL", "None", "-nan", "#N/A", "<NA>"]
 )
-_LOST = _NULLS | {"-", "--", "---", "?", "*", "NaT", "unknown", "unavailable"}
+_LOST_CELLS = _NULLS | {"-", "--", "---", "?", "*", "NaT", "unknown", "unavailable"}
 _COMMENT = ("#", "%", "//")  # how a line begins that is no row
 _LEFT_OUT = "\x1f"  # how the name of a column begins that is not kept
 _NAMELESS = "columns named c1 to c{} by position; --columns a,b,... names them"
@@ -63,7 +63,7 @@ _TERMINAL = re.compile(
 )  # of PuTTY and others, and of Arduino's serial monitor
 _ESPHOME = re.compile(r"\[(\d{2}:\d{2}:\d{2}[.\d]*)\].*?: '([^',]+)': Sending state ([-+.\d]+|ON|OFF)\b")
 _OF_HEATERS = ("target", "temp", "pwm")  # of a section of Klipper's statistics; what follows is the host's
-_NAME = re.compile(r"[A-Za-z_@][^:=,;]{0,63}")
+_LABEL = re.compile(r"[A-Za-z_@][^:=,;]{0,63}")
 _LABELLED = re.compile(r"[A-Za-z_@][^:=,;]{0,63}?[:=]([-+.\deE]{1,30}|nan|NaN)")  # a cell, name and number
 _LABELLED_LINES = 10  # with the same names, that are no chance
 _MOST = 0.9  # share of a column's cells, or of a table's lines, that decide what the others should be
@@ -73,7 +73,7 @@ _SWITCH = {
     "heating": 1.0, "cooling": 1.0, "active": 1.0, "running": 1.0, "idle": 0.0, "inactive": 0.0,
     "stopped": 0.0,
 }  # fmt: skip
-_NUMBER = re.compile(
+_NUMBER_CELL = re.compile(
     r"[+-]?(\d+\.?\d*([eE][+-]?\d+)?|\.\d+([eE][+-]?\d+)?|inf|infinity)", re.ASCII | re.IGNORECASE
 )
 _WITH_UNIT = re.compile(r"([+-]?[\d.,]+(?:[eE][+-]?\d+)?)\s*([^\W\d_]{1,4}|%|[°º]\s?[CFK])")
@@ -184,13 +184,13 @@ def check_header(headers: Sequence[str], names: Sequence[str], file: str) -> Non
 def find_layout(data: bytes, file: str) -> Layout:
     """Return how a text is a table, from its first lines."""
     head: list[tuple[int, str]] = []
-    for line_number, raw in enumerate(_lines(data[: 1 << 20]), start=1):
+    for line_number, raw in enumerate(_iterate_lines(data[: 1 << 20]), start=1):
         if len(head) < _HEAD_LINES and raw.strip():
             head.append((line_number, raw.decode("utf-8", errors="replace").strip("\r\n")))
     separator, first = _best_separator(head)
     if first is None:
         return _first_line_as_names(data, file)
-    rows = [_split(line, separator) for _, line in head[first:]]
+    rows = [_split_cells(line, separator) for _, line in head[first:]]
     n = len(rows[0])
     if n > MOST_COLUMNS:
         raise UserError(f"has {n} columns, more than {MOST_COLUMNS}", file=file, hint="leave some out")
@@ -199,7 +199,7 @@ def find_layout(data: bytes, file: str) -> Layout:
     nameless = [f"c{line_number}" for line_number, name in enumerate(header[: n - hollow], 1) if not name]
     notes = []
     if len(nameless) == n - hollow:
-        above = len(_split(head[first - 1][1].lstrip("#%/ "), separator)) if first else 0
+        above = len(_split_cells(head[first - 1][1].lstrip("#%/ "), separator)) if first else 0
         why = f"{above} names above rows of {n} cells" if above > n else "no header"
         notes = [f"{why}: {_NAMELESS.format(n - hollow)}"]
     if nameless and not notes:
@@ -225,7 +225,7 @@ def _best_separator(head: Sequence[tuple[int, str]]) -> tuple[str, int | None]:
     best_share = -1.0
     best, best_first = ",", None
     for separator in "\t;|, ":
-        rows = [[] if line.startswith(_COMMENT) else _split(line, separator) for _, line in head]
+        rows = [[] if line.startswith(_COMMENT) else _split_cells(line, separator) for _, line in head]
         starts = [k for k in range(len(rows)) if _is_row(rows, k, separator)]
         if not starts:
             continue
@@ -235,7 +235,7 @@ def _best_separator(head: Sequence[tuple[int, str]]) -> tuple[str, int | None]:
         if _like_first(rows[first:], separator) < _MOST:
             first = next((k for k in others if _like_first(rows[k:], separator) >= _MOST), first)
         n = len(rows[first])
-        fits = [len(row) == n and _values(row, separator) for row in rows[first:]]
+        fits = [len(row) == n and _number_share(row, separator) for row in rows[first:]]
         share = float(np.mean(fits)) if n > 1 else 0.0
         if share > best_share + 1e-9:
             best_share = share
@@ -248,7 +248,7 @@ def unused(name: str, others: Container[str], numbered: str = "{0}_{1}") -> str:
     return next(n for n in chain([name], (numbered.format(name, k) for k in count(2))) if n not in others)
 
 
-def _split(line: str, separator: str) -> list[str]:
+def _split_cells(line: str, separator: str) -> list[str]:
     if separator == " ":
         return line.split()
     try:
@@ -259,12 +259,17 @@ def _split(line: str, separator: str) -> list[str]:
 
 def _is_value(cell: str, separator: str) -> bool:
     plain = cell if separator == "," else cell.replace(",", ".")
-    if _NUMBER.fullmatch(plain) or STAMP.fullmatch(cell) or cell in _LOST or cell.lower() in _SWITCH:
+    if (
+        _NUMBER_CELL.fullmatch(plain)
+        or STAMP.fullmatch(cell)
+        or cell in _LOST_CELLS
+        or cell.lower() in _SWITCH
+    ):
         return True
     return (match := _WITH_UNIT.fullmatch(cell)) is not None and _is_unit(match[2])
 
 
-def _values(row: Sequence[str], separator: str) -> float:
+def _number_share(row: Sequence[str], separator: str) -> float:
     """Return the share of a row's cells that are numbers, times or lost."""
     return sum(_is_value(cell, separator) for cell in row) / max(len(row), 1)
 
@@ -272,22 +277,22 @@ def _values(row: Sequence[str], separator: str) -> float:
 def _like_first(rows: Sequence[Sequence[str]], separator: str) -> float:
     """Return the share of lines that are as long as the first one, and of which at least half are numbers."""
     n = len(rows[0])
-    return float(np.mean([len(row) == n and _values(row, separator) >= 0.5 for row in rows]))
+    return float(np.mean([len(row) == n and _number_share(row, separator) >= 0.5 for row in rows]))
 
 
 def _is_row(rows: Sequence[Sequence[str]], k: int, separator: str) -> bool:
     """Tell whether line k is one of numbers, as long as the next or the one before."""
     row, cells = rows[k], [cell for cell in rows[k] if cell]
     beside = [len(other) for other in (*rows[max(k - 1, 0) : k], *rows[k + 1 : k + 2])]
-    return bool(cells) and _values(cells, separator) >= 0.5 and (not beside or len(row) in beside)
+    return bool(cells) and _number_share(cells, separator) >= 0.5 and (not beside or len(row) in beside)
 
 
 def _names_above(lines: Sequence[tuple[int, str]], n: int, separator: str) -> tuple[list[str], int]:
-    """Return the names of n columns, empty where the file has none, and how many lines gave them."""
+    """Return the names of n columns, empty where the file has none, and the number of their lines."""
     headers: list[list[str]] = []  # the nearest first: units may stand under the names
     for _, line in reversed(lines):
         comment = line.startswith(_COMMENT)
-        cells = _split(line.lstrip("#%/ ") if comment else line, separator)
+        cells = _split_cells(line.lstrip("#%/ ") if comment else line, separator)
         if separator == " " and len(cells) != n:
             cells = [cell.strip() for cell in re.split(r"\s{2,}|\t|,|;", line.strip("#%/ "))]
         if len(cells) in (n, n - 1) and any(cells) and len(headers) < 2 and not (comment and headers):
@@ -348,21 +353,23 @@ def _without_labels(data: bytes) -> tuple[bytes, tuple[str, ...]]:
     So write serial plotters (``T1:23.5,T2:24.0``), printer hosts (``T:22.1 /200.0 @:127``, a target behind
     its reading) and Klipper (``extruder: target=200 temp=22.1 pwm=0.9``); lines without them are passed over.
     """
-    head = [line.decode("utf-8", "replace") for line in islice(_lines(data[: 1 << 20]), 5 * _HEAD_LINES)]
+    head = [
+        line.decode("utf-8", "replace") for line in islice(_iterate_lines(data[: 1 << 20]), 5 * _HEAD_LINES)
+    ]
     if any(_ESPHOME.match(line) for line in head):
-        matches = (_ESPHOME.match(line.decode("utf-8", "replace")) for line in _lines(data))
+        matches = (_ESPHOME.match(line.decode("utf-8", "replace")) for line in _iterate_lines(data))
         readings = (match.expand(r"\1,\2,\3") if match else "" for match in matches)
         return "\n".join(["time,name,state", *readings]).encode(), ("lines of an ESPHome log",)
-    labels = Counter(tuple(_labelled(line)) for line in head)
+    labels = Counter(tuple(_labelled_cells(line)) for line in head)
     del labels[()]
     names, lines_of_names = max(labels.items(), key=lambda item: (item[1], len(item[0])), default=((), 0))
     if not names or lines_of_names < min(_LABELLED_LINES, max(2, _MOST * sum(map(bool, head)))):
         return data, ()
     rows: list[str] = []
-    for raw in _lines(data):
-        cells = _labelled(raw.decode("utf-8", "replace"))
+    for raw in _iterate_lines(data):
+        cells = _labelled_cells(raw.decode("utf-8", "replace"))
         rows.append(",".join(cells[name] for name in names) if cells.keys() >= {*names} else "")
-    passed = sum(not row and bool(raw.strip()) for row, raw in zip(rows, _lines(data)))
+    passed = sum(not row and bool(raw.strip()) for row, raw in zip(rows, _iterate_lines(data)))
     first = next((place for place, row in enumerate(rows) if row), 0)
     rows[max(first - 1, 0) : first] = [",".join(names)]  # in place of a line before, if there is one
     notes = [f"lines have readings beside their names: {', '.join(names)}"]
@@ -373,7 +380,7 @@ def _without_labels(data: bytes) -> tuple[bytes, tuple[str, ...]]:
 def _stamps_as_column(data: bytes) -> bytes:
     """Return the lines of a terminal that begin with a stamp in brackets, or before an arrow, as a table with
     the stamps as its first column."""
-    head = [line for line in islice(_lines(data[: 1 << 20]), _HEAD_LINES) if line.strip()]
+    head = [line for line in islice(_iterate_lines(data[: 1 << 20]), _HEAD_LINES) if line.strip()]
     stamped = [match for line in head if (match := _TERMINAL.match(line))]
     if not head or len(stamped) < _MOST * len(head):
         return data
@@ -388,7 +395,7 @@ def _stamps_as_column(data: bytes) -> bytes:
     )
 
 
-def _labelled(line: str) -> dict[str, str]:
+def _labelled_cells(line: str) -> dict[str, str]:
     """Return the numbers of a line by the names beside them, and its stamp."""
     stamp = _LINE_STAMP.match(line)
     section = last = ""
@@ -404,9 +411,9 @@ def _labelled(line: str) -> dict[str, str]:
         mark = next((sign for sign in "=:" if sign in word), "")
         name, _, value = word.partition(mark) if mark else ("", "", word)
         name = name.strip()
-        if last and word.startswith("/") and _NUMBER.fullmatch(word[1:]):
+        if last and word.startswith("/") and _NUMBER_CELL.fullmatch(word[1:]):
             cells[unused(f"{last}_target", cells)] = word[1:]
-        elif _NAME.fullmatch(name) and (_NUMBER.fullmatch(value) or value in ("nan", "NaN")):
+        elif _LABEL.fullmatch(name) and (_NUMBER_CELL.fullmatch(value) or value in ("nan", "NaN")):
             last = f"{section}_{name}" if section and name in _OF_HEATERS else name
             cells[unused(last, cells)] = value
         elif mark == ":" and not value:
@@ -427,7 +434,7 @@ def _parse_table(
     except UnicodeDecodeError as error:
         row = data.count(b"\n", 0, error.start) + 1
         raise UserError("is not UTF-8 text", file=file, row=row, hint="save the file as UTF-8") from error
-    rows, notes = list(_rows(text, layout, file)), list(layout.notes)
+    rows, notes = list(_cell_rows(text, layout, file)), list(layout.notes)
     if rows and len(rows[-1][1]) < n and not text.endswith(("\n", "\r")):
         line, cells = rows.pop()
         notes.append(f"row {line} is the last and was cut off ({len(cells)} of {n} cells): dropped")
@@ -459,7 +466,7 @@ def _parse_table(
         except UserError as fault:
             faults += [] if name.startswith(_LEFT_OUT) else [fault]
     if faults:
-        raise _joined(faults, names if tolerated else ())  # what may be broken is a log
+        raise _joined_faults(faults, names if tolerated else ())  # what may be broken is a log
     return _table_of(columns, file, lines, notes)
 
 
@@ -471,7 +478,7 @@ def _table_of(columns: Sequence[Column], file: str, lines: NDArray[np.int64], no
     return Table(file, numbers, lasting, lines, notes=tuple(all_notes))
 
 
-def _rows(text: str, layout: Layout, file: str) -> Iterator[tuple[int, list[str]]]:
+def _cell_rows(text: str, layout: Layout, file: str) -> Iterator[tuple[int, list[str]]]:
     """Yield the first line and the cells of each row that is not empty."""
     stream = io.StringIO(text, newline="")
     for _ in range(layout.skip):
@@ -499,7 +506,7 @@ def read_column(
     number among more numbers than are tolerated."""
     if (plain := _plain_numbers(cells)) is not None:
         return Column(name, plain)
-    cells, lost = [cell.strip() for cell in cells], _LOST if tolerated else _NULLS
+    cells, lost = [cell.strip() for cell in cells], _LOST_CELLS if tolerated else _NULLS
     values = _to_numbers(cells, lost)
     notes: list[str] = []
     wrong = _not_numbers(cells, values, lost)
@@ -515,11 +522,11 @@ def read_column(
         return Column(name, text=[*cells])  # numbers and both states of a switch: readings of several signals
     if wrong.size <= 2 * tolerated * cells_known:
         if wrong.size:
-            where = f"{name_rows(lines[wrong], 5)}: {_shown(first)}"
+            where = f"{name_rows(lines[wrong], 5)}: {_quoted_cell(first)}"
             notes = [f"{name}: {wrong.size} cell(s) that are no numbers left empty ({where})", *notes]
         return Column(name, values, notes=tuple(notes))
     if tolerated and (states := switched(cells)) is not None:
-        return Column(name, states, notes=(f"{name}: words as {_shown(first)} read as 0 and 1",))
+        return Column(name, states, notes=(f"{name}: words as {_quoted_cell(first)} read as 0 and 1",))
     if tolerated and (wrong.size >= _MOST * cells_known or STAMP.fullmatch(first)):
         return Column(name, text=[*cells])
     hint = "write a number, leave the cell empty, or drop the column"
@@ -527,7 +534,7 @@ def read_column(
         hint = "write a decimal point"
     elif STAMP.fullmatch(first):
         hint = "write seconds since the first row"
-    problem = f"{_shown(first)} is not a number"
+    problem = f"{_quoted_cell(first)} is not a number"
     raise UserError(problem, file=file, row=int(lines[wrong[0]]), column=name, hint=hint)
 
 
@@ -540,7 +547,7 @@ def _to_numbers(cells: Sequence[str], lost: Container[str]) -> NDArray[np.float6
     if (plain := _plain_numbers(number_words)) is not None:
         return plain
     return np.array(
-        [float(cell) if _NUMBER.fullmatch(cell) else np.nan for cell in number_words], dtype=float
+        [float(cell) if _NUMBER_CELL.fullmatch(cell) else np.nan for cell in number_words], dtype=float
     )
 
 
@@ -584,7 +591,7 @@ def _without_unit(name: str, cells: Sequence[str], lost: Container[str]) -> tupl
 def switched(cells: Sequence[str]) -> NDArray[np.float64] | None:
     """Return the numbers of cells that are numbers or the two states of a switch, NaN where one is lost; None
     where there are other words, or two of one meaning."""
-    words, lost = [cell.strip().lower() for cell in cells], {word.lower() for word in _LOST}
+    words, lost = [cell.strip().lower() for cell in cells], {word.lower() for word in _LOST_CELLS}
     values = _to_numbers(words, lost)
     states = {words[row] for row in _not_numbers(words, values, lost)}
     if not states <= {*_SWITCH} or len({_SWITCH[state] for state in states}) < len(states):
@@ -592,11 +599,11 @@ def switched(cells: Sequence[str]) -> NDArray[np.float64] | None:
     return np.array([_SWITCH.get(word, value) for word, value in zip(words, values.tolist())], dtype=float)
 
 
-def _shown(cell: str) -> str:
+def _quoted_cell(cell: str) -> str:
     return repr(cell if len(cell) <= 40 else cell[:37] + "...")
 
 
-def _joined(faults: Sequence[UserError], names: Sequence[str]) -> UserError:
+def _joined_faults(faults: Sequence[UserError], names: Sequence[str]) -> UserError:
     """Return all that is wrong with a file as one error, of a log with what reads the rest of it."""
     first, bad = faults[0], {fault.column for fault in faults}
     column_words = ",".join("-" if name in bad else name.replace(",", " ") for name in names)
@@ -813,7 +820,7 @@ def _as_utf8(data: bytes, path: str | Path) -> bytes:
         return data.decode("utf-16").encode("utf-8")
 
 
-def _lines(data: bytes) -> Iterator[bytes]:
+def _iterate_lines(data: bytes) -> Iterator[bytes]:
     """Yield the lines without their ends; a list of all of them would be larger than the table."""
     for raw in io.BytesIO(data):
         yield from raw.splitlines()

@@ -24,7 +24,7 @@ from thermogrip.datasets.errors import UserError, known_names
 UNITS = ("degC", "K", "degF", "percent", "V", "A", "W", "s", "ms", "min", "0_255")
 _SUFFIXES = " ".join(f"_{unit}" for unit in UNITS)
 
-_TIMES, _TEMPERATURES = ("s", "ms", "min"), ("degC", "K", "degF")
+_TIME_UNITS, _TEMPERATURE_UNITS = ("s", "ms", "min"), ("degC", "K", "degF")
 
 # suffix as people write it -> what to write instead ("" where the toolkit has no such unit)
 _FOREIGN = {
@@ -55,7 +55,7 @@ DRIVE = re.compile(
     r"^(drive|pump|pwm|duty|heater|heating|cooler|cooling|peltier|tec|valve|fan|flow|cmd|command|power|input"
     r"|actuator|control|relay|mv|q[hc]|[qu])(\d*|_.*)$"
 )
-_LONGEST = 200  # characters of a header that is looked through for a unit
+_LONGEST_HEADER = 200  # characters of a header that is looked through for a unit
 
 
 def split_header(header: str, *, file: str | None = None) -> tuple[str, str]:
@@ -64,7 +64,7 @@ def split_header(header: str, *, file: str | None = None) -> tuple[str, str]:
     header = header.strip()
     for unit in UNITS:
         if header.endswith(f"_{unit}"):
-            return _named(header.removesuffix(f"_{unit}"), header, file), unit
+            return _checked_unit(header.removesuffix(f"_{unit}"), header, file), unit
     name, unit, scale = read_header(header)
     if unit != "1":
         rename = f"rename the column to {name}_{unit}"
@@ -72,7 +72,7 @@ def split_header(header: str, *, file: str | None = None) -> tuple[str, str]:
         raise UserError("unit is spelt another way", file=file, column=header, hint=hint)
     if _BRACKETED.search(header) or _FOREIGN.get(header.rpartition("_")[2]) == "":
         raise UserError("unit is unknown", file=file, column=header, hint=f"use one of {_SUFFIXES}, or none")
-    return _named(header, header, file), "1"
+    return _checked_unit(header, header, file), "1"
 
 
 def read_header(header: str, others: Sequence[str] = ()) -> tuple[str, str, float]:
@@ -85,22 +85,22 @@ def read_header(header: str, others: Sequence[str] = ()) -> tuple[str, str, floa
     series = any(f"{header[:-1]}{letter}" in others for letter in "abdeABDE" if letter != header[-1:])
     for unit in UNITS:
         if header.endswith(f"_{unit}") and not (series and len(unit) == 1):
-            return _plain(header.removesuffix(f"_{unit}")), unit, 1.0
-    match = _UNIT_AT_END.fullmatch(header) if len(header) <= _LONGEST else None
+            return _bare_name(header.removesuffix(f"_{unit}")), unit, 1.0
+    match = _UNIT_AT_END.fullmatch(header) if len(header) <= _LONGEST_HEADER else None
     if match is None:
-        return _plain(header), "1", 1.0
+        return _bare_name(header), "1", 1.0
     name, inside = match["name"], match["inside"]
     word = (match["after"] if inside is None else inside).strip()
     if inside is not None and word in ("", "-", "1"):
-        return _plain(name), "1", 1.0
+        return _bare_name(name), "1", 1.0
     unit, scale = any_unit(word)
-    timed = unit in _TIMES and re.search(r"(?i:time|elapsed)|^t$", name) is None
+    timed = unit in _TIME_UNITS and re.search(r"(?i:time|elapsed)|^t$", name) is None
     if inside is None and unit and len(word) == 1 and word != "%":
         lower = word.islower() and DRIVE.match(name.lower())
         unit = "" if series or lower or (match["mark"] or "").isspace() else unit
     if (inside is None and timed) or (word == "deg" and not re.match(r"(?i)t\d*(_|$)|.*temp", name)):
         unit = ""
-    return (_plain(name), unit, scale) if unit else (_plain(header), "1", 1.0)
+    return (_bare_name(name), unit, scale) if unit else (_bare_name(header), "1", 1.0)
 
 
 def any_unit(word: str) -> tuple[str, float]:
@@ -113,11 +113,11 @@ def any_unit(word: str) -> tuple[str, float]:
     return unit, _TO_CONVERT.get(word, 1.0)
 
 
-def _plain(name: str) -> str:
+def _bare_name(name: str) -> str:
     return re.sub(r"[\s,;\"'/()\[\]{}]+", "_", name).strip("_")
 
 
-def _named(name: str, header: str, file: str | None) -> str:
+def _checked_unit(name: str, header: str, file: str | None) -> str:
     if not name or not re.fullmatch(r"[^\s,;\"'/]+", name):
         problem = f"{name!r} is no name for a variable"
         raise UserError(problem, file=file, column=header, hint="name the column")
@@ -126,7 +126,7 @@ def _named(name: str, header: str, file: str | None) -> str:
 
 def rename_hint(name: str, headers: Sequence[str]) -> str:
     """Return which column to rename where ``name``, a time or a temperature, is missing."""
-    wanted = _TIMES if name == "time" else _TEMPERATURES
+    wanted = _TIME_UNITS if name == "time" else _TEMPERATURE_UNITS
     for header in headers:
         unit = read_header(header)[1]
         if unit in wanted and not header.startswith("time"):
@@ -164,7 +164,7 @@ def find_column(entry: str, units: Mapping[str, str], file: str | None = None) -
     entry = entry.strip()
     if entry in units:
         return entry
-    likely = {entry, _plain(entry), read_header(entry)[0]}
+    likely = {entry, _bare_name(entry), read_header(entry)[0]}
     for candidates in (
         likely & {*units},
         {n for n in units if n.lower() in {word.lower() for word in likely}},

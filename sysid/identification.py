@@ -66,7 +66,6 @@ from thermogrip.sysid.validation.free_run import FreeRun, warm_up_of
 from thermogrip.sysid.validation.held_out import (
     Case,
     Held,
-    Row,
     cases_of,
     fold_rows,
     relative_error,
@@ -74,7 +73,7 @@ from thermogrip.sysid.validation.held_out import (
     run_held_out,
 )
 from thermogrip.sysid.validation.prediction_bands import between_runs, expected_error, part_errors
-from thermogrip.sysid.validation.verdict import doubts_of, verdict_of
+from thermogrip.sysid.validation.verdict import Row, doubts_of, verdict_of
 
 if TYPE_CHECKING:
     from thermogrip.sysid.models.model import GreyModel
@@ -84,7 +83,7 @@ MODELS = (*BLACK_BOXES, "network")
 # public logs and four of a gripper none keeps sindy
 ON_REQUEST = ("armax", "bj", "parsim", "sindy")
 USUAL_MODELS = tuple(model for model in MODELS if model not in ON_REQUEST)
-LINEAR = ("arx", "oe", "armax", "bj", "subspace", "parsim")  # kept where another kind errs hardly less
+LINEAR = ("arx", "oe", "armax", "bj", "subspace", "parsim")  # kept where another kind errs barely less
 WITHIN_NOISE = 1.1  # of the best error: then the network is preferred, and a linear kind to neural models
 NO_DRAWS = (UserError, np.linalg.LinAlgError)  # what draws of a fit may fail with; the fit itself is sound
 
@@ -99,7 +98,7 @@ class Identification(Shown):
     model: str  # its kind, of :data:`MODELS`
     rows: tuple[Row, ...]  # every candidate on held-out data, then the chosen one in sample
     data_check: DataCheck
-    evidence: Evidence  # which temperatures and how many minutes of each kind of drive the plant rests on
+    evidence: Evidence  # which temperatures and the minutes of each kind of drive the plant rests on
     good: bool  # whether the chosen model may be called good
     doubts: tuple[str, ...]  # what decides and is not certain, a line each; none where it is good
     verdict: str  # one sentence
@@ -200,13 +199,13 @@ def identify(
     >>> found.model, found.good, found.errors()["oe"] < 0.05
     ('oe', True, True)
     """
-    task = _read(
+    task = _read_logs(
         as_logs(logs, inputs, outputs, disturbances),
         network if "network" in models else None,
         {"inputs": inputs, "outputs": outputs, "disturbances": disturbances},
         _Options(average, order, delay, leave_one_out, draws, seed),
     )
-    kinds = _candidates(models, task.network)
+    kinds = _candidate_kinds(models, task.network)
     cases = cases_of(task.logs, leave_one_out)
     steps = _Steps(progress, (len(cases) + 1) * len(kinds) + 2)
     boxes = _fit_black_boxes(kinds, task, steps, early)
@@ -251,7 +250,7 @@ class _Task:
     options: _Options
 
 
-def _read(
+def _read_logs(
     logs: list[Log],
     network: GreyModel | str | Path | None,
     named: Mapping[str, Sequence[str] | None],
@@ -317,7 +316,7 @@ def _for_network(
     return network, matched, [*notes, *converted]
 
 
-def _candidates(models: Sequence[str], network: GreyModel | None) -> list[str]:
+def _candidate_kinds(models: Sequence[str], network: GreyModel | None) -> list[str]:
     unknown = [name for name in models if name not in MODELS]
     if unknown:
         raise UserError(f"no model of kind {unknown[0]!r}", hint=known_names(unknown[0], MODELS))
@@ -434,12 +433,12 @@ def _hold_out(
         report = steps.start("left out", of=len(items))
         return run_parallel(_fold_of, items, workers, report, what="fitting")
     return [
-        _fold_of((kind, case, kept, task, steps.start(f"{kind} without {_names(case)}")))
+        _fold_of((kind, case, kept, task, steps.start(f"{kind} without {_case_name(case)}")))
         for kind, case in pairs
     ]
 
 
-def _names(case: Case) -> str:
+def _case_name(case: Case) -> str:
     """Return what is held out of a case, in short."""
     return case.held[0].name if len(case.held) == 1 else f"{TAIL}each log"
 
@@ -451,7 +450,7 @@ def _fold_of(item: _FoldItem) -> _Fold:
     try:
         plant = _fitted(kind, case.train, kept, task, report)
     except UserError as error:
-        fold.refused.append(f"{kind} without {_names(case)}: {error}")
+        fold.refused.append(f"{kind} without {_case_name(case)}: {error}")
         return fold
     for held_out in case.held:
         try:
@@ -492,7 +491,7 @@ def _fitted(
 
 
 def choose_black_box(fits: Sequence[BlackBoxFit], logs: Sequence[Log]) -> BlackBoxFit:
-    """Return the fit of the least error on the parts, a linear one where another kind errs hardly less.
+    """Return the fit of the least error on the parts, a linear one where another kind errs barely less.
 
     Among linear kinds the smaller one of two that tie was no better on 14 public logs (in the geometric mean
     both err 1.34 times the best structure of all), nor was the one of the less error on the whole log of its
@@ -507,7 +506,7 @@ def choose_black_box(fits: Sequence[BlackBoxFit], logs: Sequence[Log]) -> BlackB
 
 
 def beyond_reach(fits: Sequence[BlackBoxFit], logs: Sequence[Log]) -> bool:
-    """Return whether even another kind without any error would be hardly better on another run."""
+    """Return whether even another kind without any error would be barely better on another run."""
     linear = [fit for fit in fits if fit.kind in LINEAR]
     run = _run_error(linear, logs) if linear else 0.0
     return run > 0 and float(np.hypot(min(fit.choice.error for fit in linear), run)) <= WITHIN_NOISE * run
@@ -517,12 +516,12 @@ def _run_error(fits: Sequence[BlackBoxFit], logs: Sequence[Log]) -> float:
     """Return what a gain that differs from run to run adds, in units of the outputs' spread, by the best
     linear fit (else any); 0 where the logs show it."""
     best = min([fit for fit in fits if fit.kind in LINEAR] or fits, key=lambda fit: fit.choice.error)
-    changes = _rms(between_runs(best.plant, logs))
+    changes = _rms_of_changes(between_runs(best.plant, logs))
     added = [changes.get(name, 0.0) / s for name, s in zip(best.grid.outputs, best.grid.output_spread())]
     return float(np.sqrt(np.mean(np.square(added))))
 
 
-def _rms(changes: Mapping[str, Array]) -> dict[str, float]:
+def _rms_of_changes(changes: Mapping[str, Array]) -> dict[str, float]:
     return {name: float(np.sqrt(np.mean(change**2))) for name, change in changes.items()}
 
 
@@ -629,7 +628,7 @@ def _with_expected(plant: Plant, kind: str, rows: Sequence[Row], logs: Sequence[
         if row.held_out and row.model == kind
     ]
     plant = replace(plant, scores=replace(plant.scores, held_out=held_out))
-    differs = _rms(between_runs(plant, logs))
+    differs = _rms_of_changes(between_runs(plant, logs))
     expected = {
         name: expected_error(part_errors(plant, name), differs.get(name, 0.0)) for name in plant.outputs
     }

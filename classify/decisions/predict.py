@@ -164,7 +164,7 @@ def answer(
     return [
         one_answer
         for grasps in record_list(X)
-        for one_answer in _answers(classifier, grasps, names, rule, object_range, nearest=nearest)
+        for one_answer in _answers_of_record(classifier, grasps, names, rule, object_range, nearest=nearest)
     ]
 
 
@@ -176,7 +176,7 @@ def classify_grasps(
     return [one_answer.row() for one_answer in answer(classifier, X, candidates, **options)]
 
 
-def _answers(
+def _answers_of_record(
     classifier: GraspClassifier, as_read: Grasps, names: list[str], rule: StopRule | None,
     object_range: tuple[float, float] | None, *, nearest: bool,
 ) -> list[Answer]:  # fmt: skip
@@ -184,7 +184,7 @@ def _answers(
     whole, grasps = not classifier.leaves_samples_out, with_object_range(as_read, object_range)
     quality = check_grasps(grasps, longest=classifier.longest_, whole_traces=whole)
     usable, units = quality.read(grasps), unit_names(grasps)
-    named = [] if usable is None else _named(classifier, usable, names, rule, nearest=nearest)
+    named = [] if usable is None else _answers_of_usable(classifier, usable, names, rule, nearest=nearest)
     of_unit = {} if usable is None else dict(zip(unit_names(usable).tolist(), named))
     last = _last_samples(grasps["time"].values, grasps["t_surface"].values, units)
     unread, answers = iter(named), list[Answer]()
@@ -202,7 +202,7 @@ def _answers(
     return answers
 
 
-def _named(
+def _answers_of_usable(
     classifier: GraspClassifier, grasps: Grasps, names: list[str], rule: StopRule | None, *, nearest: bool
 ) -> list[Answer]:
     """Return the answers of a classifier to grasps whose usable part is given, without their ids."""

@@ -40,7 +40,7 @@ HOST = "127.0.0.1"
 Rows: TypeAlias = "Callable[[Grasps], list[dict[str, Any]]]"
 
 _TRACES = {"time_s": "time", "t_surface_degC": "t_surface", "t_surface_2_degC": "t_surface_2"}
-_NUMBERS = {META_NAMES.get(name, name) + ("" if unit == "1" else f"_{unit}"): name
+_META_FIELDS = {META_NAMES.get(name, name) + ("" if unit == "1" else f"_{unit}"): name
             for name, unit in GRASP_NUMBERS.items()}  # fmt: skip
 
 
@@ -50,7 +50,7 @@ def reply(answer: Rows, request: bytes) -> dict[str, Any]:
     try:
         content = _content(request)
         (row,) = answer(grasp_of(content))
-        response = {key: _plain(value) for key, value in row.items() if key != "grasp_id"}
+        response = {key: _json_cell(value) for key, value in row.items() if key != "grasp_id"}
     except UserError as error:
         response = {"error": str(error)}
     return ({"id": content["id"]} if "id" in content else {}) | response
@@ -58,17 +58,19 @@ def reply(answer: Rows, request: bytes) -> dict[str, Any]:
 
 def grasp_of(given: Mapping[str, Any]) -> Grasps:
     """Return the record of one grasp that a request describes."""
-    known_keys = {"id", *_TRACES, *_NUMBERS}
+    known_keys = {"id", *_TRACES, *_META_FIELDS}
     for name in given:
         if name not in known_keys:
             raise UserError(f"{name!r} is unknown", hint=known_names(name, sorted(known_keys)))
-    traces = {ours: _numbers(given, name) for name, ours in _TRACES.items() if name in given}
+    traces = {ours: _request_numbers(given, name) for name, ours in _TRACES.items() if name in given}
     for name in ("time_s", "t_surface_degC"):
         if _TRACES[name] not in traces:
             raise UserError(f"no {name}", hint="give time_s and t_surface_degC, lists of one length")
     if len({len(values) for values in traces.values()}) > 1:
         raise UserError("lists of several lengths", hint="null is a lost sample")
-    about = {ours: [_number(name, given[name])] for name, ours in _NUMBERS.items() if name in given}
+    about = {
+        ours: [_request_number(name, given[name])] for name, ours in _META_FIELDS.items() if name in given
+    }
     second = [traces["t_surface_2"]] if "t_surface_2" in traces else None
     record = make_grasps(
         traces["time"], [traces["t_surface"]], ["grasp"], name="request", t_surface_2=second, **about
@@ -81,7 +83,7 @@ def grasp_of(given: Mapping[str, Any]) -> Grasps:
 
 
 def serve_lines(answer: Rows, requests: BinaryIO, answers: BinaryIO) -> int:
-    """Answer lines of JSON until they end; return how many there were."""
+    """Answer lines of JSON until they end; return their number."""
     n = 0
     while line := requests.readline(MOST_BYTES + 2):
         if not line.endswith(b"\n") and len(line) > MOST_BYTES:
@@ -169,13 +171,13 @@ def _content(request: bytes) -> dict[str, Any]:
     return content
 
 
-def _numbers(given: Mapping[str, Any], name: str) -> list[float]:
+def _request_numbers(given: Mapping[str, Any], name: str) -> list[float]:
     if not isinstance(given[name], list):
         raise UserError(f"{name} is no list", hint="write a list of numbers")
-    return [_number(name, value) for value in given[name]]
+    return [_request_number(name, value) for value in given[name]]
 
 
-def _number(name: str, value: Any) -> float:
+def _request_number(name: str, value: Any) -> float:
     """Return a number of a request; null is NaN."""
     if value is None:
         return math.nan
@@ -190,7 +192,7 @@ def _number(name: str, value: Any) -> float:
     return number
 
 
-def _plain(value: Any) -> Any:
+def _json_cell(value: Any) -> Any:
     """Return a cell of an answer as JSON has it."""
     return None if isinstance(value, float) and not math.isfinite(value) else value
 

@@ -52,9 +52,9 @@ if TYPE_CHECKING:
 
 TIMES = (0.3, 0.5, 0.7, 1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 9.0)
 RULE_FILE = "stop_rule.json"  # beside classifier.json
-_CONTACT = 0.25  # s: readings until then may be of before contact
+_CONTACT_END_S = 0.25  # s: readings until then may be of before contact
 
-_SCHEMA, _VERSION = "thermogrip.stop_rule", 1
+_RULE_SCHEMA, _RULE_VERSION = "thermogrip.stop_rule", 1
 _RANGES = {"sure": (0.0, 1.0), "end": (0.0, 3600.0), "error": (0.0, 1.0)}  # of a file
 _SURE = np.concatenate([np.arange(0.5, 0.95, 0.05), 1 - np.geomspace(0.05, 1e-4, 28)])
 
@@ -76,12 +76,14 @@ class StopRule:
 
     def save(self, path: str | Path) -> Path:
         """Write the rule as JSON and return the path."""
-        return write_json(path, asdict(self) | {"times": list(self.times)}, schema=_SCHEMA, version=_VERSION)
+        return write_json(
+            path, asdict(self) | {"times": list(self.times)}, schema=_RULE_SCHEMA, version=_RULE_VERSION
+        )
 
     @classmethod
     def load(cls, path: str | Path) -> StopRule:
         """Return the rule of a file; a wrong entry is a :class:`UserError`."""
-        return cls.from_dict(read_json(path, _SCHEMA, _VERSION), file=path)
+        return cls.from_dict(read_json(path, _RULE_SCHEMA, _RULE_VERSION), file=path)
 
     @classmethod
     def from_dict(cls, content: Mapping[str, Any], *, file: str | Path = "stop rule") -> StopRule:
@@ -172,7 +174,7 @@ def silent_windows(grasps: Grasps, times: ArrayLike) -> NDArray[np.bool_]:
 def _read_by(grasps: Grasps, t: float) -> NDArray[np.bool_]:
     """Return which grasps have a reading of their contact by a time [s], (n,)."""
     time = np.asarray(grasps["time"].values, dtype=float)
-    in_contact = (time > _CONTACT) & (time <= t + 1e-9)
+    in_contact = (time > _CONTACT_END_S) & (time <= t + 1e-9)
     return np.asarray(np.isfinite(grasps["t_surface"].values[:, in_contact]).any(axis=1))
 
 
@@ -270,7 +272,7 @@ def contact_end(grasps: Grasps, end: float) -> float:
     return min(end, float(np.asarray(grasps["time"].values)[-1]))
 
 
-_SAME = 1e-6  # s
+_SAME_TIME_S = 1e-6  # s
 
 
 class Stream:
@@ -346,11 +348,11 @@ class Stream:
             raise UserError(f"time {time_s:g} s{after}", hint="give samples in order, each once")
         if abs(t_surface) > HOTTEST:
             raise UserError(f"a reading of {t_surface:g} degC", hint="give degC, and NaN where one was lost")
-        if time_s > _CONTACT and not self._has_level():
+        if time_s > _CONTACT_END_S and not self._has_level():
             raise UserError(f"no reading before contact, and now it is {time_s:g} s", hint="start at -1 s")
         self._time.append(float(time_s))
         self._reading.append(float(t_surface))
-        if _CONTACT < time_s <= self._model.longest_ + _SAME and np.isfinite(t_surface):
+        if _CONTACT_END_S < time_s <= self._model.longest_ + _SAME_TIME_S and np.isfinite(t_surface):
             self._evaluate()
         return self._answer(self.log_p)
 
@@ -375,7 +377,7 @@ class Stream:
         return dict(zip(self.candidates, np.exp(log_p).tolist()))
 
     def _has_level(self) -> bool:
-        return any(t < -_CONTACT and np.isfinite(y) for t, y in zip(self._time, self._reading))
+        return any(t < -_CONTACT_END_S and np.isfinite(y) for t, y in zip(self._time, self._reading))
 
     def _warm(self) -> None:
         """Look at a made-up contact once, so that no sample waits for the compiler."""
@@ -401,7 +403,7 @@ class Stream:
         rule, now = self._rule, self._time[-1]
         if rule is None or self.decided_at is not None:
             return
-        due = sum(t <= now + _SAME for t in rule.times)
+        due = sum(t <= now + _SAME_TIME_S for t in rule.times)
         if due <= self._evaluated:
             return
         self._evaluated = due

@@ -24,7 +24,7 @@ from thermogrip.datasets.schema import GRASP_LABELS, GRASP_NUMBERS, make_grasps,
 if TYPE_CHECKING:
     from thermogrip.datasets.schema import Grasps
 
-_STEP = 0.1  # s
+_SAMPLE_S = 0.1  # s
 _CHANNELS = 2
 
 
@@ -60,7 +60,7 @@ def grasps_of(estimator: Any, X: Any, *, reset: bool, **y: Any) -> Grasps:
     n, n_time, n_channel = cube.shape
     if n_channel > _CHANNELS:
         raise UserError(f"{n_channel} channels", hint="give the traces of one sensor or of two")
-    axis = _STEP * np.arange(n_time) if times is None else np.asarray(times, dtype=float)
+    axis = _SAMPLE_S * np.arange(n_time) if times is None else np.asarray(times, dtype=float)
     if axis.shape != (n_time,):
         raise UserError(f"{axis.size} times for {n_time} samples", hint="give the time of every sample [s]")
     second = {"t_surface_2": cube[:, :, 1]} if n_channel == _CHANNELS else {}

@@ -151,7 +151,7 @@ class FeatureReader:
             mostly_known = np.isfinite(table.values).mean(axis=0) > 0.5
             names += [str(f) for f in table["feature"].values[mostly_known]]
             tables.append(table)
-        names = sorted(set(names), key=_order)
+        names = sorted(set(names), key=_feature_order)
         if not names:
             where = "+".join(map(log_name, records))
             raise UserError("no feature is known for every grasp", file=where, hint="record longer")
@@ -163,7 +163,7 @@ class FeatureReader:
         readings = [
             reader._readings(record, table.reindex(feature=names)) for record, table in zip(records, tables)
         ]
-        return reader, _joined(readings), usable, notes
+        return reader, _concatenated(readings), usable, notes
 
     def to_dict(self) -> dict[str, Any]:
         """Return a JSON-able description."""
@@ -227,7 +227,7 @@ class BayesClassifier(GraspClassifier):
         self.reader_, all_read, usable, self.notes_ = FeatureReader.learn(records, labels)
         self.feature_names_ = self.reader_.names
         self.classes_ = np.unique(labels[usable])
-        self._fit_density(_rows(all_read, usable), np.searchsorted(self.classes_, labels[usable]))
+        self._fit_density(_rows_of_readings(all_read, usable), np.searchsorted(self.classes_, labels[usable]))
 
     def _fit_density(self, read: Readings, at: NDArray[np.intp]) -> None:
         """Find means, covariance and the error of object temperatures; ``at`` is the class of each grasp."""
@@ -300,7 +300,9 @@ class BayesClassifier(GraspClassifier):
         residual = x - means[at]
         within = (weight[:, None] * residual).T @ residual
         grid = _COVARIANCE_GRID if self.shrinkage is None else np.array([self.shrinkage])
-        tried = [(_log_evidence(within, means, counts, s, k), s, k) for s in grid for k in _MEAN_GRID]
+        tried = [
+            (_log_evidence_of_feature(within, means, counts, s, k), s, k) for s in grid for k in _MEAN_GRID
+        ]
         _, shrinkage, mean_shrinkage = max(tried)
         return float(shrinkage), float(mean_shrinkage)
 
@@ -326,10 +328,10 @@ class BayesClassifier(GraspClassifier):
         unknown = np.isnan(read.difference)
         wide = (unknown | (read.t_object_sd > DENSITY.wide_sd_K)) & self.reader_.normalise
         out = np.empty((wide.size, self.classes_.size + 1))
-        out[~wide] = self._log_t_of(_rows(read, ~wide))
+        out[~wide] = self._log_t_of(_rows_of_readings(read, ~wide))
         if not wide.any():
             return out
-        record, unknown, some = pick(grasps, wide), unknown[wide], _rows(read, wide)
+        record, unknown, some = pick(grasps, wide), unknown[wide], _rows_of_readings(read, wide)
         low, high = object_range(record).T
         skin = level(record)
         centre = np.where(unknown, (low + high) / 2, skin + np.where(unknown, 0.0, some.difference))
@@ -416,11 +418,11 @@ def _seen(difference: Floats, labels: Labels) -> list[str]:
     return [str(m) for m in np.unique(labels) if weight[labels == m].sum() >= DENSITY.least_weight]
 
 
-def _rows(read: Readings, at: NDArray[np.bool_]) -> Readings:
+def _rows_of_readings(read: Readings, at: NDArray[np.bool_]) -> Readings:
     return Readings(**{key: value[at] for key, value in vars(read).items()})
 
 
-def _joined(parts: Sequence[Readings]) -> Readings:
+def _concatenated(parts: Sequence[Readings]) -> Readings:
     return Readings(**{key: np.concatenate([getattr(p, key) for p in parts]) for key in vars(parts[0])})
 
 
@@ -431,7 +433,7 @@ def _times(grasps: Grasps, end: float) -> list[float]:
     return sorted([*times, round(end, 2)]) if end > DENSITY.own_end * before else times
 
 
-def _order(name: str) -> tuple[int, float]:
+def _feature_order(name: str) -> tuple[int, float]:
     """Return the place of a feature: in the order of the table, responses by time."""
     kind = next(i for i, prefix in enumerate(features.KINDS) if name.startswith(prefix))
     return kind, _time(name) if name.endswith("s") else 0.0
@@ -468,7 +470,9 @@ def _outer(rows: Floats) -> Floats:
     return np.asarray(rows[:, :, None] * rows[:, None, :])
 
 
-def _log_evidence(within: Floats, means: Floats, counts: Floats, extra: float, kappa: float) -> float:
+def _log_evidence_of_feature(
+    within: Floats, means: Floats, counts: Floats, extra: float, kappa: float
+) -> float:
     """Return ln p(features) but for a constant; ``extra`` is nu_0 - d - 1."""
     d, n = within.shape[0], float(counts.sum())
     prior = d + 1 + extra

@@ -27,7 +27,7 @@ from thermogrip.datasets.schema import Grasps
 
 RESPONSE_TIMES = (0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 40.0)
 KINDS = ("change_", "late_slope")
-_NEAR, _SHARE = 0.3, 0.2  # s, and of the time
+_ONSET_WINDOW_S, _SHARE = 0.3, 0.2  # s, and of the time
 FIT_END = 10.0
 LEAST_DIFFERENCE = 1.0  # K
 _LEAST_NOISE = 0.01  # K; a sensor that rests on one step of its converter shows less than it has
@@ -72,7 +72,9 @@ def _linear_weights(time: tuple[float, ...], names: tuple[str, ...], last: float
         slope = name == "late_slope"
         nominal_time = FIT_END if slope else float(name[len("change_") : -1])
         read_time = min(nominal_time, last)
-        used = (t >= 5.0) if slope else np.abs(t - read_time) <= max(_NEAR, _SHARE * read_time) + 1e-6
+        used = (
+            (t >= 5.0) if slope else np.abs(t - read_time) <= max(_ONSET_WINDOW_S, _SHARE * read_time) + 1e-6
+        )
         used &= t <= (read_time + 1e-6 if slope else last)
         if used.sum() < (3 if slope else 1) or last < nominal_time - max(0.06, 0.02 * nominal_time):
             continue

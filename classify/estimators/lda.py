@@ -262,7 +262,7 @@ class SvmPca(ArrayClassifier):
 
     def _made(self, labels: Labels) -> Any:
         components = max(1, min(10, labels.size // 2, self.times_.size))  # a fold has fewer grasps
-        return _calibrated(make_pipeline(PCA(components, svd_solver="full"), SVC(C=100.0)), labels)
+        return _with_probabilities(make_pipeline(PCA(components, svd_solver="full"), SVC(C=100.0)), labels)
 
 
 _LEAST_SAMPLES = 9  # length of a kernel
@@ -292,10 +292,12 @@ class RocketClassifier(ArrayClassifier):
 
         transform = MiniRocket(random_state=self.random_state)
         alphas = np.logspace(-1, 5, 7)  # of a penalty on some 10 000 features of spread 1
-        return _calibrated(make_pipeline(transform, StandardScaler(), RidgeClassifierCV(alphas)), labels)
+        return _with_probabilities(
+            make_pipeline(transform, StandardScaler(), RidgeClassifierCV(alphas)), labels
+        )
 
 
-def _calibrated(machine: Any, labels: Labels) -> Any:
+def _with_probabilities(machine: Any, labels: Labels) -> Any:
     """Return a classifier whose margins become probabilities by Platt's sigmoids on held-out grasps, itself
     where a class has too few for that."""
     folds = min(5, int(np.unique(labels, return_counts=True)[1].min()))

@@ -121,7 +121,7 @@ class LstmClassifier(JoinedClassifier):
         real = as_array(grasps, times=self.times_)
         target = np.searchsorted(self.classes_, labels).astype(np.int64)
         epochs = self.epochs
-        split = _held_out(grasps, labels, seed=self.random_state)
+        split = _early_stopping_rows(grasps, labels, seed=self.random_state)
         if split is not None and self.patience is not None and self.epochs > self.patience:
             fitted, held_out = split
             self.mean_, self.sd_ = self._standard(real[fitted])
@@ -192,7 +192,7 @@ class PaperLstm(LstmClassifier):
     patience: int | None = None
 
 
-def _held_out(
+def _early_stopping_rows(
     grasps: Grasps, labels: Labels, *, seed: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]] | None:
     """Return rows to train on and a fifth that is held out, whole sessions apart, or whole grasps where a
@@ -249,7 +249,7 @@ def _train(
             def loss_of(series: Any, target: Any) -> Any:
                 return torch.nn.functional.cross_entropy(readout(network(series)[1][0][0]), target)
 
-            curve, least, best, weights = [], float("inf"), epochs, _named(network, readout)
+            curve, least, best, weights = [], float("inf"), epochs, _weights_by_name(network, readout)
             for epoch in range(1, epochs + 1):
                 total = torch.zeros((), device=device)
                 for rows in torch.randperm(len(y)).split(model.batch):  # type: ignore[no-untyped-call]
@@ -265,11 +265,11 @@ def _train(
                 with torch.no_grad():
                     now = float(curve[-1] if held_out_tensors is None else loss_of(*held_out_tensors))
                 if now < least - _LEAST_GAIN:
-                    least, best, weights = now, epoch, _named(network, readout)
+                    least, best, weights = now, epoch, _weights_by_name(network, readout)
                 elif held_out_tensors is not None and epoch - best >= model.patience:
                     break
             if model.patience is None:
-                weights = _named(network, readout)
+                weights = _weights_by_name(network, readout)
             losses = torch.stack(curve).double().cpu().numpy()
     finally:
         torch.set_num_threads(threads)
@@ -286,7 +286,7 @@ def _device(name: str) -> str:
     return "cuda" if has_gpu and name != "cpu" else "cpu"
 
 
-def _named(network: Any, readout: Any) -> Weights:
+def _weights_by_name(network: Any, readout: Any) -> Weights:
     """Return the weights of both PyTorch modules by name."""
     modules = {"lstm": network.state_dict(), "readout": readout.state_dict()}
     return {

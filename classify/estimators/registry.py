@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 _SAVED = "posterior, bayes, features-lda, pca-lda, lstm, lstm-paper"
 _NETWORKS = ("lstm", "lstm-paper")
-_SCHEMA, _VERSION = "thermogrip.classifier", 1
+_CLASSIFIER_SCHEMA, _CLASSIFIER_VERSION = "thermogrip.classifier", 1
 _RUNTIME_ONLY = ("device",)  # a start for the next fit, not part of what was learnt
 _RETIRED = ("finish", "gripper")  # of files of 0.2.0: what they stated is decided grasp by grasp
 
@@ -165,7 +165,7 @@ def save_classifier(classifier: GraspClassifier, folder: str | Path) -> Path:
     else:
         content["arrays"] = {key: np.asarray(value, dtype=float).tolist() for key, value in arrays.items()}
     # last, since it makes the folder a classifier
-    write_json(path / "classifier.json", content, schema=_SCHEMA, version=_VERSION)
+    write_json(path / "classifier.json", content, schema=_CLASSIFIER_SCHEMA, version=_CLASSIFIER_VERSION)
     return path
 
 
@@ -197,7 +197,7 @@ def load_classifier(folder: str | Path) -> GraspClassifier:
     if not path.is_dir():
         raise UserError("is not a folder", file=path, hint="give the folder that train --out made")
     file = path / "classifier.json"
-    content = read_json(file, _SCHEMA, _VERSION)
+    content = read_json(file, _CLASSIFIER_SCHEMA, _CLASSIFIER_VERSION)
     with reading("is damaged", file=file, hint="train the classifier again"):
         if content["name"] not in CLASSIFIERS:  # never an import path: reading a file runs no code
             raise KeyError(content["name"])

@@ -112,7 +112,9 @@ class Comparison(Shown):
         pairs = [(condition, name) for condition in self.conditions for name in self.classifiers]
         tested = [(self._tested(name, condition), condition, name) for condition, name in pairs]
         unseen = [
-            _unseen(*unknown_in) for unknown_in in tested if not all(row["known"] for row in unknown_in[0])
+            _unseen_caution(*unknown_in)
+            for unknown_in in tested
+            if not all(row["known"] for row in unknown_in[0])
         ]
         return (*leaks, *unseen, *self.of_records)
 
@@ -201,15 +203,15 @@ class Comparison(Shown):
             "accuracy": right.value,
             "low": low,
             "high": high,
-            "boot_low": _known(right.low),
-            "boot_high": _known(right.high),
+            "boot_low": _none_for_nan(right.low),
+            "boot_high": _none_for_nan(right.high),
             "sd_over_splits": _sd_over_splits(rows) if self.repeats > 1 else None,
-            **_spread("log_loss", loss),
+            **_interval_row("log_loss", loss),
             "log_loss_chance": float(np.mean([np.log(r["candidates"]) for r in rows])),
             "log_loss_base": float(np.mean([r["log_loss_base"] for r in rows])),
-            **_spread("brier", brier),
+            **_interval_row("brier", brier),
             "confidence": float(confidence.mean()),
-            **_spread("ece", ece),
+            **_interval_row("ece", ece),
             "ece_calibrated": ece.if_calibrated,
             "ece_p": ece.p_value,
             **{key: self._time(classifier, rows, key) for key in ("fit_s", "predict_s_per_grasp")},
@@ -273,11 +275,11 @@ class Comparison(Shown):
         return {
             "n": int(gap.size),
             "difference": right.value,
-            "low": _known(right.low),
-            "high": _known(right.high),
+            "low": _none_for_nan(right.low),
+            "high": _none_for_nan(right.high),
             "log_loss_difference": lost.value,
-            "log_loss_low": _known(lost.low),
-            "log_loss_high": _known(lost.high),
+            "log_loss_low": _none_for_nan(lost.low),
+            "log_loss_high": _none_for_nan(lost.high),
             "only_first": test.only_first / self.repeats,
             "only_second": test.only_second / self.repeats,
             "p_value": test.p_value if self.repeats == 1 else s.sign_flip_p(gap, seed=self.seed),
@@ -357,8 +359,8 @@ def _distinct(rows: Sequence[Row]) -> set[tuple[str, str]]:
     return {(str(r["condition"]), str(r["grasp_id"])) for r in rows}
 
 
-def _unseen(rows: Sequence[Row], condition: str, classifier: str) -> Caution:
-    """Return how many test grasps are of materials that training lacks, and how they were answered."""
+def _unseen_caution(rows: Sequence[Row], condition: str, classifier: str) -> Caution:
+    """Return the number of test grasps of materials that training lacks, and how they were answered."""
     unseen = [r for r in rows if not r["known"]]
     n, materials = len(_distinct(unseen)), ", ".join(sorted({str(r["material"]) for r in unseen}))
     answers = ", ".join(f"{name} {k}" for name, k in Counter(r["predicted"] for r in unseen).most_common())
@@ -381,11 +383,15 @@ def grasp_numbers(rows: Sequence[Row]) -> NDArray[np.int64]:
     return np.array([number_of.setdefault((r["condition"], r["grasp_id"]), len(number_of)) for r in rows])
 
 
-def _spread(name: str, found: s.Interval | s.CalibrationError) -> Row:
-    return {name: found.value, f"{name}_low": _known(found.low), f"{name}_high": _known(found.high)}
+def _interval_row(name: str, found: s.Interval | s.CalibrationError) -> Row:
+    return {
+        name: found.value,
+        f"{name}_low": _none_for_nan(found.low),
+        f"{name}_high": _none_for_nan(found.high),
+    }
 
 
-def _known(value: float) -> float | None:
+def _none_for_nan(value: float) -> float | None:
     """Return None for NaN, of which neither JSON nor a page has a word."""
     return None if np.isnan(value) else value
 

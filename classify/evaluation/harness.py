@@ -168,7 +168,7 @@ def evaluate(
     )
     late = _late(plan) if probe else ()
     jobs = _jobs(named, plan, probe and not late)
-    done = run_parallel(_run, jobs, workers, progress, what="train and test")
+    done = run_parallel(_run_job, jobs, workers, progress, what="train and test")
     order = {name: i for i, name in enumerate(named)}
     results = sorted(
         (r for job_results in done for r in job_results), key=lambda r: (order.get(r.classifier, -1), r.order)
@@ -221,7 +221,7 @@ class _Job:
 
 
 @dataclass(frozen=True)
-class _Result:
+class _FoldResult:
     classifier: str
     order: int
     probe: bool
@@ -314,7 +314,7 @@ def _taught_together(classifier: GraspClassifier, fold: Fold, training: Sequence
     return not fold.apart and set(fold.candidates) <= set(np.concatenate(labels_far))
 
 
-def _run(job: _Job) -> list[_Result]:
+def _run_job(job: _Job) -> list[_FoldResult]:
     classifier: GraspClassifier = clone(job.classifier)
     only = job.probe == "only"
     training = [untouched(g, seed=1) for g in job.training] if only else list(job.training)
@@ -322,7 +322,7 @@ def _run(job: _Job) -> list[_Result]:
     try:
         classifier.fit(training if len(training) > 1 else training[0])
     except UserError as fault:
-        return [_Result(job.name, order, only, fault=fault) for order, _ in job.folds]
+        return [_FoldResult(job.name, order, only, fault=fault) for order, _ in job.folds]
     fit_s = perf_counter() - start
     results = []
     for order, fold in job.folds:
@@ -330,13 +330,13 @@ def _run(job: _Job) -> list[_Result]:
             try:
                 results.append(_tested(job.name, classifier, fold, order, fit_s, touch=touch))
             except UserError as fault:
-                results.append(_Result(job.name, order, not touch, fault=fault))
+                results.append(_FoldResult(job.name, order, not touch, fault=fault))
     return results
 
 
 def _tested(
     name: str, classifier: GraspClassifier, fold: Fold, order: int, fit_s: float, *, touch: bool
-) -> _Result:
+) -> _FoldResult:
     """Return the rows of one fold's test grasps by a fitted classifier, and the seconds a grasp; as if they
     had touched nothing where ``touch`` is not."""
     test = fold.test if touch else untouched(fold.test, seed=2)
@@ -351,15 +351,15 @@ def _tested(
     predict_s = (perf_counter() - start) / n
     first = np.sort(np.unique(units, return_index=True)[1])  # one row a unit: its touches share an answer
     head = {"classifier": name, "repeat": fold.repeat, "condition": fold.condition, "apart": fold.apart}
-    rows = _rows(pick(test, first), units[first], np.exp(log_p[first]), unknown[first], candidates)
+    rows = _fold_rows(pick(test, first), units[first], np.exp(log_p[first]), unknown[first], candidates)
     trained = Counter(map(str, grasp_labels(fold.train)))
     for row in rows:
         row["log_loss_base"] = -np.log(trained[row["material"]] / trained.total()) if row["known"] else None
     time = head | {"fit_s": fit_s, "predict_s_per_grasp": predict_s}
-    return _Result(name, order, not touch, tuple(head | row for row in rows), time)
+    return _FoldResult(name, order, not touch, tuple(head | row for row in rows), time)
 
 
-def _rows(
+def _fold_rows(
     test: Grasps, units: np.ndarray[Any, Any], p: Floats, unknown: Floats, candidates: tuple[str, ...]
 ) -> list[Row]:
     materials = [str(m) for m in test["material"].values]
@@ -385,7 +385,7 @@ def _rows(
     ]
 
 
-def _leaks(probes: Sequence[_Result]) -> list[Row]:
+def _leaks(probes: Sequence[_FoldResult]) -> list[Row]:
     """Return a row for each probe and condition; the level is shared among all rows (Bonferroni)."""
     keys = list(dict.fromkeys((r.classifier, row["condition"]) for r in probes for row in r.rows))
     table = []

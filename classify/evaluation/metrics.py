@@ -57,7 +57,7 @@ _LEAST_PROBABILITY = 1e-15
 
 
 class Bin(NamedTuple):
-    """Grasps whose confidence is in (low, high]: how many, their mean confidence and their accuracy."""
+    """Grasps whose confidence is in (low, high]: their number, mean confidence and accuracy."""
 
     low: float
     high: float
@@ -106,8 +106,8 @@ def calibration_bins(confidence: ArrayLike, correct: ArrayLike) -> list[Bin]:
     of = _bin_of(c)
     return [
         Bin(
-            low=float(_EDGES[b]),
-            high=float(_EDGES[b + 1]),
+            low=float(_CALIBRATION_EDGES[b]),
+            high=float(_CALIBRATION_EDGES[b + 1]),
             n=int((of == b).sum()),
             confidence=float(c[of == b].mean()),
             accuracy=float(ok[of == b].mean()),
@@ -150,7 +150,7 @@ def auroc(negative: ArrayLike, positive: ArrayLike) -> float:
 _DRAWS = 2000
 _FORECASTERS = 1000
 _N_BINS = 10  # of confidence
-_EDGES = np.linspace(0, 1, _N_BINS + 1)
+_CALIBRATION_EDGES = np.linspace(0, 1, _N_BINS + 1)
 
 
 class Interval(NamedTuple):
@@ -209,12 +209,12 @@ def calibration_interval(
     tests whose grasps are counted from 0."""
     c, of = np.asarray(confidence, dtype=float), np.asarray(grasp, dtype=int)
     right = np.asarray(correct, dtype=float)
-    bins = np.eye(_EDGES.size - 1)[_bin_of(c)]  # (n, 10), one in each row
+    bins = np.eye(_CALIBRATION_EDGES.size - 1)[_bin_of(c)]  # (n, 10), one in each row
     tests = np.bincount(of).astype(float)
     gaps = _by_grasp(bins * (c - right)[:, None], of)
     mean_gaps = gaps.sum(axis=0) / c.size
     value = float(np.abs(mean_gaps).sum())
-    chance = _calibrated(c, of, bins, tests.size, seed)
+    chance = _ece_of_calibrated(c, of, bins, tests.size, seed)
     p = (1 + int(np.sum(chance >= value - 1e-12))) / (1 + chance.size)
     if tests.size < 2:
         return CalibrationError(value, np.nan, np.nan, float(chance.mean()), p)
@@ -246,10 +246,12 @@ def _bca(draws: Floats, value: float, influence: Floats, level: float) -> tuple[
 
 def _bin_of(confidence: Floats) -> NDArray[np.int64]:
     """Return which bin each confidence is in, (n,)."""
-    return np.clip(np.searchsorted(_EDGES, confidence, side="left") - 1, 0, _EDGES.size - 2)
+    return np.clip(
+        np.searchsorted(_CALIBRATION_EDGES, confidence, side="left") - 1, 0, _CALIBRATION_EDGES.size - 2
+    )
 
 
-def _calibrated(c: Floats, of: NDArray[np.int64], bins: Floats, m: int, seed: int) -> Floats:
+def _ece_of_calibrated(c: Floats, of: NDArray[np.int64], bins: Floats, m: int, seed: int) -> Floats:
     """Return the ECE of forecasters whose confidences are true, (n,)."""
     rng = np.random.default_rng(seed + 1)
     stated = c @ bins

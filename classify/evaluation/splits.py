@@ -73,11 +73,11 @@ def plan_folds(
     elif split == "random":
         plan = _random(records, repeats, train_per_class, seed)
     elif split in ("session", "block"):
-        plan = _held_out(records, split, seed)
+        plan = _sessions_held_out(records, split, seed)
     else:
         raise UserError(f"split {split!r} is unknown", hint="use 'shipped', 'random', 'session' or 'block'")
     to_compare = records if test is None else []  # of test files no copy is let in
-    copies = [Caution("leak", name, words) for name, words in _copies(to_compare).items()]
+    copies = [Caution("leak", name, words) for name, words in _copied_records(to_compare).items()]
     notes = (*plan.notes, *_strangers(plan.folds))
     return replace(plan, notes=notes, cautions=(*plan.cautions, *copies))
 
@@ -169,7 +169,7 @@ def _too_few(grasps: Grasps, train_per_class: int) -> dict[str, str]:
     }
 
 
-def _held_out(records: Sequence[Grasps], kind: str, seed: int) -> Plan:
+def _sessions_held_out(records: Sequence[Grasps], kind: str, seed: int) -> Plan:
     """Return a repeat for each session, or for the first, second ... block of each material."""
     keys = [_groups(grasps, kind) for grasps in records]
     rounds = _rounds(records, keys, kind, seed)
@@ -274,7 +274,7 @@ def _refuse_shared(trains: Sequence[Grasps], tests: Sequence[Grasps]) -> None:
                     column="grasp_id",
                     hint="a grasp may be in one of them only; rename it if it is another grasp",
                 )
-    for name, words in _copies([*trains, *tests]).items():
+    for name, words in _copied_records([*trains, *tests]).items():
         if name in map(log_name, tests):
             raise UserError(words, file=name, hint="leave one of the two out")
 
@@ -300,8 +300,8 @@ def _refuse_repeated(records: Sequence[Grasps]) -> None:
             record_of[key] = log_name(grasps)
 
 
-def _copies(records: Sequence[Grasps]) -> dict[str, str]:
-    """Return by record how many of its grasps have the samples of others, where any has, in words."""
+def _copied_records(records: Sequence[Grasps]) -> dict[str, str]:
+    """Return by record the number of its grasps that have the samples of others, where any has, in words."""
     first_of: dict[bytes, str] = {}
     copies: dict[str, list[str]] = {}
     for grasps in records:

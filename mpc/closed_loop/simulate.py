@@ -52,7 +52,7 @@ class Surroundings:
     move_delay_s: float = 0.0  # time between a reading and the moment its move is applied [s]
     sensor_lag_s: float = 0.0  # by how much every sensor is slower than the plant's outputs [s]
     drive_share: float = 1.0  # share of a drive, counted from the one that holds the start, that acts
-    # outputs that drives have held at the start for long, drives that the controller is told; else all is as
+    # outputs that drives have held at the start for long, drives that the controller knows; else all is as
     # warm
     held: tuple[str, ...] = ()
     # measured disturbances by name; where absent, what the plant has where nobody reads them

@@ -6,9 +6,9 @@ every export shares (``csource/``).  ``check_export`` builds it with every warni
 the sanitizers of gcc, and compares what it answers with Python in random loops: the drives, now and in the
 plan, and the status.
 
-In a loop C is told what was applied, Python's moves.  Of two controllers on the readings of one loop only one
-has its moves applied; without being told, the other's estimate goes on under moves that never were, and what
-a controller makes of readings alone need not be stable: on a TCLab one of whose heaters must break its limit,
+In a loop C is given what was applied, Python's moves.  Of two controllers on the readings of one loop only
+one has its moves applied; without them the other's estimate goes on under moves that never were, and what a
+controller makes of readings alone need not be stable: on a TCLab one of whose heaters must break its limit,
 1e-14 between two Python controllers is half the range after 160 samples.
 """
 
@@ -38,7 +38,7 @@ from thermogrip.mpc.native.runtime import SOURCES, c_source, compiler
 
 _COPIED = (*SOURCES, "tg_design.h", "Makefile", "example.c", "check.c")
 # of a drive's range; where dozens of soft rows are broken, a plan is a small difference of large multipliers,
-# and C as well as Python is up to 1e-10 off the exact one; hard limits are a thousand times as dear
+# and C as well as Python is up to 1e-10 off the exact one; hard limits weigh a thousand times as much
 _TOLERANCE, _HARD_TOLERANCE = 1e-9, 1e-6
 _LOOP = 40  # samples of a loop, from rest
 _NEWS = 0.04  # probability of a new target, of a lost reading, of a step that is late, in a sample
@@ -58,8 +58,8 @@ class Agreement:
 
     states: int  # samples of random loops
     difference: float  # largest difference of a drive, now or anywhere in the plan, in fractions of its range
-    free: int  # in how many of them the drive stood at no limit of range or slew, so that every weight counts
-    same_status: int  # in how many of them
+    free: int  # samples in which the drive stood at no limit of range or slew, so that every weight counts
+    same_status: int  # samples with the same status
     # bytes: code with constants, one controller, its design, and the largest frame of a function
     flash: int
     ram: int
@@ -148,12 +148,12 @@ def check_export(
         for name in export.files:
             shutil.copyfile(export.folder / name, build.folder / name)
         _make(build.folder, "all", *(("sanitized",) if sanitize else ()))
-        (ram, constants), answers = _answers(build, played, sanitize)
+        (ram, constants), answers = _answers_in_c(build, played, sanitize)
         flash, stack = _footprint(build.folder)
     pairs = list(zip(played, answers, strict=True))
     return Agreement(
         states=states,
-        difference=max(_difference(sample, answer, controller.model.span) for sample, answer in pairs),
+        difference=max(_drive_difference(sample, answer, controller.model.span) for sample, answer in pairs),
         free=sum(sample.free for sample in played),
         same_status=sum(sample.status == STATUSES[int(answer.split()[0])] for sample, answer in pairs),
         flash=flash,
@@ -235,14 +235,14 @@ def _range_of(controller: Controller) -> tuple[float, float]:
     return float(low), float(high)
 
 
-def _difference(sample: _Sample, answer: str, span: Array) -> float:
+def _drive_difference(sample: _Sample, answer: str, span: Array) -> float:
     """Return the largest difference of a drive, now or in the plan, in fractions of its range."""
     numbers = np.array([float.fromhex(word) for word in answer.split()[1:]])
     drives = numbers.reshape(-1, len(span)) / span
     return float(np.max(np.abs(drives - sample.drives))) if drives.shape == sample.drives.shape else np.inf
 
 
-def _run(program: Path, text: str) -> list[str]:
+def _run_program(program: Path, text: str) -> list[str]:
     """Return the lines that a program answers to these samples."""
     command = [str(program.resolve())]
     done = subprocess.run(command, input=text, capture_output=True, text=True, check=False)
@@ -252,12 +252,12 @@ def _run(program: Path, text: str) -> list[str]:
     return done.stdout.splitlines()
 
 
-def _answers(export: Export, played: list[_Sample], sanitize: bool) -> tuple[tuple[int, int], list[str]]:
+def _answers_in_c(export: Export, played: list[_Sample], sanitize: bool) -> tuple[tuple[int, int], list[str]]:
     """Return the bytes of a controller and of a design, and what the C program answers to these samples."""
     text = "".join(f"{sample.given}\n" for sample in played)
-    head, *answers = _run(export.folder / "check", text)
+    head, *answers = _run_program(export.folder / "check", text)
     if sanitize:  # other flags, another program: it must live, and say the same
-        _same_answers(answers, _run(export.folder / "sanitized", text)[1:])
+        _same_answers(answers, _run_program(export.folder / "sanitized", text)[1:])
     _, ram, _, constants = head.split()
     return (int(ram), int(constants)), answers
 
@@ -293,7 +293,7 @@ def _footprint(folder: Path) -> tuple[int, int]:
     return flash, max((int(frame[1]) for frame in frames), default=0)
 
 
-def _listed(names: Sequence[str]) -> str:
+def _name_list(names: Sequence[str]) -> str:
     return ", ".join(markdown(name) for name in names)
 
 
@@ -307,15 +307,15 @@ def _readme(controller: Controller, sizes: design_struct.Sizes) -> str:
         model=model,
         design=design,
         sizes=sizes,
-        outputs=_listed(controlled),
-        drives=_listed(model.drives),
+        outputs=_name_list(controlled),
+        drives=_name_list(model.drives),
         y_example=", ".join(["25.0"] * model.n_y),
-        y_names=_listed(model.outputs),
+        y_names=_name_list(model.outputs),
         n_d_room=n_d,
         d_example=", ".join(f"{value:.1f}" for value in d) if model.n_d else f"{design.ambient:.1f}",
         d_names=", ".join(d_names) or "none",
         n_c=len(controlled),
-        c_names=_listed(controlled),
+        c_names=_name_list(controlled),
         c_example=", ".join(["35.0"] * len(controlled)),
         n_u_last=model.n_u - 1,
         drives_ranges=ranges,

@@ -27,9 +27,9 @@ from thermogrip.mpc.native.runtime import c_source, compiler
 from thermogrip.mpc.native.shared_constants import UNCUT
 
 _WARN = ("-std=c99", "-Wall", "-Wextra", "-Wconversion", "-Werror", "-pedantic", "-O2")
-_TOLERANCE = 1e-12  # of a range: the same operations in the same order
+_PI_TOLERANCE = 1e-12  # of a range: the same operations in the same order
 _RUN = 100  # samples between two resets
-_LOST = 0.05  # of readings, and of targets
+_LOST_SHARE = 0.05  # of readings, and of targets
 
 
 def export_pi(controller: PIController, folder: str | Path) -> Export:
@@ -43,7 +43,7 @@ def export_pi(controller: PIController, folder: str | Path) -> Export:
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     files = {name: c_source(name) for name in ("tg_pi.h", "tg_pi.c")}
-    files |= {"tg_pi_config.h": _config(controller), "README.md": _readme(controller)}
+    files |= {"tg_pi_config.h": _config(controller), "README.md": _pi_readme(controller)}
     for name, content in files.items():
         write_atomic(folder / name, content)
     return Export(folder, tuple(sorted(files)))
@@ -80,7 +80,7 @@ def _config(controller: PIController) -> str:
     return "\n".join(["/* The numbers of the loops. */", *lines, ""])
 
 
-def _readme(controller: PIController) -> str:
+def _pi_readme(controller: PIController) -> str:
     drives = controller.model.drives
     ends = zip(drives, controller.drives.lowest.tolist(), controller.drives.highest.tolist())
     count = len(controller.controlled)
@@ -120,7 +120,7 @@ def check_pi(
         ).stdout.splitlines()
         flash = sum(int(word) for word in sizes[1].split()[:2]) if len(sizes) > 1 else 0
         loops = ctypes.CDLL(str(library))
-        compared = _differences(loops, controller, states, seed, progress)
+        compared = _differences_from_c(loops, controller, states, seed, progress)
     difference, free, same = compared.T
     n_c, n_u = len(controller.controlled), controller.model.n_u
     return Agreement(
@@ -132,7 +132,7 @@ def check_pi(
         ram=8 * (4 * n_c + n_u),
         constants=8 * (3 * n_c + 5 * n_u) + 4 * n_c,
         stack=stack,
-        tolerance=_TOLERANCE,
+        tolerance=_PI_TOLERANCE,
     )
 
 
@@ -143,7 +143,7 @@ def _run_gcc(command: list[str]) -> None:
         raise UserError(f"the export does not build: {first}", hint="report it: it must")
 
 
-def _differences(
+def _differences_from_c(
     library: ctypes.CDLL,
     controller: PIController,
     states: int,
@@ -160,13 +160,13 @@ def _differences(
     python = PIController(controller.plant, controller.design)
     compared, target = np.zeros((states, 3)), 0.5 * (low + high)
     for k in range(states):
-        y = rng.uniform(low, high) * np.where(rng.random(n_c) < _LOST, np.nan, 1.0)
+        y = rng.uniform(low, high) * np.where(rng.random(n_c) < _LOST_SHARE, np.nan, 1.0)
         if k % _RUN == 0:
             python.times.reset()
             u = rng.uniform(python.drives.lowest, python.drives.highest)
             python.reset(dict(zip(controlled, y)) | dict(zip(model.drives, u)))
             library.tg_pi_reset(state, (real * n_c)(*y), (real * n_u)(*u))
-        if rng.random() < _LOST:
+        if rng.random() < _LOST_SHARE:
             target = rng.uniform(low, high)
         move = python.step(dict(zip(controlled, y)), dict(zip(controlled, target)))
         status = library.tg_pi_step(state, (real * n_c)(*y), (real * n_c)(*target))

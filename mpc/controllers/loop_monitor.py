@@ -59,7 +59,7 @@ class _Answer(NamedTuple):
 
 
 @lru_cache(maxsize=64)
-def _answer(plant: Plant, drive: str, output: str, dt: float) -> _Answer:
+def _step_answer(plant: Plant, drive: str, output: str, dt: float) -> _Answer:
     response = step_response(plant, drive, output)
     return _Answer(response.gain, max(response.delay, dt), response.lag)
 
@@ -106,7 +106,7 @@ class LoopMonitor:
         self.controlled = design.controlled
         self._rows = [model.outputs.index(p.output) for p in self.loops]
         self._drives = [model.drives.index(p.drive) for p in self.loops]
-        answers = [_answer(plant, p.drive, p.output, model.dt) for p in self.loops]
+        answers = [_step_answer(plant, p.drive, p.output, model.dt) for p in self.loops]
         spans = model.span[self._drives].tolist()
         answers_of_loops = zip(answers, spans, self.loops)
         self._promised = np.array(

@@ -73,7 +73,7 @@ class Controller(Shown):
         self.plant, self.notes = plant, dict(notes or {})
         self.design = default_design(plant) if design is None else check_design(design, plant)
         self.reference = ReferenceController(plant, self.design, clock=clock)
-        self._compiled = _in_c(self.reference)
+        self._compiled = _compiled_step(self.reference)
         self._law: ReferenceController | CompiledStep = self._compiled or self.reference
 
     @property
@@ -235,7 +235,7 @@ class Controller(Shown):
         return self._law.step(reading, target)
 
 
-def _in_c(reference: ReferenceController) -> CompiledStep | None:
+def _compiled_step(reference: ReferenceController) -> CompiledStep | None:
     """Return the steps in C, None where there is no compiler, or nobody wants one."""
     if not wanted():
         return None

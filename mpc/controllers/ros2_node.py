@@ -35,7 +35,7 @@ from thermogrip.mpc.interface import STATUSES
 KEPT_SAMPLES = 3
 TARGET = "target_"  # with the name of an output
 _OF_NODE = {"pump": "std_msgs/msg/Bool", "status": "std_msgs/msg/UInt8"}
-_TEMPERATURE, _NUMBER = "sensor_msgs/msg/Temperature", "std_msgs/msg/Float64"
+_TEMPERATURE_TYPE, _FLOAT_TYPE = "sensor_msgs/msg/Temperature", "std_msgs/msg/Float64"
 _SENT = {
     "Bool", "Float32", "Float64", "Int8", "Int16", "Int32", "Int64", "UInt8", "UInt16", "UInt32", "UInt64"
 }  # fmt: skip
@@ -75,7 +75,9 @@ class TopicLoop:
             kind, unit = self._type(name), controller.plant.units.get(name, "1")
             if not kind.startswith("std_msgs/msg/") or kind.rpartition("/")[2] not in _SENT:
                 problem = f"publishes {kind}"
-                raise UserError(problem, file=file, column=name, hint=f"type = {_NUMBER!r}, field = 'data'")
+                raise UserError(
+                    problem, file=file, column=name, hint=f"type = {_FLOAT_TYPE!r}, field = 'data'"
+                )
             if self._columns[name].unit != unit or self._columns[name].field != "data":
                 problem = f"is published as field 'data' in {unit!r}, the map says otherwise"
                 raise UserError(problem, file=file, column=name, hint="convert it where it is received")
@@ -100,7 +102,7 @@ class TopicLoop:
 
     def _type(self, name: str) -> str:
         column = self._columns[name]
-        usual = _TEMPERATURE if column.field == "temperature" else _NUMBER
+        usual = _TEMPERATURE_TYPE if column.field == "temperature" else _FLOAT_TYPE
         return column.type or _OF_NODE.get(name, usual)
 
     def reset(self) -> None:
@@ -172,7 +174,7 @@ def load_loop(folder: str | Path) -> TopicLoop:
 
 
 def replay_bag(loop: TopicLoop, bag: str | Path, out: str | Path) -> int:
-    """Write what a loop answers to a recorded bag as a ROS 2 bag (MCAP), and return how many times.
+    """Write what a loop answers to a recorded bag as a ROS 2 bag (MCAP), and return the number of answers.
 
     It ticks every sample time from the bag's first message on that it hears, and sees what came until then.
     """
@@ -219,7 +221,7 @@ def _topics_of(controller: Controller | PIController) -> str:
     roles |= dict.fromkeys(model.drives, "input") | dict.fromkeys(_OF_NODE, "other")
     for name, role in roles.items():
         unit = units.get(name.removeprefix(TARGET), "1")
-        kind = _OF_NODE.get(name, _NUMBER)
+        kind = _OF_NODE.get(name, _FLOAT_TYPE)
         column = Column(f"/thermogrip/{name}", "data", unit, role, kind)
         entries = [f'{key} = "{value}"' for key, value in vars(column).items()]
         lines += ["", f"[columns.{name}]", *entries]

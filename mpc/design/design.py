@@ -6,7 +6,7 @@ The cost over the horizon of N samples, with blocks b of the plan v, r the targe
         + drive sum_k |u_k/span|^2 + soft penalties.
 
 Temperatures count in degC, so ``move = 1`` means: one whole range in one sample costs as much as 1 degC
-for one sample.  ``default_design`` reads everything off the plant: sample time and horizon from its delay
+for one sample.  ``default_design`` takes everything from the plant: sample time and horizon from its delay
 and lag, blocks that double from one sample on, and one move weight that the tuner then improves.
 
 **Checks.**  A controller's file can be edited, cut short, or written for another plant.  Whatever is in it,
@@ -258,7 +258,7 @@ class Design:
     loops: tuple[PILoop, ...] = ()  # the PI controller that takes over when the optimiser fails
     track: Positive = 1.0  # weight of the squared error of each sample [degC^-2]
     terminal: NotNegative = 10.0  # weight of that of the last one besides [degC^-2]
-    # how many times the errors of an output count; 1 where absent
+    # factor on the errors of an output; 1 where absent
     weights: dict[str, Positive] = field(default_factory=dict)
     move: Positive = 1.0  # weight of the squared change of a drive a block, in shares of its range
     drive: NotNegative = 0.0  # weight of a squared drive a sample, in shares of its range
@@ -404,7 +404,7 @@ def _noise_of(noise: Mapping[str, Any], drives: Iterable[str]) -> dict[str, Any]
 def default_design(
     plant: Plant, *, controlled: tuple[str, ...] | None = None, dt: float | None = None, **changes: Any
 ) -> Design:
-    """Return a design read off the plant.
+    """Return a design with the plant's numbers.
 
     Parameters
     ----------

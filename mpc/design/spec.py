@@ -46,7 +46,7 @@ Deviation = Annotated[float, Field(ge=-50, le=50, allow_inf_nan=False)]
 Temperature = Annotated[float, Field(ge=-20, le=150, allow_inf_nan=False)]
 
 
-def _ends(value: Any) -> Any:
+def _both_ends(value: Any) -> Any:
     """Return both ends of a limit that may have one: ``{ max = 60 }``."""
     if not isinstance(value, dict):
         return value
@@ -55,11 +55,11 @@ def _ends(value: Any) -> Any:
     return value.get("min", -LARGEST), value.get("max", LARGEST)
 
 
-Ends = Annotated[Range, BeforeValidator(_ends)]
+Ends = Annotated[Range, BeforeValidator(_both_ends)]
 
 
 class Settling(BaseModel):
-    """What is asked of one output, where it is not what is asked of all."""
+    """Requirements of one output, where they are not those of all."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -70,7 +70,7 @@ class Settling(BaseModel):
 
 
 class Asked(NamedTuple):
-    """What is asked of one output."""
+    """Requirements of one output."""
 
     within_s: float
     band_degC: float
@@ -100,7 +100,7 @@ class Spec(BaseModel):
     moves_weight: NotNegative = 0.002  # share of the minimum time that is worth one move by a full drive less
     # times the moves of the default design, beyond which moves are charged as overshoot is; 0: no limit
     moves_limit: NotNegative = 1.5
-    # between moves; read off the plant where absent, like the next ones
+    # between moves; taken from the plant where absent, like the next ones
     sample_time_s: Positive | None = None
     slew_per_s: Positive | dict[str, Positive] | None = None  # largest change of a drive [its units per s]
     drive_limits: Range | dict[str, Range] | None = None  # narrower range of a drive, in its units
@@ -120,7 +120,7 @@ class Spec(BaseModel):
     extra_delay: Annotated[NotNegative, Field(le=10)] = 0.5
     lost_gain: Annotated[NotNegative, Field(lt=1)] = 0.15
     limits: dict[str, Ends] | None = None  # soft limits of outputs [degC]
-    weights: dict[str, Positive] | None = None  # how many times the errors of an output count
+    weights: dict[str, Positive] | None = None  # factor on the errors of an output
     zones: dict[str, Positive] | None = None  # half width about a target in which an output may be anywhere
     hard: list[str] | None = None  # outputs whose limits give way last
     energy_price: NotNegative | dict[str, NotNegative] | None = None  # of a sample at full drive [degC^2]
@@ -151,7 +151,7 @@ class Spec(BaseModel):
         return self
 
     def asked(self, output: str) -> Asked:
-        """Return what is asked of an output, which is what is asked of all where nothing is its own."""
+        """Return the requirements of an output, which are those of all where it has none of its own."""
         of_output = (self.settling or {}).get(output, Settling())
         return Asked(
             of_output.within_s or self.settle_within_s,
@@ -256,10 +256,10 @@ class Spec(BaseModel):
         _check_length(self, design.dt)
         drives = drive_names(plant)
         slews = {**design.slew_per_s, **_by_drive("slew_per_s", self.slew_per_s, drives)}
-        values: dict[str, Any] = {"drive_range": _ranges(self, design), "slew_per_s": slews}
+        values: dict[str, Any] = {"drive_range": _spec_drive_ranges(self, design), "slew_per_s": slews}
         if self.patience_s is not None:
             values["patience_s"] = self.patience_s
-        values |= {"limits": _limits(self, plant, design), "overshoot": 0.5 * self.overshoot_degC}
+        values |= {"limits": _soft_limits(self, plant, design), "overshoot": 0.5 * self.overshoot_degC}
         for name in self.weights or ():
             if name not in design.controlled:
                 hint = known_names(name, design.controlled, "these are: {}")
@@ -324,7 +324,7 @@ def _check_length(spec: Spec, dt: float) -> None:
 
 
 def _check_settling(spec: Spec, controlled: tuple[str, ...], ramps: Mapping[str, float]) -> None:
-    """Refuse what is asked of an output that has no target, or sooner than its ramp is there."""
+    """Refuse a requirement of an output that has no target, or sooner than its ramp is there."""
     for name, settling in (spec.settling or {}).items():
         if name not in controlled:
             hint = known_names(name, controlled, "these are: {}")
@@ -335,7 +335,7 @@ def _check_settling(spec: Spec, controlled: tuple[str, ...], ramps: Mapping[str,
             raise UserError(f"settling: {late}", hint="leave out one: within_s makes a ramp itself")
 
 
-def _ranges(spec: Spec, design: Design) -> dict[str, Range]:
+def _spec_drive_ranges(spec: Spec, design: Design) -> dict[str, Range]:
     """Return the range of each drive under a spec."""
     ranges = dict(design.drive_range)
     for name, (low, high) in _by_drive("drive_limits", spec.drive_limits, tuple(ranges)).items():
@@ -351,7 +351,7 @@ def _ranges(spec: Spec, design: Design) -> dict[str, Range]:
     return ranges
 
 
-def _limits(spec: Spec, plant: Plant, design: Design) -> dict[str, Range]:
+def _soft_limits(spec: Spec, plant: Plant, design: Design) -> dict[str, Range]:
     """Return the soft limits of outputs under a spec; a target must not lie beyond its output's own."""
     if spec.limits is None:
         free = "t_tank" in plant.outputs and "t_tank" not in design.controlled

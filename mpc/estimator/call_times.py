@@ -1,4 +1,4 @@
-r"""When a controller is called: how many seconds passed, and whether a move is due.
+r"""When a controller is called: the seconds that passed, and whether a move is due.
 
 Estimate, plan and slew limit count each second once, whatever the rate (``docs/explanation/mpc.md``).  A move
 is due at the call that is nearest to a sample time after the last one,

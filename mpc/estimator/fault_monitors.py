@@ -3,7 +3,7 @@ r"""A drive that does another share than before, and a sensor that has stopped.
 Both compare what a plant was driven with and what was read, and neither asks for a posterior.
 
 **Gain.**  After a new target a drive moves for the target and not for a load.  With e the innovation of the
-loop's filter, and e' that of a second one, to which a tenth less of the drive is told, the slope of the
+loop's filter, and e' that of a second one, which is given a tenth less of the drive, the slope of the
 innovation is psi = (e' - e) / 0.1, and of a drive whose gain is 1 + g times the model's e = g psi + noise, so
 
     g = sum(psi e / R) / sum(psi^2 / R),     sd^2 = sum((psi e / R)^2) / sum(psi^2 / R)^2,

@@ -176,7 +176,7 @@ def resting_state_in_room(model: PredictionModel, ambient: float, unit: tuple[fl
     return replace(resting, x=resting.x + (ambient - level) * resting.by_level)
 
 
-_REPEATS, _SAME = 5, 1e-3  # of the start on a nonlinear plant, and when it is still [units]
+_REPEATS, _STEADY = 5, 1e-3  # of the start on a nonlinear plant, and when it is still [units]
 NEWEST_INNOVATION = 0.2  # share of the newest innovation in their mean
 #: Of a drive, in fractions of its range: no drive makes up for more.
 LARGEST_BIAS = 1.0
@@ -269,10 +269,10 @@ def choose_disturbances(
     _, A, B, E = model.linearise(*model.at_rest(ambient))
     chosen: list[tuple[str, int]] = []
     margin = float("inf")
-    for entry in _in_order(model, controlled):
+    for entry in _disturbance_order(model, controlled):
         if len(chosen) == model.n_y:
             break
-        trial = _matrices(model, [*chosen, entry])
+        trial = _disturbance_matrices(model, [*chosen, entry])
         scale = np.array([0.01 if kind == "input" else 1.0 for kind, _ in [*chosen, entry]])
         into_state = B @ (trial[0] * model.span[:, None]) + E @ trial[1]
         trial_margin = detectability_margin(A, model.C, into_state, trial[2], scale=scale)
@@ -286,13 +286,13 @@ def choose_disturbances(
             hint="control an output that a drive can move"
             + (": identify does not call this plant good" if said_not_good(model.plant.verdict) else ""),
         )
-    on_drive, on_disturbance, on_output = _matrices(model, chosen)
+    on_drive, on_disturbance, on_output = _disturbance_matrices(model, chosen)
     names = {"input": model.drives, "output": model.outputs, "disturbance": model.disturbances}
     labels = tuple(f"{kind} {names[kind][row]}" for kind, row in chosen)
     return DisturbanceModel(labels, on_drive, on_disturbance, on_output, margin)
 
 
-def _in_order(model: PredictionModel, controlled: tuple[str, ...]) -> list[tuple[str, int]]:
+def _disturbance_order(model: PredictionModel, controlled: tuple[str, ...]) -> list[tuple[str, int]]:
     first = [i for i, name in enumerate(model.outputs) if name in controlled]
     uncontrolled = [i for i in range(model.n_y) if i not in first]
     order = [("input", j) for j in range(model.n_u)]
@@ -300,7 +300,9 @@ def _in_order(model: PredictionModel, controlled: tuple[str, ...]) -> list[tuple
     return order + [("disturbance", k) for k in range(model.n_d)]
 
 
-def _matrices(model: PredictionModel, entries: list[tuple[str, int]]) -> tuple[Array, Array, Array]:
+def _disturbance_matrices(
+    model: PredictionModel, entries: list[tuple[str, int]]
+) -> tuple[Array, Array, Array]:
     n_w = len(entries)
     matrices = {
         "input": np.zeros((model.n_u, n_w)),
@@ -379,7 +381,7 @@ class Observer:
             moved = np.max(np.abs(self.x - x) / self.unit)
             x = self.x
             v = np.clip(resting.past_drive(x), model.lowest, model.highest)
-            if not moved > _SAME:
+            if not moved > _STEADY:
                 break
 
     def reset_in_room(self, y: Array, d: Array) -> None:

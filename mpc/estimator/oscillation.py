@@ -37,7 +37,7 @@ NOISE_SD = 3.0  # standard deviations of a reading that are no swing
 _SWINGS = 6  # half swings in a row
 _LAST_TWO = 0.57  # of the IAE of the first two, that the last two must have
 _SHORTEST_PERIOD = 6.0  # samples, of a period
-_LONGEST = 2.5  # ultimate periods, of a half swing
+_LONGEST_HALF_SWING = 2.5  # ultimate periods, of a half swing
 
 
 class _Half(NamedTuple):
@@ -121,7 +121,9 @@ class OscillationMonitor:
         self, names: Sequence[str], dt: float, delays: Sequence[float], least: Sequence[float]
     ) -> None:
         self._signals = {
-            name: Oscillation(_SHORTEST_PERIOD * dt, _LONGEST * 4.0 * max(delay, 2.0 * dt), amplitude)
+            name: Oscillation(
+                _SHORTEST_PERIOD * dt, _LONGEST_HALF_SWING * 4.0 * max(delay, 2.0 * dt), amplitude
+            )
             for name, delay, amplitude in zip(names, delays, least, strict=True)
         }
 

@@ -112,7 +112,7 @@ class _Row(NamedTuple):
     d: Array
 
 
-class _Fitted(NamedTuple):
+class _FittedWindow(NamedTuple):
     """A run of the model over some samples: what of the unknowns (m,) is most likely, and what it shows."""
 
     run: Callable[..., Array]
@@ -204,7 +204,7 @@ class StructureMonitor:
             return None
         return self._tested(fit, self._structures(fit, rows))
 
-    def _fitted(self, observer: Observer, rows: Sequence[_Row]) -> _Fitted | None:
+    def _fitted(self, observer: Observer, rows: Sequence[_Row]) -> _FittedWindow | None:
         """Return the most likely run of the model over rows; None where it is not finite."""
         model, spread = self.model, self.spread
         if spread is None or len(rows) < _SET.fewest_samples:
@@ -224,7 +224,7 @@ class StructureMonitor:
                 model.inputs(pushed + (w @ disturbance.on_drive.T * model.span)[:, None]), model.sub, axis=1
             )
             measured = np.repeat(d + (w @ disturbance.on_disturbance.T)[:, None], model.sub, axis=1)
-            parameters = _numbers(self.plant, plant_numbers[:, :n_t] @ spread.T)
+            parameters = _changed_parameters(self.plant, plant_numbers[:, :n_t] @ spread.T)
             y, _ = model.model.rollout(x, fine, measured, parameters, model.dt / model.sub)
             return np.asarray(np.asarray(y) + (w @ disturbance.on_output.T)[:, None] + offset)
 
@@ -240,9 +240,9 @@ class StructureMonitor:
                 if not (np.abs(J).max() < _SET.diverged and np.abs(r).max() < _SET.diverged):
                     return None
                 last, z = z, np.linalg.solve(J @ J.T + np.eye(m), J @ r)
-        return _Fitted(run, last, J, r, shown[0], weight, u)
+        return _FittedWindow(run, last, J, r, shown[0], weight, u)
 
-    def _structures(self, found: _Fitted, rows: Sequence[_Row]) -> Array:
+    def _structures(self, found: _FittedWindow, rows: Sequence[_Row]) -> Array:
         """Return what each alternative of the bank adds to the readings (n, N, n_y), by its unit."""
         model, u = self.model, found.drives
         before, first = rows[: -self.window], rows[-self.window :][0]
@@ -280,15 +280,15 @@ class StructureMonitor:
                 made.append(column)
         return np.array(made)
 
-    def _tested(self, found: _Fitted, a: Array) -> Misfit:
+    def _tested(self, found: _FittedWindow, a: Array) -> Misfit:
         """Return what a fit says of the bank's alternatives, which add a (k, N, n_y)."""
         n_y, weight = self.model.n_y, found.weight
         drift = _SET.drift * np.linspace(0.0, 1.0, len(weight))[:, None] * np.eye(n_y)[:, None]
         nuisance = np.vstack([found.J, (drift * weight).reshape(n_y, -1)])
-        return _tested(self.bank, nuisance, (a * weight).reshape(len(a), -1), found.r)
+        return _test_alternatives(self.bank, nuisance, (a * weight).reshape(len(a), -1), found.r)
 
 
-def _tested(bank: Sequence[_Alternative], J: Array, a: Array, r: Array) -> Misfit:
+def _test_alternatives(bank: Sequence[_Alternative], J: Array, a: Array, r: Array) -> Misfit:
     """Return what residuals r (n,) say of alternatives a (k, n), all in standard deviations of readings;
     J (m, n) are the unknowns'."""
     tolerated = np.array([one.tolerated for one in bank])
@@ -326,7 +326,7 @@ def _posterior(plant: Plant) -> Array | None:
     return np.asarray(axes * np.sqrt(np.maximum(size, 0.0)))
 
 
-def _numbers(plant: Plant, change: Array) -> Array:
+def _changed_parameters(plant: Plant, change: Array) -> Array:
     """Return the parameters (B, n_p) of changes (B, n_free) of theta."""
     p = np.repeat(plant.p[None], len(change), axis=0)
     p[:, [plant.model.parameters.index(name) for name in plant.free]] = plant.natural(plant.theta + change)

@@ -79,7 +79,7 @@ _PARAMETERS, _DRIVES, _STATE, _DIRECTION = 1, 2, 3, 4  # what a value depends on
 _POINT = "const double *x, const double *u, const double *d, const double *k"
 _SU, _SD = "const double *restrict su", "const double *restrict sd"
 _COLUMNS = "int n, const double *m, const double *k, const double *h, const double *restrict sx"
-_HEADS = {
+_FUNCTION_HEADS = {
     part: f"void tg_model_{part}({arguments})"
     for part, arguments in {
         "prepare": "const double *p, double *k",
@@ -128,7 +128,7 @@ class _Line:
 
 
 @dataclass(frozen=True)
-class _Table:
+class _LinearRows:
     """Rows of a step that are constants times state, drives and disturbances, and a constant."""
 
     rows: list[int]
@@ -220,10 +220,10 @@ class ModelCode:
 def write_model(model: Model, drives: Sequence[int], h: float) -> ModelCode:
     """Return the C of a model's step of length h [s]; inputs that are no drives are switches, and on."""
     table, graphs = _graphs(model, drives, h)
-    return _write(min((_straight(form) for form in graphs), key=_work), table)
+    return _write_model_code(min((_straight(form) for form in graphs), key=_work), table)
 
 
-def _graphs(model: Model, drives: Sequence[int], h: float) -> tuple[_Table, list[Any]]:
+def _graphs(model: Model, drives: Sequence[int], h: float) -> tuple[_LinearRows, list[Any]]:
     """Return what is a table, and each form of the rest as a function (p, x, u, d, sx, su, sd) -> (x+,
     tangents along sx, with su, with sd)."""
     import casadi as ca
@@ -259,7 +259,7 @@ def _graphs(model: Model, drives: Sequence[int], h: float) -> tuple[_Table, list
     return table, functions
 
 
-def _tabulate(after: Any, x: Any, u: Any, d: Any) -> _Table:
+def _tabulate(after: Any, x: Any, u: Any, d: Any) -> _LinearRows:
     """Return the rows of a step whose slopes are many constants."""
     import casadi as ca
 
@@ -276,7 +276,7 @@ def _tabulate(after: Any, x: Any, u: Any, d: Any) -> _Table:
     dense = np.array(ca.DM(ca.evalf(ca.densify(slopes[long, :])))).reshape(len(long), arguments.numel())
     slope_parts = np.split(dense, [n_x, n_x + n_u], axis=1)
     level = np.array(ca.DM(ca.evalf(ca.densify(added[long])))).ravel()
-    return _Table(long, dict(zip("xud", slope_parts, strict=True)), level)
+    return _LinearRows(long, dict(zip("xud", slope_parts, strict=True)), level)
 
 
 def _straight(function: Any) -> _Line:
@@ -348,7 +348,7 @@ def _work(line: _Line) -> float:
     return once + 0.5 * (count(step, _DRIVES) + count(both, _DRIVES))
 
 
-def _write(line: _Line, table: _Table) -> ModelCode:
+def _write_model_code(line: _Line, table: _LinearRows) -> ModelCode:
     outputs = [[pair for pair in entries.items() if pair[0] not in table.rows] for entries in line.outputs]
     roots = [[number for _, number in entries] for entries in outputs]
     everything = _needed(line, [number for name in roots for number in name])
@@ -384,7 +384,7 @@ def _write(line: _Line, table: _Table) -> ModelCode:
     sizes = {"sx": n_x, "su": line.n_u, "sd": line.n_d, "out": n_x}
     along = {"tangent": "x", "tangent_u": "xu", "tangent_d": "xud"}
     for name, lines in bodies.items():
-        head = _HEADS[name]
+        head = _FUNCTION_HEADS[name]
         arguments = [item.split()[-1].lstrip("*") for item in head[head.index("(") + 1 : -1].split(",")]
         more = table.tangent(along[name]) if name in along else []
         body = "\n".join([*lines, *more])
@@ -394,7 +394,7 @@ def _write(line: _Line, table: _Table) -> ModelCode:
             moving = [item for item in arguments if item in sizes]
             lines = _over_groups(lines, more, moving, sizes)
         source.append("\n".join([head, "{", *unused, *lines, "}", ""]))
-    heads = [_HEADS[name].replace(" restrict ", " ").replace("*restrict ", "*") for name in bodies]
+    heads = [_FUNCTION_HEADS[name].replace(" restrict ", " ").replace("*restrict ", "*") for name in bodies]
     header = ";\n".join([*heads, ""])  # C++ has no such word, and to C it is the same declaration
     return ModelCode("\n".join(source), header, len(k), len(h), len(m), line)
 

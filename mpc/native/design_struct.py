@@ -51,7 +51,7 @@ _FIELDS: dict[str, tuple[bool, tuple[str, ...], str]] = {
     "dt": (False, (), "sample time [s]"),
     "track": (False, (), "weights of the cost"),
     "terminal": (False, (), ""),
-    "weight": (False, ("NC",), "how many times the error of each controlled output counts"),
+    "weight": (False, ("NC",), "factor on the error of each controlled output"),
     "move": (False, (), ""),
     "drive": (False, (), ""),
     "price": (False, (), "of an output in the overshoot band"),
@@ -157,7 +157,7 @@ def sizes_of(controller: ControllerParts, code: ModelCode, *, room: bool) -> Siz
     N, n_y = sum(design.blocks), model.n_y
     controlled, limited = (n_y, n_y) if room else (len(design.controlled), len(design.limits))
     most = -(-N // 32) * 32 if room else N
-    longest = _whole(len(design.blocks) * model.n_u)
+    longest = _multiple_of_four(len(design.blocks) * model.n_u)
     entries = most * longest if room else _row_lengths(design.blocks, model.n_u)
     return Sizes(
         NX=model.n_x,
@@ -186,7 +186,7 @@ def _settles(model: PredictionModel) -> bool:
     return bool(np.linalg.cond(np.eye(model.n_x) - model.affine[0]) < _INTEGRATES)
 
 
-def _whole(n: int) -> int:
+def _multiple_of_four(n: int) -> int:
     """Return n numbers in whole groups of four, as the C has its rows."""
     return -(-n // 4) * 4
 
@@ -195,7 +195,7 @@ def _row_lengths(blocks: Sequence[int], n_u: int) -> int:
     """Return the sum of the lengths of one output's rows: those of four samples are as long as the last."""
     of_sample = np.repeat(np.arange(1, len(blocks) + 1), blocks)
     last = np.minimum(np.arange(len(of_sample)) // 4 * 4 + 3, len(of_sample) - 1)
-    return sum(_whole(int(b) * n_u) for b in of_sample[last])
+    return sum(_multiple_of_four(int(b) * n_u) for b in of_sample[last])
 
 
 def config_header(sizes: Sizes) -> str:
@@ -295,7 +295,7 @@ def numbers_of(controller: ControllerParts, k: Array) -> dict[str, Any]:
         "rest_d": resting.by_d,
         "P_rest": resting.P,
         **_free_response(model, design, rows),
-        **_settled(model, disturbance),
+        **_steady_outputs(model, disturbance),
     }
 
 
@@ -314,7 +314,7 @@ def _free_response(model: PredictionModel, design: Design, rows: list[int]) -> d
     }
 
 
-def _settled(model: PredictionModel, disturbance: DisturbanceModel) -> dict[str, Any]:
+def _steady_outputs(model: PredictionModel, disturbance: DisturbanceModel) -> dict[str, Any]:
     """Return the outputs of a linear plant at rest by drives, disturbances and disturbance states."""
     sides = model.n_u + model.n_d + disturbance.n_w
     nothing = {"settles": False, "settled_by": np.zeros((model.n_y, sides)), "settled": np.zeros(model.n_y)}

@@ -47,7 +47,7 @@ _CODE = ("tg_qp", "tg_controller", "tg_observer", "tg_optimiser")
 SOURCES = ("tg_qp.h", "tg_controller.h", *(f"{name}.c" for name in _CODE))
 
 # sums may be done in any order and pairs of operations at once; NaN keeps its meaning
-_FLAGS = (
+_GCC_FLAGS = (
     *(
         "-std=c99",
         "-O2",
@@ -84,7 +84,7 @@ def build_library(files: dict[str, str]) -> Path:
     if gcc is None:
         raise RuntimeError("no gcc")
     text = "\n".join(f"{name}\n{content}" for name, content in sorted(files.items()))
-    key = hashlib.sha256("\n".join([*_FLAGS, _machine(gcc), text]).encode()).hexdigest()[:32]
+    key = hashlib.sha256("\n".join([*_GCC_FLAGS, _machine(gcc), text]).encode()).hexdigest()[:32]
     path = code_cache() / f"mpc-{key}.so"
     if path.is_file() and only_ours(path):
         return path
@@ -94,7 +94,7 @@ def build_library(files: dict[str, str]) -> Path:
         for name, content in files.items():
             (Path(folder) / name).write_text(content, encoding="utf-8")
         units = [name for name in files if name.endswith(".c")]
-        command = [gcc, *_FLAGS, *units, "-lm", "-o", "built.so"]
+        command = [gcc, *_GCC_FLAGS, *units, "-lm", "-o", "built.so"]
         done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
         if done.returncode:
             _refused[key] = f"gcc refused: {done.stderr.strip()[:300]}"
@@ -122,7 +122,7 @@ QP_STATUS = ("solved", "infeasible", "iteration limit", "not convex", "not finit
 _codes: dict[tuple[_ByStructure, tuple[int, ...], float], ModelCode] = {}
 
 
-def _written(model: _ByStructure, drives: tuple[int, ...], h: float) -> ModelCode:
+def _model_code(model: _ByStructure, drives: tuple[int, ...], h: float) -> ModelCode:
     key = (model, drives, h)
     if key not in _codes:
         _codes[key] = write_model(model.model, drives, h)
@@ -130,7 +130,7 @@ def _written(model: _ByStructure, drives: tuple[int, ...], h: float) -> ModelCod
 
 
 def _code_of(model: PredictionModel) -> ModelCode:
-    return _written(_ByStructure(model.model), tuple(model.drive_index), model.dt / model.sub)
+    return _model_code(_ByStructure(model.model), tuple(model.drive_index), model.dt / model.sub)
 
 
 class _ByStructure:
@@ -151,11 +151,11 @@ class _ByStructure:
 
 @cache
 def _truth_library(model: _ByStructure, drives: tuple[int, ...], h: float) -> ctypes.CDLL:
-    return ctypes.CDLL(str(build_library(_written(model, drives, h).files)))
+    return ctypes.CDLL(str(build_library(_model_code(model, drives, h).files)))
 
 
 @cache
-def _library(path: Path) -> ctypes.CDLL:
+def _loaded_library(path: Path) -> ctypes.CDLL:
     library = ctypes.CDLL(str(path))
     doubles, integers = "x w P found_offset seen target y ramped unread_s nearest", "stays qp_status"
     for names, kind in ((doubles, ctypes.c_double), (integers, ctypes.c_int)):
@@ -179,7 +179,7 @@ class CompiledController:
         code = _code_of(model)
         self.sizes: Sizes = sizes_of(controller, code, room=True)
         files = {name: c_source(name) for name in (*SOURCES, "tg_host.c")} | code.files
-        self.library = _library(build_library(files | {"tg_config.h": config_header(self.sizes)}))
+        self.library = _loaded_library(build_library(files | {"tg_config.h": config_header(self.sizes)}))
         k = np.zeros(max(1, code.n_k))
         self.library.tg_host_prepare(address(np.ascontiguousarray(model.p)), address(k))
         self.design = as_structure(self.sizes, numbers_of(controller, k[: code.n_k]))
@@ -221,7 +221,7 @@ class CompiledController:
         return plan if self.library.tg_host_plan(self.state, address(plan)) else None
 
     def view(self, name: str, shape: tuple[int, ...]) -> NDArray[Any]:
-        """Return an array that shares memory with a part of the state, one of those of :func:`_library`."""
+        """Return an array that shares memory with a part of the state; see :func:`_loaded_library`."""
         pointer = getattr(self.library, f"tg_host_{name}")(self.state)
         return np.ctypeslib.as_array(pointer, shape=shape)
 

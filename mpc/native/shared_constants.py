@@ -54,10 +54,10 @@ def _sd_of_mean(newest: float) -> float:
 
 def shared_definitions() -> list[str]:
     """Return the lines that define the shared constants in C."""
-    return [f"#define TG_{name} {_in_c(value)}" for name, value in sorted(shared_constants().items())]
+    return [f"#define TG_{name} {_c_literal(value)}" for name, value in sorted(shared_constants().items())]
 
 
-def _in_c(value: float | tuple[float, ...]) -> str:
+def _c_literal(value: float | tuple[float, ...]) -> str:
     if isinstance(value, tuple):
         return "{" + ", ".join(repr(float(v)) for v in value) + "}"
     return f"({value!r})" if value < 0 else repr(value)

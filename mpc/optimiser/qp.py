@@ -38,7 +38,7 @@ from thermogrip.datasets.arrays import Array
 LEAST_QUADRATIC = 1e-9  # of a scaled row's quadratic penalty
 
 #: What DAQP's exit flags mean where they are not positive: a positive flag is a solution.
-_FLAGS = {
+_EXIT_FLAGS = {
     -1: "infeasible",
     -2: "cycling",
     -3: "unbounded",
@@ -50,7 +50,7 @@ _FLAGS = {
 _SOFT = 8  # DAQP's flag of a row that may be broken at a penalty
 TOLERANCE = 1e-10  # of a scaled row
 SHORT = 1e-5  # a soft row shorter than this, scaled, cannot be kept by any answer
-_FAR = 1e20  # means "no bound"; DAQP takes 1e30 as infinite
+_NO_BOUND = 1e20  # means "no bound"; DAQP takes 1e30 as infinite
 
 
 @dataclass(frozen=True)
@@ -127,13 +127,13 @@ class CondensedQP:
             self._scaled = back, length, rows
             self._given = H, A
         back, length, rows = self._scaled
-        least, most = np.maximum(lower / length, -_FAR), np.minimum(upper / length, _FAR)
+        least, most = np.maximum(lower / length, -_NO_BOUND), np.minimum(upper / length, _NO_BOUND)
         idle = self.soft & (length < SHORT)
         if idle.any():
-            least[idle], most[idle] = -_FAR, _FAR
+            least[idle], most[idle] = -_NO_BOUND, _NO_BOUND
         z, multipliers, flag, iterations = self._run(f @ back, rows, least, most, length)
         if flag <= 0:
-            return self._failed(_FLAGS.get(flag, f"solver flag {flag}"), f.size, iterations)
+            return self._failed(_EXIT_FLAGS.get(flag, f"solver flag {flag}"), f.size, iterations)
         if not np.isfinite(z).all():
             return self._failed("not finite", f.size, iterations)
         x = back @ z

@@ -63,11 +63,11 @@ FIRST = 0.2
 _DEAR = 1000.0  # times the price of a soft limit, of a hard one
 #: Of its unit, by which an output breaks its limit: it is reported, and the target cannot be had.
 BREAKS, BREAKS_FAR = 0.1, 0.5
-BARELY = 1.02  # a plan that is hardly better than the QP's is not worth a jump
+BARELY = 1.02  # a plan that is barely better than the QP's is not worth a jump
 
 
 class Sample(NamedTuple):
-    """What one optimisation starts from, and what is asked of it."""
+    """What one optimisation starts from, and what it is to reach."""
 
     x: Array  # (n_x,) state
     last: Array  # (n_u,) drives that are applied now
@@ -79,7 +79,7 @@ class Sample(NamedTuple):
     drive_bias: Array  # (n_u,) in the drives' units
     slew_s: float | None = None  # seconds that the slew limit of the first move counts; a sample where absent
     lost: Mask | None = None  # (n_controlled,) outputs that cost nothing, and whose drives go to rest
-    caution: float = 1.0  # how many times the design's move weight counts
+    caution: float = 1.0  # factor on the design's move weight
     ahead: Array | None = None  # (N, n_controlled) targets of each sample, where they change
 
 

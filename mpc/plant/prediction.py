@@ -75,8 +75,8 @@ PLAUSIBLE = (-60.0, 200.0)
 SPIKE = 6.0
 # of a disturbance that is no temperature, in ranges of the logs: how far outside none is, what is no change
 _FAR, _CLOSE = 10.0, 0.02
-_ANY = 1e30
-_NEAR = 5.0  # units from what the logs showed, where a black box still knows what it does
+_UNBOUNDED = 1e30
+_KNOWN_BEYOND_LOGS = 5.0  # units from what the logs showed, where a black box still knows what it does
 
 
 class Response(NamedTuple):
@@ -128,7 +128,7 @@ class PredictionModel:
         seen = np.array([plant.valid.get(name, (0.0, 0.0)) for name in self.disturbances], dtype=float)
         self.seen_d = seen.reshape(-1, 2)
         low, high = self.seen_d.T
-        width_allowed = np.where(high > low, _FAR * (high - low), _ANY)
+        width_allowed = np.where(high > low, _FAR * (high - low), _UNBOUNDED)
         self.least_d = np.where(self.rooms, self.coldest, low - width_allowed)
         self.most_d = np.where(self.rooms, self.hottest, high + width_allowed)
         some = np.where(high > low, high - low, np.maximum(1.0, np.abs(high)))
@@ -187,7 +187,7 @@ class PredictionModel:
         """Return outputs (n_y,) that are as warm as the room [degC], or the middle of what the logs showed of
         those that never were."""
         low, high = self._seen.T
-        margin = _NEAR * self.unit
+        margin = _KNOWN_BEYOND_LOGS * self.unit
         away = (ambient < low - margin) | (ambient > high + margin)
         return np.asarray(np.mean(np.where(away, self._seen.T, ambient), axis=0), dtype=np.float64)
 
@@ -227,7 +227,7 @@ class PredictionModel:
         import casadi as ca
 
         symbols = _symbols(self)
-        after = ca.vertcat(*_step(self, symbols))
+        after = ca.vertcat(*_symbolic_step(self, symbols))
         if any(ca.which_depends(after, ca.vertcat(*symbols), 2, True)):
             return None
         # CasADi's own: once, which is not worth a compiled step
@@ -331,7 +331,7 @@ class PredictionModel:
         symbols = _symbols(self)
         state = ca.vertsplit(symbols[0])
         for _ in range(self.sub):
-            state = _step(self, [ca.vertcat(*state), *symbols[1:]])
+            state = _symbolic_step(self, [ca.vertcat(*state), *symbols[1:]])
         after = ca.vertcat(*state)
         blocks = [after, *(ca.densify(ca.jacobian(after, of)) for of in symbols)]
         return ca.Function("sample", symbols, blocks)
@@ -376,7 +376,7 @@ def _symbols(model: PredictionModel, prefix: str = "") -> list[Any]:
     return [ca.SX.sym(prefix + name, n) for name, n in zip("xud", (model.n_x, model.n_u, model.n_d))]
 
 
-def _step(model: PredictionModel, symbols: list[Any]) -> list[Any]:
+def _symbolic_step(model: PredictionModel, symbols: list[Any]) -> list[Any]:
     """Return the state a step of the model after x under u, d, switches on, as CasADi's symbols."""
     import casadi as ca
 
@@ -395,7 +395,7 @@ class _TangentSteps:
         import casadi as ca
 
         symbols, along = _symbols(model), _symbols(model, "s")
-        after = ca.vertcat(*_step(model, symbols))
+        after = ca.vertcat(*_symbolic_step(model, symbols))
         slope = ca.jtimes(after, ca.vertcat(*symbols), ca.vertcat(*along))
         results = ca.cse([ca.densify(after), ca.densify(slope)])
         self._function = ca.Function("step", [*symbols, *along], results)

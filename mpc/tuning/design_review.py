@@ -291,7 +291,7 @@ def reachable(controller: Reviewed, span: tuple[float, float], rooms: Sequence[f
     return Check(name, "pass", f"{span[0]:g} to {span[1]:g} degC in {', '.join(amid)}")
 
 
-def _known(model: PredictionModel) -> tuple[Array, Array]:
+def _known_drives(model: PredictionModel) -> tuple[Array, Array]:
     """Return the least and the most of each drive (n_u,) that is known: to a black box, of its logs."""
     if not isinstance(model.model, BlackBox):
         return model.lowest, model.highest
@@ -310,7 +310,7 @@ def gain_sign(controller: Reviewed) -> Check:
             finding = f"{drive}: {design.controlled[0]} comes to rest at no drive (it only adds up)"
             fix = "evaluate by the closed loops of tune: there is no steady state"
             return Check(name, "warn", finding, fix)
-        least, most = (float(ends[model.drives.index(drive)]) for ends in _known(model))
+        least, most = (float(ends[model.drives.index(drive)]) for ends in _known_drives(model))
         inside = [turn for turn in curve.turns if max(low, least) < turn < min(high, most)]
         ranges.append(f"{drive}: {np.nanmin(curve.y):.1f} to {np.nanmax(curve.y):.1f} degC in steady state")
         if inside:
@@ -361,7 +361,7 @@ def valid_range(controller: Reviewed, span: tuple[float, float]) -> Check:
         f"{output} at {target:g} degC"
         for output in ranges
         for target in span
-        if _beyond(controller, output, target)
+        if _outside_logs(controller, output, target)
     ]
     if beyond:
         fix = "record a log that goes there, or treat the result with care"
@@ -369,7 +369,7 @@ def valid_range(controller: Reviewed, span: tuple[float, float]) -> Check:
     return Check(name, "pass", logged)
 
 
-def _beyond(controller: Reviewed, output: str, target: float) -> bool:
+def _outside_logs(controller: Reviewed, output: str, target: float) -> bool:
     """Return whether a target lies more than half a degree outside of the plant's logs."""
     low, high = controller.plant.valid.get(output, (-np.inf, np.inf))
     return not low - 0.5 <= target <= high + 0.5
@@ -393,7 +393,7 @@ def beyond_logs(
     wanted = target if isinstance(target, Mapping) else dict.fromkeys(controller.controlled, float(target))
     sentences = []
     for output, value in wanted.items():
-        if _beyond(controller, output, value):
+        if _outside_logs(controller, output, value):
             low, high = controller.plant.valid[output]
             logged = f"{output} was {low:.1f} to {high:.1f} degC in them"
             sentences.append(

@@ -34,7 +34,7 @@ from thermogrip.mpc.plant.prediction import held_start, prediction_model
 if TYPE_CHECKING:
     from thermogrip.sysid.plant.plant import Plant
 
-_LEVELS = np.linspace(0.4, 1.0, 13)
+_DRIVE_LEVELS = np.linspace(0.4, 1.0, 13)
 _CLIMBS = 12
 
 
@@ -73,13 +73,13 @@ class _Race:
     def shortest_time(self) -> float:
         """Return the least time of arrival [s], inf where there is none."""
         direction = self._direction()
-        plans = np.stack([self._ramp(share * direction) for share in _LEVELS])
+        plans = np.stack([self._ramp(share * direction) for share in _DRIVE_LEVELS])
         heights = self._heights(plans)
         best = int(np.lexsort((-heights.max(axis=1), self._arrivals(heights)))[0])
         plan, arrival = plans[best], self._arrivals(heights)[best]
         last = int(min(arrival, heights.shape[1] - 1))
         gradient = self._gradient(plan, last)
-        if best == len(_LEVELS) - 1 and np.all(gradient * direction >= -1e-9 * np.abs(gradient).max()):
+        if best == len(_DRIVE_LEVELS) - 1 and np.all(gradient * direction >= -1e-9 * np.abs(gradient).max()):
             return self._seconds(arrival)
         return self._seconds(self._climb(plan, last))
 

@@ -1,6 +1,6 @@
 r"""What a controller is tried on, and what that costs.
 
-**Trials.**  A step of the spec begins where drives have held its start for long, and the controller is told
+**Trials.**  A step of the spec begins where drives have held its start for long, and the controller knows
 these drives, as a running loop knows them; the moves M count from there.  Readings are as noisy as those of
 the logs were found to be (which includes the logs' quantum), unless the spec states a noise; where the logs
 did not tell, they have the spec's and a thermocouple's quantum.  An MPC's filter takes every reading that
@@ -238,7 +238,7 @@ def drawn(plant: Plant, draw: int) -> Plant:
 
 
 def readings_a_move(plant: Plant, output: str, dt: float) -> float:
-    """Return how many readings of an output, as often as in the logs, come in a sample time [s].
+    """Return the number of readings of an output, as often as in the logs, come in a sample time [s].
 
     Where rows of a log were averaged, one reading has the variance s^2, a mean of n of them s^2 / n, and what
     the fit recorded as the excess of one over a mean is their difference.
@@ -373,11 +373,11 @@ def steps_on(spec: Spec, draws: Iterable[int], lacks: str = "") -> list[Case]:
 def results_of(run: ClosedLoop, spec: Spec, case: Case) -> list[StepResult]:
     """Return what a case came to: for each output where the spec has ``settling``, else of the worst."""
     if spec.settling:
-        return [_result(run, [segment], case, segment.output) for segment in run.segments]
-    return [_result(run, run.segments, case)]
+        return [_step_result(run, [segment], case, segment.output) for segment in run.segments]
+    return [_step_result(run, run.segments, case)]
 
 
-def _result(run: ClosedLoop, parts: Sequence[Segment], case: Case, output: str = "") -> StepResult:
+def _step_result(run: ClosedLoop, parts: Sequence[Segment], case: Case, output: str = "") -> StepResult:
     worst = max(parts, key=lambda part: abs(part.bias))
     errors = [run.outputs[part.output] - part.target for part in parts]
     length = parts[0].end_s - parts[0].begin_s
@@ -455,10 +455,14 @@ def score(results: Sequence[StepResult], spec: Spec, scales: Scales, *, expects:
         if lacks and cost > COSTS.late:
             cost = COSTS.late * (1 + np.log(cost / COSTS.late))
         (loads if load else steps if lacks in planned else others).append(cost)
-    return Score(_spread(steps), _spread(loads), COSTS.lacking * float(np.mean(others)) if others else 0.0)
+    return Score(
+        _mean_and_worst(steps),
+        _mean_and_worst(loads),
+        COSTS.lacking * float(np.mean(others)) if others else 0.0,
+    )
 
 
-def _spread(costs: Sequence[float]) -> float:
+def _mean_and_worst(costs: Sequence[float]) -> float:
     """Return the mean, and half of what the worst is above it."""
     return float(0.5 * (np.mean(costs) + np.max(costs))) if costs else 0.0
 

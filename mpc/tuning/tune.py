@@ -105,7 +105,10 @@ MPC_PARAMETERS = {
 PI_PARAMETERS = {"Kc": (0.2, 5.0), "Ti": (0.2, 5.0), "setpoint": (0.1, 1.0)}
 #: Of a PI whose delay is below two steps of the plant: no log shows it, SIMC's gain is the highest tried.
 PI_OF_UNSEEN_DELAY = PI_PARAMETERS | {"Kc": (0.2, 1.0), "Ti": (0.6, 5.0)}
-_PARTS = ("steps", "loads")  # of a score, in none of which a tuned MPC may be worse than the default design
+_SCORED_PARTS = (
+    "steps",
+    "loads",
+)  # of a score, in none of which a tuned MPC may be worse than the default design
 
 
 @dataclass(frozen=True)
@@ -139,10 +142,10 @@ def rows_of(name: str, results: Sequence[StepResult], bounds: Bounds) -> list[Ro
     for result in results:
         if not result.lacks:
             of.setdefault((result.step, result.load, result.output), []).append(result)
-    return [_row(name, of_case, bounds) for of_case in of.values()]
+    return [_score_row(name, of_case, bounds) for of_case in of.values()]
 
 
-def _row(name: str, part: Sequence[StepResult], bounds: Bounds) -> Row:
+def _score_row(name: str, part: Sequence[StepResult], bounds: Bounds) -> Row:
     first = part[0]
     settle = np.array([result.settle_s for result in part])
     bias = np.array([result.bias for result in part])
@@ -266,14 +269,14 @@ def tune(
     bench = Bench(spec.widened(plant), spec, seed, show)
     tried: list[Trial] = []
     try:
-        _search(bench, tried, show)
-        candidates = _candidates(bench, tried)
-        results = _compare(bench, candidates, show)
+        _search_designs(bench, tried, show)
+        candidates = _best_of_each_kind(bench, tried)
+        results = _compare_on_unseen(bench, candidates, show)
         interrupted = False
     except KeyboardInterrupt:
         if {trial_so_far.controller for trial_so_far in tried} != {"MPC", "PI"}:
             raise
-        candidates = _candidates(bench, tried)
+        candidates = _best_of_each_kind(bench, tried)
         results = {name: list(trial_so_far.results) for name, trial_so_far in candidates.items()}
         interrupted = True
     return _tuning(bench, tried, candidates, results, interrupted)
@@ -418,7 +421,7 @@ class Bench:
             self.default = self.default or parts_of_score  # which comes first
             worse = (
                 getattr(parts_of_score, name) > (1 + SEARCH.won) * getattr(self.default, name)
-                for name in _PARTS
+                for name in _SCORED_PARTS
             )
             cost = np.inf if any(worse) else cost
         return Trial(
@@ -429,7 +432,7 @@ class Bench:
         )
 
 
-def _search(bench: Bench, tried: list[Trial], show: Progress) -> None:
+def _search_designs(bench: Bench, tried: list[Trial], show: Progress) -> None:
     """Try designs of MPC and PI, into ``tried``; the defaults of both first."""
     most = bench.spec.evaluations
     ranges = {"MPC": MPC_PARAMETERS, "PI": bench.pi_parameters if bench.baseline.loops else {}}
@@ -478,7 +481,7 @@ def minimise(
     search.optimize(start)
 
 
-def _candidates(bench: Bench, tried: Sequence[Trial]) -> dict[str, Trial]:
+def _best_of_each_kind(bench: Bench, tried: Sequence[Trial]) -> dict[str, Trial]:
     """Return the default design, the best MPC and the best PI."""
     of: dict[str, list[Trial]] = {kind: [t for t in tried if t.controller == kind] for kind in ("MPC", "PI")}
     best = {kind: min(trials, key=lambda each: each.score) for kind, trials in of.items() if trials}
@@ -486,7 +489,9 @@ def _candidates(bench: Bench, tried: Sequence[Trial]) -> dict[str, Trial]:
     return candidates | ({"PI": best["PI"]} if bench.baseline.loops else {})
 
 
-def _compare(bench: Bench, candidates: Mapping[str, Trial], show: Progress) -> dict[str, list[StepResult]]:
+def _compare_on_unseen(
+    bench: Bench, candidates: Mapping[str, Trial], show: Progress
+) -> dict[str, list[StepResult]]:
     """Return the results of the candidates on draws that the search has not seen."""
     results: dict[str, list[StepResult]] = {}
     for name, of in candidates.items():
@@ -522,7 +527,7 @@ def _tuning(
     sentences = [
         best_of(saved, scored, where, unknown),
         words,
-        _moved(kept_rows, rows),
+        _drive_moves(kept_rows, rows),
         _lacking_words(missing),
     ]
     finding = " ".join(part for part in sentences if part)
@@ -548,7 +553,7 @@ def _tuning(
         scores=scores,
         history=tuple(tried),
         meets_spec=meets,
-        runs={} if interrupted else _runs(bench, candidates, controller),
+        runs={} if interrupted else _runs_as_used(bench, candidates, controller),
         spec=spec,
         seed=bench.seed,
         interrupted=interrupted,
@@ -590,7 +595,7 @@ def unknown_to_pi(spec: Spec) -> list[str]:
 def best_of(kept: str, parts: Mapping[str, Score], where: str, unknown: Sequence[str] = ()) -> str:
     """Return the sentence that names the best controller, by how much, and where the other kind loses."""
     if "PI" not in parts:
-        return f"The {_kind(kept)} is what is saved: no PI can be made."
+        return f"The {_kind_words(kept)} is what is saved: no PI can be made."
     mpc = kept if kept != "PI" else min(("baseline", "tuned"), key=lambda name: parts[name].total)
     best, other = ("PI", mpc) if kept == "PI" else (mpc, "PI")
     share = 100 * (1 - parts[best].total / parts[other].total)
@@ -602,11 +607,11 @@ def best_of(kept: str, parts: Mapping[str, Score], where: str, unknown: Sequence
     worst = max(costs, key=lambda name: costs[name][0] - costs[name][1])
     loses = f"loses most on {names[worst]} ({costs[worst][0]:.2f} for {costs[worst][1]:.2f})"
     loser = "MPC" if kept == "PI" else "PI"
-    saved = f"The {_kind(kept)} is best and is what is saved"
+    saved = f"The {_kind_words(kept)} is best and is what is saved"
     return f"{saved}: it scores {share:.0f} % better than the best {loser} {where}, which {loses}."
 
 
-def _kind(kept: str) -> str:
+def _kind_words(kept: str) -> str:
     return {"baseline": "default MPC", "tuned": "tuned MPC", "PI": "PI"}[kept]
 
 
@@ -615,10 +620,10 @@ def verdict_of(spec: Spec, least: float, default: float, rows: Sequence[Row]) ->
     kept controller's rows of steps."""
     beyond = [row for row in rows if row.bound_s > spec.asked(row.output).within_s]
     if beyond:
-        return "actuator-limited", _beyond(max(beyond, key=lambda row: row.bound_s), spec)
+        return "actuator-limited", _beyond_reach(max(beyond, key=lambda row: row.bound_s), spec)
     won = 1 - least / default
     ratio = float(np.mean([row.settle_mean_s / max(row.bound_s, 1.0) for row in rows]))
-    limits = _limits(rows, spec)
+    limits = _settling_beside_bound(rows, spec)
     if won > SEARCH.won:
         return "improved", f"Its score is {100 * won:.0f} % below the default design's. {limits}"
     if ratio <= SEARCH.near:
@@ -627,7 +632,7 @@ def verdict_of(spec: Spec, least: float, default: float, rows: Sequence[Row]) ->
     return "flat", f"Tuning wins {100 * won:.1f} %, {few}. {limits}"
 
 
-def _beyond(row: Row, spec: Spec) -> str:
+def _beyond_reach(row: Row, spec: Spec) -> str:
     """Return the sentence about a step that no controller can do in time."""
     step = f"{row.start:g} to {row.target:g} degC{row.output and f' of {row.output}'}"
     if not np.isfinite(row.bound_s):
@@ -640,7 +645,7 @@ def _beyond(row: Row, spec: Spec) -> str:
     )
 
 
-def _limits(rows: Sequence[Row], spec: Spec) -> str:
+def _settling_beside_bound(rows: Sequence[Row], spec: Spec) -> str:
     """Return each step's settling beside what the drive allows, and the ramp where there is one."""
     sentences, allowed = [], "at this drive and ramp" if spec.ramps else "at this drive"
     for row in rows:
@@ -653,7 +658,7 @@ def _limits(rows: Sequence[Row], spec: Spec) -> str:
     return "; ".join(sentences) + "."
 
 
-def _moved(kept: Sequence[Row], rows: Sequence[Row]) -> str:
+def _drive_moves(kept: Sequence[Row], rows: Sequence[Row]) -> str:
     """Return how far a step moves the drives, beside the default design."""
     saved_moves = np.mean([row.travel_mean for row in kept])
     default = np.mean([row.travel_mean for row in rows if row.controller == "baseline" and not row.load])
@@ -672,7 +677,7 @@ def _lacking_words(results: Sequence[StepResult]) -> str:
     return f"Where the model lacks structure: {'; '.join(sentences)}." if sentences else ""
 
 
-def _runs(
+def _runs_as_used(
     bench: Bench, candidates: Mapping[str, Trial], controller: Controller | PIController
 ) -> dict[str, ClosedLoop]:
     """Return every step and load on the first unseen draw by the controller as it is used, and by the best

@@ -250,7 +250,7 @@ class RelayRig:
         return bool(due)
 
     def _orders(self) -> dict[str, float]:
-        """Return what the device is told."""
+        """Return the command to the device."""
         orders = {name: self._requested[name] for name in self._through}
         for name, relay in self.relays.items():
             for channel in filter(None, (relay.heater, relay.cooler)):

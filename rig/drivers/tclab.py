@@ -36,9 +36,9 @@ from thermogrip.rig.serial.port import Port, PortError
 from thermogrip.rig.serial.protocol import REFUSALS
 
 HEATERS, SENSORS = ("q1", "q2"), ("t1", "t2")
-_NUMBER = re.compile(rb"(-?(?:0|[1-9][0-9]{0,3})\.[0-9]{3})\r?\n")
-_VERSION = re.compile(rb"TCLab Firmware [ -~]+\r?\n")
-_STOP = re.compile(rb"Stop\r?\n")
+_DECIMAL_LINE = re.compile(rb"(-?(?:0|[1-9][0-9]{0,3})\.[0-9]{3})\r?\n")
+_VERSION_LINE = re.compile(rb"TCLab Firmware [ -~]+\r?\n")
+_STOP_LINE = re.compile(rb"Stop\r?\n")
 
 
 @dataclass(frozen=True)
@@ -172,7 +172,7 @@ class TCLabRig(NoticeBook):
         """Ask for the version until the board answers, and switch the heaters off."""
         for _ in range(max(1, round(seconds / self.timeout))):
             self._wait_for_silence()
-            lines = self._once(b"VER", 1, _VERSION)
+            lines = self._once(b"VER", 1, _VERSION_LINE)
             if lines:
                 self._known_at = self.port.opened
                 self._set_heaters([0.0, 0.0])
@@ -185,10 +185,10 @@ class TCLabRig(NoticeBook):
         """Set both heaters; each answer is the value that the board took."""
         for channel, value in enumerate(power):
             text = f"Q{channel + 1} {value:.3f}".encode()
-            took = float(self._ask(text, 1, _NUMBER)[0])
+            took = float(self._ask(text, 1, _DECIMAL_LINE)[0])
             if abs(took - value) > BOARD.same:
                 self._wait_for_silence()
-                took = float(self._ask(text, 1, _NUMBER)[0])  # an answer that slipped, or was spoilt
+                took = float(self._ask(text, 1, _DECIMAL_LINE)[0])  # an answer that slipped, or was spoilt
             if abs(took - value) > BOARD.same:
                 problem = f"took {took:g} % where q{channel + 1} = {value:g} %"
                 raise PortError("lost", problem, file=self.port.url, hint="check cable and power")
@@ -220,7 +220,7 @@ class TCLabRig(NoticeBook):
         return any(abs(now - then) > self.jump for now, then in zip(numbers[:2], self._last[1]))
 
     def _scan(self) -> list[float]:
-        return [float(line) for line in self._ask(b"SCAN", 4, _NUMBER)]
+        return [float(line) for line in self._ask(b"SCAN", 4, _DECIMAL_LINE)]
 
     def _trip_if_bad(self, temperatures: list[float]) -> None:
         """Count bad scans; the fourth in a row switches off and latches."""
@@ -242,15 +242,15 @@ class TCLabRig(NoticeBook):
         with suppress(PortError):  # one that is not confirmed must not keep the other on: the stop ends both
             self._set_heaters([0.0, 0.0])
         try:
-            self._ask(b"X", 1, _STOP, known=False)  # whatever board it is
+            self._ask(b"X", 1, _STOP_LINE, known=False)  # whatever board it is
             self._set = [0.0, 0.0]
         except PortError as error:
             self._note("link", f"could not be switched off: {error}; PULL THE PLUG, the heaters stay on")
 
     def _check_board(self) -> None:
         """Raise PortError where another board than before may answer now."""
-        version = self._once(b"VER", 1, _VERSION)
-        if not version or not (scan := self._once(b"SCAN", 4, _NUMBER)):
+        version = self._once(b"VER", 1, _VERSION_LINE)
+        if not version or not (scan := self._once(b"SCAN", 4, _DECIMAL_LINE)):
             raise PortError("lost", "does not answer", file=self.port.url, hint="check cable and power")
         heaters_as_set = all(abs(float(now) - then) <= BOARD.same for now, then in zip(scan[2:], self._set))
         same = any(self._set) and heaters_as_set

@@ -141,7 +141,7 @@ class DeviceCore:
         self._expire(now_ms)
         self._values = tuple(values)
         bad = [
-            count.add(_kind(sensor, value))
+            count.add(_sensor_fault(sensor, value))
             for count, sensor, value in zip(self._bad_counts, self.board.sensors, values)
         ]
         latched = [
@@ -228,7 +228,7 @@ class DeviceCore:
         self.mode = mode
 
 
-def _kind(sensor: Sensor, value: Value) -> str:
+def _sensor_fault(sensor: Sensor, value: Value) -> str:
     """Return what is wrong with a guarded sensor's value, empty where nothing is."""
     if not sensor.guarded:
         return ""

@@ -54,7 +54,7 @@ class InputSteps:
 
     def add(self, until: float, u: Array, d: Array, keep: int) -> int:
         """Hold u (n_u,) and d (n_d,) until a time [s], keep the newest ``keep`` complete steps (but all of
-        this call), and return how many it completed."""
+        this call), and return the number completed."""
         before = self.done
         while (grid := self.start + (self.done + 1) * self.dt) <= until + 1e-9:
             self._accumulate(grid - self.time, u)

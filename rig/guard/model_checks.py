@@ -20,7 +20,7 @@ b may not exceed ``bias_limit``, and w, of standard deviation sd in the filter, 
     sqrt((drive_limit e / s)^2 + (5 sd)^2),
 
 e being what the largest drive of the longest window does in such a window, and s its slope: e / s is that
-drive, but more of it where more drive hardly does more, near a Peltier element's optimum.  From run to run
+drive, but more of it where more drive barely does more, near a Peltier element's optimum.  From run to run
 the effect of inputs differs by 5 % of itself (:data:`~thermogrip.sysid.plant.fit_record.RUN_GAIN_SD`), so
 ``drive_limit`` is three of that.
 
@@ -67,7 +67,7 @@ _NOTHING = Cause("driver", _DRIVER, "the driver gives nothing")
 _FULL_DRIVE = Cause("driver", _DRIVER, "the driver is stuck at full drive", 1.2)
 _FULL_COOLING = Cause("driver", _DRIVER, "the driver is stuck at full cooling", 1.2)
 _REVERSED = Cause("reversed", _MODULE, "the module is wired the wrong way round", 2.0)  # nobody rewires a rig
-_HALF = Cause("driver", _DRIVER, "the driver gives half of what is asked")
+_HALF = Cause("driver", _DRIVER, "the driver gives half of the command")
 _PUMP = Cause("pump", "the pump", "the pump has stopped")
 _DANGER = ("driver", "reversed", "pump", "drift", "model")  # the most dangerous first: it does not obey
 
@@ -192,7 +192,7 @@ class Residual:
 
     @property
     def excess(self) -> float:
-        """How many times what is allowed."""
+        """The multiple of what is allowed."""
         return self.off / self.allowed
 
     @property
@@ -218,8 +218,8 @@ class ModelMonitor:
 
     def reset(self, time: float, values: Mapping[str, float]) -> None:
         """Start at rest at these readings."""
-        y = _in_order(self.plant.outputs, values)
-        self._filter.reset(time, y, _in_order(self.plant.disturbances, values))
+        y = _values_of(self.plant.outputs, values)
+        self._filter.reset(time, y, _values_of(self.plant.disturbances, values))
         self.compared_from = time + (0.0 if self._filter.at_rest else self.settings.warm_up)
         self._past = History(self._filter.steps, self._seconds)
         self._past.add(self._filter.moment(time, y))
@@ -236,7 +236,7 @@ class ModelMonitor:
     ) -> None:
         """Predict the estimate at a time under what was applied since the last call."""
         u = np.array([float(pump) if n == "pump" else float(drive[n]) for n in self.plant.inputs])
-        self._filter.predict(time, u, _in_order(self.plant.disturbances, values))
+        self._filter.predict(time, u, _values_of(self.plant.disturbances, values))
         self._time = time
 
     def is_jump(self, name: str, value: float) -> bool:
@@ -251,7 +251,7 @@ class ModelMonitor:
     ) -> list[Residual]:
         """Correct the estimate with readings and return the alarms; ``masked`` outputs touch an object."""
         self._mask(time, masked)
-        y = _in_order(self.plant.outputs, values)
+        y = _values_of(self.plant.outputs, values)
         y[[name in masked for name in self.plant.outputs]] = np.nan
         self._filter.correct(y)
         self._past.add(self._filter.moment(time, y))
@@ -343,6 +343,6 @@ class ModelMonitor:
         return float(effect[k] / slope[k]) if slope[k] > 0 else np.inf
 
 
-def _in_order(names: tuple[str, ...], values: Mapping[str, float]) -> Array:
+def _values_of(names: tuple[str, ...], values: Mapping[str, float]) -> Array:
     """Return values (n,) by name, NaN where there is none."""
     return np.array([values.get(name, np.nan) for name in names], dtype=float)

@@ -9,7 +9,7 @@ reading (three in a row come every 84 readings then anyway),
 *Jump.*  Water cannot change faster than ``rate``; a reading that does is suspect.  A skin that touches an
 object may.
 
-*Stuck.*  How many bit-equal readings prove a fault depends on the noise: with white noise of standard
+*Stuck.*  What number of bit-equal readings proves a fault depends on the noise: with white noise of standard
 deviation s about the middle of a quantum q, a healthy sensor repeats itself with
 
     p = erf(q / (2 sqrt(2) s)),
@@ -104,7 +104,7 @@ def room_sensors(
 
 
 def repeats_needed(quantum: float, noise: float, alpha: float) -> float:
-    """Return how many equal readings in a row (10 or more) a healthy sensor gives with chance ``alpha``."""
+    """Return the equal readings in a row (10 or more) that a healthy sensor gives with chance ``alpha``."""
     p = erf(quantum / (2 * sqrt(2) * noise))
     needed = log(alpha) / log(p) if 0 < p < 1 else float("inf")
     return max(10, ceil(needed)) if needed < 2000 else float("inf")

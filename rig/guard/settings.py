@@ -29,7 +29,7 @@ _TEMPLATE_HINT = "`thermogrip init guard` shows every key with its unit"
 _TABLES: dict[str, type[Any]] = {"sensors": SensorSettings, "model": ModelSettings, "no_model": RuleSettings}
 
 
-def _keys(kind: type[Any]) -> dict[str, Field[Any]]:
+def _setting_keys(kind: type[Any]) -> dict[str, Field[Any]]:
     """Return the settings of a kind by their keys (:func:`~thermogrip.datasets.limits.keyed`)."""
     return {one.metadata["key"]: one for one in fields(kind) if one.metadata}
 
@@ -65,24 +65,26 @@ def guard_from_dict(content: Mapping[str, Any], *, file: str | Path | None = Non
         if not isinstance(table, dict):
             raise UserError(f"{name}: is no table", file=file, hint=f"write [{name}] above its keys")
     single = {key: value for key, value in content.items() if key not in (*tables, "pairs", "room_sensors")}
-    values = _values(single, GuardSettings, "", file)
+    values = _table_values(single, GuardSettings, "", file)
     if "room_sensors" in content:
-        values["rooms"] = _names(content["room_sensors"], file)
+        values["rooms"] = _name_tuple(content["room_sensors"], file)
     values["limits"] = {name: _limit(name, pair, file) for name, pair in tables.get("limits", {}).items()}
     for name, kind in _TABLES.items():
-        table_values = _values(tables.get(name, {}), kind, f"{name}.", file)
+        table_values = _table_values(tables.get(name, {}), kind, f"{name}.", file)
         if name == "sensors":
             table_values["pairs"] = _pairs(content.get("pairs", []), file)
         values["rules" if name == "no_model" else name] = kind(**table_values)
     settings = GuardSettings(**values, file="" if file is None else str(file))
-    for problem, hint in _faults(settings):
+    for problem, hint in _setting_faults(settings):
         raise UserError(problem, file=file, hint=hint)
     return settings
 
 
-def _values(table: Mapping[str, Any], kind: type[Any], where: str, file: str | Path | None) -> dict[str, Any]:
+def _table_values(
+    table: Mapping[str, Any], kind: type[Any], where: str, file: str | Path | None
+) -> dict[str, Any]:
     """Return the settings of a table by name; a key that is unknown, or a value outside, is refused."""
-    values_by_name, keys = {}, _keys(kind)
+    values_by_name, keys = {}, _setting_keys(kind)
     for name, value in table.items():
         if name not in keys:
             raise UserError(f"{where}{name}: no such key", file=file, hint=_instead(name, keys))
@@ -93,7 +95,7 @@ def _values(table: Mapping[str, Any], kind: type[Any], where: str, file: str | P
 def _instead(name: str, keys: Mapping[str, Any]) -> str:
     """Return what to do about an unknown key: its unit, its table, or a similar key."""
     similar = [key for key in keys if key.startswith(f"{name}_")] or get_close_matches(name, keys, 1)
-    tables = [table for table, kind in _TABLES.items() if name in _keys(kind)]
+    tables = [table for table, kind in _TABLES.items() if name in _setting_keys(kind)]
     if tables:
         return f"write it below [{tables[0]}]"
     return f"write {similar[0]}; {_TEMPLATE_HINT}" if similar else _TEMPLATE_HINT
@@ -101,14 +103,14 @@ def _instead(name: str, keys: Mapping[str, Any]) -> str:
 
 def _value(name: str, value: Any, key: Field[Any], file: str | Path | None) -> Any:
     """Return a value of the form that the setting's type asks for: a number, a whole one, a pair, a list."""
-    hint, span = f"write one that is, or leave it out for {_text(key.default)}", key.metadata["range"]
+    hint, span = f"write one that is, or leave it out for {_toml_text(key.default)}", key.metadata["range"]
     if "tuple" in str(key.type):
         pair = key.type == "tuple[float, float]"
         if not isinstance(value, list) or len(value) not in ((2,) if pair else range(1, 7)):
             form = "a pair [lowest, highest]" if pair else "a list of 1 to 6 numbers"
             raise UserError(f"{name}: {value!r} is not {form}", file=file, hint=hint)
-        return tuple(_number(name, one, span, hint, file) for one in value)
-    number = _number(name, value, span, hint, file)
+        return tuple(_checked_number(name, one, span, hint, file) for one in value)
+    number = _checked_number(name, value, span, hint, file)
     if key.type != "int":
         return number
     if number != int(number):
@@ -116,7 +118,9 @@ def _value(name: str, value: Any, key: Field[Any], file: str | Path | None) -> A
     return int(number)
 
 
-def _number(name: str, value: Any, span: tuple[float, float], hint: str, file: str | Path | None) -> float:
+def _checked_number(
+    name: str, value: Any, span: tuple[float, float], hint: str, file: str | Path | None
+) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise UserError(f"{name}: {value!r} is not a number", file=file, hint=hint)
     if not span[0] <= value <= span[1]:  # also false for NaN
@@ -132,11 +136,11 @@ def _limit(name: str, pair: Any, file: str | Path | None) -> tuple[float, float]
     if unit != "1":
         hint = f"write {bare}, and its limits in degC"
         raise UserError(f"limits.{name}: is not the name of a sensor", file=file, hint=hint)
-    low, high = _value(f"limits.{name}", pair, _keys(GuardSettings)["others_degC"], file)
+    low, high = _value(f"limits.{name}", pair, _setting_keys(GuardSettings)["others_degC"], file)
     return low, high
 
 
-def _names(value: Any, file: str | Path | None) -> tuple[str, ...]:
+def _name_tuple(value: Any, file: str | Path | None) -> tuple[str, ...]:
     if not isinstance(value, list) or not all(isinstance(name, str) for name in value):
         raise UserError("room_sensors: is no list of names", file=file, hint='write room_sensors = ["t_lab"]')
     return tuple(value)
@@ -152,12 +156,12 @@ def _pairs(tables: Any, file: str | Path | None) -> dict[tuple[str, str], float]
         names = table["sensors"]
         if not isinstance(names, list) or len(names) != 2 or not all(isinstance(n, str) for n in names):
             raise UserError("pairs.sensors: is not two names", file=file, hint=hint)
-        limit = _number("pairs.limit_K", table["limit_K"], (0.1, 50), hint, file)
+        limit = _checked_number("pairs.limit_K", table["limit_K"], (0.1, 50), hint, file)
         pair_limits[str(names[0]), str(names[1])] = limit
     return pair_limits
 
 
-def _faults(settings: GuardSettings) -> Iterator[tuple[str, str]]:
+def _setting_faults(settings: GuardSettings) -> Iterator[tuple[str, str]]:
     """Yield (problem, hint) for numbers that contradict each other."""
     low, high = settings.sensors.plausible
     ranges = {"skin_degC": settings.skin_limits, "others_degC": settings.other_limits}
@@ -175,13 +179,13 @@ def _faults(settings: GuardSettings) -> Iterator[tuple[str, str]]:
             "write a floor for each window",
         )
     if list(w.windows) != sorted(set(w.windows)):
-        yield f"model.windows_s: {_text(w.windows)} do not rise", "write the shortest first"
+        yield f"model.windows_s: {_toml_text(w.windows)} do not rise", "write the shortest first"
     elif not w.smooth < w.windows[0]:
         problem = f"model.smooth_s: {w.smooth:g} is not less than the shortest window, {w.windows[0]:g}"
         yield problem, "shorten it"
 
 
-def _text(value: Any) -> str:
+def _toml_text(value: Any) -> str:
     if isinstance(value, tuple):
         return "[" + ", ".join(f"{one:g}" for one in value) + "]"
     return f"{value:g}"

@@ -187,7 +187,7 @@ class Autotune:
             if not goals:
                 names = ", ".join(begin)
                 raise UserError(f"the rig has no sensor of {self.target}", hint=f"it has {names}")
-            test = StepTest(_ranges(rig), goals, seconds=30 * self.minutes, has_pump=rig.has_pump)
+            test = StepTest(_rig_drive_ranges(rig), goals, seconds=30 * self.minutes, has_pump=rig.has_pump)
             self._note(start={name: round(value, 2) for name, value in begin.items()})
             with RunFolder(self._next("step"), self._asked) as folder:
                 options = {"progress": self._part(0.0, 0.1), **self.shown}
@@ -339,7 +339,7 @@ def _finite(figures: Mapping[str, float]) -> dict[str, float | None]:
     return {key: round(value, 3) if value == value else None for key, value in figures.items()}
 
 
-def _ranges(rig: Rig) -> dict[str, tuple[float, float]]:
+def _rig_drive_ranges(rig: Rig) -> dict[str, tuple[float, float]]:
     """Return what each drive may be; UserError where its unit does not say."""
     ranges = {}
     for name, unit in rig.units.items():

@@ -70,7 +70,7 @@ class Batch:
     left: int  # trials without a good run
     verdict: str  # ``done``, ``stopped`` (by the operator), ``tripped`` or ``not settled``
     advice: str  # what to do before it goes on; empty when done
-    sessions: int  # how many were run this time
+    sessions: int  # those run this time
 
 
 def read_plan(path: str | Path) -> list[Trial]:
@@ -248,7 +248,7 @@ def run_batch(
                     session = run_session(source.rig, controller, warmed.target, grasp=thing, **session_args)
                     run_folder.finish(session)
                 sessions += 1
-                verdict, advice = _judged(session, k, trial, run, judge)
+                verdict, advice = _trial_verdict(session, k, trial, run, judge)
                 if verdict == "done":
                     break
                 trip = session.trip
@@ -371,7 +371,7 @@ def _with_temperature(
     return trial
 
 
-def _judged(
+def _trial_verdict(
     session: Session, k: int, trial: Trial, run: Path, judge: Callable[[int, Trial, Session], str] | None
 ) -> tuple[str, str]:
     """Return verdict and advice of a trial, the operator's included."""

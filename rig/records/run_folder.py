@@ -110,7 +110,7 @@ class RunFolder:
             self._write(self._samples, csv_text([self._header]).encode())
         if tuple(row) != self._header:
             raise ValueError(f"columns changed from {self._header} to {tuple(row)}")
-        line = ",".join(_number(value) for value in row.values())
+        line = ",".join(_csv_number(value) for value in row.values())
         due = self._clock() - self._forced >= 1.0
         self._write(self._samples, line.encode() + b"\n", force=due)
         self._disk.check(_AT_ONCE_S)
@@ -312,7 +312,7 @@ class _Lines:
         unwritten = memoryview(line)
         try:
             while unwritten:
-                unwritten = unwritten[_write(self._file, unwritten) :]
+                unwritten = unwritten[_write_bytes(self._file, unwritten) :]
         except OSError:
             with suppress(OSError):  # the reader drops half a line, too
                 os.ftruncate(self._file, self._size)
@@ -331,17 +331,17 @@ class _Lines:
         self._path.unlink()
 
 
-def _write(file: int, data: memoryview) -> int:
+def _write_bytes(file: int, data: memoryview) -> int:
     """Write to a file descriptor: the one place where a test can fill the disk."""
     return os.write(file, data)
 
 
-def _number(value: float) -> str:
+def _csv_number(value: float) -> str:
     """Return a number as the CSV has it; an empty cell where it is lost."""
     return f"{value:.9g}" if value == value else ""
 
 
-_NUMBER = re.compile(rb"-?(?:\d+(?:\.\d+)?(?:e[+-]?\d+)?|inf)")
+_CSV_NUMBER = re.compile(rb"-?(?:\d+(?:\.\d+)?(?:e[+-]?\d+)?|inf)")
 
 
 @dataclass(frozen=True)
@@ -403,7 +403,7 @@ def read_run(folder: str | Path) -> Run:
     if not (path / "samples.csv").is_file() and not (path / "run.json").is_file():
         raise UserError("is no run folder", file=path, hint="give the folder of --out")
     about = _about(path)
-    header, rows, samples = _samples(path / "samples.csv")
+    header, rows, samples = _read_samples(path / "samples.csv")
     events, whole = _events(path / "events.jsonl")
     written, unread = _written_grasps(path)
     lost = samples.lost + whole.lost + unread
@@ -441,7 +441,7 @@ def recover(folder: str | Path) -> Recovery:
     refuse_links(path)
     findings = list(run.lost)
     samples, events = path / "samples.csv", path / "events.jsonl"
-    for name, whole in ((samples.name, _samples(samples)[2]), (events.name, _events(events)[1])):
+    for name, whole in ((samples.name, _read_samples(samples)[2]), (events.name, _events(events)[1])):
         if whole.lost:
             damaged_name = _keep(path / name)
             findings.append(f"{name} as it was found is kept as {damaged_name}")
@@ -528,21 +528,23 @@ def _whole_lines(path: Path, good: Any) -> _Whole:
     return _Whole([line for line, ok in zip(lines, flags) if ok], tuple(lost))
 
 
-def _samples(path: Path) -> tuple[list[str], list[dict[str, float]], _Whole]:
+def _read_samples(path: Path) -> tuple[list[str], list[dict[str, float]], _Whole]:
     width = 0
 
     def good(at: int, line: bytes) -> bool:
         nonlocal width
         cells = line.split(b",")
         if at == 0:
-            width = len(_names(line))
+            width = len(_header_names(line))
             return line.startswith(b"time_s") and b"\0" not in line
-        return len(cells) == width and all(not c or _NUMBER.fullmatch(c) for c in cells) and bool(cells[0])
+        return (
+            len(cells) == width and all(not c or _CSV_NUMBER.fullmatch(c) for c in cells) and bool(cells[0])
+        )
 
     whole = _whole_lines(path, good)
     if not whole.lines or not whole.lines[0].startswith(b"time_s"):
         return [], [], whole
-    header = _names(whole.lines[0])
+    header = _header_names(whole.lines[0])
     rows = [
         dict(zip(header, (float(cell) if cell else float("nan") for cell in line.split(b","))))
         for line in whole.lines[1:]
@@ -550,7 +552,7 @@ def _samples(path: Path) -> tuple[list[str], list[dict[str, float]], _Whole]:
     return header, rows, whole
 
 
-def _names(line: bytes) -> list[str]:
+def _header_names(line: bytes) -> list[str]:
     try:
         return [from_csv(cell) for cell in next(csv.reader([line.decode("utf-8", "replace")]), [])]
     except csv.Error:

@@ -1,8 +1,8 @@
 """Serial ports: open, read what there is, write, and reopen when the cable is back.
 
 ``/dev/ttyACM0``, a pty and ``socket://HOST:PORT`` look alike through pyserial, but fail differently: a pulled
-cable is a ``SerialException`` on reading and a plain ``OSError`` on asking how many bytes wait, a closed
-socket reads as an exception, a frozen one as nothing.  All of them are one :class:`PortError` here.
+cable is a ``SerialException`` on reading and a plain ``OSError`` on asking what waits, a closed socket
+reads as an exception, a frozen one as nothing.  All of them are one :class:`PortError` here.
 
 A port is opened ``exclusive``, which stops every program that asks for it too; one that does not can still
 open it and steal bytes, and the protocol's checks then see damage and silence.  Windows lets nobody open a

@@ -135,7 +135,7 @@ def _switch(text: str) -> int:
     return int(text)
 
 
-def _temperatures(words: Sequence[str]) -> tuple[int | str, ...]:
+def _temperature_fields(words: Sequence[str]) -> tuple[int | str, ...]:
     return tuple(word if word in LOST else integer(word) for word in words)
 
 
@@ -149,7 +149,7 @@ def join(values: Sequence[int | str]) -> str:
     return ",".join(str(value) for value in values)
 
 
-def _words(message: Request | State) -> tuple[str, ...]:
+def _message_words(message: Request | State) -> tuple[str, ...]:
     """Return the fields of a message in their order, each as a word."""
     values = vars(message).values()
     return tuple((join(v) or "-") if isinstance(v, tuple) else str(v) for v in values)
@@ -174,9 +174,9 @@ REFUSALS = {
     "corrupt": "the device received a damaged line",
 }
 
-_NAME = re.compile(r"[a-z][a-z0-9_]{0,15}")
-_FAULT = re.compile(rf"pump|(over|under|open|short):{_NAME.pattern}")
-_VERSION = re.compile(r"[0-9A-Za-z.+-]{1,16}")
+_DEVICE_NAME = re.compile(r"[a-z][a-z0-9_]{0,15}")
+_FAULT = re.compile(rf"pump|(over|under|open|short):{_DEVICE_NAME.pattern}")
+_VERSION_WORD = re.compile(r"[0-9A-Za-z.+-]{1,16}")
 
 
 @dataclass(frozen=True)
@@ -260,7 +260,7 @@ class State:
     mode: str  # ``off``, ``armed``, ``expired`` (the last drive outlived its time) or ``latched``
     uptime_ms: int  # since the last reset, modulo 2**32
     cause: str  # of the last reset: one of :data:`CAUSES`
-    boot: int  # how many resets there were, modulo 2**16
+    boot: int  # resets so far, modulo 2**16
     faults: tuple[str, ...]  # the latch: ``over:t_tank``, ``open:t_surface``, ``pump``,
     pump: int  # 1 on or closed
     grip: int  # 1 on or closed
@@ -270,7 +270,7 @@ class State:
 
     def words(self) -> tuple[str, ...]:
         """Return the words after ``ok``."""
-        return _words(self)
+        return _message_words(self)
 
 
 @dataclass(frozen=True)
@@ -381,7 +381,7 @@ class HostEnd:
 
 def request_words(request: Request) -> tuple[str, ...]:
     """Return the words of a question: its name, and its numbers."""
-    return (type(request).__name__.lower(), *_words(request))
+    return (type(request).__name__.lower(), *_message_words(request))
 
 
 def parse_request(words: Sequence[str]) -> Request | str:
@@ -399,8 +399,8 @@ def parse_identity(words: Sequence[str]) -> Identity:
     """Return the identity that the words after ``ok`` are, ValueError where they are none."""
     protocol, version, drives, pump, sensors = words
     names = tuple(sensors.split(","))
-    _check(protocol == PROTOCOL and _VERSION.fullmatch(version) is not None and pump in ("pump", "-"))
-    _check(all(_NAME.fullmatch(name) for name in names))
+    _check(protocol == PROTOCOL and _VERSION_WORD.fullmatch(version) is not None and pump in ("pump", "-"))
+    _check(all(_DEVICE_NAME.fullmatch(name) for name in names))
     return Identity(version, tuple(map(_channel, drives.split(","))), pump == "pump", names)
 
 
@@ -413,7 +413,9 @@ def parse_state(words: Sequence[str]) -> State:
     uptime_ms, boots = integer(uptime), integer(boot)
     _check(uptime_ms >= 0 and 0 <= boots <= 0xFFFF)
     applied = (_switch(pump), _switch(grip), integers(drive))
-    return State(mode, uptime_ms, cause, boots, latched, *applied, _temperatures(temperatures.split(",")))
+    return State(
+        mode, uptime_ms, cause, boots, latched, *applied, _temperature_fields(temperatures.split(","))
+    )
 
 
 def _announcement(line: Line) -> Event:
@@ -423,7 +425,7 @@ def _announcement(line: Line) -> Event:
     try:
         word, cause, boots, version = line.words
         _check(word == "boot" and cause in CAUSES and 0 <= integer(boots) <= 0xFFFF)
-        _check(_VERSION.fullmatch(version) is not None)
+        _check(_VERSION_WORD.fullmatch(version) is not None)
         return Boot(cause, int(boots), version)
     except ValueError:
         return Unexpected("content", line)
@@ -431,5 +433,5 @@ def _announcement(line: Line) -> Event:
 
 def _channel(text: str) -> Channel:
     name, unit, low, high = text.split(":")
-    _check(_NAME.fullmatch(name) is not None and bool(unit) and integer(low) <= integer(high))
+    _check(_DEVICE_NAME.fullmatch(name) is not None and bool(unit) and integer(low) <= integer(high))
     return Channel(name, unit, int(low), int(high))

@@ -255,7 +255,9 @@ def run_session(
                 for _ in run.regulate("hold", hold):
                     pass
                 if thing is not None:
-                    touched = _touch(run, thing, output=output, seconds=grasp_time, dt=grasp_dt, stop=stop)
+                    touched = _grasp_object(
+                        run, thing, output=output, seconds=grasp_time, dt=grasp_dt, stop=stop
+                    )
         except TripError as ended:
             verdict, trip = "tripped", ended.trip
         finally:
@@ -265,7 +267,7 @@ def run_session(
         run.note("tripped", trip.line(), trip.as_dict())
     run.note("verdict", verdict)
     run.show(run.no_drive(), verdict=verdict, trip=trip)
-    return _result(run, verdict, touched, band, trip)
+    return _session_of(run, verdict, touched, band, trip)
 
 
 def _check_object(thing: Object | None, run: Loop) -> None:
@@ -296,7 +298,7 @@ def _follow(run: Loop, profile: Profile) -> None:
         run.report(passed / profile.seconds, "following the profile")
 
 
-def _touch(
+def _grasp_object(
     run: Loop,
     thing: Object,
     *,
@@ -372,7 +374,9 @@ def grasp_of_rows(
     )
 
 
-def _result(run: Loop, verdict: str, grasps: Grasps | None, band: float, trip: Trip | None = None) -> Session:
+def _session_of(
+    run: Loop, verdict: str, grasps: Grasps | None, band: float, trip: Trip | None = None
+) -> Session:
     if len(run.rows) < 2:
         raise UserError("the session ended at its first reading", hint="" if trip is None else trip.line())
     contact: float | None = np.nan

@@ -22,8 +22,10 @@ from contextlib import contextmanager
 from types import FrameType
 from typing import Any
 
-_STOP = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP", "SIGBREAK") if hasattr(signal, name))
-_HOLD = (signal.SIGINT, *_STOP)
+_STOP_SIGNALS = tuple(
+    getattr(signal, name) for name in ("SIGTERM", "SIGHUP", "SIGBREAK") if hasattr(signal, name)
+)
+_HOLD = (signal.SIGINT, *_STOP_SIGNALS)
 
 
 class _Stop:
@@ -49,7 +51,7 @@ def stop_signals() -> Iterator[None]:
     if _in_force() is not None:
         yield
         return
-    ours = [number for number in _STOP if signal.getsignal(number) != signal.SIG_IGN]
+    ours = [number for number in _STOP_SIGNALS if signal.getsignal(number) != signal.SIG_IGN]
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         ours.append(signal.SIGINT)
     with _handlers(dict.fromkeys(ours, _Stop())):

@@ -20,7 +20,7 @@ from random import Random
 
 from thermogrip.datasets.errors import UserError
 
-_CHUNK = 4096
+_CABLE_CHUNK = 4096
 
 
 class PtyLink:
@@ -66,7 +66,7 @@ class PtyLink:
         if not select.select([self._master], [], [], seconds)[0]:
             return b""
         try:
-            return os.read(self._master, _CHUNK)
+            return os.read(self._master, _CABLE_CHUNK)
         except OSError:  # EIO: a host hung up in between
             return b""
 
@@ -118,7 +118,7 @@ class SocketLink:
             self._client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             return b""
         try:
-            data = self._client.recv(_CHUNK)
+            data = self._client.recv(_CABLE_CHUNK)
         except OSError:
             data = b""
         if not data:  # the host hung up

@@ -29,7 +29,7 @@ from thermogrip.rig.firmware.reference import Board, Outputs, Value
 TCLAB_VERSION = "TCLab Firmware 2.0.1 Arduino Leonardo/Micro"
 LSB = 0.322265625  # degC a count of the converter, whose zero is at -50 degC
 CEILINGS = (200.0, 100.0)  # of the pulse widths at the start, for which the plant was identified
-_LONGEST = 64
+_LONGEST_COMMAND = 64
 
 
 class TCLabCore:
@@ -64,8 +64,8 @@ class TCLabCore:
     def receive(self, data: bytes, now_ms: int) -> bytes:
         """Take what came over the line and return what goes back."""
         *commands, unended = (self._pending + data.replace(b"\r", b"\n")).split(b"\n")
-        self._pending = unended[-_LONGEST:]
-        return b"".join(self._answer(command[:_LONGEST]) for command in commands if command.strip())
+        self._pending = unended[-_LONGEST_COMMAND:]
+        return b"".join(self._answer(command[:_LONGEST_COMMAND]) for command in commands if command.strip())
 
     def _answer(self, command: bytes) -> bytes:
         text = command.decode("ascii", errors="replace").strip().upper()

@@ -203,7 +203,7 @@ class VirtualDevice:
     seed : int, optional
         Of sensor noise and spoilt lines.
     keep : int, optional
-        How many samples ``trace`` holds (ten a second).
+        Samples that ``trace`` holds (ten a second).
     twin_options
         Handed to :class:`~thermogrip.rig.simulation.twin.Twin`: ``ambient``, ``t_start``, ``noise``,
         ``limits``, ...

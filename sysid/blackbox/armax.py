@@ -63,7 +63,7 @@ class ArmaxSearch(output_error.Search):
 
     @staticmethod
     def numbers(na: int) -> int:
-        """Return how many numbers an output has beside poles and zeros: the constant, C."""
+        """Return the count of numbers of an output beside poles and zeros: the constant, C."""
         return 1 + na
 
     def starts(self, records: output_error.Records, na: int) -> list[Array]:

@@ -71,14 +71,14 @@ def arx_family(
             continue
         for n, delay, coupled in product(kept_poles, kept_delays, couplings):
             tried = _Orders(n, delay, coupled)
-            structure = _structure(grid, products, tried)
+            structure = _arx_structure(grid, products, tried)
             model = _solve(grid, products, regression, tried) if only in (None, structure) else None
             if model is not None:
                 out[structure] = model
     return out
 
 
-def _structure(grid: Grid, terms: tuple[str, ...], orders: _Orders) -> Structure:
+def _arx_structure(grid: Grid, terms: tuple[str, ...], orders: _Orders) -> Structure:
     n_y, n_drive = len(grid.outputs), len(grid.inputs) + len(grid.disturbances) + len(terms)
     size = n_y * (orders.poles * (n_y if orders.coupled else 1) + n_drive * orders.poles + 1)
     label = f"na {orders.poles}, nb {orders.poles}, delay {orders.delay}"
@@ -128,14 +128,14 @@ def _solve(
     n_y, n_w = len(grid.outputs), len(grid.inputs) + len(grid.disturbances) + len(terms)
     solution = np.zeros((regression.gram.shape[0], n_y))
     for output in range(n_y):
-        columns = _columns(orders, regression.deep, n_y, n_w, output)
+        columns = _structure_columns(orders, regression.deep, n_y, n_w, output)
         gram, cross = regression.gram[np.ix_(columns, columns)], regression.cross[columns, output]
         solution[columns, output] = np.linalg.lstsq(gram, cross, rcond=1e-13)[0] / regression.size[columns]
     lags = solution[:-1].T
     A = [lags[:, i * n_y : (i + 1) * n_y] for i in range(orders.poles)]
     first = regression.deep * n_y
     B = [lags[:, first + i * n_w : first + (i + 1) * n_w] for i in range(orders.delay + orders.poles - 1)]
-    model = _realise(grid, terms, A, B, solution[-1])
+    model = _arx_realisation(grid, terms, A, B, solution[-1])
     return with_spread(model, grid, _at_rest(grid, terms, orders)) if model.stable else None
 
 
@@ -150,7 +150,7 @@ def _at_rest(grid: Grid, terms: tuple[str, ...], orders: _Orders) -> list[Array]
     return out
 
 
-def _columns(orders: _Orders, deep: int, n_y: int, n_w: int, output: int) -> list[int]:
+def _structure_columns(orders: _Orders, deep: int, n_y: int, n_w: int, output: int) -> list[int]:
     """Return the columns of the full regression that this structure uses for one output."""
     outputs = range(n_y) if orders.coupled else [output]
     past_y = [lag * n_y + j for lag in range(orders.poles) for j in outputs]
@@ -159,7 +159,7 @@ def _columns(orders: _Orders, deep: int, n_y: int, n_w: int, output: int) -> lis
     return [*past_y, *(first + lag * n_w + j for lag in late for j in range(n_w)), first + deep * n_w]
 
 
-def _realise(
+def _arx_realisation(
     grid: Grid, terms: tuple[str, ...], A: Sequence[Array], B: Sequence[Array], c: Array
 ) -> StateSpaceModel:
     """Return the model with state [y[k], ..., y[k-n+1], w[k-1], ..., w[k-m]], m = len(B) - 1."""

@@ -78,7 +78,7 @@ class NoiseSearch(Search):
 
     @staticmethod
     def numbers(na: int) -> int:
-        """Return how many numbers an output has beside poles and zeros: the constant, the noise."""
+        """Return the count of numbers of an output beside poles and zeros: the constant, the noise."""
         return 2
 
     def __call__(self, records: Records, na: int, nb: int, delay: int) -> Filter | None:

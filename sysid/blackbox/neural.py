@@ -16,7 +16,7 @@ the training inputs in reverse order, and the three quarters nearest to their me
 differ from fold to fold by luck, their mean by less; in the one-standard-error rule it counts as no larger
 than the smallest.
 
-**How many.**  On held-out parts of a two-tank record the error of the mean of n trained members was nearly
+**Members.**  On held-out parts of a two-tank record the error of the mean of n trained members was about
 0.270 + 0.42/n V for n = 6 to 36.  So the last fit trains :data:`TOGETHER` times as many members as each fold.
 Twelve a fold are enough to choose by: with 36 the acidity of a stirred tank errs by 0.79 on its other half as
 well, with six by 1.09.
@@ -115,11 +115,13 @@ def neural_family(
     structure = Structure("members of all sizes", min(numbers))
     if only not in (None, structure):
         return {}
-    data = _scaled(grid)
+    data = _scaled_data(grid)
     few = sum(int(np.isfinite(y).sum()) for y in data.y) <= MANY
     starts = members or (2 if few else 1) * (1 if only is None else TOGETHER)
     linear = _linear_starts(grid, data, sorted(set(orders)))
-    trained = [_train(data, linear[n], h, seed=k) for n, h in sizes if n in linear for k in range(starts)]
+    trained = [
+        _train_member(data, linear[n], h, seed=k) for n, h in sizes if n in linear for k in range(starts)
+    ]
     return {structure: _averaged(grid, data, trained)} if trained else {}
 
 
@@ -141,7 +143,7 @@ def _longest_run(constant: Mask) -> int:
     return int((edges[1::2] - edges[::2]).max(initial=0))
 
 
-def _scaled(grid: Grid) -> _Data:
+def _scaled_data(grid: Grid) -> _Data:
     y = np.concatenate([segment.y for segment in grid.segments])
     w = np.concatenate([np.hstack([segment.u, segment.d]) for segment in grid.segments])
     y_middle, y_size = np.nanmean(y, axis=0), np.maximum(grid.output_spread(), 1e-9)
@@ -210,7 +212,7 @@ def _averaged(grid: Grid, data: _Data, members: Sequence[_Member]) -> NeuralMode
     return _with_spread(model, grid, np.stack([members[k].padded(n, h).x0 for k in nearest]))
 
 
-def _train(data: _Data, linear: _Linear, h: int, *, seed: int) -> _Member:
+def _train_member(data: _Data, linear: _Linear, h: int, *, seed: int) -> _Member:
     """Return the member of one random start."""
     from thermogrip.sysid.models.neural_kernel import run_states, run_with_slopes  # pulls in numba
 
@@ -250,12 +252,12 @@ def _train(data: _Data, linear: _Linear, h: int, *, seed: int) -> _Member:
         return np.concatenate(rows), np.concatenate(slopes)
 
     size = max(float(np.sqrt(np.mean(residuals(z0[None], 1.0)[0, len(z0) :] ** 2))), 1e-6)
-    z = _descend(lambda z: linearise(z, size), lambda z: residuals(z, size), z0)
+    z = _levenberg_marquardt(lambda z: linearise(z, size), lambda z: residuals(z, size), z0)
     miss = float(np.sum(residuals(z[None], 1.0)[0, len(z) :] ** 2))
     return _Member(linear.A, z[:n_p], z[n_p:].reshape(-1, n), h, miss)
 
 
-def _descend(
+def _levenberg_marquardt(
     linearise: Callable[[Array], tuple[Array, Array]], residuals: Callable[[Array], Array], z: Array
 ) -> Array:
     """Return where Levenberg-Marquardt steps, three dampings tried at a time, no longer lower the cost; the

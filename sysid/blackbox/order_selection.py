@@ -47,9 +47,9 @@ MORE_BY_LOGS = float(np.log(1.2))  # the same over whole logs, of which there ar
 # Times the error on the worst part: a fit to all data, which it has seen, errs on them no more than that;
 # where none does (one structure was asked for, say) no more than twice that.
 _MOST_ON_ALL = (1.0, 2.0)
-_BLOCKS = 4  # of one or two logs
+_CUTS = 4  # of one or two logs
 # From twice the error on two parts of five, the other three would have to bring less than 0.6 times it each.
-_HOPELESS = 2.0
+_HOPELESS_RATIO = 2.0
 FEWEST = 20  # rows of a block that is held out
 
 _ALIKE = 0.98  # correlation of an input with its square: a line leaves a fifth of the square's spread
@@ -67,7 +67,7 @@ class Model(PlantModel, Protocol):
 
 
 class Structure(NamedTuple):
-    """Orders and delays of a model, and how many numbers it has; the same whatever data it is fitted to."""
+    """Orders and delays of a model, and its count of numbers; the same whatever data it is fitted to."""
 
     label: str
     size: int
@@ -118,13 +118,13 @@ class Fold(NamedTuple):
     runs: tuple[Run, ...]
 
 
-def folds(grid: Grid, *, blocks: int = _BLOCKS) -> list[Fold]:
+def folds(grid: Grid, *, blocks: int = _CUTS) -> list[Fold]:
     """Return the parts that are held out in turn: those whose rest moves each input that they move, or all
     where these are fewer than two."""
     if len(grid.logs) >= SEVERAL:
         parts = [_whole_log(grid, name) for name in grid.logs]
     else:
-        parts = [*_blocks(grid, blocks), _last_parts(grid)]
+        parts = [*_cut_blocks(grid, blocks), _last_parts(grid)]
     range_of = np.ptp(np.concatenate([segment.u for segment in grid.segments]), axis=0)
     excited = [part for part in parts if _moves_all(part[1], than=part[2], least=MOVED * range_of)]
     used = excited if len(excited) >= 2 else parts
@@ -139,7 +139,7 @@ def _whole_log(grid: Grid, name: str) -> _Part:
     return name, training, [Run(segment) for segment in grid.segments if segment.log == name]
 
 
-def _blocks(grid: Grid, blocks: int) -> list[_Part]:
+def _cut_blocks(grid: Grid, blocks: int) -> list[_Part]:
     total = sum(len(segment.time) for segment in grid.segments)
     if total < FEWEST * blocks:
         raise UserError(
@@ -150,7 +150,7 @@ def _blocks(grid: Grid, blocks: int) -> list[_Part]:
     edges = [round(total * block / blocks) for block in range(blocks + 1)]
     parts: list[_Part] = []
     for at, (first, last) in enumerate(pairwise(edges)):
-        inside, outside = _split(grid.segments, first, last)
+        inside, outside = _split_segments(grid.segments, first, last)
         halves = [segment.part(len(segment.time) // 2, len(segment.time)) for segment in inside]
         parts.append(
             (f"block {at + 1} of {blocks}", outside, [Run(segment) for segment in (*inside, *halves)])
@@ -176,7 +176,7 @@ def priors_of(grid: Grid) -> tuple[StartPrior, ...]:
     """Return how a first error may be shared between state and sensor, and how long an offset lasts; offsets
     that fade do in a quarter of a held-out part: a longer memory cannot be told from one that lasts."""
     seconds = grid.dt * sum(len(segment.time) for segment in grid.segments)
-    fading = _SHORT * seconds / (len(grid.logs) if len(grid.logs) >= 3 else _BLOCKS)
+    fading = _SHORT * seconds / (len(grid.logs) if len(grid.logs) >= 3 else _CUTS)
     none = [StartPrior(noise=r) for r in (0.03, 0.1, 0.3)]
     kinds = [(0.0, np.inf), *product((0.1, 0.3, 1.0), (np.inf, fading))]
     return tuple(replace(some, nuisance=q, memory=memory) for q, memory in kinds for some in none)
@@ -232,8 +232,8 @@ def choose(
     beat: Mapping[str, float] | None = None,
 ) -> Choice:
     """Fit every structure of the family on every fold and choose by the one-standard-error rule; refuse
-    where after two folds or more every structure errs :data:`_HOPELESS` times what it has to ``beat`` (errors
-    by fold)."""
+    where after two folds or more every structure errs :data:`_HOPELESS_RATIO` times what it has to ``beat``
+    (errors by fold)."""
     cases = folds(grid)
     scored = _score(grid, family, cases, warmup, progress, beat or {})
     structure, fitted = _first_sound(grid, family, scored, warmup)
@@ -317,7 +317,7 @@ def _give_up_hopeless(
         )
         for column in errors.values()
     )
-    if best > np.log(_HOPELESS):
+    if best > np.log(_HOPELESS_RATIO):
         times = f"{np.exp(best):.2g} times what is best so far"
         raise UserError(f"given up after {len(labels)} parts: errs {times}")
 
@@ -425,7 +425,9 @@ def _moves_all(rest: Sequence[Segment], *, than: Sequence[Run], least: Array) ->
     return not np.any((np.ptp(held_out_inputs, axis=0) > least) & (np.ptp(others, axis=0) <= least))
 
 
-def _split(segments: Sequence[Segment], first: int, last: int) -> tuple[list[Segment], list[Segment]]:
+def _split_segments(
+    segments: Sequence[Segment], first: int, last: int
+) -> tuple[list[Segment], list[Segment]]:
     """Cut the rows first to last, counted over all segments, out of the segments."""
     inside, outside, first_row = [], [], 0
     for segment in segments:

@@ -164,14 +164,14 @@ def _triangles(parts: Sequence[Array], na: int) -> tuple[Array, list[Array]]:
     The parts are transposed, (na + n_rest, n).  Normal equations would square the condition, and columns
     that are shifts of one another are nearly dependent.
     """
-    triangles = [_triangle(rows.T) for rows in parts]
+    triangles = [_square_r(rows.T) for rows in parts]
     shared_triangles = [R[na:, na:] for R in triangles]
     return (
-        shared_triangles[0] if len(shared_triangles) == 1 else _triangle(np.concatenate(shared_triangles))
+        shared_triangles[0] if len(shared_triangles) == 1 else _square_r(np.concatenate(shared_triangles))
     ), triangles
 
 
-def _triangle(rows: Array) -> Array:
+def _square_r(rows: Array) -> Array:
     """Return the square R of a QR."""
     n = rows.shape[1]
     if len(rows) < n:
@@ -383,7 +383,7 @@ class Search:
 
     @staticmethod
     def numbers(na: int) -> int:
-        """Return how many numbers an output has beside poles and zeros."""
+        """Return the count of numbers of an output beside poles and zeros."""
         return 1
 
     def __call__(self, records: Records, na: int, nb: int, delay: int) -> Filter | None:

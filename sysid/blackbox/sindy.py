@@ -67,7 +67,9 @@ def sindy_family(
             if only in (None, structure):
                 wanted[structure] = threshold, width
         terms = _features(grid, degree, memory) if wanted else None
-        fitted = {} if terms is None else {some: _fit(grid, terms, *how) for some, how in wanted.items()}
+        fitted = (
+            {} if terms is None else {some: _fit_terms(grid, terms, *how) for some, how in wanted.items()}
+        )
         out |= {some: model for some, model in fitted.items() if model is not None}
     return out
 
@@ -91,14 +93,14 @@ def _features(grid: Grid, degree: int, memory: int) -> _Features | None:
     x, w, move = _trajectories(grid, memory)
     if not x or sum(map(len, x)) < 3 * x[0].shape[1] + 20:
         return None
-    z, middle, size = _scaled(x, w)
+    z, middle, size = _scaled_rows(x, w)
     library = pysindy.PolynomialLibrary(degree=degree)
     theta = np.asarray(library.fit_transform(np.concatenate(z)), dtype=float)
     runs = np.split(theta, np.cumsum([len(run) for run in z])[:-1])
     return _Features(runs, move, np.asarray(library.powers_, dtype=int), middle, size, memory)
 
 
-def _fit(grid: Grid, terms: _Features, threshold: float, width: int) -> SindyModel | None:
+def _fit_terms(grid: Grid, terms: _Features, threshold: float, width: int) -> SindyModel | None:
     import pysindy
 
     weight = np.maximum(np.concatenate(terms.move).std(axis=0), 1e-12)
@@ -117,7 +119,7 @@ def _fit(grid: Grid, terms: _Features, threshold: float, width: int) -> SindyMod
         natural[
             i, int(np.flatnonzero((exponents == np.eye(exponents.shape[1], dtype=int)[i]).all(axis=1))[0])
         ] += 1
-    return _bounded(grid, exponents, natural, terms.memory)
+    return _bounded_model(grid, exponents, natural, terms.memory)
 
 
 def _bumped(terms: _Features, width: int) -> tuple[Array, Array]:
@@ -136,7 +138,7 @@ def _bumped(terms: _Features, width: int) -> tuple[Array, Array]:
     return out[0], out[1]
 
 
-def _bounded(grid: Grid, exponents: NDArray[np.int_], natural: Array, memory: int) -> SindyModel | None:
+def _bounded_model(grid: Grid, exponents: NDArray[np.int_], natural: Array, memory: int) -> SindyModel | None:
     """Return the model, or None where its simulation of the training data diverges."""
     y = np.concatenate([segment.y for segment in grid.segments])
     low, high = np.nanmin(y, axis=0), np.nanmax(y, axis=0)
@@ -167,7 +169,7 @@ def _trajectories(grid: Grid, memory: int) -> tuple[list[Array], list[Array], li
     x, w, move = [], [], []
     readings = whole_readings(grid.segments, memory + 5)
     for segment in (replace(some, y=y) for some, y in zip(grid.segments, readings)):
-        for begin, end in _whole(segment):
+        for begin, end in _whole_rows(segment):
             y = segment.y[begin:end]
             if end - begin < memory + 5:
                 continue
@@ -178,13 +180,13 @@ def _trajectories(grid: Grid, memory: int) -> tuple[list[Array], list[Array], li
     return x, w, move
 
 
-def _whole(segment: Segment) -> list[tuple[int, int]]:
+def _whole_rows(segment: Segment) -> list[tuple[int, int]]:
     is_read = np.isfinite(segment.y).all(axis=1)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], is_read, [False]]).astype(int)))
     return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
 
 
-def _scaled(x: Sequence[Array], w: Sequence[Array]) -> tuple[list[Array], Array, Array]:
+def _scaled_rows(x: Sequence[Array], w: Sequence[Array]) -> tuple[list[Array], Array, Array]:
     rows = [np.hstack(pair) for pair in zip(x, w)]
     stacked = np.concatenate(rows)
     middle, size = stacked.mean(axis=0), stacked.std(axis=0)

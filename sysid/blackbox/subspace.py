@@ -72,7 +72,7 @@ def subspace_family(
     longest = max(len(segment.time) for segment in grid.segments)
     sets = default_terms(grid) if terms is None else terms
     n_drive, n_y = len(grid.inputs) + len(grid.disturbances), len(grid.outputs)
-    few = 1.5 * _columns(3, n_drive, n_y) > sum(max(len(s.time) - 5, 0) for s in grid.segments)
+    few = 1.5 * _count_columns(3, n_drive, n_y) > sum(max(len(s.time) - 5, 0) for s in grid.segments)
     sizes = rows or (2, 3, 5, 8, 15, 30)
     if rows is None and only is None:
         sizes = [f for f in sizes if 6 * f < longest and (few or f > 2)]
@@ -87,7 +87,7 @@ def subspace_family(
     return models
 
 
-def _columns(f: int, n_drive: int, n_y: int) -> int:
+def _count_columns(f: int, n_drive: int, n_y: int) -> int:
     return 2 * f * (n_drive + n_y) + 1
 
 
@@ -209,9 +209,9 @@ def _triangle(grid: Grid, f: int, terms: tuple[str, ...]) -> Array | None:
 
 def _factorise(triangle: Array, f: int, n_y: int) -> tuple[Array, Array]:
     """Return L32 and L33 of the LQ factorisation."""
-    # the triangle has the same inner products; of an input that hardly moves columns are dependent, and the
+    # the triangle has the same inner products; of an input that barely moves columns are dependent, and the
     # directions that a QR gives those are rounding
-    future, past, ahead = _parts(triangle, f, n_y)
+    future, past, ahead = _window_columns(triangle, f, n_y)
     future_basis = _span(future)
     past, ahead = (
         past - future_basis @ (future_basis.T @ past),
@@ -222,7 +222,7 @@ def _factorise(triangle: Array, f: int, n_y: int) -> tuple[Array, Array]:
     return projected.T, (ahead - state @ projected).T
 
 
-def _parts(triangle: Array, f: int, n_y: int) -> tuple[Array, Array, Array]:
+def _window_columns(triangle: Array, f: int, n_y: int) -> tuple[Array, Array, Array]:
     """Return the columns [W_f, 1], [W_p, Y_p] and Y_f of windows."""
     future, past, ahead = np.split(triangle, [-f * n_y - (triangle.shape[1] - 1) // 2, -f * n_y], axis=1)
     return future, past, ahead
@@ -230,7 +230,7 @@ def _parts(triangle: Array, f: int, n_y: int) -> tuple[Array, Array, Array]:
 
 def predictor_observability(triangle: Array, f: int, n_y: int) -> Array:
     """Return the columns that span Gamma, from one-step predictors of every future row."""
-    future, past, ahead = _parts(triangle, f, n_y)
+    future, past, ahead = _window_columns(triangle, f, n_y)
     n_w, n_z = (future.shape[1] - 1) // f, past.shape[1]
     by_past, by_readings = np.zeros((f * n_y, n_z)), np.eye(f * n_y)
     for row in range(f):

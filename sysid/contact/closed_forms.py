@@ -152,7 +152,7 @@ def device_temperature(
     # a zero time has moved nothing, at whatever depth; xi = 1 only avoids a division by zero
     xi = np.where(started, depth / (2 * np.sqrt(alpha_dev * np.where(started, t, 1.0))), 1.0)
     share = e_obj / (e_dev + e_obj)
-    rise = np.exp(-(xi**2)) * _difference(xi, y)
+    rise = np.exp(-(xi**2)) * _erfcx_difference(xi, y)
     at_once = (depth == 0) & np.isinf(y)
     return np.asarray(
         T_dev0 + (T_obj0 - T_dev0) * share * np.where(started | at_once, np.where(started, rise, 1.0), 0.0)
@@ -331,7 +331,7 @@ def _drop(y: ArrayLike) -> Array:
     return np.where(y < 0.5, -_series(np.minimum(y, 0.5), 1), 1 - erfcx(y))
 
 
-def _difference(xi: Array, y: Array) -> Array:
+def _erfcx_difference(xi: Array, y: Array) -> Array:
     """Return erfcx(xi) - erfcx(xi + y) without cancellation, for xi, y >= 0.
 
     erfcx(x) = (2/sqrt(pi)) int_0^inf exp(-u^2 - 2 x u) du, so the difference is the integral of the positive

@@ -69,8 +69,10 @@ _N_EXACT, _N_GROUPED = 12, 24
 N_MODE = _N_EXACT + _N_GROUPED + 1
 FADED = 34.0  # lam dt past which exp(-lam dt) is nothing beside 1
 _FASTEST = 2e3  # 1/s: modes beyond it are a series resistance
-_NODE, _SHARE = (np.ascontiguousarray(v[::-1]) for v in np.polynomial.legendre.leggauss(_N_GROUPED))
-_SMALL = 1e-3  # lam dt below which the series is closer
+_NODE_PLACE, _NODE_WEIGHT = (
+    np.ascontiguousarray(v[::-1]) for v in np.polynomial.legendre.leggauss(_N_GROUPED)
+)
+_SERIES_BELOW = 1e-3  # lam dt below which the series is closer
 
 VALUE, BY_H, BY_BUILD_UP, BY_E, BY_C = range(5)
 N_STEPPED = 5
@@ -105,7 +107,16 @@ def _slabs(
     numbers[:, 5] = far
     modes, moves = np.empty((n, 4, N_MODE)), np.empty((n if moved else 0, 4, N_MODE))
     series = np.empty((n, 3))
-    slab_modes(np.stack([effusivity, capacity], axis=1), numbers, 1.0, _NODE, _SHARE, modes, moves, series)
+    slab_modes(
+        np.stack([effusivity, capacity], axis=1),
+        numbers,
+        1.0,
+        _NODE_PLACE,
+        _NODE_WEIGHT,
+        modes,
+        moves,
+        series,
+    )
     return modes, moves, series
 
 
@@ -214,7 +225,7 @@ def contacts(
     modes, series = np.zeros((n, 4, N_MODE + gripper_rows.shape[2])), np.empty((n, 3))
     moves = np.empty((n if wanted[:, BY_E:].any() else 0, 4, N_MODE))
     modes[:, :3, N_MODE:], modes[:, 3, N_MODE:] = gripper_rows, -np.expm1(-gripper_rows[:, 0] * dt[0])
-    slab_modes(contact, gripper.numbers, dt[0], _NODE, _SHARE, modes, moves, series)
+    slab_modes(contact, gripper.numbers, dt[0], _NODE_PLACE, _NODE_WEIGHT, modes, moves, series)
     rise, slope, flux = (
         np.empty((n, N_STEPPED, t.size)),
         np.empty((n, N_STEPPED, t.size)),
@@ -266,7 +277,7 @@ def step_contacts(
                 low += 1
             for j in range(last + 1):
                 y, phi = rate[j] * step, m[j] / rate[j]
-                general_form, small = (step - phi) / y, y < _SMALL
+                general_form, small = (step - phi) / y, y < _SERIES_BELOW
                 b[j] = (step * (0.5 - y * (1.0 / 6.0 - y / 24.0)) if small else general_form) * weight[j]
                 a[j] = (step * (0.5 - y * (1.0 / 3.0 - 0.125 * y)) if small else phi - general_form) * weight[
                     j
@@ -288,7 +299,7 @@ def step_contacts(
                         by_rate, by_weight = moves[p, 2 * c - 6, j], moves[p, 2 * c - 5, j]
                         y = rate[j] * step
                         d_phi = step * keep[j] - m[j] / rate[j]
-                        general_form, small = -d_phi / y - b[j] / weight[j], y < _SMALL
+                        general_form, small = -d_phi / y - b[j] / weight[j], y < _SERIES_BELOW
                         d_a = -step * y * (1.0 / 3.0 - 0.25 * y) if small else d_phi - general_form
                         d_b = -step * y * (1.0 / 6.0 - y / 12.0) if small else general_form
                         d_a = weight[j] * d_a * by_rate + a[j] * by_weight

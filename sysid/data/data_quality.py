@@ -14,7 +14,7 @@ Every finding has a verdict (``ok``, ``warn``, ``fail``) and a consequence in wo
   readings; of one that is on for a share of even windows the shares are tested.  In closed loop the noise is
   in the input too, and equation-error fits are biased.
 
-:func:`evidence` says what a plant rests on: between which temperatures, and how many minutes of each kind of
+:func:`evidence` says what a plant rests on: between which temperatures, and the minutes of each kind of
 drive. A model fitted on an hour of heating and two minutes of cooling is a model of heating.  Nothing in its
 errors shows that, for what is rare weighs little in them; the minutes do.
 """
@@ -62,7 +62,7 @@ class CheckSettings:
     thin_share: float = 0.15
 
 
-_SETTINGS = CheckSettings()
+_CHECKS = CheckSettings()
 
 
 @dataclass(frozen=True)
@@ -148,10 +148,10 @@ def check_data(
         }
         steps = np.diff(log["time"].values)
         usual = float(np.median(steps))
-        findings += _times(log_name(log), steps, usual, gaps(log))
+        findings += _step_findings(log_name(log), steps, usual, gaps(log))
         for name in y:
             channel, averaged = channels[name], grid.dt if grid.dt > 1.5 * usual else None
-            findings += [_quantum(channel, averaged), _lost(channel), _noise(channel)]
+            findings += [_quantum(channel, averaged), _lost(channel), _sensorless_output(channel)]
         findings += [_saturation(channels[name]) for name in u if name not in grid.switches]
     findings += _excitation(grid)
     for place, name in enumerate(u):
@@ -172,7 +172,9 @@ class _Channel(NamedTuple):
         return Finding(check, self.log, self.name, value, unit, verdict, says)
 
 
-def _times(log: str, steps: Array, usual: float, holes: Sequence[tuple[int, float, float]]) -> list[Finding]:
+def _step_findings(
+    log: str, steps: Array, usual: float, holes: Sequence[tuple[int, float, float]]
+) -> list[Finding]:
     """Return how even the steps between rows are, and the gaps."""
     jitter = float(np.std(steps[steps < 3 * usual]) / usual)
     says, even = f"rows are {usual:.3g} s apart, give or take {100 * jitter:.1f} %", jitter < 0.2
@@ -190,7 +192,11 @@ def _quantum(channel: _Channel, averaged: float | None) -> Finding:
     """Return the step of the converter; ``averaged`` is that of the fits [s], where it is longer."""
     q, name = quantum(channel.values), channel.name
     coarse = q > 0.05 * float(np.nanstd(channel.values))
-    says = f"{name} moves in steps of {q:.3g}{_unit(channel.unit)}" if q else f"{name} shows no quantisation"
+    says = (
+        f"{name} moves in steps of {q:.3g}{_unit_suffix(channel.unit)}"
+        if q
+        else f"{name} shows no quantisation"
+    )
     if averaged is not None:
         says += f"; averaged over {averaged:g} s before the fits"
     if coarse:
@@ -198,7 +204,7 @@ def _quantum(channel: _Channel, averaged: float | None) -> Finding:
     return channel.found("quantum", q, channel.unit, "warn" if coarse else "ok", says)
 
 
-def _noise(channel: _Channel) -> Finding:
+def _sensorless_output(channel: _Channel) -> Finding:
     """Question an output that no sensor reads: one that is constant but for jumps, or has no noise at all.
 
     The noise is that of third differences, of which a smooth course has little; its variance is 20 times that
@@ -207,20 +213,22 @@ def _noise(channel: _Channel) -> Finding:
     values = channel.values[np.isfinite(channel.values)]
     unit, name = channel.unit, channel.name
     spread, moves = float(np.ptp(values)), np.diff(values)
-    if values.size < _SETTINGS.fewest_readings or not spread:
+    if values.size < _CHECKS.fewest_readings or not spread:
         return channel.found("noise", 0.0, unit, "ok", f"{name}: too few readings to see noise")
     noise = float(np.median(np.abs(np.diff(values, 3)))) / 0.6745 / np.sqrt(20.0)
     jumps = int(np.count_nonzero(moves))
     # a coarse sensor moves by one step of its converter, to and fro
     if (
-        jumps < _SETTINGS.held_share * values.size
+        jumps < _CHECKS.held_share * values.size
         and np.abs(moves).max() > 1.5 * np.abs(moves[moves != 0]).min()
     ):
         says = f"{name} is constant but for {jumps} jumps in {values.size} rows: is it a set point?"
-    elif noise < _SETTINGS.no_noise * spread and jumps > 0.5 * values.size:
+    elif noise < _CHECKS.no_noise * spread and jumps > 0.5 * values.size:
         says = f"{name} has no noise: is it computed or smoothed, no reading?"
     else:
-        return channel.found("noise", noise, unit, "ok", f"{name} has noise of {noise:.2g}{_unit(unit)}")
+        return channel.found(
+            "noise", noise, unit, "ok", f"{name} has noise of {noise:.2g}{_unit_suffix(unit)}"
+        )
     return channel.found("noise", noise, unit, "warn", says + " Leave it out with --outputs")
 
 
@@ -257,7 +265,7 @@ def _excitation(grid: Grid, most: int = 6) -> list[Finding]:
             verdict: Verdict = "warn" if name in grid.switches else "fail"
             out.append(Finding("excitation", "", name, 0.0, "orders", verdict, says))
             continue
-        order = _order(grid, [place], most)
+        order = _regression_order(grid, [place], most)
         count = sum(int(np.count_nonzero(np.abs(np.diff(s.u[:, place])) > 1e-9)) for s in grid.segments)
         good = order >= 3 and (count >= 4 or name in grid.switches)
         says = f"{name} moves {count} times and excites {order} of {most} orders"
@@ -272,7 +280,7 @@ def _excitation(grid: Grid, most: int = 6) -> list[Finding]:
     return out
 
 
-def _order(grid: Grid, which: list[int], most: int) -> int:
+def _regression_order(grid: Grid, which: list[int], most: int) -> int:
     stacked = []
     for segment in grid.segments:
         view = np.lib.stride_tricks.sliding_window_view(segment.u[:, which], most, axis=0)
@@ -285,8 +293,8 @@ def _order(grid: Grid, which: list[int], most: int) -> int:
 def _feedback(grid: Grid, at: int, name: str, lags: int = 3) -> Finding:
     """F test: does the past of the outputs help to predict the input beyond its own past?"""
     # a smooth input is predicted by many of its own rows: with few of them, outputs that filter it would help
-    own_lags = min(_SETTINGS.own_lags, key=lambda n: _bic(*_moves(grid, at, own=n, others=0)))
-    (X, v), (Z, _) = (_moves(grid, at, own=own_lags, others=n) for n in (0, lags))
+    own_lags = min(_CHECKS.own_lags, key=lambda n: _bic(*_effect_regression(grid, at, own=n, others=0)))
+    (X, v), (Z, _) = (_effect_regression(grid, at, own=own_lags, others=n) for n in (0, lags))
     moves = (
         int(np.count_nonzero(np.abs(v - X[:, 0]) > 1e-9 * np.ptp(v))) if len(v) else 0
     )  # X[:, 0] is u[k-1]
@@ -296,10 +304,10 @@ def _feedback(grid: Grid, at: int, name: str, lags: int = 3) -> Finding:
     explained, chance = _helped(X, Z, v, moves)
     closed = chance < 1e-4 and explained > 0.02
     steps = np.abs(v - X[:, 0])  # those of a set point hide what a controller does between them
-    usual = (steps > 1e-9 * np.ptp(v)) & (steps <= np.quantile(steps[steps > 0], _SETTINGS.usual_moves))
+    usual = (steps > 1e-9 * np.ptp(v)) & (steps <= np.quantile(steps[steps > 0], _CHECKS.usual_moves))
     if not closed and usual.sum() >= 3 * Z.shape[1]:
         explained, chance = _helped(X[usual], Z[usual], v[usual], int(usual.sum()))
-        closed = chance < 1e-4 and explained > _SETTINGS.explained_between
+        closed = chance < 1e-4 and explained > _CHECKS.explained_between
     says = (
         f"{name} follows the outputs ({100 * explained:.0f} % of its moves): recorded in closed loop; noise "
     )
@@ -334,9 +342,9 @@ def _relay_feedback(grid: Grid, at: int, name: str) -> Finding:
                 between_edges = y[first : last + 1]
                 if np.isfinite(between_edges).all() and np.ptp(between_edges) > 0:
                     ratios.append(abs(between_edges[-1] - between_edges[0]) / np.ptp(between_edges))
-        if len(ratios) >= _SETTINGS.fewest_switchings:
+        if len(ratios) >= _CHECKS.fewest_switchings:
             least, switchings = min(least, float(np.median(ratios))), len(ratios)
-    closed = least <= _SETTINGS.same_reading and len(lengths) > 2
+    closed = least <= _CHECKS.same_reading and len(lengths) > 2
     says = f"no sign that {name} was driven by the outputs"
     if closed:
         says = (
@@ -349,7 +357,7 @@ def _relay_feedback(grid: Grid, at: int, name: str) -> Finding:
 def _feedback_to(name: str, at: int, grid: Grid, logs: Sequence[Log]) -> list[Finding]:
     """Return whether an input was driven by the outputs; nothing of a switch that is no relay's."""
     window = _window(logs, name)
-    if any((s.time[-1] - s.time[0]) > max(_SETTINGS.own_lags) * window > 0 for s in grid.segments):
+    if any((s.time[-1] - s.time[0]) > max(_CHECKS.own_lags) * window > 0 for s in grid.segments):
         first = [int(np.argmax(np.diff(column(log, name)) > 0)) + 1 for log in logs]
         begun = [log.isel(time=slice(row, None)) for log, row in zip(logs, first)]
         shares = _feedback(grid.of(begun, average=window), at, name)
@@ -367,14 +375,12 @@ def _window(logs: Sequence[Log], name: str) -> float:
         return 0.0
     on = [np.diff(log["time"].values[1:][np.diff(column(log, name)) > 0]) for log in logs]
     between = np.concatenate(on)
-    if between.size < _SETTINGS.fewest_switchings:
+    if between.size < _CHECKS.fewest_switchings:
         return 0.0
     row = max(float(np.median(np.diff(log["time"].values))) for log in logs)
     window = float(np.median(between))  # two of them where the relay stays on, or off, for a whole one
     even = np.abs(between - window * np.rint(between / window)) <= row
-    return (
-        window if window > _SETTINGS.rows_a_window * row and np.mean(even) >= _SETTINGS.even_windows else 0.0
-    )
+    return window if window > _CHECKS.rows_a_window * row and np.mean(even) >= _CHECKS.even_windows else 0.0
 
 
 def _set_points(log: Log) -> list[str]:
@@ -394,9 +400,9 @@ def _set_point(log: str, name: str) -> Finding:
     return Finding("feedback", log, name, float("nan"), "1", "warn", says)
 
 
-def _moves(grid: Grid, at: int, *, own: int, others: int) -> tuple[Array, Array]:
-    """Return (regressors, input) of the rows that have ``max(_SETTINGS.own_lags)`` rows before them."""
-    first = max(_SETTINGS.own_lags)
+def _effect_regression(grid: Grid, at: int, *, own: int, others: int) -> tuple[Array, Array]:
+    """Return (regressors, input) of the rows that have ``max(_CHECKS.own_lags)`` rows before them."""
+    first = max(_CHECKS.own_lags)
     rows, target = [], []
     for segment in grid.segments:
         u, n = segment.u[:, at], len(segment.time)
@@ -425,7 +431,7 @@ def _bic(X: Array, v: Array) -> float:
     return float(n * np.log(max(_squares(X, v) / n, 1e-300)) + k * np.log(n)) if n > 3 * k else np.inf
 
 
-def _unit(unit: str) -> str:
+def _unit_suffix(unit: str) -> str:
     """Return what follows a number."""
     return "" if unit == "1" else f" {unit}"
 
@@ -487,7 +493,7 @@ def evidence(plant: Plant, logs: Sequence[Rows]) -> Evidence:
         kinds = _kinds(name, values, on_off=name in plant.model.switches)
         for kind, chosen in kinds.items():
             minutes[kind] = float(sum(seconds[mask].sum() for seconds, mask in zip(spent, chosen))) / 60
-            if minutes[kind] < min(_SETTINGS.thin_minutes, _SETTINGS.thin_share * total):
+            if minutes[kind] < min(_CHECKS.thin_minutes, _CHECKS.thin_share * total):
                 thin.append(kind)
     ranges = {}
     u, y = (np.concatenate([getattr(rows, group) for rows in logs]) for group in ("u", "y"))
@@ -510,7 +516,7 @@ def _kinds(name: str, values: Sequence[Array], *, on_off: bool) -> dict[str, lis
     if on_off:
         return {f"{name} on": [v > 0.5 for v in values], f"{name} off": [v <= 0.5 for v in values]}
     low, high = min(float(np.nanmin(v)) for v in values), max(float(np.nanmax(v)) for v in values)
-    small = _SETTINGS.small_drive * max(abs(low), abs(high))
+    small = _CHECKS.small_drive * max(abs(low), abs(high))
     if low < -small:  # an input that goes both ways, such as a Peltier behind an H bridge
         return {f"{name} > 0": [v > small for v in values], f"{name} < 0": [v < -small for v in values]}
     middle = (low + high) / 2

@@ -30,7 +30,7 @@ from thermogrip.sysid.plant.log_grid import SHARES, misfit
 # keys of elements that name signals or places
 _NAMING = ("between", "from", "to", "surroundings", "node", "face", "sink", "switch", "input")
 _BESIDE_SENSOR = 1.0  # K, by which the air at the plant may differ from that at a sensor in its room
-_TEMPERATURE = re.compile(r"(t|tc|temp|temperature)[ _]?[a-z0-9]{0,2}", re.IGNORECASE)
+_TEMPERATURE_NAME = re.compile(r"(t|tc|temp|temperature)[ _]?[a-z0-9]{0,2}", re.IGNORECASE)
 
 
 def shipped_network(logs: Sequence[Log]) -> NetworkModel | None:
@@ -176,10 +176,10 @@ def _by_role(network: Network, logs: Sequence[Log]) -> dict[str, str] | None:
 
 def _suits(log: Log, name: str, item: Any) -> bool:
     """Tell whether a column may be a signal: it has its unit, or one that converts; a temperature without a
-    unit is told by its name, a drive of both signs by its readings."""
+    unit follows from its name, a drive of both signs by its readings."""
     has = str(log[name].attrs.get("units", "1"))
     if item.unit == "degC":
-        return has == item.unit or (has == "1" and _TEMPERATURE.fullmatch(name) is not None)
+        return has == item.unit or (has == "1" and _TEMPERATURE_NAME.fullmatch(name) is not None)
     signed = bool(getattr(item, "range", (0, 0))[0] < 0)
     convertible = has == item.unit or (has in SHARES and item.unit in SHARES)
     return convertible and signed == bool(np.nanmin(column(log, name)) < 0)

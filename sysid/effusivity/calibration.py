@@ -515,16 +515,16 @@ def calibrate_gripper(
     if start is not None and prior is not None:
         raise UserError("both start and prior are given", hint="a prior is a start too: give it alone")
     grasps = as_grasps(grasps)
-    data = _labelled(grasps, materials or {}, least=2 if prior is None else 1)
+    data = _labelled_touches(grasps, materials or {}, least=2 if prior is None else 1)
     names = (*(() if prior is None else prior.trained_on), *(log_name(g) for g in grasps))
     length = block_length or (0.02 if prior is None else prior.block_length)
     report = progress or (lambda fraction, what: None)
-    gripper = _calibrated(data, materials or {}, start, prior, length, names, report)
+    gripper = _calibrated_sensors(data, materials or {}, start, prior, length, names, report)
     report(1.0, "calibrated")
     return gripper
 
 
-def _calibrated(
+def _calibrated_sensors(
     data: Touches, materials: Mapping[str, Material], start: GripperModel | None, prior: GripperModel | None,
     length: float, names: tuple[str, ...], report: Progress,
 ) -> GripperModel:  # fmt: skip
@@ -539,7 +539,7 @@ def _calibrated(
         theta = gripper_theta(earlier, problem.labels, theta)
         spread = {k: float(getattr(earlier.spreads, k)) for k in spread}
         noise = earlier.noise
-    w = _begin(problem, theta, spread)
+    w = _first_nuisances(problem, theta, spread)
     rounds = SETTINGS.rounds if earlier is None else 1
     for i in range(rounds):
 
@@ -548,7 +548,7 @@ def _calibrated(
 
         # the noise found after a round makes more difference than the end of its search
         settled = SETTINGS.settled if i == rounds - 1 else SETTINGS.roughly_settled
-        last, w, spread = _fit(problem, theta, w, spread, noise, report_round, settled=settled)
+        last, w, spread = _fit_to_evidence(problem, theta, w, spread, noise, report_round, settled=settled)
         theta = last.theta
         if i < rounds - 1:
             slope = SETTINGS.noise_slope if i == rounds - 2 else SETTINGS.noise_slope_roughly
@@ -564,7 +564,7 @@ def _calibrated(
     mode = fit_pairs(gripper, replace(data, second=None), np.arange(problem.which.size), true_hypotheses)
     t_object = np.where(problem.known, data.t_object, mode.u[:, T_OBJECT])
     sd = np.where(problem.known, data.t_object_sd, np.sqrt(mode.covariance[:, T_OBJECT, T_OBJECT]))
-    beside = _calibrated(
+    beside = _calibrated_sensors(
         replace(data.second, t_object=t_object, t_object_sd=sd), materials,
         None if start is None else start.second, None if prior is None else prior.second, length, names,
         report,
@@ -586,16 +586,21 @@ def _discrepant(
     least = _log_evidence(problem, last, noise)
     problem, theta = _with_discrepancy(problem, last.theta)
     begin = replace(_SMOOTH, white=noise.white)  # from elsewhere a search may end without misfit
-    if _search(problem, theta, w, spread, (noise, begin), (3, 3), least, progress) is None:
+    if _search_discrepancy(problem, theta, w, spread, (noise, begin), (3, 3), least, progress) is None:
         return bare
     theta = problem.prior.mean.copy()
     theta[SHARED_NAMES.index("ln_build_up")] = SETTINGS.slow_ln_build_up
     begin = replace(_SMOOTH, white=max(noise.white, SETTINGS.least_white_K))
     start = theta, np.zeros(w.shape), dict(problem.prior.spread), (begin, begin)
-    return _search(problem, *start, (SETTINGS.steps, SETTINGS.steps, SETTINGS.steps), least, progress) or bare
+    return (
+        _search_discrepancy(
+            problem, *start, (SETTINGS.steps, SETTINGS.steps, SETTINGS.steps), least, progress
+        )
+        or bare
+    )
 
 
-def _search(
+def _search_discrepancy(
     problem: Problem, theta: Array, w: Array, spread: Spread, noises: tuple[Noise, Noise],
     looks: Sequence[int], least: float, progress: Progress,
 ) -> _Fitted | None:  # fmt: skip
@@ -604,7 +609,7 @@ def _search(
     with, and from where it is searched."""
     noise, begin = noises
     for i, steps in enumerate(looks):
-        last, w, spread = _fit(problem, theta, w, spread, noise, progress, steps=steps)
+        last, w, spread = _fit_to_evidence(problem, theta, w, spread, noise, progress, steps=steps)
         theta = last.theta
         if i > 0 and _log_evidence(problem, last, noise) < least:
             return None
@@ -652,7 +657,7 @@ def _problem(
     data: Touches, materials: Mapping[str, Material], prior: GripperModel | None, block_length: float
 ) -> Problem:
     touched = sorted(set(data.material.tolist()))
-    library = {label: row for label in touched if (row := _row(label, materials)) is not None}
+    library = {label: row for label in touched if (row := _library_row(label, materials)) is not None}
     labels = touched if prior is None else sorted({*touched, *prior.materials})
     anchor_of = dict(zip(labels, anchors(labels, library, prior)))
     theta = wide_prior([*anchor_of.values()])
@@ -665,7 +670,7 @@ def _problem(
     )  # fmt: skip
 
 
-def _begin(problem: Problem, theta: Array, spread: Spread) -> Array:
+def _first_nuisances(problem: Problem, theta: Array, spread: Spread) -> Array:
     """Return the nuisances to start from, (n, 7): those expected, but for objects of unknown temperature,
     which are as far beyond where the skin ended as it came; as warm as it they would show nothing."""
     w, data = np.zeros((problem.which.size, N_NUISANCE)), problem.data
@@ -676,7 +681,7 @@ def _begin(problem: Problem, theta: Array, spread: Spread) -> Array:
     return w
 
 
-def _labelled(grasps: Sequence[Grasps], materials: Mapping[str, Material], least: int) -> Touches:
+def _labelled_touches(grasps: Sequence[Grasps], materials: Mapping[str, Material], least: int) -> Touches:
     if not grasps:
         raise UserError("no training grasps", hint="give at least one record with materials")
     records = []
@@ -697,7 +702,7 @@ def _labelled(grasps: Sequence[Grasps], materials: Mapping[str, Material], least
             hint="give grasps of at least two materials, or a prior",
         )
     labels = dict.fromkeys(data.material.tolist())
-    if least > 1 and not any(_row(label, materials) for label in labels):
+    if least > 1 and not any(_library_row(label, materials) for label in labels):
         first = f"grasp {str(data.grasp_id[0])!r} is of {str(data.material[0])!r}"
         problem = f"{first}, and the materials table has none of the labels"
         hint = "name one of them at least as 'thermogrip materials' does: it holds the scale"
@@ -706,17 +711,17 @@ def _labelled(grasps: Sequence[Grasps], materials: Mapping[str, Material], least
 
 
 def _check_labels(part: Touches, materials: Mapping[str, Material], file: str) -> None:
-    """Raise UserError, with file and grasp, at a label that is hardly another word than the table's."""
+    """Raise UserError, with file and grasp, at a label that is almost the word of the table's."""
     for label in dict.fromkeys(part.material.tolist()):
         similar = get_close_matches(label.lower(), load_materials(), 1, 0.8)
-        if similar and _row(label, materials) is None:
+        if similar and _library_row(label, materials) is None:
             first = str(part.grasp_id[part.material == label][0])
             problem = f"grasp {first!r} is of {label!r}, which the materials table has not"
             hint = f"did you mean {similar[0]}? (another material needs a name less like those of the table)"
             raise UserError(problem, file=file, column="material", hint=hint)
 
 
-def _row(label: str, materials: Mapping[str, Material]) -> Material | None:
+def _library_row(label: str, materials: Mapping[str, Material]) -> Material | None:
     """Return the library's row of a label, None where it has none."""
     try:
         return materials.get(label) or find_material(label)
@@ -724,7 +729,7 @@ def _row(label: str, materials: Mapping[str, Material]) -> Material | None:
         return None
 
 
-def _fit(
+def _fit_to_evidence(
     problem: Problem, theta: Array, w: Array, spread: Spread, noise: Noise, progress: Progress,
     steps: int = SETTINGS.steps, settled: float = SETTINGS.settled,
 ) -> tuple[Step, Array, Spread]:  # fmt: skip

@@ -57,7 +57,7 @@ if TYPE_CHECKING:
     from thermogrip.datasets.schema import Grasps
 
 UNKNOWN_OBJECT_RANGE = 20.0  # K about the room, or the gripper where no room is stated
-_EDGES = np.concatenate(
+_BIN_EDGES = np.concatenate(
     [
         np.arange(-60.65, -0.7, 0.5),
         np.arange(-0.65, 1.5, 0.1),
@@ -102,7 +102,7 @@ GRADES = (
     Grade(0.0, 0.0, 0.7), Grade(0.001, 0.3, 0.05), Grade(0.003, 1.0, 0.05), Grade(0.1, 1.0, 0.05),
     Grade(0.3, 0.0, 0.05, since=1.0), Grade(0.3, 0.0, 0.05, since=2.0), Grade(0.3, 0.0, 0.05, since=4.0),
 )  # fmt: skip
-_TIMES = (0.5, 2.5, 10.0)  # s, of the discrepancy of a trace
+_DISCREPANCY_TIMES_S = (0.5, 2.5, 10.0)  # s, of the discrepancy of a trace
 KNOTS = np.array([-1.0, -0.6, -0.3, 0.0, 0.3, 0.6, 1.0, 1.5, 2.2, 3.2, 4.6, 6.6, 10.0, 16.0, 25.0, 40.0])
 
 
@@ -176,7 +176,7 @@ def touches(
     for i in np.flatnonzero(sd < 0):
         raise UserError(f"grasp {str(ids[i])!r} has a negative t_object_sd", file=where)
     time = np.asarray(variables["time"].values, dtype=float)
-    keep = (time > _EDGES[0]) & (time < min(_EDGES[-1], np.inf if until is None else until + 1e-9))
+    keep = (time > _BIN_EDGES[0]) & (time < min(_BIN_EDGES[-1], np.inf if until is None else until + 1e-9))
     time, data = time[keep], np.asarray(variables["t_surface"].values, dtype=float)[at][:, keep]
     good = np.isfinite(data) & ~masked[at][:, keep]
     for i in np.flatnonzero((good & (time > 0.15)).sum(axis=1) < 1):
@@ -185,7 +185,7 @@ def touches(
         raise UserError(
             f"grasp {str(ids[i])!r} has no sample before contact", file=where, hint="record from -2 s"
         )
-    raw = np.searchsorted(_EDGES, time)
+    raw = np.searchsorted(_BIN_EDGES, time)
     used, bins = np.unique(raw, return_inverse=True)
     pick = np.zeros((time.size, used.size))
     pick[np.arange(time.size), bins] = 1.0
@@ -274,7 +274,7 @@ def stack_touches(parts: list[Touches]) -> Touches:
 
 def noise_covariance(data: Touches, noise: Noise) -> Array:
     """Return the covariance of the bin means, (n, n_bin, n_bin) [K^2]; an empty bin has variance 1 alone."""
-    white, slow, misfit = _parts(data, noise)
+    white, slow, misfit = _noise_parts(data, noise)
     return _sum(data, white, slow, misfit)
 
 
@@ -284,7 +284,7 @@ def noise_fit(data: Touches, noise: Noise, extra: Array, left: Array) -> tuple[f
     ``extra`` (n, n_bin, n_bin) is what else C holds; slopes are by the logarithms of white, slow, correlation
     time and misfit, and by growth: with C^-1 - C^-1 r r' C^-1 = G, 1/2 tr(G dC).
     """
-    white, slow, misfit = _parts(data, noise)
+    white, slow, misfit = _noise_parts(data, noise)
     chol = np.linalg.cholesky(_sum(data, white, slow, misfit) + extra)
     root = _inverse(chol)
     z = np.einsum("nij,nj->ni", root, left)
@@ -316,7 +316,7 @@ def noise_fit(data: Touches, noise: Noise, extra: Array, left: Array) -> tuple[f
     return float(cost), np.array(slopes)
 
 
-def _parts(data: Touches, noise: Noise) -> tuple[Array, Array, Array]:
+def _noise_parts(data: Touches, noise: Noise) -> tuple[Array, Array, Array]:
     """Return white variances (n, n_bin), 1 where empty, and covariances of slow noise and of misfit."""
     t = data.t
     has_samples = data.count > 0
@@ -329,7 +329,7 @@ def _parts(data: Touches, noise: Noise) -> tuple[Array, Array, Array]:
     size = noise.misfit * data.excursion[:, None] * (1 + np.maximum(t, 0.0) / 10) ** noise.growth * (t > 0)
     misfit = alike[which] * (size * has_samples)[:, :, None] * (size * has_samples)[:, None, :]
     if data.share.any():
-        alike = np.mean([np.exp(-apart / scale) for scale in _TIMES], axis=0)
+        alike = np.mean([np.exp(-apart / scale) for scale in _DISCREPANCY_TIMES_S], axis=0)
         size = (data.share * data.excursion)[:, None] * has_samples * (t > data.since[:, None])
         misfit += alike[which] * size[:, :, None] * size[:, None, :]
     white = np.where(has_samples, noise.white**2 / np.maximum(data.count, 1.0), 1.0)

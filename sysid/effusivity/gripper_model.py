@@ -187,16 +187,25 @@ INSULATOR = 3000.0  # W s^0.5 m^-2 K^-1: below it a block's effusivity scatters 
 LEVEL_SD = 3.0  # K: the level before contact is as good as free
 UNKNOWN_OBJECT_SD = UNKNOWN_OBJECT_RANGE / 3**0.5  # K, that of values spread evenly over the range
 
-_SCHEMA, _VERSION = "thermogrip.device", 2
+_DEVICE_SCHEMA, _DEVICE_VERSION = "thermogrip.device", 2
 # what the numbers of a file may be
-_SD, _LOGARITHM, _SHARE, _TIME = (0.0, 100.0), (-50.0, 50.0), (-10.0, 10.0), (1e-9, 1e4)
+_SD = (0.0, 100.0)
+_LOGARITHM = (-50.0, 50.0)
+_RATIO = (-10.0, 10.0)
+_SECONDS = (1e-9, 1e4)
 _CONDUCTANCE, _STORE, _EFFUSIVITY, _DEPTH = (0.0, 1e7), (1e-9, 1e9), (1.0, 1e6), (1e-3, 1e3)
 _OF_STACK = {
     "e_outer": _EFFUSIVITY, "z_outer": _DEPTH, "e_inner": _EFFUSIVITY, "z_inner": _DEPTH,
-    "g_back": _CONDUCTANCE, "lag": _TIME, "first": (0.0, 1.0), "build_up": _TIME, "creep": (-0.2, 10.0),
-    "leak": _SHARE, "g_side": _CONDUCTANCE, "c_side": _STORE, "settle": _TIME, "g_far": _CONDUCTANCE,
+    "g_back": _CONDUCTANCE, "lag": _SECONDS, "first": (0.0, 1.0), "build_up": _SECONDS, "creep": (-0.2, 10.0),
+    "leak": _RATIO, "g_side": _CONDUCTANCE, "c_side": _STORE, "settle": _SECONDS, "g_far": _CONDUCTANCE,
 }  # fmt: skip
-_OF_NOISE = {"white": _SD, "slow": _SD, "correlation_time": _TIME, "misfit": _SD, "growth": _SHARE}
+_OF_NOISE = {
+    "white": _SD,
+    "slow": _SD,
+    "correlation_time": _SECONDS,
+    "misfit": _SD,
+    "growth": _RATIO,
+}
 _OF_SPREADS = {
     "ln_h": _SD, "ln_effusivity": _SD, "ln_h_of_blocks": _SD, "dof": _STORE, "insulator_dof": _STORE,
     **dict.fromkeys(("ln_build_up", "onset", "t_object"), (1e-12, 100.0)),  # whose precision is needed
@@ -206,7 +215,7 @@ _OF_BLOCK = {
     "library_effusivity": _EFFUSIVITY, "library_sd_ln": _SD, "heat_capacity": _STORE, "n_grasp": (0.0, 1e9),
 }  # fmt: skip
 _OF_GRIPPER = {
-    "onset": (-100.0, 100.0), "transit_loss": _SHARE, "bias": (-1e3, 1e3), "depth_share": (1e-9, 10.0),
+    "onset": (-100.0, 100.0), "transit_loss": _RATIO, "bias": (-1e3, 1e3), "depth_share": (1e-9, 10.0),
     "block_length": (1e-9, 10.0), "ln_h_level": _LOGARITHM, "ln_h_slope": _LOGARITHM,
 }  # fmt: skip
 
@@ -314,7 +323,7 @@ class GripperModel:
     @property
     def grades(self) -> tuple[Grade, ...]:
         """How unlike the training a grasp may be; of a gripper whose discrepancy was learnt the first grade
-        stands for the others."""
+        replaces the others."""
         return GRADES[:1] if self.discrepancy is not None else GRADES
 
     @property
@@ -423,11 +432,12 @@ class GripperModel:
         with reading("is not a whole device calibration", file=file, hint="calibrate again"):
             return cls(
                 # files from before blocks had a far face have none
-                stack=Stack(**_numbers({"g_far": 0.0, **content["stack"]}, _OF_STACK)),
+                stack=Stack(**_numbers_in_ranges({"g_far": 0.0, **content["stack"]}, _OF_STACK)),
                 noise=Noise(
-                    **_numbers(content["noise"], _OF_NOISE), smooth=bool(content["noise"].get("smooth"))
+                    **_numbers_in_ranges(content["noise"], _OF_NOISE),
+                    smooth=bool(content["noise"].get("smooth")),
                 ),
-                spreads=Spreads(**_numbers(content["spreads"], _OF_SPREADS)),
+                spreads=Spreads(**_numbers_in_ranges(content["spreads"], _OF_SPREADS)),
                 blocks={str(k): _block(v) for k, v in content["blocks"].items()},
                 trained_on=tuple(str(v) for v in content.get("trained_on", ())),
                 # files from before there was a covariance have neither
@@ -438,17 +448,17 @@ class GripperModel:
                 discrepancy=Discrepancy.from_dict(content["discrepancy"], len(content["blocks"]))
                 if "discrepancy" in content
                 else None,
-                **_numbers(content, _OF_GRIPPER),
+                **_numbers_in_ranges(content, _OF_GRIPPER),
             )
 
     def save(self, path: str | Path) -> Path:
         """Write the gripper as JSON and return the path."""
-        return write_json(path, self.to_dict(), schema=_SCHEMA, version=_VERSION)
+        return write_json(path, self.to_dict(), schema=_DEVICE_SCHEMA, version=_DEVICE_VERSION)
 
     @classmethod
     def load(cls, path: str | Path) -> GripperModel:
         """Return the gripper in a JSON file; :class:`UserError` where it is missing or not whole."""
-        return cls.from_dict(read_json(path, _SCHEMA, _VERSION), file=path)
+        return cls.from_dict(read_json(path, _DEVICE_SCHEMA, _DEVICE_VERSION), file=path)
 
     def found_effusivity(self, ln_effusivity: Array) -> Array:
         """Return what ln e of the library's scale is on the gripper's own, of the same shape."""
@@ -498,11 +508,13 @@ def load_default_gripper() -> GripperModel:
         return GripperModel.load(file)
 
 
-def _numbers(content: Mapping[str, Any], ranges: Mapping[str, tuple[float, float]]) -> dict[str, float]:
+def _numbers_in_ranges(
+    content: Mapping[str, Any], ranges: Mapping[str, tuple[float, float]]
+) -> dict[str, float]:
     keys = {name: _FILE_KEYS.get(name, name) for name in ranges}
     return {name: number_within(content, keys[name], *ranges[name]) for name in ranges}
 
 
 def _block(content: Mapping[str, Any]) -> Block:
-    numbers = _numbers(content, _OF_BLOCK)
+    numbers = _numbers_in_ranges(content, _OF_BLOCK)
     return Block(n_grasp=int(numbers.pop("n_grasp")), **numbers)

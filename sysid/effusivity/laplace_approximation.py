@@ -373,7 +373,7 @@ def hypotheses_of_second(gripper: GripperModel, second: GripperModel, one: Hypot
 def joined_modes(first: Mode, prior: Prior, second: Mode, own: Prior, apart: float) -> Mode:
     r"""Return the modes of one object that two sensors touched, with its temperature x common to both: what
     the second saw of x is its posterior over its prior, a normal likelihood of precision :math:`1/V_2 -
-    1/V_{02}`, its thermometer ``apart`` [K] above the first one's, give or take 0.3 K; all else is each
+    1/V_{02}`, its thermometer ``apart`` [K] above the first one's, within +-0.3 K; all else is each
     sensor's own."""
     second_mean, width = _seen_temperature(second, own)
     off = second_mean - apart - first.u[:, T_OBJECT]

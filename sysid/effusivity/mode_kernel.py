@@ -42,7 +42,7 @@ SEARCH = SearchSettings()
 # after so many steps, -2 ln posterior behind the best by the quadratic model: of 943 points of a free
 # effusivity that ended within 25 nats of the best, none was farther than 1734 after one, 356 after two and
 # 378 after three
-_HOPELESS = {1: 6000.0, 2: 2000.0, 3: 1000.0, 4: 1000.0, 5: 1000.0} | dict.fromkeys(range(6, 99), 120.0)
+_HOPELESS_COST = {1: 6000.0, 2: 2000.0, 3: 1000.0, 4: 1000.0, 5: 1000.0} | dict.fromkeys(range(6, 99), 120.0)
 # and where the object's temperature is stated: of the points and candidates of the example conditions that
 # ended within 25 nats none was farther than 147 behind before a step, 54 after any number; what the best
 # leaves unexplained comes on top, some 45 times _UNEXPLAINED where the model is right
@@ -91,7 +91,7 @@ def readings(asked: Asked, u: Array, vary: Mask, *, alike: bool = False) -> tupl
         numbers, every = numbers[first], np.zeros((first.size, N_STEPPED), dtype=bool)
         np.logical_or.at(every, which, stepped)
         stepped = every
-    means = _means(asked, numbers, stepped, which, onset, wanted)
+    means = _bin_means(asked, numbers, stepped, which, onset, wanted)
     n_bin = data.y.shape[1]
     y, slopes = np.empty((row.size, n_bin)), np.empty((row.size, _LEFT + 1, n_bin))
     scratch = np.empty((16, n_bin))
@@ -102,7 +102,7 @@ def readings(asked: Asked, u: Array, vary: Mask, *, alike: bool = False) -> tupl
     return y, slopes
 
 
-def _means(
+def _bin_means(
     asked: Asked, numbers: Array, stepped: Mask, which: NDArray[np.int64], onset: Array, wanted: Mask
 ) -> Array:
     """Return the bin means (n, 6, n_bin) of the ``wanted`` curves of contacts of logarithms ``numbers`` (k,
@@ -382,7 +382,7 @@ def search(
     )  # fmt: skip
     for step in range(SEARCH.most_steps + 1):
         tried = products(asked.take(state.at), whitener, state.trial, state.sd, alike=step == 0)
-        state = _moved(*_refitted(state, tried), step)
+        state = _search_moved(*_refitted(state, tried), step)
         rhs, curved = state.matrix[:, :m, m] - state.slope, state.matrix[:, :m, :m].copy()
         curved[:, diagonal, diagonal] += state.bound
         last = np.linalg.solve(curved, rhs[:, :, None])[:, :, 0]
@@ -434,7 +434,7 @@ def _hopeful(asked: Asked, step: int, ahead: Array) -> Mask:
     best = np.full(asked.data.level.size, np.inf)
     np.minimum.at(best, asked.row, ahead)
     stated = np.isfinite(asked.data.t_object)
-    limit = np.where(stated, _HOPELESS_STATED[step], _HOPELESS.get(step, np.inf))
+    limit = np.where(stated, _HOPELESS_STATED[step], _HOPELESS_COST.get(step, np.inf))
     return np.asarray(ahead < (best + limit + SEARCH.unexplained_times * np.maximum(best, 0.0))[asked.row])
 
 
@@ -466,7 +466,7 @@ def _refitted(here: _Search, there: Array) -> tuple[_Search, Array, Mask]:
     return here._replace(trial=trial), there, stale
 
 
-def _moved(here: _Search, there: Array, stale: Mask, step: int) -> _Search:
+def _search_moved(here: _Search, there: Array, stale: Mask, step: int) -> _Search:
     """Return where pairs are after they were tried, and how the next steps are made."""
     off = here.law.penalty(here.trial)
     tried, damping = there[:, -1, -1] + off.value, here.damping

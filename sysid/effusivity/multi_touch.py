@@ -84,8 +84,8 @@ from thermogrip.sysid.effusivity.quality import number_values
 if TYPE_CHECKING:
     from thermogrip.datasets.schema import Grasps
 
-_SCHEMA, _VERSION = "thermogrip.coupling", 1
-_RANGES = {  # of the numbers of a file
+_COUPLING_SCHEMA, _COUPLING_VERSION = "thermogrip.coupling", 1
+_FILE_RANGES = {  # of the numbers of a file
     "found": (0.0, 2.0), "loss": (0.0, 1e9), "sd": (1e-9, 1e6), "ln_h_sd": (1e-9, 100.0),
     "longest_rest": (0.0, np.inf),
 }  # fmt: skip
@@ -139,16 +139,16 @@ class Coupling:
         """Return what :meth:`to_dict` described; a wrong entry is a :class:`UserError`."""
         with reading("is not a whole coupling of touches", file=file, hint="train again"):
             numbers = {"longest_rest": np.inf} | dict(content)  # which earlier files do not say
-            return cls(**{name: number_within(numbers, name, *ends) for name, ends in _RANGES.items()})
+            return cls(**{name: number_within(numbers, name, *ends) for name, ends in _FILE_RANGES.items()})
 
     def save(self, path: str | Path) -> Path:
         """Write the coupling as JSON and return the path."""
-        return write_json(path, self.to_dict(), schema=_SCHEMA, version=_VERSION)
+        return write_json(path, self.to_dict(), schema=_COUPLING_SCHEMA, version=_COUPLING_VERSION)
 
     @classmethod
     def load(cls, path: str | Path) -> Coupling:
         """Return the coupling of a file."""
-        return cls.from_dict(read_json(path, _SCHEMA, _VERSION), file=path)
+        return cls.from_dict(read_json(path, _COUPLING_SCHEMA, _COUPLING_VERSION), file=path)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -415,7 +415,7 @@ def learn_coupling(gripper: GripperModel, grasps: Grasps, *, start: Coupling | N
     groups = [
         (factor, view, group_rows)
         for view, rows in _own_views(gripper, grasps, centre)
-        for factor, group_rows in zip(_factors(view, rows), rows)
+        for factor, group_rows in zip(_group_factors(view, rows), rows)
     ]
     longest = max(_longest_rests(grasps).values())
     if start is not None:
@@ -447,9 +447,9 @@ def next_touch_prior(
     (m, 4, 4) of another touch's x = (T_obj, ln h, ln e, ln C) after a ``rest`` [s]."""
     at = _one_block(grasps)
     view = _view(gripper, grasps, material_hypotheses(gripper, candidates), coupling or Coupling())
-    factor = _factors(view, [at])[0]
+    factor = _group_factors(view, [at])[0]
     if at.size > 1:
-        factor = _factors(view, [at], _cavities(view, [at], [factor]))[0]
+        factor = _group_factors(view, [at], _cavities(view, [at], [factor]))[0]
     log_evidence = combine(factor, *_prior(view, at, view.coupling, factor)).log_evidence
     # the touch to come: a flat factor, in a row of its own
     m, new = view.hypotheses.ln_h.size, int(view.traces.rest.size)
@@ -506,7 +506,9 @@ def _own_views(gripper: GripperModel, grasps: Grasps, coupling: Coupling) -> lis
     ]
 
 
-def _factors(view: _View, groups: list[Rows], found: list[tuple[Array, Array]] | None = None) -> list[Factor]:
+def _group_factors(
+    view: _View, groups: list[Rows], found: list[tuple[Array, Array]] | None = None
+) -> list[Factor]:
     """Return a factor of leading shape (m, n) a group; ``found``, (m, n) each, replaces T's prior."""
     m = view.hypotheses.ln_h.size
     # group after group, hypothesis after hypothesis, touch after touch
@@ -575,5 +577,5 @@ def _t_object(joint: Joint, k: int) -> tuple[Array, Array]:
 
 def _fits(view: _View, groups: list[Rows]) -> list[Joint]:
     """Return evidence and posterior of each group, factors expanded around what the other touches say."""
-    factors = _factors(view, groups, _cavities(view, groups, _factors(view, groups)))
+    factors = _group_factors(view, groups, _cavities(view, groups, _group_factors(view, groups)))
     return [combine(f, *_prior(view, group_rows, view.coupling, f)) for f, group_rows in zip(factors, groups)]

@@ -107,19 +107,21 @@ def effusivity_posterior(
     if rows:
         for name, fits in free_touch_fit(gripper, grasps, coupling=coupling, until=until).items():
             posterior_of |= dict(zip(rows[name].tolist(), fits))
-    return [_row(gripper, str(name), posterior_of[i]) for i, name in enumerate(grasps["grasp"].values)]
+    return [
+        _effusivity_row(gripper, str(name), posterior_of[i]) for i, name in enumerate(grasps["grasp"].values)
+    ]
 
 
-_LEVELS = (0.05, 0.5, 0.95)
+_QUANTILES = (0.05, 0.5, 0.95)
 
 
-def _row(gripper: GripperModel, name: str, found: GridPosterior) -> EffusivityRow:
+def _effusivity_row(gripper: GripperModel, name: str, found: GridPosterior) -> EffusivityRow:
     scale, scale_sd = gripper.effusivity_scale(found.x)
     scatter = np.where(np.exp(found.x) < INSULATOR, gripper.spreads.ln_effusivity, 0.0)
     ln_e, sd = found.x - scale, np.sqrt(scale_sd**2 + scatter**2 + 1e-8)
-    low, middle, high = np.exp(mixture_quantiles(found.mass, ln_e, sd, _LEVELS)).tolist()
+    low, middle, high = np.exp(mixture_quantiles(found.mass, ln_e, sd, _QUANTILES)).tolist()
     variance = found.mass @ ((ln_e - found.mass @ ln_e) ** 2 + sd**2)
-    t = np.array(mixture_quantiles(found.weight, found.t_object, found.t_object_sd, _LEVELS))
+    t = np.array(mixture_quantiles(found.weight, found.t_object, found.t_object_sd, _QUANTILES))
     if gripper.discrepancy is not None:  # it has no scale of its own: that of the temperatures it was told
         t = t - gripper.bias
     return EffusivityRow(

@@ -91,7 +91,7 @@ class ContactSettings:
 
 LIMITS = ContactSettings()
 
-#: Attribute of a record whose samples are all usable: nobody need check them again.
+#: Attribute of a record whose samples are all usable: no check is needed again.
 CHECKED = "checked_samples"
 #: Why a grasp is unusable.
 NO_CONTACT, OUT_OF_RANGE = "no contact", "no reading within the sensor's range"
@@ -179,7 +179,9 @@ def check_grasps(grasps: Grasps, *, longest: float = np.inf, whole_traces: bool 
         np.where(ever, raw[row, first_clipped], np.nan),
     )
     single = not has_touch_groups(grasps)
-    shortened = np.asarray((_ends(time, np.isfinite(raw)) > LIMITS.read_whole * longest) & single)
+    shortened = np.asarray(
+        (_last_sample_times(time, np.isfinite(raw)) > LIMITS.read_whole * longest) & single
+    )
     note = list(reason)
     for i in range(len(note)):
         if not note[i] and ever[i]:
@@ -191,7 +193,8 @@ def check_grasps(grasps: Grasps, *, longest: float = np.inf, whole_traces: bool 
     until = float(longest) if single else np.inf
     used = np.asarray(read & (time <= until + 1e-9))
     start, stop = (
-        np.where(used.any(axis=1), t, np.nan) for t in (time[used.argmax(axis=1)], _ends(time, used))
+        np.where(used.any(axis=1), t, np.nan)
+        for t in (time[used.argmax(axis=1)], _last_sample_times(time, used))
     )
     return GraspQuality(reason, note, masked, spiked, reading, start, stop, shortened, until, trace)
 
@@ -210,7 +213,7 @@ class _Trace:
     @cached_property
     def level(self) -> Floats:
         """Mean before contact (n,) [degC]."""
-        return _means(self.clean[:, self.time < LIMITS.level_until_s])
+        return _row_means(self.clean[:, self.time < LIMITS.level_until_s])
 
     @cached_property
     def difference(self) -> Floats:
@@ -225,7 +228,7 @@ class _Trace:
     @cached_property
     def moved(self) -> Floats:
         """How far each skin is above its level in its last second (n,) [K]."""
-        return _means(self.clean[:, self.time > self.time[-1] - 1.0]) - self.level
+        return _row_means(self.clean[:, self.time > self.time[-1] - 1.0]) - self.level
 
     def stays(self, share: float) -> Flags:
         """Return which grasps move by less than this share of a difference that would show contact, (n,)."""
@@ -243,7 +246,7 @@ class _Trace:
 
     def unmoved(self) -> Flags:
         """Return which grasps, 10 K from their object, have not moved towards it yet, however short, (n,)."""
-        moved = _means(self.clean[:, self.time > self.time[-1] - LIMITS.just_now_s]) - self.level
+        moved = _row_means(self.clean[:, self.time > self.time[-1] - LIMITS.just_now_s]) - self.level
         still = np.sign(self.difference) * moved < LIMITS.no_contact_share * self.away
         return np.asarray((self.away >= LIMITS.telling_difference_K) & still)
 
@@ -300,7 +303,10 @@ def find_contact(
 
 def longest_contact(records: Sequence[Grasps]) -> float:
     """Return how long the longest contact of some records was read [s]."""
-    ends = [_ends(record["time"].values, np.isfinite(record["t_surface"].values)) for record in records]
+    ends = [
+        _last_sample_times(record["time"].values, np.isfinite(record["t_surface"].values))
+        for record in records
+    ]
     return max(float(end.max()) for end in ends)
 
 
@@ -313,12 +319,12 @@ def contact_faults(grasps: Grasps) -> list[str]:
     faults = []
 
     def named(which: Flags) -> str:
-        return f"{_counted(int(which.sum()))} ({str(grasps['grasp'].values[which][0])!r} first)"
+        return f"{_grasp_count(int(which.sum()))} ({str(grasps['grasp'].values[which][0])!r} first)"
 
     if spiked.any():
         i, k = np.argwhere(spiked)[0]
         faults.append(
-            f"{int(spiked.sum())} spikes in {_counted(int(spiked.any(axis=1).sum()))} are left out, the "
+            f"{int(spiked.sum())} spikes in {_grasp_count(int(spiked.any(axis=1).sum()))} are left out, the "
             f"first of {trace.raw[i, k]:g} degC in {str(grasps['grasp'].values[i])!r}"
         )
     if clipped.any():
@@ -379,8 +385,8 @@ def _mistimed(time: Floats, skin: Floats, difference: Floats) -> str:
     early = int(np.sum(before > LIMITS.moves_before_share * difference))
     if 2 * early > len(skin):
         return (
-            f"{_counted(early)} of {len(skin)} move before time 0; time 0 must be the closed message, and "
-            "the record must start before contact"
+            f"{_grasp_count(early)} of {len(skin)} move before time 0; time 0 must be the closed message, "
+            "and the record must start before contact"
         )
     felt = [find_contact(time, row) for row in skin]
     contact_times = np.array([t for t in felt if t is not None])
@@ -398,7 +404,7 @@ def _medians(block: Floats) -> Floats:
     return np.array(medians)
 
 
-def _counted(n: int) -> str:
+def _grasp_count(n: int) -> str:
     return "1 grasp" if n == 1 else f"{n} grasps"
 
 
@@ -489,7 +495,7 @@ def number_values(grasps: Grasps, name: str) -> Floats:
     return np.asarray(grasps.variables[name].values, dtype=float)
 
 
-def _means(block: Floats) -> Floats:
+def _row_means(block: Floats) -> Floats:
     """Return the mean of each row but for lost samples, NaN where all are lost."""
     has_reading = np.isfinite(block)
     n = has_reading.sum(axis=1)
@@ -498,6 +504,6 @@ def _means(block: Floats) -> Floats:
     )
 
 
-def _ends(time: Floats, seen: Flags) -> Floats:
+def _last_sample_times(time: Floats, seen: Flags) -> Floats:
     """Return the time of each row's last sample that counts, (n,) [s]."""
     return np.asarray(time[seen.shape[1] - 1 - np.argmax(seen[:, ::-1], axis=1)], dtype=float)

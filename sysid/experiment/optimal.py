@@ -57,7 +57,7 @@ class Expectation:
     widths: dict[str, dict[str, float]]  # of each parameter's 90 % interval in natural units, by schedule
 
     def narrower(self, kind: str, than: str) -> float:
-        """Return how many times narrower intervals are expected, the geometric mean over independent
+        """Return the factor by which intervals are expected to narrow, the geometric mean over independent
         directions."""
         n = len(self.widths[than])
         return float(2.0 ** ((self.bits[kind] - self.bits[than]) / n))
@@ -124,7 +124,7 @@ def optimal_schedule(
     pool = [
         np.where(frame.low < frame.high, inputs_of(plant, log), frame.still) for log in (begin or {}).values()
     ]
-    cells = _search(
+    cells = _search_cells(
         frame, coarse, [frame.to_cells(u) for u in pool], seed, evaluations or EVALUATIONS, report
     )
     report(0.97, "checking the limits")
@@ -204,7 +204,7 @@ class _Frame:
         return np.take_along_axis(cells, first, axis=0)
 
 
-def _search(
+def _search_cells(
     frame: _Frame,
     forecast: ExperimentForecast,
     pool: list[Array],
@@ -289,10 +289,10 @@ def _exchanged(frame: _Frame, cells: Array, pool: list[Array], rng: np.random.Ge
     high = frame.high[i]
     move = rng.random()
     if move < 0.45 or (frame.switch[i] and move > 0.9):
-        out[block, i] = _level(frame, i, rng)
+        out[block, i] = _random_level(frame, i, rng)
     elif move < 0.6:
         period = unit * int(rng.integers(1, max(2, old.size // (2 * unit)) + 1))
-        first, second = _level(frame, i, rng), _level(frame, i, rng)
+        first, second = _random_level(frame, i, rng), _random_level(frame, i, rng)
         out[block, i] = np.where((np.arange(old.size) // period) % 2 == 0, first, second)
     elif move < 0.75:
         out[block, i] = pool[int(rng.integers(len(pool)))][block, i]
@@ -307,7 +307,7 @@ def _exchanged(frame: _Frame, cells: Array, pool: list[Array], rng: np.random.Ge
     return out
 
 
-def _level(frame: _Frame, i: int, rng: np.random.Generator) -> float:
+def _random_level(frame: _Frame, i: int, rng: np.random.Generator) -> float:
     """Return one end of the range more often than something between."""
     low, high = float(frame.low[i]), float(frame.high[i])
     if frame.switch[i]:

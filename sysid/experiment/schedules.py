@@ -102,7 +102,7 @@ def prbs(n: int, *, hold: int, seed: int = 0) -> Array:
     bits = max(3, min(10, int(np.floor(np.log2(max(n / hold, 7) + 1)))))
     register, _ = max_len_seq(bits, state=[0] * (bits - 1) + [1], taps=_TAPS[bits])
     sequence = np.where(register, 1.0, -1.0)
-    # golden steps: whichever seeds several inputs have, they begin far apart and hardly correlate
+    # golden steps: whichever seeds several inputs have, they begin far apart and barely correlate
     begin = round(seed * 0.6180339887498949 * len(sequence)) % len(sequence)
     rows = np.repeat(np.roll(sequence, -begin), hold)
     return np.asarray(np.tile(rows, -(-n // rows.size))[:n])

@@ -211,7 +211,7 @@ class Dynamics:
         return float(taus[np.isfinite(taus)].max(initial=self.dt))
 
     def _steps(self, n: int) -> int:
-        """Return how many steps of the plant lie between n points of a step response."""
+        """Return the number of steps of the plant between n points of a step response."""
         return max(1, round(RESPONSE.length * self._slowest / (n * self.dt)))
 
     def _estimate(self, of: Callable[[LinearPlant], Array], gain_sd: Array | None = None) -> Estimate:

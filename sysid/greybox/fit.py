@@ -8,7 +8,7 @@
 3. Covariance (:mod:`thermogrip.sysid.greybox.sandwich`), and which parameters are practically identifiable
    (:mod:`thermogrip.sysid.greybox.identifiability`).
 
-**Levenberg-Marquardt with geodesic acceleration, in a box.** Combinations of parameters that the logs hardly
+**Levenberg-Marquardt with geodesic acceleration, in a box.** Combinations of parameters that the logs barely
 determine make the cost |r(z)|^2 a narrow curved valley, which straight steps leave at once. The step
 
     v = -(J'J + lambda)^-1 J'r            is followed by half of
@@ -132,19 +132,19 @@ def _best_trial(
         return out
 
     step = solve(gradient[None])
-    probe = _bounded(residuals(np.clip(z + _PROBE * step, low, high)))
+    probe = _finite_residuals(residuals(np.clip(z + _PROBE * step, low, high)))
     curvature = 2.0 / _PROBE**2 * (probe - r - _PROBE * step @ J.T)
     bend = solve(curvature @ J)
     # a bend longer than the step: the expansion is not valid there
     longer = np.linalg.norm(bend, axis=1) > 1.5 * np.linalg.norm(step, axis=1)
     bend[longer] = 0.0
     trials = np.clip(np.concatenate([z + step, z + step + bend / 2]), low, high)
-    cost = (_bounded(residuals(trials)) ** 2).sum(axis=1)
+    cost = (_finite_residuals(residuals(trials)) ** 2).sum(axis=1)
     best = int(np.argmin(cost))
     return _Trial(trials[best], float(cost[best]), float(damping * _DAMPINGS[best % len(_DAMPINGS)]))
 
 
-def _bounded(r: Array) -> Array:
+def _finite_residuals(r: Array) -> Array:
     """Replace what is not finite by a huge residual, so that it never wins and never overflows."""
     return np.asarray(np.clip(np.nan_to_num(r, nan=_HUGE, posinf=_HUGE, neginf=-_HUGE), -_HUGE, _HUGE))
 
@@ -338,7 +338,7 @@ def _as_plant(problem: Problem, solution: Solution, tau: Array) -> Plant:
         offsets=offsets,
         logs=problem.names,
         scores=scores,
-        verdict=_verdict(problem, solution, identifiability),
+        verdict=_fit_verdict(problem, solution, identifiability),
     )
 
 
@@ -361,7 +361,7 @@ def _of_intervals(problem: Problem, spread: ScoreCovariance) -> fit_record.Inter
     )
 
 
-def _verdict(problem: Problem, solution: Solution, identifiability: fit_record.Identifiability) -> str:
+def _fit_verdict(problem: Problem, solution: Solution, identifiability: fit_record.Identifiability) -> str:
     rms = _rms_in_sd(problem, solution)
     errors = ", ".join(
         f"{name} {r * sd:.2f} {problem.plant.units.get(name, 'degC')}"

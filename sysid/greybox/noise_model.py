@@ -60,7 +60,7 @@ class Block:
     def of(cls, columns: Array, outputs: Sequence[int]) -> Block:
         """Take the columns (n, n_y, q) of a stretch by time; the last is reading less model."""
         waves = dct(columns, axis=0, norm="ortho")
-        edges = _bands(len(columns))
+        edges = _frequency_bands(len(columns))
         band_products = [
             np.einsum("fja,fkb->jkab", waves[a:b], waves[a:b], optimize=True) for a, b in pairwise(edges)
         ]
@@ -69,7 +69,7 @@ class Block:
     @property
     def sizes(self) -> Array:
         """Frequencies in each band, (n_band,)."""
-        return np.diff(_bands(self.n)).astype(float)
+        return np.diff(_frequency_bands(self.n)).astype(float)
 
     def covariance(self, numbers: ErrorModel) -> Array:
         """Return S (n_band, n_y, n_y) of these outputs."""
@@ -153,7 +153,7 @@ class Information:
 
 def information(numbers: ErrorModel, logs: Sequence[LogData], ref: Array) -> Information:
     """Return the posterior with these numbers, linearised at ``ref`` (n,)."""
-    log_terms = [_one_log(numbers, log, ref) for log in logs]
+    log_terms = [_log_terms(numbers, log, ref) for log in logs]
     by_log, pull = np.array([p.h for p in log_terms]), np.array([p.g for p in log_terms])
     whole = np.eye(pull.shape[1]) + by_log.sum(axis=0)
     covariance = np.linalg.inv(whole)
@@ -200,15 +200,15 @@ class _OneLog:
     mean: Array
 
 
-def _columns(numbers: ErrorModel, log: LogData, ref: Array) -> Array:
+def _scaling_matrix(numbers: ErrorModel, log: LogData, ref: Array) -> Array:
     """Return the matrix (q, q) that takes stored columns to scaled ones, the residual to that about zero."""
     take = np.diag(np.append(numbers.scale(log.kind), 1.0))
     take[: ref.size, -1] = ref  # about z = 0, the prior mean
     return take
 
 
-def _one_log(numbers: ErrorModel, log: LogData, ref: Array) -> _OneLog:
-    take, n = _columns(numbers, log, ref), len(log.kind) - log.n_effects
+def _log_terms(numbers: ErrorModel, log: LogData, ref: Array) -> _OneLog:
+    take, n = _scaling_matrix(numbers, log, ref), len(log.kind) - log.n_effects
     products, value = np.zeros(take.shape), 0.0
     for block in log.blocks:
         S = block.covariance(numbers)
@@ -236,7 +236,7 @@ def _evidence(v: Array, logs: Sequence[LogData], ref: Array, n_y: int, n_kind: i
     for log, joint, (effects, spread) in zip(logs, posterior.joint, posterior.effects):
         np.add.at(by_kind, log.kind[n:], effects**2 + np.diag(spread) - 1)
         unexplained = np.concatenate([-posterior.mean, -effects, [1.0]])  # the residual less its explanation
-        take = _columns(numbers, log, ref)
+        take = _scaling_matrix(numbers, log, ref)
         uncertain = np.outer(unexplained, unexplained)
         uncertain[:-1, :-1] += joint
         uncertain = take @ uncertain @ take.T
@@ -274,7 +274,7 @@ def _slopes(v: Array, numbers: ErrorModel, block: Block, uncertain: Array) -> Ar
 
 
 @lru_cache(maxsize=64)
-def _bands(n: int) -> tuple[int, ...]:
+def _frequency_bands(n: int) -> tuple[int, ...]:
     """Return the edges of the bands of n frequencies."""
     edges = list(range(min(n, _SINGLE) + 1))
     while edges[-1] < n:
@@ -288,7 +288,7 @@ def band_weights(n: int) -> Array:
     basis = dct(np.eye(n), axis=0, norm="ortho")  # row f: the f-th cosine
     weights = irfft(np.abs(rfft(basis, 2 * n, axis=1)) ** 2, 2 * n, axis=1)[:, :n]
     weights[:, 1:] *= 2  # lags of either sign
-    edges = _bands(n)
+    edges = _frequency_bands(n)
     out = np.array([weights[a:b].mean(axis=0) for a, b in pairwise(edges)])
     out.setflags(write=False)
     return out
@@ -296,7 +296,7 @@ def band_weights(n: int) -> Array:
 
 def _hyper_prior(logs: Sequence[LogData], n_y: int) -> tuple[Array, Array]:
     """Return mean and sd of the unconstrained numbers: ln tau, ln w, ln a, correlations."""
-    scale = np.array([_rms(logs, j) for j in range(n_y)])
+    scale = np.array([_residual_rms(logs, j) for j in range(n_y)])
     span = float(np.median([max(block.n for block in log.blocks) for log in logs]))
     mean = [np.log(3.0), np.log(max(span / 20, 9.0)), *np.log(0.3 * scale)]
     sd = [0.7, 0.7] + [1.0] * n_y
@@ -335,7 +335,7 @@ def _n_outputs(logs: Sequence[LogData]) -> int:
     return 1 + max(max(block.outputs) for log in logs for block in log.blocks)
 
 
-def _rms(logs: Sequence[LogData], j: int) -> float:
+def _residual_rms(logs: Sequence[LogData], j: int) -> float:
     """Return the rms residual of an output about each stretch's mean (its first cosine)."""
     total, count = 0.0, 0
     for block in (block for log in logs for block in log.blocks if j in block.outputs):

@@ -33,7 +33,7 @@ from thermogrip.sysid.plant.simulation import Start, find_starts, predict
 _WARM_ROWS = 30  # of a log, from whose readings its start is estimated at least
 
 
-_STEP = 1e-4  # of a prior sd
+_DIFFERENCE_STEP = 1e-4  # of a prior sd
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,13 +143,15 @@ class Problem:
     def by_log(self, z: Array, *, central: bool = False) -> list[tuple[Array, Array]]:
         """Return residual (m,) and Jacobian (m, n) of each log, without the prior, by ``central`` differences
         (twice the cost) where a null direction is looked for."""
-        sign = np.where(z + _STEP > self.box[1], -1.0, 1.0)  # a step outside the box may not be simulated
-        ahead = _STEP * np.diag(sign)
+        sign = np.where(
+            z + _DIFFERENCE_STEP > self.box[1], -1.0, 1.0
+        )  # a step outside the box may not be simulated
+        ahead = _DIFFERENCE_STEP * np.diag(sign)
         around = np.vstack([z, z + ahead, z - ahead] if central else [z, z + ahead])
         out = []
         for r in self.residuals(around, self._kept(z)):
             rise = (r[1 : len(z) + 1] - r[len(z) + 1 :]) / 2 if central else r[1:] - r[0]
-            out.append((r[0], (rise / (_STEP * sign[:, None])).T))
+            out.append((r[0], (rise / (_DIFFERENCE_STEP * sign[:, None])).T))
         return out
 
     def trials(self, z: Array) -> Array:

@@ -193,7 +193,7 @@ def linearise_logs(
     """Return residuals, sensitivities and effects of each log at ``z``."""
     starts, p = problem.start(z), problem.parameters(z[None])
     merge = _merge(problem)
-    runs = [_runs(problem, log_index, p, begin) for log_index, begin in enumerate(starts)]
+    runs = [_simulations(problem, log_index, p, begin) for log_index, begin in enumerate(starts)]
     discrepancy = discrepancy_responses(problem, runs)
     signals_of = list(dict.fromkeys(f"term {response.signal}" for response, _ in discrepancy))
     shared = [-1] * z.size + [signals_of.index(f"term {response.signal}") for response, _ in discrepancy]
@@ -202,12 +202,12 @@ def linearise_logs(
     warm: list[WarmUp | None] = []
     for log_index, (r, jacobian) in enumerate(by_log):
         rows, slopes = _by_stretch(problem, log_index, -r[:, None]), _by_stretch(problem, log_index, jacobian)
-        effects = _effects(problem, log_index, p, starts[log_index], slopes)
-        alike = [_scaled(problem, moves[log_index]) for _, moves in discrepancy]
+        effects = _log_effects(problem, log_index, p, starts[log_index], slopes)
+        alike = [_in_residual_units(problem, moves[log_index]) for _, moves in discrepancy]
         blocks: list[list[Block]] = [[] for _ in range(pieces)]
         for k in range(len(rows)):
             columns = [*(moves[k] for moves in alike), *(c.moves[k] for c in effects)]
-            cut = _blocks(problem, log_index, k, merge, pieces, slopes[k], columns, rows[k])
+            cut = _binned_pieces(problem, log_index, k, merge, pieces, slopes[k], columns, rows[k])
             for piece, block in zip(blocks, cut):
                 piece.append(block)
         kind = np.array(shared + [-1] * len(effects), dtype=np.int64)
@@ -227,12 +227,12 @@ def linearise_logs(
     return Linearised(logs, kinds, len(signals_of), len(shared), stated, bin_s, responses, warm)
 
 
-def _runs(problem: Problem, at: int, p: Array, starts: list[Start]) -> list[Array]:
+def _simulations(problem: Problem, at: int, p: Array, starts: list[Start]) -> list[Array]:
     """Return the free run (N + 1, n_y) of each stretch."""
     return [run[0] for run in predict(problem.model, problem.plant.dt, p, problem.logs[at][0], starts)]
 
 
-def _effects(
+def _log_effects(
     problem: Problem, at: int, p: Array, starts: list[Start], slopes: list[list[Array]]
 ) -> list[_Column]:
     """Return everything that is the log's own."""
@@ -247,12 +247,12 @@ def _effects(
                 for cells in bins
             ]
             estimate = float(starts[0].y_offset[j])
-            out.append(_Column(f"{_OFFSET}{name}", spread, estimate, _scaled(problem, moves)))
+            out.append(_Column(f"{_OFFSET}{name}", spread, estimate, _in_residual_units(problem, moves)))
     for j, name in enumerate(plant.disturbances):
         spread = min(plant.nuisance.get(name, 0.0), most)
         if spread > 0:
             moves, estimate = _of_ambient(problem, at, p, starts, j, spread), float(starts[0].d_offset[j])
-            out.append(_Column(f"bias of {name}", spread, estimate, _scaled(problem, moves)))
+            out.append(_Column(f"bias of {name}", spread, estimate, _in_residual_units(problem, moves)))
     specs = list(problem.model.specs.values())
     for i, place in enumerate(problem.free):
         spread = specs[place].per_log or 0.0
@@ -269,7 +269,7 @@ def _of_ambient(
 ) -> list[list[Array]]:
     """Return what a bias of disturbance j does to each bin: the true one is lower than the reading."""
     moved = [replace(s, d_offset=s.d_offset + spread * (np.arange(s.d_offset.size) == j)) for s in starts]
-    measured, biased = (_runs(problem, at, p, begin) for begin in (starts, moved))
+    measured, biased = (_simulations(problem, at, p, begin) for begin in (starts, moved))
     return [
         [operator @ (b[:, k] - a[:, k]) for k, operator in enumerate(cells.operators)]
         for a, b, cells in zip(measured, biased, problem.logs[at][1])
@@ -295,7 +295,7 @@ def _of_start(problem: Problem, at: int, k: int, p: Array, start: Start) -> list
     out = []
     for mode in modes.T:
         moves = [bins_of_output * sd for bins_of_output, sd in zip(np.split(mode, ends), problem.sd)]
-        everywhere = _scaled(problem, [*nothing[:k], moves, *nothing[k + 1 :]])
+        everywhere = _in_residual_units(problem, [*nothing[:k], moves, *nothing[k + 1 :]])
         out.append(_Column("", 1.0, 0.0, everywhere))
     return out
 
@@ -336,7 +336,7 @@ def _by_stretch(problem: Problem, at: int, rows: Array) -> list[list[Array]]:
     return out
 
 
-def _scaled(problem: Problem, parts: list[list[Array]]) -> list[list[Array]]:
+def _in_residual_units(problem: Problem, parts: list[list[Array]]) -> list[list[Array]]:
     """Return what moves the bins in the units of the fit's residuals."""
     return [
         [problem.scaled(k, moved_bins[None])[0] for k, moved_bins in enumerate(stretch)] for stretch in parts
@@ -348,12 +348,12 @@ def _n_bins(problem: Problem, at: int, k: int) -> int:
 
 
 def _merge(problem: Problem) -> int:
-    """Return how many bins are averaged to one."""
+    """Return the number of bins averaged to one."""
     longest = max(_n_bins(problem, at, k) for at, (s, _) in enumerate(problem.logs) for k in range(len(s)))
     return max(1, int(np.ceil(longest / EFFECTS.most_bins)))
 
 
-def _blocks(
+def _binned_pieces(
     problem: Problem,
     at: int,
     k: int,

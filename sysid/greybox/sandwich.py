@@ -57,7 +57,7 @@ from thermogrip.sysid.greybox.random_effects import Linearised, Response, WarmUp
 
 @dataclass(frozen=True)
 class ErrorPriors:
-    """What is taken for known of the errors, and how many logs and bins say more."""
+    """What is taken for known of the errors, and the number of logs and bins that add to it."""
 
     discrepancy_sd: float = 1.5  # of ln s of a response
     effect_sd: float = 0.7  # of ln s of a random effect

@@ -99,12 +99,12 @@ class Vector:
         if _is(power, 0.5):
             return self._intrinsic("sqrt")
         if isinstance(power, Vector) or power not in range(1, 9):
-            return _library("pow", self, power)
+            return _c_function("pow", self, power)
         half = self ** (power // 2) if power > 1 else 1.0
         return half * half * (self if power % 2 else 1.0)
 
     def __rpow__(self, base: Any) -> Any:
-        return _library("pow", base, self)
+        return _c_function("pow", base, self)
 
     def __lt__(self, other: Any) -> Any:
         return self._compare("<", other)
@@ -173,7 +173,7 @@ def _declared(builder: ir.IRBuilder, name: str, kind: Any) -> Any:
     return builder.module.globals.get(name) or ir.Function(builder.module, kind, name)
 
 
-def _library(name: str, *values: Any) -> Vector:
+def _c_function(name: str, *values: Any) -> Vector:
     """Return a function of the C library, of each number."""
     builder = next(value.builder for value in values if isinstance(value, Vector))
     function = _declared(builder, name, ir.FunctionType(DOUBLE, [DOUBLE] * len(values)))
@@ -234,11 +234,11 @@ _OWN: dict[Any, Callable[..., Any]] = {
     np.interp: _interp,
     np.clip: lambda a, low, high: _minimum(_maximum(a, low), high),
 }
-_SAME = (
+_SHARED_OPERATIONS = (
     *("exp", "expm1", "log", "log1p", "log10", "sin", "cos", "tan"),
     *("sinh", "cosh", "tanh", "hypot", "cbrt"),
 )
-_LIBRARY = {getattr(np, name): name for name in _SAME} | {np.arctan: "atan", np.arctan2: "atan2"}
+_LIBRARY = {getattr(np, name): name for name in _SHARED_OPERATIONS} | {np.arctan: "atan", np.arctan2: "atan2"}
 
 
 def _elementary(function: Any, method: str, inputs: Values, options: dict[str, Any]) -> Any:
@@ -249,7 +249,7 @@ def _elementary(function: Any, method: str, inputs: Values, options: dict[str, A
             f"{name} of a value not known yet; there are the elementary functions, np.where and np.interp"
         )
     plain = [item.item() if isinstance(item, np.generic) else item for item in inputs]
-    return _library(_LIBRARY[function], *plain) if function in _LIBRARY else _OWN[function](*plain)
+    return _c_function(_LIBRARY[function], *plain) if function in _LIBRARY else _OWN[function](*plain)
 
 
 def register(value: Any) -> Any:
@@ -503,7 +503,7 @@ class _Writer:
         return [gather(self.at, self.places[k], self.at.add(base, INTEGER(i))) for i in range(n)]
 
     def _put(self, values: Values, array: Any, row: Any, length: Any) -> int:
-        """Write values[m] to the block's columns of array[m, row]; return how many there are."""
+        """Write values[m] to the block's columns of array[m, row]; return their number."""
         for m, value in enumerate(values):
             offset = self.at.mul(self.at.add(self.at.mul(INTEGER(m), length), row), self.columns)
             store(self.at, self.at.gep(array, [offset]), value)

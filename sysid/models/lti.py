@@ -147,7 +147,7 @@ def join_columns(u: Array, d: Array) -> Array:
 
 
 def whole_steps(dt: float, own: float) -> int:
-    """Return how many steps of ``own`` seconds ``dt`` is; raise ValueError where it is no whole multiple."""
+    """Return ``dt`` in steps of ``own`` seconds; raise ValueError where it is no whole multiple."""
     times = round(dt / own)
     if times < 1 or abs(times * own - dt) > 1e-6 * dt:
         raise ValueError(f"step of {dt:g} s is not a whole multiple of the model's {own:g} s")

@@ -142,7 +142,9 @@ class BlackBox:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the model as plain lists and numbers, for JSON."""
-        return {"kind": self.kind} | {entry.name: _plain(getattr(self, entry.name)) for entry in fields(self)}
+        return {"kind": self.kind} | {
+            entry.name: _plain_json(getattr(self, entry.name)) for entry in fields(self)
+        }
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Self:
@@ -160,9 +162,9 @@ class BlackBox:
         return {}
 
 
-def _plain(value: Any) -> Any:
+def _plain_json(value: Any) -> Any:
     if isinstance(value, Mapping):
-        return {key: _plain(item) for key, item in value.items()}
+        return {key: _plain_json(item) for key, item in value.items()}
     if isinstance(value, np.ndarray):
         return value.tolist()
     return list(value) if isinstance(value, tuple) else value

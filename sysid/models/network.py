@@ -146,7 +146,7 @@ class ThermalSteps:
     def renew(self, u: Values, c: Values, h: Any) -> list[Any]:
         """Return the conductances, then the factors of 1 - g h A."""
         g = _conductances(u, c, self.layout)
-        return [*g, *_factors(c, g, GAMMA * h, self.layout)]
+        return [*g, *_lu_factors(c, g, GAMMA * h, self.layout)]
 
     def advance(self, x: Values, u: Values, d: Values, c: Values, kept: Values, h: Any) -> list[Any]:
         """Return the state one step of ``h`` [s] on."""
@@ -229,7 +229,7 @@ def _heat(z: Any, u: Any, c: Any, g: Any, layout: Layout) -> list[Any]:
     return q
 
 
-def _factors(c: Any, g: Any, gh: Any, layout: Layout) -> list[Any]:
+def _lu_factors(c: Any, g: Any, gh: Any, layout: Layout) -> list[Any]:
     """Return the LU factors of 1 - gh A; pivots are inverted."""
     w = [0.0 * c[0] for _ in range(layout.n_entry)]
     for i in layout.diagonal:
@@ -318,7 +318,9 @@ def build_layout(network: Network) -> Layout:
         n_d=len(network.disturbances),
         n_fixed=len(network.boundaries),
         **{f"at_{name}": position for name, position in begin.items() if name != "capacity"},
-        coefficients=tuple(_monomial(item, network) for group in groups.values() for item in group),
+        coefficients=tuple(
+            _coefficient_monomial(item, network) for group in groups.values() for item in group
+        ),
         links=tuple((link.to, link.source, link.both, link.switch) for link in links),
         bent=tuple(k for k, link in enumerate(links) if link.bend is not None),
         radiation=tuple(_receiver(r.between, index, len(states)) for r in network.radiation.values()),
@@ -399,7 +401,7 @@ def _peltier(network: Network, element: Any) -> list[Coefficient]:
     return out
 
 
-def _monomial(item: Coefficient, network: Network) -> tuple[float, int, int]:
+def _coefficient_monomial(item: Coefficient, network: Network) -> tuple[float, int, int]:
     scale, names = item
     places, one = list(network.parameters), len(network.parameters)  # the place of a factor 1
     first, second = [*map(places.index, names), one, one][:2]

@@ -301,7 +301,7 @@ def network_from_dict(content: Mapping[str, Any], *, file: str | None = None) ->
         where = ".".join(str(key) for key in first["loc"])
         text = first["msg"].removeprefix("Value error, ")
         raise UserError(f"{where}: {text}", file=file, hint="see 'thermogrip init network'") from error
-    for problem, hint in _faults(network):
+    for problem, hint in _network_faults(network):
         raise UserError(problem, file=file, hint=hint)
     return network
 
@@ -316,7 +316,7 @@ def roles(network: Network) -> Iterator[tuple[str, str, str]]:
                     yield f"{group}.{name}", key, value
 
 
-def _faults(network: Network) -> Iterator[tuple[str, str]]:
+def _network_faults(network: Network) -> Iterator[tuple[str, str]]:
     """Yield (problem, hint) for each contradiction between the tables."""
     yield from _name_faults(network)
     yield from _reference_faults(network)

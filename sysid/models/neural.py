@@ -202,8 +202,10 @@ class NeuralModel(BlackBox):
 
     def _advance(self, x: Array, w: Array) -> Array:
         """Return the next states (K, n) of x (K, n) and w (K, m), not clipped."""
-        t = np.tanh(_times(self.W, x) + _times(self.U, w) + self.b)
-        return np.asarray(_times(self.A, x) + _times(self.B, w) + self.c + _times(self.V, t))
+        t = np.tanh(_batched_product(self.W, x) + _batched_product(self.U, w) + self.b)
+        return np.asarray(
+            _batched_product(self.A, x) + _batched_product(self.B, w) + self.c + _batched_product(self.V, t)
+        )
 
     def _member_step(self, k: int, x: Values, w: Values) -> list[Any]:
         units = zip(self.W[k], self.U[k], self.b[k])
@@ -221,7 +223,7 @@ class NeuralModel(BlackBox):
         return after
 
 
-def _times(matrices: Array, vectors: Array) -> Array:
+def _batched_product(matrices: Array, vectors: Array) -> Array:
     return np.asarray(np.einsum("kij,kj->ki", matrices, vectors))
 
 

@@ -107,7 +107,9 @@ def _add_direct(p: Array, x: Array, w: Array, t: Array, s: Array, S: Array) -> N
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def _step(A: Array, p: Array, w: Array, low: Array, high: Array, x: Array, t: Array, after: Array) -> None:
+def _member_step(
+    A: Array, p: Array, w: Array, low: Array, high: Array, x: Array, t: Array, after: Array
+) -> None:
     """Set ``after`` to the next state, clipped; ``t`` is room for the units."""
     _units(p, x, w, t)
     _advance(A, p, x, w, t, after)
@@ -122,7 +124,7 @@ def run_states(A: Array, theta: Array, h: int, x0: Array, w: Array, low: Array, 
     for k in range(theta.shape[0]):
         x[k, 0] = x0[k]
         for row in range(w.shape[0]):
-            _step(A[k], theta[k], w[row], low, high, x[k, row], t, x[k, row + 1])
+            _member_step(A[k], theta[k], w[row], low, high, x[k, row], t, x[k, row + 1])
     return x
 
 
@@ -142,7 +144,7 @@ def run_outputs(
                 for i in range(n_y):
                     y[b, row, i] += last[b, k, i] / members
                 if row < rows - 1:
-                    _step(A[k], theta[k], w[row], low, high, last[b, k], t, after)
+                    _member_step(A[k], theta[k], w[row], low, high, last[b, k], t, after)
                     last[b, k] = after
     return y, last
 

@@ -30,7 +30,7 @@ class SindyModel(BlackBox):
 
     switches: tuple[str, ...]
     dt: float  # step [s]
-    # how many past values of each output the equations see, at least 1; the state is [y[k], y[k-1], ...]
+    # number of past values of each output the equations see, at least 1; the state is [y[k], y[k-1], ...]
     memory: int
     # (n_term, n_variable) powers of the variables [state, inputs, disturbances] in each term
     exponents: NDArray[np.int_]
@@ -97,7 +97,7 @@ class SindyModel(BlackBox):
         n_x = self.n_x
         times = max(1, round(dt / self.dt))  # the step of a gap may differ a little from the model's
         powers, gains = self._by_state(w)
-        factors = _factors(powers)
+        factors = _monomial_factors(powers)
         y = np.empty((x.shape[0], rows + 1, n_y))
         y[:, 0] = x[:, :n_y]
         with np.errstate(over="ignore", invalid="ignore"):  # what diverges is marked below
@@ -115,7 +115,7 @@ class SindyModel(BlackBox):
         """Return the distinct monomials of the state and, row by row, their gains (B, N, n_y, n_monomial)."""
         n_x = self.n_x
         powers, place = np.unique(self.exponents[:, :n_x], axis=0, return_inverse=True)
-        factors, rows = _factors(self.exponents[:, n_x:]), w.reshape(-1, w.shape[2])
+        factors, rows = _monomial_factors(self.exponents[:, n_x:]), w.reshape(-1, w.shape[2])
         with np.errstate(over="ignore", invalid="ignore"):
             outside = _products(factors, rows).reshape(*w.shape[:2], -1)
         gains = np.zeros((*w.shape[:2], len(self.outputs), len(powers)))
@@ -129,7 +129,7 @@ class SindyModel(BlackBox):
         names = [f"{name}{lag_suffix}" for lag_suffix in past for name in self.outputs]
         names += [*self.inputs, *self.disturbances]
         return tuple(
-            f"{name}[k+1] = {_text(row, self.exponents, names)}"
+            f"{name}[k+1] = {_polynomial_text(row, self.exponents, names)}"
             for name, row in zip(self.outputs, self.coefficients)
         )
 
@@ -152,7 +152,7 @@ def _monomial(row: NDArray[np.int_], variables: Values) -> Any:
     return value
 
 
-def _factors(powers: NDArray[np.int_]) -> NDArray[np.int_]:
+def _monomial_factors(powers: NDArray[np.int_]) -> NDArray[np.int_]:
     """Return which variables each monomial multiplies, (degree, n_monomial); n_variable denotes 1."""
     degree, one = int(powers.sum(axis=1).max(initial=0)), powers.shape[1]
     out = np.full((degree, len(powers)), one)
@@ -172,7 +172,7 @@ def _products(factors: NDArray[np.int_], x: Array) -> Array:
     return out
 
 
-def _text(row: Array, exponents: NDArray[np.int_], names: Sequence[str]) -> str:
+def _polynomial_text(row: Array, exponents: NDArray[np.int_], names: Sequence[str]) -> str:
     products = []
     for value, powers in zip(row, exponents):
         if value == 0:

@@ -46,7 +46,7 @@ from thermogrip.sysid.models.lti import (
 )
 from thermogrip.sysid.models.model import BlackBox
 
-_AT_ONCE = 2_000_000  # numbers of states at a time, 16 MB, of which a simulation has five copies
+_STATES_AT_ONCE = 2_000_000  # numbers of states at a time, 16 MB, of which a simulation has five copies
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,9 +152,9 @@ class StateSpaceModel(BlackBox):
         return constrained_lstsq(rows, right, fixed, (y - self.y0)[is_read])[: self.n_x]
 
     def rollout(self, x0: ArrayLike, u: ArrayLike, d: ArrayLike, p: ArrayLike, dt: float) -> Run:
-        """Simulate a batch, so many rows at a time that their states have :data:`_AT_ONCE` numbers."""
+        """Simulate a batch, so many rows at a time that their states have :data:`_STATES_AT_ONCE` numbers."""
         x_end, u, d = (np.asarray(value, dtype=float) for value in (x0, u, d))
-        rows = max(1, _AT_ONCE // max(1, x_end.size * max(1, round(dt / self.dt))))
+        rows = max(1, _STATES_AT_ONCE // max(1, x_end.size * max(1, round(dt / self.dt))))
         if u.shape[1] <= rows:
             x = self.states(x_end, u, d, dt)
             return x @ self.C.T + self.y0, x[:, -1]

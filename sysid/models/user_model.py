@@ -70,11 +70,11 @@ _REQUIRED = {
 _OPTIONAL = ("disturbances", "limits", "output", "rest", "average", "warmup")
 
 
-class _Table(BaseModel):
+class _ConfigTable(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
-class Input(_Table):
+class Input(_ConfigTable):
     """Something that is moved; ``switch`` marks a pump or valve that is on or off."""
 
     unit: Annotated[str, Field(min_length=1)]
@@ -82,7 +82,7 @@ class Input(_Table):
     switch: bool = False
 
 
-class Output(_Table):
+class Output(_ConfigTable):
     """A sensor: ``sd`` of a bin's mean about the model, ``log_sd`` of its offset from log to log."""
 
     unit: Annotated[str, Field(min_length=1)]
@@ -90,14 +90,14 @@ class Output(_Table):
     log_sd: Annotated[float, Field(ge=0)] = 0.0
 
 
-class Disturbance(_Table):
+class Disturbance(_ConfigTable):
     """Something measured and not moved; ``log_sd`` of its sensor's offset from log to log."""
 
     unit: Annotated[str, Field(min_length=1)]
     log_sd: Annotated[float, Field(ge=0)] = 0.0
 
 
-class _State(_Table):
+class _State(_ConfigTable):
     sd: Annotated[float, Field(gt=0)]
 
 
@@ -157,7 +157,7 @@ class OwnCode:
 
     def fault(self, problem: str, *, line: int | None = None, hint: str | None = None) -> UserError:
         """Return the error that names file and class."""
-        where = _shown(self.file, line)
+        where = _file_words(self.file, line)
         return UserError(f"{self.name} {problem}", file=where or None, hint=hint)
 
     def _call(self, what: str, names: Mapping[str, Any], args: tuple[Any, ...]) -> list[Any]:
@@ -261,7 +261,7 @@ def read_class(kind: Any) -> OwnCode:
         made = kind()
     except Exception as error:  # the user's own code
         problem = f"{kind.__name__} cannot be made without arguments ({type(error).__name__}: {error})"
-        where = _shown(_file_of(kind))
+        where = _file_words(_file_of(kind))
         raise UserError(problem, file=where or None, hint="give its arguments defaults") from error
     return OwnCode(made)
 
@@ -283,7 +283,7 @@ def load_object(file: str | Path, name: str) -> Any:
     except Exception as error:  # the user's own code may raise anything
         frames = [f for f in traceback.extract_tb(error.__traceback__) if f.filename == spec.origin]
         line = error.lineno if isinstance(error, SyntaxError) else frames[-1].lineno if frames else None
-        where = _shown(str(spec.origin), line)
+        where = _file_words(str(spec.origin), line)
         problem = f"fails with {type(error).__name__}: {error}"
         raise UserError(problem, file=where, hint="correct the file") from error
     if not hasattr(module, name):
@@ -299,7 +299,7 @@ def _file_of(kind: type) -> str:
     return str(getattr(module, "__file__", "") or "")
 
 
-def _shown(file: str, line: int | None = None) -> str:
+def _file_words(file: str, line: int | None = None) -> str:
     """Return a file as a line of an error names it: from here on where it is below, with the line."""
     if not file:
         return ""
@@ -398,7 +398,7 @@ def still(code: OwnCode, y: Array, u: Array, d: Array, p: Array, *, sd: Array, s
     limits = [code.limits.get(name, (-np.inf, np.inf)) for name in code.states]
     ends = np.array([*limits, *((ends or (-np.inf, np.inf)) for ends in ranges)], dtype=float)
     low, high = (ends / np.concatenate([scale, wide])[:, None]).T
-    z = np.clip(np.concatenate([_guess(code, y) / scale, u / wide]), low, high)
+    z = np.clip(np.concatenate([_first_state_guess(code, y) / scale, u / wide]), low, high)
     if not np.isfinite(residuals(z)).all():
         return np.full(n_x, np.nan)
     from scipy.optimize import least_squares  # a class with a rest of its own needs none
@@ -406,7 +406,7 @@ def still(code: OwnCode, y: Array, u: Array, d: Array, p: Array, *, sd: Array, s
     return np.asarray(least_squares(residuals, z, bounds=(low, high)).x[:n_x] * scale)
 
 
-def _guess(code: OwnCode, y: Array) -> Array:
+def _first_state_guess(code: OwnCode, y: Array) -> Array:
     """Return a first guess: the reading of the output of a state's name, else the mean of all readings."""
     mean, read = float(np.nanmean(y)), dict(zip(code.outputs, y.tolist()))
     guess = [read.get(name, mean) for name in code.states]
@@ -546,7 +546,7 @@ class OwnModel(Described):
         return np.array([self.sensor_sd[name] for name in self.outputs])
 
     def _pieces(self, dt: float) -> int:
-        """Return into how many Runge-Kutta steps dt is cut."""
+        """Return the number of Runge-Kutta steps of dt."""
         return max(1, int(np.ceil(self.pieces * dt / self.dt - 1e-9)))
 
     def _agree(self, runs: Sequence[tuple[str, Array]], finer: Sequence[tuple[str, Array]]) -> bool:

@@ -56,7 +56,7 @@ class Identifiability:
     condition: float  # of the scaled Hessian
     spectrum: list[float]  # its eigenvalues
     weakest: str  # the direction of the smallest, in words
-    flat: list[str]  # all directions that the logs hardly determine, in words
+    flat: list[str]  # all directions that the logs barely determine, in words
     identifiable: bool  # False: a direction changes no output at all
     prior_only: list[str]  # names
     on_bound: dict[str, str]  # name -> "low" or "high"

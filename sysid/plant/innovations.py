@@ -117,7 +117,7 @@ class _Filter:
         return np.array(gains), np.array(spreads)
 
     def squares(self, stretches: Sequence[Stretch], gains: Array, spreads: Array) -> tuple[Array, int]:
-        """Return the sum of e' S^-1 e by gain, and of how many innovations."""
+        """Return the sum of e' S^-1 e by gain, and the number of innovations."""
         model, n_x, inverse = self.plant.model, self.plant.model.n_x, np.linalg.inv(spreads)
         squares, count = np.zeros(len(gains)), 0
         for stretch in stretches:
@@ -134,11 +134,11 @@ class _Filter:
                     z = z + np.einsum("bij,bj->bi", gains, e)
                 u = np.repeat(stretch.u[k][None], len(z), axis=0)
                 u[:, self.graded] += z[:, n_x:]
-                z = np.hstack([_step(self.plant, z[:, :n_x], u, stretch.d[k]), z[:, n_x:]])
+                z = np.hstack([_states_after_step(self.plant, z[:, :n_x], u, stretch.d[k]), z[:, n_x:]])
         return squares, count
 
 
-def _step(plant: PlantData, x: Array, u: Array, d: Array) -> Array:
+def _states_after_step(plant: PlantData, x: Array, u: Array, d: Array) -> Array:
     """Return states (B, n_x) a step later under inputs (B, n_u)."""
     disturbance = np.ascontiguousarray(np.broadcast_to(d, (len(x), 1, d.size)))
     numbers = np.repeat(plant.p[None], len(x), axis=0)
@@ -161,7 +161,7 @@ def _filter_of(plant: PlantData, stretches: Sequence[Stretch], graded: list[int]
     moves = np.concatenate([np.zeros((1, n_x + n_w)), np.diag(tried)])
     pushed = np.repeat(u0[None], len(moves), axis=0)
     pushed[:, graded] += moves[:, n_x:]
-    after = _step(plant, x0 + moves[:, :n_x], pushed, d0)
+    after = _states_after_step(plant, x0 + moves[:, :n_x], pushed, d0)
     into = (after[1:] - after[0]).T / tried  # (n_x, n_x + n_w)
     if not np.isfinite(into).all():
         return None
@@ -188,13 +188,13 @@ def _most_likely(
     best = int(np.nanargmin(np.where(np.isfinite(cost), cost, np.nan)))
     by_state, by_input = divmod(best, len(_INPUT_RATIOS))
     table = cost.reshape(len(_STATE_RATIOS), len(_INPUT_RATIOS))
-    q = _between(_STATE_RATIOS, table[:, by_input], by_state)
-    b = _between(_INPUT_RATIOS, table[by_state], by_input)
+    q = _parabola_minimum(_STATE_RATIOS, table[:, by_input], by_state)
+    b = _parabola_minimum(_INPUT_RATIOS, table[by_state], by_input)
     times = float(np.sqrt(scale[best]))
     return times * q * float(np.sqrt(np.mean(sd**2))), times * sd, times * b * filtered.input_range
 
 
-def _between(ratios: Sequence[float], cost: Array, best: int) -> float:
+def _parabola_minimum(ratios: Sequence[float], cost: Array, best: int) -> float:
     """Return the ratio at the least of the parabola through the best one and its neighbours."""
     ends = cost[max(best - 1, 0) : best + 2]
     if best < 2 or len(ends) < 3 or not np.isfinite(ends).all():

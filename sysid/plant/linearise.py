@@ -127,7 +127,7 @@ def linearise_plant(
     ([40.1, 34.5], [[0.49, 0.09], [0.12, 0.38]])
     """
     u, d = operating_point(plant, inputs, disturbances)
-    x = _settled(plant, u, d) if state is None else np.asarray(state, dtype=float)
+    x = _steady_state(plant, u, d) if state is None else np.asarray(state, dtype=float)
     if x.shape != (plant.model.n_x,):
         raise UserError(f"the state has {x.size} numbers", hint=f"give {plant.model.n_x}")
     moved = [k for k, name in enumerate(plant.inputs) if name not in plant.model.switches]
@@ -202,7 +202,7 @@ def _next(plant: PlantData, x: Array, u: Array, d: Array) -> Array:
     return np.asarray(end)
 
 
-def _settled(plant: PlantData, u: Array, d: Array) -> Array:
+def _steady_state(plant: PlantData, u: Array, d: Array) -> Array:
     """Return the state in which the plant stays under u and d, by Newton's method."""
     start = np.full(len(plant.outputs), ROOM)
     x = np.asarray(plant.model.rest(start, u, d, plant.p), dtype=float)
@@ -224,7 +224,7 @@ def _settled(plant: PlantData, u: Array, d: Array) -> Array:
     )
 
 
-def _differences(function: Callable[[Array], Array], at: Array, columns: Sequence[int]) -> Array:
+def _central_differences(function: Callable[[Array], Array], at: Array, columns: Sequence[int]) -> Array:
     """Return d function / d at[columns], (n, n_column), from one batch of central differences."""
     size = LINEAR.difference_step * np.maximum(1.0, np.abs(at[list(columns)]))
     ahead = np.zeros((len(columns), at.size))
@@ -234,7 +234,7 @@ def _differences(function: Callable[[Array], Array], at: Array, columns: Sequenc
     return np.asarray(((values[:n] - values[n:]) / (2 * size[:, None])).T)
 
 
-def _matrices(
+def _jacobians(
     function: Callable[[Array, Array, Array], Array], x: Array, u: Array, d: Array, moved: Sequence[int]
 ) -> tuple[Array, Array]:
     """Return derivatives of function(x, u, d) by x, and by the moved inputs and the disturbances."""
@@ -246,16 +246,16 @@ def _matrices(
     def joined(z: Array) -> Array:
         return function(z[:, :n_x], z[:, n_x : n_x + n_u], z[:, n_x + n_u :])
 
-    both = _differences(joined, point, columns)
+    both = _central_differences(joined, point, columns)
     return both[:, :n_x], both[:, n_x:]
 
 
 def _discrete(plant: PlantData, x: Array, u: Array, d: Array, moved: Sequence[int]) -> tuple[Array, Array]:
-    return _matrices(lambda *w: _next(plant, *(np.ascontiguousarray(v) for v in w)), x, u, d, moved)
+    return _jacobians(lambda *w: _next(plant, *(np.ascontiguousarray(v) for v in w)), x, u, d, moved)
 
 
 def steps_in(plant: PlantData, dt: float) -> int:
-    """Return how many of the plant's steps ``dt`` [s] is, or refuse it."""
+    """Return ``dt`` [s] in steps of the plant, or refuse it."""
     n = round(dt / plant.dt)
     if n < 1 or abs(n * plant.dt - dt) > 1e-6 * dt:
         raise UserError(
@@ -277,7 +277,7 @@ def _continuous(
 ) -> tuple[Array, Array]:
     rate = _rate(plant)
     if rate is not None:
-        return _matrices(rate, x, u, d, moved)
+        return _jacobians(rate, x, u, d, moved)
     poles = np.linalg.eigvals(A)
     if np.abs(poles).min() < LINEAR.delay or np.any((np.abs(poles.imag) < 1e-9) & (poles.real <= 0)):
         raise UserError(

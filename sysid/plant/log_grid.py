@@ -337,7 +337,7 @@ def signals(
 
 
 def moved_before(log: Log) -> str:
-    """Return a mend, to be added to another one, of a log with a drive by name that was likely moved just
+    """Return a repair, to be added to another one, of a log with a drive by name that was likely moved just
     before its first row: its readings alone change."""
     for name, item in log.items():
         level = float(column(log, str(name))[0])
@@ -548,7 +548,7 @@ def match_logs(model: Signals, logs: Logs, *, keep_others: bool = False) -> tupl
                 f"{name}: no such column, taken as 0{'' if unit == '1' else f' {unit}'} throughout"
             ] = None
     matched = list(logs)
-    largest = {name: _largest([column(log, name) for log in logs]) for name in role_of}
+    largest = {name: _largest_magnitude([column(log, name) for log in logs]) for name in role_of}
     for index, log in enumerate(logs):
         changed = {}
         for name in role_of:
@@ -590,5 +590,5 @@ def _converted(model: Signals, name: str, unit: str, largest: float, log: str) -
     return SHARES[want] / SHARES[unit], f"{name}: converted from {unit} to {want}"
 
 
-def _largest(columns: Sequence[Array]) -> float:
+def _largest_magnitude(columns: Sequence[Array]) -> float:
     return max((float(np.nanmax(np.abs(values), initial=0.0)) for values in columns), default=0.0)

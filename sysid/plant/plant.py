@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 WARMUP = 5.0  # s of readings that set the state, where nothing else is asked for
 _SHOWN = 10  # free parameters where a plant shows itself
-_INSIDE = 64  # so many samples stand in the plant's own file
+_SAMPLES_IN_FILE = 64  # so many samples stand in the plant's own file
 #: By ``kind``, where a model's class is; a file can name no other code.
 _MODELS = {
     "network": ("network", "NetworkModel"),
@@ -215,7 +215,7 @@ class Plant(Shown, plant_data.PlantData):
     def save(self, path: str | Path) -> Path:
         """Write the plant as JSON, with more than a few samples beside it as ``.nc``, and return the path."""
         target, content = Path(path), plant_data.plain_content(self)
-        if self.samples is not None and len(self.samples) <= _INSIDE:
+        if self.samples is not None and len(self.samples) <= _SAMPLES_IN_FILE:
             content["draws"] = np.asarray(self.samples).tolist()
         elif self.samples is not None:
             beside = target.with_suffix(".nc")

@@ -226,7 +226,7 @@ def plain_content(plant: PlantData) -> dict[str, Any]:
     content |= {"free": list(plant.free), "logs": list(plant.logs)}
     content["scores"] = plant.scores.to_json()
     content["fitted_to"] = [asdict(log) for log in plant.fitted_to]
-    content |= {name: _listed(getattr(plant, name)) for name in ("bounds", "valid")}
+    content |= {name: _ranges_to_json(getattr(plant, name)) for name in ("bounds", "valid")}
     content["covariance"] = None if plant.covariance is None else np.asarray(plant.covariance).tolist()
     content["samples"] = None
     if plant.inputs_end_at_row:  # absent otherwise: files of version 0.1.0 have no such key
@@ -244,19 +244,19 @@ def fields_of(content: Mapping[str, Any]) -> dict[str, Any]:
     """Return the fields of a plant from :func:`plain_content`, but for model and samples."""
     with whole_plant():
         return {
-            "values": _numbers(content, "values"),
+            "values": _finite_numbers(content, "values"),
             "dt": number_within(content, "dt", *STEP_RANGE),
             "units": _texts(content["units"]),
             "free": tuple(str(name) for name in content["free"]),
             "scales": _texts(content["scales"]),
-            "bounds": _ranges(content["bounds"]),
+            "bounds": _ranges_of_json(content["bounds"]),
             "covariance": _covariance(content),
-            "noise": _numbers(content, "noise", 0.0, _MOST_ERROR),
-            "offsets": _numbers(content, "offsets", -_MOST_ERROR, _MOST_ERROR),
-            "nuisance": _numbers(content, "nuisance", 0.0, _MOST_ERROR),
+            "noise": _finite_numbers(content, "noise", 0.0, _MOST_ERROR),
+            "offsets": _finite_numbers(content, "offsets", -_MOST_ERROR, _MOST_ERROR),
+            "nuisance": _finite_numbers(content, "nuisance", 0.0, _MOST_ERROR),
             "reference": content["reference"],
             "valid": _valid(content["valid"]),
-            "nominal": _numbers(content, "nominal") if "nominal" in content else {},
+            "nominal": _finite_numbers(content, "nominal") if "nominal" in content else {},
             "logs": tuple(str(name) for name in content["logs"]),
             "fitted_to": tuple(_fit_log(log) for log in content.get("fitted_to", ())),
             "scores": PlantScores.from_json(content["scores"]),
@@ -325,7 +325,7 @@ def _texts(content: Mapping[str, Any]) -> dict[str, str]:
     return {str(name): str(value) for name, value in content.items()}
 
 
-def _numbers(
+def _finite_numbers(
     content: Mapping[str, Any], key: str, low: float = -LARGEST, high: float = LARGEST
 ) -> dict[str, float]:
     return {str(name): number_within(content[key], name, low, high) for name in content[key]}
@@ -341,19 +341,19 @@ def _covariance(content: Mapping[str, Any]) -> Array | None:
 
 
 def _valid(content: Mapping[str, Sequence[float | None]]) -> dict[str, tuple[float, float]]:
-    ranges = _ranges(content)
+    ranges = _ranges_of_json(content)
     for name, (low, high) in ranges.items():
         if not (low <= high and all(abs(end) <= _MOST_READING or np.isinf(end) for end in (low, high))):
             raise ValueError(f"valid of {name} is {low:g} to {high:g}")
     return ranges
 
 
-def _listed(ranges: Mapping[str, tuple[float, float]]) -> dict[str, list[float | None]]:
+def _ranges_to_json(ranges: Mapping[str, tuple[float, float]]) -> dict[str, list[float | None]]:
     """Return ranges as JSON has them; an open end is null, for JSON has no infinity."""
     return {name: [end if np.isfinite(end) else None for end in ends] for name, ends in ranges.items()}
 
 
-def _ranges(content: Mapping[str, Sequence[float | None]]) -> dict[str, tuple[float, float]]:
+def _ranges_of_json(content: Mapping[str, Sequence[float | None]]) -> dict[str, tuple[float, float]]:
     return {
         str(name): (-np.inf if low is None else float(low), np.inf if high is None else float(high))
         for name, (low, high) in content.items()

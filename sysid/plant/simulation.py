@@ -100,7 +100,7 @@ def predict(
     for index, (stretch, start) in enumerate(zip(stretches, starts)):
         d = stretch.d - start.d_offset
         if index == 0:
-            x0 = _begin(model, p, stretch, start)
+            x0 = _first_state(model, p, stretch, start)
         else:
             u_gap, d_gap, dt_gap = _through_gap(stretches[index - 1], stretch, start, [start.change], dt)
             x0 = model.rollout(x_end, u_gap, d_gap, p, dt_gap)[1] + start.shift
@@ -109,7 +109,7 @@ def predict(
     return out
 
 
-def _begin(model: Model, p: Array, stretch: Stretch, start: Start) -> Array:
+def _first_state(model: Model, p: Array, stretch: Stretch, start: Start) -> Array:
     if start.level is not None or len(p) == 1:
         return np.repeat(start.x0[None], len(p), axis=0)
     y, u, d = _about_start(stretch, start)
@@ -162,7 +162,7 @@ def _first_reading(stretch: Stretch, seconds: float = 2.0) -> Array:
 
 
 def _first_start(plant: PlantData, p: Array, stretch: Stretch, warmup: float) -> Start:
-    level = _level(plant, stretch, warmup)
+    level = _start_level(plant, stretch, warmup)
     y_offset = np.array([plant.offsets.get(name, 0.0) for name in plant.outputs])
     d_offset = np.array([plant.offsets.get(name, 0.0) for name in plant.disturbances])
     zero = np.zeros(plant.model.n_x)
@@ -183,7 +183,7 @@ def _first_start(plant: PlantData, p: Array, stretch: Stretch, warmup: float) ->
     return Start(x0, zero, y_offset, d_offset, T0, 0.0, f"started at rest at {T0:.2f} degC")
 
 
-def _level(plant: PlantData, stretch: Stretch, warmup: float) -> _LevelStart | None:
+def _start_level(plant: PlantData, stretch: Stretch, warmup: float) -> _LevelStart | None:
     """Return how a log starts at rest, None where it does not."""
     if plant.reference is None or not plant.disturbances:
         return None
@@ -210,7 +210,9 @@ def _corrected(
     for _ in range(2):
         residual, response = _warm(plant, p, stretch, start, start.x0[None], warmup)
         blocks = [response @ root]
-        blocks.append(np.concatenate([np.diag(free / noise) for noise in _noise(plant, stretch, warmup)]))
+        blocks.append(
+            np.concatenate([np.diag(free / noise) for noise in _reading_sd(plant, stretch, warmup)])
+        )
         is_read = np.isfinite(residual[0])
         A, r = np.hstack(blocks)[is_read], residual[0][is_read]
         # the prior is about the first guess, so what was moved before counts
@@ -285,7 +287,7 @@ def _warm(
     around = np.vstack([x0, x0[0] + np.diag(size)])
     u, d = stretch.u[None, :n], stretch.d[None, :n] - start.d_offset
     run = plant.model.rollout(around, u, d, p[None], plant.dt)[0]
-    sd = _noise(plant, stretch, warmup)[0]
+    sd = _reading_sd(plant, stretch, warmup)[0]
     residual = ((y - run[: len(x0)]) / sd).reshape(len(x0), -1)
     response = ((run[len(x0) :] - run[0]) / sd).reshape(len(size), -1).T / size
     return residual, response
@@ -304,7 +306,7 @@ def _binned(stretch: Stretch, dt: float, n: int, warmup: float) -> Array:
     return out
 
 
-def _noise(plant: PlantData, stretch: Stretch, warmup: float) -> Array:
+def _reading_sd(plant: PlantData, stretch: Stretch, warmup: float) -> Array:
     """Return the sd (n + 1, n_y) to give each bin of the warm-up: together one reading per 10 s."""
     n = min(len(stretch.u), max(1, int(np.ceil(warmup / plant.dt - 1e-9))))
     sd = np.array([max(plant.noise.get(name, 0.1), START.least_noise) for name in plant.outputs])

@@ -20,7 +20,7 @@ After a gap of more than 10 s the input is unknown: the run starts afresh from i
 60 s are not scored, and the figure with the last row held through the gap is given with it.
 
 **Warm-up.**  A network has few states, and begins at rest where its sensors agree: 5 s.  A black box of one
-or two logs was scored with what stands for rest in a part of a log, fifty rows, and its slowest state needs a
+or two logs was scored with the steady start of a part of a log, fifty rows, and its slowest state needs a
 tenth of its time constant to show; no run spends more than a tenth of its log on that.
 """
 
@@ -94,7 +94,7 @@ class FreeRun:
     stated: Band | None = None  # the 90 % band, where it is known already
 
     def band(self, level: float = 0.9) -> Band:
-        """Return the band about the run that a new run's readings should lie in, and how many of these do;
+        """Return the band about the run that a new run's readings should lie in, and the share that does;
         see :func:`thermogrip.sysid.validation.prediction_bands.free_run_band`."""
         if self.stated is not None and level == self.stated.level:
             return self.stated
@@ -168,7 +168,7 @@ def free_run(
     if gaps(log):
         through = plant.simulate(log, warmup=warmup, score_from=score_from, gaps="hold")
         held = _scores(plant, log, _beside(plant, log, through, average))
-    tested = _tested(plant, log, simulated, warmup) if tests else _NOT_TESTED
+    tested = _test_residual(plant, log, simulated, warmup) if tests else _NOT_TESTED
     run = FreeRun(
         log=simulated,
         scores=scores,
@@ -235,7 +235,7 @@ class _Tested:
 _NOT_TESTED = _Tested(ResidualCorrelations({}, {}))
 
 
-def _tested(
+def _test_residual(
     plant: Plant,
     log: Log,
     simulated: Log,

@@ -9,7 +9,6 @@ freely from the log's start, where its state is known.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -21,23 +20,7 @@ from thermogrip.sysid.plant.fit_record import HELD_OUT_SHARE, TAIL
 from thermogrip.sysid.plant.plant import Plant
 from thermogrip.sysid.validation.free_run import FreeRun, free_run, no_input_baseline, warm_up_of
 from thermogrip.sysid.validation.prediction_bands import check_ensemble
-from thermogrip.sysid.validation.verdict import network_name
-
-
-@dataclass(frozen=True)
-class Row:
-    """One line of the table: one model, one log, one output."""
-
-    model: str  # kind of the candidate
-    structure: str  # its orders, delays or network
-    log: str  # what was simulated
-    output: str
-    rmse: float  # of the free run
-    fit_percent: float
-    unit: str  # of the output
-    n: int  # scored samples
-    no_input_rmse: float  # the same of the no-input baseline
-    held_out: bool  # whether the model was fitted without these rows
+from thermogrip.sysid.validation.verdict import Row, network_name
 
 
 class Held(NamedTuple):

@@ -6,7 +6,7 @@ and `validate` are made of it.  It has two parts.
 
 *Parts held out.*  Each of n parts (blocks of a log and its last part, or whole logs) has an error e_f.  The
 error of one part more lies about them as they do about each other: ln e^2 is Student's t about their mean,
-with the scale s sqrt(1 + 1/n).  A few numbers hardly show a spread, so s^2 is taken with a prior of
+with the scale s sqrt(1 + 1/n).  A few numbers barely show a spread, so s^2 is taken with a prior of
 :data:`PRIOR_PARTS` parts that differ by :data:`PRIOR_SPREAD`.  The median is the geometric mean of the e_f:
 one part that is unlike all others (a tank that overflows once) makes a band of rms errors three times too
 wide everywhere else.
@@ -76,7 +76,7 @@ PRIOR_PARTS = 4  # which that counts as: as many as one log has blocks
 MEDIAN = NormalDist().inv_cdf(0.75)  # of the size of a normal number, in standard deviations
 _RANKS = 199  # quantiles of each part, of which their sum is made
 _DIVERGED = 1e6  # of an output's spread
-_SMALL = 0.05  # change of the inputs by which their effect is found
+_INPUT_CHANGE = 0.05  # change of the inputs by which their effect is found
 _LATER = (1 / 30, 1 / 10, 1 / 3)  # of a run: lags of an effect that comes later; half a decade apart
 _UNLIKE = 0.1  # of the run's error: what a run unlike the fit adds, from which it is reported
 
@@ -90,7 +90,7 @@ class Band:
     inside: dict[str, float]  # share of the scored readings that it covers
     draws: int  # of the parameters; 0: the plant has none, the band is the plant's own error alone
     own_error: str = "the error of the fit"  # how the plant's own error was estimated, in words
-    expected: dict[str, float] = field(default_factory=dict)  # rms error of the run that it stands for
+    expected: dict[str, float] = field(default_factory=dict)  # rms error of the run that it describes
     likely: dict[str, tuple[float, float]] = field(default_factory=dict)  # which 9 of 10 runs lie within
 
 
@@ -245,8 +245,8 @@ def effect_of_run(plant: Plant, error: Array, log: Log) -> InputEffect | None:
     squares to the errors (n, n_y) of the free run, NaN where it is not scored, in the spread of each output.
     None where that is within two standard deviations of what differs from run to run, or leaves half of the
     squared error.  A gain alone would be taken for what a mass that soaks for longer than the fit does."""
-    effects = effect_of_inputs(plant, [log], _SMALL)
-    at_once = np.array([effects[name] for name in plant.outputs]).T / _SMALL
+    effects = effect_of_inputs(plant, [log], _INPUT_CHANGE)
+    at_once = np.array([effects[name] for name in plant.outputs]).T / _INPUT_CHANGE
     spread = np.array([np.nanstd(column(log, name)) for name in plant.outputs])
     spread = np.where(spread > 0, spread, 1.0)
     with np.errstate(over="ignore", invalid="ignore"):  # a run that diverged has no gain

@@ -140,7 +140,7 @@ class ScoreTestSettings:
     runs_at_once: int = 1_000_000  # outputs of the runs from starts at a time, 8 MB
 
 
-_SETTINGS = ScoreTestSettings()
+_SCORE_TEST = ScoreTestSettings()
 
 
 @dataclass(frozen=True)
@@ -179,7 +179,7 @@ def residual_correlations(
         return ResidualCorrelations({}, {})
     block, width = _blocks_of_rows(plant, stretches)
     read = np.isfinite(residual)
-    if min(len(np.unique(block[rows])) for rows in read.T) < _SETTINGS.fewest_blocks:
+    if min(len(np.unique(block[rows])) for rows in read.T) < _SCORE_TEST.fewest_blocks:
         return ResidualCorrelations({}, {})
     drawn = _draw_changes(plant, stretches, run, warmup)
     starts = _start_changes(plant, stretches, warmup, block, read)
@@ -217,15 +217,15 @@ def _residual(read: Array, run: Array, scored: Mask) -> Array | None:
 
 def _blocks_of_rows(plant: Plant, stretches: Sequence[Stretch]) -> tuple[NDArray[np.int_], float]:
     """Return the number of each row's block, and the blocks' width [s]; stretches are so many numbers apart
-    that their errors are hardly correlated."""
+    that their errors are barely correlated."""
     steps = [float(np.median(np.diff(s.time))) for s in stretches if s.time.size > 1]
     step = max(plant.dt, *steps, 1e-9)
     seconds = sum(float(stretch.time[-1]) for stretch in stretches)
-    width = step * max(1, int(np.ceil(seconds / step / _SETTINGS.most_blocks)))
+    width = step * max(1, int(np.ceil(seconds / step / _SCORE_TEST.most_blocks)))
     block, first = [], 0
     for stretch in stretches:
         block.append(first + np.floor(stretch.time / width + 1e-9).astype(int))
-        first = int(block[-1][-1]) + _SETTINGS.most_blocks
+        first = int(block[-1][-1]) + _SCORE_TEST.most_blocks
     return np.concatenate(block), width
 
 
@@ -240,7 +240,7 @@ def _block_means(values: Array, block: NDArray[np.int_], read: Mask) -> Array:
 def _draw_changes(plant: Plant, stretches: Sequence[Stretch], run: Array, warmup: float) -> Array:
     """Return the changes (rows, n_y, n_draw) of draws of the parameters, one sd all together."""
     changes = []
-    for k in range(1, _SETTINGS.draws + 1 if plant.uncertain else 1):
+    for k in range(1, _SCORE_TEST.draws + 1 if plant.uncertain else 1):
         change = plant.draw(k).over(stretches, warmup)[0] - run
         if np.isfinite(change).all():  # a draw that diverges has no information on small changes
             changes.append(change)
@@ -260,7 +260,7 @@ def _start_changes(
     columns = [np.zeros((len(numbers), len(stretches) * n_x)) for numbers in blocks]
     for index, (stretch, start) in enumerate(zip(stretches, find_starts(plant, plant.p, stretches, warmup))):
         u, d = stretch.u[None], (stretch.d - start.d_offset)[None]
-        together = max(1, _SETTINGS.runs_at_once // (len(stretch.u) * n_y))
+        together = max(1, _SCORE_TEST.runs_at_once // (len(stretch.u) * n_y))
         for begin in range(0, n_x, together):
             # a tenth of it: a state near a limit must not cross it
             moved = start.x0 + 0.1 * directions[begin : begin + together]
@@ -279,7 +279,7 @@ def _start_changes(
 def _modes(starts: Array) -> Array:
     """Return the directions (n, k) in which columns (n, q) of starts move the blocks at all."""
     modes = starts @ np.linalg.eigh(starts.T @ starts)[1]
-    return np.asarray(modes[:, np.abs(modes).max(axis=0, initial=0.0) > _SETTINGS.least_start])
+    return np.asarray(modes[:, np.abs(modes).max(axis=0, initial=0.0) > _SCORE_TEST.least_start])
 
 
 def _signals(plant: Plant, stretches: Sequence[Stretch], run: Array, width: float) -> dict[str, Array]:
@@ -294,7 +294,7 @@ def _signals(plant: Plant, stretches: Sequence[Stretch], run: Array, width: floa
         signals[name + SQUARED] = [
             np.interp(plant.dt * np.arange(len(s.u)), s.time, squares[s.rows]) for s in stretches
         ]
-    keeps = [np.exp(-plant.dt / (lag * width)) for lag in _SETTINGS.input_lags]
+    keeps = [np.exp(-plant.dt / (lag * width)) for lag in _SCORE_TEST.input_lags]
     out = {}
     for name, values in signals.items():
         rows = []
@@ -318,9 +318,9 @@ class _Null:
     @classmethod
     def of(cls, *, block: NDArray[np.int_], residual: Array, starts: Array, drawn: Array) -> _Null:
         """Learn the noise of a residual."""
-        offset = np.full((len(residual), 1), _SETTINGS.offset_sd)
+        offset = np.full((len(residual), 1), _SCORE_TEST.offset_sd)
         columns = np.hstack([offset, starts, drawn])
-        columns /= np.maximum(1.0, np.abs(columns).max(axis=0) / _SETTINGS.offset_sd)
+        columns /= np.maximum(1.0, np.abs(columns).max(axis=0) / _SCORE_TEST.offset_sd)
         noise = learn_noise(block, residual, columns)
         return cls(
             residual, columns, columns[:, 1 : 1 + starts.shape[1]], np.linalg.inv(noise + columns @ columns.T)
@@ -346,7 +346,7 @@ def learn_noise(block: NDArray[np.int_], residual: Array, columns: Array) -> Arr
     """Return the covariance of w over blocks (n,) that a residual with columns N supports best."""
     lag = np.abs(np.subtract.outer(block, block))
     kernels = [np.eye(len(block))]
-    for s in 1 / np.array(_SETTINGS.noise_taus):
+    for s in 1 / np.array(_SCORE_TEST.noise_taus):
         kernels.append(
             np.where(
                 lag == 0, 2 * (s + np.expm1(-s)) / s**2, (2 * np.sinh(s / 2) / s) ** 2 * np.exp(-s * lag)
@@ -355,7 +355,7 @@ def learn_noise(block: NDArray[np.int_], residual: Array, columns: Array) -> Arr
     right = columns @ columns.T + 1e-6 * np.eye(len(block))
 
     def variances(z: Array) -> Array:
-        return np.asarray(_SETTINGS.noise_sd**2 * np.exp(2 * _SETTINGS.noise_log_sd * z))
+        return np.asarray(_SCORE_TEST.noise_sd**2 * np.exp(2 * _SCORE_TEST.noise_log_sd * z))
 
     def cost(z: Array) -> tuple[float, Array]:
         """Return -ln of likelihood and prior, and its slopes."""
@@ -364,7 +364,7 @@ def learn_noise(block: NDArray[np.int_], residual: Array, columns: Array) -> Arr
         inverse, (_, log_det) = np.linalg.inv(V), np.linalg.slogdet(V)
         explained = inverse @ residual
         slope = [np.sum(inverse * kernel) - explained @ kernel @ explained for kernel in kernels]
-        slopes = _SETTINGS.noise_log_sd * sizes * np.array(slope) + z
+        slopes = _SCORE_TEST.noise_log_sd * sizes * np.array(slope) + z
         return 0.5 * float(log_det + residual @ explained + z @ z), slopes
 
     start = np.zeros(len(kernels))

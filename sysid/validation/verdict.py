@@ -44,7 +44,6 @@ from thermogrip.sysid.plant.fit_record import RUN_GAIN_SD, SEVERAL
 if TYPE_CHECKING:
     from thermogrip.sysid.data.data_quality import DataCheck
     from thermogrip.sysid.plant.plant import Plant
-    from thermogrip.sysid.validation.held_out import Row
     from thermogrip.sysid.validation.prediction_bands import Band, InputEffect
 
 
@@ -72,6 +71,22 @@ _BECAUSE: dict[Cause, str] = {
 }
 USEFUL = 0.5  # of the no-input error: below it a model is called good
 FAR_FROM_PRIOR = 3.3  # sd: beyond it lies one parameter of a right network in a thousand
+
+
+@dataclass(frozen=True)
+class Row:
+    """One line of the table: one model, one log, one output."""
+
+    model: str  # kind of the candidate
+    structure: str  # its orders, delays or network
+    log: str  # what was simulated
+    output: str
+    rmse: float  # of the free run
+    fit_percent: float
+    unit: str  # of the output
+    n: int  # scored samples
+    no_input_rmse: float  # the same of the no-input baseline
+    held_out: bool  # whether the model was fitted without these rows
 
 
 @dataclass(frozen=True)

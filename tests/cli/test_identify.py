@@ -32,9 +32,8 @@ from thermogrip.sysid.plant.linearise import linearise_plant
 from thermogrip.sysid.plant.log_grid import roles_of
 from thermogrip.sysid.plant.plant import Plant
 from thermogrip.sysid.validation.free_run import Score
-from thermogrip.sysid.validation.held_out import Row
 from thermogrip.sysid.validation.prediction_bands import Band
-from thermogrip.sysid.validation.verdict import Standing, Verdict
+from thermogrip.sysid.validation.verdict import Row, Standing, Verdict
 
 BOARD = plant_from_prior(load_network("tclab"))
 DYNAMICS = plant_dynamics(BOARD, inputs={"q1": 30.0, "q2": 10.0}, draws=9)

@@ -41,7 +41,7 @@ def tank_maker():
 @pytest.fixture(scope="session", autouse=True)
 def _quick_builds():
     """Build C in a third of the time; the tests of whole commands build with the flags of users."""
-    flags = tuple("-O1" if flag == "-O3" else flag for flag in build._FLAGS)
+    flags = tuple("-O1" if flag == "-O3" else flag for flag in build._GCC_FLAGS)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(build, "_FLAGS", flags)
+        patch.setattr(build, "_GCC_FLAGS", flags)
         yield

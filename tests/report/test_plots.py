@@ -40,9 +40,9 @@ from thermogrip.rig import Session
 from thermogrip.sysid import free_run, identify
 from thermogrip.sysid.export.dynamics import Estimate
 from thermogrip.sysid.plant.fit_record import PlantScores
-from thermogrip.sysid.validation.held_out import Row
 from thermogrip.sysid.validation.prediction_bands import Band
 from thermogrip.sysid.validation.residual_tests import Correlation
+from thermogrip.sysid.validation.verdict import Row
 
 # Machado, Oliveira and Fernandes 2009, severity 1, on linear RGB
 EYES = {

@@ -48,8 +48,10 @@ def ran(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Sessions, list[
     out, seen = tmp_path_factory.mktemp("demo"), []
     plant = SimpleNamespace(draw=lambda k: small_plant())
     tuning = SimpleNamespace(controller=Holding())
-    demo._run(out, tuning, plant, SEED + 7, None)
-    sessions = demo._run(out, tuning, plant, SEED, lambda fraction, what: seen.append((fraction, what)))
+    demo._grasp_on_twin(out, tuning, plant, SEED + 7, None)
+    sessions = demo._grasp_on_twin(
+        out, tuning, plant, SEED, lambda fraction, what: seen.append((fraction, what))
+    )
     return out, sessions, seen
 
 

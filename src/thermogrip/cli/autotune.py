@@ -83,7 +83,7 @@ def autotune(
     page = out / "report.html"
     if work.session is not None:
         _write_page(work, page, str(rig.port or rig.twin))
-    head, rows = _table(work)
+    head, rows = _stage_table(work)
     console.table(f"{rig.port or rig.twin}, to {target} degC", head, rows)
     console.say(f"wrote {page if page.exists() else out}")
     console.answer({"verdict": verdict, **work.known, "out": out})
@@ -91,7 +91,7 @@ def autotune(
     return 0 if good else cli.ANSWER_IS_NO
 
 
-def _table(work: Autotune) -> tuple[list[str], list[list[Any]]]:
+def _stage_table(work: Autotune) -> tuple[list[str], list[list[Any]]]:
     """Return the stages: time on the rig until then, and what the loop did."""
     rows = []
     for name, begin, loop in (("first PI", "first", "pi"), ("tuned", "tuned", "checked")):
@@ -112,7 +112,7 @@ def _write_page(work: Autotune, page: Path, rig: str) -> None:
     assert work.session is not None
     assert work.tuning is not None
     assert work.found is not None
-    head, rows = _table(work)
+    head, rows = _stage_table(work)
     table = Table(tuple(head), tuple(map(tuple, rows)), "Time on the rig, and what the loops did there")
     stages = Section("What came of it?", (table,), work.found.verdict, "good" if work.found.good else "warn")
     sections: list[Section] = [

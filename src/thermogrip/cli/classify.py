@@ -400,7 +400,7 @@ def _serve(console: Console, ask: _Question, port: int | None) -> int:
 
 @dataclass(frozen=True)
 class _Question:
-    """What is asked of a classifier about each grasp."""
+    """Options of an answer about each grasp."""
 
     model_dir: Path
     candidates: tuple[str, ...] | None = None
@@ -471,7 +471,7 @@ class Said:
 
 @dataclass(frozen=True)
 class _Effusivity:
-    """What is asked about the effusivity of each grasp."""
+    """Options of the effusivity of each grasp."""
 
     device: GripperModel
     coupling: Coupling | None

@@ -148,7 +148,7 @@ def schedule_for(
         middle, reach = (0.5 * (low + high), 0.5 * (high - low)) if low >= 0 else (0.0, min(-low, high))
         full[name] = middle + reach * column(log, "drive")
     time = np.asarray(log["time"].values, dtype=float)
-    share = _largest(ExperimentForecast(plant, lowest=lowest, highest=highest), full, time.size)
+    share = _largest_interval(ExperimentForecast(plant, lowest=lowest, highest=highest), full, time.size)
     variables = {name: (share * drive, plant.units.get(name, "1"), "input") for name, drive in full.items()}
     variables |= {name: (np.ones(time.size), "1", "input") for name in plant.model.switches}
     return make_log(time, variables, name=f"{kind} schedule"), share
@@ -218,7 +218,9 @@ def _time_constants(plant: Plant, drive: str) -> tuple[float, float]:
     return fast, max(largest.lag, 2 * fast)
 
 
-def _largest(forecast: ExperimentForecast, full: dict[str, NDArray[np.float64]], n_rows: int) -> float:
+def _largest_interval(
+    forecast: ExperimentForecast, full: dict[str, NDArray[np.float64]], n_rows: int
+) -> float:
     """Return the largest share of the drives (n_rows,) at full range whose simulated outputs stay inside."""
     import numpy as np
 

@@ -24,8 +24,13 @@ KINDS: dict[str, dict[str, Any]] = tomllib.loads(
 #: What ``init`` writes.
 TEMPLATES = [kind for kind, about in KINDS.items() if "template" in about]
 TAKES = {place: kind for kind, about in KINDS.items() for place in about.get("places", ())}
-_INSIDE = {"classifier.json": "classifier", "batch.json": "batch", "run.json": "run", "samples.csv": "run"}
-_PARTS = {"log": "samples.csv", "grasps": "grasps.csv"}  # of a run
+_KIND_BY_CONTENT = {
+    "classifier.json": "classifier",
+    "batch.json": "batch",
+    "run.json": "run",
+    "samples.csv": "run",
+}
+_FILES_OF_RUN = {"log": "samples.csv", "grasps": "grasps.csv"}  # of a run
 BOTH = ({"run", "batch"}, {"batch", "grasps"})  # one may be given for the other
 TYPED = "thermogrip.typed"  # key of the words of a verb in what its check is handed
 _HEAD = 1 << 16  # bytes that show what a file is
@@ -34,7 +39,7 @@ _HEAD = 1 << 16  # bytes that show what a file is
 def kind_of(path: str | Path) -> str:
     """Return what a file or folder is, "" where that cannot be told."""
     if os.path.isdir(path):
-        return next((kind for name, kind in _INSIDE.items() if os.path.isfile(Path(path, name))), "")
+        return next((kind for name, kind in _KIND_BY_CONTENT.items() if os.path.isfile(Path(path, name))), "")
     name = str(path).lower()
     openers: dict[str, Any] = {".gz": gzip.open, ".xz": lzma.open}
     try:
@@ -68,14 +73,14 @@ def _kind_of_table(head: bytes) -> str:
 
 def _kind_of_toml(head: bytes) -> str:
     """Return which template a TOML file has most keys of, "" where two have as many."""
-    keys = _keys(head.decode("utf-8", "replace"))
-    shared = {kind: len(keys & _keys(template_text(kind))) for kind in ("spec", "guard")}
+    keys = _toml_keys(head.decode("utf-8", "replace"))
+    shared = {kind: len(keys & _toml_keys(template_text(kind))) for kind in ("spec", "guard")}
     most = max(shared.values())
     alike = [kind for kind, n_keys in shared.items() if n_keys == most]
     return alike[0] if len(alike) == 1 and most > len(keys) / 2 else ""
 
 
-def _keys(text: str) -> set[str]:
+def _toml_keys(text: str) -> set[str]:
     """Return the keys and tables of a TOML file, those that are commented out among them."""
     shown = re.findall(r"(?m)^(?:# )?(?:\[+(\w+)[\].]|(\w+) *= *)", text)
     return {table or key for table, key in shown}
@@ -112,7 +117,7 @@ def check_kind(ctx: Any, path: str, wanted: str) -> None:
     fits = {v: _places(verbs_of.get_command(above, v), actual) for v in verbs_of.list_commands(above)}
     verbs = [name for name, (_, takes) in fits.items() if takes]
     hint = KINDS[actual].get("hint", f"it is for {', '.join(verbs)}")
-    if wanted in _PARTS and os.path.isfile(file_inside := Path(path, _PARTS[wanted])):
+    if wanted in _FILES_OF_RUN and os.path.isfile(file_inside := Path(path, _FILES_OF_RUN[wanted])):
         hint = f"give {file_inside}"
     elif kind_of(folder := Path(path).parent) == wanted:
         hint = f"give {folder}"
@@ -131,7 +136,7 @@ def _places(command: Any, kind: str) -> tuple[list[str], bool]:
     return first + named, bool(takes)
 
 
-def _joined(ctx: Any, word: str) -> str:
+def _hint_of_extra_word(ctx: Any, word: str) -> str:
     """Return the hint for a word that stands behind the value of an option that takes names with commas."""
     lists = {opt for p in ctx.command.params if "," in str(p.metavar) for opt in p.opts}
     for option, first, then in zip(*(ctx.meta[TYPED][k:] for k in range(3))):
@@ -161,7 +166,7 @@ def check_files(ctx: Any) -> None:
     files = [(path, kind) for path, kind in named_files if kind not in named or os.path.isfile(path)]
     files = [(each, kind) for path, kind in files for each in _meant(path, kind)]
     for path, _ in files:
-        check_exists(path, _joined(ctx, path))
+        check_exists(path, _hint_of_extra_word(ctx, path))
     for path, kind in files:
         check_kind(ctx, path, kind)
     for path, kind in named_files:

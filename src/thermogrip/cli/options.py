@@ -122,13 +122,13 @@ def opt(
 
 
 @cache
-def _table() -> dict[str, dict[str, Any]]:
+def _option_table() -> dict[str, dict[str, Any]]:
     return tomllib.loads((resources.files(__package__) / "options.toml").read_text(encoding="utf-8"))
 
 
 def shared(name: str, check: Callable[..., Any] | None = None, **words: str) -> Any:
     """Return the Typer option of ``options.toml``, with a ``callback=`` and words in place of {names}."""
-    about = _table()[name]
+    about = _option_table()[name]
     return typer.Option(name, callback=check, **(about | {"help": about["help"].format(**words)}))
 
 

@@ -106,7 +106,7 @@ class RigOptions:
         return {"port": self.port} if self.twin is None else {"twin": self.twin.name, "draw": self.draw}
 
     def pace(self, show: ShowOptions) -> float | None:
-        """Return how many times as fast as real time a twin runs, None where it runs as fast as it goes."""
+        """Return the factor on real time at which a twin runs, None where it runs as fast as it goes."""
         if self.twin is None or self.speed is not None:
             return None if self.twin is None else self.speed
         return None if show.live is None and show.foxglove is None else WATCHED_SPEED
@@ -280,10 +280,10 @@ def run(
         write_report(report, "A session", lead, session_sections(session, regulator.moves, loaded, rig.name))
     goal = f"to {_said(wanted)} degC" if profile is None else f"along {profile.name}"
     errors = None if profile is None else tracking_error(session.log, loaded.controlled)
-    return _answer(console, session, f"{rig.name}, {goal}", out, errors)
+    return _session_code(console, session, f"{rig.name}, {goal}", out, errors)
 
 
-def _answer(
+def _session_code(
     console: Console, session: Session, title: str, out: Path, errors: tuple[float, float] | None
 ) -> int:
     """Print how a session went (along a profile its rms and largest error [K]); return the exit code."""

@@ -233,7 +233,7 @@ def application(state: State, ask: Callable[[dict[str, Any]], None], *, port: in
             if len(body) > PAGE.most_bytes:
                 return JSONResponse({"refused": "too long"}, 413)
         try:
-            words = _words(body)
+            words = _request_words(body)
         except (ValueError, RecursionError):
             return JSONResponse({"refused": "no JSON object of text"}, 400)
         status, refused = requests.take(request.url.path.lstrip("/"), words)
@@ -244,7 +244,7 @@ def application(state: State, ask: Callable[[dict[str, Any]], None], *, port: in
     return Gate(app, port=port, token=token)
 
 
-def _words(body: bytes) -> dict[str, str]:
+def _request_words(body: bytes) -> dict[str, str]:
     """Return what a request says; ValueError or RecursionError where it is no JSON object of texts."""
     content = parse_json(body.decode())
     if not isinstance(content, dict):
@@ -281,7 +281,7 @@ async def _serve(settings: dict[str, Any], lines: Iterator[bytes], listener: soc
 
         mirror = Mirror(settings["foxglove"], settings["title"], settings["layout"]).take
     server = None if listener is None else _server(state, settings["token"], listener)
-    _answer({"ready": True})
+    _send_to_session({"ready": True})
 
     def take(line: bytes) -> None:
         message = json.loads(line, parse_constant=lambda _: None)  # NaN: the session has no time to look
@@ -314,7 +314,7 @@ async def _serve(settings: dict[str, Any], lines: Iterator[bytes], listener: soc
 def _server(state: State, token: str, listener: socket.socket) -> Server:
     from uvicorn import Config, Server
 
-    app = application(state, _answer, port=listener.getsockname()[1], token=token)
+    app = application(state, _send_to_session, port=listener.getsockname()[1], token=token)
     config = Config(
         app, loop="asyncio", http="h11", ws="none", lifespan="off", log_level="critical", access_log=False,
         server_header=False, proxy_headers=False, timeout_graceful_shutdown=1,
@@ -322,14 +322,14 @@ def _server(state: State, token: str, listener: socket.socket) -> Server:
     return Server(config)
 
 
-def _answer(content: dict[str, Any]) -> None:
+def _send_to_session(content: dict[str, Any]) -> None:
     """Say something to the session; one that is gone hears nothing."""
     with suppress(OSError):
         sys.stdout.write(json.dumps(content) + "\n")
         sys.stdout.flush()
 
 
-def _lines() -> Iterator[bytes]:
+def _stdin_lines() -> Iterator[bytes]:
     """Yield the lines of standard input; unbuffered, for a thread that waits in a buffer holds up the end."""
     unfinished = b""
     while data := os.read(0, 1 << 16):
@@ -341,18 +341,18 @@ def main() -> None:
     """Serve what comes on standard input; its first line has the settings."""
     if hasattr(os, "nice"):
         os.nice(5)  # the session comes first
-    lines = _lines()
+    lines = _stdin_lines()
     settings = json.loads(next(lines))
     listener = None
     try:
         if settings["port"] is not None:
             listener = socket.create_server((HOST, settings["port"]))
-            _answer({"port": listener.getsockname()[1]})
+            _send_to_session({"port": listener.getsockname()[1]})
         asyncio.run(_serve(settings, lines, listener))
     except OSError as error:
-        _answer({"error": os.strerror(error.errno) if error.errno else str(error)})
+        _send_to_session({"error": os.strerror(error.errno) if error.errno else str(error)})
     except RuntimeError as error:  # of Foxglove's server
-        _answer({"error": str(error)})
+        _send_to_session({"error": str(error)})
 
 
 if __name__ == "__main__":

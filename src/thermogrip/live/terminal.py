@@ -71,11 +71,11 @@ def panel(title: str, now: Snapshot | None, *, note: str = "", width: int = 100)
     if now.events and now.trip is None:
         event = now.events[-1]
         lines.append(Text(printable(f"{event.time_s:.1f} s  {event.kind}: {event.text}"), style="dim"))
-    lines += _end(now)
+    lines += _ending(now)
     return Panel(Group(*lines), title=printable(title), title_align="left", border_style=_style(now))
 
 
-def _end(now: Snapshot) -> list[Any]:
+def _ending(now: Snapshot) -> list[Any]:
     """Return how it ended, with what to do after a trip."""
     from rich.text import Text
 

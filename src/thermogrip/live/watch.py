@@ -113,7 +113,7 @@ class Watch:
         self._page: subprocess.Popen[bytes] | None = None
         self._reached = False  # whether the page's process takes what is written
         self._viewers: int | None = None  # who look at the page now; None where nobody has come yet
-        self._view = _Lines(title) if not sys.stderr.isatty() else _Panel(title)
+        self._view = _LineDisplay(title) if not sys.stderr.isatty() else _Panel(title)
 
     @property
     def hooks(self) -> dict[str, Any]:
@@ -264,7 +264,7 @@ class Watch:
             "title": self.title, "what": self._what, "fraction": self._fraction,
             "columns": ["time_s", "phase", "pump", "target", *names],
             "units": ["s", "1", "1", "degC", *units],
-            "rows": [_row(snapshot) for snapshot in taken],
+            "rows": [_page_row(snapshot) for snapshot in taken],
             "now": {} if now is None else _present(now),
             "posterior": _drain(self._posterior),
             "age": time.monotonic() - self._heard,
@@ -349,7 +349,7 @@ class Watch:
         page.stdout.close()
 
 
-class _Lines:
+class _LineDisplay:
     """What is no terminal: one line a second at most."""
 
     def __init__(self, title: str) -> None:
@@ -434,7 +434,7 @@ def _drain(waiting: deque[Any]) -> list[Any]:
     return taken
 
 
-def _row(now: Snapshot) -> list[float | None]:
+def _page_row(now: Snapshot) -> list[float | None]:
     """Return a snapshot as a row of the page's columns."""
     phase = float(PHASES.index(now.phase)) if now.phase else None
     head = [now.time_s, phase, None if now.pump is None else float(now.pump), now.target.get(now.skin)]

@@ -25,13 +25,13 @@ _SCORES: Columns = (
     ("classifier", lambda row: row["classifier"]),
     ("condition", lambda row: row["condition"]),
     ("n", lambda row: _of_tested(row)),
-    ("accuracy", lambda row: _between(row["accuracy"], row["low"], row["high"])),
+    ("accuracy", lambda row: _with_interval(row["accuracy"], row["low"], row["high"])),
     ("caution", lambda row: row["caution"]),
-    ("log loss", lambda row: _between(row["log_loss"], row["log_loss_low"], row["log_loss_high"])),
+    ("log loss", lambda row: _with_interval(row["log_loss"], row["log_loss_low"], row["log_loss_high"])),
     ("by chance", lambda row: f"{row['log_loss_chance']:.2f}"),
     ("by base rates", lambda row: f"{row['log_loss_base']:.2f}"),
-    ("Brier", lambda row: _between(row["brier"], row["brier_low"], row["brier_high"])),
-    ("ECE", lambda row: _between(row["ece"], row["ece_low"], row["ece_high"])),
+    ("Brier", lambda row: _with_interval(row["brier"], row["brier_low"], row["brier_high"])),
+    ("ECE", lambda row: _with_interval(row["ece"], row["ece_low"], row["ece_high"])),
     ("if calibrated", lambda row: f"{row['ece_calibrated']:.3f}"),
     ("fit [s]", lambda row: f"{row['fit_s']:.2f}"),
 )
@@ -184,7 +184,7 @@ def _of_tested(row: Mapping[str, Any]) -> int | str:
     return f"{row['n']}/{row['n_test']}" if row["n_test"] > row["n"] else int(row["n"])
 
 
-def _between(value: float, low: float | None, high: float | None) -> str:
+def _with_interval(value: float, low: float | None, high: float | None) -> str:
     """Return a score with its interval, as narrow as three digits allow, where it has one."""
     if low is None or high is None:
         return f"{value:.3f}"

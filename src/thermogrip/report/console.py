@@ -90,7 +90,7 @@ class Console:
         It never goes back: where work turns out to be longer than was thought, it waits.
         """
         try:
-            yield _lines(printable(title))
+            yield _progress_lines(printable(title))
         finally:
             sys.stderr.write(_anew())
 
@@ -181,7 +181,7 @@ def _anew() -> str:
     return "\r\x1b[K" if sys.stderr.isatty() else ""
 
 
-def _lines(title: str) -> Progress:
+def _progress_lines(title: str) -> Progress:
     """Return a callback that writes how far the work is, with the time left where it is over 10 s."""
     last: list[Any] = [-1, "", 0.0]
     begin, first = time.monotonic(), list[float]()  # work that was begun before goes on at its share

@@ -44,15 +44,15 @@ def tuning_table(tuning: Tuning) -> Cells:
     columns: Columns = (
         ("controller", lambda row: row.controller),
         ("step [degC] or load", _case),
-        ("settles in [s], mean", lambda row: _shown(row.settle_mean_s)),
-        ("worst", lambda row: _shown(row.settle_worst_s)),
-        ("overshoot [K], mean", lambda row: _rounded(row.overshoot_mean)),
-        ("worst", lambda row: _rounded(row.overshoot_worst)),
-        ("bias [K], worst", lambda row: _rounded(row.bias_worst)),
-        ("IAE [K s]", lambda row: _rounded(row.iae_mean)),
-        ("moves", lambda row: _rounded(row.travel_mean)),
-        ("energy [s at full drive]", lambda row: _shown(row.energy_mean_s)),
-        ("minimum time [s]", lambda row: "" if row.load else _shown(row.bound_s)),
+        ("settles in [s], mean", lambda row: _seconds_cell(row.settle_mean_s)),
+        ("worst", lambda row: _seconds_cell(row.settle_worst_s)),
+        ("overshoot [K], mean", lambda row: _rounded_cell(row.overshoot_mean)),
+        ("worst", lambda row: _rounded_cell(row.overshoot_worst)),
+        ("bias [K], worst", lambda row: _rounded_cell(row.bias_worst)),
+        ("IAE [K s]", lambda row: _rounded_cell(row.iae_mean)),
+        ("moves", lambda row: _rounded_cell(row.travel_mean)),
+        ("energy [s at full drive]", lambda row: _seconds_cell(row.energy_mean_s)),
+        ("minimum time [s]", lambda row: "" if row.load else _seconds_cell(row.bound_s)),
     )
     order = list(dict.fromkeys((row.start, row.target, row.load) for row in tuning.rows))
     ordered = sorted(tuning.rows, key=lambda row: order.index((row.start, row.target, row.load)))
@@ -107,7 +107,8 @@ def tuning_section(tuning: Tuning) -> Section:
         Table(*tuning_table(tuning), tuning_caption(tuning)),
         Text(f"{tuning.verdict.capitalize()}. {tuning.finding}"),
         Text(
-            f"Band {_bands(bands_of(tuning.spec, tuning.controller.design.controlled))}. {_unseen(tuning)}; "
+            f"Band {_band_words(bands_of(tuning.spec, tuning.controller.design.controlled))}. "
+            f"{_unseen_words(tuning)}; "
             f"noise, quantum and a sensor offset of {tuning.spec.sensor_offset_degC:g} degC are unknown to "
             f"the controllers. {_before_the_last_column(tuning.spec)}"
         ),
@@ -134,8 +135,8 @@ def loop_section(run: ClosedLoop, design: Design, title: str, *, tone: str = "")
     counts = ", ".join(f"{count} {status}" for status, count in statuses.items())
     chart = closed_loop_chart(run, limits=design.limits, slew_per_s=design.slew_per_s)
     caption = (
-        f"Shaded: the band of \N{PLUS-MINUS SIGN}{_bands(run.band)}; dotted across: settled. Grey: limits of "
-        f"drive and slew. By status: {counts}."
+        f"Shaded: the band of \N{PLUS-MINUS SIGN}{_band_words(run.band)}; dotted across: settled. "
+        f"Grey: limits of drive and slew. By status: {counts}."
     )
     evidence: list[Any] = [Plot(chart, caption)]
     advices = [text for text in dict.fromkeys(run.advice) if text]
@@ -181,7 +182,7 @@ def spec_section(tuning: Tuning) -> Section:
     return Section("What was requested, and the design", evidence, words, shown=0)
 
 
-def _bands(band: float | Mapping[str, float]) -> str:
+def _band_words(band: float | Mapping[str, float]) -> str:
     """Return the half width of the settling band in words, by output where they differ."""
     if not isinstance(band, Mapping):
         return f"{band:g} degC"
@@ -259,18 +260,18 @@ def _before_the_last_column(spec: Spec) -> str:
     )
 
 
-def _unseen(tuning: Tuning) -> str:
+def _unseen_words(tuning: Tuning) -> str:
     if _uncertain(tuning):
         return "The draws of this table were not used in the search"
     return "The plant has no uncertainty, so the table is of the plant itself, under noise of its own"
 
 
-def _shown(value: float | None) -> Any:
+def _seconds_cell(value: float | None) -> Any:
     """Return a number of seconds, in words where there is none."""
     if value is None or np.isnan(value):
         return "does not settle"
     return "never" if np.isinf(value) else round(float(value), 1)
 
 
-def _rounded(value: float | None) -> Any:
+def _rounded_cell(value: float | None) -> Any:
     return None if value is None or not np.isfinite(value) else round(float(value), 3)

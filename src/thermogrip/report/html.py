@@ -102,7 +102,8 @@ class Table:
         """Return (text, right-aligned) for every cell: a number, or its absence among numbers."""
         over = self._over_numbers()
         return [
-            [(short(cell), _number(cell) or number) for cell, number in zip(row, over)] for row in self.rows
+            [(short(cell), _is_number(cell) or number) for cell, number in zip(row, over)]
+            for row in self.rows
         ]
 
     @property
@@ -113,7 +114,7 @@ class Table:
     def _over_numbers(self) -> list[bool]:
         """Return for every column whether it holds numbers, and nothing else where one is missing."""
         columns = [[row[k] for row in self.rows if row[k] is not None] for k in range(len(self.head))]
-        return [any(map(_number, cells)) and all(map(_number, cells)) for cells in columns]
+        return [any(map(_is_number, cells)) and all(map(_is_number, cells)) for cells in columns]
 
 
 @dataclass(frozen=True)
@@ -267,7 +268,7 @@ def _packed(values: Array) -> str:
     return base64.b64encode(np.asarray(with_gaps, dtype="<f4").tobytes()).decode()
 
 
-def _number(cell: Any) -> bool:
+def _is_number(cell: Any) -> bool:
     return isinstance(cell, int | float)
 
 

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from thermogrip.sysid.identification import Identification
     from thermogrip.sysid.plant.plant import Plant
     from thermogrip.sysid.validation import Band, FreeRun
-    from thermogrip.sysid.validation.held_out import Row
+    from thermogrip.sysid.validation.verdict import Row
 
 _BASELINES = (
     "Beside the free run: the best decay without input, the log's mean, and one step from each last "

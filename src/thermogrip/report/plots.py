@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from thermogrip.sysid.export.dynamics import Dynamics, Estimate
     from thermogrip.sysid.greybox import Posterior
     from thermogrip.sysid.validation import Band, FreeRun
-    from thermogrip.sysid.validation.held_out import Row
+    from thermogrip.sysid.validation.verdict import Row
 
 MODEL, TARGET = PALETTE[0], INK
 MEASURED, PREDICTED = "#9dabb9", PALETTE[1]  # a broad line, and a thin one of dashes over it

@@ -74,7 +74,7 @@ def run_demo(
             out, seed, sub_progress(progress, 0.0, 0.6, "identify")
         )
         tuning, checks = _tune(out, plant, seed, workers, sub_progress(progress, 0.6, 0.73, "tune"))
-        sessions = _run(out, tuning, plant, seed, sub_progress(progress, 0.73, 0.76, "run"))
+        sessions = _grasp_on_twin(out, tuning, plant, seed, sub_progress(progress, 0.73, 0.76, "run"))
         share = sub_progress(progress, 0.76, 0.98, "compare")
         if compared is not None and share is not None:
             share(0.0, "train and test")
@@ -149,7 +149,7 @@ def _tune(
     return tuning, review(load_controller(out / "controller.json"))
 
 
-def _run(
+def _grasp_on_twin(
     out: Path, tuning: Tuning, plant: Plant, seed: int, progress: Progress | None
 ) -> list[tuple[str, Session]]:
     """Bring the twin to the grasping temperature and grasp, once for each block."""

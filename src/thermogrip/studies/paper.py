@@ -237,7 +237,7 @@ def repeat_paper(
         progress=sub_progress(progress, 0.5, 0.8, "simulated grasps"),
     )
     copies = run_parallel(
-        _copies,
+        _train_on_copies,
         [(case, examples[case.record], quick, seed) for case in CASES],
         workers,
         sub_progress(progress, 0.8, 1.0, "copies of one grasp"),
@@ -264,7 +264,7 @@ def _simulated(case: Case, seed: int) -> Grasps:
     )
 
 
-def _copies(job: tuple[Case, Grasps, bool, int]) -> dict[str, Any]:
+def _train_on_copies(job: tuple[Case, Grasps, bool, int]) -> dict[str, Any]:
     """Train on copies of the first grasp of each material; test on further copies, and on other grasps."""
     import numpy as np
 

@@ -15,7 +15,7 @@ from thermogrip.classify.estimators.bayes import (
     BayesClassifier,
     FeatureReader,
     Readings,
-    _log_evidence,
+    _log_evidence_of_feature,
     _log_t,
     _usable,
     _weighted_mean,
@@ -184,7 +184,7 @@ def test_evidence_is_that_of_the_grasps_one_after_another() -> None:
     means = np.array([x[at == m].mean(axis=0) for m in range(3)])
     within = (x - means[at]).T @ (x - means[at])
     priors = [(0.5, 0.1), (4.0, 0.02), (30.0, 2.0)]
-    got = np.diff([_log_evidence(within, means, counts, *prior) for prior in priors])
+    got = np.diff([_log_evidence_of_feature(within, means, counts, *prior) for prior in priors])
     np.testing.assert_allclose(got, np.diff([in_turn(*prior) for prior in priors]))
 
 
@@ -355,7 +355,7 @@ def test_the_bayesian_predictive_is_the_t_distribution_of_its_formula(three: Gra
     np.testing.assert_allclose(model.means_, own * 8 / counts, atol=1e-9)
     rest = z - np.repeat(own, 8, axis=0)
     tried = {
-        (extra, kappa): _log_evidence(rest.T @ rest, own, np.full(3, 8.0), extra, kappa)
+        (extra, kappa): _log_evidence_of_feature(rest.T @ rest, own, np.full(3, 8.0), extra, kappa)
         for extra in np.geomspace(0.5, 200, 25)
         for kappa in np.geomspace(0.001, 30, 16)
     }

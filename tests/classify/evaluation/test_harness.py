@@ -258,7 +258,7 @@ def test_a_row_is_what_was_said_of_one_grasp(three: Grasps) -> None:
     test = pick(three, [0, 9, 17])
     p = np.array([[0.2, 0.5, 0.3], [0.1, 0.6, 0.3], [0.7, 0.2, 0.1]])
     names, unknown = ("copper", "iron", "tin"), np.array([0.4, np.nan, 0.1])
-    rows = harness._rows(test, np.array(["u", "v", "w"]), p, unknown, names)
+    rows = harness._fold_rows(test, np.array(["u", "v", "w"]), p, unknown, names)
     head = {"candidates": 3, "p_copper": 0.2, "p_iron": 0.5, "p_tin": 0.3}
     assert rows[0] == {
         "grasp_id": "u", "material": "copper", "predicted": "iron", "known": True, "correct": False,

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from thermogrip.classify.estimators.base import pick
-from thermogrip.classify.evaluation.splits import _alike, _copies, plan_folds, scored_apart
+from thermogrip.classify.evaluation.splits import _alike, _copied_records, plan_folds, scored_apart
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Grasps, make_grasps
 
@@ -59,7 +59,7 @@ def test_a_copy_under_another_name_is_noted_where_its_samples_speak() -> None:
     """Ten values that differ do; lost samples are none."""
     rows = [np.arange(12.0) % 10, np.arange(12.0) % 9, np.where(np.arange(12) < 9, np.arange(12.0), np.nan)]
     a, b, c = (make_grasps(np.arange(12) * 0.1 - 0.5, rows, [n + i for i in "012"], name=n) for n in "abc")
-    copies = _copies([a, b, c])
+    copies = _copied_records([a, b, c])
     assert list(copies) == ["b", "c"]
     assert copies["c"].startswith("1 grasp(s) have the samples of another, c0 of a/a0 first")
 

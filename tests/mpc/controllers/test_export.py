@@ -264,10 +264,10 @@ def test_a_difference_is_in_shares_of_a_drives_range(make: Any, span: float):
     for shift, difference in ((0.0, 0.0), (1e-3, 1e-3)):
         numbers = (span * (sample.drives + shift)).ravel()
         answer = " ".join(["0", *(float(number).hex() for number in numbers)])
-        found = exports._difference(sample, answer, controller.model.span)
+        found = exports._drive_difference(sample, answer, controller.model.span)
         assert found == pytest.approx(difference, abs=1e-12)
     short = answer.rsplit(" ", controller.model.n_u)[0]
-    assert exports._difference(sample, short, controller.model.span) == np.inf
+    assert exports._drive_difference(sample, short, controller.model.span) == np.inf
 
 
 def test_random_loops_hold_some_of_every_misfortune():

@@ -12,7 +12,7 @@ import pytest
 from tests.mpc.makers import crossed, heater, make_tank, network_plant
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.limits import LARGEST
-from thermogrip.mpc.design.spec import SPEC_TEMPLATE, Spec, _ranges, read_spec, spec_from_dict
+from thermogrip.mpc.design.spec import SPEC_TEMPLATE, Spec, _spec_drive_ranges, read_spec, spec_from_dict
 from thermogrip.mpc.plant.prediction import drive_range
 
 
@@ -123,9 +123,9 @@ def test_limits_of_a_drive_are_inside_its_range_about_0(own, limits, problem):
     spec = Spec(drive_limits={"q": limits})
     if problem:
         with pytest.raises(UserError, match=problem):
-            _ranges(spec, drives(*own))
+            _spec_drive_ranges(spec, drives(*own))
     else:
-        assert _ranges(spec, drives(*own)) == {"p": (-1.0, 2.0), "q": limits}
+        assert _spec_drive_ranges(spec, drives(*own)) == {"p": (-1.0, 2.0), "q": limits}
 
 
 @pytest.mark.parametrize(

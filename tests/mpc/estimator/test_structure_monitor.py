@@ -16,7 +16,7 @@ from tests.mpc.makers import network_plant
 from thermogrip.mpc.closed_loop.simulate import RecordedController, Surroundings, Truth
 from thermogrip.mpc.controllers.loop_monitor import LoopMonitor
 from thermogrip.mpc.controllers.mpc import design_controller
-from thermogrip.mpc.estimator.structure_monitor import Misfit, StructureMonitor, _Row, _tested
+from thermogrip.mpc.estimator.structure_monitor import Misfit, StructureMonitor, _Row, _test_alternatives
 from thermogrip.mpc.interface import Move
 from thermogrip.sysid.plant.plant import Plant
 
@@ -171,12 +171,12 @@ def test_z_is_normal_where_the_readings_are_those_of_the_model():
         )
         at = int(rng.integers(len(a)))
         own = 0.0 if granted[at] else tolerated[at] * rng.standard_normal()
-        found = _tested(monitor.bank, J, a, r + own * a[at])
+        found = _test_alternatives(monitor.bank, J, a, r + own * a[at])
         seen.append((found.z[at], found.chi))
     z, chi = np.array(seen).T
     assert abs(np.std(z) - 1) < 0.05
     assert abs(np.mean(chi) - 1) < 0.2
-    np.testing.assert_allclose(_tested(monitor.bank, J, a, 3.0 * a[1]).size[1], 3.0)
+    np.testing.assert_allclose(_test_alternatives(monitor.bank, J, a, 3.0 * a[1]).size[1], 3.0)
 
 
 def misfit(monitor: StructureMonitor, z: float, sd: float = 0.1, chi: float = 1.0) -> Misfit:

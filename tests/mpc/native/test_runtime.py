@@ -201,7 +201,7 @@ NAN = float("nan")
 
 def test_where_gcc_refuses_steps_run_in_python_and_that_is_reported(plant, tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.setattr(build, "_FLAGS", ("-std=c99", "--no-such-flag"))
+    monkeypatch.setattr(build, "_GCC_FLAGS", ("-std=c99", "--no-such-flag"))
     with pytest.warns(UserWarning, match="steps run in Python"):
         controller = Controller(plant)
     assert controller.c is None
@@ -254,7 +254,7 @@ def test_a_library_is_another_where_compiler_flags_or_machine_are(
     seen = {first, build_library({"one.c": files["one.c"], "two.h": "\n"})}
     monkeypatch.setattr(build, "_machine", lambda gcc: "another")
     seen.add(build_library(files))
-    monkeypatch.setattr(build, "_FLAGS", build._FLAGS[:1] + build._FLAGS[2:])
+    monkeypatch.setattr(build, "_GCC_FLAGS", build._GCC_FLAGS[:1] + build._GCC_FLAGS[2:])
     seen.add(build_library(files))
     assert len(seen) == 4
     assert build_library(dict(reversed(files.items()))) in seen  # the order of the files says nothing

@@ -189,10 +189,13 @@ def test_a_turn_of_the_gain_counts_inside_the_range(monkeypatch, y, turns, verdi
 
 def test_of_a_black_box_gains_are_looked_at_where_its_logs_were():
     boxed = replace(crossed(), valid={"q1": (20.0, 60.0), "q2": (0.0, 120.0)})
-    low, high = checks._known(PredictionModel(boxed, dt=2.0))
+    low, high = checks._known_drives(PredictionModel(boxed, dt=2.0))
     assert (low.tolist(), high.tolist()) == ([20.0, 0.0], [60.0, 100.0])
     network = network_plant("tclab", q1=(20.0, 60.0))
-    assert [ends.tolist() for ends in checks._known(PredictionModel(network))] == [[0.0, 0.0], [100.0, 100.0]]
+    assert [ends.tolist() for ends in checks._known_drives(PredictionModel(network))] == [
+        [0.0, 0.0],
+        [100.0, 100.0],
+    ]
 
 
 @pytest.mark.parametrize(

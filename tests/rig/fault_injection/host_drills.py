@@ -51,13 +51,13 @@ class Full:
 clock = ScaledClock(float(sys.argv[3]))
 rig = DeviceRig(Port(sys.argv[1], clock=clock), clock=clock, sleep=clock.sleep)
 if sys.argv[4] == "fill":
-    write, left = run_folder._write, [700]
+    write, left = run_folder._write_bytes, [700]
     def full(file, data):
         left[0] -= len(data)
         if left[0] < 0:
             raise OSError(28, "No space left on device")
         return write(file, data)
-    run_folder._write = full
+    run_folder._write_bytes = full
 try:
     with RunFolder(sys.argv[2]) as folder:
         session = run_session(rig, Full(), 45.0, guard=Guard(), clock=clock, recorder=folder)

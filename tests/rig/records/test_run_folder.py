@@ -479,7 +479,7 @@ def test_a_line_that_fits_by_half_is_cut_off_again(
     plant: Plant, controller: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, room: int
 ) -> None:
     path = tmp_path / "run"
-    monkeypatch.setattr(run_folder, "_write", Disk(room).write)
+    monkeypatch.setattr(run_folder, "_write_bytes", Disk(room).write)
     twin = Twin(plant, seed=1)
     with RunFolder(path) as folder:
         session = run_session(twin, controller, 38.0, recorder=folder)
@@ -500,7 +500,7 @@ def test_a_disk_without_room_for_the_last_words_keeps_what_it_has(
     def full(file: int, data: memoryview) -> int:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(run_folder, "_write", full)
+    monkeypatch.setattr(run_folder, "_write_bytes", full)
     with pytest.raises(OSError, match="No space"):
         folder.sample({"time_s": 5.0, "drive": 0.0, "pump": 1.0, "t_surface_degC": 25.0})
     run = read_run(tmp_path / "run")

@@ -81,8 +81,8 @@ def test_a_disk_that_takes_nothing_for_minutes_is_a_trip(
     monkeypatch.setattr(run_folder, "_AT_ONCE_S", 0.0)
     monkeypatch.setattr(run_folder, "MOST_WAITING", 30)
     with RunFolder(tmp_path / "run", clock=bench.clock) as folder:
-        stuck = Stuck(bench.clock, run_folder._write)
-        monkeypatch.setattr(run_folder, "_write", stuck)
+        stuck = Stuck(bench.clock, run_folder._write_bytes)
+        monkeypatch.setattr(run_folder, "_write_bytes", stuck)
         log, ended = play(bench.rig, steps(100.0), clock=bench.clock, recorder=folder)
         assert bench.device.applied_drive == {"q1": 0.0, "q2": 0.0}
         stuck.let_go.set()
@@ -136,7 +136,7 @@ def test_rows_that_the_disk_refuses_after_the_last_sample_are_no_silent_loss(
     monkeypatch.setattr(run_folder, "_AT_ONCE_S", 0.0)
     folder = RunFolder(tmp_path / "run")
     stuck = Stuck(bench.clock, full)
-    monkeypatch.setattr(run_folder, "_write", stuck)
+    monkeypatch.setattr(run_folder, "_write_bytes", stuck)
     _, ended = play(bench.rig, steps(5.0), clock=bench.clock, recorder=folder)
     assert ended == ""
     stuck.let_go.set()

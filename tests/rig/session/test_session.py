@@ -28,7 +28,7 @@ from thermogrip.rig.session.loop import PHASES, hold_last_good
 from thermogrip.rig.session.session import (
     Object,
     Playback,
-    _result,
+    _session_of,
     grasp_of_rows,
     play,
     run_session,
@@ -235,13 +235,13 @@ def test_of_several_targets_the_worst_figures_are_the_sessions() -> None:
     run = SimpleNamespace(
         rows=[{}, {}], target={"a": 30.0, "b": 20.0}, column=columns.__getitem__, events=[], log=lambda: None
     )
-    found = _result(run, "not settled", None, 0.25)
+    found = _session_of(run, "not settled", None, 0.25)
     assert (found.settle_time, found.bias) == (pytest.approx(50, abs=3), pytest.approx(0.2))
     assert found.overshoot == pytest.approx(2.0)
     assert "give it more time" in found.advice
     run.rows = run.rows[:1]
     with pytest.raises(UserError, match="ended at its first reading"):
-        _result(run, "settled", None, 0.25)
+        _session_of(run, "settled", None, 0.25)
 
 
 @pytest.mark.parametrize(

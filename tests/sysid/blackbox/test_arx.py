@@ -7,7 +7,7 @@ import pytest
 from scipy.signal import lfilter
 
 from thermogrip.datasets.schema import make_log
-from thermogrip.sysid.blackbox.arx import _columns, _Orders, arx_family
+from thermogrip.sysid.blackbox.arx import _Orders, _structure_columns, arx_family
 from thermogrip.sysid.plant.log_grid import make_grid
 
 
@@ -69,7 +69,7 @@ def test_too_few_rows_give_no_model(first_order):
     ],
 )
 def test_a_structure_uses_its_lags_of_the_one_regression(orders, output, columns):
-    assert _columns(_Orders(*orders), 4, 2, 3, output) == columns
+    assert _structure_columns(_Orders(*orders), 4, 2, 3, output) == columns
 
 
 def test_a_short_log_of_many_signals_is_fitted_with_what_its_rows_allow(many_signals):

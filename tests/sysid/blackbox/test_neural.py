@@ -65,7 +65,9 @@ def test_how_many_members_are_trained(monkeypatch, readings, how, last, sizes, e
     y[readings // 2 :] = np.nan
     made = []
     monkeypatch.setattr(neural, "_linear_starts", lambda grid, data, orders: {n: n for n in orders if n < 9})
-    monkeypatch.setattr(neural, "_train", lambda data, n, h, *, seed: made.append((n, h, seed)) or (n, h))
+    monkeypatch.setattr(
+        neural, "_train_member", lambda data, n, h, *, seed: made.append((n, h, seed)) or (n, h)
+    )
     monkeypatch.setattr(neural, "_averaged", lambda grid, data, parts: list(parts))
     # the smallest of three states and three units: A 9, B 9, c 3; V and W 18, U 9, b 3
     whole = Structure("members of all sizes", 51)
@@ -80,7 +82,7 @@ def test_how_many_members_are_trained(monkeypatch, readings, how, last, sizes, e
 def test_data_are_scaled_by_their_spread_and_what_never_moves_is_zero():
     y = [[[1.0, 10.0], [3.0, np.nan]], [[1.0, 30.0], [3.0, 20.0]]]
     u = [[[0.0, 5.0, 20.0], [2.0, 5.0, 20.0]], [[4.0, 5.0, 20.0], [2.0, 5.0, 28.0]]]
-    data = neural._scaled(grid_of(*y, u=u))
+    data = neural._scaled_data(grid_of(*y, u=u))
     assert (data.y_middle.tolist(), data.w_middle.tolist()) == ([2.0, 20.0], [2.0, 5.0, 22.0])
     np.testing.assert_allclose(
         [*data.y_size, *data.w_size], [1, np.sqrt(200 / 3), np.sqrt(2), 1, np.sqrt(12)]
@@ -90,7 +92,7 @@ def test_data_are_scaled_by_their_spread_and_what_never_moves_is_zero():
     np.testing.assert_allclose(data.reach, [1.25 * np.sqrt(2), 0, 1.25 * np.sqrt(3)])
     assert (data.low.tolist(), data.high.tolist()) == ([-np.inf] * 2, [np.inf] * 2)
     railed = np.column_stack([[0.0, 4.0] * 2 + [7.0] * 8, np.arange(12.0)])
-    data = neural._scaled(grid_of(railed))
+    data = neural._scaled_data(grid_of(railed))
     assert data.high[0] * data.y_size[0] + data.y_middle[0] == pytest.approx(7.0)
 
 
@@ -145,11 +147,11 @@ def test_a_linear_record_keeps_its_linear_fit_and_random_weights_are_drawn_to_ze
     y[7] = np.nan
     linear = _Linear(np.array([[0.5]]), np.array([[0.4]]), np.array([0.1]), 2 * [np.array([0.7])])
     data = data_of([w, w], [y, y])
-    found = neural._train(data, linear, 2, seed=0)
+    found = neural._train_member(data, linear, 2, seed=0)
     np.testing.assert_allclose(found.weights, [0.4, 0.1, *[0.0] * 8], atol=1e-5)
     assert (found.x0[0, 0], found.h) == (pytest.approx(0.7, abs=1e-5), 2)
     assert found.miss < 1e-8
-    off = neural._train(data, _Linear(linear.A, linear.B, linear.c + 0.2, linear.x0), 2, seed=0)
+    off = neural._train_member(data, _Linear(linear.A, linear.B, linear.c + 0.2, linear.x0), 2, seed=0)
     assert off.weights[1] == pytest.approx(0.1, abs=0.02)  # drawn back by the readings
     run = run_states(np.array(2 * [[[0.5]]]), np.tile(off.weights, (2, 1)), 2, off.x0, w, data.low, data.high)
     assert off.miss == pytest.approx(np.nansum((run[:, :-1] - y) ** 2))
@@ -162,12 +164,12 @@ def test_steps_end_at_the_least_squares_and_stop_where_none_lowers_the_cost():
         calls.append(z)
         return np.array([2.0, 1.0]) * (z - target), np.diag([2.0, 1.0])
 
-    found = neural._descend(linearise, lambda z: np.array([2.0, 1.0]) * (z - target), np.zeros(2))
+    found = neural._levenberg_marquardt(linearise, lambda z: np.array([2.0, 1.0]) * (z - target), np.zeros(2))
     np.testing.assert_allclose(found, target, atol=1e-2)
     # damped by 0.1, 0.01, ...: 2 * 3 / 41 and 2 / 11 are left of it, then hardly anything
     np.testing.assert_allclose(calls[1], target * [1 - 0.1 / 4.1, 1 - 0.1 / 1.1])
     np.testing.assert_allclose(target - calls[2], (target - calls[1]) * [0.01 / 4.01, 0.01 / 1.01])
-    stuck = neural._descend(linearise, lambda z: np.full((len(z), 2), 9.0), np.zeros(2))
+    stuck = neural._levenberg_marquardt(linearise, lambda z: np.full((len(z), 2), 9.0), np.zeros(2))
     assert stuck.tolist() == [0.0, 0.0]
 
 
@@ -180,7 +182,7 @@ def test_a_start_is_that_of_a_quarter_of_the_readings_of_three_to_fifty(rows, he
 
 def test_linear_starts_run_as_the_best_subspace_model_in_scaled_units(coupled):
     grid = make_grid([coupled.log(n, seed=n, reading=0.05) for n in (300, 200)], average=1.0)
-    data = neural._scaled(grid)
+    data = neural._scaled_data(grid)
     starts = neural._linear_starts(grid, data, [2, 3])
     family = list(neural.subspace_family(grid, orders=(2, 3), terms=((),)).values())
     for n, linear in starts.items():
@@ -208,14 +210,14 @@ def test_outputs_that_are_sums_of_others_are_no_states_to_start_from(coupled):
     part = grid.segments[0]
     three = np.column_stack([part.y, part.y @ [1.0, -1.0]])  # a PID log's error beside what it was taken of
     twice = replace(grid, outputs=(*grid.outputs, "error"), segments=(replace(part, y=three),))
-    assert list(neural._linear_starts(grid, neural._scaled(grid), [2, 3, 4])) == [2, 3, 4]
-    assert not neural._linear_starts(twice, neural._scaled(twice), [3, 4, 5])
+    assert list(neural._linear_starts(grid, neural._scaled_data(grid), [2, 3, 4])) == [2, 3, 4]
+    assert not neural._linear_starts(twice, neural._scaled_data(twice), [3, 4, 5])
 
 
 def test_members_of_two_sizes_are_one_model_in_the_units_of_the_readings():
     u = [np.array([[0.0, 5.0, 20.0], [2.0, 7.0, 23.0], [4.0, 5.0, 20.0]])]
     grid = grid_of([[[1.0, 10.0], [3.0, 20.0], [2.0, 60.0]]][0], u=u)
-    data, rng = neural._scaled(grid), np.random.default_rng(4)
+    data, rng = neural._scaled_data(grid), np.random.default_rng(4)
     sizes = [(2, 3), (3, 1)]  # of n (3 + 1) + 2 n h + 3 h + h numbers
     members = [
         _Member(0.3 * np.eye(n), rng.normal(size=n * 4 + 2 * n * h + 4 * h), rng.normal(size=(1, n)), h, 0.1)

@@ -55,7 +55,7 @@ def spans(segments):
     ],
 )
 def test_a_block_is_cut_out_of_the_rows_of_all_segments(first, last, inside, outside):
-    found = selection._split([rows(50), rows(40, "b")], first, last)
+    found = selection._split_segments([rows(50), rows(40, "b")], first, last)
     assert [spans(part) for part in found] == [inside, outside]
 
 

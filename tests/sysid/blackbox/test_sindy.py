@@ -113,7 +113,7 @@ def test_equations_that_diverge_are_infinite_not_wrong_and_no_model(grid):
     assert np.isinf(y[0, -1])
     assert np.isfinite(y[1]).all()  # each member of the batch for itself
     for rise, bounded in ((1.01, False), (0.9, True)):  # a plant that grows leaves the range of its data
-        model = sindy._bounded(grid, np.array([[1, 0], [0, 0]]), np.array([[rise, 1.0]]), 1)
+        model = sindy._bounded_model(grid, np.array([[1, 0], [0, 0]]), np.array([[rise, 1.0]]), 1)
         assert (model is not None) == bounded
 
 
@@ -128,7 +128,7 @@ def test_a_dict_makes_the_model_again_and_a_broken_one_is_refused(grid, fit_one)
 
 def test_the_structures_are_degrees_thresholds_memories_and_widths(grid, monkeypatch):
     monkeypatch.setattr(sindy, "_features", lambda grid, degree, memory: (degree, memory))
-    monkeypatch.setattr(sindy, "_fit", lambda grid, terms, threshold, width: (*terms, threshold, width))
+    monkeypatch.setattr(sindy, "_fit_terms", lambda grid, terms, threshold, width: (*terms, threshold, width))
     found = sindy_family(grid)
     # monomials of t and q (and of the last t): 3 and 4 of degree 1, 6 and 10 of degree 2
     terms = {(1, 1): 3, (1, 2): 4, (2, 1): 6, (2, 2): 10}
@@ -153,7 +153,7 @@ def test_rows_are_cut_at_lost_readings_scaled_and_summed_with_bumps():
     y = np.array([1.0, 4.0, 9.0, 16.0, 25.0, 36.0, 49.0, 64.0, *[np.nan] * 6, *[7.0] * 5, np.nan])[:, None]
     q = np.arange(20.0)[:, None]
     part = Segment(np.arange(20.0), y, q, 10 * q, "a")
-    assert sindy._whole(part) == [(0, 8), (14, 19)]
+    assert sindy._whole_rows(part) == [(0, 8), (14, 19)]
     two = Grid(("q",), ("room",), ("t",), (), 1.0, (part,), 1.0, {})
     x, w, move = sindy._trajectories(two, 2)  # runs of 7 rows at least
     assert [some.tolist() for some in x] == [[[4, 1], [9, 4], [16, 9], [25, 16], [36, 25], [49, 36]]]
@@ -161,7 +161,7 @@ def test_rows_are_cut_at_lost_readings_scaled_and_summed_with_bumps():
     assert move[0][:, 0].tolist() == [5, 7, 9, 11, 13, 15]
     short, *_ = sindy._trajectories(replace(two, segments=(part.part(0, 7), part.part(0, 6))), 2)
     assert [len(some) for some in short] == [5]
-    rows, middle, size = sindy._scaled([np.array([[1.0], [5.0]])], [np.array([[3.0], [3.0]])])
+    rows, middle, size = sindy._scaled_rows([np.array([[1.0], [5.0]])], [np.array([[3.0], [3.0]])])
     assert (rows[0].tolist(), middle.tolist(), size.tolist()) == ([[-1, 0], [1, 0]], [3, 3], [2, 1])
     terms = sindy._Features(
         [np.eye(8)[:, :1], np.eye(7)], [np.arange(16.0).reshape(8, 2), np.eye(7)], None, None, None, 1

@@ -297,16 +297,16 @@ def test_a_label_without_a_row_is_learnt_beside_one_that_has_one_or_given_a_row(
     label = grasps["material"].values.astype(object)
     label[[1, 2]] = "bismuth"
     odd = grasps.assign(material=("grasp", label.astype(str)))
-    wide = calibration._problem(calibration._labelled([odd], {}, 2), {}, None, 0.02)
+    wide = calibration._problem(calibration._labelled_touches([odd], {}, 2), {}, None, 0.02)
     assert wide.library[0].sd_ln == 2.0
     assert wide.library[1].sd_ln < 0.3
     name = str(grasps["grasp"].values[1])
     strange = odd.isel(grasp=[1, 2]).assign(material=("grasp", ["bismuth", "x"]))
     with pytest.raises(UserError, match=f"grasp '{name}' is of 'bismuth', and the materials table has none"):
-        calibration._labelled([strange], {}, least=2)
+        calibration._labelled_touches([strange], {}, least=2)
     row = replace(find_material("iron"), name="bismuth", rho=8000.0, c_p=200.0, effusivity=9e3)
     problem = calibration._problem(
-        calibration._labelled([odd], {"bismuth": row}, 2), {"bismuth": row}, None, 0.03
+        calibration._labelled_touches([odd], {"bismuth": row}, 2), {"bismuth": row}, None, 0.03
     )
     assert problem.labels[0] == "bismuth"
     assert problem.library[0].effusivity == 9e3

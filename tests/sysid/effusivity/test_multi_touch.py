@@ -245,7 +245,7 @@ def test_the_way_begins_where_the_touches_found_the_block(record):
     at = touch_groups(record)["p000"]
     device = load_default_gripper()
     view = multi_touch._view(device, record, material_hypotheses(device, FIVE), Coupling())
-    factor = multi_touch._factors(view, [at])[0]
+    factor = multi_touch._group_factors(view, [at])[0]
     mean, p = multi_touch._prior(view, at, view.coupling, factor)
     first = combine(factor, mean, p).mean[:, 0]
     skin, room = view.data.level[at[0]], view.data.t_ambient[at[0]]
@@ -377,9 +377,9 @@ def test_another_touch_expects_what_the_touches_found_moved_on(device, record, t
         fit = two_touch_fit(device, block, names, coupling=coupling)
         np.testing.assert_allclose(evidence, fit.log_evidence[0], atol=1e-9)
     view = multi_touch._view(device, block, material_hypotheses(device, names), coupling)
-    factors = multi_touch._factors(view, [at])
+    factors = multi_touch._group_factors(view, [at])
     if touched > 1:
-        factors = multi_touch._factors(view, [at], multi_touch._cavities(view, [at], factors))
+        factors = multi_touch._group_factors(view, [at], multi_touch._cavities(view, [at], factors))
     joint = combine(factors[0], *multi_touch._prior(view, at, coupling, factors[0]))
     taken = 0.8 * view.traces.drop(30.0)
     skin, t_last = view.data.level[-1], joint.mean[:, -4]
@@ -417,7 +417,7 @@ def test_a_temperature_that_contradicts_its_touch_is_not_taken_from_the_others(d
     """Five standard deviations apart: between them the others' temperature, beyond the prior."""
     at = np.array([0, 1])
     view = multi_touch._view(device, record, material_hypotheses(device, ["copper"]), Coupling())
-    one = multi_touch._factors(view, [at])[0]
+    one = multi_touch._group_factors(view, [at])[0]
     for off, taken in ((0.9, True), (1.1, False)):
         prior = multi_touch._prior(view, at, view.coupling, one)
         by_first, first_sd = multi_touch._t_object(combine(multi_touch._without(one, [1]), *prior), 1)

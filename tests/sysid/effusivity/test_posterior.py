@@ -29,7 +29,7 @@ from thermogrip.sysid.effusivity.laplace_approximation import (
     prior_of,
 )
 from thermogrip.sysid.effusivity.posterior import (
-    _row,
+    _effusivity_row,
     effusivity_posterior,
     material_fit,
 )
@@ -227,7 +227,7 @@ def test_a_row_is_made_of_two_mixtures(device):
     for shift in (0.0, 2.0):  # an insulator, a metal
         t, t_sd = np.array([20.0, 24.0]), np.array([0.1, 0.2])
         made = GridPosterior(x + shift, mass, 0.0, weight, t, t_sd, x)
-        row = _row(device, "g", made)
+        row = _effusivity_row(device, "g", made)
         scale, sd = device.effusivity_scale(made.x)
         sd = np.sqrt(sd**2 + (device.spreads.ln_effusivity**2 if shift == 0 else 0.0) + 1e-8)
         below = [

@@ -12,7 +12,7 @@ from scipy.stats import chi2
 
 from thermogrip.datasets.schema import make_log
 from thermogrip.sysid.greybox import random_effects
-from thermogrip.sysid.greybox.noise_model import ErrorModel, _bands
+from thermogrip.sysid.greybox.noise_model import ErrorModel, _frequency_bands
 from thermogrip.sysid.greybox.problem import make_problem, prior_plant
 from thermogrip.sysid.greybox.random_effects import WarmUp, linearise_logs, warm_noise
 from thermogrip.sysid.models.network import load_network
@@ -32,7 +32,7 @@ def test_the_covariance_in_time_is_that_of_the_cosines():
     for j in range(2):
         for k in range(2):
             waves = dct(dct(whole[:, j, :, k], axis=0, norm="ortho"), axis=1, norm="ortho")
-            bands = np.split(np.diag(waves), _bands(n)[1:-1])
+            bands = np.split(np.diag(waves), _frequency_bands(n)[1:-1])
             expected = [band.mean() for band in bands]
             np.testing.assert_allclose(NUMBERS.covariance(n)[:, j, k], expected, rtol=1e-9, atol=1e-12)
     slow = np.arange(n)

@@ -50,7 +50,7 @@ REF = np.array([0.3, -0.5, 1.0])
 def test_the_likelihood_is_the_density_of_the_data_with_everything_integrated_out():
     raw, logs = some_logs()
     blocks, shared, left = [], [], []
-    repeat = np.diff(noise_model._bands(N))
+    repeat = np.diff(noise_model._frequency_bands(N))
     for x, log, outputs in zip(raw, logs, OUTPUTS):
         waves = dct(x, axis=0, norm="ortho") * np.append(NUMBERS.scale(log.kind), 1.0)
         S = np.repeat(NUMBERS.covariance(N), repeat, axis=0)[:, outputs][:, :, outputs]
@@ -83,7 +83,9 @@ def test_cosines_make_an_autoregressive_error_nearly_diagonal():
     exact = basis @ toeplitz(np.exp(-np.arange(N) / 20.0)) @ basis.T
     S = numbers.covariance(N)[:, 0, 0]
     np.testing.assert_allclose(S[:12], np.diag(exact)[:12], rtol=1e-9)  # bands of one frequency
-    assert np.repeat(S, np.diff(noise_model._bands(N))).sum() == pytest.approx(N)  # the variance is kept
+    assert np.repeat(S, np.diff(noise_model._frequency_bands(N))).sum() == pytest.approx(
+        N
+    )  # the variance is kept
     scaled = exact / np.sqrt(np.outer(np.diag(exact), np.diag(exact)))
     assert np.abs(scaled - np.eye(N)).max() < 0.25
 

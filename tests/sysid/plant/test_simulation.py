@@ -21,7 +21,7 @@ from thermogrip.sysid.plant.simulation import (
     Start,
     _binned,
     _first_reading,
-    _noise,
+    _reading_sd,
     _through_gap,
     find_starts,
     predict,
@@ -271,7 +271,7 @@ def test_bins_of_a_warm_up_count_together_as_a_reading_every_ten_seconds(
     dt: float, warmup: float, rows: int, factor: float
 ):
     made, stretch = plant(dt=dt, noise={"b": 0.0}), stretch_of([0.0])
-    found = _noise(made, stretch, warmup)
+    found = _reading_sd(made, stretch, warmup)
     np.testing.assert_allclose(found, np.tile(np.sqrt(factor) * np.array([0.1, 1e-6]), (rows, 1)))
 
 
