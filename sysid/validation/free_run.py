@@ -372,7 +372,7 @@ def _notes(run: FreeRun, by_inputs: InputEffect | None) -> list[str]:
     ]
     if verdict is None or verdict.standing != "no test":
         notes += [
-            f"{name}: hardly better than a model without input: the fit cannot be relied on for control"
+            f"{name}: barely better than a model without input: the fit cannot be relied on for control"
             for name in run.no_better
         ]
     outside = _outside(plant, {name: column(log, name) for name in plant.valid if name in log})

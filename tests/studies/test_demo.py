@@ -129,7 +129,7 @@ def test_every_stage_has_its_share_of_the_progress_and_its_section(
     session = SimpleNamespace(grasps="a grasp")
     results = {
         "_identify": ("found", "plant", "record", "run"), "_tune": ("tuning", "checks"),
-        "_run": [("one", session), ("two", SimpleNamespace(grasps=None))],
+        "_grasp_on_twin": [("one", session), ("two", SimpleNamespace(grasps=None))],
         "_compare": ("comparison", "model"),
     }  # fmt: skip
     for name, result in results.items():
@@ -160,12 +160,12 @@ def test_every_stage_has_its_share_of_the_progress_and_its_section(
     ]  # fmt: skip
     assert asked == {
         "_identify": (tmp_path, SEED), "_tune": (tmp_path, "plant", SEED, workers),
-        "_run": (tmp_path, "tuning", "plant", SEED), "_compare": (tmp_path, SEED, workers),
+        "_grasp_on_twin": (tmp_path, "tuning", "plant", SEED), "_compare": (tmp_path, SEED, workers),
     }  # fmt: skip
     assert [section.title for section in done.sections] == [
         "identification of found", "free_run of run", "parameters of plant record",
         "tuning of tuning", "review of checks",
-        f"session of {results['_run']} the twin (posterior draw 3)", "touch of model ['a grasp']",
+        f"session of {results['_grasp_on_twin']} the twin (posterior draw 3)", "touch of model ['a grasp']",
         "shipped comparison", "The same with your files",
     ]  # fmt: skip
     assert done.report == tmp_path / "report.html"

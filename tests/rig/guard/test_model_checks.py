@@ -194,7 +194,7 @@ STORIES = [
     ({"real": 1.0}, "the driver is stuck at full drive"),
     ({"real": -1.0}, "the driver is stuck at full cooling"),
     ({"real": -0.6}, "the module is wired the wrong way round"),
-    ({"real": 0.3}, "the driver gives half of what is asked"),
+    ({"real": 0.3}, "the driver gives half of the command"),
     ({"real": 0.0, "onset": 6.0}, "the driver gives nothing"),
     ({"real": -1.0, "onset": 6.0}, "the driver is stuck at full cooling"),
     ({"off": 3.0}, "b alone is wrong"),
@@ -219,7 +219,7 @@ def test_before_there_is_a_window_nothing_is_reported() -> None:
     assert explain_window(made._model, made._past, 12.0) == []
 
 
-HALF = Cause("driver", "the driver", "the driver gives half of what is asked")
+HALF = Cause("driver", "the driver", "the driver gives half of the command")
 PUMP = Cause("pump", "the pump", "the pump has stopped")
 REVERSED = Cause("reversed", "the module", "the module is wired the wrong way round", 2.0)
 OTHER, WRONG = (Cause("drift", name, f"{name} alone is wrong") for name in "ca")

@@ -55,7 +55,7 @@ def soon(look: Callable[[], bool]) -> bool:
     return look()
 
 
-@pytest.mark.parametrize(("where", "call"), [(os, "fsync"), (run_folder, "_write")])
+@pytest.mark.parametrize(("where", "call"), [(os, "fsync"), (run_folder, "_write_bytes")])
 def test_a_disk_that_hangs_costs_no_sample_and_has_every_row_at_last(
     where: Any, call: str, bench: Bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
