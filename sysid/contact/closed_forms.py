@@ -35,16 +35,28 @@ domain:
     body Z2
 
 C = rho c_p L.  Two bodies meet through h_c, q(s) = dT/s / (1/h_c + Z_dev + Z_obj), and the inverse
-transform below gives fluxes and temperatures to 1e-11 of themselves for any effusivity ratio.
+transform below gives fluxes and temperatures to 1e-11 of themselves for any effusivity ratio.  So it does
+where a surface or a fluid has a given temperature: in a slab, of times in units of L^2 / alpha, q = sqrt(s),
 
-Inversion: transforms of conduction have their singularities on the negative real axis.  On Talbot's
-cotangent contour about it
+    rise(x) = cosh(q (1 - x)) / (s (cosh(q) + (q / Bi) sinh(q))),   Bi = h L / k, infinite at a held surface.
+
+Numerical inversion of Laplace transforms of heat conduction
+------------------------------------------------------------
+
+    f(t) = 1/(2 pi i) * integral of F(s) exp(s t) ds
+
+along a path from below to above that leaves every singularity of F on its left.  Transforms of conduction
+have theirs on the negative real axis (poles of finite bodies, branch cuts of infinite ones), so the path
+may come in from minus infinity.  On the cotangent contour
 
     s(phi) = (n / t) (-0.6122 + 0.5017 phi cot(0.6407 phi) + 0.2645 i phi),   -pi < phi < pi,
 
-the midpoint rule with n points converges as exp(-1.358 n), which the tests measure.  Rounding grows as
-exp(0.17 n), so n = 24 gives 1e-13 in double precision, relative to the size of f around t; not where f is
-exponentially small, deep inside a body.
+the midpoint rule with n points converges as exp(-1.358 n); its constants make the discretisation and
+truncation errors fall together.  Rounding grows as exp(0.17 n), so n = 24 gives 1e-13 in double precision,
+relative to the size of f around t.  It cannot give relative accuracy where f is exponentially small, deep
+inside a body.
+
+The contour is of Talbot's kind; the tests measure its convergence rate.
 
 References
 ----------
@@ -192,6 +204,24 @@ def contact_flux(
     return np.asarray(h_c * (T_obj0 - T_dev0) * erfcx(y))
 
 
+def contact_heat(
+    t: ArrayLike, *, T_dev0: float, T_obj0: float, e_dev: float, e_obj: float, h_c: float = np.inf
+) -> Array:
+    """Return the heat that the gripper has taken up [J/m^2]; parameters are those of
+    :func:`skin_temperature`.
+
+    The integral of the flux, h_c (T_obj0 - T_dev0) / H^2 (erfcx(y) - 1 + 2 y / sqrt(pi)).
+
+    >>> contact_heat([1.0, 10.0], T_dev0=23.0, T_obj0=43.0, e_dev=1.6e3, e_obj=3.64e4, h_c=500.0).round(0)
+    array([ 7990., 54795.])
+    """
+    t, y = _time_and_root(t, e_dev, e_obj, h_c)
+    series = 1 / (1 / e_dev + 1 / e_obj)
+    if np.isinf(h_c):
+        return np.asarray((T_obj0 - T_dev0) * series * 2 * np.sqrt(t / np.pi))
+    return np.asarray((T_obj0 - T_dev0) * series**2 / h_c * _excess(y))
+
+
 def sensor_temperature(
     t: ArrayLike, *, T_dev0: float, T_obj0: float, e_dev: float, e_obj: float, lag: float, h_c: float = np.inf
 ) -> Array:
@@ -264,13 +294,13 @@ def layer_on(effusivity: float, capacity: float, base: Impedance) -> Impedance:
     _positive(effusivity=effusivity, capacity=capacity)
 
     def impedance(s: Complex) -> Complex:
-        surface = 1 / (effusivity * np.sqrt(s))
+        surface_impedance = 1 / (effusivity * np.sqrt(s))
         fade = np.exp(-2 * np.sqrt(s) * capacity / effusivity)
         below = base(s)
         return np.asarray(
-            surface
-            * (below * (1 + fade) + surface * (1 - fade))
-            / (surface * (1 + fade) + below * (1 - fade))
+            surface_impedance
+            * (below * (1 + fade) + surface_impedance * (1 - fade))
+            / (surface_impedance * (1 + fade) + below * (1 - fade))
         )
 
     return impedance
@@ -308,6 +338,118 @@ def two_body_temperatures(
     return T_dev0 + difference * rise(dev), T_obj0 - difference * rise(obj)
 
 
+def block_contact_flux(
+    t: ArrayLike, *, T_dev0: float, T_obj0: float, e_dev: float, e_obj: float, capacity: float,
+    h_c: float = np.inf,
+) -> Array:  # fmt: skip
+    """Return the flux into a half-space gripper from a block of C = rho c_p L with an insulated back [W/m^2].
+
+    Times t > 0 [s]; effusivities [W s^0.5 m^-2 K^-1]; capacity [J m^-2 K^-1]; h_c [W m^-2 K^-1].
+
+    >>> block_contact_flux([10.0], T_dev0=23.0, T_obj0=43.0, e_dev=1.6e3, e_obj=3.64e4, capacity=68600.0,
+    ...                    h_c=500.0).round(0)
+    array([4082.])
+    """
+    return two_body_flux(
+        t, dev=half_space(e_dev), obj=slab(e_obj, capacity), T_dev0=T_dev0, T_obj0=T_obj0, h_c=h_c
+    )
+
+
+def block_skin_temperature(
+    t: ArrayLike, *, T_dev0: float, T_obj0: float, e_dev: float, e_obj: float, capacity: float,
+    h_c: float = np.inf,
+) -> Array:  # fmt: skip
+    """Return the skin temperature of a half-space gripper on a block [degC]; as :func:`block_contact_flux`.
+
+    >>> block_skin_temperature([10.0], T_dev0=23.0, T_obj0=43.0, e_dev=1.6e3, e_obj=3.64e4, capacity=68600.0,
+    ...                        h_c=500.0).round(2)
+    array([33.97])
+    """
+    dev, obj = half_space(e_dev), slab(e_obj, capacity)
+    return two_body_temperatures(t, dev=dev, obj=obj, T_dev0=T_dev0, T_obj0=T_obj0, h_c=h_c)[0]
+
+
+def slab_temperature(
+    t: ArrayLike, depth: ArrayLike, *, T0: float, T_surf: float, thickness: float, alpha: float
+) -> Array:
+    """Return the temperature [degC], first T0, at times t [s] and a ``depth`` from the face [m] in a slab of
+    this ``thickness`` [m] and diffusivity ``alpha`` [m^2/s], whose face is held at ``T_surf`` from t = 0 and
+    whose back is insulated.
+
+    >>> slab_temperature([1.0, 100.0], 0.02, T0=43.0, T_surf=23.0, thickness=0.02, alpha=1.0e-5).round(3)
+    array([43.   , 23.053])
+    """
+    fo, x = _fourier(t, depth, thickness, alpha)
+    return T0 + (T_surf - T0) * _slab_rise(fo, x, np.inf)
+
+
+def slab_heat(t: ArrayLike, *, T0: float, T_surf: float, capacity: float, effusivity: float) -> Array:
+    """Return the heat that the slab of :func:`slab_temperature` has taken up [J/m^2], t >= 0 [s], where
+    ``capacity`` is rho c_p L [J m^-2 K^-1].
+
+    >>> slab_heat([1.0, 1e6], T0=23.0, T_surf=43.0, capacity=68600.0, effusivity=1.6e4).round(0)
+    array([ 361081., 1372000.])
+    """
+    _positive(capacity=capacity, effusivity=effusivity)
+    t = np.asarray(t, dtype=float)
+    if not np.all(t >= 0):
+        raise ValueError("time must be >= 0 s")
+    fo = t * (effusivity / capacity) ** 2
+
+    def transform(s: Complex) -> Complex:
+        fade = np.exp(-2 * np.sqrt(s))
+        return np.asarray((1 - fade) / (1 + fade) / s**1.5)
+
+    return capacity * (T_surf - T0) * _after_start(transform, fo)
+
+
+def slab_temperature_convective(
+    t: ArrayLike, depth: ArrayLike, *, T0: float, T_fluid: float, h: float, k: float, thickness: float,
+    alpha: float,
+) -> Array:  # fmt: skip
+    """Return the temperature [degC] in the slab of :func:`slab_temperature`, of conductivity ``k``
+    [W m^-1 K^-1], where its face meets a fluid of ``T_fluid`` through a film conductance ``h``
+    [W m^-2 K^-1].
+
+    >>> slab_temperature_convective([1.0, 100.0], 0.0, T0=43.0, T_fluid=23.0, h=500.0, k=73.0, thickness=0.02,
+    ...                             alpha=2.05e-5).round(2)
+    array([42.32, 32.77])
+    """
+    _positive(h=h, k=k)
+    fo, x = _fourier(t, depth, thickness, alpha)
+    return T0 + (T_fluid - T0) * _slab_rise(fo, x, h * thickness / k)
+
+
+def layered_temperature(
+    t: ArrayLike, depth: ArrayLike, *, T0: float, T_surf: float, thickness: float, e_layer: float,
+    alpha_layer: float, e_base: float, alpha_base: float,
+) -> Array:  # fmt: skip
+    """Return the temperature [degC], first T0, at times t > 0 [s] and a ``depth`` from the face [m] in a
+    layer of this ``thickness`` [m] or the half-space below it, of these effusivities [W s^0.5 m^-2 K^-1] and
+    diffusivities [m^2/s], whose face is held at ``T_surf`` from t = 0.
+
+    >>> layered_temperature(5.0, [1e-3, 5e-3], T0=23.0, T_surf=43.0, thickness=1e-3, e_layer=600.0,
+    ...                     alpha_layer=1e-7, e_base=1600.0, alpha_base=1.4e-7).round(2)
+    array([26.47, 23.  ])
+    """
+    _positive(
+        thickness=thickness, e_layer=e_layer, alpha_layer=alpha_layer, e_base=e_base, alpha_base=alpha_base
+    )
+    t, x = np.broadcast_arrays(np.asarray(t, dtype=float), np.asarray(depth, dtype=float))
+    if not np.all(t > 0) or np.any(x < 0):
+        raise ValueError("need t > 0 s and depth >= 0 m")
+    r, z = (e_layer - e_base) / (e_layer + e_base), thickness / np.sqrt(alpha_layer)
+    inside = np.minimum(x, thickness)[..., None] / np.sqrt(alpha_layer)
+    below = np.maximum(x - thickness, 0.0)[..., None] / np.sqrt(alpha_base)
+
+    def transform(s: Complex) -> Complex:  # reflected by r at the joint, by -1 at the face
+        q = np.sqrt(s)
+        rise = (np.exp(-q * inside) + r * np.exp(-q * (2 * z - inside))) * np.exp(-q * below)
+        return np.asarray(rise / (s * (1 + r * np.exp(-2 * q * z))))
+
+    return T0 + (T_surf - T0) * invert_laplace(transform, t)
+
+
 def _time_and_root(t: ArrayLike, e_dev: float, e_obj: float, h_c: float) -> tuple[Array, Array]:
     """Return t and y = H sqrt(t), inf at perfect contact, after checking what a caller may get wrong."""
     t = np.asarray(t, dtype=float)
@@ -329,6 +471,12 @@ def _drop(y: ArrayLike) -> Array:
     """Return 1 - erfcx(y) without cancellation."""
     y = np.asarray(y, dtype=float)
     return np.where(y < 0.5, -_series(np.minimum(y, 0.5), 1), 1 - erfcx(y))
+
+
+def _excess(y: ArrayLike) -> Array:
+    """Return erfcx(y) - 1 + 2 y / sqrt(pi) without cancellation."""
+    y = np.asarray(y, dtype=float)
+    return np.where(y < 0.5, _series(np.minimum(y, 0.5), 2), erfcx(y) - 1 + 2 * y / np.sqrt(np.pi))
 
 
 def _erfcx_difference(xi: Array, y: Array) -> Array:
@@ -357,6 +505,28 @@ def _positive(**values: float) -> None:
     for name, value in values.items():
         if not value > 0:
             raise ValueError(f"{name} must be positive, got {value:g}")
+
+
+def _fourier(t: ArrayLike, depth: ArrayLike, thickness: float, alpha: float) -> tuple[Array, Array]:
+    _positive(thickness=thickness, alpha=alpha)
+    fo, x = np.broadcast_arrays(
+        np.asarray(t, float) * alpha / thickness**2, np.asarray(depth, float) / thickness
+    )
+    if not np.all(fo >= 0) or not np.all((x >= 0) & (x <= 1)):
+        raise ValueError("need t >= 0 s and depth between 0 and the thickness")
+    return np.array(fo), np.array(x)
+
+
+def _slab_rise(fo: Array, x: Array, biot: float) -> Array:
+    """Return the rise of a slab at depths x towards what its face meets, both 1 in the end."""
+    depth_share = x[..., None]
+
+    def transform(s: Complex) -> Complex:
+        q, fade = np.sqrt(s), np.exp(-2 * np.sqrt(s))
+        shape = np.exp(-q * depth_share) + np.exp(-q * (2 - depth_share))
+        return np.asarray(shape / (s * ((1 + fade) + q / biot * (1 - fade))))
+
+    return _after_start(transform, fo)
 
 
 def _after_start(transform: Callable[[Complex], Complex], t: Array) -> Array:

@@ -8,17 +8,24 @@ import pytest
 from scipy.special import erf
 
 from thermogrip.sysid.contact.closed_forms import (
+    block_contact_flux,
+    block_skin_temperature,
     contact_flux,
+    contact_heat,
     contact_temperature,
     device_temperature,
     half_space,
     invert_laplace,
     layer_on,
+    layered_temperature,
     object_surface_temperature,
     object_temperature,
     sensor_temperature,
     skin_temperature,
     slab,
+    slab_heat,
+    slab_temperature,
+    slab_temperature_convective,
     two_body_flux,
     two_body_temperatures,
 )
@@ -26,6 +33,7 @@ from thermogrip.sysid.contact.closed_forms import (
 COPPER, WATER, BLOCK = 3.64e4, 1.6e3, 68600.0
 T = np.geomspace(1e-3, 40.0, 9)
 WARM, UNIT = {"T_dev0": 23.0, "T_obj0": 43.0}, {"T_dev0": 0.0, "T_obj0": 1.0}
+ONE_LAYER = dict.fromkeys(("e_layer", "alpha_layer", "e_base", "alpha_base"), 1.0)
 
 
 def exact(transform, t):
@@ -66,7 +74,7 @@ CASES = [
 
 
 @pytest.mark.parametrize(("gamma", "h_c", "t"), CASES)
-def test_skin_and_flux_agree_with_an_independent_inversion(gamma, h_c, t):
+def test_skin_flux_and_heat_agree_with_an_independent_inversion(gamma, h_c, t):
     e_dev, e_obj = 1e3, 1e3 / gamma
 
     def flux(s):
@@ -74,6 +82,7 @@ def test_skin_and_flux_agree_with_an_independent_inversion(gamma, h_c, t):
 
     bodies = {"e_dev": e_dev, "e_obj": e_obj, "h_c": h_c, **UNIT}
     assert contact_flux([t], **bodies)[0] == pytest.approx(exact(flux, t), rel=1e-8)
+    assert contact_heat([t], **bodies)[0] == pytest.approx(exact(lambda s: flux(s) / s, t), rel=1e-8)
     rise = exact(lambda s: flux(s) / (e_dev * mp.sqrt(s)), t)
     assert skin_temperature([t], **bodies)[0] == pytest.approx(rise, rel=1e-8)
     fall = object_surface_temperature([t], **(bodies | {"T_dev0": -1.0, "T_obj0": 0.0}))[0]
@@ -163,19 +172,20 @@ def test_block_against_half_space_agrees_with_an_independent_inversion(gamma, t)
         block = mp.coth(root * mp.mpf(capacity) / mp.mpf(e_obj)) / (e_obj * root)
         return 1 / (s * (1 / mp.mpf(h_c) + 1 / (e_dev * root) + block))
 
-    bodies = {"dev": half_space(e_dev), "obj": slab(e_obj, capacity), "h_c": h_c, **UNIT}
-    assert two_body_flux([t], **bodies)[0] == pytest.approx(exact(flux, t), rel=1e-8)
+    bodies = {"e_dev": e_dev, "e_obj": e_obj, "capacity": capacity, "h_c": h_c, **UNIT}
+    assert block_contact_flux([t], **bodies)[0] == pytest.approx(exact(flux, t), rel=1e-8)
     rise = exact(lambda s: flux(s) / (e_dev * mp.sqrt(s)), t)
-    assert two_body_temperatures([t], **bodies)[0][0] == pytest.approx(rise, rel=1e-8)
+    assert block_skin_temperature([t], **bodies)[0] == pytest.approx(rise, rel=1e-8)
 
 
 def test_a_block_is_a_half_space_until_heat_has_felt_its_back():
     t = np.array([0.01, 0.05, 0.1])  # the back of 2 cm of copper is felt at about 0.9 s
-    endless = {"e_dev": WATER, "e_obj": COPPER, "h_c": 800.0, **UNIT}
-    bodies = {"dev": half_space(WATER), "obj": slab(COPPER, BLOCK), "h_c": 800.0, **UNIT}
-    np.testing.assert_allclose(two_body_flux(t, **bodies), contact_flux(t, **endless), rtol=1e-9)
-    late = two_body_temperatures([100.0], **bodies)[0]
-    assert late[0] < skin_temperature([100.0], **endless)[0] - 0.05
+    bodies = {"e_dev": WATER, "e_obj": COPPER, "h_c": 800.0, **UNIT}
+    np.testing.assert_allclose(
+        block_contact_flux(t, capacity=BLOCK, **bodies), contact_flux(t, **bodies), rtol=1e-9
+    )
+    late = block_skin_temperature([100.0], capacity=BLOCK, **bodies)
+    assert late[0] < skin_temperature([100.0], **bodies)[0] - 0.05
 
 
 def test_a_thin_good_conductor_is_a_lump():
@@ -184,6 +194,61 @@ def test_a_thin_good_conductor_is_a_lump():
     t = np.array([1.0, 10.0, 60.0])
     _, block = two_body_temperatures(t, dev=half_space(1e9), obj=slab(1e7, capacity), h_c=h_c, **UNIT)
     np.testing.assert_allclose(block, np.exp(-h_c / capacity * t), rtol=1e-5)
+
+
+@pytest.mark.parametrize("fo", [1e-4, 0.02, 0.149, 0.151, 1.0, 5.0])
+@pytest.mark.parametrize("x", [0.0, 0.3, 1.0])
+def test_slab_series_agree_with_an_independent_inversion(fo, x):
+    thickness, alpha = 0.02, 1e-5
+    t = fo * thickness**2 / alpha
+
+    def held(s):
+        q = mp.sqrt(s)
+        return mp.cosh(q * (1 - x)) / (s * mp.cosh(q))
+
+    got = slab_temperature([t], x * thickness, T0=0.0, T_surf=1.0, thickness=thickness, alpha=alpha)[0]
+    assert got == pytest.approx(exact(held, fo), rel=1e-8, abs=1e-13)
+    left = slab_temperature([t], x * thickness, T0=1.0, T_surf=0.0, thickness=thickness, alpha=alpha)[0]
+    assert left == pytest.approx(1 - exact(held, fo), rel=1e-8, abs=1e-13)
+    biot = 0.7
+
+    def film(s):
+        q = mp.sqrt(s)
+        return mp.cosh(q * (1 - x)) / (s * (mp.cosh(q) + q / biot * mp.sinh(q)))
+
+    got = slab_temperature_convective(
+        [t], x * thickness, T0=0.0, T_fluid=1.0, h=biot * 50.0 / thickness, k=50.0, thickness=thickness,
+        alpha=alpha,
+    )[0]  # fmt: skip
+    assert got == pytest.approx(exact(film, fo), rel=1e-8, abs=1e-13)
+
+
+@pytest.mark.parametrize("fo", [1e-6, 0.01, 0.149, 0.151, 3.0])
+def test_slab_heat_agrees_with_an_independent_inversion(fo):
+    got = slab_heat([fo], T0=0.0, T_surf=1.0, capacity=1.0, effusivity=1.0)[0]
+    assert got == pytest.approx(exact(lambda s: mp.tanh(mp.sqrt(s)) / s**1.5, fo), rel=1e-8)
+
+
+@pytest.mark.parametrize(("e_layer", "e_base"), [(600.0, 1600.0), (1600.0, 600.0), (1e3, 10.0), (10.0, 1e4)])
+@pytest.mark.parametrize("depth", [0.0, 5e-4, 1e-3, 3e-3])
+def test_layered_body_agrees_with_an_independent_inversion(e_layer, e_base, depth):
+    thickness, alpha_layer, alpha_base, t = 1e-3, 1e-7, 1.4e-7, 30.0
+
+    def rise(s):
+        q1, q2 = mp.sqrt(s / mp.mpf(alpha_layer)), mp.sqrt(s / mp.mpf(alpha_base))
+        r = mp.mpf(e_layer - e_base) / mp.mpf(e_layer + e_base)
+        fade = mp.exp(-2 * q1 * thickness)
+        if depth <= thickness:
+            shape = mp.exp(-q1 * depth) + r * fade * mp.exp(q1 * depth)
+        else:
+            shape = (1 + r) * mp.exp(-q1 * thickness - q2 * (depth - thickness))
+        return shape / (s * (1 + r * fade))
+
+    got = layered_temperature(
+        [t], depth, T0=0.0, T_surf=1.0, thickness=thickness, e_layer=e_layer, alpha_layer=alpha_layer,
+        e_base=e_base, alpha_base=alpha_base,
+    )[0]  # fmt: skip
+    assert got == pytest.approx(exact(rise, t), rel=1e-8)
 
 
 @pytest.mark.parametrize(("t", "like", "rtol"), [(1e-4, 600.0, 1e-7), (1e5, WATER, 5e-3)])
@@ -210,7 +275,11 @@ def test_inversion_error_falls_as_predicted():
         lambda: invert_laplace(lambda s: 1 / s, [0.0]),
         lambda: slab(0.0, 1.0),
         lambda: half_space(-1.0),
+        lambda: slab_temperature([1.0], 0.03, T0=0, T_surf=1, thickness=0.02, alpha=1e-5),
+        lambda: slab_temperature([-1.0], 0.0, T0=0, T_surf=1, thickness=0.02, alpha=1e-5),
+        lambda: slab_heat([-1.0], T0=0, T_surf=1, capacity=1.0, effusivity=1.0),
         lambda: two_body_flux([1.0], dev=half_space(1.0), obj=half_space(1.0), h_c=0.0, **UNIT),
+        lambda: layered_temperature([0.0], 0.0, T0=0, T_surf=1, thickness=1e-3, **ONE_LAYER),
     ],
 )
 def test_what_no_body_has_is_refused(call):
@@ -225,3 +294,15 @@ def test_a_sensor_on_a_perfect_contact_follows_a_step():
     want = 23.0 + 20.0 * COPPER / (WATER + COPPER) * (1 - np.exp(-t / 0.8))
     np.testing.assert_allclose(sensor_temperature(t, **of), want, rtol=1e-12)
     np.testing.assert_allclose(sensor_temperature(t, h_c=1e7, **of), want, atol=2e-3)
+
+
+def test_heat_and_profiles_begin_at_nothing_and_end_in_balance():
+    heat = slab_heat([0.0, 1e9], T0=23.0, T_surf=43.0, capacity=5e4, effusivity=1e4)
+    np.testing.assert_allclose(heat, [0.0, 20.0 * 5e4])
+    of = {"T0": 43.0, "thickness": 0.02, "alpha": 1e-5}
+    np.testing.assert_allclose(slab_temperature([0.0, 1e9], 0.01, T_surf=23.0, **of), [43.0, 23.0])
+    met = slab_temperature_convective([0.0, 1e9], [0.0, 0.02], T_fluid=23.0, h=500.0, k=70.0, **of)
+    np.testing.assert_allclose(met, [43.0, 23.0])
+    assert contact_heat([0.0], e_dev=WATER, e_obj=COPPER, h_c=800.0, **WARM)[0] == 0.0
+    perfect = contact_heat([4.0], e_dev=WATER, e_obj=COPPER, **WARM)[0]  # twice the flux times the time
+    assert perfect == pytest.approx(8.0 * contact_flux([4.0], e_dev=WATER, e_obj=COPPER, **WARM)[0])
