@@ -37,7 +37,10 @@ _KINDS = {"M": "aluminium", "W": "wood", "CW": "wood_cold"}
 _ARRAY = re.compile(
     rb"\(I(\d+)\nI(\d+)\ntcnumpy\ndtype\n.*?\(S'f8'\n.*?tbI0([01])\n(S['\"].*['\"])\ntb", re.DOTALL
 )
-_FULL_SCALE, _DIVIDER, _BETA, _KELVIN = 4095.0, (155183.0, 46555.0), 4025.0, 273.15
+_FULL_SCALE = 4095.0
+_DIVIDER = (155183.0, 46555.0)
+_BETA = 4025.0
+_KELVIN = 273.15
 _STEP, _AVERAGED = 0.01, 10  # s; samples
 
 

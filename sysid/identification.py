@@ -556,7 +556,9 @@ def _refit(kind: str, kept: BlackBoxFit | None, task: _Task, steps: _Steps) -> t
     plant = box.plant if box is not None else _fitted(kind, task.logs, None, task, report)
     if not task.options.draws or (box is not None and kind not in RESAMPLED):
         return plant, []
-    n, seed, report = task.options.draws, task.options.seed, steps.start("draws")
+    n = task.options.draws
+    seed = task.options.seed
+    report = steps.start("draws")
     try:
         if box is not None:
             return with_refits(box, n, seed=seed, progress=report), []
@@ -653,7 +655,9 @@ class _Steps:
     """Spreads the progress of steps over the whole."""
 
     def __init__(self, progress: Progress | None, steps: int) -> None:
-        self._progress, self._steps, self._done = progress, steps, 0
+        self._progress = progress
+        self._steps = steps
+        self._done = 0
 
     def start(self, what: str, of: int = 1) -> Progress | None:
         """Return where a step reports to that counts as so many."""

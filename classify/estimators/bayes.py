@@ -290,7 +290,9 @@ class BayesClassifier(GraspClassifier):
                 break
         informative = n - np.sum(np.linalg.inv(covariance) * scatter_covariance.sum(axis=0)) / d
         self.dof_ = float(self.shrinkage_ + informative + 2)  # nu_n - d + 1
-        self.means_, self.mean_covariance_, self.covariance_ = means, spread, covariance
+        self.means_ = means
+        self.mean_covariance_ = spread
+        self.covariance_ = covariance
         self.t_object_sd_ = typical
 
     def _shrinkages(self, x: Floats, weight: Floats, at: NDArray[np.intp]) -> tuple[float, float]:
@@ -331,7 +333,9 @@ class BayesClassifier(GraspClassifier):
         out[~wide] = self._log_t_of(_rows_of_readings(read, ~wide))
         if not wide.any():
             return out
-        record, unknown, some = pick(grasps, wide), unknown[wide], _rows_of_readings(read, wide)
+        record = pick(grasps, wide)
+        unknown = unknown[wide]
+        some = _rows_of_readings(read, wide)
         low, high = object_range(record).T
         skin = level(record)
         centre = np.where(unknown, (low + high) / 2, skin + np.where(unknown, 0.0, some.difference))

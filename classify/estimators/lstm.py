@@ -136,7 +136,9 @@ class LstmClassifier(JoinedClassifier):
         self, real: Floats, target: NDArray[np.int64]
     ) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
         """Return augmented series of traces, and their classes."""
-        size, noise, shift = self.series_per_class, self.noise_sd, self.shift_sd
+        size = self.series_per_class
+        noise = self.noise_sd
+        shift = self.shift_sd
         made = augment(
             real, target, series_per_class=size, noise_sd=noise, shift_sd=shift, seed=self.random_state
         )
@@ -175,7 +177,9 @@ class LstmClassifier(JoinedClassifier):
         return {}, arrays | {f"weights.{k}": v for k, v in self.weights_.items()}
 
     def set_state(self, numbers: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> None:
-        self.times_, self.mean_, self.sd_ = arrays["times"], arrays["mean"], arrays["sd"]
+        self.times_ = arrays["times"]
+        self.mean_ = arrays["mean"]
+        self.sd_ = arrays["sd"]
         self.loss_curve_ = arrays["loss_curve"]
         n, k = self.times_.size * (getattr(self, "sensors_", None) or 1), self.classes_.size
         check_shapes(arrays, mean=(n,), sd=(n,))
@@ -249,7 +253,10 @@ def _train(
             def loss_of(series: Any, target: Any) -> Any:
                 return torch.nn.functional.cross_entropy(readout(network(series)[1][0][0]), target)
 
-            curve, least, best, weights = [], float("inf"), epochs, _weights_by_name(network, readout)
+            curve = []
+            least = float("inf")
+            best = epochs
+            weights = _weights_by_name(network, readout)
             for epoch in range(1, epochs + 1):
                 total = torch.zeros((), device=device)
                 for rows in torch.randperm(len(y)).split(model.batch):  # type: ignore[no-untyped-call]
@@ -265,7 +272,9 @@ def _train(
                 with torch.no_grad():
                     now = float(curve[-1] if held_out_tensors is None else loss_of(*held_out_tensors))
                 if now < least - _LEAST_GAIN:
-                    least, best, weights = now, epoch, _weights_by_name(network, readout)
+                    least = now
+                    best = epoch
+                    weights = _weights_by_name(network, readout)
                 elif held_out_tensors is not None and epoch - best >= model.patience:
                     break
             if model.patience is None:

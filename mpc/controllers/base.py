@@ -31,7 +31,10 @@ class SampledController:
         patience_s: float,
         clock: Callable[[], float],
     ) -> None:
-        self.model, self.controlled, self.drives, self.clock = model, controlled, drives, clock
+        self.model = model
+        self.controlled = controlled
+        self.drives = drives
+        self.clock = clock
         self.times = CallTimes(model.dt)
         self._rows = [model.outputs.index(name) for name in controlled]
         self._patience_s = patience_s * (1 + SAME)

@@ -82,7 +82,9 @@ class CompiledStep:
     def step(self, reading: Readings, target: Trajectory) -> Move:
         """Return the move for this sample."""
         self._started = started = self.clock()
-        c, names, controlled = self.c, self._names, self.reference.controlled
+        c = self.c
+        names = self._names
+        controlled = self.reference.controlled
         _put(c.given, reading, names)
         unknown: list[str] = []
         if not isinstance(target, Mapping):
@@ -117,7 +119,9 @@ class CompiledStep:
         """Return the targets of the samples ahead (N, n_controlled), None where they stay."""
         if not isinstance(target, Mapping) or not any(isinstance(v, Sequence) for v in target.values()):
             return None
-        model, controlled, begin = self.reference.model, self.reference.controlled, len(self._names)
+        model = self.reference.model
+        controlled = self.reference.controlled
+        begin = len(self._names)
         targets = np.array(self.c.given[begin : begin + len(controlled)])
         good = (targets >= model.coldest) & (targets <= model.hottest)
         now = np.where(good, targets, self.c.view("target", targets.shape))

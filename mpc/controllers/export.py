@@ -190,7 +190,9 @@ def _random_loop(controller: Controller, samples: int, seed: int, progress: Prog
     ones, with readings that are lost, deadlines that pass, and drives that somebody else moved."""
     clock = _Clock()
     twin = ReferenceController(controller.plant, replace(controller.design, deadline_s=1.0), clock=clock)
-    model, rng, played = twin.model, np.random.default_rng(seed), list[_Sample]()
+    model = twin.model
+    rng = np.random.default_rng(seed)
+    played = list[_Sample]()
     low, high = _range_of(controller)
     span = twin.drives.highest - twin.drives.lowest
     rows = [model.outputs.index(name) for name in twin.controlled]

@@ -153,7 +153,9 @@ def _differences_from_c(
     """Return by sample the largest difference of a drive in ranges, whether none is limited, and whether the
     status is the same (states, 3)."""
     real = ctypes.c_double
-    rng, model, controlled = np.random.default_rng(seed), controller.model, controller.controlled
+    rng = np.random.default_rng(seed)
+    model = controller.model
+    controlled = controller.controlled
     n_c, n_u = len(controlled), model.n_u
     state = (real * (4 * n_c + n_u))()
     low, high = np.array([controller.plant.valid.get(name, (15.0, 60.0)) for name in controlled]).T

@@ -45,7 +45,9 @@ def linear_move(controller: ControllerParts) -> tuple[Array, Array, Array]:
     """Return H of the QP and the plan's gains on the free response and on the drive before, as
     :meth:`thermogrip.mpc.optimiser.rti.Optimiser.linear_gains`, linearised where the plant settles without
     drive, or where it rests if it settles nowhere."""
-    model, design, optimiser = controller.model, controller.design, controller.optimiser
+    model = controller.model
+    design = controller.design
+    optimiser = controller.optimiser
     x_rest, u, d = model.at_rest(design.ambient)
     x = model.steady_state(u, d)
     x = x_rest if not np.isfinite(x).all() else x
@@ -96,7 +98,10 @@ def plan_gains(controller: ControllerParts) -> tuple[Array, Array, Array, Array]
     _, on_free, on_last = linear_move(controller)
     F, _, E, H = augmented(controller)
     H = H[[controller.model.outputs.index(name) for name in controller.design.controlled]]
-    by_z, by_d, power, by_held_d = [], [], np.eye(len(F)), np.zeros_like(E)
+    by_z = []
+    by_d = []
+    power = np.eye(len(F))
+    by_held_d = np.zeros_like(E)
     for _ in range(sum(controller.design.blocks)):
         by_held_d, power = F @ by_held_d + E, F @ power
         by_z.append(H @ power)

@@ -145,7 +145,9 @@ class LoopMonitor:
         self.swings.restart()
         self._target = np.full(n, np.nan)
         self._error = np.full(n, np.nan)  # mean of the last errors
-        self._limited_s, self._away_s, self._strange_s = np.zeros(n), np.zeros(n), 0.0
+        self._limited_s = np.zeros(n)
+        self._away_s = np.zeros(n)
+        self._strange_s = 0.0
         self._marked_s = np.zeros(n)  # when the distance was noted
         self._marked = np.full(n, np.inf)  # the distance then
         self._begun = np.full(n, np.inf)  # the distance when 2 L were over

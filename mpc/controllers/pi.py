@@ -87,7 +87,9 @@ class PIController(SampledController):
         model = prediction_model(plant, design.dt)
         limits = DriveLimits.of(model, design.drive_range, design.slew_per_s, design.safe_drive)
         super().__init__(model, design.controlled, limits, design.patience_s, clock)
-        self.plant, self.notes, self.loops = plant, dict(notes or {}), self.design.loops
+        self.plant = plant
+        self.notes = dict(notes or {})
+        self.loops = self.design.loops
         # of each loop its drive and its controlled output, counted from 0
         self.ends = [(model.drives.index(p.drive), self.controlled.index(p.output)) for p in self.loops]
         self.integral, self._begun = np.zeros(len(self.loops)), np.full(len(self.controlled), np.nan)

@@ -187,10 +187,14 @@ class ReferenceController(SampledController):
         """Correct the estimate with this reading; return what the operator should know."""
         elapsed, silent = self.times.waited_s, self._past.silent_s
         if silent and np.isfinite(y).any():
-            u, target, side = self._u, self._target, self._approach.side
+            u = self._u
+            target = self._target
+            side = self._approach.side
             self._start(y, np.where(np.isfinite(d), d, self._past.d), self.observer.reset_in_room)
             self._u, self._past.fresh = u, False
-            self._target, self._approach.side, self._past.y = target, side, y
+            self._target = target
+            self._approach.side = side
+            self._past.y = y
             return advice.silence(silent)
         if not self._past.fresh:
             self.observer.look(self._past.d)

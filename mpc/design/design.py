@@ -163,11 +163,9 @@ def _refuse(wrong: object, problem: str) -> None:
 def _check_names(design: Design, plant: Plant) -> None:
     """Refuse what names nothing of the plant, or one thing twice."""
     drives = drive_names(plant)
-    no_output, no_drive, not_regulated = (
-        "the plant has no output {}",
-        "the plant has no drive {}",
-        "{} is not regulated",
-    )
+    no_output = "the plant has no output {}"
+    no_drive = "the plant has no drive {}"
+    not_regulated = "{} is not regulated"
     accepted: dict[str, tuple[Sequence[str] | Mapping[str, Any], str]] = {
         "controlled": (plant.outputs, no_output),
         "limits": (plant.outputs, no_output),
@@ -201,7 +199,9 @@ def _check_size(design: Design, plant: Plant) -> None:
     steps = design.dt / plant.dt
     no_multiple = abs(steps - round(steps)) > 1e-6 * steps
     _refuse(no_multiple, f"dt is {design.dt:g} s, no multiple of the plant's step of {plant.dt:g} s")
-    N, n_b, n_u = sum(design.blocks), len(design.blocks), len(drive_names(plant))
+    N = sum(design.blocks)
+    n_b = len(design.blocks)
+    n_u = len(drive_names(plant))
     _refuse(N > LONGEST_HORIZON, f"blocks sum to {N} samples, more than the {LONGEST_HORIZON} of a horizon")
     _refuse(n_b * n_u > MOST_UNKNOWNS, f"{n_b} blocks of {n_u} drives are more than {MOST_UNKNOWNS} unknowns")
 

@@ -108,7 +108,9 @@ NOISE, DRIFT = 0.05, 0.002
 
 #: Of an output in its unit: standard deviation of a sensor's offset that nobody knows; of how far a plant
 #: that is reported to be at rest moves in a sample; of its state from its own rest, where no reading shows.
-OFFSET, _RATE, _FAR = 0.3, 0.2, 10.0
+OFFSET = 0.3
+_RATE = 0.2
+_FAR = 10.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -331,7 +333,9 @@ class Observer:
         *,
         ambient: float = ROOM,
     ) -> None:
-        self.model, self.disturbance, self.ambient = model, disturbance, ambient
+        self.model = model
+        self.disturbance = disturbance
+        self.ambient = ambient
         self.noise = noise if noise is not None else ObserverNoise()
         plant = model.plant
         self.offset = np.array([float(plant.offsets.get(name, 0.0)) for name in model.outputs])
@@ -537,7 +541,9 @@ class Observer:
             return
         after, step = self._sample(self._dose / self._into, d)
         P = self._P + self._noise(share - self._noised)
-        self._P, self._share, self._noised = P, share, share
+        self._P = P
+        self._share = share
+        self._noised = share
         self._ahead = (1 - share) * self.x + share * after
         self._way = (1 - share) * np.eye(len(P)) + share * step
         self._bent = 4 * share * (1 - share) * (self.model.C @ (after - self.x))

@@ -59,7 +59,9 @@ class Oscillation:
     """
 
     def __init__(self, shortest: float, longest: float, least: float) -> None:
-        self._shortest, self._longest, self.least = shortest, longest, least
+        self._shortest = shortest
+        self._longest = longest
+        self.least = least
         self.restart()
 
     def restart(self) -> None:

@@ -129,7 +129,9 @@ class StructureMonitor:
     ``denies`` whether the last window was the model's."""
 
     def __init__(self, plant: Plant, model: PredictionModel, controlled: Sequence[str]) -> None:
-        self.model, self.plant, self.denies = model, plant, False
+        self.model = model
+        self.plant = plant
+        self.denies = False
         self.said = ""
         self.spread = _posterior(plant)
         self._rows = [model.outputs.index(name) for name in controlled]
@@ -153,7 +155,10 @@ class StructureMonitor:
 
     def forget(self) -> None:
         """Start afresh."""
-        self.said, self._at, self._sd, self.denies = "", 0, 0.0, False
+        self.said = ""
+        self._at = 0
+        self._sd = 0.0
+        self.denies = False
         self.restart()
 
     def restart(self) -> None:
@@ -211,14 +216,18 @@ class StructureMonitor:
             return None
         first, rows = rows[0], rows[1:]
         u, d, y = (np.array([getattr(row, name) for row in rows]) for name in ("u", "d", "y"))
-        n_x, n_w, n_t = model.n_x, len(first.w), spread.shape[1]
+        n_x = model.n_x
+        n_w = len(first.w)
+        n_t = spread.shape[1]
         scale = np.concatenate([_SET.state_sd * observer.unit, np.sqrt(observer.P0 + first.w**2)])
         offset, disturbance = observer.offset + observer.found_offset, observer.disturbance
 
         def run(z: Array, drives: Array) -> Array:
             """Return the outputs (B, N sub + 1, n_y) of unknowns z (B, m) under drives (B|1, N, n_u)."""
             xw = np.concatenate([first.x, first.w]) + z[:, : n_x + n_w] * scale
-            x, w, plant_numbers = xw[:, :n_x], xw[:, n_x:], z[:, n_x + n_w :]
+            x = xw[:, :n_x]
+            w = xw[:, n_x:]
+            plant_numbers = z[:, n_x + n_w :]
             pushed = drives * (1 + _SET.gain_sd * plant_numbers[:, None, n_t:])
             fine = np.repeat(
                 model.inputs(pushed + (w @ disturbance.on_drive.T * model.span)[:, None]), model.sub, axis=1

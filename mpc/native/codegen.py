@@ -75,7 +75,11 @@ _OPERATIONS |= {
         *("asinh", "acosh", "atanh", "floor", "ceil", "erf", "log1p", "expm1"),
     )
 }
-_PARAMETERS, _DRIVES, _STATE, _DIRECTION = 1, 2, 3, 4  # what a value depends on
+# what a value depends on
+_PARAMETERS = 1
+_DRIVES = 2
+_STATE = 3
+_DIRECTION = 4
 _POINT = "const double *x, const double *u, const double *d, const double *k"
 _SU, _SD = "const double *restrict su", "const double *restrict sd"
 _COLUMNS = "int n, const double *m, const double *k, const double *h, const double *restrict sx"
@@ -263,7 +267,9 @@ def _tabulate(after: Any, x: Any, u: Any, d: Any) -> _LinearRows:
     """Return the rows of a step whose slopes are many constants."""
     import casadi as ca
 
-    arguments, n_x, n_u = ca.vertcat(x, u, d), x.numel(), u.numel()
+    arguments = ca.vertcat(x, u, d)
+    n_x = x.numel()
+    n_u = u.numel()
     slopes = ca.jacobian(after, arguments)
     count = slopes.sparsity().T.colind()
     long = [i for i in range(n_x) if count[i + 1] - count[i] >= _LONG]
@@ -435,7 +441,9 @@ def _hand_over(
 
 def _body(line: _Line, stage: int, roots: Sequence[int], stores: Sequence[str]) -> list[str]:
     """Return the statements of a stage that lead to these values, and then their stores."""
-    values, written, names = line.values, [], {}
+    values = line.values
+    written = []
+    names = {}
     order = sorted(_needed(line, roots))
     for number in order:
         value = values[number]

@@ -248,8 +248,12 @@ def initialiser(sizes: Sizes, numbers: dict[str, Any]) -> str:
 
 def numbers_of(controller: ControllerParts, k: Array) -> dict[str, Any]:
     """Return every number of the table for a controller; ``k`` is what ``prepare`` gave."""
-    model, design, optimiser = controller.model, controller.design, controller.optimiser
-    observer, disturbance, loops = controller.observer, controller.disturbance, design.loops
+    model = controller.model
+    design = controller.design
+    optimiser = controller.optimiser
+    observer = controller.observer
+    disturbance = controller.disturbance
+    loops = design.loops
     resting = observer.rest_in_room()
     rows = [model.outputs.index(name) for name in (*design.controlled, *design.limits)]
     limits = np.array(list(design.limits.values()), dtype=float).reshape(-1, 2)

@@ -48,7 +48,10 @@ CONVERGED = 1e-4  # of the largest unit, and of the range: the steady state is f
 BEYOND_LIMIT = 100.0  # weight of an output beyond its limits
 CANNOT, CAN = 0.1, 0.05  # of its unit that an output is from the target: it cannot be had, it can
 LEAST_SD = 0.05  # of its unit, of a steady output where no bias is estimated
-MISS_CLIP, MISS_ALLOWANCE, MISS_ALARM = 2.0, 0.5, 3.0  # of Page's test
+# of Page's test
+MISS_CLIP = 2.0
+MISS_ALLOWANCE = 0.5
+MISS_ALARM = 3.0
 TAKE_BACK = 5  # samples in a row
 
 
@@ -70,7 +73,9 @@ class Reach:
         """Start afresh."""
         self._x: Array | None = None
         self._u = self.model.neutral
-        self._sum, self._in, self._unreachable = 0.0, 0, False
+        self._sum = 0.0
+        self._in = 0
+        self._unreachable = False
         self._target = np.full(len(self._rows), np.nan)
 
     def missed(
@@ -91,7 +96,10 @@ class Reach:
         seen which of them count [degC].
         """
         if not np.array_equal(target, self._target):
-            self._target, self._sum, self._in, self._unreachable = target.copy(), 0.0, 0, False
+            self._target = target.copy()
+            self._sum = 0.0
+            self._in = 0
+            self._unreachable = False
         if self._in >= TAKE_BACK and not self._unreachable:
             return None
         unit = self.model.unit[self._rows]
@@ -131,8 +139,12 @@ class Reach:
     ) -> tuple[Array, Array]:
         """Return the controlled outputs nearest to the targets, and their derivatives by the biases w; the
         targets and zeros where no steady state is found."""
-        model, rows, optimiser = self.model, self._rows, self._optimiser
-        bias, drive_bias, disturbance = observer.output_bias, observer.drive_bias, observer.disturbance
+        model = self.model
+        rows = self._rows
+        optimiser = self._optimiser
+        bias = observer.output_bias
+        drive_bias = observer.drive_bias
+        disturbance = observer.disturbance
         x_s, u_s = (observer.now, u) if self._x is None else (self._x, self._u)
         u_s, self._x = optimiser.drives.cut(u_s), None
         nothing = target, np.zeros((len(target), observer.w.size))
@@ -189,7 +201,9 @@ class Reach:
 
     def _range(self, G: Array, u: Array, drive_bias: Array) -> tuple[Array, Array]:
         """Return the ends (n_u,) of the drives: no further than the optimiser goes where a gain fades."""
-        drives, at_rest, neutral = self._optimiser.drives, self._optimiser.at_rest, self.model.neutral
+        drives = self._optimiser.drives
+        at_rest = self._optimiser.at_rest
+        neutral = self.model.neutral
         if at_rest.settled is None:
             return drives.lowest, drives.highest
         gain = G[np.array(self._rows)[at_rest.strongest], np.arange(len(u))]

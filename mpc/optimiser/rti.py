@@ -212,7 +212,9 @@ class Optimiser:
 
     def _program(self) -> CondensedQP:
         """Return the program: ranges and slews, then of each controlled and limited output its samples."""
-        design, weights, n = self.design, self.weights, self._differences.shape[0]
+        design = self.design
+        weights = self.weights
+        n = self._differences.shape[0]
         zoned, by_zone = weights.zone[:, None] > 0, weights.output[:, None] * weights.sample
         limited = np.repeat(weights.dear, self.N)
         controlled = np.where(zoned, by_zone, design.price).ravel()
@@ -232,7 +234,10 @@ class Optimiser:
     def solve(self, sample: Sample) -> Outcome:
         """Improve a plan."""
         model, problem = self.model, self._problem(sample)
-        x, d, bias, drive_bias = sample.x, sample.d, sample.bias, sample.drive_bias
+        x = sample.x
+        d = sample.d
+        bias = sample.bias
+        drive_bias = sample.drive_bias
         guess = self._park(sample.guess, problem)
         y_guess, G = self._linearised(x, guess + drive_bias, d)
         authority = self._authority(G)
@@ -369,7 +374,9 @@ class Optimiser:
 
     def _merit(self, plans: Array, y: Array, problem: Problem) -> Array:
         """Return the cost (B,) of plans (B, n_b, n_u) whose outputs y (B, N, n_y) were simulated."""
-        design, weights, n_u = self.design, self.weights, self.model.n_u
+        design = self.design
+        weights = self.weights
+        n_u = self.model.n_u
         shares = plans.reshape(len(plans), -1) / self._spans
         moves = shares.copy()
         moves[:, n_u:] -= shares[:, :-n_u]

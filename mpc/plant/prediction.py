@@ -108,7 +108,9 @@ class PredictionModel:
                 "the plant has no drive", hint="identify it with an input that a controller can move"
             )
         self.disturbances, self.outputs = tuple(self.model.disturbances), tuple(self.model.outputs)
-        self.n_x, self.n_u, self.n_y = int(self.model.n_x), len(self.drives), len(self.outputs)
+        self.n_x = int(self.model.n_x)
+        self.n_u = len(self.drives)
+        self.n_y = len(self.outputs)
         self.n_d = len(self.disturbances)
         self.rooms: Mask = np.array([plant.is_room(name) for name in self.disturbances], dtype=bool)
         self.drive_index = [self.model.inputs.index(name) for name in self.drives]
@@ -171,7 +173,9 @@ class PredictionModel:
     def at_rest(self, ambient: float) -> tuple[Array, Array, Array]:
         """Return state, drives and disturbances where all is at rest in a room of this temperature [degC];
         where no log was there, amid what the logs showed."""
-        d, y, v = self.undisturbed(ambient), self.usual(ambient), self.neutral
+        d = self.undisturbed(ambient)
+        y = self.usual(ambient)
+        v = self.neutral
         if np.any(y != ambient):
             logs = [self.plant.valid.get(name, (neutral, neutral)) for name, neutral in zip(self.drives, v)]
             v = np.clip(np.mean(np.array(logs, dtype=float), axis=1), self.lowest, self.highest)
@@ -286,7 +290,9 @@ class PredictionModel:
             raise RuntimeError("the plant is not linear")
         A, B, _, _ = self.affine
         rows, sums = self.C, np.zeros_like(self.C)
-        by_x, by_rest, impulse = [], [], []
+        by_x = []
+        by_rest = []
+        impulse = []
         for _ in range(sum(blocks)):
             impulse.append(rows @ B)
             sums = sums + rows
@@ -508,7 +514,9 @@ def step_response(
     step = np.zeros(model.n_u)
     step[j] = (0.05 if start[j] + 0.05 * model.span[j] <= model.highest[j] else -0.05) * model.span[j]
     x = np.repeat(x_rest[None, :], 2, axis=0)
-    time, answer, seconds = [np.zeros(1)], [np.zeros(1)], max(60.0, 100 * plant.dt)
+    time = [np.zeros(1)]
+    answer = [np.zeros(1)]
+    seconds = max(60.0, 100 * plant.dt)
     while True:
         n = round(seconds / plant.dt)
         u = np.stack([np.tile(start, (n, 1)), np.tile(start + step, (n, 1))])
@@ -635,7 +643,9 @@ def held_start(
     None. Shared: read it."""
     wanted = np.full(len(controlled), start)
     holding = holding_drive(model, controlled, wanted, d)
-    x, u, miss = model.steady_state(holding.u, d), holding.u, holding.miss
+    x = model.steady_state(holding.u, d)
+    u = holding.u
+    miss = holding.miss
     if not np.isfinite(x).all():  # an integrator
         x, u = _balance(model, [model.outputs.index(name) for name in controlled], wanted, np.array(d))
         miss = miss if np.all((model.lowest <= u) & (u <= model.highest)) else np.inf

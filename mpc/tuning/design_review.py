@@ -223,7 +223,9 @@ def lacks_structure(controller: Reviewed, swing: tuple[float, float]) -> Check:
     draw = draws_of(plant, 1)[0]
     tried = {words: replace(usual, **changes) for words, changes in lacking(plant, spec, controlled).items()}  # type: ignore[arg-type]
     tried[play := f"play of {100 * _PLAY:g} % of each drive"] = replace(usual, play=_PLAY)
-    words, verdicts, case = [], [], Case(*spec.steps[0], draw)
+    words = []
+    verdicts = []
+    case = Case(*spec.steps[0], draw)
     for structure, around in tried.items():
         run = trial(_again(controller), plant, spec, case, around=around)
         for result in results_of(run, spec, case):

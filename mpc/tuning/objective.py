@@ -180,7 +180,9 @@ def apparent_delays(plant: Plant, controlled: tuple[str, ...]) -> tuple[float, .
 def lacking(plant: Plant, spec: Spec, controlled: Sequence[str]) -> dict[str, dict[str, float]]:
     """Return what a plant may have that its model lacks: in words, and as changes of the surroundings."""
     delay = max(apparent_delays(plant, tuple(controlled)))
-    lag, late, lost = spec.extra_lag * delay, spec.extra_delay * delay, spec.lost_gain
+    lag = spec.extra_lag * delay
+    late = spec.extra_delay * delay
+    lost = spec.lost_gain
     tried = [
         (lag, f"sensors slower by {lag:.2g} s", {"sensor_lag_s": lag}),
         (late, f"delay longer by {late:.2g} s", {"move_delay_s": late}),

@@ -286,7 +286,9 @@ class Bench:
     """A plant and the trials on which its controllers are compared."""
 
     def __init__(self, plant: Plant, spec: Spec, seed: int, show: Progress) -> None:
-        self.plant, self.spec, self.seed = plant, spec, seed
+        self.plant = plant
+        self.spec = spec
+        self.seed = seed
         self.draws = draws_of(plant, spec.search_draws)
         certain = self.draws == [0]  # no draws: the comparison takes the same plant, and fresh noise
         self.unseen = [draw + SEARCH.check_from if draw else 0 for draw in draws_of(plant, spec.check_draws)]

@@ -163,7 +163,9 @@ def _arx_realisation(
     grid: Grid, terms: tuple[str, ...], A: Sequence[Array], B: Sequence[Array], c: Array
 ) -> StateSpaceModel:
     """Return the model with state [y[k], ..., y[k-n+1], w[k-1], ..., w[k-m]], m = len(B) - 1."""
-    n_y, n_w, m = len(grid.outputs), B[0].shape[1], len(B) - 1
+    n_y = len(grid.outputs)
+    n_w = B[0].shape[1]
+    m = len(B) - 1
     n = len(A) * n_y + m * n_w
     matrix = np.zeros((n, n))
     matrix[:n_y] = np.hstack([*A, *B[1:]])

@@ -253,7 +253,9 @@ def with_refits(
     family: Callable[..., Mapping[Structure, Model]] = family_of(fit.kind)
     if fit.kind in _SEARCHED:  # from the denominators of refits before: a quarter of the time
         family = partial(family, searches=[])
-    rng, most, misses = np.random.default_rng(seed), _AGREES * _error(fit, fit.choice.model), _misses(fit)
+    rng = np.random.default_rng(seed)
+    most = _AGREES * _error(fit, fit.choice.model)
+    misses = _misses(fit)
     refits: list[Model] = []
     tried = 0
     while len(refits) < n and tried < _TRIES * n and (refits or tried < _HOPELESS):

@@ -218,7 +218,9 @@ def _train_member(data: _Data, linear: _Linear, h: int, *, seed: int) -> _Member
 
     n, m = linear.B.shape
     rng = np.random.default_rng(seed)
-    W, U, b = rng.normal(size=(h, n)), rng.normal(size=(h, m)), rng.normal(size=h)
+    W = rng.normal(size=(h, n))
+    U = rng.normal(size=(h, m))
+    b = rng.normal(size=h)
     random = np.concatenate([W.ravel(), U.ravel()]) / np.sqrt(n + m)
     theta = np.concatenate([linear.B.ravel(), linear.c, np.zeros(n * h), random, b])
     n_p, n_linear = len(theta), n * m + n
@@ -305,7 +307,9 @@ def _grown(part: Array, shape: tuple[int, ...]) -> Array:
 
 
 def _as_model(grid: Grid, data: _Data, members: Sequence[_Member], h: int) -> NeuralModel:
-    n, m, count = len(members[0].A), len(data.w_middle), len(members)
+    n = len(members[0].A)
+    m = len(data.w_middle)
+    count = len(members)
     weights = np.stack([some.weights for some in members])
     shapes = {"B": (n, m), "c": (n,), "V": (n, h), "W": (h, n), "U": (h, m), "b": (h,)}
     ends = np.cumsum([int(np.prod(shape)) for shape in shapes.values()])

@@ -429,7 +429,9 @@ def _split_segments(
     segments: Sequence[Segment], first: int, last: int
 ) -> tuple[list[Segment], list[Segment]]:
     """Cut the rows first to last, counted over all segments, out of the segments."""
-    inside, outside, first_row = [], [], 0
+    inside = []
+    outside = []
+    first_row = 0
     for segment in segments:
         n = len(segment.time)
         a, b = np.clip([first - first_row, last - first_row], 0, n)

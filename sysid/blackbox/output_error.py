@@ -206,7 +206,9 @@ def arx_start(records: Records, na: int, nb: int, delay: int) -> Array | None:
     """Return a_1 ... a_na of the ARX fit, None where it is unstable or too few rows are whole."""
     deep = max(na, delay + nb - 1)
     n = na + records.n_drive * nb + 1
-    gram, right, count = np.zeros((n, n)), np.zeros(n), 0
+    gram = np.zeros((n, n))
+    right = np.zeros(n)
+    count = 0
     for reading, drive in zip(records.y, records.w):
         if len(reading) <= deep:
             continue
@@ -217,7 +219,9 @@ def arx_start(records: Records, na: int, nb: int, delay: int) -> Array | None:
         X = np.hstack([*past, *late, np.ones((rows, 1))])
         good = np.isfinite(X[:, :na]).all(axis=1) & np.isfinite(reading[deep:])
         X, y = X[good], reading[deep:][good]
-        gram, right, count = gram + X.T @ X, right + X.T @ y, count + len(y)
+        gram = gram + X.T @ X
+        right = right + X.T @ y
+        count = count + len(y)
     if count < 2 * n:
         return None
     size = order_selection.column_sizes(np.sqrt(np.diag(gram)))
@@ -339,7 +343,10 @@ def assemble(
     Observer form: v_1+ = -a_1 v_1 + v_2 + (numerator row) w, ..., y = v_1; a delay of n_k adds n_k - 1 rows
     of pure shift in front of the numerator, so that delays are states.
     """
-    A, W, c, C = [], [], [], []
+    A = []
+    W = []
+    c = []
+    C = []
     for filter_of_output in filters:
         na, (n_drive, nb) = len(filter_of_output.a), filter_of_output.b.shape
         n = max(na, filter_of_output.delay - 1 + nb)

@@ -146,7 +146,9 @@ def _bounded_model(grid: Grid, exponents: NDArray[np.int_], natural: Array, memo
         return None
     labels = (grid.inputs, grid.disturbances, grid.outputs, grid.switches)
     model = SindyModel(*labels, grid.dt, memory, exponents, natural, low, high)
-    longest, starts, states = max(len(segment.time) for segment in grid.segments), [], []
+    longest = max(len(segment.time) for segment in grid.segments)
+    starts = []
+    states = []
     for segment in grid.segments:
         first = segment.y[np.argmax(np.isfinite(segment.y), axis=0), np.arange(len(grid.outputs))]
         starts.append(model.rest(first, (), (), ()))
@@ -166,7 +168,9 @@ def _bounded_model(grid: Grid, exponents: NDArray[np.int_], natural: Array, memo
 
 def _trajectories(grid: Grid, memory: int) -> tuple[list[Array], list[Array], list[Array]]:
     """Return states, outside variables and increments of every run of whole rows."""
-    x, w, move = [], [], []
+    x = []
+    w = []
+    move = []
     readings = whole_readings(grid.segments, memory + 5)
     for segment in (replace(some, y=y) for some, y in zip(grid.segments, readings)):
         for begin, end in _whole_rows(segment):

@@ -133,7 +133,9 @@ def slab_modes(
     :class:`Gripper`, ``node`` and ``shares`` those of the quadrature."""
     start = _N_EXACT - 0.5
     for p in range(contact.shape[0]):
-        e, c, gripper_numbers = contact[p, 0], contact[p, 1], numbers[min(p, numbers.shape[0] - 1)]
+        e = contact[p, 0]
+        c = contact[p, 1]
+        gripper_numbers = numbers[min(p, numbers.shape[0] - 1)]
         unit, biot = (e / c) ** 2, gripper_numbers[5] * c / (e * e)
         top = np.sqrt(_FASTEST / unit) / np.pi
         # past it modes are too fast to count; a slab whose first dozen are has groups of a fixed span
@@ -143,7 +145,10 @@ def slab_modes(
         series[p, 0] = gripper_numbers[0] + beyond
         series[p, 1], series[p, 2] = (-beyond, 0.0) if free else (-2.0 * beyond, beyond)
         for j in range(N_MODE):
-            y, share, along, by_span = N_MODE - 1.0 - j, 2.0, 0.0, 0.0
+            y = N_MODE - 1.0 - j
+            share = 2.0
+            along = 0.0
+            by_span = 0.0
             if j < _N_GROUPED:
                 y = start * np.exp(0.5 * span * (1.0 + node[j]))
                 share = span * shares[j] * y
@@ -151,7 +156,10 @@ def slab_modes(
                     along, by_span = 0.5 * (1.0 + node[j]), 1.0 / span
             elif j < _N_GROUPED + 2:  # next Euler-Maclaurin term, f'(start)/24 as a difference of modes
                 share = 2.0 / 24.0 if j == _N_GROUPED else 2.0 - 2.0 / 24.0
-            beta, damping, place, by_biot = np.pi * y, 1.0, 1.0, 0.0
+            beta = np.pi * y
+            damping = 1.0
+            place = 1.0
+            by_biot = 0.0
             square = beta * beta
             if biot > 0.0:
                 if j == N_MODE - 1:
@@ -203,7 +211,9 @@ def grippers(lam: Array, face: Array, sensor: Array, numbers: Array) -> Gripper:
 def conductance(t: Array, h: Array, build_up: Array, numbers: Array) -> Array:
     """Return h(t) of n contacts on time nodes, and its derivative by ln tau_b, (n, 2, n_node); ``numbers``
     are those of :class:`Gripper`."""
-    first, creep, settle = numbers[:, 2, None], numbers[:, 3, None], numbers[:, 4, None]
+    first = numbers[:, 2, None]
+    creep = numbers[:, 3, None]
+    settle = numbers[:, 4, None]
     late = np.exp(-t / build_up[:, None])
     settled = h[:, None] * (1.0 - creep * np.expm1(-t / settle))
     grown = np.empty((h.size, 2, t.size))
@@ -226,11 +236,9 @@ def contacts(
     moves = np.empty((n if wanted[:, BY_E:].any() else 0, 4, N_MODE))
     modes[:, :3, N_MODE:], modes[:, 3, N_MODE:] = gripper_rows, -np.expm1(-gripper_rows[:, 0] * dt[0])
     slab_modes(contact, gripper.numbers, dt[0], _NODE_PLACE, _NODE_WEIGHT, modes, moves, series)
-    rise, slope, flux = (
-        np.empty((n, N_STEPPED, t.size)),
-        np.empty((n, N_STEPPED, t.size)),
-        np.empty((n, t.size)),
-    )
+    rise = np.empty((n, N_STEPPED, t.size))
+    slope = np.empty((n, N_STEPPED, t.size))
+    flux = np.empty((n, t.size))
     grown = conductance(t, contact[:, 2], contact[:, 3], gripper.numbers)
     room, now = np.zeros((16, modes.shape[2])), np.zeros((7, 5))
     step_contacts(repeat, dt, modes, moves, series, grown, wanted, room, now, rise, slope, flux)
@@ -251,12 +259,26 @@ def step_contacts(
     """
     last = modes.shape[2] - 1
     # states; 1 - E, a, b, E and E b + a; their derivatives by ln e and ln C
-    x, m, a, b, keep, gain, moved = room[:5], room[5], room[6], room[7], room[8], room[9], room[10:16]
+    x = room[:5]
+    m = room[5]
+    a = room[6]
+    b = room[7]
+    keep = room[8]
+    gain = room[9]
+    moved = room[10:16]
     # of each curve: flux, sensor's node and reading, sums of the states at face and sensor, Z, and the sum of
     # a past the alive modes
-    q, node, read, w, s, z, late = now[0], now[1], now[2], now[3], now[4], now[5], now[6]
+    q = now[0]
+    node = now[1]
+    read = now[2]
+    w = now[3]
+    s = now[4]
+    z = now[5]
+    late = now[6]
     for p in range(modes.shape[0]):
-        rate, weight, sensor = modes[p, 0], modes[p, 1], modes[p, 2]
+        rate = modes[p, 0]
+        weight = modes[p, 1]
+        sensor = modes[p, 2]
         for c in range(5):
             q[c] = node[c] = read[c] = rise[p, c, 0] = slope[p, c, 0] = 0.0
             for j in range(last):
@@ -319,7 +341,9 @@ def step_contacts(
             for i in range(k + 1, k + 1 + repeat[g]):
                 for c in range(4, -1, -1):  # the value last, as the others need its state of before
                     if wanted[p, c]:
-                        qc, total, at_sensor = q[c], 0.0, 0.0
+                        qc = q[c]
+                        total = 0.0
+                        at_sensor = 0.0
                         if c > 2:
                             row, q0 = 3 * (c - 3), q[0]
                             for j in range(low, N_MODE):

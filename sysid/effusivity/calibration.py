@@ -344,7 +344,9 @@ class Linearised(NamedTuple):
 
 def linearise(problem: Problem, theta: Array, w: Array, spread: Spread) -> Linearised:
     """Return the prediction of every grasp and its derivatives."""
-    data, nodes, scale = problem.data, problem.nodes, problem.scales(spread)
+    data = problem.data
+    nodes = problem.nodes
+    scale = problem.scales(spread)
     u = problem.centre(theta) + scale * w
     beyond = problem.beyond(theta)
     y, by_u = jacobian(stack_of(theta), nodes, data, u, np.ones(u.shape, dtype=bool), beyond)
@@ -418,7 +420,9 @@ def joint_step(
         )
         move, move_w = shorten * move, shorten * move_w
         if _objective(problem, theta + move, w + move_w, spread, whitener) < before + 1e-9:
-            new_theta, new_w, damping = theta + move, w + move_w, max(damping * 0.1, 1e-9)
+            new_theta = theta + move
+            new_w = w + move_w
+            damping = max(damping * 0.1, 1e-9)
             break
         damping = max(damping * 10, 1e-6)
     variance = np.diagonal(inverse, axis1=1, axis2=2)
@@ -534,7 +538,9 @@ def _calibrated_sensors(
     if earlier is not None and earlier.discrepancy is not None:
         ln_e = problem.ln_e(gripper_theta(earlier, problem.labels, problem.prior.mean))
         problem = replace(problem, fixed=earlier.discrepancy_of(ln_e))
-    theta, spread, noise = problem.prior.mean.copy(), dict(problem.prior.spread), Noise()
+    theta = problem.prior.mean.copy()
+    spread = dict(problem.prior.spread)
+    noise = Noise()
     if earlier is not None:
         theta = gripper_theta(earlier, problem.labels, theta)
         spread = {k: float(getattr(earlier.spreads, k)) for k in spread}
@@ -627,7 +633,9 @@ def _log_evidence(problem: Problem, step: Step, noise: Noise) -> float:
 
 def _with_discrepancy(problem: Problem, theta: Array) -> tuple[Problem, Array]:
     """Return the problem and theta with a discrepancy of nothing, of which little is expected."""
-    n, prior, first = len(problem.labels), problem.prior, len(SHARED_NAMES)
+    n = len(problem.labels)
+    prior = problem.prior
+    first = len(SHARED_NAMES)
     x = np.log1p((KNOTS + 1.5) / 0.5)
     correlation = np.exp(-0.5 * ((x[:, None] - x) / 0.4) ** 2) + 1e-4 * np.eye(KNOTS.size)
     alike = 0.7 + 0.3 * np.eye(n)

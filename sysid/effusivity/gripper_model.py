@@ -193,7 +193,10 @@ _SD = (0.0, 100.0)
 _LOGARITHM = (-50.0, 50.0)
 _RATIO = (-10.0, 10.0)
 _SECONDS = (1e-9, 1e4)
-_CONDUCTANCE, _STORE, _EFFUSIVITY, _DEPTH = (0.0, 1e7), (1e-9, 1e9), (1.0, 1e6), (1e-3, 1e3)
+_CONDUCTANCE = (0.0, 1e7)
+_STORE = (1e-9, 1e9)
+_EFFUSIVITY = (1.0, 1e6)
+_DEPTH = (1e-3, 1e3)
 _OF_STACK = {
     "e_outer": _EFFUSIVITY, "z_outer": _DEPTH, "e_inner": _EFFUSIVITY, "z_inner": _DEPTH,
     "g_back": _CONDUCTANCE, "lag": _SECONDS, "first": (0.0, 1.0), "build_up": _SECONDS, "creep": (-0.2, 10.0),

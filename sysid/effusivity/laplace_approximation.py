@@ -461,7 +461,9 @@ def fit_candidates(
     """Return the modes of every touch under every candidate, from nuisances ``start`` (n, m, 7), and evidence
     that is the sum over the gripper's grades; ``noise`` is :func:`whitened` of the graded touches where a
     caller has it."""
-    n, m, n_grade = data.level.size, len(candidates), len(gripper.grades)
+    n = data.level.size
+    m = len(candidates)
+    n_grade = len(gripper.grades)
     begin = None if start is None else np.repeat(start.reshape(n, m, -1), n_grade, axis=0)
     every = graded(data, gripper.grades)
     mode, prior, _ = candidate_modes(gripper, every, candidates, start=begin, noise=noise)

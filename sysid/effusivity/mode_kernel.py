@@ -135,9 +135,13 @@ def bin_means(
 ) -> None:  # fmt: skip
     """Fill ``means`` (n, 6, n_bin) of the ``wanted`` curves, ``which`` of these belongs to each pair, the
     last of them the slope of the first."""
-    last, n_curve, n_bin = nodes.size - 1, wanted.shape[1], count.shape[1]
+    last = nodes.size - 1
+    n_curve = wanted.shape[1]
+    n_bin = count.shape[1]
     for p in range(row.size):
-        i, k, begin = row[p], 0, times.shape[1]
+        i = row[p]
+        k = 0
+        begin = times.shape[1]
         means[p] = 0.0
         # the node before each sample, -1 before contact, and the weights of values and slopes there and at
         # the next one, by cubic Hermite interpolation
@@ -188,13 +192,23 @@ def predicted(
     there, by straight lines between the bins with a ``count``, zero before them."""
     n_curve, n_bin = wanted.shape[1], t.shape[1]
     # bins on either side, -1 before the first, and integrals
-    before, after, whole = room[0], room[1], room[2]
+    before = room[0]
+    after = room[1]
+    whole = room[2]
     delayed, shifted = room[4:10], room[10:16]
     for p in range(row.size):
-        i, curves, k = row[p], means[p], min(p, numbers.shape[0] - 1)
-        warmth, rate, way, leak, away = ambient[p], 0.0, 0.0, 0.0, 0.0
+        i = row[p]
+        curves = means[p]
+        k = min(p, numbers.shape[0] - 1)
+        warmth = ambient[p]
+        rate = 0.0
+        way = 0.0
+        leak = 0.0
+        away = 0.0
         if np.isfinite(warmth):
-            rate, way, leak = numbers[k, 5] * np.exp(-u[p, _C]), warmth - u[p, _T], numbers[k, 6]
+            rate = numbers[k, 5] * np.exp(-u[p, _C])
+            way = warmth - u[p, _T]
+            leak = numbers[k, 6]
             away = leak * (warmth - u[p, _LEVEL])
         late = np.exp(2.0 * (u[p, _C] - u[p, _E])) / 6.0 if rate > 0.0 else -1.0
         delayed[:], shifted[:] = 0.0, 0.0
@@ -231,7 +245,9 @@ def predicted(
                             bend = (curves[c, high] - curves[c, low]) / (t[i, high] - t[i, low])
                         delayed[c, m] = whole[low] + ahead * (curves[c, low] + 0.5 * bend * ahead)
                         shifted[c, m] = curves[c, low] + bend * ahead
-        difference, level, derivatives = u[p, _T] - u[p, _LEVEL], u[p, _LEVEL], slopes[p]
+        difference = u[p, _T] - u[p, _LEVEL]
+        level = u[p, _LEVEL]
+        derivatives = slopes[p]
         by_t, by_level = 1.0 if vary[p, _T] else 0.0, 1.0 if vary[p, _LEVEL] else 0.0
         for m in range(n_bin):
             f, lost = curves[VALUE, m] + beyond[p, 1, m], rate * delayed[VALUE, m]
@@ -404,8 +420,12 @@ def search(
             ended.matrix[finished], ended.settled[finished] = state.matrix[done], settled[done]
             if done.all():
                 break
-            state, curved, rhs = state.take(going_on), curved[going_on], rhs[going_on]
-        gain, damping_loss, move = decrease, np.zeros(1), last
+            state = state.take(going_on)
+            curved = curved[going_on]
+            rhs = rhs[going_on]
+        gain = decrease
+        damping_loss = np.zeros(1)
+        move = last
         if not going_on.all():
             gain, move = decrease[going_on], last[going_on]
         damped = state.damping > SEARCH.no_damping
@@ -442,9 +462,13 @@ def _refitted(here: _Search, there: Array) -> tuple[_Search, Array, Mask]:
     """Return the trials and their products with level and T_obj, in which readings are linear, at their best:
     these go along with a step in all else, which is larger without bending; and whether other slopes, which
     go with the difference of object and skin, must be asked for anew."""
-    law, trial, lin = here.law, here.trial.copy(), there[:, _LEVEL : _T + 1]
+    law = here.law
+    trial = here.trial.copy()
+    lin = there[:, _LEVEL : _T + 1]
     away = ((trial - law.mean) * law.per_sd)[:, _LEVEL : _T + 1]
-    a, d, b = lin[:, 0, _LEVEL] + 1.0, lin[:, 0, _T], lin[:, 1, _T] + 1.0
+    a = lin[:, 0, _LEVEL] + 1.0
+    d = lin[:, 0, _T]
+    b = lin[:, 1, _T] + 1.0
     g, h = lin[:, 0, -1] - away[:, 0], lin[:, 1, -1] - away[:, 1]
     det, before = a * b - d * d, trial[:, _T] - trial[:, _LEVEL]
     level, warmer = (b * g - d * h) / det, (a * h - d * g) / det

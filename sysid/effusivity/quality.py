@@ -169,11 +169,9 @@ def check_grasps(grasps: Grasps, *, longest: float = np.inf, whole_traces: bool 
     )
     why = np.where(trace.contradicts(), CONTRARY, np.where(out_of_range, OUT_OF_RANGE, ""))
     reason = [str(words) for words in np.where(trace.stays(LIMITS.no_contact_share), NO_CONTACT, why)]
-    first_clipped, row, ever = (
-        clipped.argmax(axis=1),
-        np.arange(len(clipped)),
-        np.asarray(clipped.any(axis=1)),
-    )
+    first_clipped = clipped.argmax(axis=1)
+    row = np.arange(len(clipped))
+    ever = np.asarray(clipped.any(axis=1))
     since, reading = (
         np.where(ever, time[first_clipped], np.nan),
         np.where(ever, raw[row, first_clipped], np.nan),

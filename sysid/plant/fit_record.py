@@ -209,7 +209,9 @@ def fit_logs(logs: Sequence[Log]) -> tuple[FitLog, ...]:
 
 def said_of_fit(fitted_to: Sequence[FitLog], seen: FitLog) -> list[str]:
     """Return a line for each log of the fit that holds rows of the one that is ``seen``."""
-    start, stop, lines = seen.start_s, seen.stop_s, []
+    start = seen.start_s
+    stop = seen.stop_s
+    lines = []
     for used in fitted_to:
         first, last = max(start, used.start_s), min(stop, used.stop_s)
         if used.sha256 != seen.sha256 or not first < last:

@@ -155,7 +155,10 @@ def _filter_of(plant: PlantData, stretches: Sequence[Stretch], graded: list[int]
     spread = np.sqrt(np.maximum(np.diag(np.atleast_2d(model.spread)), 1e-12))
     unit = spread / np.sqrt(np.einsum("ij,j,ij->i", C, spread**2, C)).max()
     u, d, y = (np.concatenate([getattr(stretch, key) for stretch in stretches]) for key in "udy")
-    size, middle, u0, d0 = np.ptp(u, axis=0)[graded], np.nanmean(y, axis=0), u.mean(axis=0), d.mean(axis=0)
+    size = np.ptp(u, axis=0)[graded]
+    middle = np.nanmean(y, axis=0)
+    u0 = u.mean(axis=0)
+    d0 = d.mean(axis=0)
     x0 = np.asarray(model.rest(middle - offset, u0, d0, p), dtype=float)
     tried = 1e-3 * np.concatenate([unit, size])
     moves = np.concatenate([np.zeros((1, n_x + n_w)), np.diag(tried)])

@@ -357,7 +357,9 @@ def _one_step(plant: Plant, log: Log, pairs: _Pairs) -> dict[str, Score]:
 
 def _notes(run: FreeRun, by_inputs: InputEffect | None) -> list[str]:
     """Return what limits the scores of a run, and what its residual shows."""
-    plant, log, verdict = run.plant, run.measured, run.verdict
+    plant = run.plant
+    log = run.measured
+    verdict = run.verdict
     first, notes = float(log["time"][0]), []
     if first > 60:
         notes.append(

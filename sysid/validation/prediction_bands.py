@@ -136,7 +136,10 @@ def free_run_band(
     for k in range(1, taken + 1):
         variances += (plant.draw(k).over(stretches, warmup)[0] - run) ** 2 / taken
     scored = np.asarray(simulated["scored"].values) > 0
-    half, inside, expected, likely = {}, {}, {}, {}
+    half = {}
+    inside = {}
+    expected = {}
+    likely = {}
     other_run, unlike = between_runs(plant, [log]), unlike_fit(plant, log, simulated, warmup)
     is_unlike, compared = False, bool(plant.scores.held_out or plant.scores.held_out_rmse)
     for column_index, name in enumerate(plant.outputs):

@@ -249,7 +249,9 @@ def known_words(plant: Plant) -> list[str]:
 def parameter_table(plant: Plant, record: Posterior | None = None) -> Cells:
     """Return the free parameters with their 90 % intervals, and those of the prior; with ``record`` mean, sd,
     effective number of samples and R-hat too."""
-    intervals, before, nothing = plant.intervals(0.9), _prior_intervals(plant), (None, None)
+    intervals = plant.intervals(0.9)
+    before = _prior_intervals(plant)
+    nothing = (None, None)
     head = ["parameter", "value", "unit", "5 %", "95 %", "prior 5 %", "prior 95 %"]
     rows: list[list[Any]] = [
         [
