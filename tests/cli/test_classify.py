@@ -148,14 +148,12 @@ def test_a_block_in_two_files_is_warned_of(gripper: SimpleNamespace) -> None:
 def test_an_end_leaves_whole_tables_alone(
     out: str, kept: list[str], gripper: SimpleNamespace, stand_in: StandIn
 ) -> None:
-    usual = verb._effusivities
-
-    def ended(device: Any, record: Grasps, *more: Any) -> list[EffusivityRow]:
+    def ended(device: Any, record: Grasps, coupling: Any) -> list[EffusivityRow]:
         if "c" in record["grasp"].values:
             raise KeyboardInterrupt
-        return usual(device, record, *more)
+        return [effusivity_row(str(n), 1e3) for n in record["grasp"].values]
 
-    stand_in("thermogrip.cli.classify._effusivities", ended)
+    stand_in("thermogrip.sysid.effusivity.posterior.effusivity_posterior", ended)
     before = {*gripper.bench.path.iterdir()}
     assert gripper.bench.run("effusivity", "grasps.csv", "--out", out).code == 130
     folder = gripper.bench.path / out
@@ -330,10 +328,11 @@ def test_a_classifier_is_trained_saved_and_reported(school: SimpleNamespace, sta
     assert (school.asked[1].quick, school.asked[1].seed) == (False, 0)
     saved: list[Path] = []
     rule = SimpleNamespace(sure=0.9876, save=saved.append)
-    learnt = stand_in("thermogrip.cli.classify._stop_rule", rule)
+    stand_in("thermogrip.classify.evaluation.splits.scored_apart", lambda record: False)
+    learnt = stand_in("thermogrip.classify.decisions.stopping_rule.learn_stop_rule", rule)
     done = school.bench.run(*words, "--stop-error", "0.1")
     assert "a contact ends once a material has probability 0.988 (--early, --stop-early)\n" in done.out
-    assert (learnt[0].args[1], learnt[0].args[3], saved) == (school.model, 0.1, [Path("m/stop_rule.json")])
+    assert (learnt[0].args[0], learnt[0].error, saved) == (school.model, 0.1, [Path("m/stop_rule.json")])
     assert json.loads(school.bench.run(*words, "--stop-error", "0.1", "--json").out)["stop_sure"] == 0.9876
     school.savable = False
     refused = school.bench.run(*words)
@@ -341,22 +340,24 @@ def test_a_classifier_is_trained_saved_and_reported(school: SimpleNamespace, sta
 
 
 def test_a_stop_rule_is_learnt_from_grasps_of_known_temperature(
-    stand_in: StandIn, capsys: pytest.CaptureFixture[str]
+    school: SimpleNamespace, stand_in: StandIn
 ) -> None:
-    def learn(*_: Any, progress: Any, **__: Any) -> str:
+    def learn(*_: Any, progress: Any, **__: Any) -> SimpleNamespace:
         progress(0.5, "fold")
-        return "a rule"
+        return SimpleNamespace(sure=0.9, save=lambda _: None)
 
     asked = stand_in("thermogrip.classify.decisions.stopping_rule.learn_stop_rule", learn)
-    stand_in("thermogrip.classify.evaluation.splits.scored_apart", lambda record: record == "apart")
-    records: Any = ["known", "apart"]
-    assert verb._stop_rule(Console(), "model", records, 0.1) == "a rule"
-    assert (asked[0].args, asked[0].error) == (("model", ["known"]), 0.1)
-    assert shares(capsys.readouterr().err, "stop rule") == [50]
-    with pytest.raises(
-        UserError, match="no training grasp has an object temperature; leave --stop-error out"
-    ):
-        verb._stop_rule(Console(), "model", records[1:], 0.1)
+    stand_in("thermogrip.classify.evaluation.splits.scored_apart", lambda record: record is apart)
+    known, apart = records = [record_of(["a"]), record_of(["b"])]
+    stand_in("thermogrip.datasets.grasp_files.read_grasp_files", lambda paths: records)
+    words = ["train", "grasps.csv", "--classifier", "bayes", "--split", "all", "--stop-error", "0.1"]
+    done = school.bench.run(*words, "--out", "m")
+    ((model, (learnt_from,)),) = [call.args for call in asked]
+    assert (model is school.model, learnt_from is known, asked[0].error) == (True, True, 0.1)
+    assert shares(done.err, "stop rule") == [50]
+    del records[0]
+    refused = school.bench.run(*words, "--out", "m").said[0]
+    assert "no training grasp has an object temperature; leave --stop-error out" in refused
 
 
 ANSWERS = (

@@ -17,9 +17,7 @@ from thermogrip.cli import rig as verbs
 from thermogrip.cli.main import main
 from thermogrip.cli.rig import RigOptions, ShowOptions
 from thermogrip.datasets.errors import UserError
-from thermogrip.live.watch import Watch
 from thermogrip.mpc.controllers.mpc import Controller
-from thermogrip.report.console import Console
 from thermogrip.rig import Session
 from thermogrip.rig.guard.trip import Trip
 from thermogrip.rig.records.batch import Batch, Trial
@@ -283,7 +281,6 @@ def test_a_batch_keeps_on_what_it_ran_and_fails_while_a_trial_is_left(
     assert (call.grasp_time, call.settle_timeout, call.stop) == (4.0, 60.0, None)
     assert [getattr(call, name) is not None for name in ("ready", "judge", "clock")] == [asks, asks, on_rig]
     assert (type(call.args[1]), len(call.args[2]), call.args[3]) == (Controller, 2, Path("out"))
-    assert call.first_touch is verbs._first_touch
     assert guards[0].args == (Path("g.toml"), call.args[1].plant)
     files = {"controller": "c.json", "plan": "plan.csv", "guard": "g.toml"} | (
         {} if on_rig else {"plant": "plant.json"}
@@ -305,12 +302,15 @@ def test_a_batch_keeps_on_what_it_ran_and_fails_while_a_trial_is_left(
     assert (batches[2].grasp_time, batches[2].settle_timeout, opened[2].args[0].draw) == (10.0, 900.0, 0)
 
 
-def test_a_batch_that_is_done_has_no_advice(bench: Bench, stand_in: StandIn) -> None:
+@pytest.fixture
+def of_batch(bench: Bench, stand_in: StandIn) -> SimpleNamespace:
+    """Return what ``batch`` asks its run of one trial on a rig to do; without advice it prints none."""
     Controller(small_plant()).save(bench.path / "c.json")
     bench.write("plan.csv", "material,target_degC\ncopper,30\n")
-    stand_in("thermogrip.rig.records.batch.run_batch", Batch((bench.path,), 0, "done", "", 1))
-    done = bench.run("batch", "c.json", "plan.csv", "--twin", "plant.json", "--out", "out")
+    calls = stand_in("thermogrip.rig.records.batch.run_batch", Batch((bench.path,), 0, "done", "", 1))
+    done = bench.run("batch", "c.json", "plan.csv", *PORT, "--out", "out")
     assert (done.code, done.out) == (0, "1 of 1 grasps are good: done\n")
+    return calls[0]
 
 
 @pytest.mark.parametrize(
@@ -329,45 +329,46 @@ def test_a_batch_that_is_done_has_no_advice(bench: Bench, stand_in: StandIn) -> 
     ],
 )
 def test_a_batch_stops_at_q_alone_and_keeps_what_nobody_calls_bad(
-    said: str, goes_on: bool, bad: str, stand_in: StandIn
+    said: str, goes_on: bool, bad: str, of_batch: SimpleNamespace, stand_in: StandIn
 ) -> None:
     stand_in("typer.prompt", said)
-    assert verbs._ready(2, Watch("batch", Console()))(0, Trial("copper", 30.0, 18.0)) is goes_on
-    verdict = verbs._verdict(Console(), Watch("batch", Console()))
-    assert verdict(0, Trial("copper", 30.0), SimpleNamespace(contact=0.1)) == bad
+    assert of_batch.ready(0, Trial("copper", 30.0, 18.0)) is goes_on
+    assert of_batch.judge(0, Trial("copper", 30.0), SimpleNamespace(contact=0.1)) == bad
 
 
 @pytest.mark.parametrize(
     ("trial", "words"),
     [
-        (Trial("copper", 30.0, 18.0), "trial 2 of 5: copper, 18.0 degC, skin to 30 degC; "),
-        (Trial("", 30.5), "trial 2 of 5: unknown, unknown temperature, skin to 30.5 degC; "),
+        (Trial("copper", 30.0, 18.0), "trial 1 of 1: copper, 18.0 degC, skin to 30 degC; "),
+        (Trial("", 30.5), "trial 1 of 1: unknown, unknown temperature, skin to 30.5 degC; "),
     ],
 )
-def test_the_operator_is_asked_for_the_next_object(trial: Trial, words: str, stand_in: StandIn) -> None:
+def test_the_operator_is_asked_for_the_next_object(
+    trial: Trial, words: str, of_batch: SimpleNamespace, stand_in: StandIn
+) -> None:
     asked = stand_in("typer.prompt", "")
-    verbs._ready(5, Watch("batch", Console()))(1, trial)
+    of_batch.ready(0, trial)
     assert asked[0].args == (f"{words}Enter when it is ready, q to stop",)
     assert (asked[0].default, asked[0].show_default) == ("", False)
 
 
 @pytest.mark.parametrize(("contact", "warned"), [(0.1, False), (float("nan"), True)])
 def test_no_contact_is_reported_to_the_operator(
-    contact: float, warned: bool, stand_in: StandIn, capsys: pytest.CaptureFixture[str]
-) -> None:
+    contact: float, warned: bool, of_batch: SimpleNamespace, stand_in: StandIn,
+    capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
     stand_in("typer.prompt", "")
-    verdict = verbs._verdict(Console(), Watch("batch", Console()))
-    verdict(0, Trial("copper", 30.0), SimpleNamespace(contact=contact))
+    of_batch.judge(0, Trial("copper", 30.0), SimpleNamespace(contact=contact))
     assert ("the skin felt nothing" in capsys.readouterr().err) == warned
 
 
 @pytest.mark.parametrize(("said", "again"), [("c", True), ("Cleared", True), ("", False), ("no", False)])
 def test_after_a_trip_the_operator_is_asked_whether_it_is_cleared(
-    said: str, again: bool, stand_in: StandIn
+    said: str, again: bool, of_batch: SimpleNamespace, stand_in: StandIn
 ) -> None:
     asked = stand_in("typer.prompt", said)
     trip = Trip("limit", 1.0, "t_surface", "3 to 55 degC", "61 degC")
-    assert verbs._cleared(Watch("batch", Console()))(0, Trial("copper", 30.0), trip) is again
+    assert of_batch.cleared(0, Trial("copper", 30.0), trip) is again
     assert asked[0].args == (f"{trip.line()}; c when it is cleared, Enter to end the batch",)
 
 
@@ -391,11 +392,13 @@ def test_what_is_published_goes_through_the_bridge(stand_in: StandIn) -> None:
     assert made[0].args == ("ws://robot:9090",)
 
 
-def test_a_first_touch_reports_median_and_sd_of_its_90_percent_interval(stand_in: StandIn) -> None:
+def test_a_first_touch_reports_median_and_sd_of_its_90_percent_interval(
+    of_batch: SimpleNamespace, stand_in: StandIn
+) -> None:
     row = SimpleNamespace(t_object=40.0, t_object_p05=40.0 - 1.645 * 0.6, t_object_p95=40.0 + 1.645 * 0.6)
     stand_in("thermogrip.sysid.effusivity.gripper_model.load_default_gripper", "the gripper")
     asked = stand_in("thermogrip.sysid.effusivity.posterior.effusivity_posterior", [row, None])
-    assert verbs._first_touch("a grasp") == pytest.approx((40.0, 0.6))
+    assert of_batch.first_touch("a grasp") == pytest.approx((40.0, 0.6))
     assert asked[0].args == ("the gripper", "a grasp")
 
 

@@ -275,15 +275,15 @@ class Unpacked:
     """Notes in which thread it is unpacked."""
 
     def __reduce__(self):
-        seen = "__import__('thermogrip.datasets.parallel').datasets.parallel._unpacked"
+        seen = "__import__('thermogrip.datasets.parallel').datasets.parallel.unpacked_in"
         return eval, (f"{seen}.append(__import__('threading').current_thread().name)",)
 
 
 def test_a_cluster_unpacks_an_item_where_it_computes_and_not_at_its_scheduler(cluster, monkeypatch) -> None:
     """The scheduler would import all that an item needs, before a worker may begin."""
-    monkeypatch.setattr(parallel, "_unpacked", [], raising=False)
+    monkeypatch.setattr(parallel, "unpacked_in", [], raising=False)
     assert run_parallel(repr, [Unpacked() for _ in range(3)], cluster) == ["None"] * 3
-    assert ["Dask-" in name for name in parallel._unpacked] == [True] * 3
+    assert ["Dask-" in name for name in parallel.unpacked_in] == [True] * 3
 
 
 @pytest.mark.skipif((os.cpu_count() or 1) < 2, reason="needs two processors")

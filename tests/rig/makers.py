@@ -26,15 +26,15 @@ class SteppedClock:
     clock run a day in minutes, the same way each time."""
 
     def __init__(self, start: float = 0.0) -> None:
-        self._now, self._lock = start, threading.Lock()
+        self.now, self.lock = start, threading.Lock()
 
     def __call__(self) -> float:
-        return self._now
+        return self.now
 
     def sleep(self, seconds: float) -> None:
         """Let so many seconds pass; rounded to a nanosecond, so that sums of tenths stay tenths."""
-        with self._lock:
-            self._now = round(self._now + max(0.0, seconds), 9)
+        with self.lock:
+            self.now = round(self.now + max(0.0, seconds), 9)
 
 
 class DirectPort(Port):
@@ -42,7 +42,7 @@ class DirectPort(Port):
 
     def __init__(self, device: VirtualDevice) -> None:
         super().__init__("direct")
-        self.device, self._answer = device, b""
+        self.device, self.answer = device, b""
         self._serial, self.opened = device, 1
 
     def open(self) -> None:
@@ -54,7 +54,7 @@ class DirectPort(Port):
 
     def close(self) -> None:
         """Close it."""
-        self._serial, self._answer = None, b""
+        self._serial, self.answer = None, b""
 
     def try_open(self) -> bool:
         """Open it if the cable is in; say whether it is open."""
@@ -64,16 +64,16 @@ class DirectPort(Port):
 
     def write(self, data: bytes) -> None:
         """Let the device hear the bytes."""
-        self._check()
-        self._answer += self.device.exchange(data)
+        self.require_open()
+        self.answer += self.device.exchange(data)
 
     def read(self, seconds: float) -> bytes:
         """Return the device's answers; there is nothing to wait for."""
-        self._check()
-        answer, self._answer = self._answer or self.device.exchange(b""), b""
+        self.require_open()
+        answer, self.answer = self.answer or self.device.exchange(b""), b""
         return answer
 
-    def _check(self) -> None:
+    def require_open(self) -> None:
         if not self.is_open or self.device.is_pulled:
             self.close()
             raise PortError("lost", "was lost", file=self.url, hint="check cable and power")

@@ -82,11 +82,9 @@ def test_the_bound_is_of_what_the_sensor_reads_at_the_drive_of_that_side(
 
 def test_the_slew_counts_from_the_drive_that_holds_the_start():
     plant = plant_of([[0.95]], [[1.0]], [[1.0]])  # 20 K at full drive, 25 degC without
-    spec = spec_of(steps=[(35.0, 40.0)], slew_per_s=0.02)
-    made = _Race(plant, spec.design(plant), (35.0, 40.0), spec, "t")
-    assert made._ramp(np.array([1.0]))[:5, 0] == pytest.approx([0.6, 0.7, 0.8, 0.9, 1.0], abs=1e-6)
-    made = _Race(plant, spec.design(plant), (90.0, 95.0), spec, "t")  # nothing holds it
-    assert made._ramp(np.array([1.0]))[:2, 0] == pytest.approx([0.1, 0.2])
+    spec = spec_of(steps=[(35.0, 40.0)], slew_per_s=0.02, hold_s=100.0)
+    # 0.6, 0.7, 0.8, 0.9, 1: 11.40 K; of the 8.60 K to full drive 5.25 are left after ten samples more
+    assert full_drive_bound(plant, spec.design(plant), (35.0, 40.0), spec) == 75.0
 
 
 @pytest.mark.parametrize("step", [STEP, (25.0, 22.0)])
@@ -175,17 +173,8 @@ def test_what_a_race_starts_from_and_is_limited_by():
         (made.low, [-0.4, 0.1]), (made.high, [1.0, 0.9]), (made.neutral, [0.0, 0.1]), (made.slew, [0.2, 0.3]),
     ):  # fmt: skip
         np.testing.assert_allclose(value, wanted, rtol=1e-12)
-    assert made._direction().tolist() == [-0.4, 0.9]  # the first drive cools t1
-    plan = np.array([[-0.2, 0.4], [-0.3, 0.7], [-0.3, 0.9], [-0.3, 0.9], [-0.3, 0.9]])
-    np.testing.assert_allclose(made._ramp(np.array([-0.3, 0.9])), plan, rtol=1e-12)
-    heights = made._heights(plan[None])
-    y, rows = 0.0, [25.0]
-    for q0, q1 in ((-0.2, 0.4), (-0.2, 0.4), (-0.3, 0.7), (-0.3, 0.7)):
-        y = 0.97 * y - 0.4 * q0 + 0.7 * q1
-        rows.append(25.0 + y)
-    np.testing.assert_allclose(heights[0, :5], rows, rtol=1e-9)
-    found = made._arrivals(np.array([[28.0, 28.75, 30.0], [28.0, 28.7, 28.0]]))
-    assert (found.tolist(), made._seconds(found[0])) == ([1.0, np.inf], 5.0)
+    # -0.2, -0.4 (it cools) and 0.4, 0.7, 0.9, for 10 s each: 0.36, 0.71, 1.34, 1.95, 2.68, 3.39, 4.08 K
+    assert made.shortest_time() == 35.0
 
 
 @pytest.mark.parametrize(

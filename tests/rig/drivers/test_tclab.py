@@ -257,12 +257,12 @@ class SlowPort(DirectPort):
         self.ends, self.now, self.lines = ends, 0.0, 0
 
     def read(self, seconds: float) -> bytes:
-        self._answer += self.device.exchange(b"")
-        if seconds < 0.15 or not self._answer:
+        self.answer += self.device.exchange(b"")
+        if seconds < 0.15 or not self.answer:
             self.now += seconds
             return b""
         self.now += 0.15
-        line, _, self._answer = self._answer.partition(b"\r\n")
+        line, _, self.answer = self.answer.partition(b"\r\n")
         self.lines += 1
         return line + self.ends[self.lines % len(self.ends)]
 
@@ -273,7 +273,7 @@ def test_a_board_that_is_slow_or_ends_its_lines_otherwise_is_read(
 ) -> None:
     device = VirtualDevice(make_lab(), protocol="tclab", link="none", clock=SteppedClock(), t_start=25.0)
     port = SlowPort(device, ends)
-    port._answer = f"{TCLAB_VERSION}\r\n".encode()  # of whoever asked before, and still under way
+    port.answer = f"{TCLAB_VERSION}\r\n".encode()  # of whoever asked before, and still under way
     monkeypatch.setattr("thermogrip.rig.drivers.tclab.time.monotonic", lambda: port.now)
     lab = TCLabRig(port)
     lab.apply(HALF, 1)

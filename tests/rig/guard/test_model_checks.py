@@ -15,7 +15,6 @@ from thermogrip.rig.guard.model_checks import (
     ModelMonitor,
     Residual,
     by_danger,
-    explain_window,
 )
 from thermogrip.rig.simulation.twin import Twin
 from thermogrip.sysid.contact.simulation import Grip
@@ -145,6 +144,7 @@ def test_a_rig_that_stood_with_a_warm_tank_is_not_taken_for_one_at_rest() -> Non
 DT = 0.5
 A = np.array([[1 - DT / 60, 0.0], [DT / 10, 1 - DT / 10]])
 B = np.array([0.5 * DT, 0.0])
+TWELVE_SECONDS = Residual("window", "b", 12.0, 0.0, 0.0, 1.0)
 
 
 def monitor(unit: str, full: float, sensors: int, names: tuple[str, str] = ("a", "b")) -> ModelMonitor:
@@ -185,7 +185,7 @@ def explained(
             y[1] = 25.0 + x[1] + off
         y += 0.02 * rng.standard_normal(2)
         follow(made, k * DT, {"q": asked * full}, dict(zip("ab", y[:sensors].tolist())))
-    return ", or ".join(cause.text for cause in explain_window(made._model, made._past, 12.0))
+    return ", or ".join(cause.text for cause in made.explain(TWELVE_SECONDS))
 
 
 STORIES = [
@@ -216,7 +216,7 @@ def test_the_only_sensor_is_not_called_wrong_by_itself() -> None:
 
 def test_before_there_is_a_window_nothing_is_reported() -> None:
     made = monitor("1", 1.0, 2)
-    assert explain_window(made._model, made._past, 12.0) == []
+    assert made.explain(TWELVE_SECONDS) == []
 
 
 HALF = Cause("driver", "the driver", "the driver gives half of the command")
@@ -241,7 +241,7 @@ def test_a_sensor_at_the_pump_is_no_pump_whatever_its_name() -> None:
     for k in range(1, 145):
         y = 25.0 + 0.02 * rng.standard_normal(2) + [0.0, 3.0 * (k > 120)]
         follow(made, k * DT, {"q": 0.0}, dict(zip(("t_driver", "t_pump"), y.tolist())))
-    (cause,) = explain_window(made._model, made._past, 12.0)
+    (cause,) = made.explain(TWELVE_SECONDS)
     assert (cause.kind, cause.subject) == ("drift", "t_pump")
 
 

@@ -179,15 +179,6 @@ def test_rows_are_cut_at_lost_readings_scaled_and_summed_with_bumps():
     ] == 2 * [(0, 7)]
 
 
-def test_a_polynomial_of_scaled_variables_is_expanded():
-    # 3 z1^2 z2 with z1 = (x - 2) / 4, z2 = (w + 1) / 5: 3/80 (x^2 - 4 x + 4) (w + 1); and 7
-    powers = np.array([[2, 1], [0, 0], [2, 0], [1, 1], [1, 0], [0, 1]])
-    scaling = np.array([2.0, -1.0]), np.array([4.0, 5.0])
-    powers, found = sindy._natural(powers, np.array([[3.0, 7.0, 0, 0, 0, 0]]), *scaling)
-    want = {(2, 1): 1, (2, 0): 1, (1, 1): -4, (1, 0): -4, (0, 1): 4, (0, 0): 4 + 7 * 80 / 3}
-    assert dict(zip(map(tuple, powers.tolist()), found[0] * 80 / 3)) == pytest.approx(want)
-
-
 @pytest.mark.parametrize(
     ("rows", "width", "fits"), [(24, 0, True), (23, 0, False), (82, 36, True), (81, 36, False)]
 )

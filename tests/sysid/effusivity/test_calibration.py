@@ -303,7 +303,7 @@ def test_a_label_without_a_row_is_learnt_beside_one_that_has_one_or_given_a_row(
     name = str(grasps["grasp"].values[1])
     strange = odd.isel(grasp=[1, 2]).assign(material=("grasp", ["bismuth", "x"]))
     with pytest.raises(UserError, match=f"grasp '{name}' is of 'bismuth', and the materials table has none"):
-        calibration._labelled_touches([strange], {}, least=2)
+        calibrate_gripper([strange])
     row = replace(find_material("iron"), name="bismuth", rho=8000.0, c_p=200.0, effusivity=9e3)
     problem = calibration._problem(
         calibration._labelled_touches([odd], {"bismuth": row}, 2), {"bismuth": row}, None, 0.03

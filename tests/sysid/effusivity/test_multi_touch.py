@@ -392,15 +392,19 @@ def test_another_touch_expects_what_the_touches_found_moved_on(device, record, t
     )
 
 
-def test_which_records_are_of_one_block(record):
+def test_another_touch_is_of_a_record_of_one_block_in_any_order(device, record):
     pair = record.isel(grasp=touch_groups(record)["p000"])
-    assert multi_touch._one_block(pair.isel(grasp=[0]).drop_vars("touch_group")).tolist() == [0]
-    assert multi_touch._one_block(pair.isel(grasp=[1, 0])).tolist() == [1, 0]
+    for same, rows in (
+        (pair.isel(grasp=[0]), pair.isel(grasp=[0]).drop_vars("touch_group")),
+        (pair, pair.isel(grasp=[1, 0])),
+    ):
+        for one, other in zip(*(next_touch_prior(device, some, FIVE) for some in (same, rows))):
+            np.testing.assert_allclose(other, one)
     stray = pair.isel(grasp=[0, 1, 1])
     stray = stray.assign(touch_group=("grasp", ["p000", "p000", ""]))
     for several in (record.isel(grasp=[0, 1, 2, 3]), stray):
         with pytest.raises(UserError, match="touches of several blocks; give those of one block"):
-            multi_touch._one_block(several)
+            next_touch_prior(device, several, FIVE)
 
 
 def test_the_longest_rest_is_between_touches():
@@ -409,7 +413,9 @@ def test_the_longest_rest_is_between_touches():
         [-1.0, 0.0, 5.0], skins, list("abcd"), touch_group=["p", "p", "q", "p"], touch=[2, 1, 1, 3],
         rest=[45.0, 500.0, 500.0, np.nan],
     )  # fmt: skip
-    assert multi_touch._longest_rests(grasps) == {"p": 60.0, "q": 0.0}
+    for learnt, longer in ((39.0, True), (41.0, False)):  # unless given, a rest is of 60 s
+        rested = rested_long(grasps, Coupling(longest_rest=learnt))
+        assert rested.tolist() == [longer, longer, False, longer]
     assert not rested_long(grasps.drop_vars("touch_group")).any()
 
 
