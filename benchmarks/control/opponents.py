@@ -159,10 +159,10 @@ class PlainFilter:
 
     def predict(self, u: Array, d: Array) -> None:
         """Go a sample on."""
-        x, A, B, _ = self.model.linearise(self.z[: self.n], u + self.z[self.n :] * self.model.span, d)
-        B, one, none = B * self.model.span, np.eye(self.m), np.zeros((self.m, self.n))
-        F, G = np.block([[A, B], [none, one]]), np.block([[0.03 * B, 0 * B], [0 * one, 0.01 * one]])
-        self.z, self.P = np.concatenate([x, self.z[self.n :]]), F @ self.P @ F.T + G @ G.T
+        step = self.model.linearise(self.z[: self.n], u + self.z[self.n :] * self.model.span, d)
+        B, one, none = step.B * self.model.span, np.eye(self.m), np.zeros((self.m, self.n))
+        F, G = np.block([[step.A, B], [none, one]]), np.block([[0.03 * B, 0 * B], [0 * one, 0.01 * one]])
+        self.z, self.P = np.concatenate([step.after, self.z[self.n :]]), F @ self.P @ F.T + G @ G.T
 
 
 class DoMPC:

@@ -83,16 +83,6 @@ class SampledController:
         y = np.array([self._clean(reading, name) for name in self.model.outputs])
         return y, self.measured(reading)
 
-    def _given(self, reading: Readings, target: Trajectory) -> tuple[Array, Array, Array, str]:
-        """Return outputs, disturbances and targets in force [degC], and what is wrong; a stale reading is
-        none."""
-        wanted, wrong = self._wanted(target)
-        self._target = wanted
-        y, d = self._read(reading)
-        if self.times.stale:
-            return np.full(len(y), np.nan), d, wanted, wrong or advice.STALE
-        return y, d, wanted, wrong
-
     def _wanted(self, target: Trajectory) -> tuple[Array, str]:
         """Return targets (n_controlled,) [degC], the last good one staying and a single number being that of
         every controlled output, and what was wrong with them."""

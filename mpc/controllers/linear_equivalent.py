@@ -16,7 +16,7 @@ what is reviewed tracks the middle of a zone.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -24,7 +24,7 @@ from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.errors import UserError
 
 if TYPE_CHECKING:
-    from thermogrip.mpc.optimiser.rti import ControllerParts
+    from thermogrip.mpc.optimiser.rti import ControllerParts, LinearGains
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +41,25 @@ class LinearLaw:
     dt: float  # sample time [s]
 
 
-def linear_move(controller: ControllerParts) -> tuple[Array, Array, Array]:
+class AugmentedModel(NamedTuple):
+    """The model with its disturbance states: z^+ = F z + B u + E d, y = H z."""
+
+    F: Array
+    B: Array
+    E: Array
+    H: Array
+
+
+class PlanGains(NamedTuple):
+    """Gains of the plan (n, .)."""
+
+    on_z: Array  # on the estimate
+    on_r: Array  # on the target
+    on_d: Array  # on the disturbances
+    on_last: Array  # on the last move
+
+
+def linear_move(controller: ControllerParts) -> LinearGains:
     """Return H of the QP and the plan's gains on the free response and on the drive before, as
     :meth:`thermogrip.mpc.optimiser.rti.Optimiser.linear_gains`, linearised where the plant settles without
     drive, or where it rests if it settles nowhere."""
@@ -63,10 +81,10 @@ def linear_law(controller: ControllerParts) -> LinearLaw:
     F, B, E, H = augmented(controller)
     n_z, L = len(F), controller.observer.settled_gain(F)
     rows = [model.outputs.index(name) for name in controller.design.controlled]
-    on_z, on_r, on_d, on_last = (gain[:n_u] for gain in plan_gains(controller))
+    first = PlanGains(*(gain[:n_u] for gain in plan_gains(controller)))
     uncorrected = np.eye(n_z) - L @ H
-    to_drive = np.hstack([on_z @ uncorrected, on_last])
-    straight = np.hstack([on_z @ L, on_r, on_d])
+    to_drive = np.hstack([first.on_z @ uncorrected, first.on_last])
+    straight = np.hstack([first.on_z @ L, first.on_r, first.on_d])
     after = np.hstack([F @ uncorrected, np.zeros((n_z, model.n_u))])
     into_z = np.hstack([F @ L, np.zeros((n_z, len(rows))), E])
     targets = tuple(f"target_{name}" for name in controller.design.controlled)
@@ -82,20 +100,20 @@ def linear_law(controller: ControllerParts) -> LinearLaw:
     )
 
 
-def augmented(controller: ControllerParts) -> tuple[Array, Array, Array, Array]:
-    """Return F, B, E, H of the model with its disturbance states, about rest in the design's room."""
+def augmented(controller: ControllerParts) -> AugmentedModel:
+    """Return the model with its disturbance states, about rest in the design's room."""
     model, chosen = controller.model, controller.disturbance
     _, A, B, E = model.linearise(*model.at_rest(controller.design.ambient))
     n_w = chosen.n_w
     into = B @ (chosen.on_drive * model.span[:, None]) + E @ chosen.on_disturbance
     F = np.block([[A, into], [np.zeros((n_w, model.n_x)), np.eye(n_w)]])
     B, E = (np.vstack([matrix, np.zeros((n_w, matrix.shape[1]))]) for matrix in (B, E))
-    return F, B, E, np.hstack([model.C, chosen.on_output])
+    return AugmentedModel(F, B, E, np.hstack([model.C, chosen.on_output]))
 
 
-def plan_gains(controller: ControllerParts) -> tuple[Array, Array, Array, Array]:
-    """Return the gains of the plan (n, .) on the estimate, the target, the disturbances, the last move."""
-    _, on_free, on_last = linear_move(controller)
+def plan_gains(controller: ControllerParts) -> PlanGains:
+    """Return the gains of the plan on the estimate, the target, the disturbances, the last move."""
+    move = linear_move(controller)
     F, _, E, H = augmented(controller)
     H = H[[controller.model.outputs.index(name) for name in controller.design.controlled]]
     by_z = []
@@ -107,7 +125,12 @@ def plan_gains(controller: ControllerParts) -> tuple[Array, Array, Array, Array]
         by_z.append(H @ power)
         by_d.append(H @ by_held_d)
     same = np.tile(np.eye(len(H)), (len(by_z), 1))
-    return on_free @ np.vstack(by_z), -on_free @ same, on_free @ np.vstack(by_d), on_last
+    return PlanGains(
+        on_z=move.on_free @ np.vstack(by_z),
+        on_r=-move.on_free @ same,
+        on_d=move.on_free @ np.vstack(by_d),
+        on_last=move.on_last,
+    )
 
 
 def to_control(controller: ControllerParts) -> Any:

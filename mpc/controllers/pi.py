@@ -27,6 +27,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from thermogrip.datasets.arrays import Array
+from thermogrip.mpc.controllers.advice import STALE
 from thermogrip.mpc.controllers.base import SampledController
 from thermogrip.mpc.controllers.controller_file import Parts
 from thermogrip.mpc.design.design import Design, PILoop, check_design, default_design
@@ -126,8 +127,12 @@ class PIController(SampledController):
         self.times.call(reading)
         if not self.times.due:
             return self._held_move(started)
-        y, room, wanted, wrong = self._given(reading, target)
+        wanted, wrong = self._wanted(target)
+        self._target = wanted
+        y, room = self._read(reading)
         y = y[self._rows]
+        if self.times.stale:  # a stale reading is none
+            y, wrong = np.full(len(y), np.nan), wrong or STALE
         self._room = np.where(np.isfinite(room), room, self._room)
         usable = np.isfinite(y) & np.isfinite(wanted).all()
         self._unread_s = np.where(usable, 0.0, self._unread_s + self.times.waited_s)

@@ -28,7 +28,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -77,6 +77,14 @@ class _Past:
     x: Array  # (n_x,) where the estimate then stood
     fresh: bool = True  # whether nothing was read since the start
     silent_s: float = 0.0  # that nobody called, where it was too long to know the past
+
+
+class _Choice(NamedTuple):
+    """The drives that a call chooses, before their slew limit."""
+
+    u: Array  # (n_u,)
+    status: str
+    why: str  # the advice, "" where there is none
 
 
 class ReferenceController(SampledController):
@@ -152,12 +160,13 @@ class ReferenceController(SampledController):
         )
         if self.design.ramp_per_s:
             wanted, ahead = self._ramp(wanted, ahead)
-        u, status, lasting = self._decide(wanted, ahead, started)
+        choice = self._decide(wanted, ahead, started)
+        status, lasting = choice.status, choice.why
         if status == "ok":  # what happened in this sample, before what has been so for long
             lasting = event or lasting
         if wrong and status == "ok":
             status = "infeasible"
-        self._u = self._within(u)
+        self._u = self._within(choice.u)
         return self._answer(status, wrong or lasting or event, started)
 
     def _start(self, y: Array, d: Array, begin: Callable[[Array, Array], None]) -> None:
@@ -250,10 +259,10 @@ class ReferenceController(SampledController):
         """Return what of a plan (N, n_u) to apply until the next call."""
         return opening(plan, self.times.slew_s / self.dt)
 
-    def _decide(self, wanted: Array, ahead: Array | None, started: float) -> tuple[Array, str, str]:
+    def _decide(self, wanted: Array, ahead: Array | None, started: float) -> _Choice:
         """Return the drives, the status and the advice: optimiser, else plan, else PI, else off."""
         if not np.isfinite(wanted).all():
-            return self.drives.safe, "off", advice.no_target(safe=bool(self.design.safe_drive))
+            return _Choice(self.drives.safe, "off", advice.no_target(safe=bool(self.design.safe_drive)))
         if (self._unread_s > 0).all():
             return self._without_readings()
         if self.clock() - started >= self.design.deadline_s:
@@ -274,8 +283,8 @@ class ReferenceController(SampledController):
         self._follows.plan = np.repeat(outcome.plan, self.design.blocks, axis=0)
         self._follows.age_s, self._follows.on_pi = 0.0, False
         if outside:
-            return self._first_of(self._follows.plan), "infeasible", advice.OUT_OF_RANGE
-        return (self._first_of(self._follows.plan), *self._judge(outcome, wanted, started))
+            return _Choice(self._first_of(self._follows.plan), "infeasible", advice.OUT_OF_RANGE)
+        return _Choice(self._first_of(self._follows.plan), *self._judge(outcome, wanted, started))
 
     def _judge(self, outcome: Outcome, wanted: Array, started: float) -> tuple[str, str]:
         """Return the status and the advice of a plan that was found."""
@@ -356,27 +365,27 @@ class ReferenceController(SampledController):
         begins = np.cumsum(lengths) - lengths
         return np.asarray(np.add.reduceat(plan, begins, axis=0) / lengths[:, None])
 
-    def _without_readings(self) -> tuple[Array, str, str]:
+    def _without_readings(self) -> _Choice:
         if not self._lost.all():
             plan = self._young_plan()
-            return self._u if plan is None else self._first_of(plan), "fallback_plan", ""
+            return _Choice(self._u if plan is None else self._first_of(plan), "fallback_plan", "")
         self._follows.plan = None
-        return self.drives.safe, "off", advice.blind(self._unread_s.min())
+        return _Choice(self.drives.safe, "off", advice.blind(self._unread_s.min()))
 
     def _young_plan(self) -> Array | None:
         return None if self._follows.on_pi or self._follows.age_s > self._patience_s else self.plan
 
-    def _fall_back(self, status: str, why: str) -> tuple[Array, str, str]:
+    def _fall_back(self, status: str, why: str) -> _Choice:
         """Follow the plan while it is young; then PI, then off."""
         plan = self._young_plan()
         if plan is not None:
-            return self._first_of(plan), status, why
+            return _Choice(self._first_of(plan), status, why)
         y = self._past.y[self._rows]
         if not self.pi.loops or not np.isfinite(y).all():
-            return self.drives.safe, "off", why
+            return _Choice(self.drives.safe, "off", why)
         if not self._follows.on_pi:
             self.pi.follow(self._u, y, self._target, self._past.d)
         self._follows.on_pi = True
         self.pi.hold(self.drives.cut(self._u))
         u = self.pi.propose(y, self._target, self._past.d, seconds=self.times.slew_s)
-        return u, "fallback_pi" if status == "fallback_plan" else status, why
+        return _Choice(u, "fallback_pi" if status == "fallback_plan" else status, why)

@@ -276,8 +276,8 @@ def choose_disturbances(
             break
         trial = _disturbance_matrices(model, [*chosen, entry])
         scale = np.array([0.01 if kind == "input" else 1.0 for kind, _ in [*chosen, entry]])
-        into_state = B @ (trial[0] * model.span[:, None]) + E @ trial[1]
-        trial_margin = detectability_margin(A, model.C, into_state, trial[2], scale=scale)
+        into_state = B @ (trial["input"] * model.span[:, None]) + E @ trial["disturbance"]
+        trial_margin = detectability_margin(A, model.C, into_state, trial["output"], scale=scale)
         if trial_margin > least:
             chosen, margin = [*chosen, entry], trial_margin
     if len(chosen) < len(controlled):
@@ -288,10 +288,10 @@ def choose_disturbances(
             hint="control an output that a drive can move"
             + (": identify does not call this plant good" if said_not_good(model.plant.verdict) else ""),
         )
-    on_drive, on_disturbance, on_output = _disturbance_matrices(model, chosen)
+    on = _disturbance_matrices(model, chosen)
     names = {"input": model.drives, "output": model.outputs, "disturbance": model.disturbances}
     labels = tuple(f"{kind} {names[kind][row]}" for kind, row in chosen)
-    return DisturbanceModel(labels, on_drive, on_disturbance, on_output, margin)
+    return DisturbanceModel(labels, on["input"], on["disturbance"], on["output"], margin)
 
 
 def _disturbance_order(model: PredictionModel, controlled: tuple[str, ...]) -> list[tuple[str, int]]:
@@ -302,9 +302,8 @@ def _disturbance_order(model: PredictionModel, controlled: tuple[str, ...]) -> l
     return order + [("disturbance", k) for k in range(model.n_d)]
 
 
-def _disturbance_matrices(
-    model: PredictionModel, entries: list[tuple[str, int]]
-) -> tuple[Array, Array, Array]:
+def _disturbance_matrices(model: PredictionModel, entries: list[tuple[str, int]]) -> dict[str, Array]:
+    """Return on what each disturbance state (n_w) acts, by the kind of row."""
     n_w = len(entries)
     matrices = {
         "input": np.zeros((model.n_u, n_w)),
@@ -313,7 +312,7 @@ def _disturbance_matrices(
     }
     for column, (kind, row) in enumerate(entries):
         matrices[kind][row, column] = 1.0
-    return matrices["input"], matrices["disturbance"], matrices["output"]
+    return matrices
 
 
 class Observer:
@@ -353,8 +352,8 @@ class Observer:
         bias_unit = np.where(disturbance.on_output.any(axis=0), disturbance.on_output.T @ model.unit, 1.0)
         drift = np.where(self.is_drive, disturbance.on_drive.T @ drives, self.noise.output * bias_unit)
         self.Q = np.concatenate([(self.noise.state * self.unit) ** 2, drift**2]) * model.dt
-        _, _, B, _ = model.linearise(*model.at_rest(ambient))
-        self.load = B * model.span * [self.noise.load.get(name, 0.0) for name in model.drives]
+        by_drive = model.linearise(*model.at_rest(ambient)).B
+        self.load = by_drive * model.span * [self.noise.load.get(name, 0.0) for name in model.drives]
         self.x = np.zeros(model.n_x)
         self.w = np.zeros(disturbance.n_w)
         self.found_offset = np.zeros(model.n_y)

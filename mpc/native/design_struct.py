@@ -183,7 +183,7 @@ def _settles(model: PredictionModel) -> bool:
     """Return whether a plant is linear, and has a steady state."""
     if model.affine is None:
         return False
-    return bool(np.linalg.cond(np.eye(model.n_x) - model.affine[0]) < _INTEGRATES)
+    return bool(np.linalg.cond(np.eye(model.n_x) - model.affine.A) < _INTEGRATES)
 
 
 def _multiple_of_four(n: int) -> int:
@@ -308,10 +308,10 @@ def _free_response(model: PredictionModel, design: Design, rows: list[int]) -> d
     state, by the disturbances, and besides."""
     if model.affine is None:
         return {"by_x": np.zeros((0, model.n_x)), "by_d": np.zeros((0, model.n_d)), "by_none": np.zeros(0)}
-    _, _, E, added = model.affine
+    from_zero = model.affine
     by_x, by_rest, _ = model.response(design.blocks)
-    by_none = by_rest @ added + model.output(np.zeros(model.n_x))
-    responses = {"by_x": by_x, "by_d": by_rest @ E, "by_none": by_none}
+    by_none = by_rest @ from_zero.after + model.output(np.zeros(model.n_x))
+    responses = {"by_x": by_x, "by_d": by_rest @ from_zero.E, "by_none": by_none}
     return {
         name: response[:, rows].reshape(len(response) * len(rows), *response.shape[2:])
         for name, response in responses.items()
@@ -324,7 +324,7 @@ def _steady_outputs(model: PredictionModel, disturbance: DisturbanceModel) -> di
     nothing = {"settles": False, "settled_by": np.zeros((model.n_y, sides)), "settled": np.zeros(model.n_y)}
     if model.affine is None or not _settles(model):
         return nothing
-    A, B, E, added = model.affine
+    added, A, B, E = model.affine
     away, by_share = np.eye(model.n_x) - A, B * model.span
     by_w = by_share @ disturbance.on_drive + E @ disturbance.on_disturbance
     by = model.C @ np.linalg.solve(away, np.column_stack([by_share, E, by_w, added]))

@@ -28,7 +28,7 @@ References
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.linalg.lapack import dpotrf, dtrtri
@@ -68,6 +68,15 @@ class QPAnswer:
     def solved(self) -> bool:
         """Whether x is the minimiser."""
         return self.status == "solved"
+
+
+class ScaledAnswer(NamedTuple):
+    """What DAQP says of a scaled program."""
+
+    z: Array  # (n,), NaN where it has seen at once that there is none
+    multipliers: Array  # (m,)
+    flag: int
+    iterations: int
 
 
 class CondensedQP:
@@ -131,20 +140,20 @@ class CondensedQP:
         idle = self.soft & (length < SHORT)
         if idle.any():
             least[idle], most[idle] = -_NO_BOUND, _NO_BOUND
-        z, multipliers, flag, iterations = self._run(f @ back, rows, least, most, length)
-        if flag <= 0:
-            return self._failed(_EXIT_FLAGS.get(flag, f"solver flag {flag}"), f.size, iterations)
-        if not np.isfinite(z).all():
-            return self._failed("not finite", f.size, iterations)
-        x = back @ z
+        scaled = self._run(f @ back, rows, least, most, length)
+        if scaled.flag <= 0:
+            status = _EXIT_FLAGS.get(scaled.flag, f"solver flag {scaled.flag}")
+            return self._failed(status, f.size, scaled.iterations)
+        if not np.isfinite(scaled.z).all():
+            return self._failed("not finite", f.size, scaled.iterations)
+        x = back @ scaled.z
         value = A @ x
         slack = np.maximum(0.0, np.maximum(value - upper, lower - value))
-        return QPAnswer(x, "solved", iterations, multipliers / length, np.where(self.soft, slack, 0.0))
+        slack = np.where(self.soft, slack, 0.0)
+        return QPAnswer(x, "solved", scaled.iterations, scaled.multipliers / length, slack)
 
-    def _run(
-        self, f: Array, A: Array, lower: Array, upper: Array, length: Array
-    ) -> tuple[Array, Array, int, int]:
-        """Hand the scaled problem to DAQP; return z, multipliers, its flag and its iterations."""
+    def _run(self, f: Array, A: Array, lower: Array, upper: Array, length: Array) -> ScaledAnswer:
+        """Hand the scaled problem to DAQP."""
         from daqp import Model
 
         model = Model()
@@ -157,14 +166,14 @@ class CondensedQP:
         sense = np.where(self.soft, _SOFT, 0).astype(np.int32)
         flag, _ = model.setup(np.eye(f.size), f, A, upper, lower, sense)
         if flag < 0:  # it has seen that there is no answer
-            return np.full(f.size, np.nan), np.zeros(lower.size), int(flag), 0
+            return ScaledAnswer(np.full(f.size, np.nan), np.zeros(lower.size), int(flag), 0)
         model.settings = settings
         # penalties in scaled units; of the quadratic one it takes the reciprocal
         reciprocal = 1.0 / np.maximum(self.quadratic * length**2, LEAST_QUADRATIC)
         linear = self._priced * length
         model.soft_weights(reciprocal, reciprocal, linear, linear)
         z, _, flag, info = model.solve()
-        return np.asarray(z), np.asarray(info["lam"]), int(flag), int(info["iterations"])
+        return ScaledAnswer(np.asarray(z), np.asarray(info["lam"]), int(flag), int(info["iterations"]))
 
     def _failed(self, status: str, n: int, iterations: int = 0) -> QPAnswer:
         zero = np.zeros(self.soft.size)

@@ -150,9 +150,9 @@ class RestGains:
         # of a drive that is no loop's and serves a limit, what it does to a target may fade or turn over
         paired = {loop.drive for loop in design.loops}
         is_seen &= np.array([name in paired or not (paired and design.limits) for name in model.drives])
-        _, A, B, _ = model.linearise(x, u, d)
+        step = model.linearise(x, u, d)
         try:
-            gain = model.C @ np.linalg.solve(np.eye(model.n_x) - A, B * model.span)
+            gain = model.C @ np.linalg.solve(np.eye(model.n_x) - step.A, step.B * model.span)
         except np.linalg.LinAlgError:
             return cls(strongest, response, is_seen, None)
         settled = gain[rows[strongest], np.arange(model.n_u)]
@@ -177,6 +177,22 @@ class Problem:
     parked: list[int]  # drives that go to rest
     more: float = 0.0  # samples, by which the slew limit of the first move is longer than one
     caution: float = 1.0  # times that the weight of moves counts
+
+
+class LinearGains(NamedTuple):
+    """The unconstrained plan of the condensed QP, whose Hessian is H (n, n)."""
+
+    H: Array
+    on_free: Array  # (n, N n_controlled) its gain on the free response, sample by sample
+    on_last: Array  # (n, n_u) and on the last drive
+
+
+class BoundedRows(NamedTuple):
+    """Rows A (m, n) of the program and their bounds (m,)."""
+
+    A: Array
+    lower: Array
+    upper: Array
 
 
 class Optimiser:
@@ -245,8 +261,7 @@ class Optimiser:
         free = y_guess - G @ (guess / model.span).ravel()  # the response without any plan
         H, f = self._cost(G, free, problem)
         ends = self._range(guess, drive_bias, authority, problem)
-        A, lower, upper = self._constraints(G, free, ends, problem)
-        answer = self.qp.solve(H, f, A, lower, upper)
+        answer = self.qp.solve(H, f, *self._constraints(G, free, ends, problem))
         plan = self._park((answer.x * self._spans).reshape(guess.shape), problem)
         if not answer.solved:
             return Outcome(plan, y_guess, answer.status, {}, answer.iterations, authority[0])
@@ -405,9 +420,8 @@ class Optimiser:
         """Start afresh: the ramps are tried at the first solve."""
         self._solves = 0
 
-    def linear_gains(self, G: Array) -> tuple[Array, Array, Array]:
-        """Return H (n, n), and the unconstrained plan's gains on the free response (n, N n_controlled),
-        sample by sample, and on the last drive (n, n_u).
+    def linear_gains(self, G: Array) -> LinearGains:
+        """Return H, and the unconstrained plan's gains on the free response and on the last drive.
 
         G (N, n_y, n) is the response to the plan in fractions of the drives' ranges; the first n_u rows of a
         gain are the first move.
@@ -419,7 +433,7 @@ class Optimiser:
         before[:n_u] = np.diag(1 / self.model.span)
         last = 2 * self.design.move * self._differences.T @ before
         on_free = -span[:, None] * np.linalg.solve(H, linear.reshape(H.shape[0], -1))
-        return H, on_free, span[:, None] * np.linalg.solve(H, last)
+        return LinearGains(H, on_free, span[:, None] * np.linalg.solve(H, last))
 
     def _hessian(self, G: Array, outputs: Sequence[int], caution: float) -> tuple[Array, list[Array]]:
         """Return H, and by controlled output the response (n, N) of each sample times twice its weight."""
@@ -444,9 +458,7 @@ class Optimiser:
         f[: self.model.n_u] -= 2 * problem.caution * self.design.move * (problem.last / self.model.span)
         return H, f
 
-    def _constraints(
-        self, G: Array, free: Array, ends: tuple[Array, Array], problem: Problem
-    ) -> tuple[Array, Array, Array]:
+    def _constraints(self, G: Array, free: Array, ends: tuple[Array, Array], problem: Problem) -> BoundedRows:
         """Return the rows A of the program and their bounds."""
         n, n_u = len(self._spans), self.model.n_u
         soft = [*self._rows, *(row for row, _, _ in self._limits)]
@@ -469,7 +481,7 @@ class Optimiser:
         for row, low, high in self._limits:
             lower.append(low - free[:, row])
             upper.append(high - free[:, row])
-        return self._A, np.concatenate(lower), np.concatenate(upper)
+        return BoundedRows(self._A, np.concatenate(lower), np.concatenate(upper))
 
     def _broken(self, y: Array) -> dict[str, float]:
         """Return by how much limits will be broken, where it is worth a word."""

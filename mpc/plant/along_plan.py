@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from threading import Lock
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import numpy as np
 
@@ -20,7 +20,7 @@ from thermogrip.datasets.arrays import Array
 if TYPE_CHECKING:
     from thermogrip.sysid.models.jit_rollout import Batch, Kernel
 
-__all__ = ["AlongPlan", "SampleDerivatives"]
+__all__ = ["AlongPlan", "LinearStep", "SampleDerivatives"]
 
 _PLANS = 8  # that take no longer than one
 
@@ -82,6 +82,15 @@ class AlongPlan:
         batch.run()
 
 
+class LinearStep(NamedTuple):
+    """One sample, linearised."""
+
+    after: Array  # (n_x,) the state after it
+    A: Array  # (n_x, n_x) its derivative by the state
+    B: Array  # (n_x, n_u) by the drives
+    E: Array  # (n_x, n_d) by the disturbances
+
+
 class SampleDerivatives:
     """One sample's next state and its derivatives."""
 
@@ -96,8 +105,8 @@ class SampleDerivatives:
         self._batch.d[:, :, n_d:] = along[:, None, n_x + n_u :]
         self._lock = Lock()
 
-    def __call__(self, x: Array, u: Array, d: Array) -> tuple[Array, Array, Array, Array]:
-        """Return the state (n_x,) after x under u (n_u,) and d (n_d,), and its derivatives by each."""
+    def __call__(self, x: Array, u: Array, d: Array) -> LinearStep:
+        """Return the state after x (n_x,) under u (n_u,) and d (n_d,), and its derivatives by each."""
         n_x, n_u, n_d = self._sizes
         batch = self._batch
         with self._lock:
@@ -106,4 +115,4 @@ class SampleDerivatives:
             batch.d[:, :, :n_d] = d
             batch.run()
             after, by = batch.x_end[0, :n_x].copy(), batch.x_end[:, n_x:].T.copy()
-        return after, by[:, :n_x], by[:, n_x : n_x + n_u], by[:, n_x + n_u :]
+        return LinearStep(after, by[:, :n_x], by[:, n_x : n_x + n_u], by[:, n_x + n_u :])

@@ -37,7 +37,7 @@ from scipy.optimize import least_squares
 
 from thermogrip.datasets.arrays import Array, Mask, Values
 from thermogrip.datasets.errors import UserError
-from thermogrip.mpc.plant.along_plan import AlongPlan, SampleDerivatives
+from thermogrip.mpc.plant.along_plan import AlongPlan, LinearStep, SampleDerivatives
 from thermogrip.sysid.models.model import Sizes
 
 if TYPE_CHECKING:
@@ -85,6 +85,14 @@ class Response(NamedTuple):
     by_x: Array  # (N, n_y, n_x)
     by_rest: Array  # (N, n_y, n_x), of what is added to the state in every sample
     G: Array  # (N, n_y, n_b, n_u)
+
+
+class Rest(NamedTuple):
+    """Where all is at rest in a room."""
+
+    x: Array  # (n_x,)
+    u: Array  # (n_u,)
+    d: Array  # (n_d,)
 
 
 class PredictionModel:
@@ -170,7 +178,7 @@ class PredictionModel:
         x = self.model.rest(np.asarray(y, float), self.inputs(self.neutral), np.asarray(d, float), self.p)
         return np.asarray(x, dtype=np.float64)
 
-    def at_rest(self, ambient: float) -> tuple[Array, Array, Array]:
+    def at_rest(self, ambient: float) -> Rest:
         """Return state, drives and disturbances where all is at rest in a room of this temperature [degC];
         where no log was there, amid what the logs showed."""
         d = self.undisturbed(ambient)
@@ -180,7 +188,7 @@ class PredictionModel:
             logs = [self.plant.valid.get(name, (neutral, neutral)) for name, neutral in zip(self.drives, v)]
             v = np.clip(np.mean(np.array(logs, dtype=float), axis=1), self.lowest, self.highest)
         x = self.model.rest(y, self.inputs(v), d, self.p)
-        return np.asarray(x, dtype=np.float64), v, d
+        return Rest(np.asarray(x, dtype=np.float64), v, d)
 
     def undisturbed(self, ambient: float) -> Array:
         """Return the measured disturbances (n_d,) where nobody reads them, in a room of this temperature
@@ -214,20 +222,20 @@ class PredictionModel:
     def next_state(self, x: Array, u: Array, d: Array) -> Array:
         """Return the state one sample later."""
         if self.affine is not None:
-            A, B, E, added = self.affine
-            return np.asarray(A @ x + B @ u + E @ d + added)
+            from_zero = self.affine
+            return np.asarray(from_zero.A @ x + from_zero.B @ u + from_zero.E @ d + from_zero.after)
         _, x_end = self.run(x[None, :], u[None, None, :], d)
         return np.asarray(x_end[0])
 
-    def linearise(self, x: Array, u: Array, d: Array) -> tuple[Array, Array, Array, Array]:
+    def linearise(self, x: Array, u: Array, d: Array) -> LinearStep:
         """Return one sample's next state (n_x,), and its derivatives A, B, E by x, u (n_x, n_u) and d."""
         if self.affine is not None:
-            return self.next_state(x, u, d), *self.affine[:3]
+            return self.affine._replace(after=self.next_state(x, u, d))
         return self._by_casadi(x, u, d) if self._sample is None else self._sample(x, u, d)
 
     @cached_property
-    def affine(self) -> tuple[Array, Array, Array, Array] | None:
-        """A, B, E of one sample and what is added in it, (n_x,), where the step is linear; else None."""
+    def affine(self) -> LinearStep | None:
+        """One sample from zero without drives and disturbances, where the step is linear; else None."""
         import casadi as ca
 
         symbols = _symbols(self)
@@ -235,12 +243,11 @@ class PredictionModel:
         if any(ca.which_depends(after, ca.vertcat(*symbols), 2, True)):
             return None
         # CasADi's own: once, which is not worth a compiled step
-        added, A, B, E = self._by_casadi(*(np.zeros(n) for n in (self.n_x, self.n_u, self.n_d)))
-        return A, B, E, added
+        return self._by_casadi(*(np.zeros(n) for n in (self.n_x, self.n_u, self.n_d)))
 
-    def _by_casadi(self, x: Array, u: Array, d: Array) -> tuple[Array, Array, Array, Array]:
+    def _by_casadi(self, x: Array, u: Array, d: Array) -> LinearStep:
         after, A, B, E = self._casadi_sample(x, u, d)
-        return after.ravel(), A, B, E
+        return LinearStep(after.ravel(), A, B, E)
 
     @cached_property
     def _kernel(self) -> Kernel | None:
@@ -266,9 +273,9 @@ class PredictionModel:
         disturbances d (n_d,), and their derivatives (N, n_y, n_b, n_u), of a linear plant the same array
         each time."""
         if self.affine is not None:
-            _, _, E, added = self.affine
+            from_zero = self.affine
             by_x, by_rest, G = self.response(tuple(blocks))
-            y = by_x @ x + by_rest @ (E @ d + added) + np.tensordot(G, plan, axes=2)
+            y = by_x @ x + by_rest @ (from_zero.E @ d + from_zero.after) + np.tensordot(G, plan, axes=2)
             return y + self.output(np.zeros(self.n_x)), G
         along = self.along(blocks, np.ones(self.n_u))
         return (
@@ -288,7 +295,7 @@ class PredictionModel:
             return self._responses[blocks]
         if self.affine is None:
             raise RuntimeError("the plant is not linear")
-        A, B, _, _ = self.affine
+        A, B = self.affine.A, self.affine.B
         rows, sums = self.C, np.zeros_like(self.C)
         by_x = []
         by_rest = []
@@ -347,9 +354,9 @@ class PredictionModel:
         u, d = np.asarray(u, float).reshape(self.n_u), np.asarray(d, float)
         x = self.rest(self.usual(self.room(d)), d)
         for _ in range(30):
-            after, A, _, _ = self.linearise(x, u, d)
+            step = self.linearise(x, u, d)
             try:
-                change = np.linalg.solve(np.eye(self.n_x) - A, after - x)
+                change = np.linalg.solve(np.eye(self.n_x) - step.A, step.after - x)
             except np.linalg.LinAlgError:
                 return np.full(self.n_x, np.nan)  # an integrator: any state may stay
             x = x + np.clip(change, -200.0, 200.0)
@@ -660,12 +667,12 @@ def _balance(model: PredictionModel, rows: list[int], wanted: Array, d: Array) -
     where there is none."""
     x, u = model.rest(np.full(model.n_y, wanted.mean()), d), model.neutral
     for _ in range(_NEWTON_STEPS):
-        after, A, B, _ = model.linearise(x, u, d)
-        off = np.concatenate([after - x, model.output(x)[rows] - wanted])
+        step = model.linearise(x, u, d)
+        off = np.concatenate([step.after - x, model.output(x)[rows] - wanted])
         if np.max(np.abs(off)) < _BALANCED:
             return x, u
         outputs = np.hstack([model.C[rows], np.zeros((len(rows), model.n_u))])
-        by = np.vstack([np.hstack([A - np.eye(model.n_x), B * model.span]), outputs])
+        by = np.vstack([np.hstack([step.A - np.eye(model.n_x), step.B * model.span]), outputs])
         move = np.linalg.lstsq(by, -off, rcond=None)[0]
         x, u = x + move[: model.n_x], u + move[model.n_x :] * model.span
     return np.full(model.n_x, np.nan), u

@@ -49,7 +49,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -129,8 +129,13 @@ class Case:
     seconds: float | None = None  # how long it runs; ``hold_s`` of the spec where absent
 
 
-#: Start, target, draw and load of a case, by which controllers are compared.
-Key: TypeAlias = tuple[float, float, int, str]
+class CaseKey(NamedTuple):
+    """What of a case controllers are compared by."""
+
+    start: float  # [degC]
+    target: float
+    draw: int
+    load: str
 
 
 @dataclass(frozen=True)
@@ -159,9 +164,9 @@ class StepResult(Record):
         return self.start, self.target
 
     @property
-    def key(self) -> Key:
+    def key(self) -> CaseKey:
         """What it is compared by, whatever the plant lacks."""
-        return self.start, self.target, self.draw, self.load
+        return CaseKey(self.start, self.target, self.draw, self.load)
 
 
 def draws_of(plant: Plant, count: int) -> list[int]:
@@ -419,8 +424,8 @@ class Scales:
 
     bounds: Bounds  # shortest times [s]
     # by start, target, draw and load: full drives that the default MPC moves, the reference's IAE [degC s]
-    moves: dict[Key, float]
-    iae: dict[Key, float]
+    moves: dict[CaseKey, float]
+    iae: dict[CaseKey, float]
 
 
 @dataclass(frozen=True)
@@ -440,23 +445,23 @@ class Score:
 def score(results: Sequence[StepResult], spec: Spec, scales: Scales, *, expects: Iterable[str] = ()) -> Score:
     """Return the score of a set of trials, see the module's text; ``expects`` are those of :func:`lacking`
     that count as any draw."""
-    costs: dict[tuple[Any, ...], list[float]] = {}
+    costs: dict[tuple[CaseKey, str, str], list[float]] = {}
     for result in results:
         cost = _cost_of_load(result, spec, scales) if result.load else _cost_of_step(result, spec, scales)
         # a plant that lacks structure is run for longer than the reference was
         default_moves = np.inf if result.lacks else scales.moves.get(result.key, np.inf)
         most = (spec.moves_limit or np.inf) * default_moves
         cost += spec.moves_weight * result.travel + COSTS.moves * max(0.0, result.travel / most - COSTS.free)
-        costs.setdefault((result.load, result.lacks, *result.key[:3], result.output), []).append(cost)
+        costs.setdefault((result.key, result.lacks, result.output), []).append(cost)
     steps: list[float] = []
     loads: list[float] = []
     others: list[float] = []
     planned = {"", *expects}
-    for (load, lacks, *_), noises in costs.items():
+    for (case, lacks, _), noises in costs.items():
         cost = float(np.mean(noises))
         if lacks and cost > COSTS.late:
             cost = COSTS.late * (1 + np.log(cost / COSTS.late))
-        (loads if load else steps if lacks in planned else others).append(cost)
+        (loads if case.load else steps if lacks in planned else others).append(cost)
     return Score(
         _mean_and_worst(steps),
         _mean_and_worst(loads),

@@ -47,7 +47,7 @@ from thermogrip.mpc.design.spec import Spec
 from thermogrip.mpc.tuning.objective import (
     Bounds,
     Case,
-    Key,
+    CaseKey,
     Record,
     Scales,
     Score,
@@ -328,11 +328,11 @@ class Bench:
 
     def _scales(self) -> Scales:
         """Return what trials count in, of all draws."""
-        moves: dict[Key, float] = {}
-        iae: dict[Key, float] = {}
+        moves: dict[CaseKey, float] = {}
+        iae: dict[CaseKey, float] = {}
         for draws, seed in ((self.draws, self.seed), (self.unseen, self.check_seed)):
             for kind, design in (("PI", self.design("PI", {})), ("MPC", self.baseline)):
-                largest: dict[Key, float] = {}  # of the outputs, where each is judged by itself
+                largest: dict[CaseKey, float] = {}  # of the outputs, where each is judged by itself
                 for result in self.run(kind, design, draws, seed):
                     if result.lacks:
                         continue

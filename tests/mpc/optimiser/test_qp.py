@@ -8,7 +8,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.optimize import minimize
 
-from thermogrip.mpc.optimiser.qp import LEAST_QUADRATIC, CondensedQP
+from thermogrip.mpc.optimiser.qp import LEAST_QUADRATIC, CondensedQP, ScaledAnswer
 
 
 def random_problem(seed: int) -> tuple:
@@ -180,7 +180,7 @@ FLAGS = {
 @pytest.mark.parametrize("z", [0.5, np.nan])
 def test_a_flag_of_the_solver_is_a_status_and_no_number_is_no_solution(monkeypatch, flag, status, z):
     solver = CondensedQP(soft=[False], linear=[0.0], quadratic=[0.0])
-    monkeypatch.setattr(solver, "_run", lambda *given: (np.full(1, z), np.full(1, 6.0), flag, 7))
+    monkeypatch.setattr(solver, "_run", lambda *given: ScaledAnswer(np.full(1, z), np.full(1, 6.0), flag, 7))
     found = solver.solve(np.array([[4.0]]), np.zeros(1), np.array([[3.0]]), -np.ones(1), np.ones(1))
     solved = flag > 0 and np.isfinite(z)
     assert found.status == ("not finite" if flag > 0 and not solved else status)
