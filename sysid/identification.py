@@ -250,6 +250,15 @@ class _Task:
     options: _Options
 
 
+@dataclass(frozen=True, eq=False)
+class _MatchedLogs:
+    """Logs in the roles and units of a network, or as they were where there is none."""
+
+    network: GreyModel | None
+    logs: list[Log]
+    converted: list[str]
+
+
 def _read_logs(
     logs: list[Log],
     network: GreyModel | str | Path | None,
@@ -257,9 +266,9 @@ def _read_logs(
     options: _Options,
 ) -> _Task:
     """Return the logs in the roles and units of all candidates, checked; each is matched once."""
-    model, logs, converted = _for_network(network, logs)
-    if model is None:
-        logs = without_still(logs)
+    matched = _for_network(network, logs)
+    model = matched.network
+    logs = without_still(logs) if model is None else matched.logs
     u, y, d = signals(logs, **named)
     # a network has a prior of what never moves, others nothing
     still = still_inputs(model, logs, u)
@@ -272,7 +281,9 @@ def _read_logs(
     roles, unused = signal_roles(logs, ([*u, *still], d, y), named, model, still)
     all_named = named["inputs"] is not None and named["outputs"] is not None
     doubts = role_doubts(logs, named_all=all_named)
-    return _Task(logs, model, u, y, d, checked, roles, doubts, (*converted, *rested, *unused), options)
+    return _Task(
+        logs, model, u, y, d, checked, roles, doubts, (*matched.converted, *rested, *unused), options
+    )
 
 
 def _ask_for_excitation(checked: DataCheck, inputs: Sequence[str], log: Log) -> None:
@@ -286,12 +297,10 @@ def _ask_for_excitation(checked: DataCheck, inputs: Sequence[str], log: Log) -> 
     raise UserError(says, file=log_name(log), column=failed[0].channel, hint=hint + moved_before(log))
 
 
-def _for_network(
-    network: GreyModel | str | Path | None, logs: list[Log]
-) -> tuple[GreyModel | None, list[Log], list[str]]:
-    """Return the network, the logs in its roles and units, and what was converted; refuse a misfit."""
+def _for_network(network: GreyModel | str | Path | None, logs: list[Log]) -> _MatchedLogs:
+    """Return the network with the logs in its roles and units; refuse a misfit."""
     if network is None:
-        return None, logs, []
+        return _MatchedLogs(None, logs, [])
     if isinstance(network, (str, Path)):
         from thermogrip.sysid.models.network import load_network
 
@@ -313,7 +322,7 @@ def _for_network(
                 hint=f"{reason.hint}; rename columns, or name another network (or none)",
             )
     matched, converted = match_logs(network, logs, keep_others=True)
-    return network, matched, [*notes, *converted]
+    return _MatchedLogs(network, matched, [*notes, *converted])
 
 
 def _candidate_kinds(models: Sequence[str], network: GreyModel | None) -> list[str]:

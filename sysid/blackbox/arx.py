@@ -14,7 +14,7 @@ minimised here.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 
@@ -66,8 +66,11 @@ def arx_family(
     out = {}
     couplings = (False, True) if len(grid.outputs) > 1 else (True,)
     for products in default_terms(grid) if terms is None else terms:
-        regression, kept_poles, kept_delays = _deepest(grid, products, poles, delays)
-        if regression is None:
+        for kept_poles, kept_delays in _orders_to_try(poles, delays):
+            regression = _regress(grid, products, max(kept_poles) + max(kept_delays) - 1)
+            if regression is not None:
+                break
+        else:
             continue
         for n, delay, coupled in product(kept_poles, kept_delays, couplings):
             tried = _Orders(n, delay, coupled)
@@ -86,19 +89,15 @@ def _arx_structure(grid: Grid, terms: tuple[str, ...], orders: _Orders) -> Struc
     return Structure(label + (f", with {', '.join(terms)}" if terms else ""), size)
 
 
-def _deepest(
-    grid: Grid, terms: tuple[str, ...], poles: Sequence[int], delays: Sequence[int]
-) -> tuple[_Regression | None, Sequence[int], Sequence[int]]:
-    """Return the regression of as many lags as the rows allow, and the orders that it has: of short logs with
-    many signals the longest delays are left out, then the highest orders."""
-    while True:
-        regression = _regress(grid, terms, max(poles) + max(delays) - 1)
-        if regression is not None or len(poles) == len(delays) == 1:
-            return regression, poles, delays
-        if len(delays) > 1:
-            delays = delays[:-1]
-        else:
-            poles = poles[:-1]
+def _orders_to_try(
+    poles: Sequence[int], delays: Sequence[int]
+) -> Iterator[tuple[Sequence[int], Sequence[int]]]:
+    """Yield all orders, then fewer for short logs with many signals: first without the longest delays, then
+    without the highest orders."""
+    for n_delay in range(len(delays), 0, -1):
+        yield poles, delays[:n_delay]
+    for n_pole in range(len(poles) - 1, 0, -1):
+        yield poles[:n_pole], delays[:1]
 
 
 def _regress(grid: Grid, terms: tuple[str, ...], deep: int) -> _Regression | None:

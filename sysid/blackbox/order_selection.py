@@ -27,7 +27,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise, product
-from typing import Any, NamedTuple, Protocol, TypeAlias, TypeVar
+from typing import Any, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -126,17 +126,20 @@ def folds(grid: Grid, *, blocks: int = _CUTS) -> list[Fold]:
     else:
         parts = [*_cut_blocks(grid, blocks), _last_parts(grid)]
     range_of = np.ptp(np.concatenate([segment.u for segment in grid.segments]), axis=0)
-    excited = [part for part in parts if _moves_all(part[1], than=part[2], least=MOVED * range_of)]
+    excited = [part for part in parts if _moves_all(part.training, than=part.runs, least=MOVED * range_of)]
     used = excited if len(excited) >= 2 else parts
-    return [Fold(label, grid.having(training), tuple(runs)) for label, training, runs in used]
+    return [Fold(part.label, grid.having(part.training), tuple(part.runs)) for part in used]
 
 
-_Part: TypeAlias = "tuple[str, list[Segment], list[Run]]"  # what is held out, the rest, what is run
+class _Part(NamedTuple):
+    label: str  # of what is held out
+    training: list[Segment]  # the rest
+    runs: list[Run]
 
 
 def _whole_log(grid: Grid, name: str) -> _Part:
     training = [segment for segment in grid.segments if segment.log != name]
-    return name, training, [Run(segment) for segment in grid.segments if segment.log == name]
+    return _Part(name, training, [Run(segment) for segment in grid.segments if segment.log == name])
 
 
 def _cut_blocks(grid: Grid, blocks: int) -> list[_Part]:
@@ -152,9 +155,8 @@ def _cut_blocks(grid: Grid, blocks: int) -> list[_Part]:
     for at, (first, last) in enumerate(pairwise(edges)):
         inside, outside = _split_segments(grid.segments, first, last)
         halves = [segment.part(len(segment.time) // 2, len(segment.time)) for segment in inside]
-        parts.append(
-            (f"block {at + 1} of {blocks}", outside, [Run(segment) for segment in (*inside, *halves)])
-        )
+        runs = [Run(segment) for segment in (*inside, *halves)]
+        parts.append(_Part(f"block {at + 1} of {blocks}", outside, runs))
     return parts
 
 
@@ -169,7 +171,7 @@ def _last_parts(grid: Grid) -> _Part:
             cut = int(np.searchsorted(segment.time, begin + (1 - HELD_OUT_SHARE) * (end - begin)))
             training += [segment.part(0, cut)] if cut >= FEWEST else []
             runs += [Run(segment, cut)] if cut < len(segment.time) else []
-    return f"{TAIL}{' and '.join(grid.logs)}", training, runs
+    return _Part(f"{TAIL}{' and '.join(grid.logs)}", training, runs)
 
 
 def priors_of(grid: Grid) -> tuple[StartPrior, ...]:

@@ -27,7 +27,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from math import comb
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -90,14 +90,23 @@ def _features(grid: Grid, degree: int, memory: int) -> _Features | None:
     """Return the terms of one degree and memory, None where too few rows are whole."""
     import pysindy
 
-    x, w, move = _trajectories(grid, memory)
-    if not x or sum(map(len, x)) < 3 * x[0].shape[1] + 20:
+    trajectories = _trajectories(grid, memory)
+    counts = [len(run.move) for run in trajectories]
+    if not trajectories or sum(counts) < 3 * memory * len(grid.outputs) + 20:
         return None
-    z, middle, size = _scaled_rows(x, w)
+    variables = np.concatenate([run.variables for run in trajectories])
+    middle, size = variables.mean(axis=0), variables.std(axis=0)
+    size = np.where(size > 1e-9, size, 1.0)
     library = pysindy.PolynomialLibrary(degree=degree)
-    theta = np.asarray(library.fit_transform(np.concatenate(z)), dtype=float)
-    runs = np.split(theta, np.cumsum([len(run) for run in z])[:-1])
-    return _Features(runs, move, np.asarray(library.powers_, dtype=int), middle, size, memory)
+    theta = np.asarray(library.fit_transform((variables - middle) / size), dtype=float)
+    return _Features(
+        theta=np.split(theta, np.cumsum(counts)[:-1]),
+        move=[run.move for run in trajectories],
+        powers=np.asarray(library.powers_, dtype=int),
+        middle=middle,
+        size=size,
+        memory=memory,
+    )
 
 
 def _fit_terms(grid: Grid, terms: _Features, threshold: float, width: int) -> SindyModel | None:
@@ -166,11 +175,15 @@ def _bounded_model(grid: Grid, exponents: NDArray[np.int_], natural: Array, memo
     return replace(model, spread=spread + 1e-8 * max(np.trace(spread), 1e-12) * np.eye(model.n_x))
 
 
-def _trajectories(grid: Grid, memory: int) -> tuple[list[Array], list[Array], list[Array]]:
-    """Return states, outside variables and increments of every run of whole rows."""
-    x = []
-    w = []
-    move = []
+class _Trajectory(NamedTuple):
+    """A run of whole rows."""
+
+    variables: Array  # states, then inputs and disturbances
+    move: Array  # increments of the outputs
+
+
+def _trajectories(grid: Grid, memory: int) -> list[_Trajectory]:
+    trajectories = []
     readings = whole_readings(grid.segments, memory + 5)
     for segment in (replace(some, y=y) for some, y in zip(grid.segments, readings)):
         for begin, end in _whole_rows(segment):
@@ -178,24 +191,17 @@ def _trajectories(grid: Grid, memory: int) -> tuple[list[Array], list[Array], li
             if end - begin < memory + 5:
                 continue
             now = range(memory - 1, len(y) - 1)
-            x.append(np.hstack([y[[k - lag for k in now]] for lag in range(memory)]))
-            w.append(np.hstack([segment.u, segment.d])[begin:end][list(now)])
-            move.append(np.diff(y, axis=0)[memory - 1 :])
-    return x, w, move
+            states = [y[[k - lag for k in now]] for lag in range(memory)]
+            outside = np.hstack([segment.u, segment.d])[begin:end][list(now)]
+            variables = np.hstack([*states, outside])
+            trajectories.append(_Trajectory(variables, np.diff(y, axis=0)[memory - 1 :]))
+    return trajectories
 
 
 def _whole_rows(segment: Segment) -> list[tuple[int, int]]:
     is_read = np.isfinite(segment.y).all(axis=1)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], is_read, [False]]).astype(int)))
     return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
-
-
-def _scaled_rows(x: Sequence[Array], w: Sequence[Array]) -> tuple[list[Array], Array, Array]:
-    rows = [np.hstack(pair) for pair in zip(x, w)]
-    stacked = np.concatenate(rows)
-    middle, size = stacked.mean(axis=0), stacked.std(axis=0)
-    size = np.where(size > 1e-9, size, 1.0)
-    return [(row - middle) / size for row in rows], middle, size
 
 
 def _natural(powers: NDArray[np.int_], coefficients: Array, middle: Array, size: Array) -> tuple[Any, Array]:

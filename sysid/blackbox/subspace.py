@@ -36,6 +36,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from functools import partial
 from itertools import product
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -211,38 +212,42 @@ def _factorise(triangle: Array, f: int, n_y: int) -> tuple[Array, Array]:
     """Return L32 and L33 of the LQ factorisation."""
     # the triangle has the same inner products; of an input that barely moves columns are dependent, and the
     # directions that a QR gives those are rounding
-    future, past, ahead = _window_columns(triangle, f, n_y)
-    future_basis = _span(future)
-    past, ahead = (
-        past - future_basis @ (future_basis.T @ past),
-        ahead - future_basis @ (future_basis.T @ ahead),
-    )
+    window = _window_columns(triangle, f, n_y)
+    future_basis = _span(window.future)
+    past = window.past - future_basis @ (future_basis.T @ window.past)
+    ahead = window.ahead - future_basis @ (future_basis.T @ window.ahead)
     state = _span(past)
     projected = state.T @ ahead
     return projected.T, (ahead - state @ projected).T
 
 
-def _window_columns(triangle: Array, f: int, n_y: int) -> tuple[Array, Array, Array]:
-    """Return the columns [W_f, 1], [W_p, Y_p] and Y_f of windows."""
-    future, past, ahead = np.split(triangle, [-f * n_y - (triangle.shape[1] - 1) // 2, -f * n_y], axis=1)
-    return future, past, ahead
+class _WindowColumns(NamedTuple):
+    future: Array  # [W_f, 1]
+    past: Array  # [W_p, Y_p]
+    ahead: Array  # Y_f
+
+
+def _window_columns(triangle: Array, f: int, n_y: int) -> _WindowColumns:
+    parts = np.split(triangle, [-f * n_y - (triangle.shape[1] - 1) // 2, -f * n_y], axis=1)
+    return _WindowColumns(*parts)
 
 
 def predictor_observability(triangle: Array, f: int, n_y: int) -> Array:
     """Return the columns that span Gamma, from one-step predictors of every future row."""
-    future, past, ahead = _window_columns(triangle, f, n_y)
-    n_w, n_z = (future.shape[1] - 1) // f, past.shape[1]
+    window = _window_columns(triangle, f, n_y)
+    n_w, n_z = (window.future.shape[1] - 1) // f, window.past.shape[1]
     by_past, by_readings = np.zeros((f * n_y, n_z)), np.eye(f * n_y)
+    constant = window.future[:, -1:]
     for row in range(f):
-        regressors = np.hstack([past, ahead[:, : row * n_y], future[:, : row * n_w], future[:, -1:]])
+        before = window.ahead[:, : row * n_y]
+        regressors = np.hstack([window.past, before, window.future[:, : row * n_w], constant])
         row_outputs = slice(row * n_y, (row + 1) * n_y)
-        weights = np.linalg.lstsq(regressors, ahead[:, row_outputs], rcond=DEPENDENT)[0].T
+        weights = np.linalg.lstsq(regressors, window.ahead[:, row_outputs], rcond=DEPENDENT)[0].T
         by_past[row_outputs], by_readings[row_outputs, : row * n_y] = (
             weights[:, :n_z],
             -weights[:, n_z : n_z + row * n_y],
         )
-    constant = future[:, -1:]
-    apart = past - constant @ (constant.T @ past) / (constant.T @ constant)
+    apart = window.past - constant @ (constant.T @ window.past) / (constant.T @ constant)
     left_vectors, values, _ = np.linalg.svd(
         np.linalg.solve(by_readings, by_past) @ apart.T, full_matrices=False
     )

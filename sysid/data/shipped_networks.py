@@ -147,7 +147,9 @@ def _by_name(network: Network, log: Log, *, needs_inputs: bool = True) -> dict[s
     written: dict[str, list[str]] = {}
     for name in log.data_vars:
         written.setdefault(str(name).lower(), []).append(str(name))
-    columns_of = {name: written.get(name.lower(), []) for group in _tables(network) for name in group}
+    columns_of = {
+        name: written.get(name.lower(), []) for group in _tables(network).values() for name in group
+    }
     columns_of |= {name: [name] for name in columns_of if name in log}
     if not needs_inputs:
         upper = all(same[0].isupper() for same in columns_of.values() if same)
@@ -160,7 +162,7 @@ def _by_name(network: Network, log: Log, *, needs_inputs: bool = True) -> dict[s
 def _by_role(network: Network, logs: Sequence[Log]) -> dict[str, str] | None:
     """Return the column of each signal by role, unit and order; None where they are not as many."""
     log, columns_of = logs[0], dict[str, str]()
-    for role, table in zip(("input", "disturbance", "output"), _tables(network)):
+    for role, table in _tables(network).items():
         columns = [name for name in names(log, role) if _moves(logs, name)]
         wanted = [name for name, item in table.items() if not getattr(item, "switch", False)]
         switches = [name for name in table if name not in wanted]
@@ -185,8 +187,9 @@ def _suits(log: Log, name: str, item: Any) -> bool:
     return convertible and signed == bool(np.nanmin(column(log, name)) < 0)
 
 
-def _tables(network: Network) -> tuple[Mapping[str, Any], Mapping[str, Any], Mapping[str, Any]]:
-    return network.inputs, network.disturbances, network.outputs
+def _tables(network: Network) -> dict[str, Mapping[str, Any]]:
+    """Return the signals of each role."""
+    return {"input": network.inputs, "disturbance": network.disturbances, "output": network.outputs}
 
 
 def _moves(logs: Sequence[Log], name: str) -> bool:

@@ -81,12 +81,19 @@ REFERENCE = 25.0  # degC at which a Peltier element has its nominal numbers
 BEND_SPAN = 10.0  # K to which the bend of a conductance refers
 
 
+class Monomial(NamedTuple):
+    """``scale * p[left] * p[right]``, where index n_p means 1."""
+
+    scale: float
+    left: int
+    right: int
+
+
 class Layout(NamedTuple):
     """The structure of a network as integers: who is linked to whom, and how to eliminate.
 
     Coefficients stand in one list c: capacities, fixed temperatures, links, their off-factors, bends,
-    radiation, heaters, Peltiers; ``at_*`` is where each part begins.  Coefficient k is
-    ``scale * p[left] * p[right]`` of ``coefficients[k]``, where index n_p means 1.
+    radiation, heaters, Peltiers; ``at_*`` is where each part begins.
     """
 
     n_x: int
@@ -99,7 +106,7 @@ class Layout(NamedTuple):
     at_radiation: int
     at_heater: int
     at_peltier: int
-    coefficients: tuple[tuple[float, int, int], ...]
+    coefficients: tuple[Monomial, ...]
     links: tuple[
         tuple[int, int, bool, int], ...
     ]  # (to, from: an index into z, taken from there, switch or -1)
@@ -134,12 +141,12 @@ class ThermalSteps:
     def prepare(self, p: Values) -> list[Any]:
         """Return the coefficients: products of at most two parameters and a number."""
         c: list[Any] = []
-        for scale, first, second in self.layout.coefficients:
-            value = scale + 0.0 * p[0]
-            if first < self.n_p:
-                value = value * p[first]
-            if second < self.n_p:
-                value = value * p[second]
+        for monomial in self.layout.coefficients:
+            value = monomial.scale + 0.0 * p[0]
+            if monomial.left < self.n_p:
+                value = value * p[monomial.left]
+            if monomial.right < self.n_p:
+                value = value * p[monomial.right]
             c.append(value)
         return c
 
@@ -401,11 +408,11 @@ def _peltier(network: Network, element: Any) -> list[Coefficient]:
     return out
 
 
-def _coefficient_monomial(item: Coefficient, network: Network) -> tuple[float, int, int]:
+def _coefficient_monomial(item: Coefficient, network: Network) -> Monomial:
     scale, names = item
     places, one = list(network.parameters), len(network.parameters)  # the place of a factor 1
-    first, second = [*map(places.index, names), one, one][:2]
-    return scale, first, second
+    left, right = [*map(places.index, names), one, one][:2]
+    return Monomial(scale, left, right)
 
 
 def _receiver(between: list[str], index: Mapping[str, int], n_x: int) -> tuple[int, int]:

@@ -153,7 +153,10 @@ class NeuralModel(BlackBox):
         """Simulate a batch."""
         from thermogrip.sysid.models.neural_kernel import run_outputs  # pulls in numba
 
-        drives, times, weights, rails = self._prepared(u, d, dt)
+        times = self._steps_per_row(dt)
+        drives = self._scaled_drives(u, d, times)
+        weights = self._joined_weights()
+        rails = self._scaled_rails()
         x0 = np.asarray(x0, dtype=float).reshape(-1, *self.A.shape[:2])
         together = [slice(None)] if len(drives) == 1 else [slice(b, b + 1) for b in range(len(x0))]
         runs = [
@@ -170,24 +173,28 @@ class NeuralModel(BlackBox):
         """Return the states (N + 1, n_x) from one x0 (n_x,) under u (N, n_u) and d (N, n_d)."""
         from thermogrip.sysid.models.neural_kernel import run_states
 
-        (w,), times, weights, rails = self._prepared(np.asarray(u)[None], np.asarray(d)[None], dt)
+        times = self._steps_per_row(dt)
+        (w,) = self._scaled_drives(np.asarray(u)[None], np.asarray(d)[None], times)
         x0 = np.asarray(x0, dtype=float).reshape(self.A.shape[:2])
-        x = run_states(self.A, weights, self.b.shape[1], x0, w, *rails)
+        x = run_states(self.A, self._joined_weights(), self.b.shape[1], x0, w, *self._scaled_rails())
         return np.moveaxis(x[:, ::times], 0, 1).reshape(-1, self.n_x)
 
-    def _prepared(
-        self, u: ArrayLike, d: ArrayLike, dt: float
-    ) -> tuple[list[Array], int, Array, tuple[Array, Array]]:
-        """Return scaled drives (N, m) of each run, steps per row, weights, and rails in scaled units."""
+    def _steps_per_row(self, dt: float) -> int:
+        return max(1, round(dt / self.dt))  # the step of a gap may differ a little from the model's
+
+    def _scaled_drives(self, u: ArrayLike, d: ArrayLike, times: int) -> list[Array]:
+        """Return the drives (N, m) of each run, every row ``times`` times."""
         w = join_columns(np.asarray(u, dtype=float), np.asarray(d, dtype=float))
         w = np.clip((w - self.w_middle) / self.w_size, -self.reach, self.reach)
-        times = max(1, round(dt / self.dt))  # the step of a gap may differ a little from the model's
-        w = np.ascontiguousarray(np.repeat(w, times, axis=1))
-        members = len(self.A)
+        return list(np.ascontiguousarray(np.repeat(w, times, axis=1)))
+
+    def _joined_weights(self) -> Array:
+        """Return each member's weights but A in a row."""
         matrices = (self.B, self.c, self.V, self.W, self.U, self.b)
-        weights = np.hstack([matrix.reshape(members, -1) for matrix in matrices])
-        rails = (self.low - self.y_middle) / self.y_size, (self.high - self.y_middle) / self.y_size
-        return list(w), times, weights, rails
+        return np.hstack([matrix.reshape(len(self.A), -1) for matrix in matrices])
+
+    def _scaled_rails(self) -> tuple[Array, Array]:
+        return (self.low - self.y_middle) / self.y_size, (self.high - self.y_middle) / self.y_size
 
     def to_dict(self) -> dict[str, Any]:
         """Return the model as plain lists and numbers, for JSON (``None``: no rail)."""

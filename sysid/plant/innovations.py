@@ -58,12 +58,11 @@ def innovation_noise(plant: PlantData, logs: Sequence[Log]) -> InnovationNoise |
         return None
     if estimate is None:
         return None
-    state, reading, inputs = estimate
     names = [plant.inputs[j] for j in graded]
     return InnovationNoise(
-        state=state,
-        reading=dict(zip(outputs, reading.tolist())),
-        input=dict(zip(names, inputs.tolist())),
+        state=estimate.state,
+        reading=dict(zip(outputs, estimate.reading.tolist())),
+        input=dict(zip(names, estimate.input.tolist())),
         fastest={name: _fastest(logs, name) for name in names},
     )
 
@@ -173,10 +172,18 @@ def _filter_of(plant: PlantData, stretches: Sequence[Stretch], graded: list[int]
     return _Filter(plant, graded, F, H, level, offset, middle, unit, size)
 
 
+@dataclass(frozen=True, eq=False)
+class _NoiseSd:
+    """Noise in a second."""
+
+    state: float
+    reading: Array  # (n_y,)
+    input: Array  # (n,) of the graded inputs
+
+
 def _most_likely(
     plant: PlantData, stretches: Sequence[Stretch], sd: Array, graded: list[int]
-) -> tuple[float, Array, Array] | None:
-    """Return the noise of the states, of readings (n_y,) and of the inputs (n,), in a second."""
+) -> _NoiseSd | None:
     filtered = _filter_of(plant, stretches, graded)
     if filtered is None:
         return None
@@ -194,7 +201,11 @@ def _most_likely(
     q = _parabola_minimum(_STATE_RATIOS, table[:, by_input], by_state)
     b = _parabola_minimum(_INPUT_RATIOS, table[by_state], by_input)
     times = float(np.sqrt(scale[best]))
-    return times * q * float(np.sqrt(np.mean(sd**2))), times * sd, times * b * filtered.input_range
+    return _NoiseSd(
+        state=times * q * float(np.sqrt(np.mean(sd**2))),
+        reading=times * sd,
+        input=times * b * filtered.input_range,
+    )
 
 
 def _parabola_minimum(ratios: Sequence[float], cost: Array, best: int) -> float:

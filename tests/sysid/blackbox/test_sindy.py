@@ -155,14 +155,18 @@ def test_rows_are_cut_at_lost_readings_scaled_and_summed_with_bumps():
     part = Segment(np.arange(20.0), y, q, 10 * q, "a")
     assert sindy._whole_rows(part) == [(0, 8), (14, 19)]
     two = Grid(("q",), ("room",), ("t",), (), 1.0, (part,), 1.0, {})
-    x, w, move = sindy._trajectories(two, 2)  # runs of 7 rows at least
-    assert [some.tolist() for some in x] == [[[4, 1], [9, 4], [16, 9], [25, 16], [36, 25], [49, 36]]]
-    assert (w[0][:, 0].tolist(), w[0][0, 1]) == ([1, 2, 3, 4, 5, 6], 10.0)
-    assert move[0][:, 0].tolist() == [5, 7, 9, 11, 13, 15]
-    short, *_ = sindy._trajectories(replace(two, segments=(part.part(0, 7), part.part(0, 6))), 2)
-    assert [len(some) for some in short] == [5]
-    rows, middle, size = sindy._scaled_rows([np.array([[1.0], [5.0]])], [np.array([[3.0], [3.0]])])
-    assert (rows[0].tolist(), middle.tolist(), size.tolist()) == ([[-1, 0], [1, 0]], [3, 3], [2, 1])
+    (run,) = sindy._trajectories(two, 2)  # runs of 7 rows at least
+    states = [[4, 1], [9, 4], [16, 9], [25, 16], [36, 25], [49, 36]]
+    assert run.variables.tolist() == [[*state, k + 1, 10 * (k + 1)] for k, state in enumerate(states)]
+    assert run.move[:, 0].tolist() == [5, 7, 9, 11, 13, 15]
+    short = sindy._trajectories(replace(two, segments=(part.part(0, 7), part.part(0, 6))), 2)
+    assert [len(run.move) for run in short] == [5]
+    t = np.arange(30.0)[:, None]
+    steady = replace(two, segments=(Segment(t[:, 0], t, t % 2, 0 * t + 3, "a"),))
+    scaled = sindy._features(steady, 1, 1)  # the last of the 30 rows has no increment
+    np.testing.assert_allclose(scaled.middle, [14, 14 / 29, 3])
+    np.testing.assert_allclose(scaled.size, [np.sqrt(70), np.sqrt(14 * 15) / 29, 1])
+    np.testing.assert_allclose(scaled.theta[0][0], [1, -14 / np.sqrt(70), -np.sqrt(14 / 15), 0])
     terms = sindy._Features(
         [np.eye(8)[:, :1], np.eye(7)], [np.arange(16.0).reshape(8, 2), np.eye(7)], None, None, None, 1
     )
