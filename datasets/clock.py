@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from thermogrip.datasets.repair import GAP_SECONDS, GAP_STEPS, name_rows
 from thermogrip.datasets.tables import STAMP, Table
-from thermogrip.datasets.units import to_record_unit
+from thermogrip.datasets.units import Header, to_record_unit
 
 Floats = NDArray[np.float64]
 
@@ -96,13 +96,15 @@ class Clock:
     doubt: str = ""  # what is a guess, and how to state it
 
 
-def clock_of(table: Table, read: Mapping[str, tuple[str, str, float]], dt: float | None) -> Clock:
+def clock_of(table: Table, read: Mapping[str, Header], dt: float | None) -> Clock:
     """Return the clock of a table; ``read`` is name, unit and factor by header, ``dt`` the step that the user
     states [s]."""
-    named = [h for h, (name, unit, _) in read.items() if unit in _TIME_UNITS and _TIME_NAME.fullmatch(name)]
+    named = [
+        h for h, column in read.items() if column.unit in _TIME_UNITS and _TIME_NAME.fullmatch(column.name)
+    ]
     # a clock that starts again with each cycle comes after one that does not
     back = {h for h in named if h in table.numbers and (np.diff(table.numbers[h]) < 0).any()}
-    named.sort(key=lambda header: (header in back, read[header][0] != "time"))
+    named.sort(key=lambda header: (header in back, read[header].name != "time"))
     others = [h for h in table.text if h not in named and read_clock(table.text[h][:20]) is not None]
     others += [h for h in table.numbers if h not in named and _behaves_as_clock(h, read[h], table.numbers[h])]
     if dt is not None:
@@ -117,11 +119,11 @@ def clock_of(table: Table, read: Mapping[str, tuple[str, str, float]], dt: float
     return _of_rows(table, read)
 
 
-def _behaves_as_clock(header: str, read: tuple[str, str, float], values: Floats) -> bool:
+def _behaves_as_clock(header: str, read: Header, values: Floats) -> bool:
     """Tell whether a column that is not named as a time rises in nearly even steps, as only a clock does."""
     steps = np.diff(_unwrapped(values, np.arange(values.size))[0])
     enough = 4 if re.fullmatch(r"c1", header) or _COUNTER.fullmatch(header) else _CLOCK.piece_rows
-    if read[1] not in _TIME_UNITS or steps.size < enough or not np.all(steps > 0):
+    if read.unit not in _TIME_UNITS or steps.size < enough or not np.all(steps > 0):
         return False
     usual = float(np.median(steps))
     return bool(np.mean(np.abs(steps - usual) <= _CLOCK.evenness * usual) >= _CLOCK.monotone_share)
@@ -144,7 +146,7 @@ def _of_text(header: str, table: Table) -> Clock | None:
     return Clock(seconds - zero, frozenset(headers), (note,), zero, doubt)
 
 
-def _of_numbers(header: str, table: Table, read: tuple[str, str, float]) -> Clock | None:
+def _of_numbers(header: str, table: Table, read: Header) -> Clock | None:
     """Return the clock in a column of numbers; None where it does not rise."""
     counts, (name, unit, scale) = table.numbers[header], read
     counts, notes = _unwrapped(counts, table.lines)
@@ -233,10 +235,12 @@ def _in_pieces(seconds: Floats, lines: NDArray[np.int64]) -> tuple[Floats, list[
     return seconds, [f"time: the clock starts again in {where}: new segments, after gaps of unknown length"]
 
 
-def _of_rows(table: Table, read: Mapping[str, tuple[str, str, float]]) -> Clock:
+def _of_rows(table: Table, read: Mapping[str, Header]) -> Clock:
     """Return a clock that counts rows, by a step that stands in the file or of 1 s."""
     steps = {
-        h: np.unique(v[np.isfinite(v)]) for h, v in table.numbers.items() if _STEP_NAME.fullmatch(read[h][0])
+        h: np.unique(v[np.isfinite(v)])
+        for h, v in table.numbers.items()
+        if _STEP_NAME.fullmatch(read[h].name)
     }
     stated = {header: float(v[0]) for header, v in steps.items() if v.size == 1 and v[0] > 0}
     beside = "dt" in table.meta  # a file may have it beside its columns

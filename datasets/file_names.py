@@ -7,6 +7,7 @@ import os
 import re
 from glob import glob
 from pathlib import Path
+from typing import NamedTuple
 
 from thermogrip.datasets.errors import UserError, as_user_error
 
@@ -40,11 +41,19 @@ def _ending(path: str | Path) -> str:
     return next((e for e in FORMATS if name.endswith(e)), Path(path).suffix.lower())
 
 
-def split_cut(path: str | Path) -> tuple[Path, float, float]:
+class CutFile(NamedTuple):
+    """A file, and the part of it that is meant."""
+
+    file: Path
+    start: float  # [s], -inf from the first row on
+    stop: float  # [s], inf to the last one
+
+
+def split_cut(path: str | Path) -> CutFile:
     """Return file, start and stop [s] of ``PATH@START:STOP``; a path that exists is whole, whatever it is."""
     match = _CUT.match(str(path))
     if match is None or os.path.exists(path):
-        return Path(path), -math.inf, math.inf
+        return CutFile(Path(path), -math.inf, math.inf)
     ends = []
     for text, empty in ((match["start"], -math.inf), (match["stop"], math.inf)):
         hint = "write PATH@START:STOP in seconds"
@@ -53,7 +62,7 @@ def split_cut(path: str | Path) -> tuple[Path, float, float]:
     start, stop = ends
     if not start < stop:
         raise UserError(f"the cut {start:g}:{stop:g} is empty", file=str(path), hint="write the start first")
-    return Path(match["path"]), start, stop
+    return CutFile(Path(match["path"]), start, stop)
 
 
 def matching_files(path: str | Path) -> list[str]:

@@ -21,7 +21,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,7 +46,7 @@ from thermogrip.datasets.tables import (
     switched,
     unused,
 )
-from thermogrip.datasets.units import join_header, read_header, to_record_unit
+from thermogrip.datasets.units import Header, join_header, read_header, to_record_unit
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -153,10 +153,11 @@ def read_log(
         log.attrs.update({k: v for k, v in table.meta.items() if k not in ("schema", "version")})
     else:
         roles = replace(roles, doubts=(*roles.doubts, *_code_doubts(roles.of, read.values)))
-        time, values, findings = _repair(read.clock.seconds, read.values, read.units, roles.of, table)
+        repaired = _repair(read.clock.seconds, read.values, read.units, roles.of, table)
         if outputs is None:
-            roles = _without_half_lost(roles, time, values)
-        log = _made(time, values, [*read.repairs, *findings], read, roles, file)
+            roles = _without_half_lost(roles, repaired.time, repaired.columns)
+        repairs = [*read.repairs, *repaired.repairs]
+        log = _made(repaired.time, repaired.columns, repairs, read, roles, file)
         log.attrs["clock_doubts"] = read.clock.doubt
         log.attrs["role_doubts"] = "\n".join(roles.doubts)
     for header, name in read.names_of.items():
@@ -312,10 +313,12 @@ def _convert(table: Table, dt: float | None) -> _Columns:
     """Return the columns of a table in the units of records, and its clock."""
     headers = [*table.numbers, *table.text]
     read = {header: read_header(header, headers) for header in headers}
-    read |= {h: (h, attrs["units"], 1.0) for h, attrs in table.attrs.items() if "units" in attrs}
+    read |= {h: Header(h, attrs["units"], 1.0) for h, attrs in table.attrs.items() if "units" in attrs}
     clock = clock_of(table, read, dt)
     table = _states_as_columns(table, clock)
-    read |= {header: (read_header(header)[0], "1", 1.0) for header in table.numbers if header not in read}
+    read |= {
+        header: Header(read_header(header).name, "1", 1.0) for header in table.numbers if header not in read
+    }
     columns: dict[str, Floats] = {}
     units: dict[str, str] = {}
     names_of = dict.fromkeys(clock.columns, "time")
@@ -376,7 +379,7 @@ def _one_column_a_signal(table: Table) -> Table:
     """Return a table with a reading of one signal in a row, as home hubs export their history, as one with a
     column a signal, each held until its next reading; any other table as it is."""
     clocks = [h for h, cells in table.text.items() if read_clock(cells[:20]) is not None]
-    clocks += [h for h in table.numbers if read_header(h)[0] in ("time", "timestamp")]
+    clocks += [h for h in table.numbers if read_header(h).name in ("time", "timestamp")]
     states = {h: switched(cells) for h, cells in table.text.items() if h not in clocks}
     named = [h for h in states if states[h] is None and 2 <= len({*table.text[h]}) <= MOST_SIGNALS]
     clocks = [h for h in clocks if len({*(table.text.get(h) or table.numbers[h].tolist())}) > 1]
@@ -407,12 +410,21 @@ def _one_column_a_signal(table: Table) -> Table:
     return replace(table, numbers=numbers, text=text, lines=lines, notes=(*table.notes, note))
 
 
+class _Repaired(NamedTuple):
+    """Time and columns of a log, and a line a finding."""
+
+    time: Floats
+    columns: dict[str, Floats]
+    repairs: list[str]
+
+
 def _repair(
     time: Floats, columns: dict[str, Floats], units: dict[str, str], roles: dict[str, str], table: Table
-) -> tuple[Floats, dict[str, Floats], list[str]]:
-    """Return the repaired time and columns, and a line a finding."""
-    time, rows, repairs = repair.order_rows(time, table.lines, table.file)
-    columns = {name: values[rows] for name, values in columns.items()}
+) -> _Repaired:
+    """Return the repaired time and columns."""
+    ordered = repair.order_rows(time, table.lines, table.file)
+    time, repairs = ordered.time, ordered.repairs
+    columns = {name: values[ordered.rows] for name, values in columns.items()}
     if time.size < 2:
         raise UserError(f"{time.size} row(s) are not a log", file=table.file, hint="give at least two rows")
     time, findings = since_first_row(time)
@@ -428,8 +440,9 @@ def _repair(
                 roles[name] = "other"
         columns[name], findings = _repair_column(name, values, time, units[name], roles[name], table.file)
         repairs += findings
-    time, columns, findings = _drop_unknown_start(time, columns, roles, table.file)
-    repairs += findings
+    known = _drop_unknown_start(time, columns, roles, table.file)
+    time, columns = known.time, known.columns
+    repairs += known.repairs
     finite_outputs = [np.isfinite(v) for n, v in columns.items() if roles[n] == "output"]
     read = np.any(finite_outputs or [np.ones(time.size, dtype=bool)], axis=0)
     if stuck and not (read[0] and read[-1]):  # a held-out part without any reading has no error
@@ -438,7 +451,7 @@ def _repair(
         repairs.append(f"{count} rows at the ends of the log, in which no output reads, left out")
         time, columns = time[first:last], {name: v[first:last] for name, v in columns.items()}
     repairs += repair.describe_gaps(time, {n: v for n, v in columns.items() if roles[n] == "input"})
-    return time, columns, repairs
+    return _Repaired(time, columns, repairs)
 
 
 def _code_doubts(roles: Mapping[str, str], columns: Mapping[str, Floats]) -> list[str]:
@@ -485,16 +498,16 @@ def _repair_column(
 
 def _drop_unknown_start(
     time: Floats, columns: dict[str, Floats], roles: dict[str, str], file: str
-) -> tuple[Floats, dict[str, Floats], list[str]]:
+) -> _Repaired:
     """Drop the rows before every input has its first value: there is nothing to hold."""
     first = max((int(np.isfinite(v).argmax()) for n, v in columns.items() if roles[n] == "input"), default=0)
     if first == 0:
-        return time, columns, []
+        return _Repaired(time, columns, [])
     if time.size - first < 2:
         problem = "an input is unknown until the last row"
         raise UserError(problem, file=file, hint="give its value from the start")
     columns = {name: values[first:] for name, values in columns.items()}
-    return time[first:], columns, [f"{first} row(s) before the first value of an input dropped"]
+    return _Repaired(time[first:], columns, [f"{first} row(s) before the first value of an input dropped"])
 
 
 def _cut(log: Log, start: float, stop: float, file: Path) -> Log:

@@ -34,6 +34,7 @@ row, since that is what an actuator does; a lost disturbance is interpolated.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,11 +65,17 @@ GAP_STEPS = 5.0
 _FEW, _MOST_MOVED = 0.05, 10  # share of rows whose time may be wrong; rows that one may be out of place
 
 
-def order_rows(
-    time: Floats, lines: NDArray[np.int64], file: str
-) -> tuple[Floats, NDArray[np.int64], list[str]]:
-    """Return strictly increasing times, the rows that they belong to, and what was repaired; UserError where
-    many times are missing, or time runs backward."""
+class OrderedRows(NamedTuple):
+    """Rows in the order of time."""
+
+    time: Floats  # strictly increasing
+    rows: NDArray[np.int64]  # that the times belong to
+    repairs: list[str]
+
+
+def order_rows(time: Floats, lines: NDArray[np.int64], file: str) -> OrderedRows:
+    """Return rows of strictly increasing times; UserError where many times are missing, or time runs
+    backward."""
     rows, repairs = np.arange(time.size), []
     lost = ~np.isfinite(time)
     if lost.mean() > _FEW:
@@ -96,11 +103,11 @@ def order_rows(
         stamps = time[rows[starts]]
         ends = np.append(starts, rows.size), np.append(stamps, stamps[-1] + np.median(np.diff(stamps)))
         repairs.append(f"time has {starts.size} stamps for {rows.size} rows: rows spread evenly between them")
-        return np.interp(np.arange(rows.size), *ends), rows, repairs
+        return OrderedRows(np.interp(np.arange(rows.size), *ends), rows, repairs)
     if repeats:
         which = name_rows(lines[rows[~first]])
         repairs.append(f"{repeats} repeated time stamp{_s(repeats)} dropped ({which})")
-    return time[rows[first]], rows[first], repairs
+    return OrderedRows(time[rows[first]], rows[first], repairs)
 
 
 def describe_steps(time: Floats) -> list[str]:

@@ -309,7 +309,7 @@ def _names_above(lines: Sequence[tuple[int, str]], n: int, separator: str) -> tu
 
 
 def _is_unit(word: str) -> bool:
-    return read_header(f"x [{word.strip('[]()')}]")[1] != "1"
+    return read_header(f"x [{word.strip('[]()')}]").unit != "1"
 
 
 def _are_units(cells: Sequence[str]) -> bool:
@@ -584,7 +584,7 @@ def _without_unit(name: str, cells: Sequence[str], lost: Container[str]) -> tupl
     unit = units.pop()
     if not _is_unit(unit):
         return None
-    named = name if read_header(name)[1] != "1" else f"{name} [{unit}]"
+    named = name if read_header(name).unit != "1" else f"{name} [{unit}]"
     return named, ["" if match is None else match[1] for match in matches]
 
 

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -65,17 +66,25 @@ def split_header(header: str, *, file: str | None = None) -> tuple[str, str]:
     for unit in UNITS:
         if header.endswith(f"_{unit}"):
             return _checked_unit(header.removesuffix(f"_{unit}"), header, file), unit
-    name, unit, scale = read_header(header)
-    if unit != "1":
-        rename = f"rename the column to {name}_{unit}"
-        hint = rename if scale == 1 else f"convert it and {rename}"
+    read = read_header(header)
+    if read.unit != "1":
+        rename = f"rename the column to {read.name}_{read.unit}"
+        hint = rename if read.scale == 1 else f"convert it and {rename}"
         raise UserError("unit is spelt another way", file=file, column=header, hint=hint)
     if _BRACKETED.search(header) or _FOREIGN.get(header.rpartition("_")[2]) == "":
         raise UserError("unit is unknown", file=file, column=header, hint=f"use one of {_SUFFIXES}, or none")
     return _checked_unit(header, header, file), "1"
 
 
-def read_header(header: str, others: Sequence[str] = ()) -> tuple[str, str, float]:
+class Header(NamedTuple):
+    """A column's header, read."""
+
+    name: str
+    unit: str
+    scale: float  # factor from the column's values to that unit
+
+
+def read_header(header: str, others: Sequence[str] = ()) -> Header:
     """Return name, unit and the factor to that unit of a column header as any program writes it.
 
     A word that is no unit stays a part of the name; so does a letter that others of ``others`` continue
@@ -85,14 +94,14 @@ def read_header(header: str, others: Sequence[str] = ()) -> tuple[str, str, floa
     series = any(f"{header[:-1]}{letter}" in others for letter in "abdeABDE" if letter != header[-1:])
     for unit in UNITS:
         if header.endswith(f"_{unit}") and not (series and len(unit) == 1):
-            return _bare_name(header.removesuffix(f"_{unit}")), unit, 1.0
+            return Header(_bare_name(header.removesuffix(f"_{unit}")), unit, 1.0)
     match = _UNIT_AT_END.fullmatch(header) if len(header) <= _LONGEST_HEADER else None
     if match is None:
-        return _bare_name(header), "1", 1.0
+        return Header(_bare_name(header), "1", 1.0)
     name, inside = match["name"], match["inside"]
     word = (match["after"] if inside is None else inside).strip()
     if inside is not None and word in ("", "-", "1"):
-        return _bare_name(name), "1", 1.0
+        return Header(_bare_name(name), "1", 1.0)
     unit, scale = any_unit(word)
     timed = unit in _TIME_UNITS and re.search(r"(?i:time|elapsed)|^t$", name) is None
     if inside is None and unit and len(word) == 1 and word != "%":
@@ -100,7 +109,7 @@ def read_header(header: str, others: Sequence[str] = ()) -> tuple[str, str, floa
         unit = "" if series or lower or (match["mark"] or "").isspace() else unit
     if (inside is None and timed) or (word == "deg" and not re.match(r"(?i)t\d*(_|$)|.*temp", name)):
         unit = ""
-    return (_bare_name(name), unit, scale) if unit else (_bare_name(header), "1", 1.0)
+    return Header(_bare_name(name), unit, scale) if unit else Header(_bare_name(header), "1", 1.0)
 
 
 def any_unit(word: str) -> tuple[str, float]:
@@ -128,7 +137,7 @@ def rename_hint(name: str, headers: Sequence[str]) -> str:
     """Return which column to rename where ``name``, a time or a temperature, is missing."""
     wanted = _TIME_UNITS if name == "time" else _TEMPERATURE_UNITS
     for header in headers:
-        unit = read_header(header)[1]
+        unit = read_header(header).unit
         if unit in wanted and not header.startswith("time"):
             return f"rename {header!r} to {name}_{unit}"
     like = next(
@@ -140,7 +149,7 @@ def rename_hint(name: str, headers: Sequence[str]) -> str:
 def join_header(name: str, unit: str, others: Sequence[str] = ()) -> str:
     """Return the column header that is read as this name and unit, among columns of other names."""
     header = name if unit == "1" else f"{name}_{unit}"
-    if read_header(header, others) != (name, unit, 1.0):
+    if read_header(header, others) != Header(name, unit, 1.0):
         problem = f"cannot stand in a header with unit {unit!r}"
         raise UserError(problem, column=name, hint=f"use {_SUFFIXES}, or rename")
     return header
@@ -164,7 +173,7 @@ def find_column(entry: str, units: Mapping[str, str], file: str | None = None) -
     entry = entry.strip()
     if entry in units:
         return entry
-    likely = {entry, _bare_name(entry), read_header(entry)[0]}
+    likely = {entry, _bare_name(entry), read_header(entry).name}
     for candidates in (
         likely & {*units},
         {n for n in units if n.lower() in {word.lower() for word in likely}},

@@ -37,7 +37,7 @@ def other_truths(name: str, minutes: float, highest: float) -> None:
     """Print the bits of each schedule where the truth is a draw of the prior."""
     plant = plant_from_prior(load_network(name))
     limits = {"lowest": 5.0, "highest": highest}
-    best, _, _ = optimal_for(plant, minutes, **limits, slew=np.inf)
+    best = optimal_for(plant, minutes, **limits, slew=np.inf).log
     kinds = ("prbs", "multisine", "staircase")
     u = {kind: inputs_of(plant, schedule_for(plant, kind, minutes, **limits, seed=0)[0]) for kind in kinds}
     u["optimal"] = inputs_of(plant, best)
@@ -103,7 +103,7 @@ def kept(loss: float, count: int) -> None:
     seen = PlantScores(independent_s={"t1": MEMORY, "t2": MEMORY}, average_s=5.0)
     plant = replace(plant, values=plant.values | TRUTH, scores=seen)
     limits = {"lowest": 5.0, "highest": 90.0}
-    best, _, _ = optimal_for(plant, 20.0, **limits, slew=np.inf)
+    best = optimal_for(plant, 20.0, **limits, slew=np.inf).log
     prbs, _ = schedule_for(plant, "prbs", 20.0, **limits, seed=0)
     u = [inputs_of(plant, prbs), inputs_of(plant, best)]
     y = [on_a_board(plant, row, loss) for row in u]

@@ -52,7 +52,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -124,6 +124,15 @@ class Readings:
         return np.where(small[:, None], np.nan, x), np.where(small[:, None, None], np.nan, noise)
 
 
+class LearntFeatures(NamedTuple):
+    """What training reads of its grasps."""
+
+    reader: FeatureReader
+    readings: Readings
+    usable: NDArray[np.bool_]  # which grasps can be learnt from
+    notes: list[str]  # the others, in words
+
+
 @dataclass(eq=False)
 class FeatureReader:
     """Which features a classifier was trained on, and how to read them again; a shorter contact has fewer,
@@ -138,11 +147,11 @@ class FeatureReader:
         cls,
         records: Sequence[Grasps],
         labels: Labels,
-    ) -> tuple[FeatureReader, Readings, NDArray[np.bool_], list[str]]:
+    ) -> LearntFeatures:
         """Return a reader of the features that most grasps of any record have, and what it reads.
 
-        The mask is of grasps that can be learnt from, the list has the others in words: where features
-        are normalised, grasps of unknown temperature, and materials that were only touched at the skin's own.
+        Not learnt from are, where features are normalised, grasps of unknown temperature, and materials that
+        were only touched at the skin's own.
         """
         end = min(float(np.median(np.concatenate([_last(record) for record in records]))), features.FIT_END)
         names, tables = [], []
@@ -163,7 +172,7 @@ class FeatureReader:
         readings = [
             reader._readings(record, table.reindex(feature=names)) for record, table in zip(records, tables)
         ]
-        return reader, _concatenated(readings), usable, notes
+        return LearntFeatures(reader, _concatenated(readings), usable, notes)
 
     def to_dict(self) -> dict[str, Any]:
         """Return a JSON-able description."""
@@ -224,10 +233,13 @@ class BayesClassifier(GraspClassifier):
             raise UserError(f"shrinkage must be > 0 grasps, got {self.shrinkage}")
         labels = np.concatenate(labels_of)
         two_or_more(labels, "+".join(map(log_name, records)))
-        self.reader_, all_read, usable, self.notes_ = FeatureReader.learn(records, labels)
+        learnt = FeatureReader.learn(records, labels)
+        self.reader_, self.notes_, usable = learnt.reader, learnt.notes, learnt.usable
         self.feature_names_ = self.reader_.names
         self.classes_ = np.unique(labels[usable])
-        self._fit_density(_rows_of_readings(all_read, usable), np.searchsorted(self.classes_, labels[usable]))
+        self._fit_density(
+            _rows_of_readings(learnt.readings, usable), np.searchsorted(self.classes_, labels[usable])
+        )
 
     def _fit_density(self, read: Readings, at: NDArray[np.intp]) -> None:
         """Find means, covariance and the error of object temperatures; ``at`` is the class of each grasp."""

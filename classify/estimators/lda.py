@@ -94,9 +94,10 @@ class FeaturesLda(_Lda):
     """Variance of the discriminants within a class, summed."""
 
     def _fit(self, grasps: Grasps, labels: Labels) -> None:
-        self.reader_, read, usable, self.notes_ = FeatureReader.learn([grasps], labels)
-        x, _ = read.normalised()
-        usable &= np.isfinite(x).any(axis=1)
+        learnt = FeatureReader.learn([grasps], labels)
+        self.reader_, self.notes_ = learnt.reader, learnt.notes
+        x, _ = learnt.readings.normalised()
+        usable = learnt.usable & np.isfinite(x).any(axis=1)
         x, labels = x[usable], labels[usable]
         whole = np.flatnonzero(np.isfinite(x).all(axis=0))
         self.reader_.names = [self.reader_.names[k] for k in whole]

@@ -484,15 +484,15 @@ class Guard:
         masked, rooms = self._masked(reading.time_s), self.rooms(reading.values)
         self._mean_drive = self._drive if reading.mean_drive is None else dict(reading.mean_drive)
         jumped = self._predict(reading)
-        accepted, suspect, trip = self.sensors.check(
+        checked = self.sensors.check(
             reading.time_s, reading.values, touching=masked, jumped=jumped, rooms=rooms
         )
         room = next((v for n, v in reading.values.items() if n in rooms), float("nan"))
-        outputs = {name: value for name, value in accepted.items() if name not in rooms}
-        trip = self._driver(reading) or trip or self._limits(reading.time_s, outputs)
+        outputs = {name: value for name, value in checked.accepted.items() if name not in rooms}
+        trip = self._driver(reading) or checked.trip or self._limits(reading.time_s, outputs)
         trip = trip or self._behaviour(reading.time_s, outputs, masked, room)
         self._time_s = reading.time_s
-        return self._findings(reading, accepted, suspect, trip)
+        return self._findings(reading, checked.accepted, checked.suspect, trip)
 
     def _findings(
         self, reading: Reading, accepted: dict[str, float], suspect: dict[str, str], trip: Trip | None

@@ -30,6 +30,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from math import ceil, erf, exp, isfinite, log, sqrt
+from typing import NamedTuple
 
 from thermogrip.datasets.limits import keyed
 from thermogrip.datasets.roles import guess_role
@@ -110,6 +111,14 @@ def repeats_needed(quantum: float, noise: float, alpha: float) -> float:
     return max(10, ceil(needed)) if needed < 2000 else float("inf")
 
 
+class CheckedReadings(NamedTuple):
+    """What the checks say of one sample."""
+
+    accepted: dict[str, float]
+    suspect: dict[str, str]  # why the others are
+    trip: Trip | None
+
+
 class SensorMonitor:
     """Check every sensor of a rig; pure: times are passed in."""
 
@@ -150,8 +159,8 @@ class SensorMonitor:
         touching: frozenset[str] = frozenset(),
         jumped: frozenset[str] = frozenset(),
         rooms: frozenset[str] = frozenset(),
-    ) -> tuple[dict[str, float], dict[str, str], Trip | None]:
-        """Return the accepted readings, why the others are suspect, and the trip, if any.
+    ) -> CheckedReadings:
+        """Return which readings are accepted, and the trip, if any.
 
         Sensors that are ``touching`` may jump now, those that have ``jumped`` did against the model; those of
         the ``rooms`` may jump, stand still and be lost.
@@ -183,7 +192,7 @@ class SensorMonitor:
                 stuck = self._stuck(name, value, time, memory)
                 trip = trip or (None if name in rooms else stuck)
                 memory.good, memory.time = value, time
-        return accepted, suspect, trip or self._pairs(time, accepted)
+        return CheckedReadings(accepted, suspect, trip or self._pairs(time, accepted))
 
     def _lost(self, name: str, value: float, time: float, memory: _Memory, why: str) -> Trip:
         low, high = self.settings.plausible

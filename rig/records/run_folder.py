@@ -31,7 +31,7 @@ from importlib.metadata import PackageNotFoundError, version
 from math import isfinite
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import Any, NamedTuple
 
 from thermogrip.datasets.atomic_files import (
     file_hash,
@@ -441,7 +441,7 @@ def recover(folder: str | Path) -> Recovery:
     refuse_links(path)
     findings = list(run.lost)
     samples, events = path / "samples.csv", path / "events.jsonl"
-    for name, whole in ((samples.name, _read_samples(samples)[2]), (events.name, _events(events)[1])):
+    for name, whole in ((samples.name, _read_samples(samples).whole), (events.name, _events(events)[1])):
         if whole.lost:
             damaged_name = _keep(path / name)
             findings.append(f"{name} as it was found is kept as {damaged_name}")
@@ -528,7 +528,15 @@ def _whole_lines(path: Path, good: Any) -> _Whole:
     return _Whole([line for line, ok in zip(lines, flags) if ok], tuple(lost))
 
 
-def _read_samples(path: Path) -> tuple[list[str], list[dict[str, float]], _Whole]:
+class _Samples(NamedTuple):
+    """What a file of samples holds."""
+
+    header: list[str]
+    rows: list[dict[str, float]]
+    whole: _Whole
+
+
+def _read_samples(path: Path) -> _Samples:
     width = 0
 
     def good(at: int, line: bytes) -> bool:
@@ -543,13 +551,13 @@ def _read_samples(path: Path) -> tuple[list[str], list[dict[str, float]], _Whole
 
     whole = _whole_lines(path, good)
     if not whole.lines or not whole.lines[0].startswith(b"time_s"):
-        return [], [], whole
+        return _Samples([], [], whole)
     header = _header_names(whole.lines[0])
     rows = [
         dict(zip(header, (float(cell) if cell else float("nan") for cell in line.split(b","))))
         for line in whole.lines[1:]
     ]
-    return header, rows, whole
+    return _Samples(header, rows, whole)
 
 
 def _header_names(line: bytes) -> list[str]:

@@ -315,7 +315,7 @@ def test_an_existing_file_with_an_at_sign_is_not_cut(tmp_path):
     path.write_text(HEAD + ROWS)
     assert read_log(path).sizes["time"] == 3
     assert read_log(f"{path}@0:0.7").sizes["time"] == 2
-    assert split_cut(tmp_path / "me@home.csv")[0].name == "me@home.csv"
+    assert split_cut(tmp_path / "me@home.csv").file.name == "me@home.csv"
 
 
 def test_roles_can_be_given(write):

@@ -128,7 +128,10 @@ def test_every_stage_has_its_share_of_the_progress_and_its_section(
     asked: dict[str, tuple[Any, ...]] = {}
     session = SimpleNamespace(grasps="a grasp")
     results = {
-        "_identify": ("found", "plant", "record", "run"), "_tune": ("tuning", "checks"),
+        "_identify": SimpleNamespace(
+            identification="found", plant="plant", posterior="record", held_out="run"
+        ),
+        "_tune": ("tuning", "checks"),
         "_grasp_on_twin": [("one", session), ("two", SimpleNamespace(grasps=None))],
         "_compare": ("comparison", "model"),
     }  # fmt: skip
@@ -207,7 +210,7 @@ def test_a_plant_is_fitted_to_three_logs_and_the_first_half_of_the_fourth(
     assert (len(names), options) == (
         4, {"network": "gripper", "models": ("arx", "oe", "sindy", "network"), "draws": 0, "seed": SEED},
     )  # fmt: skip
-    plant, n, score_from = found[3]
+    plant, n, score_from = found.held_out
     assert (plant is sampled, score_from) == (True, 1350)
     [cut] = [rows for name, rows in zip(names, rows) if name.startswith("pump_on_off")]
     assert 0.4 < cut / n < 0.6
@@ -215,5 +218,5 @@ def test_a_plant_is_fitted_to_three_logs_and_the_first_half_of_the_fourth(
         ("a plant", 4, SEED),
         tmp_path / "plant.json",
     )
-    assert found[:3] == (fitted, sampled, "a record")
+    assert (found.identification, found.plant, found.posterior) == (fitted, sampled, "a record")
     assert seen == [(pytest.approx(0.3), "x"), (pytest.approx(0.8), "posterior: y")]

@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass
 from functools import lru_cache, partial
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 from thermogrip.classify.estimators import classifier_names
 from thermogrip.cli import options as cli
@@ -31,21 +31,23 @@ ANSWERS_GO = "Where the table goes (.csv or .parquet), or a folder for a table o
 _BUNDLED = 40.0  # s: the longest contacts that taught the bundled gripper
 
 
-def calibrated_device(
-    console: Console, calibrate: Sequence[str], seed: int
-) -> tuple[GripperModel, Coupling | None, float]:
-    """Return the calibrated gripper, from labelled grasps or the bundled one with a warning.
+class CalibratedDevice(NamedTuple):
+    """A gripper and what its training shows besides."""
 
-    With it: how blocks move between touches, where the grasps identify it, and how long the contacts of the
-    training lasted [s].
-    """
+    device: GripperModel
+    coupling: Coupling | None  # how blocks move between touches, where the grasps identify it
+    longest: float  # how long the contacts of the training lasted [s]
+
+
+def calibrated_device(console: Console, calibrate: Sequence[str], seed: int) -> CalibratedDevice:
+    """Return the calibrated gripper, from labelled grasps or the bundled one with a warning."""
     if not calibrate:
         from thermogrip.sysid.effusivity import load_default_gripper
 
         console.warn(
             "the bundled gripper's calibration is used; give --calibrate with labelled grasps of yours"
         )
-        return load_default_gripper(), None, _BUNDLED
+        return CalibratedDevice(load_default_gripper(), None, _BUNDLED)
     from thermogrip.datasets.grasp_files import read_grasp_files
     from thermogrip.datasets.schema import has_touch_groups
     from thermogrip.sysid.effusivity import calibrate_gripper
@@ -62,7 +64,7 @@ def calibrated_device(
     coupling = None
     for record in filter(has_touch_groups, labelled):
         coupling = learn_coupling(device, record, start=coupling)
-    return device, coupling, longest_contact(labelled)
+    return CalibratedDevice(device, coupling, longest_contact(labelled))
 
 
 def touched_part(console: Console, records: Sequence[Grasps]) -> list[Grasps]:
@@ -146,8 +148,7 @@ def effusivity(
     check_place(out, [*grasps, *(calibrate or ())])
     pool = cli.workers_of(workers, cluster)
     console = Console(as_json)
-    device, coupling, longest = calibrated_device(console, calibrate or [], seed)
-    ask = _Effusivity(device, coupling, longest, stated)
+    ask = _Effusivity(*calibrated_device(console, calibrate or [], seed), stated)
     answers = answer_files(console, "effusivity", grasps, ask.answer, out, pool, "nan")
     rows = [row for of_file in answers for row in of_file["rows"]]
     shown = [

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 from thermogrip.cli import options as cli
 from thermogrip.datasets.errors import UserError
@@ -108,7 +108,8 @@ def _optimal(
 ) -> tuple[Log, dict[str, Any]]:
     """Return the most informative schedule and what is expected of it, and show that."""
     with console.progress("excite") as progress:
-        log, expected, notes = optimal_for(plant, minutes, **limits, hold=hold, seed=seed, progress=progress)
+        optimal = optimal_for(plant, minutes, **limits, hold=hold, seed=seed, progress=progress)
+    expected = optimal.expected
     head = ["parameter", "unit", "value", *expected.widths]
     rows = []
     for name in plant.free:
@@ -119,10 +120,10 @@ def _optimal(
         if kind != "now":
             narrower = f"; after optimal {expected.narrower('optimal', kind):.3g} times narrower in the mean"
             console.say(f"{kind}: {bits:.1f} bits{'' if kind == 'optimal' else narrower}")
-    for note in notes:
+    for note in optimal.notes:
         console.say(f"note: {note}")
     answer = {"bits": expected.bits, "widths_90": expected.widths}
-    return log, answer | {"notes": notes}
+    return optimal.log, answer | {"notes": optimal.notes}
 
 
 def schedule_for(
@@ -154,6 +155,14 @@ def schedule_for(
     return make_log(time, variables, name=f"{kind} schedule"), share
 
 
+class OptimalSchedule(NamedTuple):
+    """The most informative schedule and what is to be said of it."""
+
+    log: Log
+    expected: Expectation  # the intervals after it and after the plain ones
+    notes: list[str]
+
+
 def optimal_for(
     plant: Plant,
     minutes: float,
@@ -164,10 +173,10 @@ def optimal_for(
     hold: Collection[str] = (),
     seed: int = 0,
     progress: Progress | None = None,
-) -> tuple[Log, Expectation, list[str]]:
-    """Return the most informative schedule, the intervals expected after it and after the plain ones, and
-    notes; ``slew`` is a drive's greatest change in a second, in its unit (the plain ones are compared without
-    it), ``hold`` names inputs that do not move.  The plant needs a covariance, else UserError."""
+) -> OptimalSchedule:
+    """Return the most informative schedule; ``slew`` is a drive's greatest change in a second, in its unit
+    (the plain ones are compared without it), ``hold`` names inputs that do not move.  The plant needs a
+    covariance, else UserError."""
     from math import isinf
 
     from thermogrip.sysid.experiment.optimal import expect, optimal_schedule
@@ -199,7 +208,7 @@ def optimal_for(
         seed=seed,
         progress=progress,
     )
-    return best, expect(plant, plain | {"optimal": best}), notes
+    return OptimalSchedule(best, expect(plant, plain | {"optimal": best}), notes)
 
 
 def _ranges(plant: Plant) -> dict[str, tuple[float, float]]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
@@ -45,7 +45,7 @@ def _beside_log(ctx: typer.Context, value: Path | None) -> Path:
         return value
     from thermogrip.datasets.file_names import file_stem, split_cut
 
-    return Path(f"{file_stem(split_cut(ctx.params['paths'][0])[0])}_plant.json")
+    return Path(f"{file_stem(split_cut(ctx.params['paths'][0]).file)}_plant.json")
 
 
 Warmup = Annotated[
@@ -223,19 +223,24 @@ def _read(
     return (logs if matching is network or matching is None else read(known=roles_of(matching))), matching
 
 
-def _sampled(
-    plant: Plant, logs: Sequence[Log], out: Path, seed: int, progress: Progress | None
-) -> tuple[Plant, Posterior | None, str]:
-    """Return the plant with samples of its parameters (beside it until the chain has converged), their
-    record, and in words why there is none."""
+class _Sampled(NamedTuple):
+    """A plant with samples of its parameters, or why there are none."""
+
+    plant: Plant
+    record: Posterior | None
+    lost: str  # in words why there is no record
+
+
+def _sampled(plant: Plant, logs: Sequence[Log], out: Path, seed: int, progress: Progress | None) -> _Sampled:
+    """Sample a plant's parameters; the samples stay beside it until the chain has converged."""
     from thermogrip.sysid.greybox.posterior import sample_posterior
     from thermogrip.sysid.identification import NO_DRAWS, no_draws
 
     try:
         plant, record = sample_posterior(plant, logs, seed=seed, progress=progress)
     except NO_DRAWS as error:
-        return plant, None, no_draws("network", "posterior", error)
-    return plant, record, ""
+        return _Sampled(plant, None, no_draws("network", "posterior", error))
+    return _Sampled(plant, record, "")
 
 
 def _write_early(console: Console, out: Path, found: Identification) -> None:

@@ -70,9 +70,8 @@ def run_demo(
     with ThreadPoolExecutor(1) as beside:
         compare = partial(_compare, out, seed, workers)
         compared = None if workers == 1 else beside.submit(copy_context().run, compare, None)
-        identification, plant, record, held_out = _identify(
-            out, seed, sub_progress(progress, 0.0, 0.6, "identify")
-        )
+        identified = _identify(out, seed, sub_progress(progress, 0.0, 0.6, "identify"))
+        plant = identified.plant
         tuning, checks = _tune(out, plant, seed, workers, sub_progress(progress, 0.6, 0.73, "tune"))
         sessions = _grasp_on_twin(out, tuning, plant, seed, sub_progress(progress, 0.73, 0.76, "run"))
         share = sub_progress(progress, 0.76, 0.98, "compare")
@@ -81,9 +80,9 @@ def run_demo(
         comparison, classifier = compare(share) if compared is None else compared.result()
     touched = [session.grasps for _, session in sessions if session.grasps is not None]
     sections = [
-        identification_section(identification),
-        free_run_section(held_out, title="Does it predict the half of a log that was held out?"),
-        parameters_section(plant, record),
+        identification_section(identified.identification),
+        free_run_section(identified.held_out, title="Does it predict the half of a log that was held out?"),
+        parameters_section(plant, identified.posterior),
         replace(tuning_section(tuning), shown=1),
         replace(review_section(checks), shown=0),
         session_section(sessions, f"the twin (posterior draw {DRAW})"),
@@ -110,9 +109,17 @@ def compared_models(seed: int) -> tuple[dict[str, GraspClassifier], tuple[str, .
     return models, tuple(f"left out: {error}" for error in missing)
 
 
-def _identify(
-    out: Path, seed: int, progress: Progress | None
-) -> tuple[Identification, Plant, Posterior, FreeRun]:
+@dataclass(frozen=True)
+class _Identified:
+    """The plant of the demo, and how it was found and tested."""
+
+    identification: Identification
+    plant: Plant  # with the posterior's draws
+    posterior: Posterior
+    held_out: FreeRun
+
+
+def _identify(out: Path, seed: int, progress: Progress | None) -> _Identified:
     """Fit three logs and half of the fourth, sample the posterior, and run freely over the held-out half."""
     from thermogrip.datasets.examples import EXAMPLE_LOGS, example_path
     from thermogrip.datasets.log_files import read_log
@@ -128,7 +135,7 @@ def _identify(
     plant, record = sample_posterior(identification.plant, logs, seed=seed, progress=share)
     plant.save(out / "plant.json")
     whole = read_log(example_path("pump_on_off"))
-    return identification, plant, record, free_run(plant, whole, score_from=SPLIT_S)
+    return _Identified(identification, plant, record, free_run(plant, whole, score_from=SPLIT_S))
 
 
 def _tune(

@@ -89,8 +89,8 @@ def test_which_features_are_learnt_and_how_long_a_contact_must_be(make_touches: 
     assert read.y.shape == (6, 4)
     assert usable.all()
     half = part.isel(grasp=[0, 1, 2, 3])  # two of four reach 5 s
-    assert "change_5s" not in FeatureReader.learn([half], half["material"].values)[0].names
-    assert FeatureReader.learn([warm], warm["material"].values)[0].end == 10.0
+    assert "change_5s" not in FeatureReader.learn([half], half["material"].values).reader.names
+    assert FeatureReader.learn([warm], warm["material"].values).reader.end == 10.0
     to = lambda end: warm.sel(time=slice(None, end))  # noqa: E731
     assert np.isfinite(reader.read(to(3.0)).y).all(axis=0).tolist() == [True, True, True, False]
     empty = pick(warm, [0, 1]).assign(t_surface=pick(warm, [0, 1])["t_surface"].where(warm.time < 0))

@@ -157,7 +157,7 @@ def test_what_cannot_be_designed_is_refused(boards, block):
 
 def test_a_design_at_the_prior_medians_is_better_where_the_truth_is_another():
     plant = plant_from_prior(load_network("tclab"))
-    best, _, _ = optimal_for(plant, 30.0, lowest=5.0, highest=80.0, slew=np.inf, seed=0)
+    best = optimal_for(plant, 30.0, lowest=5.0, highest=80.0, slew=np.inf, seed=0).log
     prbs, _ = schedule_for(plant, "prbs", 30.0, lowest=5.0, highest=80.0, seed=0)
     for k in range(1, 9):  # measured: 4 to 7 bits
         truth = ExperimentForecast(plant.draw(k), draws=0)
