@@ -307,11 +307,11 @@ def changed(
     t, y, level, _ = parts_of(grasp)
     block, nodes = device.blocks[str(grasp["material"].values[0])], time_nodes(12.0)
     whole = block.heat_capacity * device.block_length * device.depth_share
-    rise, _, _ = step_response(
+    rise = step_response(
         device.stack, nodes, effusivity=np.exp(np.full(2, block.ln_effusivity)),
         capacity=whole * np.array([1.0, capacity]), h_c=np.exp(block.ln_h) * np.array([1.0, h_c]),
         build_up=device.stack.build_up * np.array([1.0, build_up]),
-    )  # fmt: skip
+    ).rise  # fmt: skip
     before, after = (np.interp(np.maximum(t - device.onset, 0.0), nodes.t, row) for row in rise)
     away = float(grasp["t_object"].values[0]) - level
     return np.asarray(y + away * (after - before) + off * after)

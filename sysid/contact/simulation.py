@@ -106,9 +106,10 @@ def time_nodes(end: float, *, first: float = 0.01, per_group: int = 10) -> TimeN
 @lru_cache(maxsize=64)
 def stack_modes(stack: Stack) -> StackModes:
     """Return the gripper's modes: rise at face and sensor per unit flux into the face."""
-    matrix, root, half = _assembled(stack)
-    lam, vectors = np.linalg.eigh(matrix)
-    shape = vectors / root[:, None]
+    cells = _assembled(stack)
+    half = cells.conductance
+    lam, vectors = np.linalg.eigh(cells.matrix)
+    shape = vectors / cells.root_capacity[:, None]
     outer_conductance, right = half[_N_OUTER - 1], half[_N_OUTER]
     sensor = (outer_conductance * shape[_N_OUTER - 1] + right * shape[_N_OUTER]) / (outer_conductance + right)
     # the time stepping needs the sensor per unit of modal rise at the face; a mode that leaves the face still
@@ -118,8 +119,13 @@ def stack_modes(stack: Stack) -> StackModes:
     return StackModes(np.maximum(lam, 0.0), shape[0] ** 2, sensor / face, float(1 / half[0]))
 
 
-def _assembled(stack: Stack) -> tuple[Array, Array, Array]:
-    """Return a symmetric matrix (32, 32), roots of capacities (32,) and cells' conductances (31,)."""
+class _Cells(NamedTuple):
+    matrix: Array  # (32, 32), symmetric
+    root_capacity: Array  # (32,)
+    conductance: Array  # (31,) of half a cell
+
+
+def _assembled(stack: Stack) -> _Cells:
     # cells grow inwards: fast changes live near the face
     growth = 1.22 ** np.arange(_N_INNER)
     outer = np.ones(_N_OUTER)
@@ -137,7 +143,7 @@ def _assembled(stack: Stack) -> tuple[Array, Array, Array]:
     matrix[-1, -1] = stack.g_side
     matrix[_N_OUTER, -1] = matrix[-1, _N_OUTER] = -stack.g_side
     root = np.sqrt(np.concatenate([e * dz, [stack.c_side]]))
-    return matrix / root[:, None] / root[None, :], root, half
+    return _Cells(matrix / root[:, None] / root[None, :], root, half)
 
 
 @lru_cache(maxsize=64)
@@ -151,11 +157,19 @@ def gripper_modes(stack: Stack) -> Any:
     )
 
 
+class ContactResponse(NamedTuple):
+    """What a contact gives per degree of initial difference, (n, n_node) each."""
+
+    rise: Array  # of the sensor
+    slope: Array  # of the sensor [1/s]
+    flux: Array  # into the face [W m^-2 K^-1]
+
+
 def step_response(
     stack: Stack, nodes: TimeNodes, *, effusivity: ArrayLike, capacity: ArrayLike, h_c: ArrayLike,
     build_up: ArrayLike | None = None,
-) -> tuple[Array, Array, Array]:  # fmt: skip
-    """Return sensor rise, slope [1/s] and flux [W m^-2 K^-1] per degree of initial difference, (n, n_node).
+) -> ContactResponse:  # fmt: skip
+    """Return the sensor's rise and slope and the flux at the nodes, per degree of initial difference.
 
     ``effusivity``, ``capacity``, settled ``h_c`` and ``build_up`` (default the stack's) are (n,);
     one that is not positive and finite raises a ValueError.
@@ -170,7 +184,7 @@ def step_response(
     wanted = np.zeros((e.size, N_STEPPED), dtype=bool)
     wanted[:, VALUE] = True
     rise, slope, flux = contacts(nodes, gripper_modes(stack), np.stack([e, c, h, tau], axis=1), wanted)
-    return rise[:, VALUE], slope[:, VALUE], flux
+    return ContactResponse(rise[:, VALUE], slope[:, VALUE], flux)
 
 
 def far_response(
@@ -282,9 +296,9 @@ class Grip:
         true = away + self.transit_loss * (ambient - away)
         nodes = time_nodes(self.until)
         build_up = self.stack.build_up * np.exp(self.build_up_sd_ln * normal[4])
-        rise, _, _ = step_response(
+        rise = step_response(
             self.stack, nodes, effusivity=e, capacity=capacity, h_c=h_c, build_up=build_up
-        )
+        ).rise
         room = far_response(self.stack, nodes, rise, effusivity=e, capacity=capacity)
         room *= (ambient - true)[:, None]
         return [

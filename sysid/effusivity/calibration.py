@@ -554,14 +554,14 @@ def _calibrated_sensors(
 
         # the noise found after a round makes more difference than the end of its search
         settled = SETTINGS.settled if i == rounds - 1 else SETTINGS.roughly_settled
-        last, w, spread = _fit_to_evidence(problem, theta, w, spread, noise, report_round, settled=settled)
-        theta = last.theta
+        fit = _fit_to_evidence(problem, theta, w, spread, noise, report_round, settled=settled)
+        theta, w, spread = fit.step.theta, fit.w, fit.spread
         if i < rounds - 1:
             slope = SETTINGS.noise_slope if i == rounds - 2 else SETTINGS.noise_slope_roughly
             noise = _fit_noise(problem, linearise(problem, theta, w, spread), w, noise, slope)
     if rounds > 1:
-        problem, last, w, spread, noise = _discrepant(problem, last, w, spread, noise, report)
-    gripper = _gripper_model(problem, last, spread, noise, length, names, prior)
+        fit = _discrepant(fit, report)
+    gripper = _gripper_model(fit, length, names, prior)
     if data.second is None:
         return gripper
     # unknown object temperatures are those that the first sensor found for the blocks that they are of
@@ -578,26 +578,32 @@ def _calibrated_sensors(
     return replace(gripper, second=beside)
 
 
-_Fitted = tuple[Problem, Step, Array, Spread, Noise]
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    """Where a fit ended."""
+
+    problem: Problem
+    step: Step  # the last
+    w: Array  # nuisances
+    spread: Spread
+    noise: Noise
 
 
-def _discrepant(
-    problem: Problem, last: Step, w: Array, spread: Spread, noise: Noise, progress: Progress
-) -> _Fitted:
+def _discrepant(bare: _Fit, progress: Progress) -> _Fit:
     """Return the fit with a discrepancy in a smooth noise where its evidence is greater, else as it was; a
     first look at twice three steps decides whether a search is worth it.  The evidence has a maximum for
     contacts that build up fast, near the fit without one, and a greater one for slow ones, where the search
     begins."""
-    bare = problem, last, w, spread, noise
-    least = _log_evidence(problem, last, noise)
-    problem, theta = _with_discrepancy(problem, last.theta)
+    noise, least = bare.noise, _log_evidence(bare)
+    problem, theta = _with_discrepancy(bare.problem, bare.step.theta)
     begin = replace(_SMOOTH, white=noise.white)  # from elsewhere a search may end without misfit
-    if _search_discrepancy(problem, theta, w, spread, (noise, begin), (3, 3), least, progress) is None:
+    near = theta, bare.w, bare.spread, (noise, begin)
+    if _search_discrepancy(problem, *near, (3, 3), least, progress) is None:
         return bare
     theta = problem.prior.mean.copy()
     theta[SHARED_NAMES.index("ln_build_up")] = SETTINGS.slow_ln_build_up
     begin = replace(_SMOOTH, white=max(noise.white, SETTINGS.least_white_K))
-    start = theta, np.zeros(w.shape), dict(problem.prior.spread), (begin, begin)
+    start = theta, np.zeros(bare.w.shape), dict(problem.prior.spread), (begin, begin)
     return (
         _search_discrepancy(
             problem, *start, (SETTINGS.steps, SETTINGS.steps, SETTINGS.steps), least, progress
@@ -609,26 +615,27 @@ def _discrepant(
 def _search_discrepancy(
     problem: Problem, theta: Array, w: Array, spread: Spread, noises: tuple[Noise, Noise],
     looks: Sequence[int], least: float, progress: Progress,
-) -> _Fitted | None:  # fmt: skip
+) -> _Fit | None:  # fmt: skip
     """Return a fit with the problem's discrepancy, after ``looks`` of so many steps, the noise found anew
     between them; None where the evidence is below ``least`` once the noise is fitted.  ``noises``: to begin
     with, and from where it is searched."""
     noise, begin = noises
     for i, steps in enumerate(looks):
-        last, w, spread = _fit_to_evidence(problem, theta, w, spread, noise, progress, steps=steps)
-        theta = last.theta
-        if i > 0 and _log_evidence(problem, last, noise) < least:
+        fit = _fit_to_evidence(problem, theta, w, spread, noise, progress, steps=steps)
+        theta, w, spread = fit.step.theta, fit.w, fit.spread
+        if i > 0 and _log_evidence(fit) < least:
             return None
         if i < len(looks) - 1:
             slope = SETTINGS.noise_slope_roughly if steps < SETTINGS.steps else SETTINGS.noise_slope
             noise = _fit_noise(problem, linearise(problem, theta, w, spread), w, begin, slope)
-    return problem, last, w, spread, noise
+    return fit
 
 
-def _log_evidence(problem: Problem, step: Step, noise: Noise) -> float:
+def _log_evidence(fit: _Fit) -> float:
     """Return the log evidence of all grasps by Laplace's method, up to what the grasps alone decide."""
+    problem, step = fit.problem, fit.step
     free = np.linalg.slogdet(step.precision)[1] - np.linalg.slogdet(problem.prior.precision)[1]
-    return -0.5 * float(step.objective + step.log_det + whiten(problem.data, noise)[1].sum() + free)
+    return -0.5 * float(step.objective + step.log_det + whiten(problem.data, fit.noise)[1].sum() + free)
 
 
 def _with_discrepancy(problem: Problem, theta: Array) -> tuple[Problem, Array]:
@@ -740,7 +747,7 @@ def _library_row(label: str, materials: Mapping[str, Material]) -> Material | No
 def _fit_to_evidence(
     problem: Problem, theta: Array, w: Array, spread: Spread, noise: Noise, progress: Progress,
     steps: int = SETTINGS.steps, settled: float = SETTINGS.settled,
-) -> tuple[Step, Array, Spread]:  # fmt: skip
+) -> _Fit:  # fmt: skip
     """Alternate Gauss-Newton and EM until the evidence settles."""
     whitener, log_det = whiten(problem.data, noise)
     damping, before = 1e-3, np.inf
@@ -753,7 +760,7 @@ def _fit_to_evidence(
         if abs(before - value) < settled:
             break
         before = value
-    return step, w, spread
+    return _Fit(problem, step, w, spread, noise)
 
 
 def _fit_noise(
@@ -814,10 +821,9 @@ def _least(
 
 
 def _gripper_model(
-    problem: Problem, step: Step, spread: Spread, noise: Noise, block_length: float, names: tuple[str, ...],
-    prior: GripperModel | None,
-) -> GripperModel:  # fmt: skip
-    theta = step.theta
+    fit: _Fit, block_length: float, names: tuple[str, ...], prior: GripperModel | None
+) -> GripperModel:
+    problem, step, theta = fit.problem, fit.step, fit.step.theta
     shared = dict(zip(SHARED_NAMES, theta.tolist()))
     n = len(problem.labels)
     of_theta = np.delete(np.arange(theta.size), np.s_[len(SHARED_NAMES) : theta.size - 2 * n])
@@ -838,15 +844,15 @@ def _gripper_model(
         )
         for k, (label, row) in enumerate(zip(problem.labels, problem.library))
     }
-    slope, level, ln_h_sd_of_blocks = _ln_h_line(blocks)
+    line = _ln_h_line(blocks)
     covariance = np.linalg.inv(step.precision)[np.ix_(of_theta, of_theta)]
     names_of_theta = (*SHARED_NAMES, *block_names(problem.labels))
     return GripperModel(
         stack=stack_of(theta),
-        noise=noise,
+        noise=fit.noise,
         spreads=Spreads(
-            **spread,
-            ln_h_of_blocks=ln_h_sd_of_blocks,
+            **fit.spread,
+            ln_h_of_blocks=line.sd,
             dof=problem.dof("ln_h"),
             insulator_dof=problem.dof("ln_effusivity"),
         ),
@@ -855,8 +861,8 @@ def _gripper_model(
         bias=shared["bias"],
         depth_share=float(np.exp(shared["ln_depth"])),
         block_length=block_length,
-        ln_h_level=level,
-        ln_h_slope=slope,
+        ln_h_level=line.level,
+        ln_h_slope=line.slope,
         blocks=blocks,
         trained_on=names,
         uncertainty=ParameterCovariance(names_of_theta, 0.5 * (covariance + covariance.T)),
@@ -864,15 +870,21 @@ def _gripper_model(
     )
 
 
-def _ln_h_line(blocks: Mapping[str, Block]) -> tuple[float, float, float]:
-    """Return slope, level at ln e = 9 and sd of ln h against ln e; a shallow slope is preferred."""
+@dataclass(frozen=True)
+class _LnHLine:
+    """ln h of blocks against ln e."""
+
+    slope: float
+    level: float  # at ln e = 9
+    sd: float
+
+
+def _ln_h_line(blocks: Mapping[str, Block]) -> _LnHLine:
+    """Return the line through the blocks; a shallow slope is preferred."""
     x = np.array([b.ln_effusivity for b in blocks.values()]) - 9.0
     y = np.array([b.ln_h for b in blocks.values()])
     design = np.stack([x, np.ones_like(x)], axis=1)
     slope, level = np.linalg.solve(design.T @ design + np.diag([0.2**2 / 0.2**2, 0.0]), design.T @ y)
     residual = y - design @ np.array([slope, level])
-    return (
-        float(slope),
-        float(level),
-        max(SETTINGS.least_ln_h_spread, float(np.sqrt((residual**2).sum() / max(1, y.size - 2)))),
-    )
+    sd = float(np.sqrt((residual**2).sum() / max(1, y.size - 2)))
+    return _LnHLine(float(slope), float(level), max(SETTINGS.least_ln_h_spread, sd))

@@ -274,8 +274,7 @@ def stack_touches(parts: list[Touches]) -> Touches:
 
 def noise_covariance(data: Touches, noise: Noise) -> Array:
     """Return the covariance of the bin means, (n, n_bin, n_bin) [K^2]; an empty bin has variance 1 alone."""
-    white, slow, misfit = _noise_parts(data, noise)
-    return _sum(data, white, slow, misfit)
+    return _noise_parts(data, noise).total()
 
 
 def noise_fit(data: Touches, noise: Noise, extra: Array, left: Array) -> tuple[float, Array]:
@@ -284,8 +283,8 @@ def noise_fit(data: Touches, noise: Noise, extra: Array, left: Array) -> tuple[f
     ``extra`` (n, n_bin, n_bin) is what else C holds; slopes are by the logarithms of white, slow, correlation
     time and misfit, and by growth: with C^-1 - C^-1 r r' C^-1 = G, 1/2 tr(G dC).
     """
-    white, slow, misfit = _noise_parts(data, noise)
-    chol = np.linalg.cholesky(_sum(data, white, slow, misfit) + extra)
+    parts = _noise_parts(data, noise)
+    chol = np.linalg.cholesky(parts.total() + extra)
     root = _inverse(chol)
     z = np.einsum("nij,nj->ni", root, left)
     cost = 0.5 * (z**2).sum() + np.log(np.diagonal(chol, axis1=1, axis2=2)).sum()
@@ -303,11 +302,11 @@ def noise_fit(data: Touches, noise: Noise, extra: Array, left: Array) -> tuple[f
     steep = (
         3 * x**2 / (1 + np.sqrt(3.0) * x) if noise.smooth else x
     )  # slope of -ln correlation by ln distance
-    g *= misfit
+    g *= parts.misfit
     by_misfit = g.sum(axis=2)
     longer = np.log1p(np.maximum(data.t, 0.0) / 10)
     slopes = [
-        (diagonal * white).sum(),
+        (diagonal * parts.white).sum(),
         by_slow.sum(),
         0.5 * (by_slow * steep).sum(),
         by_misfit.sum(),
@@ -316,8 +315,22 @@ def noise_fit(data: Touches, noise: Noise, extra: Array, left: Array) -> tuple[f
     return float(cost), np.array(slopes)
 
 
-def _noise_parts(data: Touches, noise: Noise) -> tuple[Array, Array, Array]:
-    """Return white variances (n, n_bin), 1 where empty, and covariances of slow noise and of misfit."""
+@dataclass(frozen=True, eq=False)
+class _NoiseParts:
+    """Of bin means."""
+
+    white: Array  # (n, n_bin), variances, 1 where empty
+    slow: Array  # (n, n_bin, n_bin)
+    misfit: Array  # (n, n_bin, n_bin)
+
+    def total(self) -> Array:
+        cov = self.slow + self.misfit
+        bins = np.arange(self.white.shape[1])
+        cov[:, bins, bins] += self.white
+        return np.asarray(cov)
+
+
+def _noise_parts(data: Touches, noise: Noise) -> _NoiseParts:
     t = data.t
     has_samples = data.count > 0
     # grasps of one record share their time axis, and the exponentials cost most
@@ -333,7 +346,8 @@ def _noise_parts(data: Touches, noise: Noise) -> tuple[Array, Array, Array]:
         size = (data.share * data.excursion)[:, None] * has_samples * (t > data.since[:, None])
         misfit += alike[which] * size[:, :, None] * size[:, None, :]
     white = np.where(has_samples, noise.white**2 / np.maximum(data.count, 1.0), 1.0)
-    return white, slow[which] * (has_samples[:, :, None] & has_samples[:, None, :]), misfit
+    both = has_samples[:, :, None] & has_samples[:, None, :]
+    return _NoiseParts(white, slow[which] * both, misfit)
 
 
 def _axes(data: Touches) -> tuple[Array, NDArray[np.int64]]:
@@ -342,13 +356,6 @@ def _axes(data: Touches) -> tuple[Array, NDArray[np.int64]]:
         return data.t[:1], np.zeros(len(data.t), dtype=np.int64)
     axes, which = np.unique(data.t, axis=0, return_inverse=True)
     return axes, which.ravel()
-
-
-def _sum(data: Touches, white: Array, slow: Array, misfit: Array) -> Array:
-    cov = slow + misfit
-    bins = np.arange(data.t.shape[1])
-    cov[:, bins, bins] += white
-    return np.asarray(cov)
 
 
 def _inverse(chol: NDArray[np.floating[Any]]) -> Array:

@@ -466,7 +466,7 @@ def fit_candidates(
     n_grade = len(gripper.grades)
     begin = None if start is None else np.repeat(start.reshape(n, m, -1), n_grade, axis=0)
     every = graded(data, gripper.grades)
-    mode, prior, _ = candidate_modes(gripper, every, candidates, start=begin, noise=noise)
+    mode, prior = candidate_modes(gripper, every, candidates, start=begin, noise=noise)
     place, candidate = np.arange(n)[:, None] * n_grade, np.arange(m)
     first = (place * m + candidate).ravel()
     if gripper.uncertainty is not None and gripper.discrepancy is None:
@@ -532,7 +532,7 @@ def over_grades(gripper: GripperModel, log_evidence: Array) -> Array:
 def candidate_modes(
     gripper: GripperModel, data: Touches, candidates: Sequence[str | Material], *,
     start: Array | None = None, noise: Whitened | None = None,
-) -> tuple[Mode, Prior, NDArray[np.int64]]:  # fmt: skip
+) -> tuple[Mode, Prior]:  # fmt: skip
     """Return :func:`fit_candidates` under the grade that each of the touches has."""
     one = material_hypotheses(gripper, candidates)
     n, m = data.level.size, len(candidates)
@@ -542,7 +542,7 @@ def candidate_modes(
     stated = data.known(row)
     prior = prior_of(gripper, stated, hypotheses)
     mode = fit_rivals(gripper, data, row, hypotheses, start=begin, noise=noise, prior=prior)
-    return doubted(stated, prior, mode), prior, row
+    return doubted(stated, prior, mode), prior
 
 
 def fit_rivals(
@@ -580,34 +580,48 @@ def fit_rivals(
     return mode
 
 
-def _trained(gripper: GripperModel, name: str) -> tuple[float, ...]:
+class _Hypothesis(NamedTuple):
+    """One row of :class:`Hypotheses`."""
+
+    ln_h: float
+    ln_h_sd: float
+    ln_e: float
+    ln_e_sd: float
+    ln_rho_c: float
+    ln_rho_c_sd: float
+    ln_h_dof: float
+    ln_e_dof: float
+    block: float
+
+
+def _trained(gripper: GripperModel, name: str) -> _Hypothesis:
     block, spreads = gripper.blocks[name], gripper.spreads
     scatter = spreads.ln_effusivity if block.library_effusivity < INSULATOR else 0.0
-    return (
-        block.ln_h,
-        float(np.hypot(spreads.ln_h, block.ln_h_sd)),
-        block.ln_effusivity,
-        scatter,
-        float(np.log(block.heat_capacity)),
-        0.0,
-        spreads.dof,
-        spreads.insulator_dof if scatter else np.inf,
-        float(gripper.materials.index(name)),
+    return _Hypothesis(
+        ln_h=block.ln_h,
+        ln_h_sd=float(np.hypot(spreads.ln_h, block.ln_h_sd)),
+        ln_e=block.ln_effusivity,
+        ln_e_sd=scatter,
+        ln_rho_c=float(np.log(block.heat_capacity)),
+        ln_rho_c_sd=0.0,
+        ln_h_dof=spreads.dof,
+        ln_e_dof=spreads.insulator_dof if scatter else np.inf,
+        block=float(gripper.materials.index(name)),
     )
 
 
-def _untrained(gripper: GripperModel, row: Material) -> tuple[float, ...]:
+def _untrained(gripper: GripperModel, row: Material) -> _Hypothesis:
     ln_effusivity = float(gripper.found_effusivity(np.log([row.effusivity]))[0])
     scale_sd = gripper.effusivity_scale(np.array([ln_effusivity]))[1]
     scatter = gripper.spreads.ln_effusivity if row.effusivity < INSULATOR else 0.0
-    return (
-        float(gripper.expected_ln_h(np.array(ln_effusivity))),
-        float(np.hypot(gripper.spreads.ln_h_of_blocks, gripper.spreads.ln_h)),
-        float(ln_effusivity),
-        float(np.sqrt(row.effusivity_sd_ln**2 + float(scale_sd[0]) ** 2 + scatter**2)),
-        float(np.log(row.rho * row.c_p)),
-        0.05,
-        np.inf,
-        np.inf,
-        -1.0,
+    return _Hypothesis(
+        ln_h=float(gripper.expected_ln_h(np.array(ln_effusivity))),
+        ln_h_sd=float(np.hypot(gripper.spreads.ln_h_of_blocks, gripper.spreads.ln_h)),
+        ln_e=float(ln_effusivity),
+        ln_e_sd=float(np.sqrt(row.effusivity_sd_ln**2 + float(scale_sd[0]) ** 2 + scatter**2)),
+        ln_rho_c=float(np.log(row.rho * row.c_p)),
+        ln_rho_c_sd=0.05,
+        ln_h_dof=np.inf,
+        ln_e_dof=np.inf,
+        block=-1.0,
     )

@@ -182,7 +182,7 @@ def traces_of(gripper: GripperModel, data: Touches, rest: Array, hypotheses: Hyp
     nodes = time_nodes(data.end)
     flux = step_response(
         gripper.stack, nodes, effusivity=effusivity, capacity=capacity, h_c=np.exp(hypotheses.ln_h)
-    )[2]
+    ).flux
     inside = nodes.t <= data.end
     t, q = nodes.t[inside], flux[:, inside]
     lam, weight, _ = slabs(effusivity, capacity, 0.0)
@@ -209,19 +209,25 @@ def joint_prior(
     p[:, 0, 0, 0, 0] = variance
     for k in range(1, n):
         start = None if about is None else about[:, k - 1]
-        gain, offset, way = _move(coupling, traces, int(rows[k - 1]), int(rows[k]), start)
-        mu[:, k, 0] = gain * mu[:, k - 1, 0] + offset
+        move = _move(coupling, traces, int(rows[k - 1]), int(rows[k]), start)
+        gain = move.gain
+        mu[:, k, 0] = gain * mu[:, k - 1, 0] + move.offset
         for j in range(k):
             p[:, j, 0, k, 0] = p[:, k, 0, j, 0] = gain * p[:, j, 0, k - 1, 0]
-        p[:, k, 0, k, 0] = gain**2 * p[:, k - 1, 0, k - 1, 0] + coupling.sd**2 + way**2
+        p[:, k, 0, k, 0] = gain**2 * p[:, k - 1, 0, k - 1, 0] + coupling.sd**2 + move.sd**2
     return mu.reshape(m, 4 * n), p.reshape(m, 4 * n, 4 * n)
 
 
-def _move(
-    coupling: Coupling, traces: Traces, before: int, after: int, about: Array | None
-) -> tuple[Array, Array, Array]:
-    """Return gain and offset (m,) of the block's temperature from one touch to the next, and what is
-    uncertain of how far the room takes one that is found at ``about`` (m,) [K]."""
+class _Move(NamedTuple):
+    """How the block's temperature goes from one touch to the next, (m,) each."""
+
+    gain: Array
+    offset: Array
+    sd: Array  # of how far the room takes it [K]
+
+
+def _move(coupling: Coupling, traces: Traces, before: int, after: int, about: Array | None) -> _Move:
+    """Return the move of a block that is found at ``about`` (m,); None: nothing of it is uncertain."""
     rest_s = float(traces.rest[after])
     taken = coupling.found * traces.drop(rest_s)
     room = traces.room[before]
@@ -229,9 +235,9 @@ def _move(
     gain = np.asarray(stay * (1 - taken))
     offset = stay * taken * traces.skin[before] + (1 - stay) * np.nan_to_num(room)
     if about is None:
-        return gain, np.asarray(offset), np.zeros(gain.shape)
+        return _Move(gain, np.asarray(offset), np.zeros(gain.shape))
     way = gain * about + offset - (about - taken * (about - traces.skin[before]))
-    return gain, np.asarray(offset), np.asarray(traces.law(rest_s) * way)
+    return _Move(gain, np.asarray(offset), np.asarray(traces.law(rest_s) * way))
 
 
 SHARED = (T_OBJECT, H, EFFUSIVITY, CAPACITY)
@@ -442,7 +448,7 @@ def learn_coupling(gripper: GripperModel, grasps: Grasps, *, start: Coupling | N
 def next_touch_prior(
     gripper: GripperModel, grasps: Grasps, candidates: Sequence[str | Material], *,
     coupling: Coupling | None = None, rest: float = 60.0,
-) -> tuple[Array, Array, Array]:  # fmt: skip
+) -> Joint:  # fmt: skip
     """Return the log evidence (m,) from the touches of one block, and the prior mean (m, 4) and covariance
     (m, 4, 4) of another touch's x = (T_obj, ln h, ln e, ln C) after a ``rest`` [s]."""
     at = _one_block(grasps)
@@ -461,7 +467,7 @@ def next_touch_prior(
     prior = _prior(view._replace(traces=traces), np.append(at, new), view.coupling, silent)
     joint = combine(silent, *prior)
     last = slice(-N_SHARED, None)
-    return log_evidence, joint.mean[:, last], joint.covariance[:, last, last]
+    return Joint(log_evidence, joint.mean[:, last], joint.covariance[:, last, last])
 
 
 def _one_block(grasps: Grasps) -> Rows:

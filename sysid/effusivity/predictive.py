@@ -70,7 +70,8 @@ def next_touch(
 ) -> PosteriorPredictive:  # fmt: skip
     """Return what another touch of the block would read at each gripper temperature."""
     temperature = np.atleast_1d(np.asarray(t_gripper, dtype=float))
-    evidence, x_mean, x_cov = next_touch_prior(gripper, grasps, candidates, coupling=coupling, rest=rest)
+    prior = next_touch_prior(gripper, grasps, candidates, coupling=coupling, rest=rest)
+    evidence = prior.log_evidence
     n, m = temperature.size, evidence.size
     room = float(grasps["t_ambient"].values[-1]) if "t_ambient" in grasps else np.nan
     data = _coming(np.repeat(temperature, m), room, end, _sample_time(grasps))
@@ -80,8 +81,8 @@ def next_touch(
     spread[:, own_nuisances, own_nuisances] = np.square(
         [gripper.spreads.ln_build_up, gripper.spreads.onset, FORECAST.regulation_sd_K]
     )
-    u[:, SHARED] = np.tile(x_mean, (n, 1))
-    spread[:, np.array(SHARED)[:, None], SHARED] = np.tile(x_cov, (n, 1, 1))
+    u[:, SHARED] = np.tile(prior.mean, (n, 1))
+    spread[:, np.array(SHARED)[:, None], SHARED] = np.tile(prior.covariance, (n, 1, 1))
     vary = np.diagonal(spread, axis1=1, axis2=2) > 0
     beyond = gripper.beyond(data.t, u[:, EFFUSIVITY])
     y, slopes = jacobian(gripper.stack, nodes_for(data), data, u, vary, beyond)

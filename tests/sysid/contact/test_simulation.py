@@ -106,7 +106,7 @@ def test_each_circumstance_has_its_own_draw_in_a_fixed_order():
     capacity = [load_materials()[name].rho * load_materials()[name].c_p * 0.02 for name in names]
     stack = replace(SOFT_FINGER, g_far=50.0)
     build_up = 0.78 * np.exp(0.3 * z[4])
-    rise = step_response(stack, nodes, effusivity=e, capacity=capacity, h_c=h, build_up=build_up)[0]
+    rise = step_response(stack, nodes, effusivity=e, capacity=capacity, h_c=h, build_up=build_up).rise
     room = far_response(stack, nodes, rise, effusivity=e, capacity=capacity)
     lossy = replace(grip, stack=stack).draw_many(names, 43.0, np.random.default_rng(3), ambient=28.0)
     for i, touch in enumerate(touches):
@@ -168,7 +168,7 @@ PLAIN = Stack(
 @pytest.mark.parametrize("e_obj", [367.0, 1.6e4])
 def test_one_layer_on_a_deep_block_reads_the_closed_form(e_obj, h_c):
     nodes = time_nodes(10.0)
-    rise = step_response(PLAIN, nodes, effusivity=[e_obj], capacity=[e_obj * 50], h_c=[h_c])[0][0]
+    rise = step_response(PLAIN, nodes, effusivity=[e_obj], capacity=[e_obj * 50], h_c=[h_c]).rise[0]
     want = sensor_temperature(nodes.t, T_dev0=0.0, T_obj0=1.0, e_dev=1600.0, e_obj=e_obj, h_c=h_c, lag=0.5)
     near = nodes.t < 10
     np.testing.assert_allclose(rise[near], want[near], atol=2e-3)
@@ -176,7 +176,7 @@ def test_one_layer_on_a_deep_block_reads_the_closed_form(e_obj, h_c):
 
 def test_flux_from_a_finite_block_is_the_closed_forms():
     nodes = time_nodes(40.0)
-    flux = step_response(PLAIN, nodes, effusivity=[3.64e4], capacity=[68600.0], h_c=[800.0])[2][0]
+    flux = step_response(PLAIN, nodes, effusivity=[3.64e4], capacity=[68600.0], h_c=[800.0]).flux[0]
     late = (nodes.t > 0.05) & (nodes.t < 40)
     bodies = {"dev": half_space(1600.0), "obj": slab(3.64e4, 68600.0)}
     want = two_body_flux(nodes.t[late], T_dev0=0, T_obj0=1, h_c=800.0, **bodies)
@@ -186,7 +186,7 @@ def test_flux_from_a_finite_block_is_the_closed_forms():
 def test_two_layers_are_the_layered_impedance():
     stack = replace(PLAIN, e_outer=600.0, z_outer=0.4)
     nodes = time_nodes(20.0)
-    flux = step_response(stack, nodes, effusivity=[1.6e4], capacity=[6e4], h_c=[500.0])[2][0]
+    flux = step_response(stack, nodes, effusivity=[1.6e4], capacity=[6e4], h_c=[500.0]).flux[0]
     some = (nodes.t > 0.1) & (nodes.t < 20)
     dev = layer_on(600.0, 600.0 * 0.4, half_space(1600.0))
     want = two_body_flux(nodes.t[some], dev=dev, obj=slab(1.6e4, 6e4), T_dev0=0, T_obj0=1, h_c=500.0)
@@ -198,9 +198,9 @@ def test_heat_is_conserved_in_a_closed_gripper():
     stack = replace(PLAIN, e_inner=2e3, z_inner=5.0, g_side=300.0, c_side=2.5e4)
     nodes = time_nodes(3e5)
     capacity, own = 6e4, 1600.0 * 1e-3 + 2e3 * 5.0 + 2.5e4
-    rise, _, flux = step_response(stack, nodes, effusivity=[1.6e4], capacity=[capacity], h_c=[800.0])
-    assert rise[0, -1] == pytest.approx(capacity / (capacity + own), rel=1e-4)
-    given = np.trapezoid(flux[0], nodes.t)
+    response = step_response(stack, nodes, effusivity=[1.6e4], capacity=[capacity], h_c=[800.0])
+    assert response.rise[0, -1] == pytest.approx(capacity / (capacity + own), rel=1e-4)
+    given = np.trapezoid(response.flux[0], nodes.t)
     assert given == pytest.approx(capacity * own / (capacity + own), rel=1e-3)
 
 
@@ -230,12 +230,12 @@ def test_in_the_end_heat_flows_through_all_resistances_in_a_row():
     stack = replace(PLAIN, e_outer=600.0, z_outer=0.4, z_inner=5.0, g_back=200.0, g_side=300.0, c_side=2e3)
     nodes = time_nodes(3000.0)
     given = {"effusivity": [1e8], "capacity": [1e12], "h_c": [500.0]}
-    rise, _, flux = step_response(stack, nodes, **given)
+    response = step_response(stack, nodes, **given)
     through = 1 / (1 / 500 + 0.4 / 600 + 5 / 1600 + 1 / 200)
-    assert flux[0, -1] == pytest.approx(through, rel=1e-3)
-    assert rise[0, -1] == pytest.approx(1 - through * (1 / 500 + 0.4 / 600), rel=1e-3)
+    assert response.flux[0, -1] == pytest.approx(through, rel=1e-3)
+    assert response.rise[0, -1] == pytest.approx(1 - through * (1 / 500 + 0.4 / 600), rel=1e-3)
     # a contact that creeps by a fifth ends at 600 of it
-    creeping = step_response(replace(stack, creep=0.2, first=0.5), nodes, **given)[2][0, -1]
+    creeping = step_response(replace(stack, creep=0.2, first=0.5), nodes, **given).flux[0, -1]
     assert creeping == pytest.approx(1 / (1 / through - 1 / 500 + 1 / 600), rel=1e-3)
 
 
@@ -248,7 +248,7 @@ def test_a_contact_builds_up_and_then_creeps():
     nodes = time_nodes(8.0)
     given = {"effusivity": [1e7], "capacity": [1e12], "h_c": [200.0]}
     for tau, asked in ((0.5, {}), (0.9, {"build_up": [0.9]})):
-        flux, t = step_response(stack, nodes, **given, **asked)[2][0], nodes.t
+        flux, t = step_response(stack, nodes, **given, **asked).flux[0], nodes.t
         want = 200 * (0.1 + 0.9 * -np.expm1(-t / tau)) * (1 + 0.5 * -np.expm1(-t / 3.0))
         np.testing.assert_allclose(flux, want, rtol=1e-3)
 

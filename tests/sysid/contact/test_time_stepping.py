@@ -64,7 +64,7 @@ def test_what_the_room_does_is_what_cells_say(block):
     """Through the response to a step, of which the way of the untouched face is a sum (Duhamel)."""
     nodes = time_nodes(12.0, per_group=40)
     given = {"effusivity": [block[0]], "capacity": [block[1]]}
-    rise, _, _ = step_response(STACK, nodes, **given, h_c=[1000.0])
+    rise = step_response(STACK, nodes, **given, h_c=[1000.0]).rise
     got = far_response(STACK, nodes, rise, **given)[0]
     t = np.linspace(0.0, 12.0, 1201)
     free = untouched(block, STACK.g_far, t)

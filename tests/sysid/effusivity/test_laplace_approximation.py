@@ -54,19 +54,23 @@ def u(device, data):
 
 def test_readings_are_bin_means_of_the_curve_later_by_the_onset(device, data, u):
     nodes = nodes_for(data)
-    rise, slope, _ = step_response(
+    response = step_response(
         device.stack, nodes, effusivity=np.exp(u[:, 5]), capacity=np.exp(u[:, 6]), h_c=np.exp(u[:, 0]),
         build_up=np.exp(u[:, 1]),
  )  # fmt: skip
     f = np.zeros(data.y.shape)
     for p in range(3):
         t, bins = data.sample_t[p] - u[p, 2], data.sample_bin[p]
-        at = np.where(t > 0, CubicHermiteSpline(nodes.t, rise[p], slope[p])(np.maximum(t, 0.0)), 0.0)
+        at = np.where(
+            t > 0, CubicHermiteSpline(nodes.t, response.rise[p], response.slope[p])(np.maximum(t, 0.0)), 0.0
+        )
         f[p] = np.bincount(bins, at, f.shape[1]) / np.bincount(bins, minlength=f.shape[1])
     level, t_object = u[:, 3, None], u[:, 4, None]
     want = level + (t_object - level) * f
     want += device.stack.leak * (data.t_ambient[:, None] - level) * data.ramp
-    room = far_response(device.stack, nodes, rise, effusivity=np.exp(u[:, 5]), capacity=np.exp(u[:, 6]))
+    room = far_response(
+        device.stack, nodes, response.rise, effusivity=np.exp(u[:, 5]), capacity=np.exp(u[:, 6])
+    )
     want += (data.t_ambient[:, None] - t_object) * [
         np.interp(data.t[p] - u[p, 2], nodes.t, room[p]) for p in range(3)
     ]

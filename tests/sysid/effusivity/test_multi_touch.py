@@ -298,7 +298,7 @@ def test_what_a_touch_leaves_is_what_cells_keep(device, record, name):
     capacity = float(np.exp(hypothesis.ln_rho_c[0])) * 0.02 * device.depth_share
     assert traces.capacity == pytest.approx(capacity)
     nodes = time_nodes(10.0)
-    flux = step_response(device.stack, nodes, effusivity=[e], capacity=[capacity], h_c=[h])[2][0]
+    flux = step_response(device.stack, nodes, effusivity=[e], capacity=[capacity], h_c=[h]).flux[0]
     n = 200
     link, cell = n * e**2 / capacity, capacity / n
     matrix = (
@@ -372,10 +372,11 @@ def test_another_touch_expects_what_the_touches_found_moved_on(device, record, t
     at, names = np.arange(touched), ["copper", "wood"]
     block = record.isel(grasp=touch_groups(record)["p000"][:touched])
     coupling = Coupling(found=0.8, loss=0.0, sd=0.3, ln_h_sd=0.2)
-    evidence, mean, cov = next_touch_prior(device, block, names, coupling=coupling, rest=30.0)
+    prior = next_touch_prior(device, block, names, coupling=coupling, rest=30.0)
+    mean, cov = prior.mean, prior.covariance
     if touched > 1:
         fit = two_touch_fit(device, block, names, coupling=coupling)
-        np.testing.assert_allclose(evidence, fit.log_evidence[0], atol=1e-9)
+        np.testing.assert_allclose(prior.log_evidence, fit.log_evidence[0], atol=1e-9)
     view = multi_touch._view(device, block, material_hypotheses(device, names), coupling)
     factors = multi_touch._group_factors(view, [at])
     if touched > 1:
@@ -387,8 +388,8 @@ def test_another_touch_expects_what_the_touches_found_moved_on(device, record, t
     np.testing.assert_allclose(cov[:, 0, 0], (1 - taken) ** 2 * joint.covariance[:, -4, -4] + 0.09, rtol=1e-6)
     np.testing.assert_allclose(mean[:, 2:], joint.mean[:, -2:], atol=1e-6)
     assert np.all(cov[:, 1, 1] > 0.04)
-    assert next_touch_prior(device, block, names)[1][0, 0] == pytest.approx(
-        next_touch_prior(device, block, names, rest=60.0)[1][0, 0]
+    assert next_touch_prior(device, block, names).mean[0, 0] == pytest.approx(
+        next_touch_prior(device, block, names, rest=60.0).mean[0, 0]
     )
 
 

@@ -23,8 +23,9 @@ def test_another_touch_reads_its_nuisances_through_the_slopes(device):
     grasp = load_example_grasps()["exp5_two_touch_unknown_object"].isel(grasp=[0])
     names = ["copper", "wood"]
     ahead = next_touch(device, grasp, names, [20.0, 35.0], rest=30.0, end=4.0)
-    evidence, x, spread = next_touch_prior(device, grasp, names, rest=30.0)
-    p = np.exp(evidence) / np.exp(evidence).sum()
+    prior = next_touch_prior(device, grasp, names, rest=30.0)
+    x, spread = prior.mean, prior.covariance
+    p = np.exp(prior.log_evidence) / np.exp(prior.log_evidence).sum()
     np.testing.assert_allclose(np.exp(ahead.log_p), [p, p])
     # a second about -1.5 s, then half a second each from 0.3 s on
     t = np.array([-1.5, *np.arange(0.55, 4.0, 0.5)])
