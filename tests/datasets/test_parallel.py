@@ -101,15 +101,15 @@ def test_a_fault_stops_what_has_not_begun_and_a_killed_process_is_one_line(pools
 
 class Cluster:
     def __init__(self, workers, versions):
-        self._workers, self._versions = workers, versions
+        self.workers, self.versions = workers, versions
 
     def scheduler_info(self):
-        return {"workers": self._workers}
+        return {"workers": self.workers}
 
     def run(self, _function):
-        if self._versions is None:
+        if self.versions is None:
             raise ModuleNotFoundError
-        return {str(k): parallel._versions() | {"thermogrip": v} for k, v in enumerate(self._versions)}
+        return {str(k): parallel._versions() | {"thermogrip": v} for k, v in enumerate(self.versions)}
 
 
 @pytest.mark.parametrize(

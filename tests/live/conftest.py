@@ -53,12 +53,12 @@ class Running:
             shown = {"progress": watch.progress, "listener": watch.listen, "operator": watch.operator}
             self.session = run_session(rig, PIController(rig.plant), 28.0, **shown, **options)
 
-        self._thread = threading.Thread(target=work)
-        self._thread.start()
+        self.thread = threading.Thread(target=work)
+        self.thread.start()
 
     def result(self) -> Session:
         """Wait for the end."""
-        self._thread.join(60.0)
+        self.thread.join(60.0)
         assert self.session is not None
         return self.session
 

@@ -81,10 +81,10 @@ class MarginalPosterior:
             moved[:, k] += 1.0
             step = predict(self.device.stack, self.nodes, rows, moved) - y
             columns.append(step @ self.whitener.T * prior.sd[:, k, None])
-        known = self._log_normal(residual, np.stack(columns, axis=2))
+        known = self.log_normal(residual, np.stack(columns, axis=2))
         if np.isfinite(self.data.t_object[0]):  # one stated temperature in twenty is three times as far off
             columns[1] = 3.0 * columns[1]
-            slip = self._log_normal(residual, np.stack(columns, axis=2))
+            slip = self.log_normal(residual, np.stack(columns, axis=2))
             known = np.logaddexp(np.log(0.95) + known, np.log(0.05) + slip)
         for k in SAMPLED[1:]:
             w, dof = (points[:, SAMPLED.index(k)] - prior.mean[:, k]) / prior.sd[:, k], prior.dof[:, k]
@@ -95,7 +95,7 @@ class MarginalPosterior:
         return np.where(inside, known, -np.inf)
 
     @staticmethod
-    def _log_normal(residual: Array, columns: Array) -> Array:
+    def log_normal(residual: Array, columns: Array) -> Array:
         """Return the log density of residuals (n, n_bin) of covariance I + V V', V (n, n_bin, 2), but for a
         constant."""
         matrix = np.eye(2) + columns.transpose(0, 2, 1) @ columns
@@ -123,14 +123,14 @@ class WhitenedPosterior:
 
     def points(self, z: Array) -> Array:
         """Return (ln e, ln h, ln tau_b, t0, ln C) at z, both (n_point, 5)."""
-        return self._mapped(np.atleast_2d(z))[0]
+        return self.mapped(np.atleast_2d(z))[0]
 
     def __call__(self, z: Array) -> Array:
         """Return the log density (n_point,) of z, up to a constant."""
-        points, log_volume = self._mapped(np.atleast_2d(z))
+        points, log_volume = self.mapped(np.atleast_2d(z))
         return np.asarray(self.target(points) + log_volume)
 
-    def _mapped(self, z: Array) -> tuple[Array, Array]:
+    def mapped(self, z: Array) -> tuple[Array, Array]:
         share = ndtr(z[:, 0])
         x = np.interp(share, self.cumulative, self.edges)
         cell = np.clip(np.searchsorted(self.cumulative, share) - 1, 0, self.edges.size - 2)

@@ -543,8 +543,6 @@ def test_columns_are_what_was_named_what_the_network_has_or_what_was_guessed():
     second.attrs["guesses"] = "fan: other\nt: its name is: x"
     second["q"].attrs["units"] = "V"
     logs = [first, second]
-    assert signal_roles._guesses(logs) == {"fan": "its unit is V", "t": "its name is: x"}
-    assert [signal_roles._moves(logs, name) for name in ("fan", "lamp", "room")] == [True, False, False]
     assert signal_roles._moves([first.assign(lamp=first["lamp"] * np.nan)], "lamp")
     network: Any = SimpleNamespace(name="block", inputs=("q",), disturbances=("room",), outputs=("t",))
     lists = {"inputs": ["q"], "disturbances": None, "outputs": None}

@@ -175,14 +175,14 @@ class _Rig(DeviceRig):
         self.device, self.at, self.drill, self.jump = device, at, drill, jump
         self.failed_at = float("nan")
         super().__init__(Port(device.port, clock=clock), clock=clock, sleep=clock.sleep)
-        self._count = clock
+        self.count = clock
 
     def wait(self, seconds: float) -> None:
         """Wait, and fail in the middle of it."""
         half = 0.5 * seconds
         super().wait(half)
-        if self.drill is not None and self.failed_at != self.failed_at and self._count() >= self.at:
-            self.failed_at = self._count()
+        if self.drill is not None and self.failed_at != self.failed_at and self.count() >= self.at:
+            self.failed_at = self.count()
             self.drill.fault(self.device)
         super().wait(seconds - half)
 

@@ -31,13 +31,13 @@ class Server:
     def __init__(self, port: int = 0) -> None:
         self.heard: list[dict[str, Any]] = []
         self.sockets: list[Any] = []
-        self.server = serve(self._talk, "127.0.0.1", port)
+        self.server = serve(self.talk, "127.0.0.1", port)
         self.port = self.server.socket.getsockname()[1]
         self.url = f"ws://127.0.0.1:{self.port}"
         self.thread = threading.Thread(target=self.server.serve_forever, daemon=True)
         self.thread.start()
 
-    def _talk(self, socket: Any) -> None:
+    def talk(self, socket: Any) -> None:
         self.sockets.append(socket)
         with suppress(ConnectionClosed):
             for text in socket:

@@ -30,14 +30,14 @@ class Stuck:
     session's clock."""
 
     def __init__(self, clock: SteppedClock, call: Callable[..., Any]) -> None:
-        self._clock, self._call, self.let_go = clock, call, threading.Event()
+        self.clock, self.call, self.let_go = clock, call, threading.Event()
 
     def __call__(self, *args: Any) -> Any:
         if threading.current_thread() is threading.main_thread():
-            self._clock.sleep(5.0)
+            self.clock.sleep(5.0)
         else:
             self.let_go.wait(PATIENCE_S)
-        return self._call(*args)
+        return self.call(*args)
 
 
 @pytest.fixture

@@ -155,7 +155,8 @@ def test_order_and_delay_are_those_asked_for(kind, fixed):
 def test_an_order_or_delay_that_a_kind_cannot_have_is_refused(kind, fixed, says):
     with pytest.raises(UserError, match=says):
         fit_black_box(kind, [lagged_log(4, 200)], **fixed)
-    assert fitting._of_order("arx", 20, 1).keywords == {"poles": (20,), "delays": (1,)}
+    kept = fit_black_box("arx", [lagged_log(4, 200)], order=20, delay=1).choice.structure
+    assert kept == ("na 20, nb 20, delay 1", 41)
 
 
 def test_short_logs_are_not_resampled_and_that_is_reported():

@@ -25,13 +25,6 @@ def grid_of(*readings, u=None):
 
 
 @pytest.mark.parametrize(
-    ("row", "longest"), [([], 0), ([0, 0], 0), ([1, 1, 0, 1], 2), ([1, 0, 1, 1, 1], 3), ([1, 1], 2)]
-)
-def test_the_longest_run(row, longest):
-    assert neural._longest_run(np.array(row, dtype=bool)) == longest
-
-
-@pytest.mark.parametrize(
     ("rows", "scatter", "stands"), [(8, 0, True), (7, 0, False), (8, 9e-10, True), (8, 2e-9, False)]
 )
 def test_eight_rows_at_an_end_are_a_rail(rows, scatter, stands):
@@ -45,6 +38,8 @@ def test_eight_rows_at_an_end_are_a_rail(rows, scatter, stands):
         [-np.inf] * 2,
         [5.0 if stands else np.inf, np.inf],
     ]
+    broken = np.insert(high, 9, part[0], axis=0)  # four rows at the end, and the others after it left it
+    assert saturation_levels(grid_of(part, broken))[1].tolist() == [np.inf] * 2
     if not scatter:
         assert saturation_levels(grid_of(low - 1, part))[0].tolist() == [-1.0 if stands else -np.inf, -np.inf]
 
