@@ -444,7 +444,7 @@ def _copied_columns(
             drives |= guesses.get(other, ("", ""))[1] == NO_CLUE == why and _is_held(values)
             if drives and units[name] == units[other]:
                 says = f"it always moves with {other}, and their effects cannot be told apart"
-                out[name] = "other", f"{says}: {other} stands for both"
+                out[name] = "other", f"{says}: {other} is kept for both"
             elif min(np.unique(v).size for v in (values, moving[other])) > 2:
                 out[name] = "other", f"it is {other} in another unit"
             break

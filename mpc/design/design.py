@@ -349,7 +349,7 @@ class LoadSettings:
     # the most that a load drifts by in a sample, in ranges: what a kiln's log shows beyond is what its model
     # lacks, and its drive moves 1.57 times as much as do-mpc's (1.03 with the limit)
     drift: float = 0.01
-    # how many theta a load drifts for to go as far as it jumps in a sample: without jumps a boiler swings
+    # theta that a load drifts for to go as far as it jumps in a sample: without jumps a boiler swings
     # (IAE 1.12 of the best, .92 with 2), with 3 an extruder does (1.23 for .96)
     jumps: float = 2.0
     most: float = 0.03  # jump in ranges: with .07 a kiln's drive moves 1.65 times as much as do-mpc's

@@ -177,7 +177,7 @@ def _step_findings(
 ) -> list[Finding]:
     """Return how even the steps between rows are, and the gaps."""
     jitter = float(np.std(steps[steps < 3 * usual]) / usual)
-    says, even = f"rows are {usual:.3g} s apart, give or take {100 * jitter:.1f} %", jitter < 0.2
+    says, even = f"rows are {usual:.3g} s apart, within {100 * jitter:.1f} %", jitter < 0.2
     if not even:
         says += ": time stamps are uncertain, fast dynamics cannot be trusted"
     evenness = Finding("jitter", log, "time", jitter, "1", "ok" if even else "warn", says)

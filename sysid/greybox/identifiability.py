@@ -103,7 +103,7 @@ def identifiability_report(plant: Plant) -> list[str]:
     if report is None or plant.covariance is None:
         return []
     lines = [f"condition of the scaled Hessian {report.condition:.1g}"]
-    how = "hardly" if report.identifiable else "not"
+    how = "barely" if report.identifiable else "not"
     lines += [f"{how} identifiable from these logs: {way}, together" for way in report.flat]
     for name, end in report.on_bound.items():
         side, ends = ("lower", 0) if end == "low" else ("upper", 1)

@@ -28,7 +28,7 @@ and 95 % quantiles of their sum.
 
     v +- z sqrt(var_k v_k + s^2 + (median g)^2 (effect^2 + mean effect^2)/2 + unlike^2),   z = 1.645 for 90 %,
 
-of which the constant half stands for a level: on another day a sensor or the air about the plant is off where
+of which the constant half is for a level: on another day a sensor or the air about the plant is off where
 the inputs are 0 as well, and nothing says how much of the difference is gain.  (In proportion to the effect
 alone the bands of two heaters that were off by half a degree on another day held 69 and 52 percent.)  Here
 v_k are the free runs of draws of the parameters, each with a start of its own, and s^2 what these do not

@@ -6,7 +6,7 @@ errs by X (:func:`thermogrip.sysid.validation.prediction_bands.expected_error`),
 error without input over whole logs.  A single part that was much worse than the others, of moves that no
 other part has, widens the range of X and condemns no plant: the fit has seen that part in the end.
 
-An output that half of the parts hardly excite may pass so far and be worse than no input on another run. So
+An output that half of the parts barely excite may pass so far and be worse than no input on another run. So
 where the parts show how they differ (two or more have moves) it has to err less than no input on another
 part in 19 cases of 20: with e_f and b_f the errors on part f and those without input, ln (e_f / b_f) is
 Student's t about its mean, weighted by b_f^2, with the same prior for its spread as in the error of another
@@ -177,7 +177,7 @@ def verdict_of(
             errs = f"on the logs of its own fit {name} errs by {whole:.2g}, without input by {whole_idle:.2g}"
             return False, f"Not good ({label}): {errs}; try other models, or longer logs. {another}"
         if not error.rmse < USEFUL * whole_idle:
-            errs = f"without input {name} errs by {whole_idle:.2g}, so on another run it may be hardly better"
+            errs = f"without input {name} errs by {whole_idle:.2g}, so on another run it may be barely better"
             return False, f"Not good ({label}): {errs}; it needs more excitation, or more logs. {another}"
     failed = [finding.says for finding in checked.findings if finding.verdict == "fail"]
     if failed:

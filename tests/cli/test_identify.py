@@ -339,7 +339,7 @@ def test_a_plant_is_scored_log_by_log_beside_its_baselines(bench: Bench, stand_i
     assert "good@:100 t_tank 0.1 degC 90 12 0.3 0.4 0.2" in said
     band = (
         "90 % band from 12 draws of the parameters and its errors; it covers 88 % of t_tank, nan % of t_lost "
-        "and stands for an RMSE of t_tank 0.3 (0.1 to 0.9)"
+        "and has an expected RMSE of t_tank 0.3 (0.1 to 0.9)"
     )
     assert said.endswith(f"good@:100: {band} good@:100: a note good@100:200: {band} good@100:200: a note")
     assert shares(done.err, "validate") == [0, 50]

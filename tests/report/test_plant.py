@@ -91,7 +91,7 @@ def test_a_band_says_what_it_is_made_of_and_covers(draws: int, words: str) -> No
     said = f"90 % band from {words}; it covers 88 % of t, 95 % of s"
     assert plant.band_words(band) == said
     band = replace(band, expected={"t": 0.123, "s": 4.0}, likely={"t": (0.1, 0.2), "s": (2.0, 9.0)})
-    assert plant.band_words(band) == f"{said} and stands for an RMSE of t 0.12 (0.1 to 0.2), s 4 (2 to 9)"
+    assert plant.band_words(band) == f"{said} and has an expected RMSE of t 0.12 (0.1 to 0.2), s 4 (2 to 9)"
 
 
 def test_signals_are_shown_with_their_roles_and_guesses_are_marked() -> None:

@@ -359,7 +359,7 @@ def band_words(band: Band) -> str:
         f"{name} {band.expected[name]:.2g} ({low:.2g} to {high:.2g})"
         for name, (low, high) in band.likely.items()
     )
-    return words + (f" and stands for an RMSE of {errors}" if errors else "")
+    return words + (f" and has an expected RMSE of {errors}" if errors else "")
 
 
 def _sentence(text: str) -> str:

@@ -232,7 +232,7 @@ def test_times_are_described_in_numbers_and_words(steps, jitter, verdict, gap):
     time = np.append(0.0, np.cumsum(steps))
     got = found_in(ODD, "jitter", time=time, average=2.0, channel="time")
     assert got[0] == pytest.approx(jitter, abs=1e-3)
-    says = f"rows are 1 s apart, give or take {100 * got[0]:.1f} %"
+    says = f"rows are 1 s apart, within {100 * got[0]:.1f} %"
     assert got[1:] == ("1", verdict, says + (RUNS_AWAY if verdict == "warn" else ""))
     said = (0.0, "s", "ok", "no gap longer than 10 s")
     if gap:

@@ -86,7 +86,7 @@ def test_flat_directions_are_reported_in_words(small: float):
     jacobian[j, j] = jacobian[i, j] = 1.0  # the logs see the sum of both
     jacobian[j, j] += small
     stated = identifiability_report(a_plant(0.0, jacobian))
-    how = "hardly" if small else "not"
+    how = "barely" if small else "not"
     assert f"{how} identifiable from these logs: lag_1 up, lag_2 down, together" in stated
 
 
