@@ -59,7 +59,7 @@ def compiled_loop(
     target = np.ascontiguousarray(np.repeat(wanted[:, None], len(controlled), axis=1))
     run = _Run(truth, len(target))
     if isinstance(controller, Controller):
-        _run_mpc(controller.c, controller, run, target, told=truth.known)
+        _run_mpc(controller.c, controller, run, target, drives_known=truth.known)
     elif len(schedule) > 1 or not _run_pi(controller.c, controller, run, target[0], begun):
         return simulate_closed_loop(controller, plant, schedule, **about)
     truth.y = list(run.y)
@@ -102,15 +102,17 @@ class _Run:
         self.around = _Around(truth.sub, truth.late, truth.sees, around.drive_share, *places)
 
 
-def _run_mpc(c: CompiledController, controller: Controller, run: _Run, target: Array, *, told: bool) -> None:
-    """Run an MPC that was reset to targets (n, n_controlled) [degC], told of the drives before or not."""
+def _run_mpc(
+    c: CompiledController, controller: Controller, run: _Run, target: Array, *, drives_known: bool
+) -> None:
+    """Run an MPC that was reset to targets (n, n_controlled) [degC], with the drives before known or not."""
     estimate = controller.observer.estimate()
     observed = np.concatenate([values.ravel() for values in estimate.values()])
     c.library.tg_host_loop(
         c.state,
         *(ctypes.byref(struct) for struct in (c.design, run.plant, run.around)),
         len(target),
-        int(told),
+        int(drives_known),
         *(address(values) for values in (observed, target, run.y, run.reading, run.drive, run.status)),
     )
 
