@@ -101,7 +101,7 @@ class ClosedLoop(Shown):
     status: tuple[str, ...]  # its k statuses
     advice: tuple[str, ...]  # its k advices
     seconds: Array  # (k,), time of each step [s]
-    band: float | Mapping[str, float]  # for settling [degC], by output where they differ
+    band: float  # half width, for settling [degC]
     drive_range: dict[str, tuple[float, float]]
     segments: tuple[Segment, ...]
 
@@ -128,7 +128,7 @@ def simulate_closed_loop(
     *,
     start: float | None = None,
     surroundings: Surroundings | None = None,
-    band: float | Mapping[str, float] = 0.25,
+    band: float = 0.25,
     seed: int = 0,
 ) -> ClosedLoop:
     """Return the record of a controller that is run against a plant.
@@ -144,8 +144,8 @@ def simulate_closed_loop(
     start : float, optional
         Temperature at which the whole plant rests at first [degC]; the room's where absent.
     surroundings : Surroundings, optional
-    band : float or mapping of str to float, optional
-        Half width of the settling band [degC], by output where they differ.
+    band : float, optional
+        Half width of the settling band [degC].
     seed : int, optional
         Of the noise.
 
@@ -299,7 +299,7 @@ def record_loop(
     controlled: tuple[str, ...],
     calls: Calls,
     stops: list[int],
-    band: float | Mapping[str, float],
+    band: float,
 ) -> ClosedLoop:
     """Return the record of a run, a segment, which ends at one of the calls ``stops``, for each stop and
     controlled output; ``band`` is that of settling [degC]."""
@@ -321,7 +321,7 @@ def record_loop(
                 goal,
                 scaled[calls_of_segment],
                 full[calls_of_segment],
-                band_of(band, name),
+                band,
             )
             segments.append(replace(segment, travel=float(jumps[calls_of_segment].sum())))
     return ClosedLoop(
@@ -338,11 +338,6 @@ def record_loop(
         drive_range={n: (float(a), float(b)) for n, a, b in zip(model.drives, model.lowest, model.highest)},
         segments=tuple(segments),
     )
-
-
-def band_of(band: float | Mapping[str, float], output: str) -> float:
-    """Return the half width of an output's settling band [degC]."""
-    return band[output] if isinstance(band, Mapping) else band
 
 
 def drive_shares(drives: Array, lowest: Array, highest: Array) -> tuple[Array, Mask]:

@@ -38,7 +38,7 @@ def compiled_loop(
     *,
     start: float | None = None,
     surroundings: Surroundings | None = None,
-    band: float | Mapping[str, float] = 0.25,
+    band: float = 0.25,
     seed: int = 0,
 ) -> ClosedLoop:
     """Run a compiled controller (else a ValueError) as :func:`simulate_closed_loop` does, with the same

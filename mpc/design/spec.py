@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
@@ -58,27 +58,6 @@ def _both_ends(value: Any) -> Any:
 Ends = Annotated[Range, BeforeValidator(_both_ends)]
 
 
-class Settling(BaseModel):
-    """Requirements of one output, where they are not those of all."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    within_s: Positive | None = None  # this soon: sooner wins nothing, so it may go gently
-    band_degC: Positive | None = None
-    overshoot_degC: Positive | None = None
-    bias_degC: Positive | None = None
-
-
-class Asked(NamedTuple):
-    """Requirements of one output."""
-
-    within_s: float
-    band_degC: float
-    overshoot_degC: float
-    bias_degC: float
-    pace_s: float  # within_s, where it is the output's own: sooner wins nothing; else 0
-
-
 class Spec(BaseModel):
     """What is wanted of a controller; the defaults are those of :data:`SPEC_TEMPLATE`."""
 
@@ -94,7 +73,6 @@ class Spec(BaseModel):
     band_degC: Positive = 0.25  # half width of the settling band
     overshoot_degC: Positive = 0.3  # largest
     bias_degC: Positive = 0.05  # largest mean error at the end
-    settling: dict[str, Settling] | None = None  # of single outputs, what differs from the four above
     hold_s: Annotated[float, Field(ge=10, le=36000)] = 600.0  # how long a step is simulated
     energy_weight: NotNegative = 0.0  # seconds of settling that are worth one second at full drive
     moves_weight: NotNegative = 0.002  # share of the minimum time that is worth one move by a full drive less
@@ -133,42 +111,16 @@ class Spec(BaseModel):
         for start, target in self.steps:
             if abs(start - target) <= self.band_degC:
                 raise ValueError(f"steps: {start:g} -> {target:g} stays inside the band")
-            for name, settling in (self.settling or {}).items():
-                if abs(start - target) <= (settling.band_degC or 0.0):
-                    raise ValueError(f"steps: {start:g} -> {target:g} stays inside the band of {name}")
         if isinstance(self.output, list) and len(set(self.output)) < len(self.output):
             raise ValueError("output: names one twice")
-        times = {
-            f"settling of {name}": settling.within_s or 0.0
-            for name, settling in (self.settling or {}).items()
-        }
-        if "settle_within_s" in self.model_fields_set:
-            times["settle_within_s"] = self.settle_within_s
-        for key, seconds in times.items():
-            if seconds > self.hold_s:
-                too_long = f"longer than each step is simulated (hold_s, {self.hold_s:g} s)"
-                raise ValueError(f"{key}: {seconds:g} s is {too_long}")
+        if "settle_within_s" in self.model_fields_set and self.settle_within_s > self.hold_s:
+            too_long = f"longer than each step is simulated (hold_s, {self.hold_s:g} s)"
+            raise ValueError(f"settle_within_s: {self.settle_within_s:g} s is {too_long}")
         return self
 
-    def asked(self, output: str) -> Asked:
-        """Return the requirements of an output, which are those of all where it has none of its own."""
-        of_output = (self.settling or {}).get(output, Settling())
-        return Asked(
-            of_output.within_s or self.settle_within_s,
-            of_output.band_degC or self.band_degC,
-            of_output.overshoot_degC or self.overshoot_degC,
-            of_output.bias_degC or self.bias_degC,
-            of_output.within_s or 0.0,
-        )
-
-    @property
-    def ramps(self) -> bool:
-        """Whether a target may ramp."""
-        return bool(self.ramp_per_s) or any(settling.within_s for settling in (self.settling or {}).values())
-
-    def way(self, step: tuple[float, float], output: str) -> float:
-        """Return how far a step leads an output until it is in its band [degC]."""
-        return max(0.0, abs(step[1] - step[0]) - self.asked(output).band_degC)
+    def way(self, step: tuple[float, float]) -> float:
+        """Return how far a step leads until it is in the band [degC]."""
+        return abs(step[1] - step[0]) - self.band_degC
 
     @classmethod
     def of(cls, plant: Plant) -> Spec:
@@ -266,7 +218,7 @@ class Spec(BaseModel):
                 raise UserError(f"weights: {name} is not regulated", hint=hint)
         for name, half in (self.zones or {}).items():
             for key in ("band_degC", "overshoot_degC", "bias_degC"):
-                most = getattr(self.asked(name), key)
+                most = getattr(self, key)
                 if half > most:
                     narrow = f"{half:g} about {name} is wider than {key}, {most:g}"
                     raise UserError(f"zones: {narrow}", hint="steps are judged by it: widen it too")
@@ -279,7 +231,6 @@ class Spec(BaseModel):
         values["safe_drive"] = _by_drive("safe_drive", self.safe_drive, drives)
         ramp = self.ramp_per_s or {}
         values["ramp_per_s"] = ramp if isinstance(ramp, dict) else dict.fromkeys(design.controlled, ramp)
-        _check_settling(self, design.controlled, values["ramp_per_s"])
         return check_design(replace(design, **values, **changes), plant)
 
 
@@ -321,18 +272,6 @@ def _check_length(spec: Spec, dt: float) -> None:
             f"hold_s: {spec.hold_s:g} s are less than {_SAMPLES} samples of {dt:g} s",
             hint="simulate each step for longer, or give a shorter sample_time_s",
         )
-
-
-def _check_settling(spec: Spec, controlled: tuple[str, ...], ramps: Mapping[str, float]) -> None:
-    """Refuse a requirement of an output that has no target, or sooner than its ramp is there."""
-    for name, settling in (spec.settling or {}).items():
-        if name not in controlled:
-            hint = known_names(name, controlled, "these are: {}")
-            raise UserError(f"settling: {name} is not regulated", hint=hint)
-        takes = max(spec.way(step, name) for step in spec.steps) / ramps.get(name, np.inf)
-        if settling.within_s is not None and takes > settling.within_s:
-            late = f"{name} is asked within {settling.within_s:g} s, and its ramp_per_s takes {takes:g} s"
-            raise UserError(f"settling: {late}", hint="leave out one: within_s makes a ramp itself")
 
 
 def _spec_drive_ranges(spec: Spec, design: Design) -> dict[str, Range]:
@@ -400,6 +339,8 @@ def spec_from_dict(content: Mapping[str, Any], *, file: str | Path | None = None
         problem = problem_of(error)
         key = problem.partition(":")[0].partition(".")[0]
         hint = known_names(key, Spec.model_fields, "the template of 'init spec' shows every key")
+        if key == "settling":  # of 0.2.0
+            hint = "what is asked is of every output now; ramp_per_s slows the target of one"
         raise UserError(problem, file=file, hint=hint) from error
 
 

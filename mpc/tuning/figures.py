@@ -10,7 +10,7 @@ import numpy as np
 from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.charts import INK, PALETTE, SOFT, Chart, Curve, Panel, draw_chart
 from thermogrip.datasets.limits import LARGEST
-from thermogrip.mpc.closed_loop.simulate import ClosedLoop, band_of
+from thermogrip.mpc.closed_loop.simulate import ClosedLoop
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -66,9 +66,8 @@ def closed_loop_chart(
     ends = called[[0, -1]]
     regulated, driven = [], []
     for k, (name, goal) in enumerate(run.target.items()):
-        half = band_of(run.band, name)
-        band = {"low": goal - half, "high": goal + half}
-        label = f"target, \N{PLUS-MINUS SIGN}{half:g} degC"
+        band = {"low": goal - run.band, "high": goal + run.band}
+        label = f"target, \N{PLUS-MINUS SIGN}{run.band:g} degC"
         regulated.append(Curve(label, called, goal, INK, 1.0, "--", step=True, **band))
         regulated.append(Curve(name, t, run.outputs[name], PALETTE[k % 5], 1.6))
     settled = tuple(

@@ -83,10 +83,6 @@ class CostSettings:
     load: float = 0.1  # of a drive's range, and of the first step
     load_times: float = 6.0  # integral times that a load's trial lasts
     sensor_off: float = 0.02  # of what the logs showed, a sensor of a disturbance that is not the room's
-    # an output that the drive can bring into its band in this share of the time that is asked of it alone
-    # goes gently: its target ramps, for this share of that time at most
-    at_ease: float = 0.7
-    ramped: float = 0.8
 
 
 COSTS = CostSettings()
@@ -153,7 +149,6 @@ class StepResult(Record):
     travel: float
     full_share: float
     length_s: float
-    output: str = ""  # the one it is of, where each is judged by itself
     lacks: str = ""
     load: str = ""  # in words
     iae: float = 0.0  # integral of the absolute error [degC s]
@@ -230,11 +225,10 @@ def load_seconds(design: Design) -> float:
 
 def meets_spec(result: StepResult | Segment, spec: Spec) -> bool:
     """Return whether one step is as wanted."""
-    limits = spec.asked(result.output)
     return (
-        result.settle_s <= limits.within_s  # False where NaN
-        and result.overshoot <= limits.overshoot_degC
-        and abs(result.bias) <= limits.bias_degC
+        result.settle_s <= spec.settle_within_s  # False where NaN
+        and result.overshoot <= spec.overshoot_degC
+        and abs(result.bias) <= spec.bias_degC
     )
 
 
@@ -315,11 +309,6 @@ def signal_of(
     return np.asarray(y[1] - y[0])
 
 
-def bands_of(spec: Spec, controlled: Sequence[str]) -> float | dict[str, float]:
-    """Return the half width of the settling band [degC], by output where they may differ."""
-    return {name: spec.asked(name).band_degC for name in controlled} if spec.settling else spec.band_degC
-
-
 def trial(
     controller: Regulator,
     plant: Plant,
@@ -346,7 +335,7 @@ def trial(
     about: dict[str, Any] = {
         "start": case.start,
         "surroundings": around,
-        "band": bands_of(spec, controlled),
+        "band": spec.band_degC,
         "seed": 1000 * seed + case.draw,
     }
     schedule = [(case.target, seconds)]
@@ -365,11 +354,8 @@ def run_trials(
     *,
     seed: int = 0,
 ) -> list[StepResult]:
-    """Run cases: of each a result, or where the spec has ``settling`` one for each output."""
-    results = []
-    for case in cases:
-        results += results_of(trial(controller, plant, spec, case, seed=seed), spec, case)
-    return results
+    """Return the result of each of these cases."""
+    return [result_of(trial(controller, plant, spec, case, seed=seed), case) for case in cases]
 
 
 def steps_on(spec: Spec, draws: Iterable[int], lacks: str = "") -> list[Case]:
@@ -377,14 +363,9 @@ def steps_on(spec: Spec, draws: Iterable[int], lacks: str = "") -> list[Case]:
     return [Case(start, target, draw, lacks) for start, target in spec.steps for draw in draws]
 
 
-def results_of(run: ClosedLoop, spec: Spec, case: Case) -> list[StepResult]:
-    """Return what a case came to: for each output where the spec has ``settling``, else of the worst."""
-    if spec.settling:
-        return [_step_result(run, [segment], case, segment.output) for segment in run.segments]
-    return [_step_result(run, run.segments, case)]
-
-
-def _step_result(run: ClosedLoop, parts: Sequence[Segment], case: Case, output: str = "") -> StepResult:
+def result_of(run: ClosedLoop, case: Case) -> StepResult:
+    """Return what a case came to, of the worst output."""
+    parts = run.segments
     worst = max(parts, key=lambda part: abs(part.bias))
     errors = [run.outputs[part.output] - part.target for part in parts]
     length = parts[0].end_s - parts[0].begin_s
@@ -401,21 +382,19 @@ def _step_result(run: ClosedLoop, parts: Sequence[Segment], case: Case, output: 
         travel=parts[0].travel,
         full_share=parts[0].full_share,
         length_s=length,
-        output=output,
         lacks=case.lacks,
         load=case.load.words if case.load else "",
         iae=length * float(max(np.mean(np.abs(error)) for error in errors)),
     )
 
 
-#: By start, target and draw; where outputs are judged apart by output too.
-Bounds = dict[tuple[float, float, int] | tuple[float, float, int, str], float]
+#: Shortest times [s] by start, target and draw.
+Bounds = dict[tuple[float, float, int], float]
 
 
 def bound_of(bounds: Bounds, result: StepResult) -> float:
     """Return the shortest time [s] of what a result is of."""
-    key = (result.start, result.target, result.draw)
-    return bounds[(*key, result.output) if result.output else key]
+    return bounds[result.start, result.target, result.draw]
 
 
 @dataclass(frozen=True)
@@ -445,19 +424,19 @@ class Score:
 def score(results: Sequence[StepResult], spec: Spec, scales: Scales, *, expects: Iterable[str] = ()) -> Score:
     """Return the score of a set of trials, see the module's text; ``expects`` are those of :func:`lacking`
     that count as any draw."""
-    costs: dict[tuple[CaseKey, str, str], list[float]] = {}
+    costs: dict[tuple[CaseKey, str], list[float]] = {}
     for result in results:
         cost = _cost_of_load(result, spec, scales) if result.load else _cost_of_step(result, spec, scales)
         # a plant that lacks structure is run for longer than the reference was
         default_moves = np.inf if result.lacks else scales.moves.get(result.key, np.inf)
         most = (spec.moves_limit or np.inf) * default_moves
         cost += spec.moves_weight * result.travel + COSTS.moves * max(0.0, result.travel / most - COSTS.free)
-        costs.setdefault((result.key, result.lacks, result.output), []).append(cost)
+        costs.setdefault((result.key, result.lacks), []).append(cost)
     steps: list[float] = []
     loads: list[float] = []
     others: list[float] = []
     planned = {"", *expects}
-    for (case, lacks, _), noises in costs.items():
+    for (case, lacks), noises in costs.items():
         cost = float(np.mean(noises))
         if lacks and cost > COSTS.late:
             cost = COSTS.late * (1 + np.log(cost / COSTS.late))
@@ -475,58 +454,33 @@ def _mean_and_worst(costs: Sequence[float]) -> float:
 
 
 def _cost_of_step(result: StepResult, spec: Spec, scales: Scales) -> float:
-    bound, limits = bound_of(scales.bounds, result), spec.asked(result.output)
-    unit = max(bound if np.isfinite(bound) else result.length_s, limits.pace_s, 1.0)
-    # sooner than an output's own time wins nothing
-    cost = max(result.settle_s, limits.pace_s) / unit
+    bound = bound_of(scales.bounds, result)
+    unit = max(bound if np.isfinite(bound) else result.length_s, 1.0)
     if np.isfinite(result.settle_s):
-        cost += COSTS.bias * max(0.0, abs(result.bias) / limits.bias_degC - COSTS.free)
+        cost = result.settle_s / unit + COSTS.bias * max(0.0, abs(result.bias) / spec.bias_degC - COSTS.free)
     else:
-        cost = result.length_s / unit + COSTS.error * abs(result.last_error) / limits.band_degC
-    cost += COSTS.overshoot * max(0.0, result.overshoot / limits.overshoot_degC - COSTS.free)
+        cost = result.length_s / unit + COSTS.error * abs(result.last_error) / spec.band_degC
+    cost += COSTS.overshoot * max(0.0, result.overshoot / spec.overshoot_degC - COSTS.free)
     return float(cost + spec.energy_weight * result.energy_s / unit)
 
 
 def _cost_of_load(result: StepResult, spec: Spec, scales: Scales) -> float:
     cost = result.iae / max(scales.iae[result.key], 1e-12)
     if not np.isfinite(result.settle_s):
-        cost += COSTS.error * abs(result.last_error) / spec.asked(result.output).band_degC
+        cost += COSTS.error * abs(result.last_error) / spec.band_degC
     return float(cost)
 
 
 def bounds_of(plant: Plant, design: Design, spec: Spec, draws: Sequence[int]) -> Bounds:
-    """Return :func:`full_drive_bound` of every step of the spec on these draws, or the ramp's time."""
+    """Return :func:`full_drive_bound` of every step of the spec on these draws, or when the slowest ramp
+    brings its target into the band of its end."""
     bounds: Bounds = {}
-    for draw in draws:
-        for step in spec.steps:
-            if not spec.settling:
-                bounds[(*step, draw)] = full_drive_bound(drawn(plant, draw), design, step, spec)
-                continue
-            for name in design.controlled:
-                bounds[(*step, draw, name)] = full_drive_bound(drawn(plant, draw), design, step, spec, name)
-            bounds[(*step, draw)] = max(bounds[(*step, draw, name)] for name in design.controlled)
-    return ramped_bounds(bounds, design, spec)
-
-
-def ramped_bounds(bounds: Bounds, design: Design, spec: Spec) -> Bounds:
-    """Return these bounds, or when the slowest ramp brings the target of a step into the band of its end."""
-    ramped: Bounds = {}
-    for key, bound in bounds.items():
-        of = {name: rate for name, rate in design.ramp_per_s.items() if key[3:] in ((), (name,))}
-        times = [spec.way(key[:2], name) / rate for name, rate in of.items()]
-        ramped[key] = float(np.maximum(bound, max(times, default=0.0)))  # NaN stays NaN
-    return ramped
-
-
-def paced(design: Design, spec: Spec, bounds: Bounds) -> Design:
-    """Return the design with a ramp for each output that may take its time, as slow as its longest step."""
-    ramps = dict(design.ramp_per_s)
-    for name in design.controlled:
-        pace_s = spec.asked(name).pace_s
-        slowest = max((bound for key, bound in bounds.items() if key[3:] == (name,)), default=np.inf)
-        if name not in ramps and slowest <= COSTS.at_ease * pace_s:
-            ramps[name] = max(spec.way(step, name) for step in spec.steps) / (COSTS.ramped * pace_s)
-    return replace(design, ramp_per_s=ramps)
+    for step in spec.steps:
+        ramp_s = max((spec.way(step) / rate for rate in design.ramp_per_s.values()), default=0.0)
+        for draw in draws:
+            bound = full_drive_bound(drawn(plant, draw), design, step, spec)
+            bounds[(*step, draw)] = float(np.maximum(bound, ramp_s))  # NaN stays NaN
+    return bounds
 
 
 def check_steps(bounds: Bounds) -> None:

@@ -63,8 +63,6 @@ from thermogrip.mpc.tuning.objective import (
     load_seconds,
     loads_of,
     meets_spec,
-    paced,
-    ramped_bounds,
     run_trials,
     score,
     steps_on,
@@ -131,17 +129,16 @@ class Row(Record):
     bound_s: (
         float  # before this no drive within the limits is in the band [s], mean over the draws; NaN of a load
     )
-    output: str = ""  # the one it is of, where each is judged by itself
     load: str = ""  # in words
     iae_mean: float = 0.0  # [degC s]
 
 
 def rows_of(name: str, results: Sequence[StepResult], bounds: Bounds) -> list[Row]:
-    """Return a controller's rows, one a step or load, of each output where they are judged apart."""
+    """Return a controller's rows, one a step or load."""
     of: dict[Any, list[StepResult]] = {}
     for result in results:
         if not result.lacks:
-            of.setdefault((result.step, result.load, result.output), []).append(result)
+            of.setdefault((result.step, result.load), []).append(result)
     return [_score_row(name, of_case, bounds) for of_case in of.values()]
 
 
@@ -167,7 +164,6 @@ def _score_row(name: str, part: Sequence[StepResult], bounds: Bounds) -> Row:
         travel_mean=float(np.mean([result.travel for result in part])),
         full_share=float(np.mean([result.full_share for result in part])),
         bound_s=float(np.mean(bound)),
-        output=first.output,
         load=first.load,
         iae_mean=float(np.mean([result.iae for result in part])),
     )
@@ -294,11 +290,9 @@ class Bench:
         self.unseen = [draw + SEARCH.check_from if draw else 0 for draw in draws_of(plant, spec.check_draws)]
         # a noise of the comparison is none of the search's
         self.check_seed = seed + SEARCH.noises if certain else seed
-        baseline = spec.design(plant)
+        self.baseline = spec.design(plant)
         draws = sorted({*self.draws, *self.unseen})
-        bounds = bounds_of(plant, baseline, spec, draws)
-        self.baseline = paced(baseline, spec, bounds)
-        self.bounds = ramped_bounds(bounds, self.baseline, spec)
+        self.bounds = bounds_of(plant, self.baseline, spec, draws)
         check_steps(self.bounds)
         controlled = self.baseline.controlled
         self.lacking = list(lacking(plant, spec, controlled))
@@ -332,15 +326,12 @@ class Bench:
         iae: dict[CaseKey, float] = {}
         for draws, seed in ((self.draws, self.seed), (self.unseen, self.check_seed)):
             for kind, design in (("PI", self.design("PI", {})), ("MPC", self.baseline)):
-                largest: dict[CaseKey, float] = {}  # of the outputs, where each is judged by itself
                 for result in self.run(kind, design, draws, seed):
                     if result.lacks:
                         continue
-                    largest[result.key] = max(largest.get(result.key, 0.0), result.iae)
+                    iae[result.key] = min(result.iae, iae.get(result.key, np.inf))
                     if kind == "MPC" and np.isfinite(result.settle_s) and result.travel > 0:
                         moves[result.key] = result.travel
-                for key, value in largest.items():
-                    iae[key] = min(iae.get(key, np.inf), value)
         return Scales(self.bounds, moves, iae)
 
     def design(self, kind: str, parameters: Mapping[str, float]) -> Design:
@@ -589,7 +580,7 @@ def unknown_to_pi(spec: Spec) -> list[str]:
         "zones": spec.zones,
         "energy prices": spec.energy_price,
         "limits of outputs": spec.limits,
-        "ramps": spec.ramps,
+        "ramps": spec.ramp_per_s,
     }
     return [wish for wish, value in wishes.items() if value]
 
@@ -620,7 +611,7 @@ def _kind_words(kept: str) -> str:
 def verdict_of(spec: Spec, least: float, default: float, rows: Sequence[Row]) -> tuple[str, str]:
     """Return the verdict and its numbers in words, from the least score, that of the default design and the
     kept controller's rows of steps."""
-    beyond = [row for row in rows if row.bound_s > spec.asked(row.output).within_s]
+    beyond = [row for row in rows if row.bound_s > spec.settle_within_s]
     if beyond:
         return "actuator-limited", _beyond_reach(max(beyond, key=lambda row: row.bound_s), spec)
     won = 1 - least / default
@@ -636,11 +627,11 @@ def verdict_of(spec: Spec, least: float, default: float, rows: Sequence[Row]) ->
 
 def _beyond_reach(row: Row, spec: Spec) -> str:
     """Return the sentence about a step that no controller can do in time."""
-    step = f"{row.start:g} to {row.target:g} degC{row.output and f' of {row.output}'}"
+    step = f"{row.start:g} to {row.target:g} degC"
     if not np.isfinite(row.bound_s):
         return f"{step} cannot be reached at this drive; no weight changes that."
     takes = f"takes {row.settle_mean_s:.0f} s" if np.isfinite(row.settle_mean_s) else "does not settle"
-    limit = f"{spec.asked(row.output).within_s:g} s are asked"
+    limit = f"{spec.settle_within_s:g} s are asked"
     return (
         f"{step} cannot settle under {row.bound_s:.0f} s at this drive, and {limit}; yours {takes}; "
         f"no weight changes that."
@@ -649,14 +640,12 @@ def _beyond_reach(row: Row, spec: Spec) -> str:
 
 def _settling_beside_bound(rows: Sequence[Row], spec: Spec) -> str:
     """Return each step's settling beside what the drive allows, and the ramp where there is one."""
-    sentences, allowed = [], "at this drive and ramp" if spec.ramps else "at this drive"
+    sentences, allowed = [], "at this drive and ramp" if spec.ramp_per_s else "at this drive"
     for row in rows:
         settled = np.isfinite(row.settle_mean_s)
         takes = f"takes {row.settle_mean_s:.0f} s" if settled else "does not settle on every draw"
-        step = f"{row.start:g} to {row.target:g}{row.output and f' of {row.output}'}"
-        pace = spec.asked(row.output).pace_s
-        least = f"may take {pace:g} s" if pace else f"cannot settle under {row.bound_s:.0f} s {allowed}"
-        sentences.append(f"{step} {least}, yours {takes}")
+        step = f"{row.start:g} to {row.target:g}"
+        sentences.append(f"{step} cannot settle under {row.bound_s:.0f} s {allowed}, yours {takes}")
     return "; ".join(sentences) + "."
 
 

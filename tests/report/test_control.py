@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -14,8 +13,7 @@ from thermogrip.datasets.charts import Chart
 from thermogrip.mpc.closed_loop.simulate import ClosedLoop, Segment
 from thermogrip.mpc.controllers.mpc import Controller
 from thermogrip.mpc.controllers.pi import PIController
-from thermogrip.mpc.design.spec import Settling, Spec
-from thermogrip.mpc.tuning.tune import Row
+from thermogrip.mpc.design.spec import Spec
 from thermogrip.report import control
 from thermogrip.report.html import Plot, Table, Text
 
@@ -119,30 +117,15 @@ def test_a_tuned_controller_stands_with_its_scores_and_what_it_did_not_know(
     assert control._uncertain(tuning)
 
 
-def test_outputs_that_are_judged_apart_have_their_own_rows_and_bands():
-    spec = Spec(
-        steps=STEPS,
-        settling={"t2": Settling(within_s=600.0, band_degC=0.5)},
-    )
-    start, target = STEPS[0]
-    row = Row("tuned", start, target, 80.0, 85.0, 0.1, 0.2, 0.0, 0.0, 20.0, 21.0, 2.0, 0.5, 60.0, "t1")
-    tuning = tuning_of(spec=spec, rows=[row, replace(row, output="t2")])
-    _, rows = control.tuning_table(tuning)
-    assert [of[1] for of in rows] == [f"{start:g} to {target:g}, {name}" for name in ("t1", "t2")]
-    *_, about, _ = control.tuning_section(tuning).parts
-    assert about.text.startswith("Band 0.25 degC of t1, 0.5 degC of t2. ")
-    assert "or the ramp" in about.text
-
-
 def test_what_was_asked_stands_beside_the_design_by_the_names_of_their_files() -> None:
     tank = make_tank()
-    spec = Spec(steps=STEPS, settling={"t_surface": Settling(within_s=60.0)}, zones={"t_surface": 0.05})
+    spec = Spec(steps=STEPS, zones={"t_surface": 0.05})
     controller = Controller(tank, spec.design(tank, move=0.125))
     section = control.spec_section(tuning_of(spec=spec, controller=controller))
     asked, found = (dict(part.rows) for part in section.parts)
     assert section.verdict == "Seed 7; the same seed gives the same design."
     assert (asked["steps"], asked["settle_within_s"]) == ("[[28, 38], [28, 18]]", "450")
-    assert asked["settling"].startswith("t_surface = within_s = 60; ")
+    assert asked["zones"] == "t_surface = 0.05"
     assert "limits" not in asked
     assert (found["move"], found["controlled"]) == ("0.125", "[t_surface]")
     assert found["drive_range"] == "drive = [-1, 1]"

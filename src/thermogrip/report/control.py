@@ -14,7 +14,7 @@ from thermogrip.mpc.closed_loop.simulate import session_loop
 from thermogrip.mpc.controllers.mpc import Controller
 from thermogrip.mpc.controllers.pi import PIController
 from thermogrip.mpc.tuning.figures import closed_loop_chart
-from thermogrip.mpc.tuning.objective import bands_of, meets_spec
+from thermogrip.mpc.tuning.objective import meets_spec
 from thermogrip.report.console import Cells, Columns, cells, short
 from thermogrip.report.html import Plot, Section, Table, Text
 from thermogrip.report.plots import grasps_chart, steps_chart
@@ -61,7 +61,7 @@ def tuning_table(tuning: Tuning) -> Cells:
 
 def _case(row: Row) -> str:
     """Return what a row is of, in words."""
-    return f"{row.load or f'{row.start:g} to {row.target:g}'}{row.output and f', {row.output}'}"
+    return row.load or f"{row.start:g} to {row.target:g}"
 
 
 def tuning_caption(tuning: Tuning) -> str:
@@ -107,7 +107,7 @@ def tuning_section(tuning: Tuning) -> Section:
         Table(*tuning_table(tuning), tuning_caption(tuning)),
         Text(f"{tuning.verdict.capitalize()}. {tuning.finding}"),
         Text(
-            f"Band {_band_words(bands_of(tuning.spec, tuning.controller.design.controlled))}. "
+            f"Band {tuning.spec.band_degC:g} degC. "
             f"{_unseen_words(tuning)}; "
             f"noise, quantum and a sensor offset of {tuning.spec.sensor_offset_degC:g} degC are unknown to "
             f"the controllers. {_before_the_last_column(tuning.spec)}"
@@ -135,7 +135,7 @@ def loop_section(run: ClosedLoop, design: Design, title: str, *, tone: str = "")
     counts = ", ".join(f"{count} {status}" for status, count in statuses.items())
     chart = closed_loop_chart(run, limits=design.limits, slew_per_s=design.slew_per_s)
     caption = (
-        f"Shaded: the band of \N{PLUS-MINUS SIGN}{_band_words(run.band)}; dotted across: settled. "
+        f"Shaded: the band of \N{PLUS-MINUS SIGN}{run.band:g} degC; dotted across: settled. "
         f"Grey: limits of drive and slew. By status: {counts}."
     )
     evidence: list[Any] = [Plot(chart, caption)]
@@ -180,13 +180,6 @@ def spec_section(tuning: Tuning) -> Section:
     )
     words = f"Seed {tuning.seed}; the same seed gives the same design."
     return Section("What was requested, and the design", evidence, words, shown=0)
-
-
-def _band_words(band: float | Mapping[str, float]) -> str:
-    """Return the half width of the settling band in words, by output where they differ."""
-    if not isinstance(band, Mapping):
-        return f"{band:g} degC"
-    return ", ".join(f"{half:g} degC of {name}" for name, half in band.items())
 
 
 def _as_written(value: Any) -> str:
@@ -249,7 +242,7 @@ def _uncertain(tuning: Tuning) -> bool:
 
 def _before_the_last_column(spec: Spec) -> str:
     """Return what the minimum time means."""
-    if spec.ramps:
+    if spec.ramp_per_s:
         return (
             "Before the last column no drive inside its limits brings the output into the band, or the ramp "
             "has not brought the target there; a PI takes the target at once."

@@ -10,7 +10,7 @@ import pytest
 
 from thermogrip.mpc.design.spec import Spec
 from thermogrip.mpc.plant.prediction import PredictionModel
-from thermogrip.mpc.tuning.minimum_time import _Race, full_drive_bound
+from thermogrip.mpc.tuning.minimum_time import full_drive_bound
 from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.plant import Plant
 
@@ -154,40 +154,10 @@ def test_a_drive_that_cannot_be_off_starts_from_the_least_that_it_gives():
     assert full_drive_bound(plant, design, (20.0, 30.0), spec) == 4 + np.ceil(9.47 / 0.1)
 
 
-def race() -> _Race:
-    """Return the race of t1 from 25 to 29 degC by two drives, in samples of 10 s of a plant of 5 s."""
+def test_two_drives_one_of_which_cools_are_each_as_fast_as_its_slew():
     plant = plant_of(np.diag([0.9, 0.97]), [[2.0, 0.3], [-0.4, 0.7]], np.eye(2), y0=(25.0, 25.0))
     spec = spec_of(output=["t0", "t1"], sample_time_s=10.0, hold_s=50.0, band_degC=0.25)
-    design = replace(
-        spec.design(plant),
-        drive_range={"q0": (-0.4, 1.0), "q1": (0.1, 0.9)},
-        slew_per_s={"q0": 0.02, "q1": 0.03},
-    )
-    return _Race(plant, design, STEP, spec, "t1")
-
-
-def test_what_a_race_starts_from_and_is_limited_by():
-    made = race()
-    assert (made.row, made.side, made.goal, made.n, made.sub) == (1, 1.0, 28.75, 5, 2)
-    for value, wanted in (
-        (made.low, [-0.4, 0.1]), (made.high, [1.0, 0.9]), (made.neutral, [0.0, 0.1]), (made.slew, [0.2, 0.3]),
-    ):  # fmt: skip
-        np.testing.assert_allclose(value, wanted, rtol=1e-12)
+    ranges, slews = {"q0": (-0.4, 1.0), "q1": (0.1, 0.9)}, {"q0": 0.02, "q1": 0.03}
+    design = replace(spec.design(plant), drive_range=ranges, slew_per_s=slews)
     # -0.2, -0.4 (it cools) and 0.4, 0.7, 0.9, for 10 s each: 0.36, 0.71, 1.34, 1.95, 2.68, 3.39, 4.08 K
-    assert made.shortest_time() == 35.0
-
-
-@pytest.mark.parametrize(
-    ("trust", "first", "second"),
-    # as much as the slew allows from (0, 0.1) on; then within an eighth of each range about the plan
-    [(np.inf, [-0.2, 0.4], [-0.4, 0.7]), (0.125, [-0.175, 0.3], [-0.175, 0.3])],
-)
-def test_a_programme_goes_where_the_gradient_does_within_slew_range_and_trust(trust, first, second):
-    made = race()
-    plan = np.tile([0.0, 0.2], (5, 1))
-    gradient = made._gradient(plan, 3)  # two samples, the second of which ends after it
-    # by 0.97^2 = 0.9409: 1 + 0.97 by the last sample, times 0.9409 by the one before
-    np.testing.assert_allclose(gradient[:2], 1.97 * np.array([[0.9409], [1.0]]) * [-0.4, 0.7], rtol=1e-9)
-    assert not gradient[2:].any()
-    found = made._programme(gradient, plan, 2, trust)
-    np.testing.assert_allclose(found, [first, *[second] * 4], atol=1e-9)
+    assert full_drive_bound(plant, replace(design, controlled=("t1",)), STEP, spec) == 35.0

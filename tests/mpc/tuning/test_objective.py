@@ -26,7 +26,7 @@ from thermogrip.mpc.tuning.objective import (
     expected,
     lacking,
     loads_of,
-    results_of,
+    result_of,
     run_trials,
     score,
     signal_of,
@@ -76,7 +76,7 @@ def test_a_load_without_noise_is_seen_and_met_without_any_before(tank):
     load = Load("t_surface", -1.0, 10.0)
     made = Controller(tank, design)
     run = trial(made, tank, spec, Case(36.0, 36.0, 0, load=load))
-    (result,) = results_of(run, spec, Case(36.0, 36.0, 0, load=load))
+    result = result_of(run, Case(36.0, 36.0, 0, load=load))
     assert 0.3 < result.overshoot < 1.0  # the largest error: less than the load, which comes gradually
     assert np.isfinite(result.settle_s)
     assert abs(result.bias) < 0.05
