@@ -63,11 +63,6 @@ def limit_breaks(name: str, over: float) -> str:
     return f"limit of {name} will be broken by {over:.1f} degC: choose a nearer target"
 
 
-def out_of_reach(name: str, target: float, nearest: float) -> str:
-    """Return what is said of a target that no drive holds."""
-    return f"no drive holds {name} at {target:.1f} degC: {nearest:.1f} degC can be held"
-
-
 def pump_off(switches: Sequence[str]) -> str:
     """Return what is said while no water moves the heat."""
     return f"{', '.join(switches)} is off: drive to zero until it runs"

@@ -40,12 +40,11 @@ class _Code(IntEnum):
     OUT_OF_RANGE = 9
     LIMIT_BREAKS = 10
     STUCK = 11
-    OUT_OF_REACH = 12
-    TOO_LATE = 13
-    SENSOR_OFFSET = 14
-    WORLD_CHANGED = 15
-    UNSEEN = 16
-    PUMP_OFF = 17
+    TOO_LATE = 12
+    SENSOR_OFFSET = 13
+    WORLD_CHANGED = 14
+    UNSEEN = 15
+    PUMP_OFF = 16
 
 
 class CompiledStep:
@@ -144,9 +143,6 @@ class CompiledStep:
         if code in (_Code.BLIND, _Code.UNSEEN):
             unread_s = self.c.view("unread_s", (len(reference.controlled),))
             return advice.blind(unread_s.min()) if code == _Code.BLIND else reference.say_unseen(unread_s)
-        if code == _Code.OUT_OF_REACH:
-            wanted = self.c.view("ramped", (len(reference.controlled),))[reference.controlled.index(name)]
-            return advice.out_of_reach(name, wanted, self.c.view("nearest", (1,))[0])
         if code == _Code.BAD_TARGET:
             begin = len(self._names)
             targets = self.c.given[begin : begin + len(reference.controlled)]

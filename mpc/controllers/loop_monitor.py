@@ -12,16 +12,14 @@ loop of a PI has the poles of
 and with the slowest of them, 1 / t, it is there in L + 4 t (2 % are left); a predictive controller is held to
 the PI by Skogestad's rule.
 
-**Limits.**  Where a drive is within 1 % of its range of its limit, on the side to which the error drives it,
-the plant has nothing but its own lag.  On the way to a rest at or beyond the target the distance falls by
-1 - exp(-1) in T, or by 28 % where the lag is three times the model's; one of which three quarters remain
-after L + T is held by nothing.  One that has grown after 2 L, and for as long as the loop takes to arrive, is
-driven by another plant or a load.
+**Reach.**  At a new target, and while an output stays off its own, the drives are sought that hold all
+targets in steady state, with the biases that the filter has found.  Where none do, within the ranges of the
+drives and the limits of outputs, it is said, with what can be held: a dead heater is a drive with a bias of
+its whole range.
 
 **Another plant.**  A drive whose estimated bias is beyond 30 % of its range, or an output's beyond a third of
 a jump, for as long as the loop takes to arrive: a draw is over by then.  Besides,
-:mod:`thermogrip.mpc.estimator.structure_monitor`, :mod:`thermogrip.mpc.estimator.fault_monitors` and
-:mod:`thermogrip.mpc.estimator.oscillation`.
+:mod:`thermogrip.mpc.estimator.fault_monitors` and :mod:`thermogrip.mpc.estimator.oscillation`.
 """
 
 from __future__ import annotations
@@ -32,24 +30,22 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from thermogrip.datasets.arrays import Array, Mask
+from thermogrip.datasets.arrays import Array
 from thermogrip.mpc.design.design import Design, PILoop
 from thermogrip.mpc.estimator.call_times import RESTART_S, SAME
 from thermogrip.mpc.estimator.fault_monitors import GainMonitor, StuckMonitor
 from thermogrip.mpc.estimator.oscillation import NOISE_SD, OscillationMonitor
 from thermogrip.mpc.estimator.reading_checks import follows
-from thermogrip.mpc.estimator.structure_monitor import StructureMonitor
 from thermogrip.mpc.interface import Move, Readings, Trajectory, number, target_now
-from thermogrip.mpc.plant.prediction import prediction_model, step_response
+from thermogrip.mpc.optimiser.rti import BREAKS
+from thermogrip.mpc.plant.prediction import holding_drive, prediction_model, step_response
 
 if TYPE_CHECKING:
     from thermogrip.sysid.plant.plant import Plant
 
 _CONSTANTS = 4.0  # time constants until a loop is there
-_AT_LIMIT = 0.01  # of a range
-_STALLED = 0.75  # of a distance, left after the delay and the lag
+_OUTSIDE = 0.01  # of a range, by which what balances an integrator may be beyond it
 _REMEMBER = 0.3  # share of the newest distance in their mean
-_EVEN = 0.1  # of a sample time, by which calls may differ from it in a window of the structure's monitor
 
 
 class _Answer(NamedTuple):
@@ -102,7 +98,7 @@ class LoopMonitor:
 
     def __init__(self, plant: Plant, design: Design, loops: Sequence[PILoop] | None = None) -> None:
         self.model, self.loops = prediction_model(plant, design.dt), tuple(loops or design.loops)
-        model, n = self.model, len(self.loops)
+        model = self.model
         self.controlled = design.controlled
         self._rows = [model.outputs.index(p.output) for p in self.loops]
         self._drives = [model.drives.index(p.drive) for p in self.loops]
@@ -112,11 +108,11 @@ class LoopMonitor:
         self._promised = np.array(
             [settling_time(a.gain / s, *a[1:], p.Kc, p.Ti) for a, s, p in answers_of_loops]
         )
-        low, high = np.array([design.drive_range[p.drive] for p in self.loops], dtype=float).reshape(n, 2).T
-        self._low, self._high = low + _AT_LIMIT * (high - low), high - _AT_LIMIT * (high - low)
-        self._side = np.sign([p.Kc for p in self.loops])
-        self._delay, self._lag = np.array([[a.delay, a.lag] for a in answers]).reshape(n, 2).T
+        self._look_s = max((a.delay + a.lag for a in answers), default=np.inf)
+        delays = [a.delay for a in answers]
         self._zone = np.array([design.zones.get(p.output, 0.0) for p in self.loops])
+        self._ranges = np.array([design.drive_range[name] for name in model.drives], dtype=float).T
+        self._limits = dict(design.limits)
         self.names = tuple(p.output for p in self.loops)
         filters = {name: design.observer(model) for name in model.drives}
         self.gain = GainMonitor(filters, float(np.max(self._promised, initial=0.0)))
@@ -124,8 +120,7 @@ class LoopMonitor:
         self.observer = design.observer(model)
         noise = NOISE_SD * np.sqrt(self.observer.R[self._rows])
         self._near = np.maximum(2.0 * design.overshoot, noise)  # of its target an output is there
-        self.swings = OscillationMonitor(self.names, model.dt, self._delay.tolist(), self._near.tolist())
-        self.structure = StructureMonitor(plant, model, self.controlled)
+        self.swings = OscillationMonitor(self.names, model.dt, delays, self._near.tolist())
         self.forget()
 
     def forget(self) -> None:
@@ -134,7 +129,6 @@ class LoopMonitor:
         self._time_s = np.nan
         self._u: Array | None = None
         self._goals: list[float] = []
-        self.structure.forget()
         self.gain.forget()
         self.stuck.forget()
         self._restart()
@@ -145,13 +139,9 @@ class LoopMonitor:
         self.swings.restart()
         self._target = np.full(n, np.nan)
         self._error = np.full(n, np.nan)  # mean of the last errors
-        self._limited_s = np.zeros(n)
-        self._away_s = np.zeros(n)
         self._strange_s = 0.0
-        self._marked_s = np.zeros(n)  # when the distance was noted
-        self._marked = np.full(n, np.inf)  # the distance then
-        self._begun = np.full(n, np.inf)  # the distance when 2 L were over
-        self._stalled = np.zeros(n, dtype=bool)
+        self._looked_s = np.inf  # since the drives were sought that hold the targets
+        self._unreachable = ""
 
     def note(self, reading: Readings, move: Move, target: Trajectory) -> str:
         """Note a reading, the move that answered it, and the target; return what is to be said of the loop,
@@ -178,7 +168,7 @@ class LoopMonitor:
             self._restart()  # no law is followed
             self.said = ""
         else:
-            self.said = self._judge(y[self._rows], np.array(goals), applied[self._drives], seconds, strange)
+            self.said = self._judge(y[self._rows], np.array(goals), d, seconds, strange)
         return self.said
 
     def _follow(self, y: Array, d: Array, applied: Array, seconds: float, *, new: bool) -> str:
@@ -188,59 +178,63 @@ class LoopMonitor:
         if self._u is None or seconds > RESTART_S + self.model.dt:
             observer.reset(y, d)
             observer.update(y)
-            self.structure.restart()
             self.gain.restart(y, d)
             self.stuck.forget()
         else:
             observer.advance(seconds, applied, d)
             observer.look(d)
             self.gain.note(observer.update(y), observer.R, y, applied, d, seconds, new=new)
-        if self._u is not None and abs(seconds - self.model.dt) > _EVEN * self.model.dt:
-            self.structure.restart()
-        self.structure.note(observer, y, applied, d)
         self.stuck.note(observer, y, applied, d)
         return follows(observer, self.controlled)
 
-    def _judge(self, y: Array, target: Array, u: Array, seconds: float, strange: str) -> str:
-        """Return what is to be said after readings y and targets of the loops (n,) and drives u (n,)."""
+    def _judge(self, y: Array, target: Array, d: Array, seconds: float, strange: str) -> str:
+        """Return what is to be said after readings y and targets of the loops (n,) amid disturbances d."""
         if np.any(target != self._target):
             self._restart()
             self._target = target.copy()
-        error, band = target - y, self._near
+        error = target - y
         swings = self.swings.note(-np.sign(error) * np.maximum(np.abs(error) - self._zone, 0.0), seconds)
         begun = np.where(np.isfinite(self._error), self._error, error)
         self._error = np.where(np.isfinite(error), begun + _REMEMBER * (error - begun), begun)
-        limited = self._limits(u, seconds)
-        off, names = np.abs(self._error), self.names
-        away = limited & (off > self._begun + band)
-        self._away_s = np.where(away, self._away_s + seconds, 0.0)
         self._strange_s = self._strange_s + seconds if strange else 0.0
-        if self.stuck.said:
-            return self.stuck.said
-        for which in (self._away_s > self._promised, limited & self._stalled):
-            if which.any():
-                k = int(np.argmax(np.where(which, off / band, 0.0)))
-                does = f"stays {off[k]:.2g} off its target"
-                does = "goes away from its target" if away[k] and not self._stalled[k] else does
-                why = "a load, or another plant than the model"
-                return f"{names[k]} {does} while {self.loops[k].drive} is at its limit: {why}"
+        self._look(target, d, seconds)
+        lasts = self._strange_s > np.max(self._promised, initial=0.0)
+        if said := self.stuck.said or self._unreachable:
+            return said
         if swings:
             return "; ".join(filter(None, (swings, strange)))
-        lasts = self._strange_s > np.max(self._promised, initial=0.0)
-        other = self.structure.said or self.gain.said
-        return other or (f"{strange} or is it a load?" if strange and lasts else "")
+        return self.gain.said or (f"{strange} or is it a load?" if strange and lasts else "")
 
-    def _limits(self, u: Array, seconds: float) -> Mask:
-        """Note for how long drives have been at the limits to which errors drive them; return which are."""
-        way, off = self._side * self._error, np.abs(self._error)
-        limited = (off > self._near) & np.where(way > 0, u >= self._high, u <= self._low)
-        self._limited_s = np.where(limited, self._limited_s + seconds, 0.0)
-        fresh = ~limited | np.isinf(self._marked)
-        self._stalled &= limited
-        due = limited & (self._limited_s - self._marked_s >= self._delay + self._lag)
-        self._stalled = np.where(due, off > _STALLED * self._marked, self._stalled)
-        self._marked = np.where(fresh | due, np.where(limited, off, np.inf), self._marked)
-        self._marked_s = np.where(fresh | due, self._limited_s, self._marked_s)
-        early = self._limited_s <= 2.0 * self._delay
-        self._begun = np.where(early, np.where(limited, off, np.inf), self._begun)
-        return np.asarray(limited)
+    def _look(self, target: Array, d: Array, seconds: float) -> None:
+        """Seek the drives that hold the targets of the loops (n,), where they are new or have been missed for
+        long."""
+        self._looked_s += seconds
+        if not np.any(np.abs(self._error) > self._near + self._zone):
+            self._unreachable = ""
+        elif self._looked_s >= self._look_s:
+            self._unreachable, self._looked_s = self._missed(target, d), 0.0
+
+    def _missed(self, target: Array, d: Array) -> str:
+        """Return which target (n,) no drive holds, and what can be held; empty where drives hold all."""
+        observer, bias, rows = self.observer, self.observer.output_bias, self._rows
+        low, high = self._ranges + observer.drive_bias
+        asked = target - bias[rows]
+        d = d + observer.disturbance_bias
+        if not np.isfinite(asked).all():
+            return ""
+        held = holding_drive(self.model, self.names, asked, d, within=(low, high))
+        shown = held.y + bias
+        miss = np.abs(shown[rows] - target) - self._zone
+        slack = _OUTSIDE * self.model.span
+        if np.any((held.u < low - slack) | (held.u > high + slack)):
+            return f"no drive holds {', '.join(self.names)}: the drives would go beyond their ranges"
+        if np.any(miss > self._near):
+            k = int(np.argmax(miss / self._near))
+            can = f"{shown[rows[k]]:.4g} can be held while the load is as it is"
+            return f"no drive holds {self.names[k]} at {target[k]:.4g}: {can}"
+        for name, (least, most) in self._limits.items():
+            i = self.model.outputs.index(name)
+            beyond = max(least - shown[i], shown[i] - most)
+            if beyond > BREAKS * self.model.unit[i]:
+                return f"with {', '.join(self.names)} on target {name} is at {shown[i]:.4g}, beyond its limit"
+        return ""

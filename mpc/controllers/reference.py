@@ -6,7 +6,7 @@ an answer, so every failure has a next best one, and the status says which:
 
 * ``ok``: the optimiser's move;
 * ``late``: the deadline passed, so the last plan goes on (the PI, where there is none);
-* ``infeasible``: a target that is no number or out of reach, a limit that must break, an applied drive out
+* ``infeasible``: a target that is no number, a limit that must break, an applied drive out
   of range; the move is the nearest that can be;
 * ``fallback_plan``: no usable reading, or the solver failed; the last plan goes on, for ``patience_s``.  Of
   several controlled outputs one may be lost: the optimiser goes on, for ``patience_s`` with the model in
@@ -15,8 +15,6 @@ an answer, so every failure has a next best one, and the status says which:
 * ``off``: no reading to act on, or the pump is off; the drive goes to zero.
 
 Whatever the status, a drive is finite, inside its range, and within the slew limit of the one before.
-Where mean innovations exceed 3 standard deviations, the weight of moves is multiplied by their third, up
-to 30 times: a gain that is off by 30 % does not swing.
 
 It may be called at any rate (:mod:`thermogrip.mpc.estimator.call_times`): before a move is due the last one
 is held, with its status; called more seldom than its sample time, it answers with the mean of the plan over
@@ -41,8 +39,7 @@ from thermogrip.mpc.estimator.call_times import RESTART_S, opening, shifted
 from thermogrip.mpc.estimator.observer import DisturbanceModel
 from thermogrip.mpc.estimator.reading_checks import ReadingMonitor, is_off
 from thermogrip.mpc.interface import Move, Readings, Trajectory
-from thermogrip.mpc.native.shared_constants import CAUTION, MOST_CAUTION, STAYS, WEAK
-from thermogrip.mpc.optimiser.reach import Reach
+from thermogrip.mpc.native.shared_constants import STAYS, WEAK
 from thermogrip.mpc.optimiser.rti import BREAKS_FAR, Optimiser, Outcome, Sample
 from thermogrip.mpc.plant.prediction import prediction_model
 
@@ -99,7 +96,6 @@ class ReferenceController(SampledController):
         self.observer = design.observer(model)
         self.pi = PIController(plant, design, loops=tuple(replace(p, feedforward=0.0) for p in design.loops))
         self.monitor = ReadingMonitor(model.n_y, spike=model.spike)
-        self.reach = Reach(self.optimiser, self.observer)
         lost = np.full(model.n_y, np.nan)
         self._start(lost, model.undisturbed(design.ambient), self.observer.reset)
 
@@ -179,7 +175,6 @@ class ReferenceController(SampledController):
         self._approach = _Approach(np.zeros(len(self._rows)), np.full(len(self._rows), np.nan))
         self._past = _Past(y, d, self.observer.now)
         self.monitor.forget(y)
-        self.reach.forget()
         self.optimiser.forget()
 
     def _pass(self, seconds: float, applied: Array) -> None:
@@ -226,7 +221,7 @@ class ReferenceController(SampledController):
             return
         self.observer.look(self._past.d)
         self.monitor.expect(self.model.C @ (self.observer.now - self._past.x))
-        self.observer.refine(self.monitor.screen_between(y, self.observer.reading()))
+        self.observer.update(self.monitor.screen_between(y, self.observer.reading()))
         self._past.x = self.observer.now
 
     def _accept_jump(self, y: Array, stays: Mask) -> str:
@@ -284,23 +279,10 @@ class ReferenceController(SampledController):
         self._follows.age_s, self._follows.on_pi = 0.0, False
         if outside:
             return _Choice(self._first_of(self._follows.plan), "infeasible", advice.OUT_OF_RANGE)
-        return _Choice(self._first_of(self._follows.plan), *self._judge(outcome, wanted, started))
+        return _Choice(self._first_of(self._follows.plan), *self._judge(outcome, started))
 
-    def _judge(self, outcome: Outcome, wanted: Array, started: float) -> tuple[str, str]:
+    def _judge(self, outcome: Outcome, started: float) -> tuple[str, str]:
         """Return the status and the advice of a plan that was found."""
-        end, zone = outcome.y[-1, self._rows], self.optimiser.weights.zone
-        missed = self.reach.missed(
-            self.observer,
-            self._u,
-            self._past.d,
-            target=np.where(zone > 0, np.clip(end, wanted - zone, wanted + zone), wanted),
-            side=self._approach.side,
-            ahead=end,
-            seen=self._unread_s == 0,
-        )
-        if missed is not None:
-            which, nearest = missed
-            return "infeasible", advice.out_of_reach(self.controlled[which], wanted[which], nearest)
         if outcome.broken:
             units = dict(zip(self.model.outputs, self.model.unit.tolist()))
             name, over = max(outcome.broken.items(), key=lambda item: item[1] / units[item[0]])
@@ -323,10 +305,9 @@ class ReferenceController(SampledController):
         observer = self.observer
         d = self._past.d + observer.disturbance_bias
         guess, biases = self._guess(wanted, last), (observer.output_bias, observer.drive_bias)
-        caution = min(max(1.0, float(np.max(np.abs(observer.innovation))) / CAUTION), MOST_CAUTION)
         slew_s = self.times.slew_s
         sample = Sample(
-            observer.now, last, guess, d, wanted, self._approach.side, *biases, slew_s, self._lost, caution
+            observer.now, last, guess, d, wanted, self._approach.side, *biases, slew_s, self._lost
         )
         return self._converged(sample._replace(ahead=ahead))
 

@@ -179,7 +179,6 @@ def resting_state_in_room(model: PredictionModel, ambient: float, unit: tuple[fl
 
 
 _REPEATS, _STEADY = 5, 1e-3  # of the start on a nonlinear plant, and when it is still [units]
-NEWEST_INNOVATION = 0.2  # share of the newest innovation in their mean
 #: Of a drive, in fractions of its range: no drive makes up for more.
 LARGEST_BIAS = 1.0
 
@@ -320,8 +319,7 @@ class Observer:
 
     Where readings come at other times: ``advance`` by the seconds that passed, ``look``, then ``update``. x
     (n_x,) is the state at the last sample, w (n_w,) the disturbances, ``found_offset`` (n_y,) what each
-    sensor was found to read too much at the start or after a jump that stayed, ``innovation`` (n_y,)
-    the mean of the last innovations in their standard deviations.
+    sensor was found to read too much at the start or after a jump that stayed.
     """
 
     def __init__(
@@ -364,7 +362,6 @@ class Observer:
         self._n = model.n_x + disturbance.n_w
         self._P = np.zeros((self._n, self._n))
         self._held = np.zeros(self._n, dtype=bool)
-        self.innovation = np.zeros(model.n_y)
         self._on_sample()
 
     def hold_drives(self, weak: Mask) -> None:
@@ -413,7 +410,7 @@ class Observer:
         self.x, self.w = x, np.zeros(self.disturbance.n_w)
         self._held[:] = False
         self._on_sample()
-        self.found_offset, self.innovation = np.zeros(self.model.n_y), np.zeros(self.model.n_y)
+        self.found_offset = np.zeros(self.model.n_y)
         whole = np.zeros((n, n))
         whole[:n_x, :n_x] = P
         whole[n_x:, n_x:] = np.diag(self.P0)
@@ -473,18 +470,9 @@ class Observer:
 
     def update(self, y: Array) -> Array:
         """Correct the estimate with a reading (n_y,), NaN where lost; return the innovation (n_y,)."""
-        return self._correct(y, self.R + self._bent**2, remember=NEWEST_INNOVATION)
+        return self._correct(y, self.R + self._bent**2)
 
-    def refine(self, y: Array) -> None:
-        """Correct the estimate with a reading (n_y,) between two moves, of which alone innovations count."""
-        self._correct(y, self.R + self._bent**2)
-
-    @property
-    def innovation_bias(self) -> float:
-        """How far the mean innovation is from 0, in standard deviations of that mean; the largest of all."""
-        return float(np.max(np.abs(self.innovation)) * np.sqrt((2 - NEWEST_INNOVATION) / NEWEST_INNOVATION))
-
-    def _correct(self, y: Array, R: Array, *, remember: float = 0.0) -> Array:
+    def _correct(self, y: Array, R: Array) -> Array:
         """Correct the estimate with a reading whose variances are R (n_y,), but for states that are held."""
         innovation = y - self.reading()
         read = np.flatnonzero(np.isfinite(y))
@@ -493,9 +481,6 @@ class Observer:
             PH = self._P @ H.T
             S = H @ PH + np.diag(R[read])
             gain = np.linalg.solve(S, PH.T).T
-            mean = self.innovation.copy()
-            mean[read] += remember * (innovation[read] / np.sqrt(np.diag(S)) - mean[read])
-            self.innovation = mean
             gain[np.asarray(self._held, dtype=bool)] = 0.0  # C holds whole numbers
             uncorrected = np.eye(self._P.shape[0]) - gain @ H  # Joseph's form: right for any gain
             self._P = uncorrected @ self._P @ uncorrected.T + (gain * R[read]) @ gain.T

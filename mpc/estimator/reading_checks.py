@@ -88,15 +88,10 @@ class ReadingMonitor:
         return y, np.asarray(np.abs(np.nan_to_num(y - expected)) > self._spike)
 
 
-def too_weak(observer: Observer) -> np.bool_:
-    """Return whether a drive does far less, or far more, than the model has."""
-    return np.any(np.abs(observer.disturbance.on_drive @ observer.w) >= FOLLOWS_DRIVE)
-
-
 def follows(observer: Observer, controlled: tuple[str, ...]) -> str:
     """Return the report where the model no longer explains the plant; empty where it does."""
     pump = "does the pump run" if observer.model.model.switches else ""
-    if too_weak(observer):
+    if np.any(np.abs(observer.disturbance.on_drive @ observer.w) >= FOLLOWS_DRIVE):
         do = "does" if len(controlled) == 1 else "do"
         return f"{', '.join(controlled)} {do} not follow the drive: {pump or 'is it another plant'}?"
     off = np.abs(observer.output_bias - observer.offset)

@@ -18,13 +18,11 @@ from thermogrip.mpc.native.shared_constants import shared_definitions
 
 if TYPE_CHECKING:
     from thermogrip.mpc.design.design import Design
-    from thermogrip.mpc.estimator.observer import DisturbanceModel
     from thermogrip.mpc.native.codegen import ModelCode
     from thermogrip.mpc.optimiser.rti import ControllerParts
     from thermogrip.mpc.plant.prediction import PredictionModel
 
 ITERATION_LIMIT = 500
-_INTEGRATES = 1e10  # condition of I - A, from which on a plant has no steady state worth the name
 
 #: name -> (whole number?, shape in names of sizes, comment)
 _FIELDS: dict[str, tuple[bool, tuple[str, ...], str]] = {
@@ -81,7 +79,6 @@ _FIELDS: dict[str, tuple[bool, tuple[str, ...], str]] = {
     "limit_low": (False, ("NL",), "[degC]"),
     "limit_high": (False, ("NL",), "[degC]"),
     "at_rest": (False, ("NB", "NU"), "response to each block at rest"),
-    "settled_gain": (False, ("NU",), "steady gain of each drive at rest, 0 where it is not known"),
     "Kc": (False, ("NC",), "gain of each loop [drive units per degC]"),
     "Ti": (False, ("NC",), "its integral time [s]"),
     "setpoint": (False, ("NC",), "share of a change of the target that its gain answers to"),
@@ -100,9 +97,6 @@ _FIELDS: dict[str, tuple[bool, tuple[str, ...], str]] = {
     "rest": (False, ("NX",), "state at rest where all is at `ambient` and `usual_d`"),
     "rest_level": (False, ("NX",), "how it answers to the mean of the readings"),
     "rest_d": (False, ("NX", "ND"), "and to the measured disturbances"),
-    "settles": (True, (), "whether what follows says where a linear plant settles"),
-    "settled_by": (False, ("NY", "NV"), "outputs at rest by shares of the drives, disturbances, and biases"),
-    "settled": (False, ("NY",), "and without them"),
     "by_x": (False, ("NO", "NX"), "of a linear plant, the soft rows of each sample by the state,"),
     "by_d": (False, ("NO", "ND"), "by the disturbances,"),
     "by_none": (False, ("NO",), "and without them"),
@@ -135,11 +129,6 @@ class Sizes:
     def NS(self) -> int:
         """Soft rows of a sample."""
         return self.NC + self.NL
-
-    @property
-    def NV(self) -> int:
-        """Drives, measured disturbances and disturbance states."""
-        return self.NU + self.ND + self.NW
 
     @property
     def NZ(self) -> int:
@@ -179,13 +168,6 @@ def sizes_of(controller: ControllerParts, code: ModelCode, *, room: bool) -> Siz
     )
 
 
-def _settles(model: PredictionModel) -> bool:
-    """Return whether a plant is linear, and has a steady state."""
-    if model.affine is None:
-        return False
-    return bool(np.linalg.cond(np.eye(model.n_x) - model.affine.A) < _INTEGRATES)
-
-
 def _multiple_of_four(n: int) -> int:
     """Return n numbers in whole groups of four, as the C has its rows."""
     return -(-n // 4) * 4
@@ -200,7 +182,7 @@ def _row_lengths(blocks: Sequence[int], n_u: int) -> int:
 
 def config_header(sizes: Sizes) -> str:
     """Return ``tg_config.h``: the sizes, and the struct of a design."""
-    names = [*(entry.name for entry in fields(Sizes)), "NS", "NV"]
+    names = [*(entry.name for entry in fields(Sizes)), "NS"]
     lines = ["/* Sizes and numbers of one controller. */", "#ifndef TG_CONFIG_H", "#define TG_CONFIG_H", ""]
     lines += [f"#define TG_{name} {getattr(sizes, name)}" for name in names]
     lines += ["", "/* What the C shares with the Python. */", *shared_definitions()]
@@ -267,7 +249,6 @@ def numbers_of(controller: ControllerParts, k: Array) -> dict[str, Any]:
         (observer, "fixed offset R Q load P0 R_start"),
         (disturbance, "on_drive on_disturbance on_output"),
     )
-    settled = optimiser.at_rest.settled
     return {name: getattr(source, name) for source, names in same_names for name in names.split()} | {
         "n_b": len(design.blocks),
         "N": sum(design.blocks),
@@ -290,7 +271,6 @@ def numbers_of(controller: ControllerParts, k: Array) -> dict[str, Any]:
         "weight": optimiser.weights.output,
         "energy": [design.energy_price.get(name, 0.0) for name in model.drives],
         "at_rest": optimiser.at_rest.response,
-        "settled_gain": np.zeros(model.n_u) if settled is None else settled,
         **{name: [getattr(loop, name) for loop in loops] for name in ("Kc", "Ti", "setpoint")},
         "k": k,
         "y0": model.output(np.zeros(model.n_x)),
@@ -299,7 +279,6 @@ def numbers_of(controller: ControllerParts, k: Array) -> dict[str, Any]:
         "rest_d": resting.by_d,
         "P_rest": resting.P,
         **_free_response(model, design, rows),
-        **_steady_outputs(model, disturbance),
     }
 
 
@@ -316,20 +295,6 @@ def _free_response(model: PredictionModel, design: Design, rows: list[int]) -> d
         name: response[:, rows].reshape(len(response) * len(rows), *response.shape[2:])
         for name, response in responses.items()
     }
-
-
-def _steady_outputs(model: PredictionModel, disturbance: DisturbanceModel) -> dict[str, Any]:
-    """Return the outputs of a linear plant at rest by drives, disturbances and disturbance states."""
-    sides = model.n_u + model.n_d + disturbance.n_w
-    nothing = {"settles": False, "settled_by": np.zeros((model.n_y, sides)), "settled": np.zeros(model.n_y)}
-    if model.affine is None or not _settles(model):
-        return nothing
-    added, A, B, E = model.affine
-    away, by_share = np.eye(model.n_x) - A, B * model.span
-    by_w = by_share @ disturbance.on_drive + E @ disturbance.on_disturbance
-    by = model.C @ np.linalg.solve(away, np.column_stack([by_share, E, by_w, added]))
-    level = by[:, -1] + model.output(np.zeros(model.n_x))
-    return {"settles": True, "settled_by": by[:, :-1], "settled": level}
 
 
 def _padded(sizes: Sizes, name: str, values: Any) -> Array:

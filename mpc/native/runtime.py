@@ -157,7 +157,7 @@ def _truth_library(model: _ByStructure, drives: tuple[int, ...], h: float) -> ct
 @cache
 def _loaded_library(path: Path) -> ctypes.CDLL:
     library = ctypes.CDLL(str(path))
-    doubles, integers = "x w P found_offset seen target y ramped unread_s nearest", "stays qp_status"
+    doubles, integers = "x w P found_offset seen target y unread_s", "stays qp_status"
     for names, kind in ((doubles, ctypes.c_double), (integers, ctypes.c_int)):
         for name in names.split():
             getattr(library, f"tg_host_{name}").restype = ctypes.POINTER(kind)

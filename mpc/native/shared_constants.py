@@ -9,21 +9,16 @@ from __future__ import annotations
 from types import ModuleType
 
 from thermogrip.mpc.estimator import call_times, observer, reading_checks
-from thermogrip.mpc.optimiser import qp, reach, rti
+from thermogrip.mpc.optimiser import qp, rti
 
-CAUTION, MOST_CAUTION = 3.0, 30.0  # of a mean innovation, from which on moves weigh more; how much more
 STAYS = 1e-5  # of its range: a plan that moves by less has converged
 UNCUT = 1e-9  # of its range: a drive of the PI that is cut by less is not limited
 WEAK = 0.05  # of its gain at rest, below which a drive's bias is not learnt
 
 _SHARED: dict[ModuleType, tuple[str, ...]] = {
     call_times: ("RESTART_S", "SAME"),
-    observer: ("LARGEST_BIAS", "NEWEST_INNOVATION"),
+    observer: ("LARGEST_BIAS",),
     qp: ("SHORT", "TOLERANCE"),
-    reach: (
-        *("BEYOND_LIMIT", "CAN", "CANNOT", "CONVERGED", "LEAST_SD", "MISS_ALARM", "MISS_ALLOWANCE"),
-        *("MISS_CLIP", "STEADY_STEPS", "STRIDE", "SWEEPS", "TAKE_BACK"),
-    ),
     reading_checks: (*("LEFT_OUT", "SHARE"),),
     rti: (
         "BARELY",
@@ -42,14 +37,7 @@ _SHARED: dict[ModuleType, tuple[str, ...]] = {
 def shared_constants() -> dict[str, float | tuple[float, ...]]:
     """Return each shared constant by the name that the C puts behind ``TG_``."""
     out = {name: getattr(module, name) for module, names in _SHARED.items() for name in names}
-    out |= {"CAUTION": CAUTION, "MOST_CAUTION": MOST_CAUTION, "STAYS": STAYS, "UNCUT": UNCUT, "WEAK": WEAK}
-    # standard deviation of a mean with an exponential memory, of unit variance
-    out["INNOVATION_SD"] = _sd_of_mean(observer.NEWEST_INNOVATION)
-    return out
-
-
-def _sd_of_mean(newest: float) -> float:
-    return float((newest / (2 - newest)) ** 0.5)
+    return out | {"STAYS": STAYS, "UNCUT": UNCUT, "WEAK": WEAK}
 
 
 def shared_definitions() -> list[str]:

@@ -79,7 +79,6 @@ class Sample(NamedTuple):
     drive_bias: Array  # (n_u,) in the drives' units
     slew_s: float | None = None  # seconds that the slew limit of the first move counts; a sample where absent
     lost: Mask | None = None  # (n_controlled,) outputs that cost nothing, and whose drives go to rest
-    caution: float = 1.0  # factor on the design's move weight
     ahead: Array | None = None  # (N, n_controlled) targets of each sample, where they change
 
 
@@ -135,8 +134,6 @@ class RestGains:
     response: Array  # (n_b, n_u) of that output to each block, summed over time
     # (n_b, n_u) whether the horizon shows the response of a drive whose gain may fade or turn over
     seen: Mask
-    # (n_u,) steady gain of that output; None where a drive moves nothing or the plant does not settle
-    settled: Array | None
 
     @classmethod
     def of(cls, model: PredictionModel, design: Design) -> RestGains:
@@ -150,14 +147,7 @@ class RestGains:
         # of a drive that is no loop's and serves a limit, what it does to a target may fade or turn over
         paired = {loop.drive for loop in design.loops}
         is_seen &= np.array([name in paired or not (paired and design.limits) for name in model.drives])
-        step = model.linearise(x, u, d)
-        try:
-            gain = model.C @ np.linalg.solve(np.eye(model.n_x) - step.A, step.B * model.span)
-        except np.linalg.LinAlgError:
-            return cls(strongest, response, is_seen, None)
-        settled = gain[rows[strongest], np.arange(model.n_u)]
-        moves = np.isfinite(settled).all() and np.all(np.abs(settled) > 1e-9)
-        return cls(strongest, response, is_seen, settled if moves else None)
+        return cls(strongest, response, is_seen)
 
 
 def _strongest_response(G: Array, rows: NDArray[np.int_]) -> Array:
@@ -176,7 +166,6 @@ class Problem:
     counted: list[int]  # controlled outputs that cost anything
     parked: list[int]  # drives that go to rest
     more: float = 0.0  # samples, by which the slew limit of the first move is longer than one
-    caution: float = 1.0  # times that the weight of moves counts
 
 
 class LinearGains(NamedTuple):
@@ -284,7 +273,6 @@ class Optimiser:
             counted=np.flatnonzero(~lost).tolist(),
             parked=np.flatnonzero(lost[self.pair]).tolist(),
             more=0.0 if sample.slew_s is None else sample.slew_s / self.design.dt - 1.0,
-            caution=sample.caution,
         )
 
     def _linearised(self, x: Array, plan: Array, d: Array) -> tuple[Array, Array]:
@@ -355,29 +343,23 @@ class Optimiser:
         away, last_away = guess - drives.neutral, problem.last - drives.neutral
         reach = (self.reach[:, None] + problem.more) * drives.slew
         least = np.where(away * last_away > 0, np.abs(last_away) - reach, 0.0)  # what the slew allows
-        ends = self.faded_range(away, drive_bias, authority, drives.neutral, least)
-        low, high = (np.broadcast_to(end, guess.shape) for end in ends)
+        low, high = self._faded_range(away, drive_bias, authority, least)
         if not problem.parked:
             return low, high
         little = np.zeros(self.model.n_u)
         little[problem.parked] = LITTLE * self.model.span[problem.parked]
         return self._park(low, problem) - little, self._park(high, problem) + little
 
-    def faded_range(
-        self, away: Array, bias: Array, share: Array, neutral: Array, least: Array | float = 0.0
-    ) -> tuple[Array, Array]:
-        """Return the ends of drives ``away`` from neutral, of whose gain at rest a ``share`` remains, where
-        it will have faded; never nearer than the ``least`` distance."""
-        lowest, highest = self.drives.lowest, self.drives.highest
-        fades = share < 1 - FADING
-        if not fades.any():
-            return lowest, highest
+    def _faded_range(self, away: Array, bias: Array, share: Array, least: Array) -> tuple[Array, Array]:
+        """Return the ends (n_b, n_u) of drives ``away`` from neutral, of whose gain at rest a ``share``
+        remains, where it will have faded; never nearer than the ``least`` distance."""
+        drives, fades = self.drives, share < 1 - FADING
         best = np.abs(away + bias) / np.maximum(1 - share, FADING)  # where the gain is nothing
-        end = np.abs(np.where(away < 0, lowest, highest) - neutral)
+        end = np.abs(np.where(away < 0, drives.lowest, drives.highest) - drives.neutral)
         room = np.maximum(best * allowed_share(end, best, self.model.span), least)
-        low = np.where(fades & (away < 0), neutral - room, lowest)
-        high = np.where(fades & (away > 0), neutral + room, highest)
-        return np.maximum(low, lowest), np.minimum(high, highest)
+        low = np.where(fades & (away < 0), drives.neutral - room, drives.lowest)
+        high = np.where(fades & (away > 0), drives.neutral + room, drives.highest)
+        return np.maximum(low, drives.lowest), np.minimum(high, drives.highest)
 
     def _simulate(self, x: Array, plans: Array, d: Array) -> Array:
         """Return the outputs (B, N, n_y) of plans (B, n_b, n_u)."""
@@ -396,7 +378,7 @@ class Optimiser:
         moves = shares.copy()
         moves[:, n_u:] -= shares[:, :-n_u]
         moves[:, :n_u] -= problem.last / self.model.span
-        cost = problem.caution * design.move * np.sum(moves * moves, axis=1)
+        cost = design.move * np.sum(moves * moves, axis=1)
         cost += (shares * shares) @ weights.drive + shares @ weights.energy
         beyond: list[tuple[float, Array]] = []
         for i in problem.counted:
@@ -427,7 +409,7 @@ class Optimiser:
         gain are the first move.
         """
         n_u, span = self.model.n_u, self._spans
-        H, weighted = self._hessian(G, range(len(self._rows)), 1.0)
+        H, weighted = self._hessian(G, range(len(self._rows)))
         linear = np.stack(weighted, axis=2)
         before = np.zeros((H.shape[0], n_u))
         before[:n_u] = np.diag(1 / self.model.span)
@@ -435,9 +417,9 @@ class Optimiser:
         on_free = -span[:, None] * np.linalg.solve(H, linear.reshape(H.shape[0], -1))
         return LinearGains(H, on_free, span[:, None] * np.linalg.solve(H, last))
 
-    def _hessian(self, G: Array, outputs: Sequence[int], caution: float) -> tuple[Array, list[Array]]:
+    def _hessian(self, G: Array, outputs: Sequence[int]) -> tuple[Array, list[Array]]:
         """Return H, and by controlled output the response (n, N) of each sample times twice its weight."""
-        moves = caution * self.design.move * (self._differences.T @ self._differences)
+        moves = self.design.move * (self._differences.T @ self._differences)
         H = 2 * (moves + np.diag(self.weights.drive))
         weighted = []
         for i in outputs:
@@ -448,14 +430,13 @@ class Optimiser:
 
     def _cost(self, G: Array, free: Array, problem: Problem) -> tuple[Array, Array]:
         tracked = [i for i in problem.counted if not self.weights.zone[i]]
-        key = tracked, problem.caution
-        if self._kept is None or self._kept[0] != key or self.model.affine is None:
-            self._kept = key, *self._hessian(G, tracked, problem.caution)
+        if self._kept is None or self._kept[0] != tracked or self.model.affine is None:
+            self._kept = tracked, *self._hessian(G, tracked)
         _, H, weighted = self._kept
         f = self.weights.energy.copy()
         for i, by_error in zip(tracked, weighted):
             f += by_error @ (free[:, self._rows[i]] - problem.target[:, i])
-        f[: self.model.n_u] -= 2 * problem.caution * self.design.move * (problem.last / self.model.span)
+        f[: self.model.n_u] -= 2 * self.design.move * (problem.last / self.model.span)
         return H, f
 
     def _constraints(self, G: Array, free: Array, ends: tuple[Array, Array], problem: Problem) -> BoundedRows:

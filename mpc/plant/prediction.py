@@ -544,23 +544,6 @@ def step_response(
     return StepResponse(gain, delay, abs(gain / steepest), t, response)
 
 
-#: Samples: where a delay is longer, what waits for several of them would wait too long.
-LONGEST_DELAY = 200 / 7.5
-
-
-@lru_cache(maxsize=64)
-def apparent_delays(
-    plant: Plant, drives: tuple[str, ...], controlled: tuple[str, ...], dt: float
-) -> tuple[float, ...]:
-    """Return the apparent delay [s] of each controlled output behind the drive that moves it most, of one
-    sample ``dt`` [s] to :data:`LONGEST_DELAY`."""
-    delays = []
-    for of in controlled:
-        best = max((step_response(plant, name, of) for name in drives), key=lambda one: abs(one.gain))
-        delays.append(float(np.clip(best.delay, dt, LONGEST_DELAY * dt)))
-    return tuple(delays)
-
-
 def sample_time(plant: Plant) -> float:
     """Return a sample time [s] for control, on a 1-2-5 grid: a quarter of the longest apparent delay of an
     output behind the drive that moves it most.
@@ -609,11 +592,17 @@ class SteadyCurve:
 
 
 def holding_drive(
-    model: PredictionModel, controlled: tuple[str, ...], target: ArrayLike, d: ArrayLike
+    model: PredictionModel,
+    controlled: tuple[str, ...],
+    target: ArrayLike,
+    d: ArrayLike,
+    *,
+    within: tuple[Array, Array] | None = None,
 ) -> Holding:
-    """Return the drives inside their range that hold the controlled outputs nearest to target (n_controlled,)
-    [degC] in the least-squares sense, the smaller of two beyond an optimum; of an integrator, which rests at
-    any temperature or at none, those that balance it there, which may lie outside their range."""
+    """Return the drives inside their range, or ``within`` these ends, that hold the controlled outputs
+    nearest to target (n_controlled,) [degC] in the least-squares sense, the smaller of two beyond an optimum;
+    of an integrator, which rests at any temperature or at none, those that balance it there, which may lie
+    outside their range."""
     wanted = np.asarray(target, dtype=float).reshape(len(controlled))
     d = np.asarray(d, dtype=float)
     rows = [model.outputs.index(name) for name in controlled]
@@ -622,7 +611,7 @@ def holding_drive(
         y = model.steady_output(scaled * model.span, d)[rows]
         return np.where(np.isfinite(y), y - wanted, 1e3)
 
-    low, high = model.lowest / model.span, model.highest / model.span
+    low, high = (ends / model.span for ends in within or (model.lowest, model.highest))
     starts = [low + share * (high - low) for share in (0.1, 0.3, 0.5, 0.7, 0.9)]
     # a small weight of the drive itself picks the smaller of two that hold the same temperature
     costs = [float(np.sum(miss(start) ** 2) + 1e-2 * np.sum(start**2)) for start in starts]

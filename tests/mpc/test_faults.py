@@ -121,9 +121,6 @@ FAULTS: Mapping[str, Fault] = {
     # what is asked
     "the target is NaN": Fault(["infeasible"], 10, target=NAN, advice="target"),
     "the target is absurd": Fault(["infeasible"], 10, target=900.0, advice="target"),
-    "the target breaks the tank's limit": Fault(
-        ["ok", "infeasible"], 170, target=60.0, advice="no drive holds", after=150
-    ),
     "the drive is at its end for ever on a plant that loses five times the heat": Fault(
         ["ok"], 150, target=47.0, world="leaky"
     ),

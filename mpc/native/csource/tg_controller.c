@@ -5,8 +5,6 @@
 #include <math.h>
 #include <string.h>
 
-/* of a jump: what the model expects of a reading that has not moved at all, and a bias of an output
-   that is no small error of the model */
 #define TINY 1e-9
 
 /* ---- the loop ---- */
@@ -52,10 +50,9 @@ static void start(tg_controller *c, const double *y, const double *d)
     c->ramps = 0;
     c->has_plan = c->solves = c->on_pi = 0;
     memset(c->spikes, 0, sizeof c->spikes);
-    c->age_s = c->silent_s = c->miss_sum = 0.0;
+    c->age_s = c->silent_s = 0.0;
     memset(c->unread_s, 0, sizeof c->unread_s);
     memset(c->lost, 0, sizeof c->lost);
-    c->has_steady = c->in = c->unreachable = 0;
     memset(c->moved, 0, sizeof c->moved);
     memcpy(c->last_y, y, sizeof c->last_y);
     c->fresh = 1;
@@ -214,7 +211,7 @@ static void refine(tg_controller *c, double *y)
     for (int i = 0; i < TG_NY; i++)
         if (fabs(y[i] - mean[i]) > c->design->spike[i])
             y[i] = NAN;
-    tg_observer_refine(c, y);
+    tg_observer_update(c, y);
     memcpy(c->seen, tg_now(c), sizeof c->seen);
 }
 
@@ -286,10 +283,6 @@ static int set_target(tg_controller *c, const double *target)
             c->side[r] = far > 0.0 ? 1.0 : far < 0.0 ? -1.0 : 0.0;
         }
         c->target[r] = wanted;
-    }
-    if (moved) {
-        c->in = c->unreachable = 0;
-        c->miss_sum = 0.0;
     }
     return wrong;
 }
@@ -399,9 +392,6 @@ static int optimise(tg_controller *c)
     for (int j = 0; j < TG_NU; j++)
         last[j] = fmin(fmax(c->u[j], s->lowest[j]), s->highest[j]);
     tg_guess(c, last, guess);
-    c->caution = 1.0;
-    for (int i = 0; i < TG_NY; i++)
-        c->caution = fmin(fmax(c->caution, fabs(c->innovation[i]) / TG_CAUTION), TG_MOST_CAUTION);
     status = tg_optimise(c, x, last, guess, d, c->ramped, c->side, on_y, on_u);
     changes = c->iterations;
     for (int n = 1; n < s->iterations && status == TG_QP_SOLVED && !s->linear && has_moved(s, guess, c->best); n++) {
@@ -477,99 +467,6 @@ static void follow(tg_controller *c, tg_move *move, int status, int advice)
         move->status = TG_FALLBACK_PI;
 }
 
-/* What of the target of controlled output r that output's own limits allow. */
-static double own_limit(const tg_controller *c, int r)
-{
-    const tg_design *s = c->design;
-    double allowed = c->target[r];
-    for (int l = 0; l < s->n_l; l++)
-        if (s->limited[l] == s->controlled[r])
-            allowed = fmin(fmax(allowed, s->limit_low[l]), s->limit_high[l]);
-    return allowed;
-}
-
-/* In place of targets that ramp where they are now, and with zones what of them is nearest to the end of the plan; the
- * targets into kept. */
-static void aim(tg_controller *c, double *kept)
-{
-    const tg_design *s = c->design;
-    int other = 0;
-    memcpy(kept, c->target, sizeof c->target);
-    for (int r = 0; r < s->n_c; r++) {
-        double end = c->y_best[(s->N - 1) * TG_NY + s->controlled[r]], zone = s->zone[r];
-        c->target[r] = c->ramped[r];
-        if (zone > 0.0)
-            c->target[r] = fmin(fmax(end, c->target[r] - zone), c->target[r] + zone);
-        other = other || c->target[r] != c->aim[r];
-        c->aim[r] = c->target[r];
-    }
-    if (other) {
-        c->in = c->unreachable = 0;
-        c->miss_sum = 0.0;
-    }
-}
-
-/* Whether a target cannot be held: by how much it is missed [degC], 0 where all can. */
-static double missed_by(tg_controller *c)
-{
-    const tg_design *s = c->design;
-    double limit, unit, held[TG_NC] = {0.0}, by_w[TG_NC * TG_SOME(TG_NW)] = {0.0};
-    double d[TG_SOME(TG_ND)] = {0.0}, on_u[TG_NU], on_y[TG_NY], scaled = -1.0, worst = 0.0, inflation = 1.0;
-    double kept[TG_NC];
-    int away = 0, out = 0, alarm = 0, lost = 0;
-    aim(c, kept);
-    if (c->in >= TG_TAKE_BACK && !c->unreachable) { /* it was answered */
-        memcpy(c->target, kept, sizeof kept);
-        return 0.0;
-    }
-    limit = c->unreachable ? TG_CAN : TG_CANNOT; /* of an output's unit */
-    for (int r = 0; r < s->n_c; r++)
-        away = away || (!(c->unread_s[r] > 0.0) &&
-                        fabs(c->target[r] - c->y_best[(s->N - 1) * TG_NY + s->controlled[r]]) >
-                            limit * s->unit[s->controlled[r]]);
-    if (away) {
-        tg_biases(c, on_u, d, on_y);
-        for (int i = 0; i < TG_ND; i++)
-            d[i] += c->d[i];
-        away = tg_find_steady(c, d, on_u, on_y, held, by_w);
-        lost = !away && c->miss_sum >= TG_MISS_ALARM; /* the last answer is kept */
-    }
-    if (!away)
-        memset(by_w, 0, sizeof by_w);
-    for (int i = 0; i < TG_NY; i++)
-        inflation = fmax(inflation, fabs(c->innovation[i]) / TG_INNOVATION_SD);
-    for (int r = 0; r < s->n_c; r++) {
-        const double *J = by_w + r * TG_SOME(TG_NW);
-        double sd = 0.0, miss, beyond = fabs(c->target[r] - own_limit(c, r));
-        int is_barred;
-        unit = s->unit[s->controlled[r]];
-        is_barred = beyond > TG_CANNOT * unit;
-        if (c->unread_s[r] > 0.0)
-            continue;
-        for (int i = 0; i < TG_NW; i++)
-            for (int j = 0; j < TG_NW; j++)
-                sd += J[i] * J[j] * c->P[(TG_NX + i) * TG_Z + TG_NX + j];
-        sd = fmax(sqrt(fmax(sd, 0.0)), TG_LEAST_SD * unit);
-        miss = away ? fabs(c->target[r] - held[r]) : 0.0;
-        scaled = fmax(scaled, (miss - TG_CANNOT * unit) / (sd * inflation));
-        out = out || miss > limit * unit || is_barred;
-        alarm = alarm || is_barred;
-        miss = miss > limit * unit ? miss : 0.0;
-        beyond = is_barred ? beyond : 0.0;
-        if (fmax(miss, beyond) > worst) {
-            worst = fmax(miss, beyond);
-            c->missing = s->controlled[r];
-            c->nearest = miss > beyond ? held[r] : own_limit(c, r);
-        }
-    }
-    if (!lost)
-        c->miss_sum = fmin(fmax(0.0, c->miss_sum + fmin(scaled, TG_MISS_CLIP) - TG_MISS_ALLOWANCE), TG_MISS_ALARM);
-    memcpy(c->target, kept, sizeof kept);
-    c->in = !out && !lost ? c->in + 1 : 0;
-    c->unreachable = c->unreachable ? c->in < TG_TAKE_BACK : c->miss_sum >= TG_MISS_ALARM || alarm;
-    return c->unreachable ? fmax(worst, TINY) : 0.0;
-}
-
 /* For how long no controlled output was read [s], and whether one of them is not. */
 static double unread_for(const tg_controller *c, int *one)
 {
@@ -613,7 +510,6 @@ void tg_keep_plan(tg_controller *c)
 static void decide(tg_controller *c, tg_move *move)
 {
     const tg_design *s = c->design;
-    double missed;
     int outside = 0, unseen;
     double unread = unread_for(c, &unseen);
     move->status = TG_OK;
@@ -653,12 +549,7 @@ static void decide(tg_controller *c, tg_move *move)
         move->advice = TG_OUT_OF_RANGE;
         return;
     }
-    if (missed = missed_by(c), missed > 0.0) {
-        move->status = TG_INFEASIBLE;
-        move->advice = TG_OUT_OF_REACH;
-        move->which = c->missing;
-        move->over = missed;
-    } else if (c->broken > TG_BREAKS * s->unit[c->breaks]) {
+    if (c->broken > TG_BREAKS * s->unit[c->breaks]) {
         move->status = c->broken > TG_BREAKS_FAR * s->unit[c->breaks] ? TG_INFEASIBLE : TG_OK;
         move->advice = TG_LIMIT_BREAKS;
         move->which = c->breaks;
@@ -798,7 +689,6 @@ const char *tg_advice_text(int advice)
         "the drive that was applied is out of range: brought back",
         "a limit of an output will be broken: choose a nearer target",
         "a reading does not move though it should: is the sensor stuck?",
-        "no drive holds the output at its target: choose a nearer one",
         "the deadline passed: the last plan goes on, then PI",
         "a jump of a reading stays: taken for an offset of the sensor",
         "a jump of the readings stays: the estimate was started again",

@@ -40,7 +40,6 @@ enum tg_advice {
     TG_OUT_OF_RANGE,
     TG_LIMIT_BREAKS,
     TG_STUCK,
-    TG_OUT_OF_REACH,
     TG_TOO_LATE,
     TG_SENSOR_OFFSET,
     TG_WORLD_CHANGED,
@@ -55,7 +54,7 @@ typedef struct {
     int advice;     /* enum tg_advice; tg_advice_text has its sentence */
     int which;      /* where one output is advised of: which */
     int iterations; /* of the quadratic program */
-    double over;    /* by how much a limit will be broken, a target missed [degC]; how long nobody called [s]: where advised */
+    double over;    /* by how much a limit will be broken [degC]; how long nobody called [s]: where advised */
 } tg_move;
 
 typedef double tg_time; /* seconds of any clock */
@@ -67,7 +66,7 @@ typedef struct {
     void *about;
     /* observer */
     double x[TG_NX], w[TG_SOME(TG_NW)];
-    double P[TG_Z * TG_Z], found_offset[TG_NY], innovation[TG_NY];
+    double P[TG_Z * TG_Z], found_offset[TG_NY];
     int held[TG_Z];
     double into_s, share, noised;      /* seconds since x; of a sample: time of the estimate, and the noise in P */
     double dose[TG_NU], ahead[TG_NX];  /* the drives summed over those seconds, the state there */
@@ -77,24 +76,19 @@ typedef struct {
     double interval_s, passed_s, since_s, assumed_s, spent_s, waited_s, slew_s;
     int repeats, stale, due;
     /* loop */
-    double d[TG_SOME(TG_ND)], y[TG_NY], u[TG_NU], target[TG_NC], side[TG_NC], aim[TG_NC];
+    double d[TG_SOME(TG_ND)], y[TG_NY], u[TG_NU], target[TG_NC], side[TG_NC];
     double plan[TG_NH * TG_NU], unread_s[TG_NC], age_s, silent_s;
     double last_y[TG_NY], moved[TG_NY]; /* the newest reading, and what was expected since it changed */
     double seen[TG_NX];                 /* the state after the newest reading */
     double integral[TG_NC];             /* of the PI controller */
-    double caution;                     /* how many times the weight of moves counts */
     double ramped[TG_NC];               /* where targets are that may only ramp */
-    double steady_x[TG_NX], steady_u[TG_NU], miss_sum; /* nearest to the targets, and evidence that they are missed */
-    double nearest;                                    /* what the output that misses its target most can be held at */
-    int has_steady, in, unreachable, missing;          /* samples in a row within reach again; that output */
     int has_plan, fresh, solves, on_pi, status, advice, spikes[TG_NY], stays[TG_NY];
     int ramps; /* whether targets are on their way in path */
     int lost[TG_NC]; /* outputs that cost nothing */
     /* what the last optimisation gave */
     double best[TG_Q_N], y_best[TG_NH * TG_NY], authority[TG_Q_N], broken;
     int qp_status, iterations, breaks; /* and which output will break its limit by so much */
-    double kept_caution; /* of a linear plant: for what H was made, and whether there is a G */
-    int kept_lost[TG_NC], has_gains, laid_out, has_jacobian;
+    int kept_lost[TG_NC], has_gains, laid_out, has_jacobian; /* of a linear plant: for what H was made, and whether there is a G */
     /* room to work in */
     tg_qp qp;
     double path[TG_SOME(TG_NR)]; /* in place of goals, where targets may only ramp */
@@ -130,7 +124,6 @@ const char *tg_advice_text(int advice);
 /* The parts, for tests and for other loops. */
 void tg_observer_reset(tg_controller *c, const double *y, const double *d);
 void tg_observer_update(tg_controller *c, const double *y);
-void tg_observer_refine(tg_controller *c, const double *y); /* with a reading between two moves */
 /* Take what a reading differs by for offsets of the sensors that are not 0 in which. */
 void tg_observer_set_offsets(tg_controller *c, const double *y, const int *which);
 void tg_observer_predict(tg_controller *c, const double *u, const double *d);
@@ -139,10 +132,6 @@ void tg_observer_look(tg_controller *c, const double *d);
 const double *tg_now(const tg_controller *c); /* the state at the time of the estimate */
 void tg_biases(const tg_controller *c, double *on_u, double *on_d, double *on_y);
 void tg_expected(const tg_controller *c, double *y);
-/* The controlled outputs nearest to the targets that drives can hold, and their derivatives by w (n_c rows); 0 where
- * no steady state is found. */
-int tg_find_steady(tg_controller *c, const double *d, const double *on_u, const double *on_y, double *held, double *by_w);
-double tg_allowed_share(double end, double best, double span); /* of the way to an optimum */
 void tg_hold_drives(tg_controller *c);
 double tg_planned(const tg_controller *c, int k, int j); /* drive j in the k-th sample from now */
 void tg_guess(const tg_controller *c, const double *last, double *guess);

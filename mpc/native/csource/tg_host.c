@@ -24,9 +24,7 @@ double *tg_host_found_offset(tg_controller *c) { return c->found_offset; }
 double *tg_host_seen(tg_controller *c) { return c->seen; }
 double *tg_host_target(tg_controller *c) { return c->target; }
 double *tg_host_y(tg_controller *c) { return c->y; }
-double *tg_host_ramped(tg_controller *c) { return c->ramped; }
 double *tg_host_unread_s(tg_controller *c) { return c->unread_s; }
-double *tg_host_nearest(tg_controller *c) { return &c->nearest; }
 int *tg_host_stays(tg_controller *c) { return c->stays; }
 int *tg_host_qp_status(tg_controller *c) { return &c->qp_status; }
 

@@ -12,8 +12,6 @@
 #include <string.h>
 
 #define ROUNDED 1e-16 /* of the length of a row, that its sum is rounded by at least */
-#define LEAST_SHARE 1e-12 /* of the trace, added to a curvature that may be 0 */
-#define LEAST_TRACE 1e-300
 
 static double output(const tg_controller *c, int i, const double *x)
 {
@@ -158,7 +156,7 @@ static void add_two(double *restrict into, double a, const double *restrict x, d
 }
 
 /* Correct the estimate by a reading of variances R.  A lost one is given no weight: its row of H P is 0. */
-static void correct(tg_controller *c, const double *y, const double *R, double remember)
+static void correct(tg_controller *c, const double *y, const double *R)
 {
     double off[TG_NY], S[TG_NY * TG_NY], HP[TG_NY * TG_Z], gain[TG_NY * TG_Z], back[TG_NY * TG_Z];
     double HPH[TG_NY * TG_NY], H[TG_NY * TG_Z], change[TG_Z] = {0.0};
@@ -178,9 +176,6 @@ static void correct(tg_controller *c, const double *y, const double *R, double r
             HPH[a * TG_NY + b] = isfinite(y[a]) ? seen_by(H + a * TG_Z, HP + b * TG_Z) : 0.0;
             S[a * TG_NY + b] = HPH[a * TG_NY + b] + (a == b ? R[a] : 0.0);
         }
-    for (int a = 0; a < TG_NY; a++)
-        if (isfinite(y[a]))
-            c->innovation[a] += remember * (off[a] / sqrt(S[a * (TG_NY + 1)]) - c->innovation[a]);
     memcpy(gain, HP, sizeof gain);
     eliminate(S, gain); /* row a of gain: what reading a does to each state */
     for (int a = 0; a < TG_NY; a++)
@@ -203,17 +198,13 @@ static void correct(tg_controller *c, const double *y, const double *R, double r
     apply(c, change);
 }
 
-static void correct_now(tg_controller *c, const double *y, double remember)
+void tg_observer_update(tg_controller *c, const double *y)
 {
     double R[TG_NY];
     for (int i = 0; i < TG_NY; i++)
         R[i] = c->design->R[i] + c->bent[i] * c->bent[i];
-    correct(c, y, R, remember);
+    correct(c, y, R);
 }
-
-void tg_observer_update(tg_controller *c, const double *y) { correct_now(c, y, TG_NEWEST_INNOVATION); }
-
-void tg_observer_refine(tg_controller *c, const double *y) { correct_now(c, y, 0.0); }
 
 void tg_observer_set_offsets(tg_controller *c, const double *y, const int *which)
 {
@@ -244,23 +235,21 @@ void tg_observer_reset(tg_controller *c, const double *y, const double *d)
     memset(c->w, 0, sizeof c->w);
     memset(c->held, 0, sizeof c->held);
     memset(c->found_offset, 0, sizeof c->found_offset);
-    memset(c->innovation, 0, sizeof c->innovation);
     memset(c->P, 0, sizeof c->P);
     for (int i = 0; i < TG_NX; i++)
         memcpy(c->P + i * TG_Z, s->P_rest + i * TG_NX, TG_NX * sizeof(double));
     for (int k = 0; k < TG_NW; k++)
         c->P[(TG_NX + k) * (TG_Z + 1)] = s->P0[k];
     stand_on_sample(c);
-    correct(c, y, s->R_start, 0.0);
+    correct(c, y, s->R_start);
     tg_observer_set_offsets(c, y, s->fixed);
 }
 
 /* Entry i of direction c, of those that are kept in groups of four. */
 static double *entry(double *of, int n, int i, int c) { return of + (c / 4) * 4 * n + 4 * i + c % 4; }
 
-/* The Jacobian of a sample by tangents of the unit directions; the state one sample later into next.
- * Returned: its entries, by states, drives and disturbances. */
-static double *sample_jacobian(tg_controller *c, const double *u, const double *d, double *next)
+/* The Jacobian of a sample by tangents of the unit directions; the state one sample later into next. */
+static void sample_jacobian(tg_controller *c, const double *u, const double *d, double *next)
 {
     const tg_design *s = c->design;
     double x[TG_NX];
@@ -300,7 +289,6 @@ static double *sample_jacobian(tg_controller *c, const double *u, const double *
     for (int k = TG_NX; k < TG_Z; k++)
         c->jacobian[k * (TG_Z + 1)] = 1.0;
     c->has_jacobian = 1;
-    return now;
 }
 
 /* The state one sample later into next, and the Jacobian, which of a linear plant stays. */
@@ -318,248 +306,6 @@ static void look_ahead(tg_controller *c, const double *u, const double *d, doubl
         tg_model_step(x, u, d, s->k, c->by_drives, next);
         memcpy(x, next, sizeof x);
     }
-}
-
-#define SIDES (1 + TG_NU + TG_NW)
-#define ROWS (TG_NC + TG_SOME(TG_NL))
-
-/* Solve M X = X0 (n_x rows, SIDES columns) in place, by elimination with pivots; 0 where it is singular. */
-static int solve_sides(double *M, double *X)
-{
-    for (int p = 0; p < TG_NX; p++) {
-        int best = p;
-        for (int i = p + 1; i < TG_NX; i++)
-            if (fabs(M[i * TG_NX + p]) > fabs(M[best * TG_NX + p]))
-                best = i;
-        if (!(fabs(M[best * TG_NX + p]) > 0.0))
-            return 0;
-        for (int j = 0; j < TG_NX; j++) {
-            double swap = M[p * TG_NX + j];
-            M[p * TG_NX + j] = M[best * TG_NX + j];
-            M[best * TG_NX + j] = swap;
-        }
-        for (int j = 0; j < SIDES; j++) {
-            double swap = X[p * SIDES + j];
-            X[p * SIDES + j] = X[best * SIDES + j];
-            X[best * SIDES + j] = swap;
-        }
-        for (int i = p + 1; i < TG_NX; i++) {
-            double share = M[i * TG_NX + p] / M[p * TG_NX + p];
-            if (share == 0.0)
-                continue;
-            for (int j = p; j < TG_NX; j++)
-                M[i * TG_NX + j] -= share * M[p * TG_NX + j];
-            for (int j = 0; j < SIDES; j++)
-                X[i * SIDES + j] -= share * X[p * SIDES + j];
-        }
-    }
-    for (int p = TG_NX - 1; p >= 0; p--)
-        for (int j = 0; j < SIDES; j++) {
-            double sum = X[p * SIDES + j];
-            for (int i = p + 1; i < TG_NX; i++)
-                sum -= M[p * TG_NX + i] * X[i * SIDES + j];
-            X[p * SIDES + j] = sum / M[p * TG_NX + p];
-            if (!isfinite(X[p * SIDES + j]))
-                return 0;
-        }
-    return 1;
-}
-
-/* z between low and high that makes |weight (e - G z)| least, by coordinates in turn. */
-static void squares_in_box(int n, const double *weight, const double *G, const double *e, const double *low,
-                           const double *high, double *z)
-{
-    double H[TG_NU * TG_NU], f[TG_NU], trace = 0.0;
-    for (int j = 0; j < TG_NU; j++) {
-        z[j] = f[j] = 0.0;
-        for (int r = 0; r < n; r++)
-            f[j] += weight[r] * weight[r] * G[r * TG_NU + j] * e[r];
-        for (int k = 0; k < TG_NU; k++) {
-            H[j * TG_NU + k] = 0.0;
-            for (int r = 0; r < n; r++)
-                H[j * TG_NU + k] += weight[r] * weight[r] * G[r * TG_NU + j] * G[r * TG_NU + k];
-        }
-        trace += H[j * TG_NU + j];
-    }
-    for (int sweep = 0; sweep < TG_SWEEPS; sweep++) {
-        double moved = 0.0;
-        for (int j = 0; j < TG_NU; j++) {
-            double slope = f[j], best;
-            for (int k = 0; k < TG_NU; k++)
-                slope -= H[j * TG_NU + k] * z[k];
-            best = z[j] + slope / (H[j * TG_NU + j] + LEAST_SHARE * fmax(trace, LEAST_TRACE));
-            best = fmin(fmax(best, low[j]), high[j]);
-            moved = fmax(moved, fabs(best - z[j]));
-            z[j] = best;
-        }
-        if (moved < 1e-9)
-            break;
-    }
-}
-
-/* The ends of the drives: no further than the optimiser goes where a gain falls.  G: rows of all outputs. */
-static void range_of(const tg_design *s, const double *G, const double *u, const double *on_u, double *low, double *high)
-{
-    for (int j = 0; j < TG_NU; j++) {
-        double away = u[j] - s->neutral[j], end = fabs((away < 0.0 ? s->lowest[j] : s->highest[j]) - s->neutral[j]);
-        double left = s->settled_gain[j] != 0.0
-                          ? G[s->controlled[s->strongest[j]] * TG_NU + j] / s->settled_gain[j] : 1.0;
-        double best = fabs(away + on_u[j]) / fmax(1.0 - left, TG_FADING);
-        double room = best * tg_allowed_share(end, best, s->span[j]);
-        low[j] = s->lowest[j];
-        high[j] = s->highest[j];
-        if (left < 1.0 - TG_FADING && away < 0.0)
-            low[j] = fmax(low[j], s->neutral[j] - room);
-        if (left < 1.0 - TG_FADING && away > 0.0)
-            high[j] = fmin(high[j], s->neutral[j] + room);
-        low[j] = fmin(fmax((low[j] - u[j]) / s->span[j], -TG_STRIDE), TG_STRIDE);
-        high[j] = fmax(fmin((high[j] - u[j]) / s->span[j], TG_STRIDE), low[j]);
-    }
-}
-
-/* The change z of the drives, in ranges, that brings the outputs y nearest to targets and limits. */
-static void nearest(const tg_controller *c, const double *G, const double *y, const double *low, const double *high,
-                    double *z)
-{
-    const tg_design *s = c->design;
-    int rows = s->n_c + s->n_l;
-    double own[ROWS * TG_NU] = {0.0}, e[ROWS] = {0.0}, weight[ROWS] = {0.0}, over[ROWS] = {0.0};
-    for (int r = 0; r < s->n_c; r++)
-        weight[r] = c->unread_s[r] > 0.0 ? 0.0 : 1.0;
-    for (int pass = 0, changed = 1; pass < rows && changed; pass++) {
-        for (int r = 0; r < rows; r++) {
-            int i = r < s->n_c ? s->controlled[r] : s->limited[r - s->n_c];
-            double end = r < s->n_c ? c->target[r] : over[r] > 0.0 ? s->limit_high[r - s->n_c] : s->limit_low[r - s->n_c];
-            e[r] = end - y[i];
-            memcpy(own + r * TG_NU, G + i * TG_NU, TG_NU * sizeof(double));
-        }
-        squares_in_box(rows, weight, own, e, low, high, z);
-        changed = 0;
-        for (int r = 0; r < rows; r++) {
-            int i = r < s->n_c ? s->controlled[r] : s->limited[r - s->n_c];
-            double value = y[i], before = r < s->n_c ? weight[r] : over[r], near = TG_CAN * s->unit[i];
-            for (int j = 0; j < TG_NU; j++)
-                value += G[i * TG_NU + j] * z[j];
-            if (r < s->n_c) {
-                if (weight[r] > 0.0 && c->side[r] * (value - c->target[r]) > near)
-                    weight[r] = sqrt(s->price * (TG_FIRST + 1.0) / s->track); /* what 1 degC costs the optimiser */
-                changed = changed || weight[r] != before;
-                continue;
-            }
-            if (value > s->limit_high[r - s->n_c] + near)
-                over[r] = 1.0;
-            if (value < s->limit_low[r - s->n_c] - near)
-                over[r] = -1.0;
-            weight[r] = over[r] != 0.0 ? TG_BEYOND_LIMIT : 0.0;
-            changed = changed || over[r] != before;
-        }
-    }
-}
-
-/* The steady state as seen from x: what is missing of it in X, a column by each drive and bias behind, and the outputs
- * there, y, by the drives, G; 0 where there is none. */
-static int look_for_steady(tg_controller *c, const double *x, const double *u, const double *d, const double *on_u,
-                           double *X, double *y, double *G)
-{
-    const tg_design *s = c->design;
-    double keep[TG_NX], both[TG_NU], next[TG_NX] = {0.0}, *slopes;
-    for (int j = 0; j < TG_NU; j++)
-        both[j] = u[j] + on_u[j];
-    memcpy(keep, c->x, sizeof keep);
-    memcpy(c->x, x, sizeof keep);
-    slopes = sample_jacobian(c, both, d, next);
-    memcpy(c->x, keep, sizeof keep);
-    for (int i = 0; i < TG_NX; i++) {
-        for (int j = 0; j < TG_NX; j++)
-            c->spare[i * TG_NX + j] = (i == j ? 1.0 : 0.0) - *entry(slopes, TG_NX, i, j);
-        X[i * SIDES] = next[i] - x[i];
-        for (int j = 0; j < TG_NU; j++)
-            X[i * SIDES + 1 + j] = *entry(slopes, TG_NX, i, TG_NX + j) * s->span[j];
-        for (int k = 0; k < TG_NW; k++)
-            X[i * SIDES + 1 + TG_NU + k] = c->jacobian[i * TG_Z + TG_NX + k];
-    }
-    if (!solve_sides(c->spare, X))
-        return 0;
-    for (int r = 0; r < TG_NY; r++) {
-        const double *C = s->C + r * TG_NX;
-        y[r] = s->y0[r];
-        for (int i = 0; i < TG_NX; i++) {
-            y[r] += C[i] * (x[i] + X[i * SIDES]);
-            for (int j = 0; j < TG_NU; j++)
-                G[r * TG_NU + j] += C[i] * X[i * SIDES + 1 + j];
-        }
-    }
-    return 1;
-}
-
-/* The same outputs of a plant that is linear, and settles. */
-static void settle(const tg_design *s, const double *u, const double *d, const double *on_u, double *y, double *G)
-{
-    for (int r = 0; r < TG_NY; r++) {
-        const double *by = s->settled_by + r * TG_NV;
-        y[r] = s->settled[r];
-        for (int j = 0; j < TG_NU; j++) {
-            G[r * TG_NU + j] = by[j];
-            y[r] += by[j] * (u[j] + on_u[j]) / s->span[j];
-        }
-        for (int j = 0; j < TG_ND; j++)
-            y[r] += by[TG_NU + j] * d[j];
-    }
-}
-
-int tg_find_steady(tg_controller *c, const double *d, const double *on_u, const double *on_y, double *held, double *by_w)
-{
-    const tg_design *s = c->design;
-    double x[TG_NX], u[TG_NU], X[TG_NX * SIDES] = {0.0};
-    double G[TG_NY * TG_NU] = {0.0}, y[TG_NY] = {0.0}, low[TG_NU] = {0.0}, high[TG_NU] = {0.0}, z[TG_NU] = {0.0};
-    double largest = 0.0;
-    int found = 0;
-    for (int i = 0; i < TG_NY; i++)
-        largest = fmax(largest, s->unit[i]);
-    memcpy(x, c->has_steady ? c->steady_x : tg_now(c), sizeof x);
-    memcpy(u, c->has_steady ? c->steady_u : c->u, sizeof u);
-    c->has_steady = 0;
-    for (int j = 0; j < TG_NU; j++)
-        u[j] = fmin(fmax(u[j], s->lowest[j]), s->highest[j]);
-    for (int step = 0; step < TG_STEADY_STEPS && !found; step++) {
-        double moved = 0.0;
-        memset(G, 0, sizeof G);
-        if (s->settles)
-            settle(s, u, d, on_u, y, G);
-        else if (!look_for_steady(c, x, u, d, on_u, X, y, G))
-            return 0;
-        for (int r = 0; r < TG_NY; r++)
-            y[r] += on_y[r];
-        range_of(s, G, u, on_u, low, high);
-        nearest(c, G, y, low, high, z);
-        for (int i = 0; i < TG_NX && !s->settles; i++) {
-            moved = fmax(moved, fabs(X[i * SIDES]) / largest);
-            x[i] += X[i * SIDES];
-            for (int j = 0; j < TG_NU; j++)
-                x[i] += X[i * SIDES + 1 + j] * z[j];
-        }
-        for (int j = 0; j < TG_NU; j++) {
-            moved = fmax(moved, fabs(z[j]));
-            u[j] += z[j] * s->span[j];
-        }
-        found = moved < TG_CONVERGED;
-    }
-    for (int r = 0; r < s->n_c; r++) {
-        int i = s->controlled[r];
-        held[r] = y[i];
-        for (int j = 0; j < TG_NU; j++)
-            held[r] += G[i * TG_NU + j] * z[j];
-        for (int k = 0; k < TG_NW; k++) {
-            double *by = by_w + r * TG_SOME(TG_NW) + k;
-            *by = s->on_output[i * TG_NW + k] + (s->settles ? s->settled_by[i * TG_NV + TG_NU + TG_ND + k] : 0.0);
-            for (int j = 0; j < TG_NX && !s->settles; j++)
-                *by += s->C[i * TG_NX + j] * X[j * SIDES + 1 + TG_NU + k];
-        }
-    }
-    memcpy(c->steady_x, x, sizeof x);
-    memcpy(c->steady_u, u, sizeof u);
-    c->has_steady = found;
-    return found;
 }
 
 /* Where a row of the Jacobian begins and ends: what is left out is less than what its sums are rounded by. */

@@ -290,7 +290,7 @@ static double merit(const tg_controller *c, const double *plan, const double *y,
         for (int j = 0; j < TG_NU; j++) {
             double value = plan[b * TG_NU + j], energy = s->energy[j] * s->blocks[b];
             double step = (value - (b ? plan[(b - 1) * TG_NU + j] : last[j])) / s->span[j];
-            cost += c->caution * s->move * step * step;
+            cost += s->move * step * step;
             value /= s->span[j];
             cost += s->drive * value * value * s->blocks[b] + energy * value;
         }
@@ -304,7 +304,8 @@ static double merit(const tg_controller *c, const double *plan, const double *y,
     return cost;
 }
 
-double tg_allowed_share(double end, double best, double span)
+/* Of the way to an optimum, that a drive may go. */
+static double allowed_share(double end, double best, double span)
 {
     double share = end / fmax(best, 1e-9 * span);
     return fmax(TG_SAFE, fmin(share, 3.0 - 2.0 * share));
@@ -325,7 +326,7 @@ static void set_bounds(tg_controller *c, const double *guess, const double *driv
             if (lost > TG_FADING) {
                 double best = fabs(away + drive_bias[j]) / lost, held = last[j] - s->neutral[j];
                 double end = fabs((away < 0.0 ? low : high) - s->neutral[j]);
-                double room = best * tg_allowed_share(end, best, s->span[j]);
+                double room = best * allowed_share(end, best, s->span[j]);
                 double still = away * held > 0.0 ? fabs(held) - (s->reach[b] + more) * s->slew[j] : 0.0;
                 if (room < still)
                     room = still; /* what the slew allows */
@@ -374,7 +375,7 @@ static void set_linear_cost(tg_controller *c, const double *target, const double
         }
     }
     for (int j = 0; j < TG_NU; j++)
-        q->f[j] -= 2.0 * c->caution * s->move * last[j] / s->span[j];
+        q->f[j] -= 2.0 * s->move * last[j] / s->span[j];
 }
 
 /* Sum up over n rows of the response, begun at start, apart apart, the products of their numbers i to i + 3 with j to
@@ -442,24 +443,22 @@ static void set_quadratic_cost(tg_controller *c)
 {
     const tg_design *s = c->design;
     tg_qp *q = &c->qp;
-    double weight_of_moves = c->caution * s->move;
     for (int r = 0; r < s->n_c; r++)
         add_squares(c, r);
     for (int b = 0; b < s->n_b; b++)
         for (int j = 0; j < TG_NU; j++) {
             int i = b * TG_NU + j;
             double *row = q->H + (size_t)i * TG_Q_W;
-            row[i] += 2.0 * (weight_of_moves * (b < s->n_b - 1 ? 2.0 : 1.0) + s->drive * s->blocks[b]);
+            row[i] += 2.0 * (s->move * (b < s->n_b - 1 ? 2.0 : 1.0) + s->drive * s->blocks[b]);
             if (b)
-                row[i - TG_NU] -= 2.0 * weight_of_moves;
+                row[i - TG_NU] -= 2.0 * s->move;
         }
 }
 
 /* Whether what was made for the program of the last solve is this one's. */
 static int is_kept(const tg_controller *c)
 {
-    return c->design->linear && c->qp.kept && c->kept_caution == c->caution &&
-           !memcmp(c->kept_lost, c->lost, sizeof c->lost);
+    return c->design->linear && c->qp.kept && !memcmp(c->kept_lost, c->lost, sizeof c->lost);
 }
 
 static void set_soft_rows(tg_controller *c, const double *target, const double *side)
@@ -637,7 +636,6 @@ int tg_optimise(tg_controller *c, const double *x, const double *last, const dou
     q->kept = is_kept(c);
     if (!q->kept)
         set_quadratic_cost(c);
-    c->kept_caution = c->caution;
     memcpy(c->kept_lost, c->lost, sizeof c->lost);
     set_linear_cost(c, target, last);
     set_bounds(c, guess, drive_bias, last);

@@ -265,20 +265,6 @@ def test_the_past_drive_of_a_state_is_the_likeliest_that_held_it() -> None:
     assert rest.past_drive(x) == pytest.approx(SPAN * (B * W @ left) / (B * W @ B + 1))
 
 
-def test_the_mean_innovation_takes_a_fifth_of_the_newest_and_nothing_of_a_lost_one() -> None:
-    observer, level = Observer(MODEL, CHOSEN, NOISE), LEVEL + OFFSET
-    observer.reset(level, np.array([22.0]))
-    want, mean = Textbook(level, 22.0), np.zeros(2)
-    for y in (level + [0.4, -0.3], np.array([np.nan, level[1] + 0.5]), level + [-0.2, 0.9]):
-        spread = np.sqrt(np.diag(want.H @ want.P @ want.H.T + want.R))
-        scaled = (y - want.H @ want.z - want.levels) / spread
-        mean = np.where(np.isfinite(y), 0.8 * mean + 0.2 * scaled, mean)
-        observer.update(y)
-        want.correct(y)
-        np.testing.assert_allclose(observer.innovation, mean, rtol=1e-5)
-        assert observer.innovation_bias == pytest.approx(3 * np.abs(mean).max(), rel=1e-5)
-
-
 @pytest.mark.parametrize("held", [False, True])
 def test_between_samples_the_filter_is_that_of_the_state_there(held: bool) -> None:
     """0.6 of a sample at 30 %, a reading, 0.8 of one at 50 %; the drive and the room may be off."""

@@ -46,7 +46,7 @@ def tclab() -> Plant:
 
 
 def test_what_is_kept_of_a_linear_plant_is_what_would_be_made_anew(tank_maker):
-    # lost outputs, and moves that weigh more, are another program; between them the first one comes back
+    # lost outputs are another program; between them the first one comes back
     plant = tank_maker(joule=0.0)
     design = default_design(plant, dt=2.0, controlled=("t_tank", "t_surface"), limits=LIMITS)
     kept, fresh = (ReferenceController(plant, design) for _ in range(2))
@@ -57,7 +57,7 @@ def test_what_is_kept_of_a_linear_plant_is_what_would_be_made_anew(tank_maker):
         last = rng.uniform(-1, 1, 1)
         about = {"target": rng.uniform(15, 40, 2), "side": rng.choice([-1.0, 0, 1], 2)}
         about |= {"bias": 0.2 * rng.normal(size=2), "drive_bias": 0.02 * rng.normal(size=1)}
-        about |= {"lost": np.array([k % 7 == 3, False]), "caution": 4.0 if k % 5 == 4 else 1.0}
+        about["lost"] = np.array([k % 7 == 3, False])
         guess = np.repeat(last[None], kept.optimiser.n_b, axis=0)
         sample = Sample(x, last, guess, room, **about)
         if k % 9 == 8:  # nothing of a program that fails is kept
@@ -101,7 +101,6 @@ def test_a_rod_of_many_masses_is_the_same_in_c():
     for controller in (python, c):
         controller.reset(reading)
     for k in range(110):
-        # in turn targets that the end of a plan does not reach, and one that nothing does
         target = {"a": 41.0 if k < 80 else 28.0, "b": 38.0 if k < 80 else 60.0}
         y = truth.output(x) + 0.02 * rng.standard_normal(3)
         reading = dict(zip(("a", "b", "c"), y.tolist())) | {"room": 25.0} | applied
@@ -113,9 +112,7 @@ def test_a_rod_of_many_masses_is_the_same_in_c():
         np.testing.assert_allclose(c.c.view("P", P.shape), P, rtol=0.0, atol=1e-8 * P.max())
         statuses.append(one.status)
         x = truth.next_state(x, ours, d)
-    assert set(statuses[:80]) == {"ok"}
-    assert statuses.index("infeasible") == 81  # found by the steady state
-    assert set(statuses[81:]) == {"infeasible"}
+    assert set(statuses) == {"ok"}
 
 
 @pytest.mark.parametrize("held", [(), ("t_surface",)])

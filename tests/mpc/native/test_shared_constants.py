@@ -11,7 +11,7 @@ import pytest
 
 from thermogrip.mpc.native import design_struct, shared_constants
 from thermogrip.mpc.native.shared_constants import shared_definitions
-from thermogrip.mpc.optimiser import reach
+from thermogrip.mpc.optimiser import rti
 
 MPC = Path(str(design_struct.__file__)).parents[1]
 SOURCES = sorted((MPC / "native" / "csource").glob("tg_*.[ch]"))
@@ -50,8 +50,7 @@ def test_every_shared_constant_is_used_in_c() -> None:
 def test_another_value_is_another_header(monkeypatch: pytest.MonkeyPatch) -> None:
     # which is hashed into the name of a compiled library
     before = shared_definitions()
-    monkeypatch.setattr(reach, "STRIDE", 0.4)
+    monkeypatch.setattr(rti, "SAFE", 0.8)
     changed = set(shared_definitions()) - set(before)
-    assert changed == {"#define TG_STRIDE 0.4"}
-    assert "#define TG_CAUTION 3.0" in before
+    assert changed == {"#define TG_SAFE 0.8"}
     assert "#define TG_SHARES {0.5, 0.25, 0.1, 0.0}" in before

@@ -10,11 +10,11 @@ import pytest
 
 from tests.mpc.makers import WAYS, crossed
 from thermogrip.mpc.closed_loop.simulate import Surroundings, simulate_closed_loop
-from thermogrip.mpc.controllers.mpc import Controller, design_controller
+from thermogrip.mpc.controllers.mpc import design_controller
 from thermogrip.mpc.design.design import Design, PILoop, default_design
 from thermogrip.mpc.design.spec import Spec
 from thermogrip.mpc.optimiser.qp import QPAnswer
-from thermogrip.mpc.optimiser.rti import Optimiser, Problem, RestGains, Sample, allowed_share
+from thermogrip.mpc.optimiser.rti import Optimiser, Problem, Sample, allowed_share
 from thermogrip.mpc.plant.prediction import PredictionModel
 from thermogrip.mpc.tuning.minimum_time import full_drive_bound
 from thermogrip.sysid.models.state_space import StateSpaceModel
@@ -210,7 +210,6 @@ def test_the_share_of_the_way_to_an_optimum(end, share):
 
 def test_gains_at_rest(optimiser):
     at_rest = optimiser.at_rest
-    np.testing.assert_allclose(at_rest.settled, [25.0, 51.0])  # b by q1, a by q2, over their ranges
     assert (at_rest.strongest.tolist(), optimiser.pair.tolist()) == ([0, 1], [0, 1])
     G, _ = condensed(optimiser)
     sums = G.sum(axis=0).reshape(2, 3, 2)
@@ -240,25 +239,3 @@ def test_a_solve_predicts_what_its_plan_does_and_parks_what_is_lost(optimiser):
     assert (failed.status, failed.broken, failed.iterations) == ("cycling", {}, 4)
     assert np.isnan(failed.plan).all()
     np.testing.assert_allclose(failed.y, outputs(guess + bias), atol=1e-9)
-
-
-@pytest.mark.parametrize(("a", "b"), [(1.0, 0.1), (0.9, 0.0)])
-def test_a_plant_that_settles_nowhere_or_is_not_moved_has_no_settled_gain(a, b):
-    model = StateSpaceModel(("q",), (), ("t",), A=[[a]], B=[[b]], C=[[1.0]], dt=2.0)
-    plant = Plant(model, {}, dt=2.0, units={"q": "1", "t": "degC"}, valid={"q": (0.0, 1.0)})
-    design = Design(2.0, ("t",), (1, 1), {"q": (0.0, 1.0)}, {"q": 1.0})
-    assert RestGains.of(PredictionModel(plant), design).settled is None
-
-
-def test_caution_counts_as_so_many_times_the_weight_of_moves():
-    plant = crossed()
-    design = replace(design_controller(plant, dt=2.0).design, move=0.5, price=0.0)
-    more = Controller(plant, replace(design, move=2.0)).optimiser
-    own = Controller(plant, design).optimiser
-    sample = Sample(
-        np.array([24.0, 22.0]), np.array([20.0, 30.0]), np.full((own.n_b, 2), 25.0), np.array([20.0]),
-        np.array([24.5, 24.5]), np.ones(2), np.zeros(2), np.zeros(2), caution=4.0,
-    )  # fmt: skip
-    cautious, plain = own.solve(sample).plan, own.solve(sample._replace(caution=1.0)).plan
-    np.testing.assert_allclose(cautious, more.solve(sample._replace(caution=1.0)).plan, atol=1e-6)
-    assert np.abs(plain - cautious).max() > 1.0
