@@ -1,5 +1,9 @@
 """Before any test: one thread for linear algebra, whose matrices are small; the same examples in each run.
 
+What is collected stays to the end, so Python's collector of garbage need not look through it again and again:
+that was a third of the collection's time and a seventh of the tests'.  Compiled modules are kept, which every
+process that a test starts imports.
+
 And Ctrl-C: a shell that starts the tests in the background has them ignore it, and so would the programs that
 they start.
 
@@ -9,6 +13,7 @@ failure: a missing compiler or package must not take hundreds of tests out of a 
 
 from __future__ import annotations
 
+import gc
 import os
 import re
 import signal
@@ -26,6 +31,10 @@ if "numpy" in sys.modules:  # a plugin of another package imported it, which has
 for _name in ("FORCE_COLOR", "NO_COLOR", "COLUMNS"):  # what a program shows is not what this terminal wishes
     os.environ.pop(_name, None)
 
+sys.dont_write_bytecode = False
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+gc.disable()  # until all tests are collected
+
 settings.register_profile("steady", derandomize=True, deadline=None)
 settings.load_profile("steady")
 
@@ -37,6 +46,13 @@ ALLOWED_SKIPS = {
     r"needs POSIX and two processors": "one core shares no work",
     r"no browser: ": "the distribution's chromium, which `.ci/run` installs where it may",
 }
+
+
+def pytest_collection_finish() -> None:
+    """Look for garbage again, in what the tests make, and not after each 700 objects."""
+    gc.freeze()
+    gc.set_threshold(20_000, 20, 20)
+    gc.enable()
 
 
 def unexpected_skip(reason: str) -> str:

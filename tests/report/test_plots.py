@@ -1,9 +1,8 @@
-"""Figures: colours that every reader can distinguish, units on every axis, legends that cover nothing."""
+"""Figures: what each shows, units on every axis, legends that cover nothing."""
 
 from __future__ import annotations
 
 import os
-from itertools import combinations
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -12,12 +11,10 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 from matplotlib.text import Text as MplText
-from numpy.typing import NDArray
 
 from tests.end_to_end.conftest import HEADER, small_log_rows, small_plant
 from tests.report.conftest import described
-from thermogrip.classify import figures as of_classifiers
-from thermogrip.datasets.charts import PALETTE, draw_chart
+from thermogrip.datasets.charts import draw_chart
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.log_files import read_log
 from thermogrip.datasets.schema import make_grasps, make_log
@@ -43,58 +40,6 @@ from thermogrip.sysid.plant.fit_record import PlantScores
 from thermogrip.sysid.validation.prediction_bands import Band
 from thermogrip.sysid.validation.residual_tests import Correlation
 from thermogrip.sysid.validation.verdict import Row
-
-# Machado, Oliveira and Fernandes 2009, severity 1, on linear RGB
-EYES = {
-    "usual": np.eye(3),
-    "protan": np.reshape(
-        [0.152286, 1.052583, -0.204868, 0.114503, 0.786281, 0.099216, -0.003882, -0.048116, 1.051998], (3, 3)
-    ),
-    "deutan": np.reshape(
-        [0.367322, 0.860646, -0.227968, 0.280085, 0.672501, 0.047413, -0.011820, 0.042940, 0.968881], (3, 3)
-    ),
-    "tritan": np.reshape(
-        [1.255528, -0.076749, -0.178779, -0.078411, 0.930809, 0.147602, 0.004733, 0.691367, 0.303900], (3, 3)
-    ),
-}
-TO_XYZ = np.array(
-    [[0.4124564, 0.3575761, 0.1804375], [0.2126729, 0.7151522, 0.0721750], [0.0193339, 0.1191920, 0.9503041]]
-)
-LEAST = 7.0  # three times what an eye just notices (2.3 in CIE Lab)
-
-
-def lab_of(colour: str, eye: str) -> NDArray[np.float64]:
-    """Return CIE Lab of a colour as an eye sees it."""
-    rgb = np.array([int(colour[k : k + 2], 16) / 255 for k in (1, 3, 5)])
-    linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
-    xyz = TO_XYZ @ np.clip(EYES[eye] @ linear, 0, 1) / [0.95047, 1.0, 1.08883]
-    f = np.where(xyz > 0.008856, np.cbrt(xyz), 7.787 * xyz + 16 / 116)
-    return np.array([116 * f[1] - 16, 500 * (f[0] - f[1]), 200 * (f[1] - f[2])])
-
-
-@pytest.mark.parametrize("eye", EYES)
-@pytest.mark.parametrize("colours", [PALETTE, of_classifiers.PALETTE])
-def test_no_eye_takes_two_colours_of_a_figure_for_one(colours, eye):
-    seen = {colour: lab_of(colour, eye) for colour in colours}
-    near = {(a, b): np.linalg.norm(seen[a] - seen[b]) for a, b in combinations(colours, 2)}
-    assert min(near.values()) > LEAST, min(near, key=near.__getitem__)
-
-
-def test_the_check_of_colours_finds_red_and_green_that_a_protan_eye_takes_for_one():
-    seen = [lab_of(colour, "protan") for colour in ("#c8553d", "#17703f")]
-    assert np.linalg.norm(seen[0] - seen[1]) < LEAST
-
-
-def a_log(shift: float = 0.0):
-    t = np.arange(5.0)
-    return make_log(
-        t,
-        {
-            "q1": (10 * t, "percent", "input"),
-            "drive": (t / 5, "1", "input"),
-            "t1": (20 + t + shift, "degC", "output"),
-        },
-    )
 
 
 def test_the_loop_on_a_session_page_has_the_figures_that_the_command_line_prints():

@@ -47,7 +47,7 @@ class Desk:
         guard = GuardSettings().below(LIMIT)
         return Autotune(
             self.folder, target, self.open, lambda plant: Guard(plant, guard, skin="t1"), clock=self.clock,
-            minutes=20.0, spec=SPEC, models=("oe",), say=self.said.append, **{**self.options, **options},
+            minutes=20.0, spec=SPEC, models=("arx",), say=self.said.append, **{**self.options, **options},
         )  # fmt: skip
 
 
