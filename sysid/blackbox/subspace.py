@@ -48,7 +48,6 @@ from thermogrip.sysid.blackbox.order_selection import (
     drives,
     with_spread,
 )
-from thermogrip.sysid.models.lti import scan_states
 from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.log_grid import Grid, whole_readings
 
@@ -163,11 +162,14 @@ def fit_inputs(grid: Grid, A: Array, C: Array, terms: tuple[str, ...] = ()) -> S
 
 def _unit_responses(drive: Array, A: Array, C: Array) -> Array:
     """Simulate y for each unit entry of [B E F c], drive by drive, then of x0: (n_w n + n, N, n_y)."""
+    from thermogrip.sysid.models.recurrences import run_linear  # pulls in numba
+
     n, rows = A.shape[0], len(drive)
     w = np.hstack([drive, np.ones((rows, 1))])
-    push = np.einsum("km,ab->makb", w, np.eye(n)).reshape(-1, rows, n)
-    forced = scan_states(A, push[:, :-1], np.zeros((len(push), n)))
-    free = scan_states(A, np.zeros((n, rows - 1, n)), np.eye(n))
+    pushes = np.einsum("km,ab->makb", w, np.eye(n)).reshape(-1, rows, n)
+    nothing = np.zeros((1, rows - 1, 0))
+    forced = run_linear(A[None], nothing, pushes[:, :-1], np.zeros((len(pushes), n)), 1)
+    free = run_linear(A[None], nothing, np.zeros((1, rows - 1, n)), np.eye(n), 1)
     return np.concatenate([forced, free]) @ C.T
 
 

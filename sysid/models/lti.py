@@ -1,8 +1,4 @@
-"""Linear algebra of discrete state-space models: fast simulation, products of inputs, state at the start.
-
-**Simulation.**  x[k+1] = A x[k] + b[k] seems sequential, yet by superposition every block of L rows can run
-from zero at the same time; only the block ends are chained, with A^L.  With L = sqrt(N) a simulation of N
-rows costs 3 sqrt(N) matrix products.
+"""Linear algebra of discrete state-space models: products of inputs, state at the start.
 
 **Start.**  A log seldom begins where the model would: the state is unknown, and the sensors are off by some
 amount o that is constant over the log.  With x0 = x_rest + s, s ~ N(0, P), o ~ N(0, q^2) and white reading
@@ -14,7 +10,7 @@ run.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -33,64 +29,6 @@ def evaluate_terms(terms: Sequence[str], names: Sequence[str], rows: Array) -> A
         for index, magnitude in factors:
             out[..., column] *= np.abs(rows[..., index]) if magnitude else rows[..., index]
     return out
-
-
-def scan_states(A: Array, push: Array, x0: Array) -> Array:
-    """Solve x[k+1] = A x[k] + push[k] for a batch without a loop over the rows.
-
-    The rows are cut into about sqrt(N) blocks.  All blocks run from zero at once, then the block ends are
-    chained with A^L, then each block's free response is added: 3 sqrt(N) small products instead of N.
-    """
-    n_batch, n, n_x = push.shape
-    if not n:
-        return x0[:, None]
-    length = int(np.ceil(np.sqrt(n)))
-    blocks = -(-n // length)
-    padded = np.zeros((n_batch, blocks * length, n_x))
-    padded[:, :n] = push
-    padded = padded.reshape(n_batch, blocks, length, n_x)
-    x = np.empty((n_batch, blocks, length + 1, n_x))
-    with np.errstate(
-        over="ignore", invalid="ignore"
-    ):  # an unstable model ends in inf, which its caller refuses
-        x[:, :, 0] = 0
-        for k in range(length):
-            x[:, :, k + 1] = x[:, :, k] @ A.T + padded[:, :, k]
-        power, begin = np.linalg.matrix_power(A, length), np.empty((n_batch, blocks, n_x))
-        begin[:, 0] = x0
-        for b in range(blocks - 1):
-            begin[:, b + 1] = begin[:, b] @ power.T + x[:, b, length]
-        free = begin
-        for k in range(length):
-            x[:, :, k] += free
-            free = free @ A.T
-        x[:, :, length] += free
-    inner = x[:, :, :length].reshape(n_batch, blocks * length, n_x)
-    whole = np.concatenate([inner, x[:, -1:, length]], axis=1)
-    return np.asarray(whole[:, : n + 1])
-
-
-def switched_states(A: Array, switched: Mapping[str, tuple[Array, Array]], push: Array, x0: Array) -> Array:
-    """Solve x[k+1] = (A + sum_s u_s[k] A_s) x[k] + push[k], run by run of constant switches."""
-    n_batch, n, n_x = push.shape
-    position = np.concatenate(
-        [on[:1] for on, _ in switched.values()], axis=0
-    )  # (n_switch, n), first of the batch
-    if any(not np.array_equal(on, np.broadcast_to(on[:1], on.shape)) for on, _ in switched.values()):
-        single = [
-            switched_states(
-                A, {k: (on[b : b + 1], m) for k, (on, m) in switched.items()}, push[b : b + 1], x0[b : b + 1]
-            )
-            for b in range(n_batch)
-        ]
-        return np.concatenate(single)
-    edges = np.flatnonzero(np.any(np.diff(position, axis=1) != 0, axis=0)) + 1
-    x = np.empty((n_batch, n + 1, n_x))
-    x[:, 0] = x0
-    for begin, end in zip([0, *edges], [*edges, n]):
-        A_now = A + sum((on[0, begin] * matrix for on, matrix in switched.values()), 0.0 * A)
-        x[:, begin : end + 1] = scan_states(A_now, push[:, begin:end], x[:, begin])
-    return x
 
 
 def constrained_lstsq(rows: Array, right: Array, fixed: Array, value: Array) -> Array:

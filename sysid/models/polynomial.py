@@ -90,38 +90,17 @@ class SindyModel(BlackBox):
     def rollout(self, x0: ArrayLike, u: ArrayLike, d: ArrayLike, p: ArrayLike, dt: float) -> Run:
         """Simulate a batch; a state beyond :data:`BOUND` times the range of the data has diverged and is
         infinite from there on."""
-        x = np.array(x0, dtype=float)
-        w = join_columns(np.asarray(u, dtype=float), np.asarray(d, dtype=float))
-        n_y = len(self.outputs)
-        rows = w.shape[1]
-        n_x = self.n_x
+        from thermogrip.sysid.models.recurrences import run_polynomial  # pulls in numba
+
+        w = np.ascontiguousarray(join_columns(np.asarray(u, dtype=float), np.asarray(d, dtype=float)))
+        x0 = np.ascontiguousarray(x0, dtype=float)
         times = max(1, round(dt / self.dt))  # the step of a gap may differ a little from the model's
-        powers, gains = self._by_state(w)
-        factors = _monomial_factors(powers)
-        y = np.empty((x.shape[0], rows + 1, n_y))
-        y[:, 0] = x[:, :n_y]
-        with np.errstate(over="ignore", invalid="ignore"):  # what diverges is marked below
-            for k in range(rows):
-                for _ in range(times):
-                    after = np.matmul(gains[:, k], _products(factors, x)[:, :, None])[:, :, 0]
-                    x = np.hstack([after, x[:, : n_x - n_y]])
-                y[:, k + 1] = x[:, :n_y]
-            middle, reach = (self.low + self.high) / 2, BOUND * (self.high - self.low)
+        y, x = run_polynomial(self.exponents, self.coefficients, x0, w, times)
+        middle, reach = (self.low + self.high) / 2, BOUND * (self.high - self.low)
+        with np.errstate(invalid="ignore"):
             gone = np.maximum.accumulate(~(np.abs(y - middle) < reach).all(axis=2), axis=1)
         y[gone], x[gone[:, -1]] = np.inf, np.inf
         return y, x
-
-    def _by_state(self, w: Array) -> tuple[NDArray[np.int_], Array]:
-        """Return the distinct monomials of the state and, row by row, their gains (B, N, n_y, n_monomial)."""
-        n_x = self.n_x
-        powers, place = np.unique(self.exponents[:, :n_x], axis=0, return_inverse=True)
-        factors, rows = _monomial_factors(self.exponents[:, n_x:]), w.reshape(-1, w.shape[2])
-        with np.errstate(over="ignore", invalid="ignore"):
-            outside = _products(factors, rows).reshape(*w.shape[:2], -1)
-        gains = np.zeros((*w.shape[:2], len(self.outputs), len(powers)))
-        for term, monomial in enumerate(place.ravel()):
-            gains[..., monomial] += outside[..., term, None] * self.coefficients[:, term]
-        return powers, gains
 
     def equations(self) -> tuple[str, ...]:
         """Return one equation per output as text, in natural units."""
@@ -150,26 +129,6 @@ def _monomial(row: NDArray[np.int_], variables: Values) -> Any:
         for _ in range(power):
             value = value * variable
     return value
-
-
-def _monomial_factors(powers: NDArray[np.int_]) -> NDArray[np.int_]:
-    """Return which variables each monomial multiplies, (degree, n_monomial); n_variable denotes 1."""
-    degree, one = int(powers.sum(axis=1).max(initial=0)), powers.shape[1]
-    out = np.full((degree, len(powers)), one)
-    for term, row in enumerate(powers):
-        chosen = np.repeat(np.arange(one), row)
-        out[: len(chosen), term] = chosen
-    return out
-
-
-def _products(factors: NDArray[np.int_], x: Array) -> Array:
-    """Return the monomials (n, n_monomial) of states (n, n_variable)."""
-    padded = np.ones((x.shape[0], x.shape[1] + 1))
-    padded[:, :-1] = x
-    out = np.ones((x.shape[0], factors.shape[1]))
-    for row in factors:
-        out *= padded[:, row]
-    return out
 
 
 def _polynomial_text(row: Array, exponents: NDArray[np.int_], names: Sequence[str]) -> str:

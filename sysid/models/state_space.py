@@ -40,8 +40,6 @@ from thermogrip.sysid.models.lti import (
     join_columns,
     product_of,
     read_terms,
-    scan_states,
-    switched_states,
     whole_steps,
 )
 from thermogrip.sysid.models.model import BlackBox
@@ -154,11 +152,9 @@ class StateSpaceModel(BlackBox):
     def rollout(self, x0: ArrayLike, u: ArrayLike, d: ArrayLike, p: ArrayLike, dt: float) -> Run:
         """Simulate a batch, so many rows at a time that their states have :data:`_STATES_AT_ONCE` numbers."""
         x_end, u, d = (np.asarray(value, dtype=float) for value in (x0, u, d))
-        rows = max(1, _STATES_AT_ONCE // max(1, x_end.size * max(1, round(dt / self.dt))))
-        if u.shape[1] <= rows:
-            x = self.states(x_end, u, d, dt)
-            return x @ self.C.T + self.y0, x[:, -1]
+        rows = max(1, _STATES_AT_ONCE // max(1, x_end.size))
         y = np.empty((len(x_end), u.shape[1] + 1, len(self.outputs)))
+        y[:, 0] = x_end @ self.C.T + self.y0
         for begin in range(0, u.shape[1], rows):
             block = slice(begin, begin + rows)
             x = self.states(x_end, u[:, block], d[:, block], dt)
@@ -168,22 +164,13 @@ class StateSpaceModel(BlackBox):
 
     def states(self, x0: ArrayLike, u: ArrayLike, d: ArrayLike, dt: float) -> Array:
         """Return the states (n_batch, N + 1, n_x) of :meth:`rollout`."""
-        x0 = np.asarray(x0, dtype=float)
-        u, d = np.asarray(u, dtype=float), np.asarray(d, dtype=float)
+        from thermogrip.sysid.models.recurrences import run_linear  # pulls in numba
+
+        x0, u, d = (np.ascontiguousarray(value, dtype=float) for value in (x0, u, d))
         times = max(1, round(dt / self.dt))  # the step of a gap may differ a little from the model's
-        if times > 1:
-            u, d = np.repeat(u, times, axis=1), np.repeat(d, times, axis=1)
-        push = self.push(u, d)
-        push = np.broadcast_to(push, (x0.shape[0], *push.shape[1:]))
-        if self.A_switch:
-            on = {
-                name: np.broadcast_to(u[:, :, self.inputs.index(name)], push.shape[:2])
-                for name in self.A_switch
-            }
-            x = switched_states(self.A, {key: (on[key], self.A_switch[key]) for key in on}, push, x0)
-        else:
-            x = scan_states(self.A, push, x0)
-        return x[:, ::times]
+        on = np.ascontiguousarray(u[:, :, [self.inputs.index(name) for name in self.A_switch]])
+        A = np.stack([self.A, *self.A_switch.values()])
+        return np.asarray(run_linear(A, on, np.ascontiguousarray(self.push(u, d)), x0, times))
 
     @staticmethod
     def others(data: Mapping[str, Any]) -> dict[str, Any]:

@@ -19,41 +19,11 @@ from thermogrip.sysid.models.lti import (
     join_columns,
     product_of,
     read_terms,
-    switched_states,
     whole_steps,
 )
 from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.linearise import linearise_plant
 from thermogrip.sysid.plant.plant import Plant
-
-
-@given(seed=st.integers(0, 10**6), n=st.integers(1, 30))
-def test_two_switches_that_move_at_different_times_are_followed_row_by_row(seed: int, n: int):
-    rng = np.random.default_rng(seed)
-    A, more, other = (0.4 * rng.standard_normal((2, 2)) for _ in range(3))
-    p, q = (rng.random((1, n)) < 0.5).astype(float), (rng.random((1, n)) < 0.2).astype(float)
-    push, x = rng.standard_normal((1, n, 2)), [np.array([1.0, -1.0])]
-    for k in range(n):
-        x.append((A + p[0, k] * more + q[0, k] * other) @ x[-1] + push[0, k])
-    got = switched_states(A, {"p": (p, more), "q": (q, other)}, push, x[0][None])
-    np.testing.assert_allclose(got[0], x, rtol=1e-9, atol=1e-9)
-
-
-def test_members_with_switches_of_their_own_run_each_by_itself():
-    A, more = np.array([[0.5, 0.2], [0.0, 0.4]]), np.array([[0.1, 0.0], [0.3, -0.2]])
-    on = np.array([[0.0, 1.0, 1.0, 0.0], [1.0, 1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
-    push, x0 = (
-        np.random.default_rng(0).standard_normal((3, 4, 2)),
-        np.array([[1.0, 2.0], [3.0, -1.0], [0.5, 0.0]]),
-    )
-    got = switched_states(A, {"p": (on, more)}, push, x0)
-    assert got.shape == (3, 5, 2)
-    for b in range(3):
-        x = x0[b]
-        for k in range(4):
-            np.testing.assert_allclose(got[b, k], x)
-            x = (A + on[b, k] * more) @ x + push[b, k]
-        np.testing.assert_allclose(got[b, 4], x)
 
 
 def test_columns_are_joined_in_the_last_axis_and_batches_broadcast():

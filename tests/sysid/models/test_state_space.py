@@ -7,12 +7,9 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from scipy.signal import dlsim
 
 from thermogrip.datasets.errors import UserError
-from thermogrip.sysid.models.lti import scan_states
 from thermogrip.sysid.models.state_space import StateSpaceModel
 
 
@@ -52,18 +49,6 @@ def test_a_free_run_of_a_mimo_model_is_scipys_dlsim():
     _, want, _ = dlsim((A, B, C, np.zeros((2, 3)), 0.5), u, x0=x0)
     got, _ = model.rollout(x0[None], u[None], np.zeros((1, 400, 0)), (), 0.5)
     np.testing.assert_allclose(got[0, :-1], want, rtol=0, atol=1e-10)
-
-
-@settings(max_examples=25, deadline=None)
-@given(n=st.integers(0, 40), n_batch=st.integers(1, 3), seed=st.integers(0, 99))
-def test_the_blocked_scan_is_the_plain_loop(n, n_batch, seed):
-    rng = np.random.default_rng(seed)
-    A, push = 0.5 * rng.standard_normal((3, 3)), rng.standard_normal((n_batch, n, 3))
-    x = [rng.standard_normal((n_batch, 3))]
-    for k in range(n):
-        x.append(x[-1] @ A.T + push[:, k])
-    want = np.stack(x, axis=1)
-    np.testing.assert_allclose(scan_states(A, push, x[0]), want, rtol=1e-9, atol=1e-9 * np.abs(want).max())
 
 
 def test_rollout_of_a_switched_model_is_its_own_step_repeated():
