@@ -32,7 +32,6 @@ inside the limits, with s the class's spread of each state and T the seconds of 
 
 from __future__ import annotations
 
-import difflib
 import hashlib
 import importlib.util
 import inspect
@@ -40,16 +39,25 @@ import keyword
 import sys
 import traceback
 from collections import namedtuple
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from difflib import get_close_matches
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Self
 
 import numpy as np
 from numpy.lib.mixins import NDArrayOperatorsMixin
 from numpy.typing import ArrayLike
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    ValidationError,
+    model_validator,
+)
 
 from thermogrip.datasets.arrays import Array, Run, Values
 from thermogrip.datasets.errors import UserError, known_names, reading
@@ -59,75 +67,123 @@ from thermogrip.sysid.models.network_spec import Parameter
 if TYPE_CHECKING:
     from thermogrip.sysid.models.jit_rollout import Kernel
 
-_REQUIRED = {
+_EXAMPLES = {
     "inputs": 'inputs = {"pump": "V"}: name and unit of each',
     "outputs": 'outputs = {"level": "V"}: name and unit of each',
     "states": 'states = {"level": 0.1}: each with how unsure it is where a log begins',
     "parameters": 'parameters = {"area": {"value": 2.0, "sd_log": 0.7, "unit": "m2"}}',
+    "limits": 'limits = {"level": (0, 10)}: lowest and highest of a state, None for an open end',
     "dt": "dt = 1.0: the step of the simulation in seconds",
     "rhs": "def rhs(self, x, u, d, p): return dx/dt of each state",
+    "output": "def output(self, x, p): return what each output reads",
 }
-_OPTIONAL = ("disturbances", "limits", "output", "rest", "average", "warmup")
 
 
-class _ConfigTable(BaseModel):
+def _signal_name(name: str) -> str:
+    if not name.isidentifier() or name.startswith("_") or keyword.iskeyword(name):
+        raise ValueError("use letters, digits and underscores, and no word of Python's own")
+    return name
+
+
+def _bare(key: str, **others: Any) -> BeforeValidator:
+    """Let a bare value stand for a table that has it under ``key``."""
+    return BeforeValidator(lambda item: item if isinstance(item, Mapping) else {key: item} | others)
+
+
+def _open(end: float) -> BeforeValidator:
+    return BeforeValidator(lambda given: end if given is None else given)
+
+
+_Name = Annotated[str, AfterValidator(_signal_name)]
+_Unit = Annotated[str, Field(min_length=1)]
+_Positive = Annotated[float, Field(gt=0, allow_inf_nan=False, strict=True)]
+_Some = Field(min_length=1)
+_Ends = tuple[Annotated[float, _open(-np.inf)], Annotated[float, _open(np.inf)]]
+
+
+class _Table(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
-class Input(_ConfigTable):
+class Input(_Table):
     """Something that is moved; ``switch`` marks a pump or valve that is on or off."""
 
-    unit: Annotated[str, Field(min_length=1)]
+    unit: _Unit
     range: tuple[float, float] | None = None
     switch: bool = False
 
 
-class Output(_ConfigTable):
+class Output(_Table):
     """A sensor: ``sd`` of a bin's mean about the model, ``log_sd`` of its offset from log to log."""
 
-    unit: Annotated[str, Field(min_length=1)]
-    sd: Annotated[float, Field(gt=0)] | None = None
+    unit: _Unit
+    sd: _Positive | None = None
     log_sd: Annotated[float, Field(ge=0)] = 0.0
 
 
-class Disturbance(_ConfigTable):
+class Disturbance(_Table):
     """Something measured and not moved; ``log_sd`` of its sensor's offset from log to log."""
 
-    unit: Annotated[str, Field(min_length=1)]
+    unit: _Unit
     log_sd: Annotated[float, Field(ge=0)] = 0.0
 
 
-class _State(_ConfigTable):
-    sd: Annotated[float, Field(gt=0)]
+class _OwnParameter(Parameter):
+    unit: str = "1"
+
+
+class _Attributes(_Table):
+    """What a class states beside its functions."""
+
+    inputs: dict[_Name, Annotated[Input, _bare("unit")]]
+    outputs: Annotated[dict[_Name, Annotated[Output, _bare("unit")]], _Some]
+    states: Annotated[dict[_Name, _Positive], _Some]
+    parameters: Annotated[dict[_Name, Annotated[_OwnParameter, _bare("value", fixed=True)]], _Some]
+    dt: _Positive
+    disturbances: dict[_Name, Annotated[Disturbance, _bare("unit")]] = {}
+    limits: dict[_Name, _Ends] = {}
+    average: _Positive | None = None
+    warmup: _Positive | None = None
+
+    @model_validator(mode="after")
+    def _limited(self) -> Self:
+        for name, (low, high) in self.limits.items():
+            if name not in self.states:
+                raise ValueError(f"{name!r} is no state")
+            if not low < high:
+                raise ValueError(f"{name} is between {low:g} and {high:g}")
+        return self
 
 
 class OwnCode:
-    """A user's class, its tables checked and its functions guarded; from :func:`read_class`."""
+    """A user's class, its tables checked and its functions guarded: the steps of a model
+    (:class:`thermogrip.sysid.models.model.Equations`)."""
 
     def __init__(self, made: Any) -> None:
         self.made, self.name = made, type(made).__name__
         self.file = _file_of(type(made))
-        self._check_attributes()
-        self.inputs = self._table("inputs", Input, short="unit")
-        self.outputs = self._table("outputs", Output, short="unit")
-        self.disturbances = self._table("disturbances", Disturbance, short="unit")
-        self.parameters = self._table("parameters", Parameter, short="value")
-        self.states = {name: item.sd for name, item in self._table("states", _State, short="sd").items()}
-        self.limits = self._limits()
-        self.dt = self._seconds("dt") or 1.0
-        self.average, self.warmup = self._seconds("average"), self._seconds("warmup")
-        for table in ("outputs", "states", "parameters"):
-            if not getattr(self, table):
-                raise self.fault(f"has no {table}", hint=_REQUIRED[table])
-        self.X, self.U = _tuple("states", self.states), _tuple("inputs", self.inputs)
-        self.D, self.P = _tuple("disturbances", self.disturbances), _tuple("parameters", self.parameters)
-        self.Y = _tuple("outputs", self.outputs)
-        if not hasattr(made, "output") and not set(self.outputs) <= set(self.states):
-            lost = next(name for name in self.outputs if name not in self.states)
-            raise self.fault(
-                f"does not say what output {lost!r} reads: it is no state",
-                hint="def output(self, x, p): return what each output reads",
-            )
+        self._check_names()
+        stated = {name: getattr(made, name) for name in _Attributes.model_fields if hasattr(made, name)}
+        try:
+            tables = _Attributes.model_validate(stated)
+        except ValidationError as error:
+            first = error.errors()[0]
+            place = [str(key) for key in first["loc"]] or ["limits"]  # what the tables say of each other
+            problem = f"states {' '.join(place)}: {first['msg'].removeprefix('Value error, ')}"
+            example = _EXAMPLES.get(place[0])
+            raise self.fault(problem, hint=f"write {example}" if example else "give seconds") from error
+        self.inputs, self.outputs, self.disturbances = tables.inputs, tables.outputs, tables.disturbances
+        self.parameters, self.states, self.dt = tables.parameters, tables.states, tables.dt
+        self.average, self.warmup = tables.average or 5 * self.dt, tables.warmup or 50 * self.dt
+        self.limits = np.array([tables.limits.get(name, (-np.inf, np.inf)) for name in self.states])
+        groups = ("states", "inputs", "disturbances", "parameters", "outputs")
+        self.X, self.U, self.D, self.P, self.Y = (
+            namedtuple(group, list(getattr(self, group))) for group in groups
+        )
+        unread = [name for name in self.outputs if name not in self.states]
+        if unread and not hasattr(made, "output"):
+            problem = f"does not say what output {unread[0]!r} reads: it is no state"
+            raise self.fault(problem, hint=f"write {_EXAMPLES['output']}")
 
     @property
     def sha256(self) -> str | None:
@@ -137,17 +193,43 @@ class OwnCode:
         text = Path(self.file).read_bytes().replace(b"\r\n", b"\n")
         return hashlib.sha256(text).hexdigest()
 
-    def rhs(self, x: Values, u: Values, d: Values, p: Values) -> list[Any]:
-        """Return dx/dt, a list of length n_x."""
-        args = (self.X(*x), self.U(*u), self.D(*d), self.P(*p))
-        return self._call("rhs", self.states, args)
+    @property
+    def sizes(self) -> Sizes:
+        """Numbers of states, inputs, disturbances and parameters."""
+        return Sizes(len(self.states), len(self.inputs), len(self.disturbances), len(self.parameters))
 
-    def output(self, x: Values, p: Values) -> list[Any]:
+    def prepare(self, p: Values) -> list[Any]:
+        """Return the parameters."""
+        return list(p)
+
+    def renew(self, u: Values, c: Values, h: Any) -> list[Any]:
+        """Return nothing: no part of a class is known to hang on switches alone."""
+        return []
+
+    def advance(self, x: Values, u: Values, d: Values, c: Values, kept: Values, h: Any) -> list[Any]:
+        """Return the state one Runge-Kutta step of ``h`` on."""
+        k1 = self.rhs(x, u, d, c)
+        k2 = self.rhs([a + h / 2 * k for a, k in zip(x, k1)], u, d, c)
+        k3 = self.rhs([a + h / 2 * k for a, k in zip(x, k2)], u, d, c)
+        k4 = self.rhs([a + h * k for a, k in zip(x, k3)], u, d, c)
+        state = [a + h / 6 * (s + 2 * (q + r) + t) for a, s, q, r, t in zip(x, k1, k2, k3, k4)]
+        for i, (low, high) in enumerate(self.limits):
+            if np.isfinite(low):
+                state[i] = np.maximum(state[i], low)
+            if np.isfinite(high):
+                state[i] = np.minimum(state[i], high)
+        return state
+
+    def read(self, x: Values, c: Values) -> list[Any]:
         """Return what the outputs read, a list of length n_y."""
         if not hasattr(self.made, "output"):
             named = dict(zip(self.states, x))
             return [named[name] for name in self.outputs]
-        return self._call("output", self.outputs, (self.X(*x), self.P(*p)))
+        return self._call("output", self.outputs, (self.X(*x), self.P(*c)))
+
+    def rhs(self, x: Values, u: Values, d: Values, p: Values) -> list[Any]:
+        """Return dx/dt, a list of length n_x."""
+        return self._call("rhs", self.states, (self.X(*x), self.U(*u), self.D(*d), self.P(*p)))
 
     def rest(self, y: Values, u: Values, d: Values, p: Values) -> list[Any] | None:
         """Return the class's own state at rest, None where it has no such function."""
@@ -157,8 +239,7 @@ class OwnCode:
 
     def fault(self, problem: str, *, line: int | None = None, hint: str | None = None) -> UserError:
         """Return the error that names file and class."""
-        where = _file_words(self.file, line)
-        return UserError(f"{self.name} {problem}", file=where or None, hint=hint)
+        return UserError(f"{self.name} {problem}", file=_file_words(self.file, line) or None, hint=hint)
 
     def _call(self, what: str, names: Mapping[str, Any], args: tuple[Any, ...]) -> list[Any]:
         try:
@@ -166,104 +247,28 @@ class OwnCode:
         except UserError:
             raise
         except Exception as error:  # the user's own code may raise anything
-            raise self._raised(what, error) from error
-        try:
-            values = list(got)
-        except TypeError:
-            values = [got]
+            hint, fields = f"correct {what}", getattr(getattr(error, "obj", None), "_fields", None)
+            if fields is not None:  # of a named tuple of the arguments
+                hint = f"the {type(error.obj).__name__} are {', '.join(fields) or 'none'}"  # type: ignore[attr-defined]
+            elif "truth value" in str(error):
+                hint = "an if about many values at once: choose with np.where or np.maximum"
+            problem = f"fails in {what}: {type(error).__name__}: {error}"
+            raise self.fault(problem, line=_line_of(error, self.file), hint=hint) from error
+        values = list(got) if np.iterable(got) else [got]
         if len(values) != len(names):
-            raise self.fault(
-                f"returns {len(values)} numbers from {what}, not {len(names)}",
-                hint=f"return one for each of {', '.join(names)}",
-            )
+            problem = f"returns {len(values)} numbers from {what}, not {len(names)}"
+            raise self.fault(problem, hint=f"return one for each of {', '.join(names)}")
         return values
 
-    def _raised(self, what: str, error: Exception) -> UserError:
-        """Return the line about an exception inside the user's function."""
-        frames = [f for f in traceback.extract_tb(error.__traceback__) if f.filename == self.file]
-        line = frames[-1].lineno if frames else None
-        problem, hint = f"{type(error).__name__}: {error}", f"correct {what}"
-        fields = getattr(error.obj, "_fields", None) if isinstance(error, AttributeError) else None
-        if isinstance(error, AttributeError) and fields is not None:
-            group = type(error.obj).__name__
-            problem = f"{error.name!r} is not among its {group}"
-            hint = f"they are {', '.join(fields)}" if fields else f"it has no {group}"
-        elif isinstance(error, ValueError) and "truth value" in str(error):
-            problem, hint = "an if about many values at once", "choose with np.where or np.maximum"
-        return self.fault(f"fails in {what}: {problem}", line=line, hint=hint)
-
-    def _check_attributes(self) -> None:
-        """Refuse a class that lacks something or seems to misspell it."""
-        for name, example in _REQUIRED.items():
-            if not hasattr(self.made, name):
-                raise self.fault(f"lacks {name}", hint=f"write {example}")
-        attributes = (*_REQUIRED, *_OPTIONAL)
+    def _check_names(self) -> None:
+        """Refuse a class without equations, or one that seems to misspell an attribute."""
+        if not callable(getattr(self.made, "rhs", None)):
+            raise self.fault("has no function rhs", hint=f"write {_EXAMPLES['rhs']}")
+        known = (*_Attributes.model_fields, "rhs", "output", "rest")
         for name in vars(type(self.made)):
-            close = difflib.get_close_matches(name, _OPTIONAL, n=1, cutoff=0.8)
-            if close and name not in attributes and not hasattr(self.made, close[0]):
-                raise self.fault(f"has {name!r}, which nothing reads", hint=f"call it {close[0]!r}")
-        if not callable(self.made.rhs):
-            raise self.fault("has an rhs that is not a function", hint=f"write {_REQUIRED['rhs']}")
-
-    def _table(self, what: str, kind: Any, *, short: str) -> dict[str, Any]:
-        """Return a checked table; a bare value is that of its ``short`` key."""
-        table = getattr(self.made, what, {})
-        if not isinstance(table, Mapping):
-            raise self.fault(f"has {what} that are not a table", hint=f"write {_REQUIRED[what]}")
-        out = {}
-        for name, item in table.items():
-            if not isinstance(name, str) or not name.isidentifier() or name.startswith("_"):
-                raise self.fault(f"has {name!r} in {what}", hint="use letters, digits and underscores")
-            if keyword.iskeyword(name):
-                raise self.fault(f"has {name!r} in {what}, a word of Python's own", hint="choose another")
-            content = dict(item) if isinstance(item, Mapping) else {short: item}
-            if kind is Parameter:
-                content = {"unit": "1", "fixed": not isinstance(item, Mapping)} | content
-            try:
-                out[name] = kind.model_validate(content)
-            except ValidationError as error:
-                first = error.errors()[0]
-                key = ".".join(str(key_part) for key_part in first["loc"])
-                problem = first["msg"].removeprefix("Value error, ")
-                raise self.fault(f"{what} {name}{': ' + key if key else ''}: {problem}") from error
-        return out
-
-    def _limits(self) -> dict[str, tuple[float, float]]:
-        out = {}
-        for name, ends in dict(getattr(self.made, "limits", {})).items():
-            if name not in self.states:
-                raise self.fault(f"limits {name!r}, which is no state", hint=known_names(name, self.states))
-            try:
-                low, high = ends
-                low = -float("inf") if low is None else float(low)
-                high = float("inf") if high is None else float(high)
-            except (TypeError, ValueError):
-                low = high = 0.0
-            if not low < high:
-                raise self.fault(f"limits {name} to {ends!r}", hint="write (lowest, highest), None for open")
-            out[name] = (low, high)
-        return out
-
-    def _seconds(self, what: str) -> float | None:
-        value = getattr(self.made, what, None)
-        if value is None:
-            return None
-        if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 < value < float("inf"):
-            raise self.fault(f"has {what} = {value!r}", hint="give seconds, more than 0")
-        return float(value)
-
-
-def read_class(kind: Any) -> OwnCode:
-    """Return a user's class (or an instance of one), checked."""
-    if not inspect.isclass(kind):
-        return OwnCode(kind)
-    try:
-        made = kind()
-    except Exception as error:  # the user's own code
-        problem = f"{kind.__name__} cannot be made without arguments ({type(error).__name__}: {error})"
-        where = _file_words(_file_of(kind))
-        raise UserError(problem, file=where or None, hint="give its arguments defaults") from error
-    return OwnCode(made)
+            meant = get_close_matches(name, known, n=1, cutoff=0.8)
+            if meant and name not in known and not hasattr(self.made, meant[0]):
+                raise self.fault(f"has {name!r}, which nothing reads", hint=f"call it {meant[0]!r}")
 
 
 def load_object(file: str | Path, name: str) -> Any:
@@ -281,11 +286,10 @@ def load_object(file: str | Path, name: str) -> Any:
     except UserError:
         raise
     except Exception as error:  # the user's own code may raise anything
-        frames = [f for f in traceback.extract_tb(error.__traceback__) if f.filename == spec.origin]
-        line = error.lineno if isinstance(error, SyntaxError) else frames[-1].lineno if frames else None
-        where = _file_words(str(spec.origin), line)
-        problem = f"fails with {type(error).__name__}: {error}"
-        raise UserError(problem, file=where, hint="correct the file") from error
+        where = _file_words(str(spec.origin), _line_of(error, str(spec.origin)))
+        raise UserError(
+            f"fails with {type(error).__name__}: {error}", file=where, hint="correct the file"
+        ) from error
     if not hasattr(module, name):
         classes = [n for n, item in vars(module).items() if inspect.isclass(item) and hasattr(item, "rhs")]
         hint = known_names(name, classes, "it has {}") if classes else "name a class that is in it"
@@ -293,24 +297,24 @@ def load_object(file: str | Path, name: str) -> Any:
     return getattr(module, name)
 
 
+def _line_of(error: Exception, file: str) -> int | None:
+    """Return the line of a file where an exception was raised."""
+    if isinstance(error, SyntaxError):
+        return error.lineno
+    lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == file]
+    return lines[-1] if lines else None
+
+
 def _file_of(kind: type) -> str:
     """Return the file of a class, "" where it was typed in."""
-    module = sys.modules.get(kind.__module__)
-    return str(getattr(module, "__file__", "") or "")
+    return str(getattr(sys.modules.get(kind.__module__), "__file__", "") or "")
 
 
 def _file_words(file: str, line: int | None = None) -> str:
     """Return a file as a line of an error names it: from here on where it is below, with the line."""
-    if not file:
-        return ""
     path = Path(file)
     short = path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path
-    return str(short) if line is None else f"{short}:{line}"
-
-
-def _tuple(what: str, names: Mapping[str, Any]) -> Callable[..., Any]:
-    """Return the named tuple type of these fields."""
-    return namedtuple(what, list(names))
+    return f"{short}:{line}" if line else str(short) if file else ""
 
 
 @dataclass(frozen=True)
@@ -327,60 +331,21 @@ class OwnSettings:
 OWN = OwnSettings()
 
 
-@dataclass(frozen=True)
-class OwnSteps:
-    """The steps of a class; see :class:`thermogrip.sysid.models.model.Equations`."""
-
-    code: OwnCode
-
-    @property
-    def sizes(self) -> Sizes:
-        """Numbers of states, inputs, disturbances and parameters."""
-        code = self.code
-        return Sizes(len(code.states), len(code.inputs), len(code.disturbances), len(code.parameters))
-
-    def prepare(self, p: Values) -> list[Any]:
-        """Return the parameters."""
-        return list(p)
-
-    def renew(self, u: Values, c: Values, h: Any) -> list[Any]:
-        """Return nothing: no part of a class is known to hang on switches alone."""
-        return []
-
-    def advance(self, x: Values, u: Values, d: Values, c: Values, kept: Values, h: Any) -> list[Any]:
-        """Return the state one step of ``h`` on."""
-        rhs = self.code.rhs
-        k1 = rhs(x, u, d, c)
-        k2 = rhs([a + h / 2 * k for a, k in zip(x, k1)], u, d, c)
-        k3 = rhs([a + h / 2 * k for a, k in zip(x, k2)], u, d, c)
-        k4 = rhs([a + h * k for a, k in zip(x, k3)], u, d, c)
-        state = [a + h / 6 * (s + 2 * (q + r) + t) for a, s, q, r, t in zip(x, k1, k2, k3, k4)]
-        for name, (low, high) in self.code.limits.items():
-            i = list(self.code.states).index(name)
-            if np.isfinite(low):
-                state[i] = np.maximum(state[i], low)
-            if np.isfinite(high):
-                state[i] = np.minimum(state[i], high)
-        return state
-
-    def read(self, x: Values, c: Values) -> list[Any]:
-        """Return the outputs."""
-        return self.code.output(x, c)
-
-
 @lru_cache(maxsize=32)
 def compile_steps(code: OwnCode) -> tuple[Kernel | None, str]:
     """Return the compiled steps of a class, or None and why there are none."""
     from thermogrip.sysid.models.jit_rollout import Kernel  # pulls in llvmlite
 
     try:
-        return Kernel(OwnSteps(code), in_pieces=True), ""
+        return Kernel(code, in_pieces=True), ""
     except UserError as error:
         return None, error.problem
 
 
 def still(code: OwnCode, y: Array, u: Array, d: Array, p: Array, *, sd: Array, seconds: float) -> Array:
     """Return the state (n_x,) at rest; it may be not finite where the class's functions are not."""
+    from scipy.optimize import least_squares  # a class with a rest of its own needs none
+
     n_x, is_read = len(code.states), np.isfinite(y)
     scale = np.array(list(code.states.values()))
     ranges = [item.range for item in code.inputs.values()]
@@ -391,26 +356,19 @@ def still(code: OwnCode, y: Array, u: Array, d: Array, p: Array, *, sd: Array, s
         """Return the residuals (n_r,) at states, then inputs, in units of their scale."""
         x, v = z[:n_x] * scale, np.where(moved, z[n_x:] * wide, u)
         flow = seconds * np.array(code.rhs(list(x), list(v), list(d), list(p)), dtype=float)
-        read = np.array(code.output(list(x), list(p)), dtype=float)
+        read = np.array(code.read(list(x), list(p)), dtype=float)
         miss = (OWN.sensor_weight * (read - y) / sd)[is_read]
         return np.concatenate([flow / scale, miss, OWN.input_weight * (z[n_x:] - u / wide)])
 
-    limits = [code.limits.get(name, (-np.inf, np.inf)) for name in code.states]
-    ends = np.array([*limits, *((ends or (-np.inf, np.inf)) for ends in ranges)], dtype=float)
+    ends = np.array([*code.limits, *((ends or (-np.inf, np.inf)) for ends in ranges)], dtype=float)
     low, high = (ends / np.concatenate([scale, wide])[:, None]).T
-    z = np.clip(np.concatenate([_first_state_guess(code, y) / scale, u / wide]), low, high)
+    # a first guess is the reading of the output of a state's name, else the mean of all
+    readings = dict(zip(code.outputs, np.where(is_read, y, np.nanmean(y)).tolist()))
+    guess = np.array([readings.get(name, np.nanmean(y)) for name in code.states])
+    z = np.clip(np.concatenate([guess / scale, u / wide]), low, high)
     if not np.isfinite(residuals(z)).all():
         return np.full(n_x, np.nan)
-    from scipy.optimize import least_squares  # a class with a rest of its own needs none
-
     return np.asarray(least_squares(residuals, z, bounds=(low, high)).x[:n_x] * scale)
-
-
-def _first_state_guess(code: OwnCode, y: Array) -> Array:
-    """Return a first guess: the reading of the output of a state's name, else the mean of all readings."""
-    mean, read = float(np.nanmean(y)), dict(zip(code.outputs, y.tolist()))
-    guess = [read.get(name, mean) for name in code.states]
-    return np.array([value if np.isfinite(value) else mean for value in guess])
 
 
 @dataclass(eq=False)
@@ -425,6 +383,7 @@ class OwnModel(Described):
     kind = "own"
     smooth = 0.0  # nothing says that its disturbances are of heat
     command_steps: ClassVar[dict[str, float]] = {}
+    reference = None  # no output defines a scale: a log that starts at rest is not recognised as such
 
     def __post_init__(self) -> None:
         code = self.code
@@ -432,12 +391,9 @@ class OwnModel(Described):
         self.states, self.n_x = tuple(code.states), len(code.states)
         learnt_sd = dict(self.sd or {})
         self.sensor_sd = {name: item.sd or learnt_sd.get(name, 1.0) for name, item in code.outputs.items()}
-        self.average, self.warmup = code.average or 5 * self.dt, code.warmup or 50 * self.dt
+        self.average, self.warmup = code.average, code.warmup
         self.independent = 4 * self.average
-        # no output defines a scale: a log that starts at rest is not recognised as such
-        self.reference: str | None = None
         self.spread = np.diag(np.square(list(code.states.values())))
-        self.limits = np.array([code.limits.get(name, (-np.inf, np.inf)) for name in code.states])
 
     @property
     def slow_because(self) -> str:
@@ -446,15 +402,15 @@ class OwnModel(Described):
 
     def step(self, x: Values, u: Values, d: Values, p: Values, dt: float) -> list[Any]:
         """Return the state after ``dt`` seconds; numbers, NumPy rows or CasADi symbols alike."""
-        n, steps = self._pieces(dt), OwnSteps(self.code)
+        n = self._pieces(dt)
         state, u, d, p = (_for_numpy(values) for values in (x, u, d, p))
         for _ in range(n):
-            state = steps.advance(state, u, d, p, (), dt / n)
-        return _bare(state)
+            state = self.code.advance(state, u, d, p, (), dt / n)
+        return _plain(state)
 
     def output(self, x: Values, p: Values) -> list[Any]:
         """Return what the outputs read at state x, a list of length n_y."""
-        return _bare(self.code.output(_for_numpy(x), _for_numpy(p)))
+        return _plain(self.code.read(_for_numpy(x), _for_numpy(p)))
 
     def rest(self, y: ArrayLike, u: ArrayLike, d: ArrayLike, p: ArrayLike) -> Array:
         """Return the state (n_x,) of a plant at rest whose outputs read y: the class's own or a found one."""
@@ -474,7 +430,7 @@ class OwnModel(Described):
             lost = self.states[int(np.flatnonzero(~np.isfinite(x))[0])]
             hint = "guard roots and divisions with np.maximum, or write rest(self, y, u, d, p)"
             raise self.code.fault(f"has no finite state at rest ({lost} is not)", hint=hint)
-        return np.asarray(np.clip(x, *self.limits.T))
+        return np.asarray(np.clip(x, *self.code.limits.T))
 
     def rollout(self, x0: ArrayLike, u: ArrayLike, d: ArrayLike, p: ArrayLike, dt: float) -> Run:
         """Simulate a batch."""
@@ -482,7 +438,7 @@ class OwnModel(Described):
         n = self._pieces(dt)
         kernel = compile_steps(self.code)[0] if self.compiled else None
         if kernel is None:
-            return roll_rows(OwnSteps(self.code), x0, u, d, p, dt / n, pieces=n)
+            return roll_rows(self.code, x0, u, d, p, dt / n, pieces=n)
         return kernel.rollout(x0, u, d, p, dt / n, pieces=n)
 
     def prepared(self, free_runs: FreeRuns, spread: Mapping[str, float], p: Array | None = None) -> OwnModel:
@@ -607,7 +563,7 @@ def _for_numpy(values: Values) -> list[Any]:
     return [_Symbol(view(value, ndim=0)) if isinstance(value, kinds) else value for value in values]
 
 
-def _bare(values: Values) -> list[Any]:
+def _plain(values: Values) -> list[Any]:
     """Return values with CasADi's symbols as CasADi knows them."""
     return [
         sys.modules["casadi"].vertcat(value.view) if isinstance(value, _Symbol) else value for value in values
@@ -641,12 +597,18 @@ def own_model(kind: Any) -> OwnModel:
     >>> float(y[0, -1, 0].round(6)), float(np.exp(-1).round(6))
     (0.367879, 0.367879)
     """
-    code = read_class(kind)
+    try:
+        made = kind() if inspect.isclass(kind) else kind
+    except Exception as error:  # the user's own code
+        problem = f"{kind.__name__} cannot be made without arguments ({type(error).__name__}: {error})"
+        where = _file_words(_file_of(kind)) or None
+        raise UserError(problem, file=where, hint="give its arguments defaults") from error
+    code = OwnCode(made)
     model = OwnModel(code)
     two = [np.full(2, value) for value in model.prior]  # rows of two, so that an if is found out
     x, u, d = ([np.ones(2)] * n for n in (model.n_x, len(model.inputs), len(model.disturbances)))
     with np.errstate(all="ignore"):
         code.rhs(x, u, d, two)
-        code.output(x, two)
+        code.read(x, two)
         code.rest([1.0] * len(model.outputs), [1.0] * len(u), [1.0] * len(d), model.prior.tolist())
     return model

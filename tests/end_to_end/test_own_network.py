@@ -72,7 +72,7 @@ def test_a_class_goes_through_identify_validate_and_simulate(tank: Bench):
         ("pond.py:Tank", ("pond.py", "no such file")),
         ("tank.py", ("tank.py:CLASS",)),
         ("bad.py:Tank", ("bad.py:12", "ZeroDivisionError")),
-        ("lost.py:Tank", ("lost.py:12", "'gian' is not among its parameters", "gain, drain")),
+        ("lost.py:Tank", ("lost.py:12", "no attribute 'gian'", "gain, drain")),
     ],
 )
 def test_a_wrong_class_is_one_line_and_code_2(tank: Bench, network: str, names: tuple[str, ...]):
