@@ -170,7 +170,7 @@ def _unit_responses(drive: Array, A: Array, C: Array) -> Array:
     nothing = np.zeros((1, rows - 1, 0))
     forced = run_linear(A[None], nothing, pushes[:, :-1], np.zeros((len(pushes), n)), 1)
     free = run_linear(A[None], nothing, np.zeros((1, rows - 1, n)), np.eye(n), 1)
-    return np.concatenate([forced, free]) @ C.T
+    return np.asarray(np.concatenate([forced, free]) @ C.T)
 
 
 def _realise(grid: Grid, gamma: Array, terms: tuple[str, ...]) -> StateSpaceModel:

@@ -120,7 +120,7 @@ def optimal_schedule(
     frame = _Frame(plant, minutes, ranges, shortest, slew, hold)
     report = progress or (lambda fraction, what: None)
     fine = ExperimentForecast(plant, lowest=lowest, highest=highest)
-    coarse = ExperimentForecast(plant, lowest=lowest, highest=highest, dt=frame.dt, starts=False)
+    coarse = ExperimentForecast(plant, lowest=lowest, highest=highest, dt=frame.dt)
     pool = [
         np.where(frame.low < frame.high, inputs_of(plant, log), frame.still) for log in (begin or {}).values()
     ]

@@ -280,11 +280,6 @@ def _descend(problem: Problem, z0: Array, report: Progress, part: tuple[float, f
     return levenberg_marquardt(problem.linearise, problem.trials, z0, low=low, high=high, callback=callback)
 
 
-def _rms_in_sd(problem: Problem, solution: Solution) -> list[float]:
-    errors = problem.errors(solution.z)
-    return [_rms([s[k] for log in errors for s in log]) / sd for k, sd in enumerate(problem.sd)]
-
-
 def _rms(parts: Sequence[Array]) -> float:
     joined = np.concatenate(parts) if parts else np.zeros(1)
     return float(np.sqrt(np.mean(joined**2))) if joined.size else 0.0
@@ -344,25 +339,19 @@ def _as_plant(problem: Problem, solution: Solution, tau: Array) -> Plant:
 
 def _of_intervals(problem: Problem, spread: ScoreCovariance) -> fit_record.Intervals:
     """Return what the intervals rest on."""
-    outputs = problem.model.outputs
-    names = [problem.plant.units.get(name, "degC") for name in outputs]
-    unit = (problem.sd * np.sqrt(problem.tau)).tolist()
-    units = list(zip(unit, names))
-    learnt, merge = spread.numbers, round(spread.bin_s / problem.average)
+    unit, merge = problem.sd * np.sqrt(problem.tau), round(spread.bin_s / problem.average)
     return fit_record.Intervals(
-        numbers=fit_record.ErrorNumbers(**vars(learnt), unit=tuple(unit), bin_s=spread.bin_s, merge=merge),
-        hessian=(spread.hessian / np.outer(problem.width, problem.width)).tolist(),
-        terms=[fit_record.DiscrepancyTerm(t.signal, t.lag, t.size.tolist(), t.rms) for t in spread.terms],
-        stretches=sum(len(stretches) for stretches, _ in problem.logs),
-        pull=(spread.pull / problem.width[:, None]).tolist(),
-        error=learnt.describe(outputs, spread.bin_s, units),
+        numbers=fit_record.ErrorNumbers(
+            **vars(spread.numbers), unit=tuple(unit.tolist()), bin_s=spread.bin_s, merge=merge
+        ),
         between_logs=round(spread.phi, 3),
-        spread_over_logs={name: round(value, 4) for name, value in spread.spreads.items()},
+        coarsening=round(spread.coarsening, 3),
     )
 
 
 def _fit_verdict(problem: Problem, solution: Solution, identifiability: fit_record.Identifiability) -> str:
-    rms = _rms_in_sd(problem, solution)
+    by_log = problem.errors(solution.z)
+    rms = [_rms([s[k] for log in by_log for s in log]) / sd for k, sd in enumerate(problem.sd)]
     errors = ", ".join(
         f"{name} {r * sd:.2f} {problem.plant.units.get(name, 'degC')}"
         for name, r, sd in zip(problem.model.outputs, rms, problem.sd)

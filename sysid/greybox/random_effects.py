@@ -61,35 +61,27 @@ class EffectSettings:
 EFFECTS = EffectSettings()
 
 
-@dataclass(frozen=True, eq=False)
-class Response:
-    """One response of the model discrepancy."""
-
-    signal: str  # a name of :func:`signals`
-    lag: float  # [s]
-    size: Array  # (n_y,) static gain, in the outputs' units
-    rms: float  # of the lagged signal, over the logs that gave the size
-
-    def lagged(self, given: Mapping[str, Array], dt: float) -> Array:
-        """Return the lagged signal (N + 1,) of the signals (N,) every ``dt`` seconds."""
-        keep = np.exp(-dt / self.lag)
-        return np.append(0.0, lfilter([1 - keep], [1, -keep], given[self.signal]))
-
-
-def discrepancy_responses(problem: Problem, runs: Sequence[Sequence[Array]]) -> list[tuple[Response, Parts]]:
-    """Return the responses with s = 1, and each by log, stretch and output in the units of the readings."""
-    inputs_and_states = [
+def discrepancy_responses(problem: Problem, runs: Sequence[Sequence[Array]]) -> list[tuple[str, Parts]]:
+    """Return the responses with s = 1 by log, stretch and output, in the units of the readings, each with the
+    name of its signal."""
+    signals_of = [
         [signals(problem.model, stretch.u, stretch.d, run) for stretch, run in zip(stretches, of_log)]
         for (stretches, _), of_log in zip(problem.logs, runs)
     ]
-    names = [name for name in inputs_and_states[0][0] if not _is_twin(name, inputs_and_states)]
+    stretches_of = [stretch for of_log in signals_of for stretch in of_log]
+    names = [
+        name
+        for name in stretches_of[0]
+        # the size of an input that is never negative is that input
+        if not name.startswith("|") or any(np.any(one[name] != one[name[1:-1]]) for one in stretches_of)
+    ]
     rms = EFFECTS.discrepancy_rms / np.sqrt(len(names) * len(EFFECTS.lags))
     out = [
-        _of_rms(problem, inputs_and_states, name, lag * problem.average, rms)
+        (name, _response(problem, signals_of, name, lag * problem.average, rms))
         for name in names
         for lag in EFFECTS.lags
     ]
-    return [(one, means) for one, means in out if any(p.any() for log in means for k in log for p in k)]
+    return [(name, moves) for name, moves in out if any(p.any() for log in moves for k in log for p in k)]
 
 
 def signals(model: Model, u: Array, d: Array, run: Array) -> dict[str, Array]:
@@ -105,32 +97,20 @@ def signals(model: Model, u: Array, d: Array, run: Array) -> dict[str, Array]:
     return out
 
 
-def _of_rms(
-    problem: Problem, given: Sequence[Sequence[Mapping[str, Array]]], name: str, lag: float, rms: float
-) -> tuple[Response, Parts]:
-    """Return the response of this rms [sd of a bin], and it by log, stretch and output."""
-    plain = Response(name, lag, np.ones(1), 1.0)
-    means = [
-        [
-            [operator @ slow for operator in cells.operators]
-            for cells, slow in zip(bins, (plain.lagged(driving, problem.plant.dt) for driving in of_log))
-        ]
-        for of_log, (_, bins) in zip(given, problem.logs)
-    ]
-    squares = [
-        float(np.mean(driving**2)) for log in means for stretch in log for driving in stretch if driving.size
-    ]
+def _response(
+    problem: Problem, signals_of: Sequence[Sequence[Mapping[str, Array]]], name: str, lag: float, rms: float
+) -> Parts:
+    """Return the response to a signal behind a lag [s], of this rms [sd of a bin], by log, stretch and
+    output."""
+    keep = np.exp(-problem.plant.dt / lag)
+    means = []
+    for of_log, (_, bins) in zip(signals_of, problem.logs):
+        lagged = [np.append(0.0, lfilter([1 - keep], [1, -keep], one[name])) for one in of_log]
+        means.append([[operator @ slow for operator in cells.operators] for cells, slow in zip(bins, lagged)])
+    squares = [float(np.mean(mean**2)) for log in means for stretch in log for mean in stretch if mean.size]
     size = float(np.sqrt(np.mean(squares))) if squares else 0.0
-    factor = rms * problem.sd / size if size > 1e-9 else np.zeros(len(problem.sd))
-    moves = [[[f * driving for f, driving in zip(factor, stretch)] for stretch in log] for log in means]
-    return Response(name, lag, factor, size), moves
-
-
-def _is_twin(name: str, given: Sequence[Sequence[Mapping[str, Array]]]) -> bool:
-    """Say whether this is the size of an input that is never negative."""
-    if not name.startswith("|"):
-        return False
-    return all(np.array_equal(stretch[name], stretch[name[1:-1]]) for of_log in given for stretch in of_log)
+    gains = rms * problem.sd / size if size > 1e-9 else np.zeros(len(problem.sd))
+    return [[[gain * mean for gain, mean in zip(gains, stretch)] for stretch in log] for log in means]
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,7 +153,6 @@ class Linearised:
     # of each effect of a log: name (empty for its start), stated sd, value that the start already contains
     effects: list[list[tuple[str, float, float]]]
     bin_s: float  # width of a bin [s]
-    responses: list[Response]  # in the order of their columns
     warm: list[WarmUp | None]  # of each log whose start was estimated from its first bins
 
 
@@ -195,8 +174,8 @@ def linearise_logs(
     merge = _merge(problem)
     runs = [_simulations(problem, log_index, p, begin) for log_index, begin in enumerate(starts)]
     discrepancy = discrepancy_responses(problem, runs)
-    signals_of = list(dict.fromkeys(f"term {response.signal}" for response, _ in discrepancy))
-    shared = [-1] * z.size + [signals_of.index(f"term {response.signal}") for response, _ in discrepancy]
+    signals_of = list(dict.fromkeys(f"term {signal}" for signal, _ in discrepancy))
+    shared = [-1] * z.size + [signals_of.index(f"term {signal}") for signal, _ in discrepancy]
     logs: list[LogData] = []
     effects_of_logs: list[list[_Column]] = []
     warm: list[WarmUp | None] = []
@@ -223,8 +202,7 @@ def linearise_logs(
     for log, effects in zip(logs, effects_of_logs):
         log.kind[len(shared) :] = [kinds.index(c.name) if c.name else -1 for c in effects]
     stated = [[(c.name, c.stated, c.base) for c in log] for log in effects_of_logs]
-    responses, bin_s = [response for response, _ in discrepancy], merge * problem.average
-    return Linearised(logs, kinds, len(signals_of), len(shared), stated, bin_s, responses, warm)
+    return Linearised(logs, kinds, len(signals_of), len(shared), stated, merge * problem.average, warm)
 
 
 def _simulations(problem: Problem, at: int, p: Array, starts: list[Start]) -> list[Array]:

@@ -42,7 +42,7 @@ References
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -52,7 +52,7 @@ from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.errors import UserError
 from thermogrip.sysid.greybox.noise_model import ErrorModel, LogData, information, learn_error_model
 from thermogrip.sysid.greybox.problem import Problem
-from thermogrip.sysid.greybox.random_effects import Linearised, Response, WarmUp, linearise_logs
+from thermogrip.sysid.greybox.random_effects import Linearised, WarmUp, linearise_logs
 
 
 @dataclass(frozen=True)
@@ -92,9 +92,6 @@ class ScoreCovariance:
     bin_s: float  # width of its bins [s]
     # by log and effect: estimate and standard deviation, in the signal's unit or of ln p
     effects: dict[str, dict[str, tuple[float, float]]]
-    spreads: dict[str, float]  # by effect: its standard deviation over logs
-    terms: list[Response]  # model discrepancy, each response of the learnt size
-    pull: Array  # U, (n_free, n_term)
 
     @property
     def widening(self) -> Array:
@@ -115,7 +112,9 @@ def score_covariance(
         problem_is = f"too short: fewer than {PRIORS.least_bins} means of {problem.average:g} s"
         raise UserError(problem_is, file=problem.names[0], hint="give a longer log, or a smaller average")
     if numbers is None or len(numbers.spread) != len(data.kinds):
-        numbers = learn_error_model(data.logs, z, width=_widths(data))
+        width = [PRIORS.discrepancy_sd] * data.n_responses
+        width += [PRIORS.effect_sd] * (len(data.kinds) - data.n_responses)
+        numbers = learn_error_model(data.logs, z, width=width)
     whole = _log_scores(problem, data, numbers, z.size)
     pull, pieces = whole.discrepancy.sum(axis=0), whole
     if len(data.logs) < PRIORS.least_logs:
@@ -125,7 +124,9 @@ def score_covariance(
     inverse = np.linalg.inv(hessian)
     phi = common_factor(disagreement(pieces, z), len(pieces.score), cut=pieces is not whole)
     fixed, spread = np.eye(z.size) + pull @ pull.T, phi * whole.spread.sum(axis=0)
-    covariance = _no_wider_than_prior(inverse @ (fixed + spread) @ inverse)
+    covariance = inverse @ (fixed + spread) @ inverse
+    narrower = 1 / np.sqrt(np.maximum(np.diag(covariance), 1.0))  # the prior's variance is 1
+    covariance = covariance * np.outer(narrower, narrower)
     by_weights = np.trace(inverse @ whole.hessian.sum(axis=0))
     coarsening = max(1.0, float(np.trace(inverse @ spread)) / max(float(by_weights), 1e-12))
     return ScoreCovariance(
@@ -136,9 +137,7 @@ def score_covariance(
         phi,
         numbers,
         data.bin_s,
-        *_effects(data, numbers, z),
-        _learnt_responses(data, numbers, z.size),
-        pull,
+        _effects(data, numbers, z),
     )
 
 
@@ -169,19 +168,6 @@ def common_factor(q: Array, n_log: int, *, cut: bool = False) -> float:
     expected_log = digamma(freedom / 2) - np.log(freedom / 2)  # of ln chi^2 / freedom
     phi = float(np.exp(np.log(np.maximum(q, 1e-9)).mean() - expected_log))
     return max(phi, 1.0 if cut else (1 + freedom * phi) / n_log)
-
-
-def _no_wider_than_prior(covariance: Array) -> Array:
-    """Return the covariance, of z, with no parameter of more than the prior's variance 1."""
-    narrower = 1 / np.sqrt(np.maximum(np.diag(covariance), 1.0))
-    return np.asarray(covariance * np.outer(narrower, narrower))
-
-
-def _widths(data: Linearised) -> list[float]:
-    """Return the prior sd of ln s of each kind."""
-    return [PRIORS.discrepancy_sd] * data.n_responses + [PRIORS.effect_sd] * (
-        len(data.kinds) - data.n_responses
-    )
 
 
 def _log_scores(problem: Problem, data: Linearised, numbers: ErrorModel, n: int) -> LogScores:
@@ -223,23 +209,11 @@ def _one_log(
     )
 
 
-def _learnt_responses(data: Linearised, numbers: ErrorModel, n: int) -> list[Response]:
-    """Return the responses of the model discrepancy, each of the learnt size."""
-    factors = numbers.scale(data.logs[0].kind[n : data.n_shared])
-    return [replace(term, size=s * term.size) for term, s in zip(data.responses, factors)]
-
-
-def _effects(
-    data: Linearised, numbers: ErrorModel, z: Array
-) -> tuple[dict[str, dict[str, tuple[float, float]]], dict[str, float]]:
-    """Return the effects of each log with their sd, and the spread of each kind."""
+def _effects(data: Linearised, numbers: ErrorModel, z: Array) -> dict[str, dict[str, tuple[float, float]]]:
+    """Return the effects of each log with their sd."""
     posterior, out = information(numbers, data.logs, z), {}
-    spreads = dict.fromkeys(data.kinds[data.n_responses :], 0.0)
     for log, names, (mean, covariance) in zip(data.logs, data.effects, posterior.effects):
         scale = numbers.scale(log.kind[data.n_shared :])
         rows = zip(names, scale * mean, scale * np.sqrt(np.diag(covariance)))
         out[log.name] = {name: (float(base + m * s), float(d * s)) for (name, s, base), m, d in rows if name}
-        for (name, s, _), factor in zip(names, scale):
-            if name:
-                spreads[name] = max(spreads[name], float(factor * s))
-    return out, spreads
+    return out

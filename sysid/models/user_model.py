@@ -383,7 +383,6 @@ class OwnModel(Described):
     kind = "own"
     smooth = 0.0  # nothing says that its disturbances are of heat
     command_steps: ClassVar[dict[str, float]] = {}
-    reference = None  # no output defines a scale: a log that starts at rest is not recognised as such
 
     def __post_init__(self) -> None:
         code = self.code
@@ -393,6 +392,8 @@ class OwnModel(Described):
         self.sensor_sd = {name: item.sd or learnt_sd.get(name, 1.0) for name, item in code.outputs.items()}
         self.average, self.warmup = code.average, code.warmup
         self.independent = 4 * self.average
+        # no output defines a scale: a log that starts at rest is not recognised as such
+        self.reference: str | None = None
         self.spread = np.diag(np.square(list(code.states.values())))
 
     @property

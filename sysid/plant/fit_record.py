@@ -78,27 +78,12 @@ class ErrorNumbers:
 
 
 @dataclass(frozen=True)
-class DiscrepancyTerm:
-    """A term that the model lacks: its signal, its lag [s], its size by output, its rms."""
-
-    signal: str
-    lag_s: float
-    size: list[float]
-    rms: float
-
-
-@dataclass(frozen=True)
 class Intervals:
-    """What the intervals of a grey-box fit rest on, in theta."""
+    """What the intervals of a grey-box fit rest on."""
 
     numbers: ErrorNumbers | None = None
-    hessian: list[list[float]] = field(default_factory=list)  # (n_free, n_free)
-    terms: list[DiscrepancyTerm] = field(default_factory=list)
-    stretches: int = 1
-    pull: list[list[float]] = field(default_factory=list)  # (n_free, n_terms)
-    error: str = ""
     between_logs: float = 1.0
-    spread_over_logs: dict[str, float] = field(default_factory=dict)
+    coarsening: float = 1.0  # times less information in a log than the fit's weights assume
 
 
 @dataclass(frozen=True)

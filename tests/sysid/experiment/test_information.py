@@ -1,4 +1,4 @@
-"""Information of an experiment: a learnt error by hand in one parameter, what a forecast keeps."""
+"""Information of an experiment: in closed form, and what a forecast keeps."""
 
 from __future__ import annotations
 
@@ -11,142 +11,21 @@ import pytest
 from tests.sysid.experiment.makers import EVERY, POWER, SD, C, G, heated_block
 from thermogrip.datasets.errors import UserError
 from thermogrip.sysid.experiment.information import (
-    Experiment,
     ExperimentForecast,
-    ReadingError,
     interval_widths,
-    learnt_error,
     plant_from_prior,
     reading_noise,
 )
-from thermogrip.sysid.greybox.noise_model import ErrorModel
-from thermogrip.sysid.greybox.random_effects import Response
 from thermogrip.sysid.models.network import NetworkModel, load_network
 from thermogrip.sysid.models.network_spec import network_from_dict
 from thermogrip.sysid.models.state_space import StateSpaceModel
-from thermogrip.sysid.plant.fit_record import DiscrepancyTerm, ErrorNumbers, Intervals, PlantScores
+from thermogrip.sysid.plant.fit_record import Intervals, PlantScores
 from thermogrip.sysid.plant.plant import Plant
-
-
-def rows(*values: float) -> np.ndarray:
-    """One column of one output; the last row is left over behind the last bin of two rows."""
-    return np.array([*values, 99.0])[None, :, None]
-
-
-WHITE = ErrorModel((0.3,), (1.0,), ((0.0,),), (0.0,))
-
-
-def learnt(**change: Any) -> ReadingError:
-    content = {
-        "numbers": WHITE, "hessian": np.array([[400.0]]), "unit": np.array([0.5]),
-        "sensor": np.array([0.2]),
-        "bin_s": 2.0, "merge": 2.0, "phi": 1.5, "offset": np.array([0.1]), "bias": np.zeros(0),
-        "parameter_sd": np.zeros(1), "stretches": 3, "pull": np.array([[80.0]]),
-        "terms": (Response("q", 20.0, np.array([0.25]), 2.0),),
-    }  # fmt: skip
-    return ReadingError(**(content | change))
-
-
-def experiment(n: int = 7, warm_up: float = 0.0) -> Experiment:
-    """In units of 0.5: bins of 4, 6, 2; an effect of 2, 2, 4, a start of 2, 0, 0, a term of 0.5, 1, 1.5."""
-    rise, effect = rows(1, 3, 2, 4, 0, 2), rows(2, 0, 1, 1, 3, 1)
-    start, lagged = rows(1, 1, 0, 0, 0, 0), np.array([[1.0, 1, 2, 2, 3, 3, 7]])
-    return Experiment(rise[:, :n], effect[:, :n], start[:, :n], lagged[:, :n], 1.0, warm_up)
-
-
-NOISE, OWN, OFFSET, START = 4 * 0.09 * 56, (2 * 28) ** 2, (2 * 2.4) ** 2, 16**2  # of 2 J'x, J'J = 56
-
-
-@pytest.mark.parametrize(
-    ("rms", "pull", "shared", "factor"),
-    [
-        (2.0, 80.0, 0.4, 4 / (3 + 11 / 4)),  # the mean square of the lagged signal is 11
-        (4.0, 80.0, 0.4, 4 / (3 + 11 / 16)),
-        (2.0, 300.0, 1.0, 4 / (3 + 11 / 4)),  # 1.5, cut to 1
-        (2.0, -80.0, -0.4, 4 / (3 + 11 / 4)),
-    ],
-)
-def test_the_gain_of_an_experiment_by_hand(rms: float, pull: float, shared: float, factor: float):
-    """With R = 0.5 the fit's Hessian is 100, the experiment's 2 * 56; the term's pull on it is 2 * 11."""
-    error = learnt(terms=(Response("q", 20.0, np.array([0.25]), rms),), pull=np.array([[pull]]))
-    both = (100 * shared + 22) ** 2 * factor
-    score = 100**2 * (1 - shared**2) + both + 1.5 * (NOISE + OWN + OFFSET + START)
-    got = error.gain(np.array([[0.5]]), experiment())
-    np.testing.assert_allclose(got, [[212**2 / score]])
-
-
-def test_without_terms_or_bins_nothing_is_shared_or_added():
-    bare = learnt(terms=(), pull=np.zeros((1, 0)))
-    new = replace(experiment(), lagged=np.zeros((0, 7)))
-    score = 100**2 + 1.5 * (NOISE + OWN + OFFSET + START)
-    np.testing.assert_allclose(bare.gain(np.array([[0.5]]), new), [[212**2 / score]])
-    np.testing.assert_allclose(
-        bare.gain(np.array([[0.5]]), replace(experiment(3), lagged=new.lagged[:, :3])), [[1.0]]
-    )
-    two = replace(experiment(4), lagged=new.lagged[:, :4])  # two bins count: 4 and 6
-    after, own = 100 + 2 * 52, (2 * 20) ** 2
-    score = 100**2 + 1.5 * (4 * 0.09 * 52 + own + (2 * 2.0) ** 2 + START)
-    np.testing.assert_allclose(bare.gain(np.array([[0.5]]), two), [[after**2 / score]])
-    coarse = replace(new, dt=9.0)  # a row is longer than a bin: it is one
-    J = np.array([1, 3, 2, 4, 0, 2, 99.0]) / 0.5
-    B, S = np.array([2, 0, 1, 1, 3, 1, 99.0]) / 0.5, np.array([1, 1, 0, 0, 0, 0, 99.0]) / 0.5
-    score = 100**2 + 1.5 * (0.36 * J @ J + 4 * ((J @ B) ** 2 + (0.2 * J.sum()) ** 2 + (J @ S) ** 2))
-    np.testing.assert_allclose(bare.gain(np.array([[0.5]]), coarse), [[(100 + 2 * J @ J) ** 2 / score]])
-
-
-@pytest.mark.parametrize(("warm_up", "n"), [(4.0, 2), (0.5, 1), (40.0, 3)])
-def test_a_warm_up_leaves_of_the_start_what_its_bins_do_not_show(warm_up: float, n: int):
-    """Bins of noise r have an error of 0.3: H = (1 - K B)(1 - K B)' + 0.09 K K', K = (B'B + r^2)^-1 B'."""
-    r = np.sqrt(warm_up / (1 + warm_up / 10) / 2.0) * 0.2 / 0.5
-    B = np.array([[0.2, 2.0], [0.2, 0.0], [0.2, 0.0]])[:n]
-    K = np.linalg.solve(B.T @ B + r**2 * np.eye(2), B.T)
-    left = (np.eye(2) - K @ B) @ (np.eye(2) - K @ B).T + 0.09 * K @ K.T
-    start = np.array([4.8, 16.0])
-    bare = learnt(terms=(), pull=np.zeros((1, 0)))
-    new = replace(experiment(warm_up=warm_up), lagged=np.zeros((0, 7)))
-    score = 100**2 + 1.5 * (NOISE + OWN + start @ left @ start)
-    np.testing.assert_allclose(bare.gain(np.array([[0.5]]), new), [[212**2 / score]])
 
 
 @pytest.fixture(scope="module")
 def gripper() -> Plant:
     return plant_from_prior(load_network("gripper"))
-
-
-def test_what_a_fit_has_learnt_is_taken_from_its_record(gripper: Plant):
-    n, first = len(gripper.free), gripper.free[0]
-    numbers = ErrorNumbers((0.1, 0.2), (3.0,), ((0.4, 0.5),), (0.6,), (0.7, 0.8), 9.0, 2, (1.1,))
-    spread = {"offset of t_tank": 0.3, "bias of t_ambient": 0.4, first: 0.5}
-    term = DiscrepancyTerm("v |v|", 20.0, [0.1, 0.2], 0.05)
-    known = Intervals(numbers, np.eye(n).tolist(), [term], 4, np.ones((n, 1)).tolist(), "", 0.7, spread)
-    plant = replace(gripper, scores=PlantScores(intervals=known))
-    found = learnt_error(plant)
-    assert found is not None
-    assert found.numbers == ErrorModel((0.1, 0.2), (3.0,), ((0.4, 0.5),), (0.6,), (1.1,))
-    assert (found.unit.tolist(), found.bin_s, found.merge, found.phi, found.stretches) == (
-        [0.7, 0.8],
-        9.0,
-        2.0,
-        1.0,
-        4,
-    )
-    assert (found.offset.tolist(), found.bias.tolist()) == ([0.3, 0.0], [0.4])
-    assert found.parameter_sd.tolist() == [0.5] + [0.0] * (n - 1)
-    assert found.sensor.tolist() == [plant.model.sensor_sd[name] for name in plant.outputs]
-    assert (found.pull.shape, found.hessian.shape) == ((n, 1), (n, n))
-    (got,) = found.terms
-    assert (got.signal, got.lag, got.size.tolist(), got.rms) == ("v |v|", 20.0, [0.1, 0.2], 0.05)
-    wide = learnt_error(
-        replace(plant, scores=PlantScores(intervals=replace(known, between_logs=2.5, terms=[], pull=[])))
-    )
-    assert wide is not None
-    assert (wide.phi, wide.pull.shape) == (2.5, (n, 0))
-    for less in (
-        {"covariance": None},
-        {"scores": PlantScores()},
-        {"scores": PlantScores(intervals=replace(known, numbers=None))},
-    ):
-        assert learnt_error(replace(plant, **less)) is None
 
 
 def lag() -> Plant:
@@ -177,7 +56,7 @@ def test_limits_are_of_temperatures_and_a_margin_is_inside_them(
     u = np.ones((6, 1))  # 20, 25, 27.5 .. 29.84
     assert forecast.outputs(u)[0, :, 0].tolist() == pytest.approx([30 - 10 * 0.5**k for k in range(7)])
     assert forecast.stays(u, margin=margin) is kept
-    assert (forecast.n_draws, forecast.dt, forecast.starts) == (0, 2.0, True)
+    assert (forecast.n_draws, forecast.dt) == (0, 2.0)
     assert not forecast.stays(np.full((6, 1), np.inf))
     only = replace(lag(), units={"q": "V", "t": "rpm", "n": "rpm"})
     assert ExperimentForecast(only, room=20.0, **limits).stays(u, margin=margin)
@@ -225,13 +104,6 @@ def test_the_information_of_a_step_is_the_integral_in_closed_form():
     assert forecast.bits(u) == pytest.approx(0.5 * np.log2(1 + F), rel=3e-4)
 
 
-def test_noise_is_what_the_fit_saw_and_never_less_than_the_sensors():
-    seen = PlantScores(independent_s={"t1": 20.0, "t2": 20.0}, average_s=5.0)
-    board = replace(plant_from_prior(load_network("tclab")), scores=seen, noise={"t1": 0.9, "t2": 0.01})
-    sd, seconds = reading_noise(board)
-    assert (sd.tolist(), seconds.tolist()) == ([0.9, 0.4], [20.0, 20.0])
-
-
 @pytest.mark.parametrize("name", ["gripper", "tclab"])
 def test_the_belief_before_any_log_is_the_priors(name):
     model = load_network(name)
@@ -243,16 +115,14 @@ def test_the_belief_before_any_log_is_the_priors(name):
     assert plant.valid == {n: item.range for n, item in model.network.inputs.items() if item.range}
 
 
-def test_a_reading_counts_once_a_bin_or_correlation_time(gripper: Plant):
+def test_a_log_tells_so_many_times_less_than_the_weights_of_the_fit_say(gripper: Plant):
     sd, seconds = reading_noise(gripper)
     assert seconds.tolist() == [60.0, 60.0]
     assert sd.tolist() == [gripper.model.sensor_sd[name] for name in gripper.outputs]
-    known = PlantScores(average_s=30.0, independent_s={"t_tank": 20.0, "t_surface": 45.0})
-    assert reading_noise(replace(gripper, scores=known))[1].tolist() == [30.0, 45.0]
-    black = replace(lag(), noise={"t": 0.2, "n": 0.3})
-    assert [part.tolist() for part in reading_noise(black)] == [[0.2, 0.3], [60.0, 60.0]]
-    with pytest.raises(UserError, match="the plant has no sensor error for n; identify it again"):
-        reading_noise(replace(lag(), noise={"t": 0.2}))
+    known = PlantScores(weight_s={"t_tank": 20.0, "t_surface": 45.0}, intervals=Intervals(coarsening=3.0))
+    assert reading_noise(replace(gripper, scores=known))[1].tolist() == [60.0, 135.0]
+    with pytest.raises(UserError, match="no stated error; identify a network"):
+        reading_noise(lag())
 
 
 def test_widths_are_of_ninety_percent_intervals_in_natural_units():

@@ -21,9 +21,7 @@ NETWORK = {
     "intervals": {
         "numbers": {"white": [0.13], "tau": [2.97, 10.8], "sd": [[0.05], [0.06]], "correlation": [0.0, 0.0],
                     "unit": [0.16], "bin_s": 10.0, "merge": 1, "spread": [0.9]},
-        "hessian": [[25615.5]], "terms": [{"signal": "v |v|", "lag_s": 20.0, "size": [4e-4], "rms": 0.01}],
-        "stretches": 1, "pull": [[9.5]], "error": "model error t 0.0075 degC over 30 s",
-        "between_logs": 6.598, "spread_over_logs": {},
+        "between_logs": 6.598, "coarsening": 3.2,
     },
     "per_log": {"step": {"bias of room": [0.2, 0.1]}}, "seconds": 10.75,
     "held_out": [{"log": "last 30 % of step", "output": "t", "rmse": 0.08, "fit_percent": 98.0,
@@ -43,9 +41,9 @@ def test_scores_of_an_older_file_come_back_key_by_key(content):
 
 
 def test_what_a_later_version_adds_is_left_out_and_what_an_earlier_one_lacked_has_its_default():
-    short = {"intervals": {"hessian": [[1.0]], "pull": []}, "mood": "good"}
+    short = {"intervals": {"hessian": [[1.0]], "pull": [], "error": "slow"}, "mood": "good"}
     intervals = PlantScores.from_json(short).intervals
-    assert (intervals.numbers, intervals.between_logs, intervals.stretches) == (None, 1.0, 1)
+    assert (intervals.numbers, intervals.between_logs, intervals.coarsening) == (None, 1.0, 1.0)
 
 
 @pytest.mark.parametrize(
@@ -85,4 +83,4 @@ def test_rows_of_a_log_are_in_the_fit_where_it_is_the_same_log_at_the_same_time(
 def test_what_a_fit_does_not_know_is_left_out_of_its_scores():
     assert PlantScores().to_json() == {}
     bare = Intervals()
-    assert (bare.numbers, bare.stretches, bare.between_logs, bare.error) == (None, 1, 1.0, "")
+    assert (bare.numbers, bare.between_logs, bare.coarsening) == (None, 1.0, 1.0)
