@@ -16,7 +16,6 @@ import math
 import os
 import stat
 from collections.abc import Callable, Mapping
-from dataclasses import field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
@@ -184,11 +183,6 @@ def number_within(content: Mapping[str, Any], key: str, low: float, high: float)
     if not low <= value <= high:
         raise ValueError(f"{key} is {value:g}, not {low:g} to {high:g}")
     return float(value)
-
-
-def keyed(default: Any, key: str, low: float, high: float) -> Any:
-    """Return the dataclass field of a setting: its default, its key in a document and its range there."""
-    return field(default=default, metadata={"key": key, "range": (low, high)})
 
 
 def array_within(content: Mapping[str, Any], key: str, largest: float = LARGEST) -> NDArray[np.float64]:

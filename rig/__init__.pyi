@@ -17,7 +17,7 @@ from thermogrip.sysid.contact.simulation import simulate_grasps as simulate_gras
 if typing.TYPE_CHECKING:  # doors of 0.1.0, which are found and not listed
     from thermogrip.rig.drivers.tclab import TCLabRig as TCLabRig
     from thermogrip.rig.drivers.thermogrip import DeviceRig as DeviceRig
-    from thermogrip.rig.guard.guard import GuardSettings as GuardSettings
+    from thermogrip.rig.guard.settings import GuardSettings as GuardSettings
     from thermogrip.rig.guard.trip import Trip as Trip
     from thermogrip.rig.records.batch import Trial as Trial
     from thermogrip.rig.records.run_folder import RunFolder as RunFolder

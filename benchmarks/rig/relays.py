@@ -20,7 +20,6 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -29,7 +28,8 @@ from thermogrip.datasets.schema import make_log
 from thermogrip.mpc import Controller, PIController
 from thermogrip.mpc.interface import Move
 from thermogrip.rig.drivers.relays import Relay, RelayRig
-from thermogrip.rig.guard.guard import Guard, GuardSettings, RuleSettings
+from thermogrip.rig.guard.guard import Guard
+from thermogrip.rig.guard.settings import GuardSettings, RuleSettings, SensorSettings
 from thermogrip.rig.interface import Reading
 from thermogrip.rig.session.profile import Profile
 from thermogrip.rig.session.session import play, run_session
@@ -140,8 +140,10 @@ def relayed(plant: Plant) -> RelayRig:
 
 def guard() -> Guard:
     """Return a guard with room for a bath, whose rules, made for a finger, are off."""
-    wide = GuardSettings(skin_limits=(-20.0, 80.0), other_limits=(-20.0, 80.0))
-    return Guard(None, replace(wide, rules=RuleSettings(energy=3600.0, far=0.5)), skin="t")
+    wide, rule = (-20.0, 80.0), RuleSettings(full_drive_s=3600.0, far_K=0.5)
+    sensors = SensorSettings(believable_degC=wide)
+    settings = GuardSettings(skin_degC=wide, others_degC=wide, sensors=sensors, no_model=rule)
+    return Guard(None, settings, skin="t")
 
 
 def identified(kind: type[Plant], seed: int) -> Any:

@@ -23,12 +23,16 @@ times say.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from math import inf
 from pathlib import Path
+from typing import Annotated
+
+from pydantic import ConfigDict, Field, Strict, TypeAdapter, ValidationError
 
 from thermogrip.datasets.atomic_files import read_toml
 from thermogrip.datasets.errors import UserError, known_names
+from thermogrip.mpc.design.design import problem_of
 from thermogrip.rig.interface import UNIT_RANGES, Event, Reading, Rig, check_order
 
 
@@ -39,21 +43,25 @@ class Switching:
     now_s: float = 1e-6  # a switching that is due within this is due
     shortest_s: float = 0.01  # wait between two switchings: what comes later for it is owed
     same: float = 0.01  # of full: a device rounds what it applies
-    longest_s: float = 3600.0  # that a least time may be
 
 
 _SWITCHING = Switching()
+
+#: A least time.
+Seconds = Annotated[float, Strict(), Field(ge=0, le=3600)]
 
 
 @dataclass(frozen=True)
 class Relay:
     """One drive that is switched: by one relay, or by two, of which the cooler is the other sign."""
 
+    __pydantic_config__ = ConfigDict(extra="forbid")
+
     heater: str  # the device's input that is full on; where both are one input, its ends are on and reversed
     cooler: str = ""  # empty where nothing cools
-    on_s: float = 1.0  # least time on [s]
-    off_s: float = 1.0  # and off
-    dead_s: float = 0.0  # least time between heater and cooler
+    on_s: Seconds = 1.0  # least time on [s]
+    off_s: Seconds = 1.0  # and off
+    dead_s: Seconds = 0.0  # least time between heater and cooler
 
 
 class Switch:
@@ -274,23 +282,15 @@ def read_relays(path: str | Path) -> dict[str, Relay]:
     >>> read_relays(path)
     {'q1': Relay(heater='q1', cooler='', on_s=10.0, off_s=10.0, dead_s=0.0)}
     """
-    relays, keys = {}, {key.name: key.type for key in fields(Relay)}
-    content = read_toml(path, hint="write [q1] and below it on_s = 10")
-    for name, table in content.items():
-        if not isinstance(table, dict):
-            raise UserError(f"{name}: is no table", file=path, hint="write [q1] and below it on_s = 10")
-        for key, value in table.items():
-            if key not in keys:
-                raise UserError(f"{name}.{key}: no such key", file=path, hint=known_names(key, keys))
-            number = isinstance(value, int | float) and not isinstance(value, bool)
-            fits, allowed = isinstance(value, str), "the name of an input"
-            if keys[key] == "float":
-                fits = number and 0 <= value <= _SWITCHING.longest_s
-                allowed = f"a time of 0 to {_SWITCHING.longest_s:g} s"
-            if not fits:
-                raise UserError(f"{name}.{key}: {value!r} is not {allowed}", file=path, hint="correct it")
-        times = {key: float(value) for key, value in table.items() if keys[key] == "float"}
-        relays[name] = Relay(table.get("heater", name), table.get("cooler", ""), **times)
-    if not relays:
-        raise UserError("has no relay", file=path, hint="write [q1] and below it on_s = 10")
-    return relays
+    hint = "write [q1] and below it on_s = 10"
+    content = read_toml(path, hint=hint)
+    if not content:
+        raise UserError("has no relay", file=path, hint=hint)
+    tables = {
+        name: {"heater": name, **table} if isinstance(table, dict) else table
+        for name, table in content.items()
+    }
+    try:
+        return TypeAdapter(dict[str, Relay]).validate_python(tables)
+    except ValidationError as error:
+        raise UserError(problem_of(error), file=path, hint=hint) from error

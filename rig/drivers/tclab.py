@@ -1,4 +1,4 @@
-"""The TCLab as a rig: a driver that checks every answer and trips where the firmware would not.
+"""The TCLab as a rig: a driver that checks every answer, of a board that checks nothing.
 
 The TCLab's protocol has no number, no checksum, no time to live and no trip, so what can be done is done
 here:
@@ -9,14 +9,12 @@ here:
 * **What is plausible.**  A jump of more than ``jump`` since the last scan of less than 10 s ago is asked
   again, and the median of three counts: without a checksum a flipped digit is as good as any other.  A
   converter at its end is an open or shorted sensor: NaN.
-* **Trips.**  Four scans in a row above ``highest`` or with a lost sensor switch both heaters off and latch,
-  as our own firmware does.  Where the board could not be reached then, its heaters go off at the first scan
-  that shows them on.
 * **Which board it is.**  After a silence or on a new connection it is the same board where a heater that was
   on still is, to the last digit.  With the heaters off nothing tells one board from another: it is not driven
   any more.
 
-What cannot be done: **nothing ends the heaters when the program is dead or the cable out**; they stay as they
+A temperature that is too high, or lost, is the guard's matter (:mod:`~thermogrip.rig.guard.guard`).  What
+cannot be done: **nothing ends the heaters when the program is dead or the cable out**; they stay as they
 were until the board loses its power.  ``Q2B`` is never used: firmware 2.0.1 sets heater 1 with it.
 """
 
@@ -31,9 +29,8 @@ from statistics import median
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.rig.clock import Metronome
-from thermogrip.rig.interface import DeviceRefusedError, NoticeBook, Reading, check_order
+from thermogrip.rig.interface import NoticeBook, Reading, check_order
 from thermogrip.rig.serial.port import Port, PortError
-from thermogrip.rig.serial.protocol import REFUSALS
 
 HEATERS, SENSORS = ("q1", "q2"), ("t1", "t2")
 _DECIMAL_LINE = re.compile(rb"(-?(?:0|[1-9][0-9]{0,3})\.[0-9]{3})\r?\n")
@@ -48,7 +45,6 @@ class BoardSettings:
     # degC: outside, the converter (-50 degC, 1023 counts of 0.32 K) is at its end, the sensor open or short
     lowest: float = -49.9
     ceiling: float = 130.0
-    bad_scans: int = 4  # in a row that trip, as on our own firmware
     timeout_s: float = 0.5  # of a line
     fresh_s: float = 10.0  # age of a scan from which a jump is counted: a heater does 0.35 K/s
     same: float = 0.002  # percent: the board answers with three digits
@@ -60,16 +56,14 @@ BOARD = BoardSettings()
 class TCLabRig(NoticeBook):
     """A TCLab behind the rig's interface; inputs ``q1``, ``q2`` in percent, outputs ``t1``, ``t2``.
 
-    It trips above ``highest`` [degC], and a change of ``jump`` [K] between two scans is asked again;
-    ``timeout`` of each line of an answer, of which three are waited for, and ``greeting`` of a board that
-    starts are real seconds.
+    A change of ``jump`` [K] between two scans is asked again; ``timeout`` of each line of an answer, of which
+    three are waited for, and ``greeting`` of a board that starts are real seconds.
     """
 
     def __init__(
         self,
         port: Port,
         *,
-        highest: float = 80.0,
         jump: float = 3.0,
         timeout: float = BOARD.timeout_s,
         greeting: float = 6.0,
@@ -77,18 +71,15 @@ class TCLabRig(NoticeBook):
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
         self.port = port
-        self.highest = highest
         self.jump = jump
         self.timeout = timeout
         super().__init__(clock)
         self._beat = Metronome(clock, sleep)
         self._set = [0.0, 0.0]
         self._pump = 0
-        self._bad = 0
         self._last: tuple[float, list[float]] | None = None
         self._lost, self.closed = False, False
         self._known_at, self._heard = 0, 0  # the connection whose board is known; bytes so far
-        self.faults: tuple[str, ...] = ()
         port.open()
         self.version = self._greet(greeting)
 
@@ -112,29 +103,22 @@ class TCLabRig(NoticeBook):
         heaters are then what they were set to: nothing there ends them)."""
         try:
             temperatures, heaters = self._checked_scan()
-            if self.faults and any(heaters):  # it tripped while the board could not be reached
-                self._end_heaters()
         except PortError:
             temperatures, heaters = [float("nan")] * 2, list(self._set)
-        self._trip_if_bad(temperatures)
         drive = dict(zip(HEATERS, heaters))
         return Reading(self._now(), dict(zip(SENSORS, temperatures)), drive, self._pump)
 
     def apply(self, drive: Mapping[str, float], pump: int) -> None:
         """Set both heaters and have the board confirm them; there is no pump, its state is only kept.
 
-        Raises PortError where the board does not confirm (a heater may be as it was), DeviceRefusedError
-        where a trip is latched, ValueError for an unknown input or a value outside 0 to 100, RuntimeError
-        where closed.
+        Raises PortError where the board does not confirm (a heater may be as it was), ValueError for an
+        unknown input or a value outside 0 to 100, RuntimeError where closed.
         """
         check_order(drive, pump, dict.fromkeys(HEATERS, (0.0, 100.0)))
-        on = any(drive.values())
         if self.closed:
-            if on or pump:
+            if any(drive.values()) or pump:
                 raise RuntimeError("the rig is closed")
             return
-        if self.faults and on:
-            raise DeviceRefusedError("latched", REFUSALS["latched"], self.faults)
         self._set_heaters([float(drive[name]) for name in HEATERS])
         self._pump = pump
 
@@ -148,13 +132,6 @@ class TCLabRig(NoticeBook):
 
     def release(self) -> None:
         """Do nothing: nothing was grasped."""
-
-    def clear(self) -> None:
-        """Clear the trip; DeviceRefusedError where its cause is still there."""
-        temperatures, _ = self._checked_scan()
-        if any(not value <= self.highest for value in temperatures):
-            raise DeviceRefusedError("active", REFUSALS["active"], self.faults)
-        self.faults, self._bad = (), 0
 
     def close(self) -> None:
         """Switch both heaters off and let the port go; never raises, and may be called twice."""
@@ -216,26 +193,11 @@ class TCLabRig(NoticeBook):
         if any(abs(now - then) > BOARD.same for now, then in zip(numbers[2:], self._set)):
             return True
         if self._last is None or self._clock() - self._last[0] > BOARD.fresh_s:
-            return any(not BOARD.lowest < value < self.highest for value in numbers[:2])
+            return any(not BOARD.lowest < value < BOARD.ceiling for value in numbers[:2])
         return any(abs(now - then) > self.jump for now, then in zip(numbers[:2], self._last[1]))
 
     def _scan(self) -> list[float]:
         return [float(line) for line in self._ask(b"SCAN", 4, _DECIMAL_LINE)]
-
-    def _trip_if_bad(self, temperatures: list[float]) -> None:
-        """Count bad scans; the fourth in a row switches off and latches."""
-        bad = [
-            ("over" if value == value else "lost") + f":{name}"
-            for name, value in zip(SENSORS, temperatures)
-            if not value <= self.highest
-        ]
-        self._bad = self._bad + 1 if bad else 0
-        if self._bad < BOARD.bad_scans or self.faults:
-            return
-        self.faults = tuple(bad)
-        shown = ", ".join(f"{n} {v:.1f} degC" for n, v in zip(SENSORS, temperatures))
-        self._note("latched", f"{', '.join(bad)} ({shown}, at most {self.highest:g}); heaters off")
-        self._end_heaters()
 
     def _end_heaters(self) -> None:
         """Switch both heaters off; never raises."""

@@ -8,8 +8,8 @@ It asks, in this order:
     sensors   is each reading plausible?  (lost, jump, stuck, disagree;
               :mod:`~thermogrip.rig.guard.sensor_checks`)
     limits    is everything inside its limits?  (limit)
-    model     does the rig follow its identified model?  (model, pump, driver, reversed, drift;
-              :mod:`~thermogrip.rig.guard.model_checks`), or, without a model, the rules below
+    model     does the rig follow its identified model?  (model, stuck, driver, drift;
+              :mod:`~thermogrip.rig.guard.model_checks`), or, without a model, the rule below
     operator  has somebody asked to stop?  (operator)
 
 and of a move, before it goes out: is it finite, and does it pump heat into standing water?  (drive,
@@ -30,40 +30,31 @@ noise: 0.35 K + 0.1 K for a TCLab at full power.  What is in a heater by then st
 on by 1.3 K from 40 degC.  :data:`LIMIT_MARGIN` holds for both together wherever the heat in transit is less
 than 1.5 K (docs/reference/faults.md has measured figures).
 
-**The rules that need no model** are those of 3-D printers (Klipper's ``verify_heater``, Marlin's
+**The rule that needs no model** is that of 3-D printers (Klipper's ``verify_heater``, Marlin's
 ``WATCH_TEMP``), with a sign, because a Peltier drive does both, and by energy, because what heats slowly
 burns as well.
 
-*No answer.*  Each time the integral of the drive (a share of its range, positive heats) has come to
-``energy`` seconds of full drive without a change of sign, an output must have moved by ``least`` kelvin with
-the drive, or one must stand where such a drive holds it:
+Each time the integral of the drive (a share of its range, positive heats) has come to ``full_drive_s``
+without a change of sign, an output must have moved by ``least_K`` with the drive, or one must stand where
+such a drive holds it:
 
-    |T - T_room| >= far min(1, 2 |mean drive|) - least,    T on the drive's side of the room.
+    |T - T_room| >= far_K min(1, 2 |mean drive|) - least_K,    T on the drive's side of the room.
 
-By ``least`` sensors may disagree as well: a drive that holds no more than that apart, with the defaults 1/16
-of its range, is not judged.  Where no sensor reads the room, the output must stand ``least`` beyond what it
-read before in the session.
-
-*Away.*  Once an output was within ``near`` of its target, the area by which it is beyond ``leave`` kelvin
-from it may not exceed ``area`` kelvin seconds (Klipper's 120).
+By ``least_K`` sensors may disagree as well: a drive that holds no more than that apart, with the defaults
+1/16 of its range, is not judged.  Where no sensor reads the room, the output must stand ``least_K`` beyond
+what it read before in the session.
 """
 
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from math import isfinite
 
-from thermogrip.datasets.errors import UserError, known_names
-from thermogrip.datasets.limits import keyed
-from thermogrip.rig.guard.model_checks import ModelMonitor, ModelSettings, Residual, by_danger
-from thermogrip.rig.guard.sensor_checks import (
-    HOTTEST,
-    SensorMonitor,
-    SensorSettings,
-    room_disturbances,
-    room_sensors,
-)
+from thermogrip.datasets.errors import UserError
+from thermogrip.rig.guard.model_checks import ModelMonitor, Residual
+from thermogrip.rig.guard.sensor_checks import SensorMonitor, room_disturbances, room_sensors
+from thermogrip.rig.guard.settings import GuardSettings, RuleSettings
 from thermogrip.rig.guard.trip import KINDS, Trip
 from thermogrip.rig.interface import Reading, range_of
 from thermogrip.sysid.plant.plant import Plant
@@ -72,24 +63,8 @@ from thermogrip.sysid.plant.plant import Plant
 LIMIT_MARGIN = 2.0
 
 
-@dataclass(frozen=True)
-class RuleSettings:
-    """Numbers of the rules."""
-
-    # a minute of full drive: what was heated may rise for half of it (of 72 experiments on the example rig
-    # 30 s ended four, 60 s none)
-    energy: float = keyed(60.0, "full_drive_s", 1, 3600)
-    least: float = keyed(1.0, "least_K", 0.05, 50)
-    far: float = keyed(8.0, "far_K", 0.5, 100)  # at half of full drive
-    near: float = keyed(1.0, "near_K", 0.05, 50)
-    leave: float = keyed(5.0, "leave_K", 0.1, 50)
-    area: float = keyed(120.0, "area_K_s", 1, 1e5)
-    # where people work [degC]: an output outside was heated or cooled before the session
-    usual_room: tuple[float, float] = (10.0, 35.0)
-
-
 class RuleMonitor:
-    """Apply the rules; pure: times are passed in."""
+    """Apply the rule that needs no model; pure: times are passed in."""
 
     def __init__(self, settings: RuleSettings | None = None) -> None:
         self.settings = RuleSettings() if settings is None else settings
@@ -98,7 +73,6 @@ class RuleMonitor:
     def start(self) -> None:
         """Forget the past."""
         self._ranges: dict[str, tuple[float, float]] = {}  # of each output in this session [degC]
-        self._been_near: dict[str, tuple[float, float]] = {}  # target, area so far
         self._time = self._begun = float("nan")
         self._energy = 0.0  # since it was ``_begun``
         self._since = dict(self._ranges)
@@ -111,10 +85,9 @@ class RuleMonitor:
         accepted: Mapping[str, float],
         *,
         room: float,
-        target: Mapping[str, float],
     ) -> Trip | None:
         """Return the trip, if any; ``drive`` is what was applied since the last call, -1...1 of its range,
-        positive heats; temperatures and targets are in degC, no target where nothing is regulated."""
+        positive heats; temperatures are in degC."""
         passed = time - self._time if isfinite(self._time) else 0.0
         self._time = time
         if not isfinite(self._begun) or drive * self._energy < 0:
@@ -126,11 +99,11 @@ class RuleMonitor:
                 ranges[name] = min(low, value), max(high, value)
             (low, high), (rise, fall) = self._since[name], self._moved.get(name, (0.0, 0.0))
             self._moved[name] = max(rise, value - low), max(fall, high - value)
-        trip = None
-        if accepted and abs(self._energy) >= self.settings.energy:
-            trip = self._no_answer(time, accepted, room)
-            self._begin(time, accepted)
-        return trip or self._away(time, passed, accepted, target)
+        if not accepted or abs(self._energy) < self.settings.full_drive_s:
+            return None
+        trip = self._no_answer(time, accepted, room)
+        self._begin(time, accepted)
+        return trip
 
     def _begin(self, time: float, accepted: Mapping[str, float]) -> None:
         self._begun, self._energy = time, 0.0
@@ -140,24 +113,24 @@ class RuleMonitor:
     def _no_answer(self, time: float, outputs: Mapping[str, float], room: float) -> Trip | None:
         s, seconds = self.settings, time - self._begun
         mean = self._energy / seconds
-        heats, holds = mean > 0, s.far * min(1.0, 2 * abs(mean))
+        heats, holds = mean > 0, s.far_K * min(1.0, 2 * abs(mean))
         with_drive, against = {}, {}
         for name in outputs:
             rise, fall = self._moved[name]
             with_drive[name], against[name] = (rise, fall) if heats else (fall, rise)
         most = max(with_drive, key=with_drive.__getitem__)
         beyond = max(self._beyond_room(name, value, room, heats) for name, value in outputs.items())
-        stands = beyond >= (holds - s.least if isfinite(room) else s.least)
-        if with_drive[most] >= s.least or stands or holds <= s.least:
+        stands = beyond >= (holds - s.least_K if isfinite(room) else s.least_K)
+        if with_drive[most] >= s.least_K or stands or holds <= s.least_K:
             return None
-        kind = "reversed" if against[most] >= s.least else "driver"
+        kind = "reversed" if against[most] >= s.least_K else "driver"
         change = -against[most] if kind == "reversed" else with_drive[most]
         change = change if heats else -change
         return Trip(
             kind=kind,
             time_s=time,
             subject=most,
-            expected=f"at least {s.least:g} K {'warmer' if heats else 'colder'} "
+            expected=f"at least {s.least_K:g} K {'warmer' if heats else 'colder'} "
             f"in {seconds:.0f} s of drive {mean:+.2f}",
             measured=f"{change:+.1f} K",
             check=_to_check(["drift", kind]),
@@ -172,111 +145,6 @@ class RuleMonitor:
             lowest_room, highest_room = self.settings.usual_room
             low, high = min(coldest, highest_room), max(warmest, lowest_room)
         return value - low if heats else high - value
-
-    def _away(
-        self, time: float, passed: float, accepted: Mapping[str, float], target: Mapping[str, float]
-    ) -> Trip | None:
-        s = self.settings
-        for name, goal in target.items():
-            if name not in accepted:
-                continue
-            off = abs(accepted[name] - goal)
-            known, area = self._been_near.get(name, (float("nan"), 0.0))
-            if known != goal:
-                if off <= s.near:
-                    self._been_near[name] = (goal, 0.0)
-                else:
-                    self._been_near.pop(name, None)
-                continue
-            area = area + (off - s.leave) * passed if off > s.leave else 0.0
-            self._been_near[name] = (goal, area)
-            if area > s.area:
-                expected = f"within {s.leave:g} K of the target {goal:g} degC, where it was"
-                measured = f"{accepted[name]:.1f} degC"
-                return Trip("model", time, name, expected, measured, figures={"area": area})
-        return None
-
-
-@dataclass(frozen=True)
-class GuardSettings:
-    """What the guard allows."""
-
-    # of single sensors by name [degC]
-    limits: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    # of the skin's sensors, where ``limits`` does not name them [degC]
-    skin_limits: tuple[float, float] = keyed((3.0, 55.0), "skin_degC", -50, 150)
-    # of every other one [degC]: water that neither freezes nor scalds
-    other_limits: tuple[float, float] = keyed((-1.0, 70.0), "others_degC", -50, HOTTEST)
-    # the device's own time to live of a drive [s]: a longer silence of ours and it is off
-    expiry_s: float = keyed(2.0, "expiry_s", 0.5, 2)
-    stale_s: float = keyed(2.0, "stale_s", 0.5, 60)  # longest time without a new reading [s]
-    # by how much the rig's clock may differ from ours between two readings [s]
-    clock_slack_s: float = keyed(1.0, "clock_slack_s", 0.1, 60)
-    # by how much the applied drive may differ from what was asked, a fraction of half its range
-    drive_slack: float = keyed(0.05, "drive_slack", 0.005, 0.5)
-    # after a touch the skin is what the object made of it for so long [s]
-    forget_s: float = keyed(60.0, "forget_s", 0, 3600)
-    sensors: SensorSettings = field(default_factory=SensorSettings)
-    # sensors that read the room, of those that the plant does not know; None goes by their names
-    rooms: tuple[str, ...] | None = None
-    model: ModelSettings = field(default_factory=ModelSettings)
-    rules: RuleSettings = field(default_factory=RuleSettings)
-    file: str = field(default="", compare=False)  # where it was read from, for messages
-    # a reading is believed so far beyond the highest limit [K], as 75 is beyond the usual 70 degC
-    believed_beyond: float = 5.0
-    beyond_logs: float = 0.1  # of the logs' range: by so much a loop by SIMC overshoots a step
-    known_s: float = 300.0  # pause after which the model still knows the rig: that between trials of a batch
-
-    @classmethod
-    def of(cls, plant: Plant | None, skin: str = "t_surface") -> GuardSettings:
-        """Return what is allowed where no file says it: an output of a plant whose logs went beyond the usual
-        limits may go there again."""
-        usual = cls()
-        coldest, hottest = usual.other_limits
-        logged = {} if plant is None else {name: plant.valid.get(name) for name in plant.outputs}
-        limits = {
-            name: (coldest, ends[1] + usual.beyond_logs * (ends[1] - ends[0]))
-            for name, ends in logged.items()
-            if ends is not None and ends[1] > hottest and name not in (skin, f"{skin}_2")
-        }
-        return replace(usual, limits=limits)._believing()
-
-    def _believing(self) -> GuardSettings:
-        """Return these with readings believed until beyond every limit."""
-        low, high = self.sensors.plausible
-        highest = max(most for _, most in (self.other_limits, *self.limits.values()))
-        return replace(
-            self, sensors=replace(self.sensors, plausible=(low, max(high, highest + self.believed_beyond)))
-        )
-
-    def below(self, limit: float) -> GuardSettings:
-        """Return these with no sensor above a limit [degC] that somebody states; where no file states others,
-        it holds for all but the skin also where it is higher than usual."""
-        if not self.file and limit > self.other_limits[1]:
-            limit = min(limit, HOTTEST)
-            return replace(self, limits={}, other_limits=(self.other_limits[0], limit))._believing()
-
-        def cut(ends: tuple[float, float]) -> tuple[float, float]:
-            if limit <= ends[0]:
-                problem = f"a limit of {limit:g} degC leaves nothing above {ends[0]:g}"
-                raise UserError(problem, hint="raise it")
-            return ends[0], min(ends[1], limit)
-
-        limits = {name: cut(ends) for name, ends in self.limits.items()}
-        skin, others = cut(self.skin_limits), cut(self.other_limits)
-        return replace(self, limits=limits, skin_limits=skin, other_limits=others)
-
-    def check_sensors(self, have: Collection[str], rooms: Collection[str]) -> None:
-        """Raise UserError where a limit or a pair names a sensor that the rig has not, or the room's."""
-        guarded = [name for name in have if name not in rooms]  # the room's is no reason to stop
-        for name in (*self.limits, *(name for pair in self.sensors.pairs for name in pair)):
-            if name not in guarded:
-                hint = known_names(name, guarded, "name one of {}")
-                raise UserError(f"the rig has no sensor {name!r} to guard", file=self.file or None, hint=hint)
-        for name in self.rooms or ():
-            if name not in rooms:
-                problem = f"the rig has no sensor {name!r} that may read the room"
-                raise UserError(problem, file=self.file or None, hint="name none that the plant has")
 
 
 @dataclass(frozen=True)
@@ -342,7 +210,7 @@ class Guard:
         self._logged = {} if plant is None else plant.valid
         self.model = None if plant is None else ModelMonitor(plant, self.settings.model)
         self.sensors = SensorMonitor(self.settings.sensors)
-        self.rules = RuleMonitor(self.settings.rules)
+        self.rules = RuleMonitor(self.settings.no_model)
         self.target: dict[str, float] = {}
         self.trips: list[Trip] = []
         self._time_s = float("-inf")  # of the newest reading, by the rig's clock
@@ -452,7 +320,7 @@ class Guard:
         if self.model is None:
             return True
         since_s = max(self.model.compared_from, self._released_s + self.settings.forget_s)
-        return not self._touched and time >= since_s + self.settings.model.windows[0]
+        return not self._touched and time >= since_s + self.settings.model.windows_s[0]
 
     def check(
         self,
@@ -575,12 +443,12 @@ class Guard:
         """Return which of these sensors read the room; what touches or is regulated never does."""
         plant = None if self.model is None else self.model.plant
         outputs = (self.skin, f"{self.skin}_2", *self.target)
-        return room_sensors(names, plant, stated=self.settings.rooms, outputs=outputs)
+        return room_sensors(names, plant, stated=self.settings.room_sensors, outputs=outputs)
 
     def guessed_rooms(self, names: Collection[str]) -> list[str]:
         """Return the sensors that are taken for the room's by their names alone."""
         stated = () if self.model is None else room_disturbances(self.model.plant)
-        return sorted(self.rooms(names).difference(stated)) if self.settings.rooms is None else []
+        return sorted(self.rooms(names).difference(stated)) if self.settings.room_sensors is None else []
 
     def unread(self, names: Collection[str]) -> dict[str, float]:
         """Return the plant's measured disturbances that are none of these sensors' and no temperature of the
@@ -594,7 +462,7 @@ class Guard:
     def limits_of(self, name: str) -> tuple[float, float]:
         """Return between which temperatures a sensor may read [degC]."""
         s, skin = self.settings, name in (self.skin, f"{self.skin}_2")
-        return s.limits.get(name, s.skin_limits if skin else s.other_limits)
+        return s.limits.get(name, s.skin_degC if skin else s.others_degC)
 
     def check_target(self, name: str, value: float) -> None:
         """Raise UserError where a target [degC] of a sensor is beyond its limits."""
@@ -602,7 +470,7 @@ class Guard:
         if not low <= value <= high:
             problem = f"target {value:g} degC is unsafe"
             hint = f"choose one from {low:g} to {high:g} degC, or state the limits of {name} in a guard file"
-            raise UserError(problem, file=self.settings.file or None, hint=hint)
+            raise UserError(problem, file=self.settings.file, hint=hint)
 
     def _masked(self, time: float) -> frozenset[str]:
         """Return the outputs that an object determines, now or lately."""
@@ -628,10 +496,9 @@ class Guard:
     ) -> Trip | None:
         if self.model is None:
             outputs = {n: v for n, v in outputs.items() if n not in masked}
-            target = {} if masked else self.target
             share = [self._share(name, value) for name, value in self._mean_drive.items()]
             mean = max(share, key=abs, default=0.0)
-            return self.rules.check(time, mean, outputs, room=room, target=target)
+            return self.rules.check(time, mean, outputs, room=room)
         alarms = self.model.update(time, outputs, masked)
         if not self.model.compared_now:  # a grasp is sampled faster than the model steps
             return None
@@ -643,39 +510,32 @@ class Guard:
         return self._against_model(time, max(confirmed, key=lambda a: a.excess)) if confirmed else None
 
     def _against_model(self, time: float, alarm: Residual) -> Trip:
-        figures = {"expected": alarm.expected, "measured": alarm.measured, "allowed": alarm.allowed}
-        figures |= {"window_s": alarm.window}
-        assert self.model is not None
-        name = alarm.subject
-        if alarm.kind == "bias":
-            unit = "of its range" if name in self._drive else "K"
-            kind = "driver" if name in self._drive else "drift"
-            return Trip(
-                kind=kind,
-                time_s=time,
-                subject=name,
-                expected=f"within {alarm.allowed:.2g} {unit} of the model",
-                measured=f"{alarm.measured:+.2f} {unit}",
-                check=_to_check([kind, "drift"]),  # a sensor may drift, whichever bias shows it
-                figures=figures,
-            )
-        causes = self.model.explain(alarm)
-        because, kinds = ", or ".join(cause.text for cause in causes), by_danger(causes, name)
-        kind, subject = kinds[0]
+        name, off = alarm.subject, f"{alarm.measured:+.2f}"
+        is_drive = name in self._drive
         repeats, seconds = self.sensors.same_for(name)
-        if repeats >= 4 and abs(alarm.measured) < abs(alarm.expected):
-            kind = "stuck"
-            subject = name
-            because = f"bit for bit the same for {seconds:.0f} s"
-            kinds = [(kind, subject)]
+        if alarm.kind == "bias":
+            unit = "of its range" if is_drive else "K"
+            kind = "driver" if is_drive else "drift"
+            expected, measured = f"within {alarm.allowed:.2g} {unit} of the model", f"{off} {unit}"
+        else:
+            kind, measured = "model", f"{off} K"
+            expected = f"{name} {alarm.expected:+.2f} +- {alarm.allowed:.2f} K in {alarm.window:.0f} s"
+            if repeats >= 4 and abs(alarm.measured) < abs(alarm.expected):
+                kind, measured = "stuck", f"{measured} (bit for bit the same for {seconds:.0f} s)"
         return Trip(
             kind=kind,
             time_s=time,
-            subject=subject,
-            expected=f"{name} {alarm.expected:+.2f} +- {alarm.allowed:.2f} K in {alarm.window:.0f} s",
-            measured=f"{alarm.measured:+.2f} K" + (f" ({because})" if because else ""),
-            check=_to_check([likely for likely, _ in kinds]),
-            figures=figures,
+            subject=name,
+            expected=expected,
+            measured=measured,
+            # a sensor may drift, whichever bias shows it
+            check=_to_check([kind, "drift"]) if alarm.kind == "bias" else "",
+            figures={
+                "expected": alarm.expected,
+                "measured": alarm.measured,
+                "allowed": alarm.allowed,
+                "window_s": alarm.window,
+            },
         )
 
     def _share(self, name: str, value: float) -> float:

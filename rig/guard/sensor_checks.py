@@ -6,8 +6,8 @@ reading (three in a row come every 84 readings then anyway),
 
     share += (1 - exp(-passed / 60 s)) (lost - share),    lost = 1 from a suspect reading to the next, else 0.
 
-*Jump.*  Water cannot change faster than ``rate``; a reading that does is suspect.  A skin that touches an
-object may.
+*Jump.*  Water cannot change faster than ``rate_K_per_s``; a reading that does is suspect.  A skin that
+touches an object may.
 
 *Stuck.*  What number of bit-equal readings proves a fault depends on the noise: with white noise of standard
 deviation s about the middle of a quantum q, a healthy sensor repeats itself with
@@ -18,7 +18,8 @@ so n = ln(alpha) / ln(p) repeats are a false alarm with probability alpha.  For 
 takes 37 samples at 1e-9; for a converter of 0.3 K with the same noise no number proves anything (the model
 has to).  q is the smallest step seen.
 
-*Pairs.*  Two sensors of one temperature may differ by ``pair_limit`` for ``pair_s``, no longer.
+*Pairs.*  Two sensors of one temperature, ``x`` and ``x_2``, may differ by ``pair_limit_K`` for ``pair_s``, no
+longer.
 
 **The room's sensors.**  Losing one is no reason to stop, and no limit holds for it.  They are the plant's
 disturbances that are temperatures, and of the sensors that the plant does not know those that the guard file
@@ -28,37 +29,14 @@ states, or else those that are called so (:func:`~thermogrip.datasets.roles.gues
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from math import ceil, erf, exp, isfinite, log, sqrt
 from typing import NamedTuple
 
-from thermogrip.datasets.limits import keyed
 from thermogrip.datasets.roles import guess_role
+from thermogrip.rig.guard.settings import SensorSettings
 from thermogrip.rig.guard.trip import Trip
 from thermogrip.sysid.plant.plant import Plant
-
-#: The hottest limit that may be stated [degC]: above the thermocouples of a kiln (type S ends at 1768 degC).
-HOTTEST = 1800.0
-
-
-@dataclass(frozen=True)
-class SensorSettings:
-    """What a sensor may do."""
-
-    # a reading outside is suspect [degC]
-    plausible: tuple[float, float] = keyed((-5.0, 75.0), "believable_degC", -50, HOTTEST + 50)
-    rate: float = keyed(5.0, "rate_K_per_s", 0.05, 100)  # fastest change of water [K/s]
-    slack: float = keyed(0.5, "slack_K", 0, 10)  # noise allowance of a change [K]
-    bad_in_a_row: int = keyed(3, "bad_in_a_row", 1, 20)  # so many suspect readings trip
-    noise: float = keyed(0.04, "noise_K", 0.001, 5)  # least white noise, standard deviation [K]
-    # probability that a healthy sensor repeats itself until it counts as stuck
-    alpha: float = keyed(1e-9, "alpha", 1e-15, 1e-3)
-    pairs: Mapping[tuple[str, str], float] = field(default_factory=dict)  # may differ by so much [K]
-    pair_limit: float = keyed(4.0, "pair_limit_K", 0.1, 50)  # of ``x`` and ``x_2``, always a pair [K]
-    pair_s: float = keyed(30.0, "pair_s", 0, 3600)  # for how long a pair may differ by more [s]
-    # share of the last minute without a good reading that trips: three in a row come every 84 readings then
-    lost_share: float = 0.25
-    lost_s: float = 60.0  # memory of that share [s]
 
 
 @dataclass
@@ -125,7 +103,7 @@ class SensorMonitor:
     def __init__(self, settings: SensorSettings | None = None) -> None:
         self.settings = SensorSettings() if settings is None else settings
         self._memory: dict[str, _Memory] = {}
-        self._apart: dict[tuple[str, str], float] = {}
+        self._apart_since: dict[str, float] = {}
         self._seen = 0.0  # time of the newest readings [s]
 
     def start(self, time: float, values: Mapping[str, float]) -> None:
@@ -135,11 +113,11 @@ class SensorMonitor:
             for name, value in values.items()
         }
         self._seen = time
-        self._apart = {}
+        self._apart_since = {}
 
     def plausible(self, value: float) -> bool:
         """Say whether a value [degC] is finite and inside the plausible range."""
-        low, high = self.settings.plausible
+        low, high = self.settings.believable_degC
         return isfinite(value) and low <= value <= high
 
     def last_good(self) -> dict[str, float]:
@@ -173,7 +151,7 @@ class SensorMonitor:
         for name, value in values.items():
             memory = self._memory.setdefault(name, _Memory(value, time, since=time, last=value))
             memory.lost_share += newer * ((memory.bad > 0) - memory.lost_share)
-            allowed = self.settings.rate * max(time - memory.time, 0.0) + self.settings.slack
+            allowed = self.settings.rate_K_per_s * max(time - memory.time, 0.0) + self.settings.slack_K
             jump = (
                 isfinite(memory.good) and abs(value - memory.good) > allowed and name not in touching | rooms
             )
@@ -195,7 +173,7 @@ class SensorMonitor:
         return CheckedReadings(accepted, suspect, trip or self._pairs(time, accepted))
 
     def _lost(self, name: str, value: float, time: float, memory: _Memory, why: str) -> Trip:
-        low, high = self.settings.plausible
+        low, high = self.settings.believable_degC
         expected = f"{low:g} to {high:g} degC"
         if why == "jump":
             expected = f"near the last good {memory.good:.2f} degC"
@@ -213,7 +191,7 @@ class SensorMonitor:
             memory.last = value
             return None
         memory.same += 1
-        needed = repeats_needed(memory.quantum, self.settings.noise, self.settings.alpha)
+        needed = repeats_needed(memory.quantum, self.settings.noise_K, self.settings.alpha)
         if memory.changes < 20 or memory.same < needed:
             return None
         seconds = time - memory.since
@@ -223,20 +201,23 @@ class SensorMonitor:
         return Trip("stuck", time, name, expected, measured, figures=figures)
 
     def _pairs(self, time: float, accepted: Mapping[str, float]) -> Trip | None:
-        twins = {
-            (name, f"{name}_2"): self.settings.pair_limit for name in accepted if f"{name}_2" in accepted
-        }
-        for pair, limit in {**self.settings.pairs, **twins}.items():
-            if not accepted.keys() >= set(pair):
+        limit = self.settings.pair_limit_K
+        for name in accepted:
+            twin = f"{name}_2"
+            if twin not in accepted:
                 continue
-            first, second = (accepted[name] for name in pair)
-            if abs(first - second) <= limit:
-                self._apart.pop(pair, None)
+            apart = accepted[name] - accepted[twin]
+            if abs(apart) <= limit:
+                self._apart_since.pop(name, None)
                 continue
-            seconds = time - self._apart.setdefault(pair, time)
+            seconds = time - self._apart_since.setdefault(name, time)
             if seconds >= self.settings.pair_s:
-                expected = f"within {limit:g} K of each other"
-                measured = f"{first:.2f} and {second:.2f} degC for {seconds:.0f} s"
-                figures = {"apart": first - second}
-                return Trip("disagree", time, " and ".join(pair), expected, measured, figures=figures)
+                return Trip(
+                    kind="disagree",
+                    time_s=time,
+                    subject=f"{name} and {twin}",
+                    expected=f"within {limit:g} K of each other",
+                    measured=f"{accepted[name]:.2f} and {accepted[twin]:.2f} degC for {seconds:.0f} s",
+                    figures={"apart": apart},
+                )
         return None

@@ -7,31 +7,233 @@ No file can switch a check off: each number has a range in which the check still
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import Field, fields
-from difflib import get_close_matches
+from collections.abc import Collection, Mapping
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, ClassVar
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, PrivateAttr, Strict, ValidationError
+from pydantic import model_validator as whole
 
 from thermogrip.datasets.atomic_files import read_toml
-from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.units import split_header
-from thermogrip.rig.guard.guard import GuardSettings, RuleSettings
-from thermogrip.rig.guard.model_checks import ModelSettings
-from thermogrip.rig.guard.sensor_checks import SensorSettings
+from thermogrip.datasets.errors import UserError, known_names
+from thermogrip.mpc.design.design import problem_of
+from thermogrip.sysid.plant.plant import Plant
 
 GUARD_TEMPLATE = (files(__package__) / "guard.toml").read_text(encoding="utf-8")
 
-_TEMPLATE_HINT = "`thermogrip init guard` shows every key with its unit"
+#: The hottest limit that may be stated [degC]: above the thermocouples of a kiln (type S ends at 1768 degC).
+HOTTEST = 1800.0
 
 
-_TABLES: dict[str, type[Any]] = {"sensors": SensorSettings, "model": ModelSettings, "no_model": RuleSettings}
+def _rising(ends: tuple[float, float]) -> tuple[float, float]:
+    if not ends[0] < ends[1]:
+        raise ValueError(f"{ends[0]:g} to {ends[1]:g} is empty: write the lower one first")
+    return ends
 
 
-def _setting_keys(kind: type[Any]) -> dict[str, Field[Any]]:
-    """Return the settings of a kind by their keys (:func:`~thermogrip.datasets.limits.keyed`)."""
-    return {one.metadata["key"]: one for one in fields(kind) if one.metadata}
+Number = Annotated[float, Strict()]  # neither "2 s" nor true
+Limit = Annotated[Number, Field(ge=-50, le=HOTTEST)]
+Limits = Annotated[tuple[Limit, Limit], AfterValidator(_rising)]
+SkinLimit = Annotated[Number, Field(ge=-50, le=150)]
+Reading = Annotated[Number, Field(ge=-50, le=HOTTEST + 50)]
+Window = Annotated[Number, Field(ge=2, le=600)]
+Floor = Annotated[Number, Field(ge=0.05, le=20)]
+
+
+class _Table(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class SensorSettings(_Table):
+    """What a sensor may do."""
+
+    # a reading outside is suspect
+    believable_degC: Annotated[tuple[Reading, Reading], AfterValidator(_rising)] = (-5.0, 75.0)
+    rate_K_per_s: Annotated[Number, Field(ge=0.05, le=100)] = 5.0  # fastest change of water
+    slack_K: Annotated[Number, Field(ge=0, le=10)] = 0.5  # noise allowance of a change
+    bad_in_a_row: Annotated[int, Strict(), Field(ge=1, le=20)] = 3  # so many suspect readings trip
+    noise_K: Annotated[Number, Field(ge=0.001, le=5)] = 0.04  # least white noise, standard deviation
+    # probability that a healthy sensor repeats itself until it counts as stuck
+    alpha: Annotated[Number, Field(ge=1e-15, le=1e-3)] = 1e-9
+    pair_limit_K: Annotated[Number, Field(ge=0.1, le=50)] = 4.0  # of ``x`` and ``x_2``
+    pair_s: Annotated[Number, Field(ge=0, le=3600)] = 30.0  # for how long they may differ by more
+    # share of the last minute without a good reading that trips: three in a row come every 84 readings then
+    lost_share: ClassVar[float] = 0.25
+    lost_s: ClassVar[float] = 60.0  # memory of that share
+
+
+class ModelSettings(_Table):
+    """How far the rig may be from its model (docs/reference/faults.md), and the noise of the filter."""
+
+    windows_s: Annotated[tuple[Window, ...], Field(min_length=1, max_length=6)] = (10.0, 30.0, 90.0)
+    # of each, where the model predicts no change
+    floors_K: Annotated[tuple[Floor, ...], Field(min_length=1, max_length=6)] = (0.55, 0.35, 0.45)
+    share: Annotated[Number, Field(ge=0, le=2)] = 0.25  # allowed part of the change in the window
+    switching_K: Annotated[Number, Field(ge=0, le=20)] = 0.5  # besides, where the pump was switched in it
+    smooth_s: Annotated[Number, Field(ge=0, le=60)] = 3.0  # readings of so long are averaged
+    bias_limit_K: Annotated[Number, Field(ge=0.1, le=20)] = 2.0  # of an output
+    # of a drive's bias, a share of what was asked for lately: three of the 5 % from run to run
+    drive_limit: Annotated[Number, Field(ge=0.01, le=0.45)] = 0.15
+    # nothing is compared where it starts not at rest
+    warm_up_s: Annotated[Number, Field(ge=0, le=3600)] = 60.0
+    # an innovation that makes a reading suspect: standard deviations, and kelvin
+    jump_k: Annotated[Number, Field(ge=3, le=100)] = 8.0
+    jump_floor_K: Annotated[Number, Field(ge=0.1, le=50)] = 3.0
+    state_K_per_sqrt_s: Annotated[Number, Field(ge=1e-4, le=1)] = 0.01  # process noise of the states
+    drive_per_sqrt_s: Annotated[Number, Field(ge=1e-5, le=0.1)] = 0.002  # of a drive's bias
+    output_K_per_sqrt_s: Annotated[Number, Field(ge=1e-5, le=1)] = 0.002  # of an output's bias
+    reading_K: Annotated[Number, Field(ge=0.001, le=5)] = 0.08  # least noise of a reading
+    compared_every_s: ClassVar[float] = 1.0  # a tenth of the shortest window; it costs half of a look
+    bias_after_s: ClassVar[float] = 60.0  # a bias is not evaluated before the filter has seen something
+
+    @whole(mode="after")
+    def _fitting(self) -> ModelSettings:
+        windows, floors = self.windows_s, self.floors_K
+        if len(windows) != len(floors):
+            raise ValueError(
+                f"{len(windows)} windows_s and {len(floors)} floors_K: write a floor for each window"
+            )
+        if list(windows) != sorted(set(windows)):
+            raise ValueError("windows_s do not rise: write the shortest first")
+        if not self.smooth_s < windows[0]:
+            raise ValueError(f"smooth_s is not less than the shortest window, {windows[0]:g}: shorten it")
+        return self
+
+
+class RuleSettings(_Table):
+    """Numbers of the rule that needs no model."""
+
+    # a minute of full drive: what was heated may rise for half of it (of 72 experiments on the example rig
+    # 30 s ended four, 60 s none)
+    full_drive_s: Annotated[Number, Field(ge=1, le=3600)] = 60.0
+    least_K: Annotated[Number, Field(ge=0.05, le=50)] = 1.0
+    far_K: Annotated[Number, Field(ge=0.5, le=100)] = 8.0  # at half of full drive
+    # where people work [degC]: an output outside was heated or cooled before the session
+    usual_room: ClassVar[tuple[float, float]] = (10.0, 35.0)
+
+
+class GuardSettings(_Table):
+    """What the guard allows."""
+
+    limits: dict[str, Limits] = {}  # of single sensors by name [degC]
+    # of the skin's sensors, where ``limits`` does not name them
+    skin_degC: Annotated[tuple[SkinLimit, SkinLimit], AfterValidator(_rising)] = (3.0, 55.0)
+    # of every other one: water that neither freezes nor scalds
+    others_degC: Limits = (-1.0, 70.0)
+    # the device's own time to live of a drive: a longer silence of ours and it is off
+    expiry_s: Annotated[Number, Field(ge=0.5, le=2)] = 2.0
+    stale_s: Annotated[Number, Field(ge=0.5, le=60)] = 2.0  # longest time without a new reading
+    # by how much the rig's clock may differ from ours between two readings
+    clock_slack_s: Annotated[Number, Field(ge=0.1, le=60)] = 1.0
+    # by how much the applied drive may differ from what was asked, a fraction of half its range
+    drive_slack: Annotated[Number, Field(ge=0.005, le=0.5)] = 0.05
+    # after a touch the skin is what the object made of it for so long
+    forget_s: Annotated[Number, Field(ge=0, le=3600)] = 60.0
+    # sensors that read the room, of those that the plant does not know; None goes by their names
+    room_sensors: tuple[str, ...] | None = None
+    sensors: SensorSettings = SensorSettings()
+    model: ModelSettings = ModelSettings()
+    no_model: RuleSettings = RuleSettings()
+    # a reading is believed so far beyond the highest limit [K], as 75 is beyond the usual 70 degC
+    believed_beyond: ClassVar[float] = 5.0
+    beyond_logs: ClassVar[float] = 0.1  # of the logs' range: by so much a loop by SIMC overshoots a step
+    # pause after which the model still knows the rig: that between trials of a batch
+    known_s: ClassVar[float] = 300.0
+    _file: str = PrivateAttr(default="")
+
+    @property
+    def file(self) -> str | None:
+        """Where it was read from, for messages; None where no file says it."""
+        return self._file or None
+
+    @whole(mode="after")
+    def _believed(self) -> GuardSettings:
+        low, high = self.sensors.believable_degC
+        ranges = {"skin_degC": self.skin_degC, "others_degC": self.others_degC}
+        ranges |= {f"limits.{name}": ends for name, ends in self.limits.items()}
+        for name, (least, most) in ranges.items():
+            if not low <= least <= most <= high:
+                raise ValueError(
+                    f"{name}: {least:g} to {most:g} reaches beyond what is plausible, {low:g} to {high:g}: "
+                    "narrow it, or widen sensors.believable_degC"
+                )
+        return self
+
+    @classmethod
+    def from_dict(cls, content: Mapping[str, Any], *, file: str | Path | None = None) -> GuardSettings:
+        """Return settings from plain values; a wrong or unknown key is a :class:`UserError` that names it."""
+        try:
+            settings = cls.model_validate(dict(content))
+        except ValidationError as error:
+            problem = problem_of(error)
+            raise UserError(problem, file=file, hint=_instead(problem.partition(": ")[0])) from error
+        settings._file = "" if file is None else str(file)
+        return settings
+
+    @classmethod
+    def of(cls, plant: Plant | None, skin: str = "t_surface") -> GuardSettings:
+        """Return what is allowed where no file says it: an output of a plant whose logs went beyond the usual
+        limits may go there again."""
+        usual = cls()
+        coldest, hottest = usual.others_degC
+        logged = {} if plant is None else {name: plant.valid.get(name) for name in plant.outputs}
+        limits = {
+            name: (coldest, ends[1] + usual.beyond_logs * (ends[1] - ends[0]))
+            for name, ends in logged.items()
+            if ends is not None and ends[1] > hottest and name not in (skin, f"{skin}_2")
+        }
+        return usual._with_limits(limits=limits)
+
+    def _with_limits(self, **limits: Any) -> GuardSettings:
+        """Return these with other limits, and readings believed until beyond every one."""
+        changed = self.model_copy(update=limits)
+        low, high = self.sensors.believable_degC
+        highest = max(most for _, most in (changed.others_degC, *changed.limits.values()))
+        believed = {"believable_degC": (low, max(high, highest + self.believed_beyond))}
+        return changed.model_copy(update={"sensors": self.sensors.model_copy(update=believed)})
+
+    def below(self, limit: float) -> GuardSettings:
+        """Return these with no sensor above a limit [degC] that somebody states; where no file states others,
+        it holds for all but the skin also where it is higher than usual."""
+        if not self.file and limit > self.others_degC[1]:
+            return self._with_limits(limits={}, others_degC=(self.others_degC[0], min(limit, HOTTEST)))
+
+        def cut(ends: tuple[float, float]) -> tuple[float, float]:
+            if limit <= ends[0]:
+                problem = f"a limit of {limit:g} degC leaves nothing above {ends[0]:g}"
+                raise UserError(problem, hint="raise it")
+            return ends[0], min(ends[1], limit)
+
+        limits = {name: cut(ends) for name, ends in self.limits.items()}
+        skin, others = cut(self.skin_degC), cut(self.others_degC)
+        return self.model_copy(update={"limits": limits, "skin_degC": skin, "others_degC": others})
+
+    def check_sensors(self, have: Collection[str], rooms: Collection[str]) -> None:
+        """Raise UserError where a limit names a sensor that the rig has not, or the room's."""
+        guarded = [name for name in have if name not in rooms]  # the room's is no reason to stop
+        for name in self.limits:
+            if name not in guarded:
+                hint = known_names(name, guarded, "name one of {}")
+                raise UserError(f"the rig has no sensor {name!r} to guard", file=self.file, hint=hint)
+        for name in self.room_sensors or ():
+            if name not in rooms:
+                problem = f"the rig has no sensor {name!r} that may read the room"
+                raise UserError(problem, file=self.file, hint="name none that the plant has")
+
+
+def _instead(place: str) -> str:
+    """Return what to do about a wrong key: the table that it is of, or the key that is most like it."""
+    key = place.rpartition(".")[2]
+    tables: dict[str, type[_Table]] = {
+        "sensors": SensorSettings, "model": ModelSettings, "no_model": RuleSettings,
+    }  # fmt: skip
+    known = [*GuardSettings.model_fields]
+    for table, kind in tables.items():
+        if place == key and key in kind.model_fields:
+            return f"write it below [{table}]"
+        known += kind.model_fields
+    return known_names(key, known, "`thermogrip init guard` shows every key with its unit")
 
 
 def read_guard(path: str | Path) -> GuardSettings:
@@ -55,137 +257,5 @@ def read_guard(path: str | Path) -> GuardSettings:
     >>> read_guard(path).limits
     {'t_tank': (2.0, 65.0)}
     """
-    return guard_from_dict(read_toml(path, hint="`thermogrip init guard` writes one to edit"), file=path)
-
-
-def guard_from_dict(content: Mapping[str, Any], *, file: str | Path | None = None) -> GuardSettings:
-    """Return settings from plain values; a wrong or unknown key is a :class:`UserError` that names it."""
-    tables = {name: content[name] for name in (*_TABLES, "limits") if name in content}
-    for name, table in tables.items():
-        if not isinstance(table, dict):
-            raise UserError(f"{name}: is no table", file=file, hint=f"write [{name}] above its keys")
-    single = {key: value for key, value in content.items() if key not in (*tables, "pairs", "room_sensors")}
-    values = _table_values(single, GuardSettings, "", file)
-    if "room_sensors" in content:
-        values["rooms"] = _name_tuple(content["room_sensors"], file)
-    values["limits"] = {name: _limit(name, pair, file) for name, pair in tables.get("limits", {}).items()}
-    for name, kind in _TABLES.items():
-        table_values = _table_values(tables.get(name, {}), kind, f"{name}.", file)
-        if name == "sensors":
-            table_values["pairs"] = _pairs(content.get("pairs", []), file)
-        values["rules" if name == "no_model" else name] = kind(**table_values)
-    settings = GuardSettings(**values, file="" if file is None else str(file))
-    for problem, hint in _setting_faults(settings):
-        raise UserError(problem, file=file, hint=hint)
-    return settings
-
-
-def _table_values(
-    table: Mapping[str, Any], kind: type[Any], where: str, file: str | Path | None
-) -> dict[str, Any]:
-    """Return the settings of a table by name; a key that is unknown, or a value outside, is refused."""
-    values_by_name, keys = {}, _setting_keys(kind)
-    for name, value in table.items():
-        if name not in keys:
-            raise UserError(f"{where}{name}: no such key", file=file, hint=_instead(name, keys))
-        values_by_name[keys[name].name] = _value(f"{where}{name}", value, keys[name], file)
-    return values_by_name
-
-
-def _instead(name: str, keys: Mapping[str, Any]) -> str:
-    """Return what to do about an unknown key: its unit, its table, or a similar key."""
-    similar = [key for key in keys if key.startswith(f"{name}_")] or get_close_matches(name, keys, 1)
-    tables = [table for table, kind in _TABLES.items() if name in _setting_keys(kind)]
-    if tables:
-        return f"write it below [{tables[0]}]"
-    return f"write {similar[0]}; {_TEMPLATE_HINT}" if similar else _TEMPLATE_HINT
-
-
-def _value(name: str, value: Any, key: Field[Any], file: str | Path | None) -> Any:
-    """Return a value of the form that the setting's type asks for: a number, a whole one, a pair, a list."""
-    hint, span = f"write one that is, or leave it out for {_toml_text(key.default)}", key.metadata["range"]
-    if "tuple" in str(key.type):
-        pair = key.type == "tuple[float, float]"
-        if not isinstance(value, list) or len(value) not in ((2,) if pair else range(1, 7)):
-            form = "a pair [lowest, highest]" if pair else "a list of 1 to 6 numbers"
-            raise UserError(f"{name}: {value!r} is not {form}", file=file, hint=hint)
-        return tuple(_checked_number(name, one, span, hint, file) for one in value)
-    number = _checked_number(name, value, span, hint, file)
-    if key.type != "int":
-        return number
-    if number != int(number):
-        raise UserError(f"{name}: {value!r} is not a whole number", file=file, hint=hint)
-    return int(number)
-
-
-def _checked_number(
-    name: str, value: Any, span: tuple[float, float], hint: str, file: str | Path | None
-) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise UserError(f"{name}: {value!r} is not a number", file=file, hint=hint)
-    if not span[0] <= value <= span[1]:  # also false for NaN
-        raise UserError(f"{name}: {value:g} is not from {span[0]:g} to {span[1]:g}", file=file, hint=hint)
-    return float(value)
-
-
-def _limit(name: str, pair: Any, file: str | Path | None) -> tuple[float, float]:
-    try:
-        bare, unit = split_header(name)
-    except UserError:
-        bare, unit = name.rpartition("_")[0], ""  # as people write degrees: t_tank_C
-    if unit != "1":
-        hint = f"write {bare}, and its limits in degC"
-        raise UserError(f"limits.{name}: is not the name of a sensor", file=file, hint=hint)
-    low, high = _value(f"limits.{name}", pair, _setting_keys(GuardSettings)["others_degC"], file)
-    return low, high
-
-
-def _name_tuple(value: Any, file: str | Path | None) -> tuple[str, ...]:
-    if not isinstance(value, list) or not all(isinstance(name, str) for name in value):
-        raise UserError("room_sensors: is no list of names", file=file, hint='write room_sensors = ["t_lab"]')
-    return tuple(value)
-
-
-def _pairs(tables: Any, file: str | Path | None) -> dict[tuple[str, str], float]:
-    """Return by how much two sensors of one temperature may differ [K]."""
-    pair_limits = {}
-    hint = 'write [[pairs]], sensors = ["a", "b"], limit_K = 4.0'
-    for table in tables if isinstance(tables, list) else [tables]:
-        if not isinstance(table, dict) or set(table) != {"sensors", "limit_K"}:
-            raise UserError("pairs: needs sensors and limit_K, nothing else", file=file, hint=hint)
-        names = table["sensors"]
-        if not isinstance(names, list) or len(names) != 2 or not all(isinstance(n, str) for n in names):
-            raise UserError("pairs.sensors: is not two names", file=file, hint=hint)
-        limit = _checked_number("pairs.limit_K", table["limit_K"], (0.1, 50), hint, file)
-        pair_limits[str(names[0]), str(names[1])] = limit
-    return pair_limits
-
-
-def _setting_faults(settings: GuardSettings) -> Iterator[tuple[str, str]]:
-    """Yield (problem, hint) for numbers that contradict each other."""
-    low, high = settings.sensors.plausible
-    ranges = {"skin_degC": settings.skin_limits, "others_degC": settings.other_limits}
-    ranges |= {f"limits.{name}": pair for name, pair in settings.limits.items()}
-    for name, (least, most) in {"sensors.believable_degC": (low, high), **ranges}.items():
-        if not least < most:
-            yield f"{name}: {least:g} to {most:g} is empty", "write the lower one first"
-        elif not low <= least <= most <= high:
-            problem = f"{name}: {least:g} to {most:g} reaches beyond the plausible range, {low:g} to {high:g}"
-            yield problem, "narrow it, or widen sensors.believable_degC"
-    w = settings.model
-    if len(w.windows) != len(w.floors):
-        yield (
-            f"model: {len(w.windows)} windows_s and {len(w.floors)} floors_K",
-            "write a floor for each window",
-        )
-    if list(w.windows) != sorted(set(w.windows)):
-        yield f"model.windows_s: {_toml_text(w.windows)} do not rise", "write the shortest first"
-    elif not w.smooth < w.windows[0]:
-        problem = f"model.smooth_s: {w.smooth:g} is not less than the shortest window, {w.windows[0]:g}"
-        yield problem, "shorten it"
-
-
-def _toml_text(value: Any) -> str:
-    if isinstance(value, tuple):
-        return "[" + ", ".join(f"{one:g}" for one in value) + "]"
-    return f"{value:g}"
+    content = read_toml(path, hint="`thermogrip init guard` writes one to edit")
+    return GuardSettings.from_dict(content, file=path)

@@ -17,7 +17,7 @@ PRBS lasts half of one, the time in which the loop answers a change of its targe
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -31,7 +31,7 @@ from thermogrip.datasets.parallel import sub_progress
 from thermogrip.datasets.schema import Log, column
 from thermogrip.rig.guard.guard import LIMIT_MARGIN, Guard
 from thermogrip.rig.interface import Rig, range_of
-from thermogrip.rig.records.run_folder import RunFolder, read_run, recover
+from thermogrip.rig.records.run_folder import Run, RunFolder, read_run, recover
 from thermogrip.rig.session.profile import Profile
 from thermogrip.rig.session.session import Session, play, run_session, step_figures
 from thermogrip.rig.session.step_test import StepTest
@@ -222,6 +222,10 @@ class Autotune:
         plant.save(self.folder / "plant.json")
         design = default_design(plant, controlled=tuple(self._targets(plant)))
         PIController(plant, design).save(self.folder / "controller.json")
+        loops = (run for run in map(read_run, self._folders("loop")) if run.log is not None)
+        steps = [step for run in loops if (step := first_step(run, self._targets(plant)))]
+        if steps:  # also of a loop that was stopped after its first step
+            self._note(pi=steps[0])
         self.say(self.found.verdict)
 
     def _targets(self, plant: Plant) -> dict[str, float]:
@@ -261,8 +265,6 @@ class Autotune:
                 folder.finish(session)
         if session.trip is not None:
             raise Tripped(session.advice)
-        if "pi" not in self.known:
-            self._note(pi=step_of(session.log, targets, LOG.hold * slowest))
         return True
 
     def _excited(self, targets: Mapping[str, float], slowest: float, seconds: float, guard: Guard) -> Profile:
@@ -322,14 +324,17 @@ class Autotune:
         self._note(checked={"verdict": self.session.verdict, **_finite(figures)})
 
 
-def step_of(log: Log, targets: Mapping[str, float], seconds: float) -> dict[str, float | None]:
-    """Return the figures of the first step of a log, those of the worst output."""
+def first_step(run: Run, targets: Iterable[str]) -> dict[str, float | None] | None:
+    """Return the figures of a loop's first step, those of the worst output; None where it ended in it."""
+    log = run.log
+    assert log is not None
     time = np.asarray(log["time"].values, dtype=float)
-    early = time < time[0] + seconds
-    steps = [
-        step_figures(time[early], column(log, name)[early], float(column(log, f"target_{name}")[0]))
-        for name in targets
-    ]
+    goals = {name: column(log, f"target_{name}") for name in targets}
+    moved = np.any([goal != goal[0] for goal in goals.values()], axis=0)
+    if not moved.any() and run.about.get("verdict") != "followed":
+        return None
+    n = int(np.argmax(moved)) or time.size
+    steps = [step_figures(time[:n], column(log, name)[:n], float(goals[name][0])) for name in goals]
     settle, overshoot = np.max([(step.settle_time, step.overshoot) for step in steps], axis=0)
     return _finite({"settle_s": float(settle), "overshoot": float(overshoot)})
 

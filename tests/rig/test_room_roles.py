@@ -14,9 +14,9 @@ import pytest
 from tests.rig.makers import Constant
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import names
-from thermogrip.rig.guard.guard import Findings, Guard, GuardSettings
+from thermogrip.rig.guard.guard import Findings, Guard
 from thermogrip.rig.guard.sensor_checks import room_sensors
-from thermogrip.rig.guard.settings import guard_from_dict
+from thermogrip.rig.guard.settings import GuardSettings
 from thermogrip.rig.interface import Reading
 from thermogrip.rig.records.run_folder import RunFolder, read_run
 from thermogrip.rig.session.session import run_session
@@ -85,13 +85,13 @@ def test_a_room_that_no_plant_knows_is_stated_or_guessed_and_the_guess_is_report
         return [event.text for event in session.events if event.kind == "room"]
 
     assert events(Guard(plant)) == []
-    assert events(Guard(settings=guard_from_dict({"room_sensors": ["t_ambient"]}))) == []
+    assert events(Guard(settings=GuardSettings.from_dict({"room_sensors": ["t_ambient"]}))) == []
     (guess,) = events(Guard())
     assert guess.startswith("t_ambient by name taken for the room's; state room_sensors")
     with pytest.raises(UserError, match="no sensor 't_tnk' that may read the room"):
-        events(Guard(settings=GuardSettings(rooms=("t_tnk",))))
-    with pytest.raises(UserError, match="room_sensors: is no list of names"):
-        guard_from_dict({"room_sensors": "t_ambient"})
+        events(Guard(settings=GuardSettings(room_sensors=("t_tnk",))))
+    with pytest.raises(UserError, match="room_sensors: input should be a valid tuple"):
+        GuardSettings.from_dict({"room_sensors": "t_ambient"})
 
 
 @pytest.mark.parametrize(
@@ -100,7 +100,7 @@ def test_a_room_that_no_plant_knows_is_stated_or_guessed_and_the_guess_is_report
      (Guard(PLANT), {BLOCK: nan}, "lost"),
      (Guard(PLANT), {BLOCK: 45.0}, "jump"),
      (Guard(skin=BLOCK), {BLOCK: nan}, "lost"),
-     (Guard(PLANT, GuardSettings(other_limits=(0.0, 30.0))), {ROOM: 33.0}, ""),
+     (Guard(PLANT, GuardSettings(others_degC=(0.0, 30.0))), {ROOM: 33.0}, ""),
      (Guard(PLANT), {ROOM: nan}, ""),
      (Guard(), {ROOM: nan}, "")],
 )  # fmt: skip

@@ -6,7 +6,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -533,12 +533,12 @@ def guard_of(
     """Return the guard of a rig; what no file says is as by default, and nothing may be beyond a ``limit``.
     Of a virtual device that runs ``speed`` times as fast this program may be as late as of others, in seconds
     of the computer."""
-    from thermogrip.rig.guard.guard import Guard, GuardSettings
-    from thermogrip.rig.guard.settings import read_guard
+    from thermogrip.rig.guard.guard import Guard
+    from thermogrip.rig.guard.settings import GuardSettings, read_guard
 
     settings = GuardSettings.of(plant) if path is None else read_guard(path)
     if speed > 1.0:
-        settings = replace(settings, expiry_s=speed * settings.expiry_s)
+        settings = settings.model_copy(update={"expiry_s": speed * settings.expiry_s})
     if limit is not None:
         settings = settings.below(limit)
     return Guard(plant, settings)

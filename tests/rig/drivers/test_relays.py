@@ -173,11 +173,11 @@ def test_a_session_under_relays_settles_and_switches_off() -> None:
 
 @pytest.mark.parametrize(
     ("text", "words"),
-    [("", "has no relay; write [q1]"), ("q1 = 3\n", "q1: is no table"),
+    [("", "has no relay; write [q1]"), ("q1 = 3\n", "q1: input should be a dictionary"),
      ("[q1]\non = 3\n", "q1.on: no such key"),
-     ("[q1]\non_s = -1\n", "q1.on_s: -1 is not a time of 0 to 3600 s"),
-     ("[q1]\non_s = true\n", "q1.on_s: True is not a time"),
-     ("[q1]\ncooler = 3\n", "q1.cooler: 3 is not the name of an input")],
+     ("[q1]\non_s = -1\n", "q1.on_s: input should be greater than or equal to 0"),
+     ("[q1]\non_s = true\n", "q1.on_s: input should be a valid number"),
+     ("[q1]\ncooler = 3\n", "q1.cooler: input should be a valid string")],
 )  # fmt: skip
 def test_a_file_that_is_wrong_anywhere_is_refused(tmp_path: Path, text: str, words: str) -> None:
     path = tmp_path / "relays.toml"

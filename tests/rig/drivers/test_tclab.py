@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator
 
 import numpy as np
@@ -13,7 +12,6 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.mpc.interface import Move, Readings, Target
 from thermogrip.rig.drivers.connect import open_rig
 from thermogrip.rig.drivers.tclab import TCLabRig
-from thermogrip.rig.interface import DeviceRefusedError
 from thermogrip.rig.serial.port import PortError
 from thermogrip.rig.session.session import run_session
 from thermogrip.rig.simulation.tclab_firmware import LSB, TCLAB_VERSION, TCLabCore
@@ -25,7 +23,7 @@ HALF = {"q1": 50.0, "q2": 0.0}
 
 class Lab(Bench):
     def __init__(self, **device: float) -> None:
-        super().__init__(make_lab(), protocol="tclab", options={"timeout": 0.02, "highest": 60.0}, **device)
+        super().__init__(make_lab(), protocol="tclab", options={"timeout": 0.02}, **device)
         self.lab = self.rig
 
     def scan(self, times: int) -> None:
@@ -81,38 +79,11 @@ def test_temperatures_are_tenths_of_the_converters_step() -> None:
     assert value == pytest.approx(25.0, abs=LSB / 20 + 0.001)
 
 
-def test_it_trips_above_its_limit_and_holds_until_cleared() -> None:
-    bench = Lab(t_start=62.0, ambient=62.0)
-    bench.lab.apply(HALF, 1)
-    bench.scan(4)
-    assert bench.device.applied_drive == OFF
-    assert bench.lab.faults == ("over:t1", "over:t2")
-    text = next(notice.text for notice in bench.lab.notices() if notice.kind == "latched")
-    assert re.fullmatch(
-        r"over:t1, over:t2 \(t1 6[12]\.. degC, t2 6[12]\.. degC, at most 60\); heaters off", text
-    )
-    with pytest.raises(DeviceRefusedError, match="over:t1"):
-        bench.lab.apply(HALF, 1)
-    bench.lab.apply(OFF, 0)
-    with pytest.raises(DeviceRefusedError, match="still there"):
-        bench.lab.clear()
-    bench.lab.close()
-
-
 @pytest.mark.parametrize("fault", ["sensor_open", "sensor_short"])
-def test_a_lost_sensor_reads_nan_and_trips(bench: Lab, fault: str) -> None:
-    bench.lab.apply(HALF, 1)
+def test_a_lost_sensor_reads_nan(bench: Lab, fault: str) -> None:
     bench.device.fault(fault, sensor="t2")
     bench.clock.sleep(0.2)
     assert np.isnan(bench.lab.read().values["t2"])
-    assert bench.device.applied_drive == HALF
-    bench.scan(3)
-    assert bench.device.applied_drive == OFF
-    bench.device.clear()
-    bench.clock.sleep(0.2)
-    bench.lab.clear()
-    bench.lab.apply(HALF, 1)
-    assert bench.device.applied_drive == HALF
 
 
 def test_a_reset_shows_in_the_heaters(bench: Lab) -> None:
@@ -132,17 +103,6 @@ def test_nothing_ends_the_heaters_of_a_board_whose_host_is_gone(bench: Lab) -> N
         bench.lab.apply(OFF, 0)
     bench.lab.close()
     assert any("PULL THE PLUG" in notice.text for notice in bench.lab.notices())
-
-
-def test_heaters_that_outlived_the_cable_go_off_when_it_is_back(bench: Lab) -> None:
-    bench.lab.apply(HALF, 1)
-    bench.device.fault("cable_pulled")
-    bench.scan(4)
-    assert bench.lab.faults == ("lost:t1", "lost:t2")
-    assert bench.device.applied_drive == HALF
-    bench.device.clear()
-    bench.scan(1)
-    assert bench.device.applied_drive == OFF
 
 
 class ListensLater(DirectPort):
@@ -217,10 +177,6 @@ def test_a_spoilt_line_is_asked_again_and_a_jump_three_times(bench: Lab) -> None
             lost += 1
         elif abs(reading.values["t1"] - true) > bench.lab.jump:
             wrong += 1
-        if bench.lab.faults:
-            bench.device.clear()
-            bench.lab.clear()
-            bench.device.fault("garbage", rate=0.05)
     assert wrong == 0
     assert lost < 50
     bench.device.clear()
@@ -229,7 +185,7 @@ def test_a_spoilt_line_is_asked_again_and_a_jump_three_times(bench: Lab) -> None
 @pytest.mark.parametrize(
     ("passed", "scans", "read", "heater"),
     [(1.0, [(28.0, 0.0)], 28.0, 0.0), (10.0, [(28.1, 0.0), (25.1, 0.0), (25.2, 0.0)], 25.2, 0.0),
-     (10.1, [(59.9, 0.0)], 59.9, 0.0), (10.1, [(60.0, 0.0)] * 3, 60.0, 0.0),  # its highest is 60 degC
+     (10.1, [(129.9, 0.0)], 129.9, 0.0), (10.1, [(130.0, 0.0)] * 3, np.nan, 0.0),
      (10.1, [(-49.8, 0.0)], -49.8, 0.0), (10.1, [(-49.9, 0.0)] * 3, np.nan, 0.0),
      (1.0, [(129.9, 0.0)] * 3, 129.9, 0.0), (1.0, [(130.0, 0.0)] * 3, np.nan, 0.0),
      (1.0, [(25.0, 0.002)], 25.0, 0.002), (1.0, [(25.0, 0.003)] * 3, 25.0, 0.003)],

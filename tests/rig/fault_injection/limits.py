@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 from tests.rig.makers import Bench
 from thermogrip.datasets.schema import Log, make_log
-from thermogrip.rig.guard.guard import Guard, GuardSettings
+from thermogrip.rig.guard.guard import Guard
+from thermogrip.rig.guard.settings import GuardSettings
 from thermogrip.rig.interface import Rig
 from thermogrip.rig.session.session import play
 from thermogrip.rig.simulation.twin import Twin

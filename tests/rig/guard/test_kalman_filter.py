@@ -9,14 +9,8 @@ import pytest
 
 from tests.end_to_end.conftest import small_plant
 from tests.rig.makers import make_heater
-from thermogrip.rig.guard.kalman_filter import (
-    Estimate,
-    FilterSettings,
-    History,
-    InputSteps,
-    RigFilter,
-    RigModel,
-)
+from thermogrip.rig.guard.kalman_filter import RigFilter
+from thermogrip.rig.guard.settings import ModelSettings
 from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.plant import Plant
 
@@ -24,7 +18,9 @@ A = np.array([[0.95, 0.02], [0.06, 0.9]])
 B = np.array([0.4, -0.1])
 C = np.array([[1.0, 0.0], [0.5, 0.5]])
 LEVEL, OFFSET, HALF = np.array([25.0, 24.0]), np.array([0.3, -0.2]), 50.0
-BELIEF = FilterSettings(state=0.03, drive=0.01, output=0.02, reading=0.1)
+BELIEF = ModelSettings(
+    state_K_per_sqrt_s=0.03, drive_per_sqrt_s=0.01, output_K_per_sqrt_s=0.02, reading_K=0.1
+)
 
 
 def plant() -> Plant:
@@ -45,8 +41,8 @@ def plant() -> Plant:
     return Plant(model, {}, dt=2.0, units=units, offsets=offsets, noise={"a": 0.2, "b": 0.01}, reference="b")
 
 
-def at_rest() -> RigFilter:
-    made = RigFilter(RigModel(plant()), BELIEF, 100)
+def at_rest(**settings: float) -> RigFilter:
+    made = RigFilter(plant(), BELIEF.model_copy(update=settings), 100)
     made.reset(0.0, 25.0 + OFFSET, np.array([25.0]))
     assert made.at_rest
     return made
@@ -94,7 +90,7 @@ def test_state_and_biases_are_those_of_the_textbook(seed: int) -> None:
         np.testing.assert_allclose(found.expected, want.expected(), atol=1e-6)
         np.testing.assert_allclose(found.spread(), want.spread(), rtol=1e-4)
         y = LEVEL + OFFSET + np.where(rng.random(2) < 0.2, np.nan, rng.uniform(-1.0, 1.0, 2))
-        found.correct(y)
+        found.correct(2.0 * k, y)
         want.correct(y)
         np.testing.assert_allclose([*found.x, found.w[0], found.b[0]], want.z, atol=1e-5)
     assert found.b[1] == 0.0  # the reference has no bias
@@ -120,7 +116,7 @@ def test_what_is_not_described_for_a_while_is_known_as_little_as_at_first_beside
     for k in range(1, 30):
         found.predict(2.0 * k, np.array([40.0]), np.array([25.0]))
         want.predict(40.0)
-        found.correct(LEVEL + OFFSET)
+        found.correct(2.0 * k, LEVEL + OFFSET)
         want.correct(LEVEL + OFFSET)
     found.loosen()
     want.P[:2, :2] += 0.25 * np.eye(2)
@@ -142,22 +138,22 @@ def test_what_is_not_described_for_a_while_is_known_as_little_as_at_first_beside
 def test_a_rig_rests_where_its_sensors_agree_with_each_other_and_with_the_room(
     y: tuple[float, float], room: float, rests: bool
 ) -> None:
-    made = RigFilter(RigModel(plant()), BELIEF, 100)
+    made = RigFilter(plant(), BELIEF, 100)
     made.reset(0.0, np.array(y), np.array([room]))
     assert made.at_rest == rests
     times = Textbook(made.x, 1.0 if rests else 100.0)
     np.testing.assert_allclose(made.spread(), times.spread(), rtol=1e-9)
     if not rests:  # the reference says how warm it is, the room where nothing does
         level = np.nan_to_num(y[1] - OFFSET[1], nan=25.0)
-        want = made.model.plant.model.rest(np.full(2, level), np.zeros(1), np.array([room]), made.model.p)
+        want = plant().model.rest(np.full(2, level), np.zeros(1), np.array([room]), plant().p)
         np.testing.assert_allclose(made.x, want, atol=1e-9)
 
 
 def test_a_room_that_is_not_read_is_as_warm_as_the_rig_and_a_pump_runs() -> None:
-    made = RigFilter(RigModel(plant()), BELIEF, 100)
+    made = RigFilter(plant(), BELIEF, 100)
     made.reset(0.0, np.array([30.3, 29.7]), np.array([np.nan]))
     assert made.d.tolist() == [30.0]
-    small = RigFilter(RigModel(small_plant()), BELIEF, 9)
+    small = RigFilter(small_plant(), BELIEF, 9)
     small.reset(0.0, np.array([25.0, 25.0]), np.array([25.0]))
     assert small.u.tolist() == [0.0, 1.0]
 
@@ -166,22 +162,20 @@ def test_a_room_that_is_not_read_is_as_warm_as_the_rig_and_a_pump_runs() -> None
 def test_a_state_is_as_uncertain_as_the_fit_says_and_no_less_than_a_tenth(spread: float, unit: float) -> None:
     known = plant()
     model = replace(known.model, C=np.eye(2), spread=np.diag([4.0, spread]))
-    made = RigFilter(RigModel(replace(known, model=model)), BELIEF, 9)
+    made = RigFilter(replace(known, model=model), BELIEF, 9)
     made.reset(0.0, 25.0 + OFFSET, np.array([25.0]))
     want = [0.5**2 + 0.3**2 + 0.2**2, (0.5 * unit) ** 2 + 0.1**2]
     np.testing.assert_allclose(made.spread() ** 2, want)
     np.testing.assert_allclose(made._q, [0.03**2, (0.03 * unit) ** 2, 0.01**2, 0.02**2])
 
 
-def test_a_jump_is_beyond_its_deviations_and_the_floor() -> None:
-    found = at_rest()
-    settings_ = replace(BELIEF, jump_k=2.0, jump_floor=0.5)
-    for jump_k, jump_floor, limit in ((2.0, 0.1, 2 * found.spread()[0]), (0.1, 0.5, 0.5)):
-        found.settings = replace(settings_, jump_k=jump_k, jump_floor=jump_floor)
-        at = float(found.expected[0])
-        for off in (limit, -limit):
-            assert found.is_jump(0, at + 1.01 * off)
-            assert not found.is_jump(0, at + 0.99 * off)
+@pytest.mark.parametrize(("jump_k", "jump_floor_K"), [(3.0, 0.1), (3.0, 5.0)])
+def test_a_jump_is_beyond_its_deviations_and_the_floor(jump_k: float, jump_floor_K: float) -> None:
+    found = at_rest(jump_k=jump_k, jump_floor_K=jump_floor_K)
+    limit = max(jump_k * found.spread()[0], jump_floor_K)
+    for off in (limit, -limit):
+        assert found.is_jump(0, float(found.expected[0]) + 1.01 * off)
+        assert not found.is_jump(0, float(found.expected[0]) + 0.99 * off)
 
 
 def test_between_two_steps_the_reading_lies_between_theirs() -> None:
@@ -201,11 +195,9 @@ def test_the_bias_of_a_drive_ends_at_half_of_half_its_range() -> None:
     for k in range(1, 400):
         found.predict(2.0 * k, np.array([10.0]), np.array([25.0]))
         y = y + 0.5
-        found.correct(y)
+        found.correct(2.0 * k, y)
         assert abs(found.w[0]) <= 0.5
     assert found.w[0] == 0.5
-    # and what a driver gives is its command and the bias, no further than the bias beyond its range
-    assert found.driven(np.array([[10.0], [100.0]])).tolist() == [[35.0], [125.0]]
 
 
 # ---- inputs between readings ----
@@ -214,58 +206,40 @@ def test_the_bias_of_a_drive_ends_at_half_of_half_its_range() -> None:
 NOTHING = np.zeros(0)
 
 
-def heater() -> RigFilter:
-    """A filter that keeps ten steps of 1 s, at rest at 25 degC."""
-    made = RigFilter(RigModel(make_heater()), FilterSettings(), 10)
+def heater(keep: int = 10) -> RigFilter:
+    """A filter that keeps so many steps of 1 s, at rest at 25 degC."""
+    made = RigFilter(make_heater(), ModelSettings(), keep)
     made.reset(0.0, np.array([25.0]), NOTHING)
     return made
 
 
 @pytest.mark.parametrize(
-    ("unit", "valid", "span", "half"),
-    [("W", None, (-1.0, 1.0), 1.0), ("W", (2.0, 8.0), (2.0, 8.0), 3.0),
-     ("percent", (2.0, 8.0), (0.0, 100.0), 50.0), ("0_255", None, (0.0, 255.0), 127.5),
-     (None, (-0.2, 0.8), (-1.0, 1.0), 1.0), (None, (0.0, 100.0), (0.0, 100.0), 50.0)],
+    ("unit", "valid", "half"),
+    [("W", None, 1.0), ("W", (2.0, 8.0), 3.0), ("percent", (2.0, 8.0), 50.0), ("0_255", None, 127.5),
+     (None, (-0.2, 0.8), 1.0), (None, (0.0, 100.0), 50.0)],
 )  # fmt: skip
-def test_a_drive_has_the_range_of_its_unit_else_of_its_logs(
-    unit: str | None, valid: tuple[float, float] | None, span: tuple[float, float], half: float
+def test_a_bias_is_a_share_of_half_the_range_of_the_unit_else_of_the_logs(
+    unit: str | None, valid: tuple[float, float] | None, half: float
 ) -> None:
     units, spans = {} if unit is None else {"q": unit}, {} if valid is None else {"q": valid}
-    model = RigModel(replace(make_heater(), units=units, valid=spans))
-    assert (model.ranges.tolist(), model.half.tolist()) == ([list(span)], [half])
-    assert model.biased(np.array([[2.0], [3.0]]), np.array([0.1])).tolist() == [
-        [2.0 + 0.1 * half],
-        [3.0 + 0.1 * half],
-    ]
-    assert model.offsets.tolist() == [0.0]
+    made = RigFilter(replace(make_heater(), units=units, valid=spans), ModelSettings(), 10)
+    biased = made.driven(np.array([[2.0], [3.0]]), np.array([0.1]))
+    assert biased.tolist() == [[2.0 + 0.1 * half], [3.0 + 0.1 * half]]
 
 
-def estimate(time: float, step: int, *y: float) -> Estimate:
-    return Estimate(time, step, np.zeros(1), np.zeros(1), np.zeros(len(y)), np.array(y))
-
-
-def test_a_history_keeps_its_seconds_and_finds_where_a_window_begins() -> None:
-    steps = InputSteps(dt=1.0, start=0.0, time=0.0)
-    past = History(steps, 3.0)
-    for k in range(6):
-        past.add(estimate(float(k), k))
-    assert past.now == 5.0
-    assert [one.time for one in past.after(0.0)] == [2.0, 3.0, 4.0, 5.0]
-    assert [one.time for one in past.after(4.0)] == [5.0]
-    for time, step in ((2.0, 2), (3.0 - 5e-7, 3), (2.9, 2), (99.0, 5)):
-        assert past.begin(time).step == step
-    assert past.begin(1.9) is None
-    steps.first = 3
-    assert (past.begin(2.9), past.begin(3.0).step) == (None, 3)  # inputs of the second step are lost
-
-
-def test_errors_are_readings_less_paths_at_their_steps() -> None:
-    past = History(InputSteps(dt=1.0, start=0.0, time=0.0), 99.0)
-    for k, y in ((3, 0.0), (4, 5.0), (6, 7.0)):
-        past.add(estimate(float(k), k, y))
-    paths = np.array([[[0.0], [1.0], [2.0], [3.0]], [[0.0], [0.5], [0.0], [10.0]]])
-    errors = past.errors(past.begin(3.0), paths)
-    assert errors.tolist() == [[[4.0], [4.0]], [[4.5], [-3.0]]]
+def test_a_window_begins_at_the_newest_estimate_that_is_so_old_and_whose_inputs_are_kept() -> None:
+    found = heater(keep=3)
+    for k in range(1, 6):
+        found.predict(float(k), np.array([0.1 * k]), NOTHING)
+        found.correct(float(k), np.array([25.0]))
+    assert [one.time for one in found.estimates] == [2.0, 3.0, 4.0, 5.0]
+    for seconds, step in ((3.0, 2), (2.0 + 5e-7, 3), (1.9, 3), (0.0, 5)):
+        assert found.begin(seconds).step == step
+    assert found.begin(3.1) is None
+    for step, inputs in ((2, [0.3, 0.4, 0.5]), (4, [0.5]), (5, [])):
+        assert found.applied_since(step)[0].ravel().tolist() == pytest.approx(inputs)
+    found.predict(6.5, np.array([1.0]), NOTHING)
+    assert found.begin(3.0) is None  # what was applied in its first step is forgotten
 
 
 @pytest.mark.parametrize("silence", [5, 15, 40])
@@ -279,24 +253,11 @@ def test_a_long_silence_counts_as_many_short_waits(silence: int) -> None:
     np.testing.assert_allclose(once.expected, often.expected, rtol=1e-12)
 
 
-def test_steps_that_are_forgotten_are_refused() -> None:
-    steps = InputSteps(dt=1.0, start=0.0, time=0.0)
-    for k in range(1, 8):
-        steps.add(float(k), np.array([float(k)]), NOTHING, keep=3)
-    assert steps.rows(4)[0].tolist() == [[5.0], [6.0], [7.0]]
-    with pytest.raises(ValueError, match="the oldest that is kept is 4"):
-        steps.rows(3)
-
-
 def test_inputs_are_averaged_over_each_native_step() -> None:
-    steps = InputSteps(dt=2.0, start=0.0, time=0.0)
-    assert [steps.add(t, np.array([u]), NOTHING, keep=10) for t, u in ((1.0, 1.0), (2.5, 0.0))] == [0, 1]
-    assert steps.rows(0)[0].tolist() == [[0.5]]
-    assert steps.part(2.5) == 0.25
-    assert (
-        steps.add(6.0 - 5e-10, np.array([4.0]), NOTHING, keep=1) == 2
-    )  # until the third step, but for rounding
-    assert steps.rows(1)[0].tolist() == [[3.0], [4.0]]  # 0.5 s of 0, then 4; those of one call are all kept
-    assert steps.add(6.5, np.array([2.0]), NOTHING, keep=1) == 0
-    assert steps.add(8.0, np.array([6.0]), NOTHING, keep=1) == 1
-    assert steps.rows(3)[0].tolist() == [[5.0]]
+    found = heater(keep=5)
+    for time, u in ((0.5, 1.0), (1.25, 0.0), (3.0 - 5e-10, 4.0)):  # until the third step, but for rounding
+        found.predict(time, np.array([u]), NOTHING)
+    assert found.applied_since(0)[0].ravel().tolist() == pytest.approx([0.5, 3.0, 4.0])
+    for time, u in ((3.25, 2.0), (4.0, 6.0)):
+        found.predict(time, np.array([u]), NOTHING)
+    assert found.applied_since(3)[0].ravel().tolist() == pytest.approx([5.0])

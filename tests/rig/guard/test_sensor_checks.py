@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from math import erf, inf, log, nan, sqrt
 
 import numpy as np
@@ -10,12 +9,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from thermogrip.rig.guard.sensor_checks import SensorMonitor, SensorSettings, repeats_needed
+from thermogrip.rig.guard.sensor_checks import SensorMonitor, repeats_needed
+from thermogrip.rig.guard.settings import SensorSettings
 from thermogrip.rig.guard.trip import Trip
 
 
 def monitor(name: str = "t", **settings: object) -> SensorMonitor:
-    made = SensorMonitor(replace(SensorSettings(), **settings))
+    made = SensorMonitor(SensorSettings(**settings))
     made.start(0.0, {name: 25.0})
     return made
 
@@ -150,27 +150,27 @@ def test_each_trip_of_a_sensor_has_its_two_numbers() -> None:
     for at, kind, value, expected in ((2, "lost", 80.0, "-5 to 75 degC"), (6, "jump", 42.0, near)):
         figures = {"measured": value, "last": 25.0}
         assert said(trips[at]) == (kind, "t", expected, f"{value:g} degC, 3 readings in a row", figures)
-    made = monitor(alpha=0.5)  # ten repeats are enough then
+    made = monitor(alpha=1e-3, noise_K=5.0)  # ten repeats are enough then
     for k in range(1, 31):
         trip = made.check(float(k), {"t": 25.0 + 0.125 * (k % 2 if k < 22 else 1)})[2]
         assert trip is None
     figures = {"measured": 25.125, "seconds": 10.0}
     said_ = ("a change of 0.125 degC every few readings", "25.125 degC 11 times in a row, for 10 s", figures)
     assert said(made.check(31.0, {"t": 25.125})[2])[2:] == said_
-    made = SensorMonitor(SensorSettings(pairs={("a", "b"): 1.0}))
-    made.start(0.0, {"a": 20.0, "b": 20.0})
-    assert made.check(1.0, {"a": 20.0, "b": 21.0})[2] is None  # the limit itself
+    made = SensorMonitor(SensorSettings(pair_limit_K=1.0))
+    made.start(0.0, {"a": 20.0, "a_2": 20.0})
+    assert made.check(1.0, {"a": 20.0, "a_2": 21.0})[2] is None  # the limit itself
     for time, value in ((2.0, 21.25), (31.9, 21.5)):
-        assert made.check(time, {"a": 20.0, "b": value})[2] is None
+        assert made.check(time, {"a": 20.0, "a_2": value})[2] is None
     assert made.check(31.95, {"a": 20.0})[2] is None  # the other is not read
     pair = (
         "disagree",
-        "a and b",
+        "a and a_2",
         "within 1 K of each other",
         "20.00 and 21.50 degC for 30 s",
         {"apart": -1.5},
     )
-    assert said(made.check(32.0, {"a": 20.0, "b": 21.5})[2]) == pair
+    assert said(made.check(32.0, {"a": 20.0, "a_2": 21.5})[2]) == pair
 
 
 def test_a_reading_that_jumped_against_the_model_is_suspect_and_a_new_sensor_begins_where_it_reads() -> None:

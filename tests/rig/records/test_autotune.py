@@ -15,7 +15,8 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import column
 from thermogrip.mpc import PIController, Spec, load_controller
 from thermogrip.rig.drivers.tclab import TCLabRig
-from thermogrip.rig.guard.guard import Guard, GuardSettings
+from thermogrip.rig.guard.guard import Guard
+from thermogrip.rig.guard.settings import GuardSettings
 from thermogrip.rig.interface import Rig
 from thermogrip.rig.records.autotune import Autotune, Tripped
 from thermogrip.rig.records.run_folder import read_run
@@ -40,7 +41,7 @@ class Desk:
         self.said: list[str] = []
 
     def open(self) -> Rig:
-        self.clock.sleep(900.0)  # of work between sessions, in which it cools
+        self.clock.sleep(300.0)  # of work between sessions, in which it cools
         return TCLabRig(DirectPort(self.device), clock=self.clock, sleep=self.clock.sleep)
 
     def autotune(self, target: float = TARGET, **options: Any) -> Autotune:
@@ -82,7 +83,7 @@ class Done:
 @pytest.fixture(scope="module")
 def tuned(tmp_path_factory: pytest.TempPathFactory) -> Done:
     desk, stopped = Desk(tmp_path_factory.mktemp("autotune") / "board"), []
-    for when, fraction in (("playing the schedule", 0.02), ("following the profile", 0.25), ("", 0.5)):
+    for when, fraction in (("playing the schedule", 0.02), ("following the profile", 0.27), ("", 0.5)):
         with pytest.raises(KeyboardInterrupt):
             desk.autotune(progress=stop_at(when, fraction)).run()
         assert desk.device.applied_drive == {"q1": 0.0, "q2": 0.0}
@@ -111,7 +112,7 @@ def test_what_was_stopped_goes_on_with_what_is_there(tuned: Done) -> None:
     begun, in_loop, in_tuning = tuned.stopped
     assert begun == ["01-step"]  # a step test that was not played out is played again
     assert in_loop == ["01-step", "02-step", "03-loop"]
-    assert in_tuning == [*in_loop, "04-loop"]
+    assert in_tuning == in_loop  # its first step was over, and the plant is good
     assert len([line for line in tuned.desk.said if line.startswith("goes on after")]) == 3
     rows = read_run(tuned.desk.folder / "03-loop")
     assert rows.about["verdict"] == "interrupted"
@@ -131,11 +132,11 @@ def test_the_step_test_moves_one_heater_at_a_time_to_half_of_the_way(tuned: Done
     assert not np.any((q1 > 0) & (q2 > 0))
     assert {*q1.tolist(), *q2.tolist()} == {0.0, 100.0}
     first_off = int(np.argmax(q1 == 0))
-    assert t1[first_off] == pytest.approx(ROOM + 0.5 * (TARGET - ROOM), abs=0.5)
+    assert t1[first_off] == pytest.approx(0.5 * (t1[0] + TARGET), abs=0.5)
 
 
 def test_targets_of_the_loop_are_moved_and_stay_below_the_limit(tuned: Done) -> None:
-    log = read_run(tuned.desk.folder / "04-loop").log
+    log = read_run(tuned.desk.folder / "03-loop").log
     assert log is not None
     targets = np.stack([column(log, f"target_{name}") for name in ("t1", "t2")])
     assert targets[:, 0].tolist() == [TARGET, TARGET]

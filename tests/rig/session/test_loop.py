@@ -12,7 +12,8 @@ import pytest
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.mpc.interface import Move, Readings, Target
-from thermogrip.rig.guard.guard import Guard, GuardSettings
+from thermogrip.rig.guard.guard import Guard
+from thermogrip.rig.guard.settings import GuardSettings
 from thermogrip.rig.guard.trip import ENDLESS, KINDS, TripError
 from thermogrip.rig.interface import DeviceRefusedError, Event, Reading
 from thermogrip.rig.serial.port import PortError
@@ -111,7 +112,7 @@ def test_a_start_opens_the_gripper_and_gives_the_controller_the_first_reading() 
     run.open_gripper()
     assert not run.touching
     assert told(run, "opened")[1][1].startswith("the gripper could not be opened (COM3: did not answer")
-    assert told(started(settings=GuardSettings(rooms=("t_ambient",))), "room") == []
+    assert told(started(settings=GuardSettings(room_sensors=("t_ambient",))), "room") == []
 
 
 def test_the_controller_is_asked_once_a_sample_time_and_of_fresh_readings_alone() -> None:
