@@ -38,7 +38,14 @@ may be touched at another face).  Meanwhile the block relaxes towards the room w
 
 One time constant is not the law of a slab, least of one that has not become even since: of the way that the
 block went towards the room law = 0.15 + 0.25 exp(-lam_1 rest) is uncertain, a sixth in metals, two fifths in
-wood.  And a block's temperature is known to 3 % of its distance from the skin beyond 15 K, as far as they lay
+wood.  Blocks of another shape or in another place lose k times as much: k is a nuisance of a record, 1 with a
+probability of .8, else log-normal, on a few nodes.  A group i is answered under each by what the others say,
+
+    p(k | others) ~ p_k prod_{j != i} [0.9 Z_jk + 0.1 max_l Z_jl],
+
+of which each decides no more than a factor of ten: it may be of no candidate.
+
+A block's temperature is known to 3 % of its distance from the skin beyond 15 K, as far as they lay
 from the skin where s was learnt.  Contact conductance scatters from touch to touch about the block's own by
 ``ln_h_sd``, which may be wider than between grasps of a series.  All of it is learnt from groups of known
 material by maximum likelihood (:func:`learn_coupling`); the defaults are those of the example rig.
@@ -48,12 +55,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import logsumexp
 
 from thermogrip.datasets.arrays import Array, Mask
 from thermogrip.datasets.atomic_files import read_json, write_json
@@ -104,6 +113,17 @@ class BlockSettings:
     into_s: float = 2.0  # the next touch: where its reading knows most of the block
     longer_rest: float = 1.5  # times the longest rest that the coupling was learnt from
     contradiction_sd: float = 5.0  # beyond which touches contradict each other
+    # ln k, what blocks lose in units of the training's: free convection alone goes from 2 to 25 W/m2K
+    ln_loss: tuple[float, ...] = (0.0, -1.1, -0.55, 0.55, 1.1, 1.65)
+    ln_loss_sd: float = 0.64
+    other_loss: float = 0.2  # probability that k is not 1
+    no_candidate: float = 0.1  # that a group is of none: it says little of k then
+
+    def log_loss_prior(self) -> Array:
+        """Return the log probabilities of the losses, (n_loss,)."""
+        z = np.array(self.ln_loss[1:]) / self.ln_loss_sd
+        others = np.log(self.other_loss) - 0.5 * z**2 - logsumexp(-0.5 * z**2)
+        return np.concatenate([[np.log1p(-self.other_loss)], others])
 
 
 BLOCK = BlockSettings()
@@ -363,7 +383,9 @@ def two_touch_fit(
     groups = list(rows.values())
     hypotheses = material_hypotheses(gripper, candidates)
     view = _view(gripper, grasps, hypotheses, coupling or Coupling(), until)
-    fits = _fits(view, groups)
+    by_loss = _fits(view, groups)
+    log_prior = _loss_priors([logsumexp(fit.log_evidence, axis=1) for fit in by_loss])
+    fits = [_over_losses(fit, prior) for fit, prior in zip(by_loss, log_prior)]
     t_object = np.array([fit.mean[:, 0] for fit in fits])
     skin = np.array([view.data.level[group_rows[0]] for group_rows in groups])
     variance = np.array([fit.covariance[:, 0, 0] for fit in fits])
@@ -383,27 +405,36 @@ def free_touch_fit(
     data = touches(grasps, until=until)
     whitener, rest_s = whiten(data, gripper.noise), number_values(grasps, "rest")
 
-    def view(x: Array) -> _View:
+    def by_loss(group_rows: Rows, x: Array) -> Joint:
         hypotheses = free_hypotheses(gripper, x)
-        return _View(gripper, data, whitener, hypotheses, traces_of(gripper, data, rest_s, hypotheses), used)
+        traces = traces_of(gripper, data, rest_s, hypotheses)
+        return _fits(_View(gripper, data, whitener, hypotheses, traces, used), [group_rows])[0]
 
+    grids = [_on_a_grid(partial(by_loss, group_rows)) for group_rows in rows.values()]
+    log_prior = _loss_priors([logsumexp(fit.log_evidence, axis=1, b=np.gradient(x)) for x, fit in grids])
     return {
-        name: _free(group_rows, lambda at, x: _fits(view(x), [at])[0], used, data.level[group_rows])
-        for name, group_rows in rows.items()
+        name: _touch_posteriors(x, _over_losses(fit, prior), used, data.level[group_rows])
+        for (name, group_rows), (x, fit), prior in zip(rows.items(), grids, log_prior)
     }
 
 
-def _free(
-    at: Rows, joint: Callable[[Rows, Array], Joint], coupling: Coupling, skin: Array
-) -> list[posterior_grid.GridPosterior]:
+def _on_a_grid(by_loss: Callable[[Array], Joint]) -> tuple[Array, Joint]:
+    """Return effusivities ln e, denser where they are likely, and the fits (n_loss, n_x) there."""
     x = np.linspace(*posterior_grid.LN_E_RANGE, posterior_grid.GRID.coarse_points)
-    fit = joint(at, x)
+    fit = by_loss(x)
     for widen, n_point in posterior_grid.REFINEMENTS:
-        more = posterior_grid.refined(x, fit.log_evidence, widen, n_point)
-        extra = joint(at, more)
+        log_density = _over_losses(fit, BLOCK.log_loss_prior()).log_evidence
+        more = posterior_grid.refined(x, log_density, widen, n_point)
         order = np.argsort(np.concatenate([x, more]))
         x = np.concatenate([x, more])[order]
-        fit = Joint(*(np.concatenate(pair)[order] for pair in zip(fit, extra)))
+        fit = Joint(*(np.concatenate(pair, axis=1)[:, order] for pair in zip(fit, by_loss(more))))
+    return x, fit
+
+
+def _touch_posteriors(
+    x: Array, fit: Joint, coupling: Coupling, skin: Array
+) -> list[posterior_grid.GridPosterior]:
+    """Return the posterior of each touch of a block from its fits at effusivities x."""
     variance = np.diagonal(fit.covariance, axis1=1, axis2=2)[:, ::N_SHARED]
     t_object, ln_h = fit.mean[:, ::N_SHARED], fit.mean[:, 1::N_SHARED]
     sd = np.hypot(np.sqrt(variance), coupling.touch_sd(t_object - skin))
@@ -456,7 +487,6 @@ def next_touch_prior(
     factor = _group_factors(view, [at])[0]
     if at.size > 1:
         factor = _group_factors(view, [at], _cavities(view, [at], [factor]))[0]
-    log_evidence = combine(factor, *_prior(view, at, view.coupling, factor)).log_evidence
     # the touch to come: a flat factor, in a row of its own
     m, new = view.hypotheses.ln_h.size, int(view.traces.rest.size)
     silent = Factor(*(np.concatenate([f, np.zeros((m, 1, *f.shape[2:]))], axis=1) for f in factor))
@@ -464,10 +494,10 @@ def next_touch_prior(
     before = view.traces
     skin, room = np.append(before.skin, np.nan), np.append(before.room, np.nan)
     traces = replace(before, skin=skin, room=room, rest=np.append(before.rest, rest))
-    prior = _prior(view._replace(traces=traces), np.append(at, new), view.coupling, silent)
-    joint = combine(silent, *prior)
+    by_loss = _by_loss(view._replace(traces=traces), np.append(at, new), silent)
+    joint = _over_losses(by_loss, BLOCK.log_loss_prior())
     last = slice(-N_SHARED, None)
-    return Joint(log_evidence, joint.mean[:, last], joint.covariance[:, last, last])
+    return Joint(joint.log_evidence, joint.mean[:, last], joint.covariance[:, last, last])
 
 
 def _one_block(grasps: Grasps) -> Rows:
@@ -582,6 +612,38 @@ def _t_object(joint: Joint, k: int) -> tuple[Array, Array]:
 
 
 def _fits(view: _View, groups: list[Rows]) -> list[Joint]:
-    """Return evidence and posterior of each group, factors expanded around what the other touches say."""
+    """Return evidence and posterior of each group at each loss, factors expanded around what the other touches
+    say."""
     factors = _group_factors(view, groups, _cavities(view, groups, _group_factors(view, groups)))
-    return [combine(f, *_prior(view, group_rows, view.coupling, f)) for f, group_rows in zip(factors, groups)]
+    return [_by_loss(view, group_rows, factor) for group_rows, factor in zip(groups, factors)]
+
+
+def _by_loss(view: _View, at: Rows, factor: Factor) -> Joint:
+    """Return evidence and posterior of one group at each loss, of leading shape (n_loss, m); what a block
+    loses during a touch is little beside what it loses between two, so that one factor serves all."""
+    fits = []
+    for ln_loss in BLOCK.ln_loss:
+        losing = replace(view.coupling, loss=view.coupling.loss * float(np.exp(ln_loss)))
+        fits.append(combine(factor, *_prior(view, at, losing, factor)))
+    return Joint(*map(np.stack, zip(*fits)))
+
+
+def _loss_priors(evidence: Sequence[Array]) -> Array:
+    """Return the log probability of each loss for each group, (n, n_loss), by the evidence of the record's
+    other groups."""
+    by_loss = np.array(evidence)
+    some = np.log1p(-BLOCK.no_candidate) + by_loss
+    says = np.logaddexp(some, np.log(BLOCK.no_candidate) + by_loss.max(axis=1, keepdims=True))
+    by_others = BLOCK.log_loss_prior() + says.sum(axis=0) - says
+    return np.asarray(by_others - logsumexp(by_others, axis=1, keepdims=True))
+
+
+def _over_losses(fit: Joint, log_prior: Array) -> Joint:
+    """Return evidence and the first two moments of the posterior with the loss (n_loss,) integrated out."""
+    log_z = log_prior[:, None] + fit.log_evidence
+    log_evidence = logsumexp(log_z, axis=0)
+    share = np.exp(log_z - log_evidence)[:, :, None]
+    mean = (share * fit.mean).sum(axis=0)
+    off = fit.mean - mean
+    within = fit.covariance + off[..., :, None] * off[..., None, :]
+    return Joint(np.asarray(log_evidence), mean, (share[..., None] * within).sum(axis=0))

@@ -219,6 +219,16 @@ def test_a_rest_longer_than_those_of_the_training_is_noted():
     assert notes == ["", rested] * 2
 
 
+@pytest.mark.parametrize("rest", [20.0, 180.0])
+def test_blocks_that_lose_otherwise_are_named_as_well(device, record, rest):
+    """All rested 60 s: by what their rows say of it, they lost three times as much as expected, or a third."""
+    known = PosteriorClassifier().with_device(device)
+    p = known.predict_proba(record.assign(rest=("grasp", np.full(record.sizes["grasp"], rest))))
+    true = np.searchsorted(known.classes_, record["material"].values)
+    assert (p.argmax(axis=1) == true).mean() > 0.8  # 0.87 where the rests are right
+    assert -np.log(p[np.arange(true.size), true]).mean() < 0.4  # 0.34
+
+
 @pytest.mark.parametrize(
     ("rest", "room", "way"),
     [(0.0, 22.0, [0.0, 0.0]), (1e9, 22.0, [-38.0, -8.0]), (1e9, np.nan, [0.0, 0.0]), (600.0, 22.0, None)],
