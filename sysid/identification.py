@@ -14,9 +14,9 @@ in-sample.
 **Which candidate is kept.**  Among black boxes the one of the least error on parts held out, a linear one
 where another kind errs less by no more than a standard error and 5 percent.  On another run the gain differs
 besides (:mod:`thermogrip.sysid.validation.prediction_bands`): of one or two logs that is added to the errors,
-and where even no error at all would not be 10 percent better neural models are not fitted.  On whole logs,
-and beside a network, that of the least held-out error over that of a model without input; the network also
-when it is within 10 percent of the best, for its parameters mean something.
+and where no error beside white noise would not be 10 percent better either, neural models are not fitted.  On
+whole logs, and beside a network, that of the least held-out error over that of a model without input; the
+network also when it is within 10 percent of the best, for its parameters mean something.
 """
 
 from __future__ import annotations
@@ -40,6 +40,7 @@ from thermogrip.sysid.blackbox.fit import (
     BlackBoxFit,
     family_of,
     fit_black_box,
+    white_error,
     with_refits,
 )
 from thermogrip.sysid.blackbox.order_selection import HARDLY_MORE, MORE_BY_LOGS, excess_within_noise
@@ -383,8 +384,8 @@ def _to_beat(others: Sequence[BlackBoxFit], logs: Sequence[Log]) -> dict[str, fl
         return None
     if beyond_reach(others, logs):
         raise UserError(
-            "left out, for even without any error on held-out parts it would not be kept: another run "
-            "differs by more than the linear models err (--models neural fits it)"
+            "left out, for even without any error on held-out parts it would not be kept: linear models err "
+            "by little more than noise, or less than another run differs (--models neural fits it)"
         )
     choice = min((fit.choice for fit in others), key=lambda choice: choice.error)
     return dict(zip((fold.label for fold in choice.folds), choice.errors[choice.structure].tolist()))
@@ -490,7 +491,7 @@ def _fitted(
     if kept is None:
         return _fit_box(kind, train, task, report).plant
     grid = kept.grid.of(train, ends=kept.grid.ends)
-    model = family_of(kind)(grid, only=kept.choice.structure).get(kept.choice.structure)
+    model = family_of(kind)(grid, only=(kept.choice.structure,)).get(kept.choice.structure)
     if model is None:
         raise UserError(f"{kind}: the chosen structure is unstable without the last part of the logs")
     return replace(kept.plant, model=model)
@@ -515,10 +516,13 @@ def choose_black_box(fits: Sequence[BlackBoxFit], logs: Sequence[Log]) -> BlackB
 
 
 def beyond_reach(fits: Sequence[BlackBoxFit], logs: Sequence[Log]) -> bool:
-    """Return whether even another kind without any error would be barely better on another run."""
+    """Return whether a kind that errs by the noise of the readings alone would be barely better on another
+    run."""
     linear = [fit for fit in fits if fit.kind in LINEAR]
-    run = _run_error(linear, logs) if linear else 0.0
-    return run > 0 and float(np.hypot(min(fit.choice.error for fit in linear), run)) <= WITHIN_NOISE * run
+    if not linear:
+        return False
+    best, run = min(linear, key=lambda fit: fit.choice.error), _run_error(linear, logs)
+    return float(np.hypot(best.choice.error, run)) <= WITHIN_NOISE * float(np.hypot(white_error(best), run))
 
 
 def _run_error(fits: Sequence[BlackBoxFit], logs: Sequence[Log]) -> float:

@@ -14,7 +14,7 @@ minimised here.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 
@@ -56,7 +56,7 @@ def arx_family(
     poles: Sequence[int] = (1, 2, 3, 4, 6, 8),
     delays: Sequence[int] = (1, 2),
     terms: Sequence[tuple[str, ...]] | None = None,
-    only: Structure | None = None,
+    only: Collection[Structure] | None = None,
 ) -> Mapping[Structure, StateSpaceModel]:
     """Return an ARX model for each structure that gives a stable one, delays n_k in rows.
 
@@ -75,7 +75,7 @@ def arx_family(
         for n, delay, coupled in product(kept_poles, kept_delays, couplings):
             tried = _Orders(n, delay, coupled)
             structure = _arx_structure(grid, products, tried)
-            model = _solve(grid, products, regression, tried) if only in (None, structure) else None
+            model = _solve(grid, products, regression, tried) if only is None or structure in only else None
             if model is not None:
                 out[structure] = model
     return out

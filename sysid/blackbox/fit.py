@@ -28,6 +28,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from importlib import import_module
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -35,11 +36,11 @@ from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.errors import UserError, known_names
 from thermogrip.datasets.schema import Log
 from thermogrip.sysid.blackbox.order_selection import (
+    MANY_ROWS,
     Choice,
     Family,
     Model,
     Run,
-    Structure,
     choose,
     excess_within_noise,
     free_run_errors,
@@ -63,7 +64,8 @@ _MODULES = {
     "neural": "neural",
 }
 BLACK_BOXES = tuple(_MODULES)
-_SEARCHED = ("oe", "armax", "bj")  # kinds whose denominators are searched, and begin from those known
+# what fits leave to the next ones: denominators where a search begins, triangles of segments
+_SEARCHED, _FACTORISED = ("oe", "armax", "bj"), ("subspace", "parsim")
 # a refit of a neural model takes as long as its fit
 RESAMPLED = ("arx", "oe", "armax", "bj", "subspace", "parsim", "sindy")
 
@@ -73,7 +75,6 @@ _FIXED |= {(kind, "delay"): "delays" for kind, _ in _FIXED}
 _FIXED |= {(kind, "order"): "orders" for kind in ("subspace", "parsim")}
 _MOST_FIXED = 20  # more poles, or steps of delay, than any record determines
 _AVERAGED = ("sindy", "neural")  # fitted at the averaged rate alone
-_MAX_ROWS = 8000  # beyond it one step alone is tried
 _FEWEST_ROWS = 160  # of means over five rows: eight blocks' worth of the shortest that is held out
 _MEMORIES, _MEMORY_ROWS = 32, 20  # l of the bootstrap: this part of the logs, and so many rows at least
 _SHORTEST = 160  # rows of logs that are resampled: l is an eighth
@@ -136,13 +137,15 @@ def fit_black_box(
     """
     if kind not in BLACK_BOXES:
         raise UserError(f"no model of kind {kind!r}", hint=known_names(kind, BLACK_BOXES))
-    family = _of_order(kind, order, delay)
     best: tuple[float, Grid, Choice] | None = None
     refused: UserError | None = None
     if grid is not None and kind not in _AVERAGED:
         grids = [grid]
     else:
         grids = _grids(kind, logs, inputs, outputs, disturbances, average)
+    # of few rows a search of its own for each part takes little, and may find another optimum
+    many = sum(len(segment.time) for segment in grids[0].segments) > MANY_ROWS
+    family = _remembering(kind, order, delay, searches=many)
     for at, tried in enumerate(grids):
 
         def report(done: float, what: str, at: int = at) -> None:
@@ -176,7 +179,7 @@ def _grids(
     logs' own, five times it too."""
     first = make_grid(logs, inputs=inputs, outputs=outputs, disturbances=disturbances, average=average)
     rows = sum(len(segment.time) for segment in first.segments) * first.dt / first.native
-    if average is not None or kind in _AVERAGED or rows > _MAX_ROWS:
+    if average is not None or kind in _AVERAGED or rows > MANY_ROWS:
         return [first]
     if first.dt > 1.5 * first.native:
         other, usual = first.native, "the logs' own"
@@ -204,9 +207,12 @@ def _within_steps(grid: Grid, grids: Sequence[Grid]) -> float:
     return float(np.mean(missed / np.maximum(finest.output_spread(), 1e-9)))
 
 
-def _of_order(kind: str, order: int | None, delay: int | None) -> Family:
-    """Return the family with order and delay as asked for; refuse a kind that has none to fix."""
-    fixed: dict[str, Any] = {}
+def _remembering(
+    kind: str, order: int | None = None, delay: int | None = None, *, searches: bool = True
+) -> Family:
+    """Return the family with order and delay as asked for, whose fits leave something to the next ones; a
+    kind that has none to fix is refused."""
+    settings: dict[str, Any] = {}
     for what, value in (("order", order), ("delay", delay)):
         if value is None:
             continue
@@ -214,8 +220,12 @@ def _of_order(kind: str, order: int | None, delay: int | None) -> Family:
             raise UserError(f"a {kind} model has no {what} to fix", hint=f"leave the {what} away, or {kind}")
         if not 1 <= value <= _MOST_FIXED:
             raise UserError(f"{what} {value} is not between 1 and {_MOST_FIXED}", hint="give another")
-        fixed[_FIXED[kind, what]] = (value,)
-    return partial(family_of(kind), **fixed) if fixed else family_of(kind)
+        settings[_FIXED[kind, what]] = (value,)
+    if kind in _SEARCHED and searches:
+        settings["searches"] = []
+    if kind in _FACTORISED:
+        settings["triangles"] = WeakKeyDictionary()
+    return partial(family_of(kind), **settings)
 
 
 def _with_convention(
@@ -226,7 +236,8 @@ def _with_convention(
     if grid.dt > 1.5 * grid.native or kind in _AVERAGED:
         return grid, choice
     moved = replace(grid.of(logs, ends=True), why=grid.why)
-    for tried in (partial(family, only=choice.structure), family):  # the same structure first: one fit a fold
+    # the same structure first: one fit a fold
+    for tried in (partial(family, only=(choice.structure,)), family):
         try:
             other = choose(moved, tried, warmup=_warmup_rows(moved, warmup))
         except UserError:  # no structure of it is stable
@@ -250,9 +261,7 @@ def with_refits(
     if rows < _SHORTEST:
         problem = f"{rows} rows of {fit.grid.dt:g} s are too few to resample their errors"
         raise UserError(f"{fit.kind}: {problem}", hint=f"a log of {_SHORTEST} rows has intervals")
-    family: Callable[..., Mapping[Structure, Model]] = family_of(fit.kind)
-    if fit.kind in _SEARCHED:  # from the denominators of refits before: a quarter of the time
-        family = partial(family, searches=[])
+    family = _remembering(fit.kind)
     rng = np.random.default_rng(seed)
     most = _AGREES * _error(fit, fit.choice.model)
     misses = _misses(fit)
@@ -264,7 +273,7 @@ def with_refits(
         drawn = fit.grid.having(
             _resampled(fit.grid.segments, misses, max(_MEMORY_ROWS, rows // _MEMORIES), rng)
         )
-        model, tried = family(drawn, only=fit.choice.structure).get(fit.choice.structure), tried + 1
+        model, tried = family(drawn, only=(fit.choice.structure,)).get(fit.choice.structure), tried + 1
         if model is not None and _error(fit, model) <= most:
             refits.append(model)
     if len(refits) < n:
@@ -280,16 +289,17 @@ def _resampled(
 ) -> list[Segment]:
     """Return the segments with readings of the module's theory, of one course w for all outputs, whose
     correlation l is so many rows."""
-    from scipy.ndimage import gaussian_filter1d  # half a second
+    from scipy.signal import oaconvolve  # half a second
 
     # a Gaussian filter of sd sigma leaves white noise the correlation exp(-(t - s)^2 / (4 sigma^2))
     sigma = memory / 2
-    sd = (2 * sigma * np.sqrt(np.pi)) ** -0.5  # of unit white noise after it
     pad = int(4 * sigma)
+    gaussian = np.exp(-0.5 * (np.arange(-pad, pad + 1) / sigma) ** 2)
+    gaussian /= np.linalg.norm(gaussian)  # so that white noise keeps its variance
     out = []
     for segment, miss in zip(segments, misses):
         noise = rng.standard_normal(len(segment.time) + 2 * pad)
-        w = gaussian_filter1d(noise, sigma)[pad : pad + len(segment.time)] / sd
+        w = oaconvolve(noise, gaussian, mode="valid")
         out.append(replace(segment, y=segment.y + miss - miss * w[:, None]))
     return out
 
@@ -302,6 +312,14 @@ def _error(fit: BlackBoxFit, model: Model) -> float:
 def _misses(fit: BlackBoxFit) -> list[Array]:
     settings = _run_settings(fit)
     return [free_run_misses(fit.choice.model, segment, **settings)[0] for segment in fit.grid.segments]
+
+
+def white_error(fit: BlackBoxFit) -> float:
+    """Return the part of the error over all logs that is white, which no model would predict: by the second
+    differences, whose variance is six times that of white noise; mean over the outputs, in their spreads."""
+    scale = np.maximum(fit.grid.output_spread(), 1e-9)
+    differences = np.concatenate([np.diff(miss, n=2, axis=0) for miss in _misses(fit)])
+    return float(np.mean(np.sqrt(np.nanmean(differences**2, axis=0) / 6) / scale))
 
 
 def _run_settings(fit: BlackBoxFit) -> dict[str, Any]:

@@ -24,7 +24,7 @@ well, with six by 1.09.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from typing import Any
@@ -103,7 +103,7 @@ def neural_family(
     states: Sequence[int] | None = None,
     units: Sequence[int] = (3, 8),
     members: int | None = None,
-    only: Structure | None = None,
+    only: Collection[Structure] | None = None,
 ) -> Mapping[Structure, NeuralModel]:
     """Return the mean of members of each number of states and units, each started from ``members`` random
     weights: 2 where absent, 1 with more than :data:`MANY` readings, and with ``only``, in the last fit,
@@ -113,7 +113,7 @@ def neural_family(
     sizes = list(product(orders, units))
     numbers = [n * (n + n_w + 1) + h * (2 * n + n_w + 1) for n, h in sizes]
     structure = Structure("members of all sizes", min(numbers))
-    if only not in (None, structure):
+    if only is not None and structure not in only:
         return {}
     data = _scaled_data(grid)
     few = sum(int(np.isfinite(y).sum()) for y in data.y) <= MANY

@@ -24,7 +24,7 @@ than on any part.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise, product
 from typing import Any, NamedTuple, Protocol, TypeVar
@@ -50,6 +50,7 @@ _MOST_ON_ALL = (1.0, 2.0)
 _CUTS = 4  # of one or two logs
 # From twice the error on two parts of five, the other three would have to bring less than 0.6 times it each.
 _HOPELESS_RATIO = 2.0
+MANY_ROWS = 8000  # beyond it a fit to all structures and steps takes minutes, and two parts tell them apart
 FEWEST = 20  # rows of a block that is held out
 
 _ALIKE = 0.98  # correlation of an input with its square: a line leaves a fifth of the square's spread
@@ -74,9 +75,9 @@ class Structure(NamedTuple):
 
 
 class Family(Protocol):
-    """A kind of models: fits every structure that it has, or ``only`` one, and returns the stable models."""
+    """A kind of models: fits every structure that it has, or ``only`` some, and returns the stable models."""
 
-    def __call__(self, grid: Grid, *, only: Structure | None = None) -> Mapping[Structure, Model]:
+    def __call__(self, grid: Grid, *, only: Collection[Structure] | None = None) -> Mapping[Structure, Model]:
         """Return a model for each structure that could be fitted to the grid."""
         ...
 
@@ -276,25 +277,31 @@ class _Errors(NamedTuple):
 
 def _score(
     grid: Grid,
-    fit: Callable[[Grid], Mapping[Structure, Model]],
+    family: Family,
     cases: Sequence[Fold],
     warmup: int,
     progress: Callable[[float, str], None] | None = None,
     beat: Mapping[str, float] | None = None,
 ) -> dict[Structure, _Errors]:
-    """Return the errors of each structure that ``fit`` makes of the rest of the folds."""
+    """Return the errors of each structure that the family fits to the rest of the folds."""
     scale, priors = np.maximum(grid.output_spread(), 1e-9), priors_of(grid)
     refused = np.full((len(priors), len(scale)), np.inf)
     errors: dict[Structure, list[Array]] = {}
+    remaining: list[Structure] | None = None
+    many = sum(len(segment.time) for segment in grid.segments) > MANY_ROWS
     for at, (label, train, runs) in enumerate(cases):
         if progress is not None:
             progress(at / len(cases), f"without {label}")
-        for structure, model in fit(train).items():
+        models = family(train) if remaining is None else family(train, only=remaining)
+        for structure, model in models.items():
             column = errors.setdefault(structure, [refused] * at)
             column.append(free_run_errors(model, runs, dt=grid.dt, scale=scale, warmup=warmup, priors=priors))
         for column in errors.values():  # a structure that could not be fitted on this fold is refused
             column.extend([refused] * (at + 1 - len(column)))
         _give_up_hopeless(errors, [fold.label for fold in cases[: at + 1]], beat or {}, scale)
+        best = _non_dominated(errors, scale)
+        if many and at >= 1 and len(best) < len(errors):
+            remaining = best
     out = {}
     for structure, columns in errors.items():
         by_output = np.stack(columns)  # (n_fold, n_prior, n_y)
@@ -303,6 +310,21 @@ def _score(
             at = int(np.argmin(np.log(by_prior).mean(axis=0)))
         out[structure] = _Errors(priors[at], by_prior[:, at], by_output[:, at])
     return out
+
+
+def _non_dominated(errors: Mapping[Structure, list[Array]], scale: Array) -> list[Structure]:
+    """Return the structures for which no other one has at most as many numbers and errs less on each part so
+    far; of some that all err alike, as on a long log of a simple plant, these are the smallest ones."""
+    points = {
+        structure: np.array([structure.size, *(np.min(np.mean(e / scale, axis=1)) for e in column)])
+        for structure, column in errors.items()
+    }
+    return [
+        structure
+        for structure, point in points.items()
+        if np.isfinite(point).all()
+        and not any(np.all(other <= point) and np.any(other < point) for other in points.values())
+    ]
 
 
 def _give_up_hopeless(
@@ -328,7 +350,7 @@ def _fit_to_all(
     grid: Grid, family: Family, structure: Structure, errors: _Errors, warmup: int
 ) -> tuple[Model, float] | None:
     """Return the structure fitted to all data and its error on them; None if it is unstable."""
-    fitted = family(grid, only=structure).get(structure)
+    fitted = family(grid, only=(structure,)).get(structure)
     return None if fitted is None else (fitted, _error_on_all(fitted, grid, errors.prior, warmup))
 
 
@@ -345,12 +367,16 @@ def drives(grid: Grid, terms: Sequence[str]) -> list[Array]:
     """Return the columns w = [u, d, phi(u, d)] of each segment, shape (n, n_drive); a column that never moves
     cannot be distinguished from a constant; it is zero here, so that its effect is fitted as none and not as
     an arbitrary share of the constant."""
-    names = grid.inputs + grid.disturbances
-    rows = [np.hstack([segment.u, segment.d]) for segment in grid.segments]
-    w = [np.hstack([some, evaluate_terms(terms, names, some)]) for some in rows]
+    w = [drives_of(grid, segment, terms) for segment in grid.segments]
     whole = np.concatenate(w)
     moves = np.ptp(whole, axis=0) > 1e-9 * np.maximum(np.abs(whole).max(axis=0), 1e-300)
     return [column * moves for column in w]
+
+
+def drives_of(grid: Grid, segment: Segment, terms: Sequence[str]) -> Array:
+    """Return the columns of one segment, of which none is set to zero."""
+    rows = np.hstack([segment.u, segment.d])
+    return np.hstack([rows, evaluate_terms(terms, grid.inputs + grid.disturbances, rows)])
 
 
 def column_sizes(norms: Array) -> Array:

@@ -29,7 +29,7 @@ the denominators found so far: one that suits one delay is a few steps from that
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 from operator import attrgetter
@@ -180,7 +180,7 @@ def _square_r(rows: Array) -> Array:
 
 
 def least_squares(
-    own: Sequence[Array], shared: Sequence[Array], right: Sequence[Array]
+    own: Sequence[Array], shared: Sequence[Array], right: Sequence[Array], dependent: float = DEPENDENT
 ) -> tuple[Array, Array]:
     """Return the least-squares weights of the shared columns, and those of each part's own ones."""
     na, n_own = len(own[0]), len(own) * len(own[0])
@@ -191,7 +191,7 @@ def least_squares(
         R[rows, rows], R[rows, n_own:] = triangle[:na, :na], triangle[:na, na:]
     R[n_own:, n_own:] = whole[:-1]
     size = order_selection.column_sizes(np.sqrt((R[:, :-1] ** 2).sum(axis=0)))
-    weights = np.linalg.lstsq(R[:, :-1] / size, R[:, -1], rcond=DEPENDENT)[0] / size
+    weights = np.linalg.lstsq(R[:, :-1] / size, R[:, -1], rcond=dependent)[0] / size
     return weights[n_own:], weights[:n_own].reshape(-1, na)
 
 
@@ -307,7 +307,7 @@ def oe_family(
     zeros: Sequence[int] = (1, 2),
     delays: Sequence[int] = (1, 2, 3),
     terms: Sequence[tuple[str, ...]] | None = None,
-    only: order_selection.Structure | None = None,
+    only: Collection[order_selection.Structure] | None = None,
     searches: list[Search] | None = None,
     search: type[Search] | None = None,
 ) -> Mapping[order_selection.Structure, StateSpaceModel]:
@@ -324,7 +324,7 @@ def oe_family(
             label = f"na {na}, nb {nb}, delay {nk}" + (f", with {', '.join(products)}" if products else "")
             size = (na + w[0].shape[1] * nb + kind.numbers(na)) * len(grid.outputs)
             structure = order_selection.Structure(label, size)
-            if only not in (None, structure):
+            if only is not None and structure not in only:
                 continue
             fitted = [
                 search_of_output(record, na, nb, nk) for search_of_output, record in zip(searches, records)

@@ -23,7 +23,7 @@ an equation whose simulation leaves ten times the range of the data is refused.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from math import comb
@@ -45,7 +45,7 @@ def sindy_family(
     thresholds: Sequence[float] = (0.0, 0.01, 0.05),
     memories: Sequence[int] = (1, 2),
     widths: Sequence[int] = (0, 12, 36),
-    only: Structure | None = None,
+    only: Collection[Structure] | None = None,
 ) -> Mapping[Structure, SindyModel]:
     """Return a model for each degree, threshold and memory whose simulation stays bounded.
 
@@ -64,7 +64,7 @@ def sindy_family(
             label = f"degree {degree}, memory {memory}, threshold {threshold:g}"
             label += f", weak over {width} rows" if width else ""
             structure = Structure(label, max(1, n_y * n_term - rank))
-            if only in (None, structure):
+            if only is None or structure in only:
                 wanted[structure] = threshold, width
         terms = _features(grid, degree, memory) if wanted else None
         fitted = (

@@ -37,6 +37,7 @@ from collections.abc import Collection, Mapping, Sequence
 from functools import partial
 from itertools import product
 from typing import NamedTuple
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,10 +47,12 @@ from thermogrip.sysid.blackbox.order_selection import (
     as_state_space,
     default_terms,
     drives,
+    drives_of,
     with_spread,
 )
+from thermogrip.sysid.blackbox.output_error import least_squares
 from thermogrip.sysid.models.state_space import StateSpaceModel
-from thermogrip.sysid.plant.log_grid import Grid, whole_readings
+from thermogrip.sysid.plant.log_grid import Grid, Segment, whole_readings
 
 Array = NDArray[np.float64]
 
@@ -62,12 +65,15 @@ def subspace_family(
     orders: Sequence[int] = (1, 2, 3, 4, 5, 6),
     rows: Sequence[int] | None = None,
     terms: Sequence[tuple[str, ...]] | None = None,
-    only: Structure | None = None,
+    only: Collection[Structure] | None = None,
     weightings: Sequence[str] = ("moesp", "cva"),
+    triangles: Triangles | None = None,
 ) -> Mapping[Structure, StateSpaceModel]:
     """Return a model for each order, number of block rows f and weighting that the data allow; where absent,
     ``rows`` are 3, 5, 8, 15 and 30 as far as the data allow (2 where they allow none), and ``terms`` none and
-    the magnitudes of signed inputs, or else the squares of others."""
+    the magnitudes of signed inputs, or else the squares of others; ``triangles``, empty at first,
+    keep what segments add for later fits."""
+    triangles = WeakKeyDictionary() if triangles is None else triangles
     models: dict[Structure, StateSpaceModel] = {}
     longest = max(len(segment.time) for segment in grid.segments)
     sets = default_terms(grid) if terms is None else terms
@@ -82,8 +88,8 @@ def subspace_family(
             for f, w, n in product(sizes, weightings, orders)
             if n < f or (f == 2 and n <= n_y)
         }
-        wanted = {of: name for of, name in names.items() if only in (None, name)}
-        models |= {wanted[of]: model for of, model in _realised(grid, wanted, some).items()}
+        wanted = {of: name for of, name in names.items() if only is None or name in only}
+        models |= {wanted[of]: model for of, model in _realised(grid, wanted, some, triangles).items()}
     return models
 
 
@@ -97,12 +103,12 @@ def _structure(n: int, f: int, weighting: str, some: Sequence[str], n_drive: int
 
 
 def _realised(
-    grid: Grid, wanted: Collection[tuple[int, str, int]], terms: tuple[str, ...]
+    grid: Grid, wanted: Collection[tuple[int, str, int]], terms: tuple[str, ...], triangles: Triangles
 ) -> dict[tuple[int, str, int], StateSpaceModel]:
     """Return the models of these block rows, weightings and orders."""
     out: dict[tuple[int, str, int], StateSpaceModel] = {}
     for f in dict.fromkeys(f for f, _, _ in wanted):
-        triangle = _triangle(grid, f, terms)
+        triangle = _triangle(grid, f, terms, triangles)
         if triangle is None:
             continue
         n_y = len(grid.outputs)
@@ -138,39 +144,35 @@ def fit_inputs(grid: Grid, A: Array, C: Array, terms: tuple[str, ...] = ()) -> S
     scale = np.maximum(grid.output_spread(), 1e-9)
     w = drives(grid, terms)
     centre = np.concatenate(w).mean(axis=0)
-    n_shared = n * (len(centre) + 1)
-    n_all = n_shared + n * len(grid.segments)
-    blocks, targets = [], []
-    for place, (segment, drive) in enumerate(zip(grid.segments, w)):
-        columns = _unit_responses(drive - centre, A, C)  # (n_shared + n, N, n_y)
-        block = np.zeros((*segment.y.shape, n_all))
-        block[:, :, :n_shared] = np.moveaxis(columns[:n_shared], 0, 2)
-        block[:, :, n_shared + place * n : n_shared + (place + 1) * n] = np.moveaxis(columns[n_shared:], 0, 2)
-        is_read = np.isfinite(segment.y)
-        block /= scale[None, :, None]
-        blocks.append(block[is_read])
-        targets.append(((segment.y - y0) / scale)[is_read])
-    gram, right = np.concatenate(blocks), np.concatenate(targets)
-    size = np.linalg.norm(gram, axis=0)
-    size[size < 1e-9 * size.max()] = 1.0  # of an input that never moves only rounding would be scaled up
-    solved = np.linalg.lstsq(gram / size, right, rcond=1e-9)[0] / size
-    W = solved[:n_shared].reshape(len(centre) + 1, n).T
+    columns, targets = [], []
+    for segment, drive in zip(grid.segments, w):
+        is_read = np.isfinite(segment.y).T
+        columns.append(_unit_responses(drive - centre, A, C / scale[:, None])[is_read].T)
+        targets.append(((segment.y - y0) / scale).T[is_read])
+    weights, starts = least_squares([X[-n:] for X in columns], [X[:-n] for X in columns], targets, DEPENDENT)
+    W = weights.reshape(len(centre) + 1, n).T
     c = W[:, -1] - W[:, :-1] @ centre
     model = as_state_space(grid, A, W[:, :-1], C, c, terms=terms, origin="subspace", y0=y0)
-    return with_spread(model, grid, list(solved[n_shared:].reshape(-1, n)))
+    return with_spread(model, grid, list(starts))
 
 
 def _unit_responses(drive: Array, A: Array, C: Array) -> Array:
-    """Simulate y for each unit entry of [B E F c], drive by drive, then of x0: (n_w n + n, N, n_y)."""
+    """Simulate each output for each unit entry of [B E F c], drive by drive, then of x0: (n_y, N, n_w n + n).
+
+    An entry e_k moves output i by C_i A^j e_k after j + 1 rows, which is entry k of A'^j C_i': one run of the
+    transposed system, pushed by the drive along C_i, has the responses to all n entries.
+    """
     from thermogrip.sysid.models.recurrences import run_linear  # pulls in numba
 
-    n, rows = A.shape[0], len(drive)
-    w = np.hstack([drive, np.ones((rows, 1))])
-    pushes = np.einsum("km,ab->makb", w, np.eye(n)).reshape(-1, rows, n)
-    nothing = np.zeros((1, rows - 1, 0))
-    forced = run_linear(A[None], nothing, pushes[:, :-1], np.zeros((len(pushes), n)), 1)
-    free = run_linear(A[None], nothing, np.zeros((1, rows - 1, n)), np.eye(n), 1)
-    return np.asarray(np.concatenate([forced, free]) @ C.T)
+    n_y, n = C.shape
+    rows = len(drive)
+    w = np.vstack([drive.T, np.ones(rows), np.zeros(rows)])  # the last one: a start and no drive
+    push = w[None, :, :-1, None] * C[:, None, None, :]
+    starts = np.zeros((n_y, len(w), n))
+    starts[:, -1] = C
+    pushes, nothing = push.reshape(-1, rows - 1, n), np.zeros((1, rows - 1, 0))
+    runs = run_linear(A.T[None], nothing, pushes, starts.reshape(-1, n), 1)
+    return np.moveaxis(runs.reshape(n_y, len(w), rows, n), 1, 2).reshape(n_y, rows, -1)
 
 
 def _realise(grid: Grid, gamma: Array, terms: tuple[str, ...]) -> StateSpaceModel:
@@ -194,20 +196,56 @@ def stabilised(A: Array, rows: int) -> Array:
     return np.asarray(np.real(vectors * poles @ np.linalg.pinv(vectors)))
 
 
-def _triangle(grid: Grid, f: int, terms: tuple[str, ...]) -> Array | None:
-    """Return R of the QR of all windows, signals at unit spread; None with too few windows."""
+class _Windows(NamedTuple):
+    """All windows of a segment, less its means: R of their QR, which has the same inner products."""
+
+    triangle: Array
+    n_windows: int
+    mean: Array  # of the signals
+
+
+# by segment, as long as that is alive: by rows, terms, and whether its readings are bridged
+Triangles = WeakKeyDictionary[Segment, dict[tuple[int, tuple[str, ...], bool], _Windows]]
+
+
+def _triangle(grid: Grid, f: int, terms: tuple[str, ...], triangles: Triangles) -> Array | None:
+    """Return R of the QR of all windows, signals at unit spread; None with too few windows.
+
+    What a segment adds does not depend on the others, so that its own triangle serves each fold that has it.
+    """
     readings = whole_readings(grid.segments, 2 * f)
-    signals = [np.hstack(pair) for pair in zip(drives(grid, terms), readings)]
-    whole = np.concatenate(signals)
+    whole = np.hstack([np.concatenate(drives(grid, terms)), np.concatenate(readings)])
     mean, size = np.nanmean(whole, axis=0), np.nanstd(whole, axis=0)
+    per_unit = np.divide(1.0, size, out=np.zeros_like(size), where=size > 0)
     n_w = whole.shape[1] - len(grid.outputs)
-    windows = [
-        _windows((z - mean) / np.where(size > 0, size, 1.0), n_w, f) for z in signals if len(z) > 2 * f
-    ]
-    stacked = np.concatenate(windows) if windows else np.empty((0, 0))
-    if stacked.shape[0] < 1.5 * stacked.shape[1] or not stacked.size:
+    parts, count = [], 0
+    for segment, y in zip(grid.segments, readings):
+        if len(y) <= 2 * f:
+            continue
+        known, key = triangles.setdefault(segment, {}), (f, terms, y is not segment.y)
+        if key not in known:
+            known[key] = _windows_of(np.hstack([drives_of(grid, segment, terms), y]), n_w, f)
+        windows = known[key]
+        shift = _by_column(windows.mean - mean, n_w, f, constant=0.0)
+        scale = _by_column(per_unit, n_w, f, constant=1.0)
+        constant = windows.triangle[:, f * n_w : f * n_w + 1]
+        parts.append((windows.triangle + constant * shift) * scale)
+        count += windows.n_windows
+    if not parts or count < 1.5 * parts[0].shape[1]:
         return None
-    return np.asarray(np.linalg.qr(stacked, mode="r"))
+    return np.asarray(np.linalg.qr(np.concatenate(parts), mode="r"))
+
+
+def _windows_of(z: Array, n_w: int, f: int) -> _Windows:
+    mean = np.nan_to_num(np.nanmean(z, axis=0))
+    rows = _windows(z - mean, n_w, f)
+    return _Windows(np.asarray(np.linalg.qr(rows, mode="r")), len(rows), mean)
+
+
+def _by_column(of_signal: Array, n_w: int, f: int, *, constant: float) -> Array:
+    """Return what each signal has for each column of a window."""
+    w, y = np.tile(of_signal[:n_w], f), np.tile(of_signal[n_w:], f)
+    return np.concatenate([w, [constant], w, y, y])
 
 
 def _factorise(triangle: Array, f: int, n_y: int) -> tuple[Array, Array]:

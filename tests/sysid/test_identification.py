@@ -146,10 +146,19 @@ def fit_of(kind, values):
 
 
 @pytest.mark.parametrize(
-    ("oe", "run", "out"),  # sqrt(1.1^2 - 1) = 0.458 of what differs between runs
-    [(0.0318, 0.14, True), (0.0324, 0.14, False), (0.001, 0.0, False)],
+    ("oe", "run", "noise", "out"),
+    [
+        (0.0318, 0.14, 0.0, True),  # sqrt(1.1^2 - 1) = 0.458 of what differs between runs
+        (0.0324, 0.14, 0.0, False),
+        (0.001, 0.0, 0.0, False),
+        (0.0109, 0.0, 0.01, True),
+        (0.0111, 0.0, 0.01, False),
+    ],
 )
-def test_a_kind_is_beyond_reach_where_even_no_error_would_not_be_a_tenth_better(monkeypatch, oe, run, out):
+def test_a_kind_is_beyond_reach_where_noise_alone_would_not_be_a_tenth_better(
+    monkeypatch, oe, run, noise, out
+):
+    monkeypatch.setattr(identification, "white_error", lambda fit: noise)
     monkeypatch.setattr(identification, "between_runs", lambda *_: {"t": np.full(9, run)})
     assert beyond_reach([fit_of("oe", [oe] * 4), fit_of("arx", [0.3] * 4)], []) == out
     assert not beyond_reach([fit_of("sindy", [1e-9] * 4)], [])
@@ -165,6 +174,13 @@ def test_neural_models_that_could_not_be_kept_are_left_out_with_the_reason():
     assert any(note.startswith("neural: left out, for even without any error") for note in found.notes)
     assert any(what.startswith("oe: ") for what in said)
     assert not any(what.startswith("neural") for what in said)
+
+
+def test_neural_models_are_left_out_where_linear_ones_err_by_white_noise():
+    logs = [plant_log(300, seed=s, name=name, noise=0.2) for s, name in enumerate("abc")]
+    found = identify(logs, models=["neural", "oe"], average=1.0, draws=0)
+    (note,) = [note for note in found.notes if note.startswith("neural: ")]
+    assert "little more than noise" in note
 
 
 def test_a_fixed_order_leaves_kinds_without_one_out():

@@ -77,4 +77,4 @@ def test_a_short_log_of_many_signals_is_fitted_with_what_its_rows_allow(many_sig
     small = "na 1, nb 1, delay 1"
     assert small in {structure.label for structure in models}
     [chosen] = [structure for structure in models if structure.label == small]
-    assert list(arx_family(many_signals, only=chosen)) == [chosen]
+    assert list(arx_family(many_signals, only=[chosen])) == [chosen]

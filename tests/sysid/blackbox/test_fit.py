@@ -336,7 +336,7 @@ def test_inputs_up_to_their_rows_are_taken_where_that_errs_clearly_less(
     grid = stub_grid(dt=dt, why="so")
     found, choice = fitting._with_convention(family, grid, first, [], family_of(family), 9.0)
     assert (found.ends, found.dt, found.why, choice is not first) == (moved, dt, "so", moved)
-    assert asked == [(True, {"only": "s"}, 9 / dt), (True, None, 9 / dt)][: len(others)]
+    assert asked == [(True, {"only": ("s",)}, 9 / dt), (True, None, 9 / dt)][: len(others)]
 
 
 @pytest.mark.parametrize(("agree", "n"), [(6, 6), (1, 2), (0, 6)])  # of the tries after the first
@@ -345,7 +345,7 @@ def test_refits_that_err_more_than_half_as_much_again_are_left_out(monkeypatch, 
 
     def family(grid, *, only, searches):
         made.append((only, len(grid.segments)))
-        return {only: None if len(made) == 1 else len(made)}
+        return {only[0]: None if len(made) == 1 else len(made)}
 
     errors = {0: 0.2, **{k: 0.3 if k <= agree + 1 else 0.301 for k in range(1, 99)}}
     monkeypatch.setattr(fitting, "family_of", lambda kind: family)
@@ -362,7 +362,7 @@ def test_refits_that_err_more_than_half_as_much_again_are_left_out(monkeypatch, 
         found = with_refits(fit, n, progress=lambda *what: said.append(what))
         assert found.refits == tuple(range(2, n + 2))
         assert said == [(k / n, "oe, refits to resampled errors") for k in (0, *range(n))]
-    assert (set(made), len(made)) == ({("s", 1)}, 7 if agree == n else tried)
+    assert (set(made), len(made)) == ({(("s",), 1)}, 7 if agree == n else tried)
 
 
 @pytest.mark.parametrize("kind", ["arx", "oe", "subspace"])

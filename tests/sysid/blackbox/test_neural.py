@@ -66,12 +66,12 @@ def test_how_many_members_are_trained(monkeypatch, readings, how, last, sizes, e
     monkeypatch.setattr(neural, "_averaged", lambda grid, data, parts: list(parts))
     # the smallest of three states and three units: A 9, B 9, c 3; V and W 18, U 9, b 3
     whole = Structure("members of all sizes", 51)
-    found = neural.neural_family(grid_of(y), **how, only=whole if last else None)
+    found = neural.neural_family(grid_of(y), **how, only=[whole] if last else None)
     assert made == [(*size, k) for size in sizes for k in range(each)]
     assert list(found.values()) == [[size for size in sizes for _ in range(each)]]
     if "states" not in how:
         assert list(found) == [whole]
-    assert not neural.neural_family(grid_of(y), only=Structure("3 states, 8 units", 101))
+    assert not neural.neural_family(grid_of(y), only=[Structure("3 states, 8 units", 101)])
 
 
 def test_data_are_scaled_by_their_spread_and_what_never_moves_is_zero():

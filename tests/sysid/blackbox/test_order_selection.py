@@ -170,7 +170,7 @@ def test_the_choice_has_the_errors_of_its_structure_and_of_its_best_prior(monkey
         return {
             s: s
             for s, errors in by_fold.items()
-            if only in (None, s) and of <= set(errors) and (only != SMALL or on_all)
+            if (only is None or s in only) and of <= set(errors) and (only != (SMALL,) or on_all)
         }
 
     def errors_of(model, runs, *, dt, scale, warmup, priors):
@@ -200,6 +200,27 @@ def test_the_choice_has_the_errors_of_its_structure_and_of_its_best_prior(monkey
     by_fold = late  # not fitted on the first fold
     choice = selection.choose(grid, family, warmup=6)
     assert (choice.structure, np.isinf(choice.errors[SMALL]).tolist()) == (MIDDLE, [True, False, False])
+
+
+@pytest.mark.parametrize(("many", "fitted"), [(89, [None, None, (SMALL, LARGE)]), (90, [None] * 3)])
+def test_of_many_rows_a_structure_that_a_smaller_one_beats_on_two_parts_is_not_fitted_again(
+    monkeypatch, many, fitted
+):
+    grid = grid_of(*(segment(np.outer([0, 1] * 15, [4]), log=n) for n in "abc"))
+    errors = {SMALL: 0.2, MIDDLE: 0.201, LARGE: 0.1}
+    asked = []
+
+    def family(part, *, only=None):
+        asked.append(only and tuple(only))
+        return {s: s for s in errors if only is None or s in only}
+
+    def errors_of(model, runs, *, scale, priors, **_):
+        return np.full((len(priors), 1), errors[model]) * scale
+
+    monkeypatch.setattr(selection, "free_run_errors", errors_of)
+    monkeypatch.setattr(selection, "MANY_ROWS", many)
+    assert selection.choose(grid, family, warmup=6).structure == LARGE
+    assert asked == [*fitted, (LARGE,)]
 
 
 @pytest.mark.parametrize(

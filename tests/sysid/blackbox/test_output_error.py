@@ -145,7 +145,7 @@ def test_one_structure_alone_is_fitted_when_it_is_asked_for(first_order):
     grid = make_grid([first_order.log(300)], average=1.0)
     whole = oe_family(grid, poles=(1, 2), zeros=(1,), delays=(1, 2))
     wanted = list(whole)[1]
-    assert list(oe_family(grid, poles=(1, 2), zeros=(1,), delays=(1, 2), only=wanted)) == [wanted]
+    assert list(oe_family(grid, poles=(1, 2), zeros=(1,), delays=(1, 2), only=[wanted])) == [wanted]
 
 
 def test_a_model_with_the_wrong_delay_loses(first_order):

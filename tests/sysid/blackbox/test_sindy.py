@@ -144,7 +144,7 @@ def test_the_structures_are_degrees_thresholds_memories_and_widths(grid, monkeyp
         memories=(1,),
         widths=(0,),
         thresholds=(0.3, 0.2),
-        only=Structure("degree 0, memory 1, threshold 0.3", 1),
+        only=[Structure("degree 0, memory 1, threshold 0.3", 1)],
     ).values()
     assert only == (0, 1, 0.3, 0)
 
