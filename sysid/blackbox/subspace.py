@@ -171,8 +171,8 @@ def _unit_responses(drive: Array, A: Array, C: Array) -> Array:
     starts = np.zeros((n_y, len(w), n))
     starts[:, -1] = C
     pushes, nothing = push.reshape(-1, rows - 1, n), np.zeros((1, rows - 1, 0))
-    runs = run_linear(A.T[None], nothing, pushes, starts.reshape(-1, n), 1)
-    return np.moveaxis(runs.reshape(n_y, len(w), rows, n), 1, 2).reshape(n_y, rows, -1)
+    runs = run_linear(np.ascontiguousarray(A.T)[None], nothing, pushes, starts.reshape(-1, n), 1)
+    return np.asarray(np.moveaxis(runs.reshape(n_y, len(w), rows, n), 1, 2).reshape(n_y, rows, -1))
 
 
 def _realise(grid: Grid, gamma: Array, terms: tuple[str, ...]) -> StateSpaceModel:
