@@ -612,8 +612,7 @@ def _t_object(joint: Joint, k: int) -> tuple[Array, Array]:
 
 
 def _fits(view: _View, groups: list[Rows]) -> list[Joint]:
-    """Return evidence and posterior of each group at each loss, factors expanded around what the other touches
-    say."""
+    """Return what :func:`_by_loss` does of each group, factors expanded around what the other touches say."""
     factors = _group_factors(view, groups, _cavities(view, groups, _group_factors(view, groups)))
     return [_by_loss(view, group_rows, factor) for group_rows, factor in zip(groups, factors)]
 

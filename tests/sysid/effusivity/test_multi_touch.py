@@ -221,7 +221,7 @@ def test_a_rest_longer_than_those_of_the_training_is_noted():
 
 @pytest.mark.parametrize("rest", [20.0, 180.0])
 def test_blocks_that_lose_otherwise_are_named_as_well(device, record, rest):
-    """All rested 60 s: by what their rows say of it, they lost three times as much as expected, or a third."""
+    """All rested 60 s: by what their rows say of it, they lost three times as much as expected or a third."""
     known = PosteriorClassifier().with_device(device)
     p = known.predict_proba(record.assign(rest=("grasp", np.full(record.sizes["grasp"], rest))))
     true = np.searchsorted(known.classes_, record["material"].values)
