@@ -41,10 +41,10 @@ if TYPE_CHECKING:
 
 MOST_COLUMNS = 4096  # of a table; one of thermogrip has twelve
 
-_NULLS = frozenset(
-    ["", "nan", "NaN", "NAN", "NA", "na", "N/A", "null", "NULL", "None", "-nan", "#N/A", "<NA>"]
-)
-_LOST_CELLS = _NULLS | {"-", "--", "---", "?", "*", "NaT", "unknown", "unavailable"}
+_LOST_CELLS = frozenset(
+    ["", "nan", "NaN", "NAN", "NA", "na", "N/A", "null", "NULL", "None", "-nan", "#N/A", "<NA>", "NaT",
+     "-", "--", "---", "?", "*", "unknown", "unavailable"]
+)  # fmt: skip
 _COMMENT = ("#", "%", "//")  # how a line begins that is no row
 _LEFT_OUT = "\x1f"  # how the name of a column begins that is not kept
 _NAMELESS = "columns named c1 to c{} by position; --columns a,b,... names them"
@@ -58,9 +58,7 @@ _TIME_OF_DAY = r"((?:\d{1,4}[-/.]\d{1,2}[-/.]\d{1,4}[ T]+)?\d{1,2}:\d{2}:\d{2}(?
 _LINE_STAMP = re.compile(
     r"\W{0,2}" + _TIME_OF_DAY + r"|Stats (\d+\.\d+):"
 )  # how a line of a program's log begins: a stamp, or Klipper's seconds
-_TERMINAL = re.compile(
-    rb"(?m)^\[?" + _TIME_OF_DAY.encode() + rb"(?:\]|\s+->)[ \t]*"
-)  # of PuTTY and others, and of Arduino's serial monitor
+_TERMINAL = re.compile(r"(?m)^\[?" + _TIME_OF_DAY + r"(?:\]|\s+->)[ \t]*")  # PuTTY, Arduino's monitor
 _ESPHOME = re.compile(r"\[(\d{2}:\d{2}:\d{2}[.\d]*)\].*?: '([^',]+)': Sending state ([-+.\d]+|ON|OFF)\b")
 _OF_HEATERS = ("target", "temp", "pwm")  # of a section of Klipper's statistics; what follows is the host's
 _LABEL = re.compile(r"[A-Za-z_@][^:=,;]{0,63}")
@@ -120,40 +118,41 @@ def read_csv_table(path: str | Path, *, text: Callable[[str], bool] | None = Non
     if the header has no comma; then numbers may have a decimal comma, which is noted. ``text`` tells which
     headers are those of text.  Nothing that is broken is passed over.
     """
-    data, file = _text_of(path), str(path)
+    file = str(path)
+    content, _ = _decoded(_bytes_of(path), file, strict=True)
     with as_user_error(csv.Error, "the header is no line of names", file=file, hint="correct it"):
-        layout = _first_line_as_names(data, file)
+        layout = _first_line_as_names(content, file)
     for place, name in enumerate(layout.names):
         if not name or name in layout.names[:place]:
             problem = f"column {place + 1} has no name" if not name else f"column {name!r} occurs twice"
             raise UserError(problem, file=file, row=layout.skip, hint="name each column once")
-    return _parse_table(data, layout, file, text or (lambda name: False), tolerated=0.0)
+    return _parse_table(content, layout, file, text or (lambda name: False), tolerated=0.0)
 
 
 def read_text_table(path: str | Path, columns: Sequence[str] | None = None) -> Table:
     """Return the columns of a text table that any program wrote; ``columns`` are names in place of the file's
     own, one a column, ``-`` to leave one out."""
-    return parse_text(_text_of(path), str(path), columns)
+    return parse_text(_bytes_of(path), str(path), columns)
 
 
 def parse_text(data: bytes, file: str, columns: Sequence[str] | None = None) -> Table:
     """Return the table in the text of a file; see :func:`read_text_table`."""
-    data, coded = _any_coding(data)
-    if data.startswith(b"LabVIEW Measurement"):
-        head, _, rows = data.rpartition(b"***End_of_Header***")
-        data = b"\n" * head.count(b"\n") + rows.lstrip(b"\t\r")
-    data, labelled = _without_labels(data)
+    text, coded = _decoded(data, file)
+    if text.startswith("LabVIEW Measurement"):
+        head, _, rows = text.rpartition("***End_of_Header***")
+        text = "\n" * head.count("\n") + rows.lstrip("\t\r")
+    text, labelled = _without_labels(text)
     if not labelled:
-        data = _stamps_as_column(data)
-    layout = find_layout(data, file)
+        text = _stamps_as_column(text)
+    layout = find_layout(text, file)
     notes = (*coded, *labelled, *layout.notes)
     if columns is not None:
         named = [name for name in layout.names if not name.startswith(_LEFT_OUT)]
         layout = replace(layout, names=[*_new_names(columns, len(named), file), *layout.names[len(named) :]])
         notes = tuple(note for note in notes if "--columns" not in note)
     if layout.separator == " ":  # one run at a time: [ ]+$ would look at each of its blanks again
-        data = re.sub(rb"(?m)^ | ?\r?$", b"", re.sub(rb"[ \t]+", b" ", data))
-    table = _parse_table(data, replace(layout, notes=notes), file, lambda name: False, _TOLERATED)
+        text = re.sub(r"(?m)^ | ?\r?$", "", re.sub(r"[ \t]+", " ", text))
+    table = _parse_table(text, replace(layout, notes=notes), file, lambda name: False, _TOLERATED)
     numbers = {name: values for name, values in table.numbers.items() if not name.startswith(_LEFT_OUT)}
     return replace(table, numbers=numbers)
 
@@ -181,36 +180,32 @@ def check_header(headers: Sequence[str], names: Sequence[str], file: str) -> Non
         raise UserError("has no header", file=file, hint=hint)
 
 
-def find_layout(data: bytes, file: str) -> Layout:
+def find_layout(text: str, file: str) -> Layout:
     """Return how a text is a table, from its first lines."""
-    head: list[tuple[int, str]] = []
-    for line_number, raw in enumerate(_iterate_lines(data[: 1 << 20]), start=1):
-        if len(head) < _HEAD_LINES and raw.strip():
-            head.append((line_number, raw.decode("utf-8", errors="replace").strip("\r\n")))
-    separator, first = _best_separator(head)
+    head = [(place, line) for place, line in enumerate(_head_lines(text), start=1) if line.strip()]
+    head = head[:_HEAD_LINES]
+    separator, first = _best_separator([line for _, line in head])
     if first is None:
-        return _first_line_as_names(data, file)
+        return _first_line_as_names(text, file)
     rows = [_split_cells(line, separator) for _, line in head[first:]]
     n = len(rows[0])
     if n > MOST_COLUMNS:
         raise UserError(f"has {n} columns, more than {MOST_COLUMNS}", file=file, hint="leave some out")
-    header, used = _names_above(head[:first], n, separator)
+    header, used = _names_above([line for _, line in head[:first]], n, separator)
     hollow = not header[-1] and all(row[-1] == "" for row in rows)  # every line ends with a separator
-    nameless = [f"c{line_number}" for line_number, name in enumerate(header[: n - hollow], 1) if not name]
+    nameless = [f"c{place}" for place, name in enumerate(header[: n - hollow], 1) if not name]
     notes = []
     if len(nameless) == n - hollow:
         above = len(_split_cells(head[first - 1][1].lstrip("#%/ "), separator)) if first else 0
         why = f"{above} names above rows of {n} cells" if above > n else "no header"
         notes = [f"{why}: {_NAMELESS.format(n - hollow)}"]
-    if nameless and not notes:
-        notes.append(f"without a name: {', '.join(nameless)}")
+    elif nameless:
+        notes = [f"without a name: {', '.join(nameless)}"]
     names: list[str] = []
-    for line_number, name in enumerate(header):
-        names.append(
-            unused(name or f"c{line_number + 1}", names, "{1}_{0}")
-        )  # the unit at the end stays there
-        if name and names[line_number] != name:
-            notes.append(f"{name} occurs again: named {names[line_number]}")
+    for place, name in enumerate(header, start=1):
+        names.append(unused(name or f"c{place}", names, "{1}_{0}"))  # the unit at the end stays there
+        if name and names[-1] != name:
+            notes.append(f"{name} occurs again: named {names[-1]}")
     if hollow:
         names[-1] = f"{_LEFT_OUT}end"
     passed = sum(not line.startswith(_COMMENT) for _, line in head[:first]) - used
@@ -219,27 +214,20 @@ def find_layout(data: bytes, file: str) -> Layout:
     return Layout(names, head[first][0] - 1, separator, tuple(notes), header)
 
 
-def _best_separator(head: Sequence[tuple[int, str]]) -> tuple[str, int | None]:
+def _best_separator(lines: Sequence[str]) -> tuple[str, int | None]:
     """Return the separator that makes most of the lines rows of numbers, and which is the first row, None
     where no line is one."""
-    best_share = -1.0
+    most_values = -1.0
     best, best_first = ",", None
     for separator in "\t;|, ":
-        rows = [[] if line.startswith(_COMMENT) else _split_cells(line, separator) for _, line in head]
-        starts = [k for k in range(len(rows)) if _is_row(rows, k, separator)]
-        if not starts:
-            continue
+        rows = [[] if line.startswith(_COMMENT) else _split_cells(line, separator) for line in lines]
         # a preamble may have a line like a row, of another length than the rows of the table
-        others = (k for k in starts if len(rows[k]) not in (1, len(rows[starts[0]])))
-        first = starts[0]
-        if _like_first(rows[first:], separator) < _MOST:
-            first = next((k for k in others if _like_first(rows[k:], separator) >= _MOST), first)
-        n = len(rows[first])
-        fits = [len(row) == n and _number_share(row, separator) for row in rows[first:]]
-        share = float(np.mean(fits)) if n > 1 else 0.0
-        if share > best_share + 1e-9:
-            best_share = share
-            best, best_first = separator, first
+        lengths = [len(row) if _number_share([*filter(None, row)], separator) >= 0.5 else 0 for row in rows]
+        n = max(filter(None, lengths), key=lambda length: (lengths.count(length), length), default=0)
+        values = sum(_number_share(row, separator) for row in rows if len(row) == n > 1)
+        if n and values > most_values + 1e-9:
+            most_values = values
+            best, best_first = separator, lengths.index(n)
     return best, best_first
 
 
@@ -274,37 +262,24 @@ def _number_share(row: Sequence[str], separator: str) -> float:
     return sum(_is_value(cell, separator) for cell in row) / max(len(row), 1)
 
 
-def _like_first(rows: Sequence[Sequence[str]], separator: str) -> float:
-    """Return the share of lines that are as long as the first one, and of which at least half are numbers."""
-    n = len(rows[0])
-    return float(np.mean([len(row) == n and _number_share(row, separator) >= 0.5 for row in rows]))
-
-
-def _is_row(rows: Sequence[Sequence[str]], k: int, separator: str) -> bool:
-    """Tell whether line k is one of numbers, as long as the next or the one before."""
-    row, cells = rows[k], [cell for cell in rows[k] if cell]
-    beside = [len(other) for other in (*rows[max(k - 1, 0) : k], *rows[k + 1 : k + 2])]
-    return bool(cells) and _number_share(cells, separator) >= 0.5 and (not beside or len(row) in beside)
-
-
-def _names_above(lines: Sequence[tuple[int, str]], n: int, separator: str) -> tuple[list[str], int]:
+def _names_above(lines: Sequence[str], n: int, separator: str) -> tuple[list[str], int]:
     """Return the names of n columns, empty where the file has none, and the number of their lines."""
     headers: list[list[str]] = []  # the nearest first: units may stand under the names
-    for _, line in reversed(lines):
+    for line in reversed(lines):
         comment = line.startswith(_COMMENT)
         cells = _split_cells(line.lstrip("#%/ ") if comment else line, separator)
         if separator == " " and len(cells) != n:
             cells = [cell.strip() for cell in re.split(r"\s{2,}|\t|,|;", line.strip("#%/ "))]
         if len(cells) in (n, n - 1) and any(cells) and len(headers) < 2 and not (comment and headers):
             headers.append([*cells, ""][:n])
-        if headers and not _are_units(headers[0]):
+        if headers and not all(_is_unit(cell) for cell in headers[0] if cell):
             break
     if not headers:
         return [""] * n, 0
     names = headers[-1]
     if len(headers) == 2:
         names = [f"{name} [{unit.strip('[]()')}]" if unit else name for name, unit in zip(names, headers[0])]
-    used = sum(not line.startswith(_COMMENT) for _, line in lines[-len(headers) :])
+    used = sum(not line.startswith(_COMMENT) for line in lines[-len(headers) :])
     return [from_csv(name) for name in names], used
 
 
@@ -312,22 +287,12 @@ def _is_unit(word: str) -> bool:
     return read_header(f"x [{word.strip('[]()')}]").unit != "1"
 
 
-def _are_units(cells: Sequence[str]) -> bool:
-    """Tell whether a line under the names has their units."""
-    words = [cell for cell in cells if cell]
-    return bool(words) and all(map(_is_unit, words))
-
-
-def _first_line_as_names(data: bytes, file: str) -> Layout:
+def _first_line_as_names(text: str, file: str) -> Layout:
     """Return the layout of a table whose first line, comments aside, is its header."""
-    lines = enumerate(io.BytesIO(data), start=1)
-    first = next(
-        ((line_number, raw) for line_number, raw in lines if raw.strip() and not raw.startswith(b"#")), None
-    )
-    if first is None:
+    lines = ((place, line.strip()) for place, line in enumerate(_iterate_lines(text), start=1))
+    skip, line = next(((place, line) for place, line in lines if line and line[0] != "#"), (0, ""))
+    if not line:
         raise UserError("has only comments", file=file, hint="give a header and at least two rows")
-    skip, raw = first
-    line = raw.decode("utf-8", "replace").strip()
     separator = next((sign for sign in ",;\t" if sign in line), ",")
     names = [from_csv(cell.strip()) for cell in next(csv.reader([line], delimiter=separator))]
     if len(names) > MOST_COLUMNS:
@@ -336,63 +301,50 @@ def _first_line_as_names(data: bytes, file: str) -> Layout:
     return Layout(names, skip, separator)
 
 
-def _any_coding(data: bytes) -> tuple[bytes, tuple[str, ...]]:
-    """Return text in UTF-8; what is not is taken as Windows-1252, and that is noted."""
-    if data.isascii():
-        return data, ()
-    try:
-        data.decode("utf-8")
-    except UnicodeDecodeError:
-        return data.decode("cp1252", "replace").encode(), ("text is not UTF-8: read as Windows-1252",)
-    return data, ()
-
-
-def _without_labels(data: bytes) -> tuple[bytes, tuple[str, ...]]:
+def _without_labels(text: str) -> tuple[str, tuple[str, ...]]:
     """Return the lines of a log that have readings beside their names, as a table with a header.
 
     So write serial plotters (``T1:23.5,T2:24.0``), printer hosts (``T:22.1 /200.0 @:127``, a target behind
     its reading) and Klipper (``extruder: target=200 temp=22.1 pwm=0.9``); lines without them are passed over.
     """
-    head = [
-        line.decode("utf-8", "replace") for line in islice(_iterate_lines(data[: 1 << 20]), 5 * _HEAD_LINES)
-    ]
-    if any(_ESPHOME.match(line) for line in head):
-        matches = (_ESPHOME.match(line.decode("utf-8", "replace")) for line in _iterate_lines(data))
+    head = list(islice(_head_lines(text), 5 * _HEAD_LINES))
+    if any(map(_ESPHOME.match, head)):
+        matches = map(_ESPHOME.match, _iterate_lines(text))
         readings = (match.expand(r"\1,\2,\3") if match else "" for match in matches)
-        return "\n".join(["time,name,state", *readings]).encode(), ("lines of an ESPHome log",)
+        return "\n".join(["time,name,state", *readings]), ("lines of an ESPHome log",)
     labels = Counter(tuple(_labelled_cells(line)) for line in head)
     del labels[()]
     names, lines_of_names = max(labels.items(), key=lambda item: (item[1], len(item[0])), default=((), 0))
     if not names or lines_of_names < min(_LABELLED_LINES, max(2, _MOST * sum(map(bool, head)))):
-        return data, ()
+        return text, ()
     rows: list[str] = []
-    for raw in _iterate_lines(data):
-        cells = _labelled_cells(raw.decode("utf-8", "replace"))
+    passed = 0
+    for line in _iterate_lines(text):
+        cells = _labelled_cells(line)
         rows.append(",".join(cells[name] for name in names) if cells.keys() >= {*names} else "")
-    passed = sum(not row and bool(raw.strip()) for row, raw in zip(rows, _iterate_lines(data)))
+        passed += not rows[-1] and bool(line.strip())
     first = next((place for place, row in enumerate(rows) if row), 0)
     rows[max(first - 1, 0) : first] = [",".join(names)]  # in place of a line before, if there is one
     notes = [f"lines have readings beside their names: {', '.join(names)}"]
     notes += [f"{passed} line(s) without them passed over"] if passed else []
-    return "\n".join(rows).encode() + b"\n", tuple(notes)
+    return "\n".join(rows) + "\n", tuple(notes)
 
 
-def _stamps_as_column(data: bytes) -> bytes:
+def _stamps_as_column(text: str) -> str:
     """Return the lines of a terminal that begin with a stamp in brackets, or before an arrow, as a table with
     the stamps as its first column."""
-    head = [line for line in islice(_iterate_lines(data[: 1 << 20]), _HEAD_LINES) if line.strip()]
+    head = [line for line in islice(_head_lines(text), _HEAD_LINES) if line.strip()]
     stamped = [match for line in head if (match := _TERMINAL.match(line))]
     if not head or len(stamped) < _MOST * len(head):
-        return data
+        return text
     cells = stamped[-1].string[stamped[-1].end() :]
-    separator = next((sign for sign in (b"\t", b";", b"|", b",") if sign in cells), b" ")
-    before, _, after = data.partition(stamped[0][0])
-    names = before.rstrip().rpartition(b"\n")[2]
+    separator = next((sign for sign in "\t;|," if sign in cells), " ")
+    before, _, after = text.partition(stamped[0][0])
+    names = before.rstrip().rpartition("\n")[2]
     if len(names.split(separator)) == len(cells.split(separator)):
-        before = before.replace(names, b"time" + separator + names)
-    return before + _TERMINAL.sub(
-        lambda match: match[1].replace(b" ", b"T") + separator, stamped[0][0] + after
-    )
+        before = before.replace(names, f"time{separator}{names}")
+    rows = _TERMINAL.sub(lambda match: match[1].replace(" ", "T") + separator, stamped[0][0] + after)
+    return before + rows
 
 
 def _labelled_cells(line: str) -> dict[str, str]:
@@ -422,18 +374,13 @@ def _labelled_cells(line: str) -> dict[str, str]:
 
 
 def _parse_table(
-    data: bytes, layout: Layout, file: str, is_text: Callable[[str], bool], tolerated: float
+    text: str, layout: Layout, file: str, is_text: Callable[[str], bool], tolerated: float
 ) -> Table:
-    """Return the table in a text; all that is wrong beyond what is tolerated is named in one error.
+    """Return the table in a text; of the columns that are wrong beyond what is tolerated the first is named.
 
     Up to a share ``tolerated`` of the rows, and twice as many cells of a column, may be left out.
     """
     names, n = layout.names, len(layout.names)
-    try:
-        text = data.decode("utf-8")
-    except UnicodeDecodeError as error:
-        row = data.count(b"\n", 0, error.start) + 1
-        raise UserError("is not UTF-8 text", file=file, row=row, hint="save the file as UTF-8") from error
     rows, notes = list(_cell_rows(text, layout, file)), list(layout.notes)
     if rows and len(rows[-1][1]) < n and not text.endswith(("\n", "\r")):
         line, cells = rows.pop()
@@ -442,20 +389,19 @@ def _parse_table(
     if again and tolerated:  # the logger was started again
         notes.append(f"the header stands again in {name_rows(again, 5)}")
         rows = [(line, cells) for line, cells in rows if cells != layout.header]
-    ragged = {line: len(cells) for line, cells in rows if len(cells) != n}
-    faults: list[UserError] = []
+    ragged = [line for line, cells in rows if len(cells) != n]
     if len(ragged) > tolerated * len(rows):
         more = f"; {len(ragged) - 1} more rows do not fit" if len(ragged) > 1 else ""
-        line, cell_count = next(iter(ragged.items()))
-        problem = f"has {cell_count} cell(s), the header has {n}{more}"
-        faults.append(UserError(problem, file=file, row=line, hint="complete or remove the row"))
-    elif ragged:
+        problem = f"has {len(dict(rows)[ragged[0]])} cell(s), the header has {n}{more}"
+        raise UserError(problem, file=file, row=ragged[0], hint="complete or remove the row")
+    if ragged:
         left_out = f"{len(ragged)} row(s) with too few or too many cells left out"
-        notes.append(f"{left_out} ({name_rows([*ragged], 5)})")
+        notes.append(f"{left_out} ({name_rows(ragged, 5)})")
     rows = [(line, cells) for line, cells in rows if len(cells) == n]
-    if not rows and not faults:
+    if not rows:
         raise UserError("has a header but no rows", file=file, hint="give at least two rows")
     lines = np.array([line for line, _ in rows], dtype=np.int64)
+    faults: list[UserError] = []
     columns: list[Column] = []
     for name, column in zip(names, zip(*(cells for _, cells in rows))):
         if is_text(name):
@@ -466,7 +412,7 @@ def _parse_table(
         except UserError as fault:
             faults += [] if name.startswith(_LEFT_OUT) else [fault]
     if faults:
-        raise _joined_faults(faults, names if tolerated else ())  # what may be broken is a log
+        raise _with_command(faults, names) if tolerated else faults[0]  # what may be broken is a log
     return _table_of(columns, file, lines, notes)
 
 
@@ -506,29 +452,29 @@ def read_column(
     number among more numbers than are tolerated."""
     if (plain := _plain_numbers(cells)) is not None:
         return Column(name, plain)
-    cells, lost = [cell.strip() for cell in cells], _LOST_CELLS if tolerated else _NULLS
-    values = _to_numbers(cells, lost)
+    cells = [cell.strip() for cell in cells]
+    values = _to_numbers(cells)
     notes: list[str] = []
-    wrong = _not_numbers(cells, values, lost)
+    wrong = _not_numbers(cells, values)
     if wrong.size and separator != "," and _has_decimal_comma(cells):
-        values, notes = _to_numbers([cell.replace(",", ".") for cell in cells], lost), [_COMMAS]
-        wrong = _not_numbers(cells, values, lost)
-    cells_known = len(cells) - sum(cell in lost for cell in cells)
-    if tolerated and wrong.size and (united := _without_unit(name, cells, lost)) is not None:
+        values, notes = _to_numbers([cell.replace(",", ".") for cell in cells]), [_COMMAS]
+        wrong = _not_numbers(cells, values)
+    cells_known = len(cells) - sum(cell in _LOST_CELLS for cell in cells)
+    if tolerated and wrong.size and (united := _without_unit(name, cells)) is not None:
         return read_column(*united, lines, file, separator, tolerated)
     first = cells[wrong[0]] if wrong.size else ""
-    states = switched(cells) if tolerated and len({cells[row].lower() for row in wrong}) > 1 else None
-    if states is not None and np.isfinite(values).any():
-        return Column(name, text=[*cells])  # numbers and both states of a switch: readings of several signals
+    states = switched(cells) if tolerated else None
+    if states is not None and np.isfinite(values).any() and len({cells[row].lower() for row in wrong}) > 1:
+        return Column(name, text=cells)  # numbers and both states of a switch: readings of several signals
     if wrong.size <= 2 * tolerated * cells_known:
         if wrong.size:
             where = f"{name_rows(lines[wrong], 5)}: {_quoted_cell(first)}"
             notes = [f"{name}: {wrong.size} cell(s) that are no numbers left empty ({where})", *notes]
         return Column(name, values, notes=tuple(notes))
-    if tolerated and (states := switched(cells)) is not None:
+    if states is not None:
         return Column(name, states, notes=(f"{name}: words as {_quoted_cell(first)} read as 0 and 1",))
     if tolerated and (wrong.size >= _MOST * cells_known or STAMP.fullmatch(first)):
-        return Column(name, text=[*cells])
+        return Column(name, text=cells)
     hint = "write a number, leave the cell empty, or drop the column"
     if re.fullmatch(r"[+-]?\d+,\d+", first):
         hint = "write a decimal point"
@@ -541,14 +487,12 @@ def read_column(
 _COMMAS = "numbers have a decimal comma"
 
 
-def _to_numbers(cells: Sequence[str], lost: Container[str]) -> NDArray[np.float64]:
+def _to_numbers(cells: Sequence[str]) -> NDArray[np.float64]:
     """Return the numbers of cells, NaN where one is none."""
-    number_words = ["nan" if cell in lost else cell for cell in cells]
+    number_words = ["nan" if cell in _LOST_CELLS else cell for cell in cells]
     if (plain := _plain_numbers(number_words)) is not None:
         return plain
-    return np.array(
-        [float(cell) if _NUMBER_CELL.fullmatch(cell) else np.nan for cell in number_words], dtype=float
-    )
+    return np.array([float(cell) if _NUMBER_CELL.fullmatch(cell) else np.nan for cell in number_words])
 
 
 def _plain_numbers(cells: Sequence[str]) -> NDArray[np.float64] | None:
@@ -562,12 +506,10 @@ def _plain_numbers(cells: Sequence[str]) -> NDArray[np.float64] | None:
         return None
 
 
-def _not_numbers(
-    cells: Sequence[str], values: NDArray[np.float64], lost: Container[str]
-) -> NDArray[np.int64]:
+def _not_numbers(cells: Sequence[str], values: NDArray[np.float64]) -> NDArray[np.int64]:
     """Return which cells are neither numbers nor lost."""
     at_nan = np.flatnonzero(np.isnan(values)).tolist()
-    return np.array([row for row in at_nan if cells[row] not in lost], dtype=np.int64)
+    return np.array([row for row in at_nan if cells[row] not in _LOST_CELLS], dtype=np.int64)
 
 
 def _has_decimal_comma(cells: Sequence[str]) -> bool:
@@ -575,14 +517,13 @@ def _has_decimal_comma(cells: Sequence[str]) -> bool:
     return any(map(comma.fullmatch, cells)) and not any("." in cell for cell in cells)
 
 
-def _without_unit(name: str, cells: Sequence[str], lost: Container[str]) -> tuple[str, list[str]] | None:
+def _without_unit(name: str, cells: Sequence[str]) -> tuple[str, list[str]] | None:
     """Return a column's name and cells where one unit stands behind each of its numbers (``23.4 °C``)."""
-    matches = [None if cell in lost else _WITH_UNIT.fullmatch(cell) for cell in cells]
+    matches = [None if cell in _LOST_CELLS else _WITH_UNIT.fullmatch(cell) for cell in cells]
     units = {match[2] for match in matches if match is not None}
-    if len(units) != 1 or any(m is None and cell not in lost for m, cell in zip(matches, cells)):
+    if any(match is None and cell not in _LOST_CELLS for match, cell in zip(matches, cells)):
         return None
-    unit = units.pop()
-    if not _is_unit(unit):
+    if len(units) != 1 or not _is_unit(unit := units.pop()):
         return None
     named = name if read_header(name).unit != "1" else f"{name} [{unit}]"
     return named, ["" if match is None else match[1] for match in matches]
@@ -591,9 +532,9 @@ def _without_unit(name: str, cells: Sequence[str], lost: Container[str]) -> tupl
 def switched(cells: Sequence[str]) -> NDArray[np.float64] | None:
     """Return the numbers of cells that are numbers or the two states of a switch, NaN where one is lost; None
     where there are other words, or two of one meaning."""
-    words, lost = [cell.strip().lower() for cell in cells], {word.lower() for word in _LOST_CELLS}
-    values = _to_numbers(words, lost)
-    states = {words[row] for row in _not_numbers(words, values, lost)}
+    words = ["" if cell.strip() in _LOST_CELLS else cell.strip().lower() for cell in cells]
+    values = _to_numbers(words)
+    states = {words[row] for row in _not_numbers(words, values)}
     if not states <= {*_SWITCH} or len({_SWITCH[state] for state in states}) < len(states):
         return None
     return np.array([_SWITCH.get(word, value) for word, value in zip(words, values.tolist())], dtype=float)
@@ -603,20 +544,15 @@ def _quoted_cell(cell: str) -> str:
     return repr(cell if len(cell) <= 40 else cell[:37] + "...")
 
 
-def _joined_faults(faults: Sequence[UserError], names: Sequence[str]) -> UserError:
-    """Return all that is wrong with a file as one error, of a log with what reads the rest of it."""
+def _with_command(faults: Sequence[UserError], names: Sequence[str]) -> UserError:
+    """Return the first fault of a log, with what reads the rest of its columns."""
     first, bad = faults[0], {fault.column for fault in faults}
-    column_words = ",".join("-" if name in bad else name.replace(",", " ") for name in names)
     hint = first.hint
-    if bad - {None} and len(bad) < len(names):
+    if len(bad) < len(names):
+        column_words = ",".join("-" if name in bad else name.replace(",", " ") for name in names)
         command = shlex.join(["thermogrip", "identify", str(first.file), "--columns", column_words])
         hint = f"{hint}, or leave columns out: {command}"
-    if len(faults) == 1:
-        return UserError(first.problem, file=first.file, row=first.row, column=first.column, hint=hint)
-    fault_lines = [
-        f"row {f.row}" + (f", column {f.column}" if f.column else "") + f": {f.problem}" for f in faults
-    ]
-    return UserError(f"{len(faults)} faults: " + "; ".join(fault_lines), file=first.file, hint=hint)
+    return UserError(first.problem, file=first.file, row=first.row, column=first.column, hint=hint)
 
 
 def frame_table(
@@ -783,8 +719,8 @@ def _decode(metadata: dict[bytes, bytes] | None) -> dict[str, str]:
     return {k.decode(errors="replace"): v.decode(errors="replace") for k, v in (metadata or {}).items()}
 
 
-def _text_of(path: str | Path) -> bytes:
-    """Return the text of a file, unpacked, within the limits of :mod:`thermogrip.datasets.limits`."""
+def _bytes_of(path: str | Path) -> bytes:
+    """Return a file of text, unpacked, within the limits of :mod:`thermogrip.datasets.limits`."""
     limits.check_size(limits.check_source(path), file=path)
     openers: dict[str, Any] = {".gz": gzip.open, ".xz": lzma.open}
     opener = openers.get(Path(path).suffix.lower())
@@ -794,33 +730,35 @@ def _text_of(path: str | Path) -> bytes:
             data = limits.read_within(file, limits.most_bytes())
         else:
             with opener(file, "rb") as stream:
-                _check_text(stream.read(4096), path)
-                stream.seek(0)
                 data = limits.unpack_within(stream, file, file=path)
     limits.check_size(len(data), file=path)  # a pipe says no size, and a file may grow
-    data = _as_utf8(data, path).removeprefix(b"\xef\xbb\xbf")
-    if b"\n" not in data:
-        data = data.replace(b"\r", b"\n")
-    _check_text(data[:4096], path)
-    if not data.strip():
-        raise UserError("is empty", file=path, hint="give a header and at least two rows")
     return data
 
 
-def _check_text(start: bytes, path: str | Path) -> None:
-    if not start.startswith((b"\xff\xfe", b"\xfe\xff")) and (b"\0" in start or start[:1] == b"\x80"):
-        raise UserError("is not text, so it is not CSV", file=path, hint="export it as comma-separated text")
+def _decoded(data: bytes, file: str, *, strict: bool = False) -> tuple[str, tuple[str, ...]]:
+    """Return text, UTF-16 where its mark says so, as spreadsheets write it; what is not UTF-8 is taken as
+    Windows-1252, and that is noted."""
+    wide, notes = data.startswith((b"\xff\xfe", b"\xfe\xff")), ()
+    if not wide and (b"\0" in data[:4096] or data[:1] == b"\x80"):
+        raise UserError("is not text, so it is not CSV", file=file, hint="export it as comma-separated text")
+    try:
+        text = data.decode("utf-16" if wide else "utf-8-sig")
+    except UnicodeDecodeError as error:
+        if wide:
+            raise UserError("is damaged UTF-16 text", file=file, hint="save it as UTF-8") from error
+        if strict:
+            row = data.count(b"\n", 0, error.start) + 1
+            raise UserError("is not UTF-8 text", file=file, row=row, hint="save the file as UTF-8") from error
+        text, notes = data.decode("cp1252", "replace"), ("text is not UTF-8: read as Windows-1252",)
+    if not text.strip():
+        raise UserError("is empty", file=file, hint="give a header and at least two rows")
+    return text if "\n" in text else text.replace("\r", "\n"), notes
 
 
-def _as_utf8(data: bytes, path: str | Path) -> bytes:
-    """Return UTF-16 text, as spreadsheets write it, in UTF-8; any other bytes as they are."""
-    if not data.startswith((b"\xff\xfe", b"\xfe\xff")):
-        return data
-    with as_user_error(UnicodeDecodeError, "is damaged UTF-16 text", file=path, hint="save it as UTF-8"):
-        return data.decode("utf-16").encode("utf-8")
-
-
-def _iterate_lines(data: bytes) -> Iterator[bytes]:
+def _iterate_lines(text: str) -> Iterator[str]:
     """Yield the lines without their ends; a list of all of them would be larger than the table."""
-    for raw in io.BytesIO(data):
-        yield from raw.splitlines()
+    return (line.rstrip("\n") for line in io.StringIO(text, newline=None))
+
+
+def _head_lines(text: str) -> Iterator[str]:
+    return _iterate_lines(text[: 1 << 20])

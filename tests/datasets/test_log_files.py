@@ -156,7 +156,7 @@ def test_the_unfinished_last_line_of_a_killed_logger_is_dropped(write):
         ("# note\n" + HEAD + "0,x,25\n1,0,25\n", ["row 3", "column drive", "'x'"]),
         (
             HEAD + "0,x,25\n1,0\n2,0,hot\n3,0,25\n",
-            ["3 faults: row 3: has 2 cell(s)", "row 2, column drive: 'x'", "'hot'"],
+            ["row 3: has 2 cell(s), the header has 3; complete"],
         ),
         (
             HEAD + "0,0.5,25\n1,0.5,warm\n2,0,25\n",
