@@ -12,7 +12,6 @@ file holds.
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import re
@@ -26,7 +25,7 @@ from typing import Any
 
 from thermogrip.datasets.errors import UserError, as_user_error, os_fault, os_faults
 from thermogrip.datasets.limits import check_content, check_size, check_source, most_bytes, read_within
-from thermogrip.datasets.provenance import KEY, note_written, provenance
+from thermogrip.datasets.provenance import KEY, hash_file, note_written, provenance
 
 #: A document's part of what a file of records may have (:mod:`thermogrip.datasets.limits`): 8 MiB, 1 MiB.
 JSON_SHARE, _TOML_SHARE = 256, 2048
@@ -41,12 +40,10 @@ def make_folder(path: str | Path) -> None:
     that is refused."""
     folder = Path(path)
     with os_faults(path):
-        missing = [
-            missing_folder for missing_folder in (folder, *folder.parents) if not missing_folder.exists()
-        ]
+        missing = [place for place in (folder, *folder.parents) if not place.exists()]
         folder.mkdir(parents=True, exist_ok=True)
-        for missing_folder in missing:
-            _sync_folder(missing_folder.parent)
+        for place in missing:
+            _sync_folder(place.parent)
 
 
 # Windows writes a line end of two bytes unless it is asked not to; a child process gets no copy on either
@@ -64,9 +61,8 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     temporary: Path | None = None
     try:
         # the suffix stays, since writers choose their format or compression by it
-        handle, name = tempfile.mkstemp(
-            prefix=f".{target.stem[:40]}-", suffix=target.suffix, dir=target.parent
-        )
+        prefix = f".{target.stem[:40]}-"
+        handle, name = tempfile.mkstemp(prefix=prefix, suffix=target.suffix, dir=target.parent)
         os.close(handle)
         temporary = Path(name)
         yield temporary
@@ -114,8 +110,8 @@ def read_bytes(path: str | Path, *, share: int = 1) -> bytes:
 def file_hash(path: str | Path) -> str:
     """Return the SHA-256 of a file as 64 hexadecimal digits."""
     check_source(path)
-    with os_faults(path), open(path, "rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()
+    with os_faults(path):
+        return hash_file(path)
 
 
 def write_json(path: str | Path, content: Mapping[str, Any], *, schema: str, version: int) -> Path:
@@ -147,14 +143,13 @@ def read_json(path: str | Path, schema: str, version: int) -> dict[str, Any]:
     too_deep = as_user_error(RecursionError, "is nested too deeply", **place)
     with too_deep, as_user_error(ValueError, "is not JSON ({error})", **place):
         try:
-            content = parse_json(text, parse_constant=_refuse_constant)
+            content: dict[str, Any] = parse_json(text, parse_constant=_refuse_constant)
         except json.JSONDecodeError as error:
             problem = f"is not JSON ({error.msg}, column {error.colno})"
             raise UserError(problem, **place, row=error.lineno) from error
     check_json(content, schema, version, file=path)
     check_content(content, file=path)
-    whole: dict[str, Any] = content
-    return whole
+    return content
 
 
 def parse_json(text: str, **options: Any) -> Any:

@@ -11,7 +11,7 @@ largest value of every column, and one of its gaps.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -92,10 +92,8 @@ def thin(columns: Sequence[Array], most: int) -> NDArray[np.intp]:
             finite = np.isfinite(values[bin_rows])
             if finite.any():
                 finite_rows = bin_rows[finite]
-                kept_rows |= {
-                    int(finite_rows[values[finite_rows].argmin()]),
-                    int(finite_rows[values[finite_rows].argmax()]),
-                }
+                extremes = values[finite_rows].argmin(), values[finite_rows].argmax()
+                kept_rows |= {int(finite_rows[extreme]) for extreme in extremes}
             if not finite.all():
                 kept_rows.add(int(bin_rows[~finite][0]))
     return np.array(sorted(kept_rows))
@@ -157,8 +155,13 @@ def _draw(axis: Axes, panel: Panel) -> None:
         axis.axvspan(begin, end, color=SHADE, lw=0, zorder=0)
     for mark in panel.marks:
         axis.axvline(mark, color=INK, lw=0.9, ls=":")
-    for label, curve in _once((curve.label, thinned(curve, _STILL)) for curve in panel.curves):
-        look: dict[str, Any] = {"color": curve.colour, "label": label}
+    labels_shown = {""}
+    for curve in (thinned(curve, _STILL) for curve in panel.curves):
+        look: dict[str, Any] = {
+            "color": curve.colour,
+            "label": None if curve.label in labels_shown else curve.label,
+        }
+        labels_shown.add(curve.label)
         if curve.low is not None and curve.high is not None:
             axis.fill_between(
                 curve.x, curve.low, curve.high, color=curve.colour, alpha=0.18, lw=0,
@@ -172,11 +175,3 @@ def _draw(axis: Axes, panel: Panel) -> None:
     axis.set_ylabel(panel.label)
     if panel.title:
         axis.set_title(panel.title, fontsize=9)
-
-
-def _once(curves: Iterable[tuple[str, Curve]]) -> Iterable[tuple[str | None, Curve]]:
-    """Yield each curve with its label, the first time only."""
-    labels_shown = {""}
-    for label, curve in curves:
-        yield None if label in labels_shown else label, curve
-        labels_shown.add(label)

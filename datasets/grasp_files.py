@@ -171,9 +171,12 @@ def write_grasps(grasps: Grasps, path: str | Path) -> Path:
         return write_netcdf(grasps, path)
     if file_format(path) != "csv" or Path(path).suffix.lower() != ".csv":
         raise UserError("grasps are written as .csv or .nc", file=path, hint="use one of the two")
-    stem = file_stem(path)
-    write_atomic(Path(path).with_name(f"{stem}_meta.csv"), _meta_text(grasps))
-    return write_atomic(path, _samples_text(grasps))
+    write_atomic(Path(path).with_name(f"{file_stem(path)}_meta.csv"), _meta_text(grasps))
+    channels = [name for name in ("t_surface", "t_surface_2") if name in grasps]
+    samples = grasps[channels].to_dataframe(["grasp", "time"])[channels].dropna(how="all").reset_index()
+    samples["grasp"] = samples["grasp"].map(csv_cell)
+    header = ["grasp_id", "time_s", *(f"{name}_degC" for name in channels)]
+    return write_atomic(path, samples.to_csv(index=False, header=header, lineterminator="\n"))
 
 
 def read_grasp_files(paths: Sequence[str | Path]) -> list[Grasps]:
@@ -193,7 +196,20 @@ def list_grasp_files(paths: Sequence[str | Path]) -> list[Path]:
     """Return the grasp files in paths and folders, as of :func:`read_grasp_files`, unread."""
     files: list[Path] = []
     for path in (Path(name) for pattern in paths for name in matching_files(pattern)):
-        files += _in_folder(path) if path.is_dir() else [path]
+        if not path.is_dir():
+            files.append(path)
+            continue
+        with os_faults(path):
+            inside = sorted(path.iterdir())
+        shown = (file for file in inside if not file.name.startswith("."))
+        endings = (*_ENDINGS, ".nc", ".parquet", ".pq")
+        of_grasps = [file for file in shown if file.name.lower().endswith(endings)]
+        files += [file for file in of_grasps if not file_stem(file).endswith("_meta")]
+        if not of_grasps:
+            hint = "give a folder with .csv, .nc or .parquet in it"
+            if any(file.is_dir() for file in inside):
+                hint += f", or a pattern in quotes: '{path}/*/*.parquet'"
+            raise UserError("holds no grasp files", file=path, hint=hint)
     return files
 
 
@@ -201,51 +217,26 @@ def distinct_names(files: Sequence[Path]) -> list[str | None]:
     """Return for each file None, or where another one has its stem its path below the folder that all of this
     stem have in common; UserError where a file is given twice."""
     places = [os.path.abspath(file) for file in files]
+    names: list[str | None] = []
     for file, place in zip(files, places):
         if places.count(place) > 1:
             raise UserError("is given twice", file=file, hint="give each file once")
-    of_stem: dict[str, list[str]] = {}
-    for file, place in zip(files, places):
-        of_stem.setdefault(file_stem(file), []).append(place)
-    return [
-        os.path.relpath(place, os.path.commonpath(alike))
-        if len(alike := of_stem[file_stem(file)]) > 1
-        else None
-        for file, place in zip(files, places)
-    ]
-
-
-def grasp_file_parts(path: Path) -> list[Path]:
-    """Return the files that hold the grasps of one: itself, and of a CSV its meta file."""
-    return [path, _meta_path(path)] if file_format(path) == "csv" else [path]
+        alike = [other for other in places if file_stem(other) == file_stem(file)]
+        names.append(os.path.relpath(place, os.path.commonpath(alike)) if len(alike) > 1 else None)
+    return names
 
 
 def check_apart(out: str | Path, paths: Sequence[str | Path]) -> None:
     """Refuse an output that is among the files that are read, or would be the next time."""
     place, hint = Path(os.path.realpath(out)), "choose another name or folder for --out"
     for pattern in paths:
-        if place.match(os.path.realpath(pattern)) and not os.path.isdir(pattern):
+        given = [Path(name).resolve() for name in matching_files(pattern)]
+        if any(place.parent == path for path in given if path.is_dir()):
+            raise UserError("is in a folder that is read", file=out, hint=hint)
+        of_csv = [_meta_path(path) for path in given if path.is_file() and file_format(path) == "csv"]
+        matches = place.match(os.path.realpath(pattern)) and not os.path.isdir(pattern)
+        if matches or place in (*given, *of_csv):
             raise UserError("is to be read and written", file=out, hint=hint)
-        for path in map(Path, matching_files(pattern)):
-            if path.is_dir():
-                folder = path.resolve()
-                if place.parent == folder:
-                    raise UserError("is in a folder that is read", file=out, hint=hint)
-            elif place in [file_part.resolve() for file_part in grasp_file_parts(path)]:
-                raise UserError("is to be read and written", file=out, hint=hint)
-
-
-def _in_folder(folder: Path) -> list[Path]:
-    with os_faults(folder):
-        endings = (*_ENDINGS, ".nc", ".parquet", ".pq")
-        files = sorted(p for p in folder.iterdir() if p.name.lower().endswith(endings))
-    files = [p for p in files if not file_stem(p).endswith("_meta") and not p.name.startswith(".")]
-    if not files:
-        hint = "give a folder with .csv, .nc or .parquet in it"
-        if any(path.is_dir() for path in folder.iterdir()):
-            hint += f", or a pattern in quotes: '{folder}/*/*.parquet'"
-        raise UserError("holds no grasp files", file=folder, hint=hint)
-    return files
 
 
 def _is_text(header: str) -> bool:
@@ -256,40 +247,40 @@ def _is_text(header: str) -> bool:
 def _samples_of(table: Table, facts: Table | None) -> _Samples:
     """Return the samples of a table, in which the facts of a grasp may stand too, where they have no table of
     their own."""
-    path = table.file
+    file = table.file
     if "grasp_id" not in table.text:
-        problem = "no column grasp_id"
-        raise UserError(problem, file=path, hint="a grasp file has grasp_id,time_s,t_surface_degC")
+        hint = "a grasp file has grasp_id,time_s,t_surface_degC"
+        raise UserError("no column grasp_id", file=file, hint=hint)
     channels, repairs = {}, list(table.notes)
-    for header in (header for header in table.numbers if header.startswith(_SAMPLE_COLUMNS)):
-        name, unit = split_header(header, file=str(path))
-        channels[name], after = to_record_unit(table.numbers[header], unit)
-        if name.startswith("t_surface") and after != "degC":
-            raise UserError("is not a temperature", file=path, column=header, hint=f"write {name}_degC")
-        if name == "time" and after != "s":
-            raise UserError("is not a time", file=path, column=header, hint="write time_s or time_ms")
-        if after != unit:
-            repairs.append(f"{name}: converted from {unit} to {after}")
+    others = [h for h in table.text if h != "grasp_id"]
+    for header, values in table.numbers.items():
+        if not header.startswith(_SAMPLE_COLUMNS):
+            others.append(header)
+            continue
+        name, unit = split_header(header, file=file)
+        channels[name], unit_after = to_record_unit(values, unit)
+        if name.startswith("t_surface") and unit_after != "degC":
+            raise UserError("is not a temperature", file=file, column=header, hint=f"write {name}_degC")
+        if name == "time" and unit_after != "s":
+            raise UserError("is not a time", file=file, column=header, hint="write time_s or time_ms")
+        if unit_after != unit:
+            repairs.append(f"{name}: converted from {unit} to {unit_after}")
     for need, wanted in (("time", "time_s"), ("t_surface", "t_surface_degC")):
         if need not in channels:
-            problem = f"no column {wanted}"
-            raise UserError(problem, file=path, hint=rename_hint(need, [*table.text, *table.numbers]))
+            hint = rename_hint(need, [*table.text, *table.numbers])
+            raise UserError(f"no column {wanted}", file=file, hint=hint)
     time, ids = channels["time"], table.text["grasp_id"]
     if not np.isfinite(time).all():
         row = int(table.lines[np.argmin(np.isfinite(time))])
-        raise UserError("has no time", file=path, row=row, hint="remove the row")
+        raise UserError("has no time", file=file, row=row, hint="remove the row")
     if "" in ids:
         row = int(table.lines[ids.index("")])
-        raise UserError("is empty", file=path, row=row, column="grasp_id", hint="name the grasp")
-    others = [
-        h for h in (*table.text, *table.numbers) if not h.startswith((*_SAMPLE_COLUMNS, "grasp_id", "pump"))
-    ]
-    if others and facts is not None:
-        repairs.append(f"not used: {', '.join(others)}")
-    skin_channels = {
-        name: values for name, values in channels.items() if name in ("t_surface", "t_surface_2")
-    }
-    return _Samples(ids, np.round(time, 6), skin_channels, repairs)
+        raise UserError("is empty", file=file, row=row, column="grasp_id", hint="name the grasp")
+    unused = [header for header in others if not header.startswith("pump")]
+    if unused and facts is not None:
+        repairs.append(f"not used: {', '.join(unused)}")
+    skin = {name: values for name, values in channels.items() if name in ("t_surface", "t_surface_2")}
+    return _Samples(ids, np.round(time, 6), skin, repairs)
 
 
 def _onto_one_axis(samples: _Samples, order: Sequence[str], file: str) -> tuple[Floats, dict[str, Floats]]:
@@ -356,17 +347,15 @@ def _common_step(times: Sequence[Floats], order: Sequence[str], file: str) -> fl
 
 def _on_axis(axis: Floats, time: Floats, values: Floats, step: float) -> Floats:
     """Return a grasp on the axis: as it is where it has a sample, NaN where none is near."""
-    out, finite = np.full(axis.size, np.nan), np.isfinite(values)
+    finite = np.isfinite(values)
     if not finite.any():
-        return out
+        return np.full(axis.size, np.nan)
     t = time[finite]
     after = np.clip(np.searchsorted(t, axis), 0, t.size - 1)
     before = np.clip(np.searchsorted(t, axis, side="right") - 1, 0, t.size - 1)
-    has_neighbours = (
-        (axis >= t[0] - 0.5 * step) & (axis <= t[-1] + 0.5 * step) & (t[after] - t[before] <= 1.5 * step)
-    )
-    out[has_neighbours] = np.interp(axis[has_neighbours], t, values[finite])
-    return out
+    inside = (axis >= t[0] - 0.5 * step) & (axis <= t[-1] + 0.5 * step)
+    near = inside & (t[after] - t[before] <= 1.5 * step)
+    return np.where(near, np.interp(axis, t, values[finite]), np.nan)
 
 
 def _meta_path(path: str | Path) -> Path:
@@ -416,12 +405,13 @@ def _rows_of_meta(table: Table, order: Sequence[str], file: str) -> list[int]:
         raise UserError("no column grasp_id", file=table.file, hint=hint)
     rows: dict[str, int] = {}
     for row_of_table, grasp in enumerate(table.text["grasp_id"]):
-        if grasp in rows or grasp not in order:
+        line = int(table.lines[row_of_table])
+        if grasp in rows:
+            problem = f"grasp_id {grasp!r} occurs twice"
+            raise UserError(problem, file=table.file, row=line, hint="give each its own")
+        if grasp not in order:
             problem = f"grasp {grasp!r} has no samples in {Path(file).name}"
-            hint, row = "remove the row or add the samples", int(table.lines[row_of_table])
-            if grasp in rows:
-                problem, hint = f"grasp_id {grasp!r} occurs twice", "give each its own"
-            raise UserError(problem, file=table.file, row=row, hint=hint)
+            raise UserError(problem, file=table.file, row=line, hint="remove the row or add the samples")
         rows[grasp] = row_of_table
     for grasp in order:
         if grasp not in rows:
@@ -506,24 +496,13 @@ def _of_dataset(data: xr.Dataset, path: str | Path, called: str | None = None) -
 
 
 def _meta_text(grasps: Grasps) -> str:
-    headers: list[str] = ["grasp_id"]
-    columns: list[list[str]] = [[str(g) for g in grasps["grasp"].values]]
+    columns: dict[str, list[str]] = {"grasp_id": [str(grasp) for grasp in grasps["grasp"].values]}
     for name, variable in grasps.data_vars.items():
         key = str(name)
         if key in GRASP_LABELS:
-            headers.append(key)
-            columns.append([str(v) for v in variable.values])
+            columns[key] = [str(label) for label in variable.values]
         elif key in GRASP_NUMBERS:
             unit = "" if GRASP_NUMBERS[key] == "1" else f"_{GRASP_NUMBERS[key]}"
-            headers.append(META_NAMES.get(key, key) + unit)
-            columns.append(["" if np.isnan(v) else repr(float(v)) for v in variable.values])
-    return csv_text([headers, *zip(*columns, strict=True)])
-
-
-def _samples_text(grasps: Grasps) -> str:
-    """Return the long table; a sample that is NaN in every channel has no row."""
-    channels = [name for name in ("t_surface", "t_surface_2") if name in grasps]
-    table = grasps[channels].to_dataframe(["grasp", "time"])[channels].dropna(how="all").reset_index()
-    table["grasp"] = table["grasp"].map(csv_cell)
-    header = ["grasp_id", "time_s", *(f"{name}_degC" for name in channels)]
-    return table.to_csv(index=False, header=header, lineterminator="\n")
+            cells = ["" if np.isnan(number) else repr(float(number)) for number in variable.values]
+            columns[META_NAMES.get(key, key) + unit] = cells
+    return csv_text([[*columns], *zip(*columns.values(), strict=True)])

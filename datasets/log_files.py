@@ -144,9 +144,10 @@ def read_log(
         content = "a time column and nothing else" if read.clock.columns else "no column of numbers"
         raise UserError(f"has {content}", file=file, hint="add inputs and outputs")
     lists = {"inputs": inputs, "outputs": outputs, "disturbances": disturbances}
-    roles = assign_roles(
-        read.units, given=_roles_given(table, read, known or {}), columns=read.values, file=str(file), **lists
-    )
+    in_file = {name: table.attrs.get(header, {}).get("role", "") for header, name in read.names_of.items()}
+    of_known = {name: role for name, role in (known or {}).items() if name in read.units}
+    given = {name: role for name, role in in_file.items() if role} | of_known
+    roles = assign_roles(read.units, given=given, columns=read.values, file=str(file), **lists)
     if table.meta.get("schema") == "thermogrip.log":
         repairs = [line for line in table.meta.get("repairs", "").splitlines() if line]
         log = _made(read.clock.seconds, read.values, repairs, read, roles, file)
@@ -164,13 +165,6 @@ def read_log(
         if (words := table.attrs.get(header, {}).get("flag_meanings")) and name in log:
             log[name].attrs["flag_meanings"] = words
     return _cut(log, start, stop, file) if (start, stop) != (-np.inf, np.inf) else log
-
-
-def _roles_given(table: Table, read: _Columns, known: Mapping[str, str]) -> dict[str, str]:
-    """Return the roles that the file states, and those that a model gives to its signals."""
-    in_file = {name: table.attrs.get(header, {}).get("role", "") for header, name in read.names_of.items()}
-    of_model = {name: role for name, role in known.items() if name in read.units}
-    return {name: role for name, role in in_file.items() if role} | of_model
 
 
 def _made(
@@ -233,7 +227,7 @@ def write_log(log: Log, path: str | Path) -> Path:
     check_log(log)
     kind = check_written(path)
     if kind == "csv":
-        return write_atomic(path, _pack(_to_csv(log), path))
+        return write_atomic(path, _as_csv(log, Path(path).suffix.lower()))
     if kind == "parquet":
         return _write_parquet(log, path)
     from thermogrip.datasets.netcdf import write_netcdf
@@ -250,42 +244,26 @@ def check_written(path: str | Path) -> str:
     return kind
 
 
-def _format(path: Path) -> str:
-    """Return the format of a log: that of a folder is known by what is in it."""
-    if not os.path.isdir(path):
-        return file_format(path)
-    from thermogrip.datasets.rosbag import bag_parts
-
-    if not bag_parts(path):
-        raise UserError("is a folder, and no ROS 2 bag", file=path, hint="name a file in it")
-    return "rosbag"
-
-
 def _read_netcdf_table(path: str | Path) -> Table:
     """Return the variables over ``time`` of a NetCDF file as a table."""
     from thermogrip.datasets.netcdf import convention_unit, open_netcdf
 
     data = open_netcdf(path)
     if "time" not in data.dims or "time" not in data.variables:
-        problem = "no time axis"
-        raise UserError(problem, file=path, hint="give it a dimension and a variable 'time' in seconds")
-    numbers, attrs = {}, {}
-    not_over_time = []
-    for key in ["time", *data.data_vars]:
-        name, variable = str(key), data[key]
-        if variable.dims != ("time",):
-            not_over_time.append(name)
-            continue
-        if variable.dtype.kind not in "fiub":
-            problem = f"holds {variable.dtype}, not numbers"
+        hint = "give it a dimension and a variable 'time' in seconds"
+        raise UserError("no time axis", file=path, hint=hint)
+    not_over_time = [str(name) for name, variable in data.data_vars.items() if variable.dims != ("time",)]
+    numbers: dict[str, Floats] = {}
+    attrs: dict[str, dict[str, str]] = {}
+    for name in ["time", *map(str, data.drop_vars(not_over_time).data_vars)]:
+        values, in_file = data[name].values, data[name].attrs
+        if values.dtype.kind not in "fiub":
+            problem = f"holds {values.dtype}, not numbers"
             raise UserError(problem, file=path, column=name, hint="leave it out")
-        numbers[name] = np.asarray(variable.values, dtype=float)
-        unit = variable.attrs.get("units")
-        attrs[name] = {"role": str(variable.attrs.get("role", ""))}
-        if "flag_meanings" in variable.attrs:
-            attrs[name]["flag_meanings"] = str(variable.attrs["flag_meanings"])
-        if unit is not None:
-            attrs[name]["units"] = convention_unit(str(unit), name, str(path))
+        numbers[name] = np.asarray(values, dtype=float)
+        attrs[name] = {key: str(in_file[key]) for key in ("role", "flag_meanings") if key in in_file}
+        if "units" in in_file:
+            attrs[name]["units"] = convention_unit(str(in_file["units"]), name, str(path))
     meta = {str(key): str(value) for key, value in data.attrs.items()}
     notes = (f"left out, not over time alone: {', '.join(not_over_time)}",) if not_over_time else ()
     return Table(str(path), numbers, {}, np.arange(1, data.sizes["time"] + 1), attrs, meta, notes)
@@ -297,16 +275,16 @@ _OF_TEXT = {
 
 
 def _read_table(file: Path, columns: Sequence[str] | None) -> Table:
-    kind = _format(file)
+    kind = "rosbag" if os.path.isdir(file) else file_format(file)
     if kind in _OF_TEXT:
         return _OF_TEXT[kind](file, columns)
     if columns is not None:
         raise UserError("has names of its own", file=file, hint="leave --columns out")
-    if kind == "rosbag":
-        from thermogrip.datasets.rosbag import read_rosbag_table
+    if kind != "rosbag":
+        return _read_netcdf_table(file) if kind == "netcdf" else read_parquet_table(file)
+    from thermogrip.datasets.rosbag import read_rosbag_table
 
-        return read_rosbag_table(file)
-    return _read_netcdf_table(file) if kind == "netcdf" else read_parquet_table(file)
+    return read_rosbag_table(file)
 
 
 def _convert(table: Table, dt: float | None) -> _Columns:
@@ -385,25 +363,25 @@ def _one_column_a_signal(table: Table) -> Table:
     clocks = [h for h in clocks if len({*(table.text.get(h) or table.numbers[h].tolist())}) > 1]
     if not clocks or len(named) != 1:
         return table
-    signals = np.array([name.rpartition(".")[2] for name in table.text[named[0]]])
+    signals = [name.rpartition(".")[2] for name in table.text[named[0]]]
     columns = {**table.numbers, **{h: v for h, v in states.items() if v is not None}}
     readings = {h: v for h, v in columns.items() if h not in clocks and np.isfinite(v).any()}
-    count = np.unique(signals).size
+    count = len({*signals})
     # a column with a number for each signal is its name once more
     values = [h for h, v in readings.items() if len({*zip(signals, v)}) > count or np.unique(v).size < count]
     if len(values) != 1 or len(table.lines) < 5 * count:
         return table
-    clock, value = clocks[0], values[0]
+    clock = clocks[0]
     clock_of_text = read_clock(table.text[clock]) if clock in table.text else None
     time = table.numbers[clock] if clock_of_text is None else clock_of_text[0]
     order = np.argsort(time, kind="stable")
     times, first = np.unique(time[order], return_index=True)
-    numbers = {} if clock in table.text else {clock: times}
-    text = {clock: [table.text[clock][order[row]] for row in first]} if clock in table.text else {}
-    for signal in dict.fromkeys(signals.tolist()):
-        rows_of_signal = order[signals[order] == signal]
+    text = {clock: [table.text[clock][row] for row in order[first]]} if clock in table.text else {}
+    numbers = {} if text else {clock: times}
+    for signal in dict.fromkeys(signals):
+        rows_of_signal = order[np.asarray(signals)[order] == signal]
         newest = np.searchsorted(time[rows_of_signal], times, side="right") - 1
-        numbers[signal] = np.where(newest < 0, np.nan, readings[value][rows_of_signal[newest]])
+        numbers[signal] = np.where(newest < 0, np.nan, readings[values[0]][rows_of_signal[newest]])
     signal_names = ", ".join(sorted({*signals}))
     note = f"a reading of one signal in a row: {signal_names} each hold until their next reading"
     lines = np.arange(1, times.size + 1)
@@ -466,15 +444,16 @@ def _without_half_lost(roles: Roles, time: Floats, columns: Mapping[str, Floats]
     """Return roles without the outputs that miss a long part of what others have, which a fit would lose."""
     lost = {n: float(np.isnan(v).mean()) for n, v in columns.items() if roles.of[n] == "output"}
     whole = next((n for n, share in lost.items() if share < LOST_SHARE / 5), None)
-    out = [n for n, share in lost.items() if share > LOST_SHARE and whole is not None]
-    reasons = {n: f"it has no reading in {100 * lost[n]:.0f} % of the rows, {whole} has" for n in out}
-    doubts = []
-    for name, why in reasons.items():
-        read_times = time[np.isfinite(columns[name])]
-        log_cut = f"LOG@{read_times[0]:.6g}:{read_times[-1]:.6g}"
+    reasons, doubts = {}, []
+    for name in [n for n, share in lost.items() if share > LOST_SHARE and whole is not None]:
+        why = f"it has no reading in {100 * lost[name]:.0f} % of the rows, {whole} has"
+        first, *_, last = time[np.isfinite(columns[name])]
+        log_cut = f"LOG@{first:.6g}:{last:.6g}"
         doubts.append(f"{name} is left out: {why}; to fit it too, cut the log to where it reads: {log_cut}")
-    roles_left = roles.of | dict.fromkeys(out, "other")
-    return Roles(roles_left, roles.reasons | reasons, (*roles.doubts, *doubts))
+        reasons[name] = why
+    return Roles(
+        roles.of | dict.fromkeys(reasons, "other"), roles.reasons | reasons, (*roles.doubts, *doubts)
+    )
 
 
 def _repair_column(
@@ -514,29 +493,21 @@ def _cut(log: Log, start: float, stop: float, file: Path) -> Log:
     from thermogrip.datasets.resample import cut  # it loads xarray
 
     log_part = cut(log, start, stop)
-    log_part.attrs["name"] = f"{log.attrs['name']}@{_second_text(start)}:{_second_text(stop) or 'end'}"
+    first, last = (f"{end:.10g}" if np.isfinite(end) else "" for end in (start, stop))
+    log_part.attrs["name"] = f"{log.attrs['name']}@{first}:{last or 'end'}"
     repairs = [line for line in str(log.attrs["repairs"]).splitlines() if line]
-    first = f"{_second_text(start)} s" if np.isfinite(start) else "the start"
-    last = f"{_second_text(stop)} s" if np.isfinite(stop) else "the end"
-    repairs.append(f"taken from {first} to {last}; the lines above speak of the whole log")
-    log_part.attrs["repairs"] = "\n".join(repairs if len(repairs) > 1 else [repairs[0].split(";")[0]])
+    note = f"taken from {f'{first} s' if first else 'the start'} to {f'{last} s' if last else 'the end'}"
+    repairs.append(f"{note}; the lines above speak of the whole log" if repairs else note)
+    log_part.attrs["repairs"] = "\n".join(repairs)
     return log_part
 
 
-def _second_text(value: float) -> str:
-    return f"{value:.10g}" if np.isfinite(value) else ""
-
-
-def _to_csv(log: Log) -> str:
-    """Return a log as text; each number is the shortest that reads back as the same double."""
+def _as_csv(log: Log, ending: str) -> bytes:
+    """Return a log as text, packed as its ending says; each number is the shortest that reads back as the
+    same double."""
     names = [join_header(str(n), v.attrs["units"], [*log]) for n, v in log.data_vars.items()]
     header = [str(csv_cell(name)) for name in names]
-    return log.to_dataframe().to_csv(header=header, index_label="time_s", lineterminator="\n")
-
-
-def _pack(text: str, path: str | Path) -> bytes:
-    data = text.encode()
-    ending = Path(path).suffix.lower()
+    data = log.to_dataframe().to_csv(header=header, index_label="time_s", lineterminator="\n").encode()
     if ending == ".gz":
         return gzip.compress(data, mtime=0)  # without a date the same log is the same file
     return lzma.compress(data) if ending == ".xz" else data

@@ -108,11 +108,10 @@ def _in_memory(variable: Any) -> int:
 def write_netcdf(data: xr.Dataset, path: str | Path) -> Path:
     """Write a record as NetCDF-4 in one step, and return the path."""
     packed = {"zlib": True, "complevel": 4, "fletcher32": True, "_FillValue": np.nan}
-    encoding: dict[Any, dict[str, Any]] = {
-        name: packed
-        for name, variable in data.data_vars.items()
-        if variable.dtype.kind == "f" and variable.ndim
-    }
+    numbers = [
+        name for name, variable in data.data_vars.items() if variable.dtype.kind == "f" and variable.ndim
+    ]
+    encoding: dict[Any, Any] = dict.fromkeys(numbers, packed)
     encoding |= {name: {"_FillValue": None} for name in data.coords}
     with atomic_path(path) as temporary:
         data.to_netcdf(temporary, engine="h5netcdf", encoding=encoding)
@@ -145,9 +144,8 @@ def _text_as_str(data: xr.Dataset) -> xr.Dataset:
     """Turn the object arrays that variable-length text is read as into arrays of str."""
     for key, variable in data.variables.items():
         if variable.dtype.kind in "OS":
-            text = np.asarray(
-                [v.decode() if isinstance(v, bytes) else str(v) for v in variable.values.ravel()]
-            )
+            cells = variable.values.ravel()
+            text = np.asarray([cell.decode() if isinstance(cell, bytes) else str(cell) for cell in cells])
             data[key] = (variable.dims, text.reshape(variable.shape), variable.attrs)
     return data
 

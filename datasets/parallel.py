@@ -62,26 +62,27 @@ def run_parallel(
     ``progress`` is called with the fraction done and ``what``. UserError if processes are killed again and
     again, or the cluster cannot be reached, has no workers, or has other versions.
     """
-    todo = list(items)
-    results: dict[int, _Result] = {}
-    with closing(_done(function, todo, workers)) as done:
-        for place, result in done:
-            results[place] = result
-            if progress is not None:
-                progress(len(results) / len(todo), what)
-    return [results[place] for place in range(len(todo))]
+    return list(in_order(function, items, workers, progress, what=what))
 
 
 def in_order(
-    function: Callable[[_Item], _Result], items: Iterable[_Item], workers: Workers = 1
+    function: Callable[[_Item], _Result],
+    items: Iterable[_Item],
+    workers: Workers = 1,
+    progress: Progress | None = None,
+    *,
+    what: str = "working",
 ) -> Iterator[_Result]:
     """Yield the results of :func:`run_parallel` in the order of the items, each once it and those before it
     are there."""
+    todo = list(items)
     waiting: dict[int, _Result] = {}
     following = 0
-    with closing(_done(function, list(items), workers)) as done:
-        for place, result in done:
+    with closing(_done(function, todo, workers)) as done:
+        for count, (place, result) in enumerate(done, start=1):
             waiting[place] = result
+            if progress is not None:
+                progress(count / len(todo), what)
             while following in waiting:
                 yield waiting.pop(following)
                 following += 1

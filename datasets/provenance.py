@@ -96,7 +96,8 @@ def provenance() -> dict[str, Any]:
         folder = ""
     below = folder.rstrip(os.sep) + os.sep
     for name in now.read:
-        now.read[name] = now.read[name] or _hash(name)
+        with suppress(OSError):  # it is gone
+            now.read[name] = now.read[name] or (hash_file(name) if os.path.isfile(name) else "")
     return {
         "thermogrip": __version__,
         "written": _date(),
@@ -114,15 +115,10 @@ def _date() -> str:
     return time.strftime("%Y-%m-%dT%H:%M:%SZ", moment)
 
 
-def _hash(name: str) -> str:
-    """Return the SHA-256 of a file, "" where it is gone or no file."""
-    try:
-        if not os.path.isfile(name):
-            return ""
-        with open(name, "rb") as stream:
-            return hashlib.file_digest(stream, "sha256").hexdigest()
-    except OSError:
-        return ""
+def hash_file(path: str | Path) -> str:
+    """Return the SHA-256 of a file as 64 hexadecimal digits."""
+    with open(path, "rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def _commit_of(folder: str) -> str | None:

@@ -27,6 +27,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from importlib.util import find_spec
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -171,12 +172,14 @@ def write_bag(folder: str | Path, messages: Iterable[tuple[str, str, float, floa
 
 
 def bag_parts(folder: str | Path) -> list[Path]:
-    """Return the files of the ROS 2 bag that a folder is, none where it is no bag; UserError if its
+    """Return the files of the ROS 2 bag that a folder is; UserError where it is none, or its
     ``metadata.yaml`` names no file, or one that is missing or not read."""
     place = Path(folder)
     listed = place / "metadata.yaml"
     if not listed.is_file():
-        return sorted(path for path in place.iterdir() if path.suffix.lower() in _STORED)
+        if stored := sorted(path for path in place.iterdir() if path.suffix.lower() in _STORED):
+            return stored
+        raise UserError("is a folder, and no ROS 2 bag", file=place, hint="name a file in it")
     names = _files_in_metadata(listed)
     hint = "copy the whole bag again"
     if not names:
@@ -264,19 +267,15 @@ def _stamped(message: Message, stamp: str, file: Path) -> float:
     if stamp == "log":
         return message.time
     try:
-        stamp_of_header = _field(message.content, "header.stamp")
+        of_header = _field(message.content, "header.stamp")
+        ros_2 = _has(of_header, "sec")
         seconds, nanoseconds = (
-            _either(stamp_of_header, "sec", "secs"),
-            _either(stamp_of_header, "nanosec", "nsecs"),
+            _field(of_header, f) for f in (("sec", "nanosec") if ros_2 else ("secs", "nsecs"))
         )
         return float(seconds) + 1e-9 * float(nanoseconds)
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         problem = f"{message.topic} ({message.type}) has no header.stamp"
         raise UserError(problem, file=file, hint='set stamp = "log" in the topic map') from error
-
-
-def _either(content: Any, first: str, second: str) -> Any:
-    return _field(content, first if _has(content, first) else second)
 
 
 def _check_found(
@@ -299,7 +298,9 @@ def _bag_table(
     clock: str,
     notes: list[str],
 ) -> Table:
-    sorted_series = {name: _by_time(*pair) for name, pair in series.items()}
+    sorted_series = {
+        name: np.asarray(sorted(zip(*pair), key=itemgetter(0))).T for name, pair in series.items()
+    }
     units = {name: to_record_unit(v, columns[name].unit)[1] for name, (_, v) in sorted_series.items()}
     roles = {name: column.role or guess_role(name, units[name]) for name, column in columns.items()}
     if not clock:
@@ -317,12 +318,6 @@ def _bag_table(
             how = "the last message holds" if is_input else "the nearest message is taken"
             notes.append(f"{name}: {len(times)} messages of {column.topic} on the times of {clock}; {how}")
     return Table(str(file), numbers, {}, np.arange(1, axis.size + 1), attrs, {}, tuple(notes))
-
-
-def _by_time(times: list[float], values: list[float]) -> tuple[Floats, Floats]:
-    t, v = np.asarray(times, dtype=float), np.asarray(values, dtype=float)
-    order = np.argsort(t, kind="stable")
-    return t[order], v[order]
 
 
 def _held(axis: Floats, times: Floats, values: Floats) -> Floats:
@@ -371,19 +366,14 @@ def _bag_messages(file: Path) -> Iterator[Message]:
     hint = "run `rosbag reindex` on it" if bag1 else "copy it again, or export it as MCAP"
     with reading("is damaged or no bag", file=file, hint=hint):
         check_size(check_source(file), file=file)
-        with AnyReader([_bag_path(file)], default_typestore=store) as reader:
+        whole = not bag1 and (file.parent / "metadata.yaml").is_file()  # a .db3 belongs to its folder
+        with AnyReader(
+            [file.parent if whole and bag_parts(file.parent) else file], default_typestore=store
+        ) as reader:
             unpack = _bound_chunks(reader, file) if bag1 else _bound_messages(reader, file)
             for connection, stamp, raw in reader.messages():
                 content = reader.deserialize(unpack(raw), connection.msgtype)
                 yield Message(connection.topic, connection.msgtype, 1e-9 * stamp, content, {})
-
-
-def _bag_path(file: Path) -> Path:
-    """Return what the reader opens: a .db3 belongs to a folder with its metadata."""
-    if file.suffix.lower() != ".db3" or not (file.parent / "metadata.yaml").is_file():
-        return file
-    bag_parts(file.parent)
-    return file.parent
 
 
 def _bound_messages(reader: Any, file: Path) -> Callable[[bytes], bytes]:

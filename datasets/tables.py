@@ -597,7 +597,8 @@ def read_matlab_table(path: str | Path, columns: Sequence[str] | None = None) ->
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", MatReadWarning)  # of objects without names
             content = loadmat(source, simplify_cells=True)
-    arrays = dict(_matlab_arrays({k: v for k, v in content.items() if not k.startswith("__")}))
+    members = [*_matlab_members({k: v for k, v in content.items() if not k.startswith("__")})]
+    arrays = dict(_matlab_arrays(members))
     lengths = [values.shape[0] for values in arrays.values() for _ in range(values.shape[1])]
     if not lengths:
         hint = "save the signals as vectors or a matrix (timeseries and tables are objects of MATLAB's own)"
@@ -618,29 +619,27 @@ def read_matlab_table(path: str | Path, columns: Sequence[str] | None = None) ->
     if columns is not None:
         names = _new_names(columns, len(numbers), path)
         numbers = {k: v for k, v in zip(names, numbers.values()) if not k.startswith(_LEFT_OUT)}
-    scalars = dict(_matlab_scalars(content))
+    scalars = {name.lower(): value for name, value in members if isinstance(value, int | float) and value > 0}
     step = scalars.get("ts") or scalars.get("dt") or 1 / scalars.get("fs", 1.0)
     meta = {"dt": repr(float(step))}
     return Table(str(path), numbers, {}, np.arange(1, n + 1), meta=meta, notes=tuple(notes))
 
 
-def _matlab_arrays(found: Mapping[str, Any], depth: int = 0) -> Iterator[tuple[str, NDArray[np.float64]]]:
-    """Yield name and columns (n_row, n_column) of each array of numbers, those of structures among them."""
-    for name, value in found.items():
+def _matlab_members(found: Mapping[str, Any], depth: int = 0) -> Iterator[tuple[str, Any]]:
+    """Yield name and value of what a file holds, that of structures first."""
+    for value in found.values():
         if isinstance(value, dict) and depth < 4:
-            yield from _matlab_arrays(value, depth + 1)
-        elif isinstance(value, np.ndarray) and value.dtype.kind in "fiub" and value.ndim in (1, 2):
+            yield from _matlab_members(value, depth + 1)
+    yield from found.items()
+
+
+def _matlab_arrays(members: Sequence[tuple[str, Any]]) -> Iterator[tuple[str, NDArray[np.float64]]]:
+    """Yield name and columns (n_row, n_column) of each array of numbers."""
+    for name, value in members:
+        if isinstance(value, np.ndarray) and value.dtype.kind in "fiub" and value.ndim in (1, 2):
             rows = value[:, None] if value.ndim == 1 else value if len(value) >= value.shape[1] else value.T
             if len(rows) > 1 and rows.shape[1]:
                 yield name, np.asarray(rows, dtype=float)
-
-
-def _matlab_scalars(found: Mapping[str, Any], depth: int = 0) -> Iterator[tuple[str, float]]:
-    """Yield name, in small letters, and value of each number above zero, those of structures first."""
-    for value in found.values():
-        if isinstance(value, dict) and depth < 4:
-            yield from _matlab_scalars(value, depth + 1)
-    yield from ((k.lower(), v) for k, v in found.items() if isinstance(v, int | float) and v > 0)
 
 
 def _unpacked_matlab(raw: bytes, path: str | Path) -> bytes:
@@ -738,7 +737,8 @@ def _bytes_of(path: str | Path) -> bytes:
 def _decoded(data: bytes, file: str, *, strict: bool = False) -> tuple[str, tuple[str, ...]]:
     """Return text, UTF-16 where its mark says so, as spreadsheets write it; what is not UTF-8 is taken as
     Windows-1252, and that is noted."""
-    wide, notes = data.startswith((b"\xff\xfe", b"\xfe\xff")), ()
+    notes: tuple[str, ...] = ()
+    wide = data.startswith((b"\xff\xfe", b"\xfe\xff"))
     if not wide and (b"\0" in data[:4096] or data[:1] == b"\x80"):
         raise UserError("is not text, so it is not CSV", file=file, hint="export it as comma-separated text")
     try:
