@@ -156,7 +156,7 @@ def check_data(
     findings += _excitation(grid)
     for place, name in enumerate(u):
         findings += _feedback_to(name, place, grid, logs)
-    findings += [_set_point(log_name(log), name) for log in logs for name in _set_points(log)]
+    findings += [finding for log in logs for finding in _set_points(log)]
     return DataCheck(tuple(findings))
 
 
@@ -383,21 +383,21 @@ def _window(logs: Sequence[Log], name: str) -> float:
     return window if window > _CHECKS.rows_a_window * row and np.mean(even) >= _CHECKS.even_windows else 0.0
 
 
-def _set_points(log: Log) -> list[str]:
-    """Return the columns of a log that are set points by their names, or by what follows them."""
+def _set_points(log: Log) -> list[Finding]:
+    """Return a finding for each column of a log that is a set point by its name, or by what follows it."""
     units = {str(name): str(item.attrs.get("units", "1")) for name, item in log.items()}
     by_course = [
         line.partition(": ")[0] for line in log.attrs.get("guesses", "").splitlines() if FOLLOWED in line
     ]
-    return [n for n, unit in units.items() if explain_role(n, unit)[1] == IS_SET_POINT or n in by_course]
-
-
-def _set_point(log: str, name: str) -> Finding:
+    found = [n for n, unit in units.items() if explain_role(n, unit)[1] == IS_SET_POINT or n in by_course]
     says = (
-        f"{name} is a set point: recorded in closed loop, if its controller was on; noise is in the input "
-        "too, so trust simulation-error fits and not one-step fits"
+        "{} is a set point: recorded in closed loop, if its controller was on; noise is in the input too, so "
+        "trust simulation-error fits and not one-step fits"
     )
-    return Finding("feedback", log, name, float("nan"), "1", "warn", says)
+    nothing = float("nan")
+    return [
+        Finding("feedback", log_name(log), name, nothing, "1", "warn", says.format(name)) for name in found
+    ]
 
 
 def _effect_regression(grid: Grid, at: int, *, own: int, others: int) -> tuple[Array, Array]:
@@ -442,18 +442,15 @@ def reading_excess(logs: Sequence[Rows], outputs: Sequence[str], seconds: float)
     within = [max(0.0, 1.0 - rows.step / seconds) for rows in logs]
     out = {}
     for k, name in enumerate(outputs):
-        squares = np.concatenate([
-            share * _second_differences(rows.y[:, k], np.diff(rows.time)) for rows, share in zip(logs, within)
-        ])  # fmt: skip
+        second_differences = []
+        for rows, share in zip(logs, within):
+            steps = np.diff(rows.time)
+            even = steps < 1.5 * np.median(steps)  # readings that follow each other without a gap
+            second_differences.append(share * np.diff(rows.y[:, k], n=2)[even[1:] & even[:-1]] ** 2)
+        squares = np.concatenate(second_differences)
+        squares = squares[np.isfinite(squares)]
         out[name] = float(np.sqrt(squares.mean() / 6)) if squares.size else 0.0
     return out
-
-
-def _second_differences(y: Array, steps: Array) -> Array:
-    """Return the squared second differences of readings that follow each other without a gap."""
-    even = steps < 1.5 * np.median(steps)
-    squares = np.diff(y, n=2)[even[1:] & even[:-1]] ** 2
-    return np.asarray(squares[np.isfinite(squares)])
 
 
 @dataclass(frozen=True)
@@ -484,7 +481,10 @@ class Evidence:
 
 def evidence(plant: Plant, logs: Sequence[Rows]) -> Evidence:
     """Return what ``logs``, in the plant's signals, cover of its inputs and outputs."""
-    spent = [_spent(np.diff(rows.time)) for rows in logs]
+    spent = []  # seconds that each row's input was held; beyond a gap it is unknown
+    for rows in logs:
+        held = np.append(np.diff(rows.time), rows.step)
+        spent.append(np.minimum(held, max(GAP_SECONDS, GAP_STEPS * rows.step)))
     total = float(sum(seconds.sum() for seconds in spent)) / 60
     minutes: dict[str, float] = {}
     thin = []
@@ -502,13 +502,6 @@ def evidence(plant: Plant, logs: Sequence[Rows]) -> Evidence:
             low, high = np.nanpercentile(values, [1, 99])
             ranges[name] = (float(low), float(high))
     return Evidence(ranges, minutes, total, tuple(thin))
-
-
-def _spent(steps: Array) -> Array:
-    """Return the seconds that each row's input was held, from those between rows."""
-    usual = float(np.median(steps))
-    # beyond a gap the input is unknown
-    return np.asarray(np.minimum(np.append(steps, usual), max(GAP_SECONDS, GAP_STEPS * usual)))
 
 
 def _kinds(name: str, values: Sequence[Array], *, on_off: bool) -> dict[str, list[Mask]]:

@@ -260,7 +260,7 @@ def _shrunk(
         return cells, value
     for _ in range(halvings):
         share = 0.5 * (low + high)
-        trial = _drawn(frame, cells, share)
+        trial = np.where(frame.switch, cells, frame.still + share * (cells - frame.still))
         trial_value = evaluate(trial)
         if np.isfinite(trial_value):
             low = share
@@ -269,11 +269,6 @@ def _shrunk(
         else:
             high = share
     return best, value
-
-
-def _drawn(frame: _Frame, cells: Array, share: float) -> Array:
-    """Return cells with so much of their distance from rest; switches stay."""
-    return np.where(frame.switch, cells, frame.still + share * (cells - frame.still))
 
 
 def _exchanged(frame: _Frame, cells: Array, pool: list[Array], rng: np.random.Generator) -> Array:

@@ -2,9 +2,6 @@ import typing
 
 from thermogrip.sysid.export.dynamics import plant_dynamics as plant_dynamics
 from thermogrip.sysid.plant.linearise import linearise_plant as linearise_plant
-from thermogrip.sysid.plant.linearise import to_casadi as to_casadi
-from thermogrip.sysid.plant.linearise import to_control as to_control
-from thermogrip.sysid.plant.linearise import to_scipy as to_scipy
 
 if typing.TYPE_CHECKING:  # doors of 0.1.0, which are found and not listed
     from thermogrip.sysid.export.dynamics import Dynamics as Dynamics

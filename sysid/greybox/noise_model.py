@@ -171,9 +171,8 @@ def information(numbers: ErrorModel, logs: Sequence[LogData], ref: Array) -> Inf
 
 def learn_error_model(logs: Sequence[LogData], ref: Array, *, width: Sequence[float]) -> ErrorModel:
     """Return the numbers that the residuals support best."""
-    if sum(block.n for log in logs for block in log.blocks) < 10:
-        raise ValueError("need ten bins at least")
-    n_y, n_kind = _n_outputs(logs), len(width)
+    blocks = [block for log in logs for block in log.blocks]
+    n_y, n_kind = 1 + max(max(block.outputs) for block in blocks), len(width)
     mean, sd = _hyper_prior(logs, n_y)
     mean, sd = np.append(mean, np.zeros(n_kind)), np.append(sd, width)
 
@@ -269,7 +268,8 @@ def _slopes(v: Array, numbers: ErrorModel, block: Block, uncertain: Array) -> Ar
         if n_y > 1:
             k = N_SLOW + n_y * (1 + N_SLOW) + m
             across = float(share.sum() - share[:, range(n_y), range(n_y)].sum())
-            out[k] = across / numbers.correlation[m] * _correlation_rate(v[k], n_y)
+            rate = 0.999 * (1 + 1 / (n_y - 1)) * 0.5 * (1 - np.tanh(v[k]) ** 2)  # d correlation / d v
+            out[k] = across / numbers.correlation[m] * rate
     return out
 
 
@@ -296,7 +296,12 @@ def band_weights(n: int) -> Array:
 
 def _hyper_prior(logs: Sequence[LogData], n_y: int) -> tuple[Array, Array]:
     """Return mean and sd of the unconstrained numbers: ln tau, ln w, ln a, correlations."""
-    scale = np.array([_residual_rms(logs, j) for j in range(n_y)])
+    total, count = np.zeros(n_y), np.zeros(n_y)  # rms residuals about each stretch's mean, its first cosine
+    for block in (block for log in logs for block in log.blocks):
+        for k, j in enumerate(block.outputs):
+            total[j] += block.products[1:, k, k, -1, -1].sum()
+            count[j] += block.n
+    scale = np.maximum(np.sqrt(total / np.maximum(count, 1)), 1e-6)
     span = float(np.median([max(block.n for block in log.blocks) for log in logs]))
     mean = [np.log(3.0), np.log(max(span / 20, 9.0)), *np.log(0.3 * scale)]
     sd = [0.7, 0.7] + [1.0] * n_y
@@ -324,22 +329,3 @@ def _unpack(v: Array, n_y: int, n_kind: int) -> ErrorModel:
     tau = tuple(float(a) for a in np.exp(v[:N_SLOW]))
     spread = tuple(float(a) for a in np.exp(v[v.size - n_kind :])) if n_kind else ()
     return ErrorModel(at(0), tau, tuple(at(1 + m) for m in range(N_SLOW)), tuple(correlation), spread)
-
-
-def _correlation_rate(x: float, n_y: int) -> float:
-    """Return d correlation / d x of :func:`_unpack`."""
-    return float(0.999 * (1 + 1 / (n_y - 1)) * 0.5 * (1 - np.tanh(x) ** 2))
-
-
-def _n_outputs(logs: Sequence[LogData]) -> int:
-    return 1 + max(max(block.outputs) for log in logs for block in log.blocks)
-
-
-def _residual_rms(logs: Sequence[LogData], j: int) -> float:
-    """Return the rms residual of an output about each stretch's mean (its first cosine)."""
-    total, count = 0.0, 0
-    for block in (block for log in logs for block in log.blocks if j in block.outputs):
-        k = block.outputs.index(j)
-        total += float(block.products[1:, k, k, -1, -1].sum())
-        count += block.n
-    return max(float(np.sqrt(total / max(count, 1))), 1e-6)

@@ -47,6 +47,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -287,7 +288,10 @@ def run_chain(
     for _ in sampler.sample(state, iterations=max_steps, skip_initial_state_check=True):
         n_step = sampler.iteration
         if n_step % DRAW.check_steps == 0 or n_step == max_steps:
-            tau = _autocorrelation(sampler.get_chain())
+            with np.errstate(invalid="ignore"):
+                tau = np.asarray(sampler.get_autocorr_time(tol=0, quiet=True))
+            # the whole chain for a dimension in which a walker has not moved yet
+            tau = np.maximum(np.where(np.isfinite(tau), tau, n_step), 1.0)
             slowest = float(np.max(tau))
             if progress is not None:
                 share = max(n_step / max_steps, min(1.0, n_step / (LENGTH * slowest)))
@@ -325,16 +329,6 @@ def _proposals(mean: Array, covariance: Array) -> Callable[..., tuple[Array, Arr
     return propose
 
 
-def _autocorrelation(steps: Array) -> Array:
-    """Return the integrated autocorrelation times, never below one step, and the whole chain for a dimension
-    in which a walker has not moved yet."""
-    from emcee.autocorr import integrated_time
-
-    with np.errstate(invalid="ignore"):
-        times = np.asarray(integrated_time(steps, tol=0, quiet=True), dtype=float)
-    return np.asarray(np.maximum(np.where(np.isfinite(times), times, len(steps)), 1.0))
-
-
 @dataclass(frozen=True, eq=False)
 class Posterior:
     """The record of a posterior."""
@@ -354,11 +348,12 @@ class Posterior:
     off_centre: float  # of the medians from the fitted values, in standard deviations, at most
     verdict: str  # one sentence
     ess: dict[str, float]  # effective number of samples of each sampled parameter, by its autocorrelation
-    r_hat: dict[str, float]  # split R-hat over the walkers; an ensemble's walkers are not independent chains
 
     def inference_data(self) -> Any:
         """Return the chain and, as ``posterior_whole``, the whole samples: arviz ``InferenceData``."""
-        arviz = _arviz()
+        with warnings.catch_warnings():  # its import announces its next major version once a day
+            warnings.simplefilter("ignore", FutureWarning)
+            arviz: Any = import_module("arviz")
         chain = np.moveaxis(self.chain.steps, 1, 0)  # arviz wants (chain, draw)
         about = {"likelihood": self.likelihood, "verdict": self.verdict, "converged": int(self.converged)}
         data = arviz.from_dict(
@@ -566,16 +561,4 @@ def _record(
         off_centre=float(np.max(np.abs(np.median(whole, axis=0) - z) / whole.std(axis=0))),
         verdict=verdict,
         ess={name: drawn.settled[..., 0].size / tau for name, tau in zip(names, chain.tau.tolist())},
-        r_hat={
-            name: float(_arviz().rhat(drawn.settled[..., i].T, method="split"))
-            for i, name in enumerate(names)
-        },
     )
-
-
-def _arviz() -> Any:
-    """Return arviz, whose import announces its next major version once a day."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", FutureWarning)
-        import arviz
-    return arviz

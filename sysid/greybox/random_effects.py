@@ -171,7 +171,8 @@ def linearise_logs(
 ) -> Linearised:
     """Return residuals, sensitivities and effects of each log at ``z``."""
     starts, p = problem.start(z), problem.parameters(z[None])
-    merge = _merge(problem)
+    longest = max(_n_bins(problem, at, k) for at, (s, _) in enumerate(problem.logs) for k in range(len(s)))
+    merge = max(1, int(np.ceil(longest / EFFECTS.most_bins)))  # bins averaged to one
     runs = [_simulations(problem, log_index, p, begin) for log_index, begin in enumerate(starts)]
     discrepancy = discrepancy_responses(problem, runs)
     signals_of = list(dict.fromkeys(f"term {signal}" for signal, _ in discrepancy))
@@ -323,12 +324,6 @@ def _in_residual_units(problem: Problem, parts: list[list[Array]]) -> list[list[
 
 def _n_bins(problem: Problem, at: int, k: int) -> int:
     return max((int(place[-1]) + 1 for place in problem.logs[at][1][k].places if place.size), default=0)
-
-
-def _merge(problem: Problem) -> int:
-    """Return the number of bins averaged to one."""
-    longest = max(_n_bins(problem, at, k) for at, (s, _) in enumerate(problem.logs) for k in range(len(s)))
-    return max(1, int(np.ceil(longest / EFFECTS.most_bins)))
 
 
 def _binned_pieces(

@@ -540,14 +540,6 @@ class NetworkModel(Described):
         """Return what the sensors read at state x [degC], a list of length n_y."""
         return self.steps.read(x, ())
 
-    def flows(self, x: Values, u: Values, d: Values, p: Values) -> list[Any]:
-        """Return the heat that each state receives [W] (sensors: [K]), a list of length n_x."""
-        return self.steps.heat(x, u, d, p)
-
-    def capacities(self, p: Values) -> list[Any]:
-        """Return the heat capacity of each state [J/K] (sensors: lag [s]), a list of length n_x."""
-        return self.steps.prepare(p)[: self.n_x]
-
     def rest(self, y: ArrayLike, u: ArrayLike, d: ArrayLike, p: ArrayLike) -> Array:
         """Return the state (n_x,) of a plant at rest whose sensors read y; see the module's theory."""
         return np.asarray(self.rest_of_each(y, u, d, np.asarray(p, dtype=float)[None])[0])
@@ -590,7 +582,7 @@ class NetworkModel(Described):
         inputs: list[Any] = list(u)
         for share, i in enumerate(moved):
             inputs[i] = v[..., share] * full[share]
-        flow = self.flows(states, inputs, list(d), list(p.T[:, :, None]))
+        flow = self.steps.heat(states, inputs, list(d), list(p.T[:, :, None]))
         is_read = np.isfinite(y)
         read = np.stack(self.output(states, ()), axis=-1)
         residuals = [

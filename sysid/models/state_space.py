@@ -24,7 +24,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -109,7 +108,10 @@ class StateSpaceModel(BlackBox):
 
     def step(self, x: Values, u: Values, d: Values, p: Values, dt: float) -> list[Any]:
         """Return the state one step later, in plain arithmetic (numbers, NumPy rows or CasADi symbols)."""
-        phi = [product_of(factors, u, d, len(self.inputs)) for factors in self._term_factors]
+        phi = [
+            product_of(factors, u, d, len(self.inputs))
+            for factors in read_terms(self.terms, self.inputs + self.disturbances)
+        ]
         push = [
             self.c[i] + _dot(self.B[i], u) + _dot(self.E[i], d) + _dot(self.F[i], phi)
             for i in range(self.n_x)
@@ -132,7 +134,8 @@ class StateSpaceModel(BlackBox):
     def rest(self, y: ArrayLike, u: ArrayLike, d: ArrayLike, p: ArrayLike) -> Array:
         """Return the state (n_x,) of a plant at rest whose outputs read y (see the module's theory)."""
         u, d, y = (np.asarray(value, dtype=float) for value in (u, d, y))
-        A, push = self._frozen(u, d)
+        switched = (u[self.inputs.index(name)] * matrix for name, matrix in self.A_switch.items())
+        A, push = self.A + sum(switched, 0.0 * self.A), self.push(u, d)
         move = np.array([name not in self.switches for name in self.inputs], dtype=bool)
         gain = (self.B + self._term_slopes(u, d))[:, move]
         n_v = gain.shape[1]
@@ -201,7 +204,10 @@ class StateSpaceModel(BlackBox):
 
     def poles(self) -> NDArray[np.complex128]:
         """Return the eigenvalues of A at the position of the switches where the largest is largest."""
-        sets = [np.linalg.eigvals(matrix) for matrix in self._positions()]
+        positions = [self.A]
+        for matrix in self.A_switch.values():
+            positions += [position + matrix for position in positions]
+        sets = [np.linalg.eigvals(position) for position in positions]
         return np.asarray(max(sets, key=lambda roots: float(np.abs(roots).max(initial=0.0))), dtype=complex)
 
     @property
@@ -220,17 +226,6 @@ class StateSpaceModel(BlackBox):
         """Return the steady gain (n_y, n_u) of the linear part with the switches off."""
         return np.asarray(self.C @ np.linalg.solve(np.eye(self.n_x) - self.A, self.B))
 
-    @cached_property
-    def _term_factors(self) -> list[list[tuple[int, bool]]]:
-        return read_terms(self.terms, self.inputs + self.disturbances)
-
-    def _frozen(self, u: Array, d: Array) -> tuple[Array, Array]:
-        """Return A and the drive at fixed inputs."""
-        A = self.A + sum(
-            (u[self.inputs.index(key)] * matrix for key, matrix in self.A_switch.items()), 0.0 * self.A
-        )
-        return A, self.push(u, d)
-
     def _term_slopes(self, u: Array, d: Array) -> Array:
         """Return F dphi/du at (u, d), shape (n_x, n_u), by central differences of a small step."""
         if not self.terms:
@@ -242,12 +237,6 @@ class StateSpaceModel(BlackBox):
         )
         up, down = (evaluate_terms(self.terms, names, rows) for rows in joined)
         return np.asarray(self.F @ ((up - down) / 2e-3).T)
-
-    def _positions(self) -> list[Array]:
-        out = [self.A]
-        for matrix in self.A_switch.values():
-            out += [some + matrix for some in out]
-        return out
 
 
 def _shaped(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:

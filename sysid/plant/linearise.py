@@ -14,8 +14,7 @@ arithmetic, n steps composed.  **Continuous**: the heat balance itself for a net
 a model of the user's own, and for a black box the logarithm of [[A, B], [0, 1]] over its step, which undoes
 the hold; a delay (a pole at zero) has no such logarithm and is refused.
 
-:func:`to_control` and :func:`to_scipy` hand these on; :func:`to_casadi` is one step of the plant itself, for
-optimisation, with exact derivatives.
+python-control and scipy are handed these; CasADi one step of the plant itself, with exact derivatives.
 """
 
 from __future__ import annotations
@@ -224,30 +223,19 @@ def _steady_state(plant: PlantData, u: Array, d: Array) -> Array:
     )
 
 
-def _central_differences(function: Callable[[Array], Array], at: Array, columns: Sequence[int]) -> Array:
-    """Return d function / d at[columns], (n, n_column), from one batch of central differences."""
-    size = LINEAR.difference_step * np.maximum(1.0, np.abs(at[list(columns)]))
-    ahead = np.zeros((len(columns), at.size))
-    ahead[np.arange(len(columns)), list(columns)] = size
-    values = function(np.vstack([at + ahead, at - ahead]))
-    n = len(columns)
-    return np.asarray(((values[:n] - values[n:]) / (2 * size[:, None])).T)
-
-
 def _jacobians(
     function: Callable[[Array, Array, Array], Array], x: Array, u: Array, d: Array, moved: Sequence[int]
 ) -> tuple[Array, Array]:
-    """Return derivatives of function(x, u, d) by x, and by the moved inputs and the disturbances."""
-    point = np.concatenate([x, u, d])
-    n_x = x.size
-    n_u = u.size
-    columns = [*range(n_x), *(n_x + k for k in moved), *(n_x + n_u + k for k in range(d.size))]
-
-    def joined(z: Array) -> Array:
-        return function(z[:, :n_x], z[:, n_x : n_x + n_u], z[:, n_x + n_u :])
-
-    both = _central_differences(joined, point, columns)
-    return both[:, :n_x], both[:, n_x:]
+    """Return derivatives of function(x, u, d) by x, and by the moved inputs and the disturbances, from one
+    batch of central differences."""
+    point, ends = np.concatenate([x, u, d]), [x.size, x.size + u.size]
+    columns = [*range(x.size), *(x.size + k for k in moved), *range(ends[1], point.size)]
+    size = LINEAR.difference_step * np.maximum(1.0, np.abs(point[columns]))
+    ahead = np.zeros((len(columns), point.size))
+    ahead[np.arange(len(columns)), columns] = size
+    values = function(*np.split(np.vstack([point + ahead, point - ahead]), ends, axis=1))
+    both = ((values[: len(columns)] - values[len(columns) :]) / (2 * size[:, None])).T
+    return both[:, : x.size], both[:, x.size :]
 
 
 def _discrete(plant: PlantData, x: Array, u: Array, d: Array, moved: Sequence[int]) -> tuple[Array, Array]:
@@ -294,11 +282,12 @@ def _rate(plant: PlantData) -> Callable[[Array, Array, Array], Array] | None:
     model: Any = plant.model
     p = plant.p.tolist()
     if plant.model.kind == "network":
+        capacities = model.steps.prepare(p)[: model.n_x]
 
         def heated(x: Array, u: Array, d: Array) -> Array:
-            flows = model.flows(list(x.T), list(u.T), list(d.T), p)
-            rates = [flow / c for flow, c in zip(flows, model.capacities(p))]
-            return np.stack([np.broadcast_to(rate, len(x)) for rate in rates], axis=1)
+            flows = model.steps.heat(list(x.T), list(u.T), list(d.T), p)
+            rates = [np.broadcast_to(flow / capacity, len(x)) for flow, capacity in zip(flows, capacities)]
+            return np.stack(rates, axis=1)
 
         return heated
     if plant.model.kind == "own":
@@ -311,39 +300,9 @@ def _rate(plant: PlantData) -> Callable[[Array, Array, Array], Array] | None:
     return None
 
 
-def to_control(
-    plant: PlantData,
-    *,
-    inputs: Mapping[str, float] | None = None,
-    disturbances: Mapping[str, float] | None = None,
-    state: ArrayLike | None = None,
-    dt: float | None = None,
-) -> Any:
-    """Return the plant about an operating point as a python-control ``StateSpace``.
-
-    Its signals are changes from that point, by the plant's names (dots in the names of states become
-    underscores); :func:`thermogrip.sysid.plant.linearise.linearise_plant` with the same arguments has the
-    point.
-
-    Parameters
-    ----------
-    plant, inputs, disturbances, state, dt
-        As for :func:`thermogrip.sysid.plant.linearise.linearise_plant`.
-
-    Raises
-    ------
-    UserError
-        If ``control`` is not installed, or there is no linear model at the point.
-
-    Examples
-    --------
-    >>> from thermogrip.sysid.greybox.problem import prior_plant
-    >>> from thermogrip.sysid.models.network import load_network
-    >>> system = to_control(prior_plant(load_network("tclab")), inputs={"q1": 30.0})
-    >>> system.input_labels, system.output_labels, bool(max(system.poles().real) < 0)
-    (['q1', 'q2'], ['t1', 't2'], True)
-    """
-    linear = linearise_plant(plant, inputs=inputs, disturbances=disturbances, state=state, dt=dt)
+def to_control(plant: PlantData, **point: Any) -> Any:
+    """Return a plant for python-control; see :meth:`thermogrip.sysid.plant.plant.Plant.to_control`."""
+    linear = linearise_plant(plant, **point)
     D = np.zeros((len(linear.outputs), len(linear.inputs)))
     return control_system(linear, (linear.A, linear.B, linear.C, D, linear.dt or 0), linear.name)
 
@@ -363,67 +322,18 @@ def control_system(labels: Any, numbers: Sequence[Any], name: str) -> Any:
     )
 
 
-def to_scipy(
-    plant: PlantData,
-    *,
-    inputs: Mapping[str, float] | None = None,
-    disturbances: Mapping[str, float] | None = None,
-    state: ArrayLike | None = None,
-    dt: float | None = None,
-) -> Any:
-    """Return the plant about an operating point as a ``scipy.signal.StateSpace``, discrete where dt is given.
-
-    scipy names no signals: inputs are the plant's without its switches, then its disturbances, in order.
-
-    Parameters
-    ----------
-    plant, inputs, disturbances, state, dt
-        As for :func:`thermogrip.sysid.plant.linearise.linearise_plant`.
-
-    Examples
-    --------
-    >>> from thermogrip.sysid.greybox.problem import prior_plant
-    >>> from thermogrip.sysid.models.network import load_network
-    >>> system = to_scipy(prior_plant(load_network("tclab")), inputs={"q1": 30.0}, dt=2.0)
-    >>> type(system).__name__, system.dt, bool(np.abs(np.linalg.eigvals(system.A)).max() < 1)
-    ('StateSpaceDiscrete', 2.0, True)
-    """
+def to_scipy(plant: PlantData, **point: Any) -> Any:
+    """Return a plant for scipy; see :meth:`thermogrip.sysid.plant.plant.Plant.to_scipy`."""
     from scipy import signal
 
-    linear: LinearPlant = linearise_plant(plant, inputs=inputs, disturbances=disturbances, state=state, dt=dt)
+    linear = linearise_plant(plant, **point)
+    step = {} if linear.dt is None else {"dt": linear.dt}
     D = np.zeros((len(linear.outputs), len(linear.inputs)))
-    if dt is None:
-        return signal.StateSpace(linear.A, linear.B, linear.C, D)
-    return signal.StateSpace(linear.A, linear.B, linear.C, D, dt=dt)
+    return signal.StateSpace(linear.A, linear.B, linear.C, D, **step)
 
 
 def to_casadi(plant: PlantData, *, dt: float | None = None) -> Any:
-    """Return one step of the plant as a CasADi ``Function`` (x, u, d, p) -> (x_next, y).
-
-    y is what the sensors read at x, before the step.  The order within x, u, d, p and y is that of
-    :func:`~thermogrip.sysid.plant.linearise.state_labels`, ``plant.inputs`` (switches among them),
-    ``plant.disturbances``, ``plant.model.parameters`` and ``plant.outputs``; ``plant.p`` are its parameters.
-
-    Parameters
-    ----------
-    plant : Plant
-    dt : float, optional
-        Length of the step [s], a whole multiple of the plant's, which it is where absent.
-
-    Raises
-    ------
-    UserError
-        If dt is no multiple, or a model of the user's own cannot be written in symbols.
-
-    Examples
-    --------
-    >>> from thermogrip.sysid.greybox.problem import prior_plant
-    >>> from thermogrip.sysid.models.network import load_network
-    >>> plant = prior_plant(load_network("tclab"))
-    >>> step = to_casadi(plant)
-    >>> step
-    Function(step:(x[4],u[2],d[0],p[11])->(x_next[4],y[2]) SXFunction)
-    """
+    """Return a step for CasADi; see :meth:`thermogrip.sysid.plant.plant.Plant.to_casadi`."""
     import casadi as ca
 
     model = plant.model

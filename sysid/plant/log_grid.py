@@ -136,9 +136,7 @@ class Grid:
 
     def of(self, logs: Sequence[Log], *, average: float | None = None, ends: bool = False) -> Grid:
         """Return logs on a grid like this one, of its step or of ``average`` [s]."""
-        u = self.inputs
-        y = self.outputs
-        d = self.disturbances
+        u, y, d = self.inputs, self.outputs, self.disturbances
         return make_grid(logs, inputs=u, outputs=y, disturbances=d, average=average or self.dt, ends=ends)
 
     def having(self, segments: Sequence[Segment]) -> Grid:
@@ -212,7 +210,10 @@ def cut_stretches(plant: PlantData, log: Log, *, gaps: str = "mend") -> list[Str
 
     def steps(seconds: float) -> int:
         n = max(1, int(np.ceil((seconds + middle) / plant.dt - 1e-9)))
-        _check_steps(n, plant, rows.log)
+        n_signals = len(plant.inputs) + len(plant.disturbances) + len(plant.outputs)
+        if 8 * n * n_signals > most_bytes(_GRIDS):  # refused before its grid is made
+            hint = "cut the log, or use a plant of a longer step"
+            raise UserError(f"would be simulated in {n} steps of {plant.dt:g} s", file=rows.log, hint=hint)
         return n
 
     rows = rows.from_row_on() if plant.inputs_end_at_row else rows
@@ -415,15 +416,6 @@ def _segments(rows: Rows, step: float, native: float) -> list[Segment]:
     return out
 
 
-def _check_steps(n: int, plant: PlantData, log: str) -> None:
-    """Refuse a run of more steps than there is room for, before its grid is made."""
-    signals = len(plant.inputs) + len(plant.disturbances) + len(plant.outputs)
-    if 8 * n * signals > most_bytes(_GRIDS):
-        took = f"{n} steps of {plant.dt:g} s"
-        hint = "cut the log, or use a plant of a longer step"
-        raise UserError(f"would be simulated in {took}", file=log, hint=hint)
-
-
 def _smooth(time: Array, values: Array, edges: Array, seconds: float) -> Array:
     """Return means (N, n_d) over ``seconds`` (the step, if longer) about the middle of each step."""
     middle = (edges[1:] + edges[:-1]) / 2
@@ -548,7 +540,10 @@ def match_logs(model: Signals, logs: Logs, *, keep_others: bool = False) -> tupl
                 f"{name}: no such column, taken as 0{'' if unit == '1' else f' {unit}'} throughout"
             ] = None
     matched = list(logs)
-    largest = {name: _largest_magnitude([column(log, name) for log in logs]) for name in role_of}
+    largest = {
+        name: max((float(np.nanmax(np.abs(column(log, name)), initial=0.0)) for log in logs), default=0.0)
+        for name in role_of
+    }
     for index, log in enumerate(logs):
         changed = {}
         for name in role_of:
@@ -588,7 +583,3 @@ def _converted(model: Signals, name: str, unit: str, largest: float, log: str) -
     if unit == "1" and largest > 1 + _SLACK:
         return 1.0, f"{name}: has no unit and values up to {largest:g}, taken as {want}"
     return SHARES[want] / SHARES[unit], f"{name}: converted from {unit} to {want}"
-
-
-def _largest_magnitude(columns: Sequence[Array]) -> float:
-    return max((float(np.nanmax(np.abs(values), initial=0.0)) for values in columns), default=0.0)

@@ -259,21 +259,67 @@ class Plant(Shown, plant_data.PlantData):
             return cls(model=equations, samples=samples, refits=refits, **fields)
 
     def to_control(self, **point: Any) -> Any:
-        """Return the plant about an operating point for python-control; see
-        :func:`thermogrip.sysid.plant.linearise.to_control`."""
+        """Return the plant about an operating point as a python-control ``StateSpace``.
+
+        Its signals are changes from that point, by the plant's names (dots in the names of states become
+        underscores).
+
+        Parameters
+        ----------
+        **point
+            As for :func:`thermogrip.sysid.plant.linearise.linearise_plant`, which has the point as well.
+
+        Raises
+        ------
+        UserError
+            If ``control`` is not installed, or there is no linear model at the point.
+
+        Examples
+        --------
+        >>> from thermogrip.sysid.greybox.problem import prior_plant
+        >>> from thermogrip.sysid.models.network import load_network
+        >>> system = prior_plant(load_network("tclab")).to_control(inputs={"q1": 30.0})
+        >>> system.input_labels, system.output_labels, bool(max(system.poles().real) < 0)
+        (['q1', 'q2'], ['t1', 't2'], True)
+        """
         from thermogrip.sysid.plant.linearise import to_control  # pulls in scipy.linalg
 
         return to_control(self, **point)
 
     def to_scipy(self, **point: Any) -> Any:
-        """Return the plant about an operating point for scipy; see
-        :func:`thermogrip.sysid.plant.linearise.to_scipy`."""
+        """Return the plant about an operating point as a ``scipy.signal.StateSpace``, discrete where dt is
+        given; ``point`` as for :meth:`to_control`.
+
+        scipy names no signals: inputs are the plant's without its switches, then its disturbances, in order.
+        """
         from thermogrip.sysid.plant.linearise import to_scipy
 
         return to_scipy(self, **point)
 
     def to_casadi(self, *, dt: float | None = None) -> Any:
-        """Return one step as a CasADi function; see :func:`thermogrip.sysid.plant.linearise.to_casadi`."""
+        """Return one step of the plant as a CasADi ``Function`` (x, u, d, p) -> (x_next, y).
+
+        y is what the sensors read at x, before the step.  The order within x, u, d, p and y is that of
+        :func:`~thermogrip.sysid.plant.linearise.state_labels`, ``inputs`` (switches among them),
+        ``disturbances``, ``model.parameters`` and ``outputs``; :attr:`p` are its parameters.
+
+        Parameters
+        ----------
+        dt : float, optional
+            Length of the step [s], a whole multiple of the plant's, which it is where absent.
+
+        Raises
+        ------
+        UserError
+            If dt is no multiple, or a model of the user's own cannot be written in symbols.
+
+        Examples
+        --------
+        >>> from thermogrip.sysid.greybox.problem import prior_plant
+        >>> from thermogrip.sysid.models.network import load_network
+        >>> prior_plant(load_network("tclab")).to_casadi()
+        Function(step:(x[4],u[2],d[0],p[11])->(x_next[4],y[2]) SXFunction)
+        """
         from thermogrip.sysid.plant.linearise import to_casadi
 
         return to_casadi(self, dt=dt)

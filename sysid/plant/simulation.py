@@ -100,22 +100,19 @@ def predict(
     for index, (stretch, start) in enumerate(zip(stretches, starts)):
         d = stretch.d - start.d_offset
         if index == 0:
-            x0 = _first_state(model, p, stretch, start)
+            x0 = np.repeat(start.x0[None], len(p), axis=0)
+            if start.level is None and len(p) > 1:
+                y, u, d_rest = _about_start(stretch, start)
+                if hasattr(model, "rest_of_each"):  # of networks: a fit asks for hundreds
+                    x0 = model.rest_of_each(y, u, d_rest, p) + start.shift
+                else:
+                    x0 = np.array([model.rest(y, u, d_rest, row) for row in p]) + start.shift
         else:
             u_gap, d_gap, dt_gap = _through_gap(stretches[index - 1], stretch, start, [start.change], dt)
             x0 = model.rollout(x_end, u_gap, d_gap, p, dt_gap)[1] + start.shift
         y, x_end = model.rollout(x0, stretch.u[None], d[None], p, dt)
         out.append(y + start.offset(dt * np.arange(y.shape[1], dtype=np.float64)))
     return out
-
-
-def _first_state(model: Model, p: Array, stretch: Stretch, start: Start) -> Array:
-    if start.level is not None or len(p) == 1:
-        return np.repeat(start.x0[None], len(p), axis=0)
-    y, u, d = _about_start(stretch, start)
-    together = getattr(model, "rest_of_each", None)  # of networks: a fit asks for hundreds
-    rests = np.array([model.rest(y, u, d, row) for row in p]) if together is None else together(y, u, d, p)
-    return np.asarray(rests + start.shift)
 
 
 class _RestPoint(NamedTuple):

@@ -212,8 +212,8 @@ def parameters_section(plant: Plant, record: Posterior | None = None) -> Section
             Picture(corner_figure(record), caption),
             Text(_sentence(record.likelihood)),
             Text(
-                f"emcee moved {', '.join(record.sampled)}, which have an effective number of samples (ESS) "
-                "and R-hat; the others were integrated out and fitted to each sample. "
+                f"emcee moved {', '.join(record.sampled)}, which have an effective number of samples (ESS); "
+                "the others were integrated out and fitted to each sample. "
                 f"{record.n_steps} steps, {record.verdict}, {100 * record.acceptance:.0f} % accepted. "
                 f"Medians lie within {record.off_centre:.2f} standard deviations of the fitted values."
             ),
@@ -247,8 +247,8 @@ def known_words(plant: Plant) -> list[str]:
 
 
 def parameter_table(plant: Plant, record: Posterior | None = None) -> Cells:
-    """Return the free parameters with their 90 % intervals, and those of the prior; with ``record`` mean, sd,
-    effective number of samples and R-hat too."""
+    """Return the free parameters with their 90 % intervals, and those of the prior; with ``record`` mean, sd
+    and effective number of samples too."""
     intervals = plant.intervals(0.9)
     before = _prior_intervals(plant)
     nothing = (None, None)
@@ -261,12 +261,12 @@ def parameter_table(plant: Plant, record: Posterior | None = None) -> Cells:
         for name in plant.free
     ]  # fmt: skip
     if record is not None:
-        head[3:3], head[7:7] = ["mean", "sd"], ["ESS", "R-hat"]
+        head[3:3], head[7:7] = ["mean", "sd"], ["ESS"]
         for k, row in enumerate(rows):
             draws = record.samples[:, k]
             row[3:3] = [float(draws.mean()), float(draws.std(ddof=1))]
             ess = record.ess.get(row[0])
-            row[7:7] = [None if ess is None else round(ess), record.r_hat.get(row[0])]
+            row[7:7] = [None if ess is None else round(ess)]
     return tuple(head), tuple(map(tuple, rows))
 
 

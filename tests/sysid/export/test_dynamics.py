@@ -13,7 +13,6 @@ from thermogrip.sysid.experiment.information import plant_from_prior
 from thermogrip.sysid.export.dynamics import plant_dynamics
 from thermogrip.sysid.models.network import load_network
 from thermogrip.sysid.models.state_space import StateSpaceModel
-from thermogrip.sysid.plant.linearise import to_control, to_scipy
 from thermogrip.sysid.plant.plant import Plant
 
 FAST, SLOW = np.exp(-2.0 / 8.0), np.exp(-2.0 / 50.0)  # steps of 2 s: 8 s and 50 s
@@ -122,7 +121,7 @@ def test_disturbances_have_a_gain_without_the_spread_between_runs():
 def test_responses_of_a_network_are_those_of_scipy_and_python_control():
     plant = plant_from_prior(load_network("tclab"))
     point = {"inputs": {"q1": 30.0, "q2": 20.0}}
-    found, system = plant_dynamics(plant, **point, draws=0), to_scipy(plant, **point, dt=plant.dt)
+    found, system = plant_dynamics(plant, **point, draws=0), plant.to_scipy(**point, dt=plant.dt)
     time, step = found.step_response(40)
     every = round(time[1] / plant.dt)
     _, answers = signal.dstep(system, n=40 * every + 1)
@@ -130,7 +129,7 @@ def test_responses_of_a_network_are_those_of_scipy_and_python_control():
         np.testing.assert_allclose(step.value[:, :, j], answer[::every], rtol=1e-7, atol=1e-9)
     assert time[-1] == pytest.approx(5 * found.time_constants[0], rel=0.04)  # whole steps
     omega, size, phase = found.frequency_response(30)
-    wanted = to_control(plant, **point, dt=plant.dt).frequency_response(omega).complex
+    wanted = plant.to_control(**point, dt=plant.dt).frequency_response(omega).complex
     np.testing.assert_allclose(size.value, np.moveaxis(np.abs(wanted), 2, 0), rtol=1e-6)
     turned = (phase.value - np.degrees(np.moveaxis(np.angle(wanted), 2, 0)) + 180) % 360 - 180
     np.testing.assert_allclose(turned, 0.0, atol=1e-5)

@@ -107,10 +107,3 @@ def test_the_error_is_reported_in_seconds_and_the_outputs_units():
     )
     one = ErrorModel((1.0,), (2.0,), ((0.5,),), (0.0,)).describe(("t",), 4.0, [(0.1, "degC")])
     assert one == "model error t 0.05 degC over 8 s"
-
-
-def test_nine_bins_teach_nothing():
-    rng = np.random.default_rng(4)
-    with pytest.raises(ValueError, match="need ten bins"):
-        learn_error_model([log_of(rng.normal(size=(9, 1)), (0,))], np.zeros(1), width=())
-    learn_error_model([log_of(rng.normal(size=(5, 1)), (0,))] * 2, np.zeros(1), width=())

@@ -251,7 +251,7 @@ def declared(numbers: dict[str, tuple[str, float]], **tables: Any) -> dict[str, 
 
 
 def heats(model: NetworkModel, x: list[float], u: list[float], d: tuple[float, ...] = ()) -> list[float]:
-    return [float(q) for q in model.flows(x, u, list(d), model.prior.tolist())]
+    return [float(q) for q in model.steps.heat(x, u, list(d), model.prior.tolist())]
 
 
 def test_a_bent_link_between_two_bodies_takes_from_one_what_it_gives_to_the_other():
@@ -333,7 +333,7 @@ def test_what_a_network_says_of_its_signals_is_what_its_file_says():
     assert (model.switches, model.average, model.dt) == (("pump",), 7.0, 0.5)
     assert (model.independent, model.warmup, model.smooth) == (60.0, 60.0, 20.0)
     np.testing.assert_allclose(np.sqrt(np.diag(model.spread)), [1.0, 3.0, 1.0] + [0.5] * 6)
-    assert [float(c) for c in model.capacities(model.prior.tolist())] == pytest.approx(
+    assert [float(c) for c in model.steps.prepare(model.prior.tolist())[: model.n_x]] == pytest.approx(
         [500.0, 200.0, 80.0, 48.0, 15.0, 48.0, 15.0, 96.0, 3.0]
     )
     plain = model_of(everything())
@@ -531,7 +531,7 @@ def test_rest_for_many_parameters_is_that_for_each(name: str, y: list[float], u:
     np.testing.assert_allclose(found[-1], model.rest_of_each(y, u, d, p[-1:])[0], rtol=0, atol=0)
     if name == "tclab":  # all of the heater holds some of them there, and not others
         nodes, full = len(model.network.nodes), [100.0, 0.0]
-        gains = [sum(model.flows(x, full, d, row)[:nodes]) for x, row in zip(found, p)]
+        gains = [sum(model.steps.heat(x, full, d, row)[:nodes]) for x, row in zip(found, p)]
         assert min(gains) < -0.01
         assert max(gains) > 0.01
 
