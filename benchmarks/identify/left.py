@@ -5,7 +5,7 @@
 ``tclab``: logs of a TCLab with the numbers of the virtual board, white noise of 0.043 K, its converter's
 steps; 25 min of random pulses.  ``rig``: logs of the gripper's network, fitted to the bundled ones, with
 their inputs, white noise of 0.04 K, steps of 1/16 K and a slow error.  ``power``: a TCLab that has what the
-fitted network lacks.  With the test is given the count of lags outside of their bands, whose place it took.
+fitted network lacks.
 """
 
 from __future__ import annotations
@@ -163,12 +163,8 @@ def row(name: str, cases: Iterable[Case]) -> str:
     runs = [free_run(plant, log, warmup=w, score_from=begin) for plant, log, w, begin in cases]
     rmse = np.median([[s.rmse for s in run.scores.values()] for run in runs], axis=0)
     errors = ", ".join(f"{r:.3f}" for r in rmse)
-    said = (np.mean([about(run) for run in runs]) for about in (_lags_outside, _named, _told))
+    said = (np.mean([about(run) for run in runs]) for about in (_named, _told))
     return f"| {name} | {len(runs)} | {errors} | {' | '.join(f'{share:.2f}' for share in said)} |"
-
-
-def _lags_outside(run: FreeRun) -> bool:
-    return any(not found.independent for row in run.input_correlation.values() for found in row.values())
 
 
 def _named(run: FreeRun) -> bool:
@@ -186,8 +182,8 @@ def main() -> None:
     parser.add_argument("--only", default="tclab,rig,power")
     parser.add_argument("--seed", type=int, default=0)
     given = parser.parse_args()
-    print("| plant and log | logs | RMSE [degC] | by count of lags | by the test | start reported |")
-    print("|---|---|---|---|---|---|")
+    print("| plant and log | logs | RMSE [degC] | by the test | start reported |")
+    print("|---|---|---|---|---|")
     kinds = {"tclab": tclab, "rig": rig, "power": power}
     for name in given.only.split(","):
         for what, cases in kinds[name](given.logs, np.random.default_rng(given.seed)):

@@ -9,15 +9,8 @@ Theta all monomials up to a degree, and Xi sparse: sequentially thresholded leas
 Proctor, Kutz) drops what is smaller than a threshold, refits, and repeats.  The increment is fitted rather
 than the next value, so that the threshold weighs what moves the plant and not its persistence.
 
-**Weak form.**  One increment of a slow plant is mostly noise.  With a smooth bump phi of a few rows the same
-equations hold for sums,
-
-    sum_j phi_j (y[k+j+1] - y[k+j]) = Xi' sum_j phi_j Theta(z[k+j]),
-
-the noise of a reading then enters through the differences of phi alone (the summation by parts that lets the
-weak form of a differential equation do without derivatives; Messenger and Bortz), and the terms are averaged
-too.  Degree, threshold, memory and width of the bump (0: single increments) are chosen by held-out free run;
-an equation whose simulation leaves ten times the range of the data is refused.
+Degree, threshold and memory are chosen by held-out free run; an equation whose simulation leaves ten times
+the range of the data is refused.
 """
 
 from __future__ import annotations
@@ -44,33 +37,30 @@ def sindy_family(
     degrees: Sequence[int] = (1, 2),
     thresholds: Sequence[float] = (0.0, 0.01, 0.05),
     memories: Sequence[int] = (1, 2),
-    widths: Sequence[int] = (0, 12, 36),
     only: Collection[Structure] | None = None,
 ) -> Mapping[Structure, SindyModel]:
     """Return a model for each degree, threshold and memory whose simulation stays bounded.
 
-    Thresholds of STLSQ are relative to the largest coefficient, ``memories`` are past values of each output,
-    ``widths`` are rows of the bump of the weak form; with a memory of more than 1, width 0 alone is tried.
+    Thresholds of STLSQ are relative to the largest coefficient, ``memories`` are past values of each output.
     """
     out: dict[Structure, SindyModel] = {}
     n_y, outside = len(grid.outputs), len(grid.inputs) + len(grid.disturbances)
     for degree, memory in product(degrees, memories):
         n_term = comb(memory * n_y + outside + degree, degree)
-        wanted: dict[Structure, tuple[float, int]] = {}
-        for width, (rank, threshold) in product(widths, enumerate(sorted(thresholds))):
-            if width and memory > 1:
-                continue
+        wanted: dict[Structure, float] = {}
+        for rank, threshold in enumerate(sorted(thresholds)):
             # the same on every fold, however many terms survive there: all terms, less for each threshold
             label = f"degree {degree}, memory {memory}, threshold {threshold:g}"
-            label += f", weak over {width} rows" if width else ""
             structure = Structure(label, max(1, n_y * n_term - rank))
             if only is None or structure in only:
-                wanted[structure] = threshold, width
+                wanted[structure] = threshold
         terms = _features(grid, degree, memory) if wanted else None
-        fitted = (
-            {} if terms is None else {some: _fit_terms(grid, terms, *how) for some, how in wanted.items()}
-        )
-        out |= {some: model for some, model in fitted.items() if model is not None}
+        if terms is None:
+            continue
+        for structure, threshold in wanted.items():
+            model = _fit_terms(grid, terms, threshold)
+            if model is not None:
+                out[structure] = model
     return out
 
 
@@ -78,8 +68,8 @@ def sindy_family(
 class _Features:
     """Monomials and increments of every run of whole rows, and what they were scaled with."""
 
-    theta: list[Array]
-    move: list[Array]
+    theta: Array
+    move: Array
     powers: NDArray[np.int_]
     middle: Array
     size: Array
@@ -91,8 +81,7 @@ def _features(grid: Grid, degree: int, memory: int) -> _Features | None:
     import pysindy
 
     trajectories = _trajectories(grid, memory)
-    counts = [len(run.move) for run in trajectories]
-    if not trajectories or sum(counts) < 3 * memory * len(grid.outputs) + 20:
+    if sum(len(run.move) for run in trajectories) < 3 * memory * len(grid.outputs) + 20:
         return None
     variables = np.concatenate([run.variables for run in trajectories])
     middle, size = variables.mean(axis=0), variables.std(axis=0)
@@ -100,8 +89,8 @@ def _features(grid: Grid, degree: int, memory: int) -> _Features | None:
     library = pysindy.PolynomialLibrary(degree=degree)
     theta = np.asarray(library.fit_transform((variables - middle) / size), dtype=float)
     return _Features(
-        theta=np.split(theta, np.cumsum(counts)[:-1]),
-        move=[run.move for run in trajectories],
+        theta=theta,
+        move=np.concatenate([run.move for run in trajectories]),
         powers=np.asarray(library.powers_, dtype=int),
         middle=middle,
         size=size,
@@ -109,11 +98,11 @@ def _features(grid: Grid, degree: int, memory: int) -> _Features | None:
     )
 
 
-def _fit_terms(grid: Grid, terms: _Features, threshold: float, width: int) -> SindyModel | None:
+def _fit_terms(grid: Grid, terms: _Features, threshold: float) -> SindyModel | None:
     import pysindy
 
-    weight = np.maximum(np.concatenate(terms.move).std(axis=0), 1e-12)
-    theta, move = _bumped(terms, width)
+    theta, move = terms.theta, terms.move
+    weight = np.maximum(move.std(axis=0), 1e-12)
     if len(theta) < 2 * theta.shape[1]:
         return None
     with warnings.catch_warnings():
@@ -129,22 +118,6 @@ def _fit_terms(grid: Grid, terms: _Features, threshold: float, width: int) -> Si
             i, int(np.flatnonzero((exponents == np.eye(exponents.shape[1], dtype=int)[i]).all(axis=1))[0])
         ] += 1
     return _bounded_model(grid, exponents, natural, terms.memory)
-
-
-def _bumped(terms: _Features, width: int) -> tuple[Array, Array]:
-    """Return terms and increments, summed with bumps of ``width`` rows that overlap by three quarters."""
-    if not width:
-        return np.concatenate(terms.theta), np.concatenate(terms.move)
-    place = (np.arange(width) + 0.5) / width * 2 - 1
-    bump = (1 - place**2) ** 2
-    bump /= np.linalg.norm(bump)
-    out = []
-    for runs in (terms.theta, terms.move):
-        long = [rows for rows in runs if len(rows) >= width]
-        views = [np.lib.stride_tricks.sliding_window_view(rows, width, axis=0) for rows in long]
-        sums = [view[:: max(1, width // 4)] @ bump for view in views]
-        out.append(np.concatenate(sums) if sums else np.empty((0, runs[0].shape[1])))
-    return out[0], out[1]
 
 
 def _bounded_model(grid: Grid, exponents: NDArray[np.int_], natural: Array, memory: int) -> SindyModel | None:

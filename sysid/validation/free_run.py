@@ -12,9 +12,9 @@ Beside the free run stand
 * **no input**: y = m + (y_first - m) exp(-t/tau), with m the mean of the scored samples and tau chosen in
   hindsight. A model that does not beat it has learnt nothing from the input.
 
-The residual is tested twice (:mod:`thermogrip.sysid.validation.residual_tests`): is it white, and does it
-correlate with an input? Whether that matters is another question: the verdict goes by how large the error is
-beside the stated one (:mod:`thermogrip.sysid.validation.verdict`).
+The residual is tested (:mod:`thermogrip.sysid.validation.residual_tests`): does it correlate with an input?
+Whether that matters is another question: the verdict goes by how large the error is beside the stated one
+(:mod:`thermogrip.sysid.validation.verdict`).
 
 After a gap of more than 10 s the input is unknown: the run starts afresh from its own warm-up, the next
 60 s are not scored, and the figure with the last row held through the gap is given with it.
@@ -41,11 +41,8 @@ from thermogrip.sysid.plant.fit_record import SEVERAL, fit_logs, said_of_fit
 from thermogrip.sysid.plant.log_grid import cut_stretches, match_logs
 from thermogrip.sysid.validation.residual_tests import (
     SQUARED,
-    Correlation,
     CorrelationTest,
     ResidualCorrelations,
-    autocorrelation,
-    cross_correlation,
     residual_correlations,
 )
 from thermogrip.sysid.validation.verdict import NO_BETTER, Cause, Verdict, judge
@@ -80,9 +77,6 @@ class FreeRun:
     one_step: dict[str, Score]  # of the last reading plus the model's move
     naive: dict[str, dict[str, Score]]  # of the baselines ``"mean"`` and ``"no_input"``
     held: dict[str, Score]  # with the last row held through the gaps; empty without a gap
-    whiteness: dict[str, Correlation]  # autocorrelation of the residual
-    # of the residual with the inputs before it, of those that move in this log; what a figure shows
-    input_correlation: dict[str, dict[str, Correlation]]
     # tests of the residual for correlation with signals; empty without ``tests``
     residual: ResidualCorrelations
     no_better: tuple[str, ...]  # outputs whose free run does not clearly beat the no-input baseline
@@ -161,8 +155,6 @@ def free_run(
         )
     simulated = plant.simulate(log, warmup=warmup, score_from=score_from)
     pairs = _beside(plant, log, simulated, average)
-    errors = {name: y - v for name, (y, v) in pairs.outputs.items()}
-    moved = {name: values for name, values in pairs.inputs.items() if np.ptp(values) > 0}
     scores, naive = _scores(plant, log, pairs), _baselines(plant, log, pairs)
     held = {}
     if gaps(log):
@@ -175,10 +167,6 @@ def free_run(
         one_step=_one_step(plant, log, pairs),
         naive=naive,
         held=held,
-        whiteness={name: autocorrelation(error) for name, error in errors.items()},
-        input_correlation={
-            name: {u: cross_correlation(error, w) for u, w in moved.items()} for name, error in errors.items()
-        },
         residual=tested.residual,
         no_better=tuple(
             name for name in plant.outputs if not scores[name].rmse < NO_BETTER * naive["no_input"][name].rmse
@@ -300,11 +288,10 @@ def no_input_baseline(time: Array, measured: Array) -> Array:
 
 
 class _Pairs(NamedTuple):
-    """Readings beside the run at the same times (n,), NaN where not scored, and the inputs there."""
+    """Readings beside the run at the same times (n,), NaN where not scored."""
 
     time: Array
     outputs: dict[str, tuple[Array, Array]]  # measured, simulated
-    inputs: dict[str, Array]
 
 
 def _beside(plant: Plant, log: Log, simulated: Log, average: float | None = None) -> _Pairs:
@@ -315,16 +302,14 @@ def _beside(plant: Plant, log: Log, simulated: Log, average: float | None = None
         hint = "give a longer log, or score from an earlier time"
         raise UserError(problem, file=log_name(log), hint=hint)
     read, run = (np.where(scored[:, None], columns(each, plant.outputs), np.nan) for each in (log, simulated))
-    inputs = columns(log, plant.inputs)
     if average is not None:
-        values, n_y = np.hstack([read, run, inputs]), len(plant.outputs)
-        is_held = np.arange(values.shape[1]) >= 2 * n_y
+        values, n_y = np.hstack([read, run]), len(plant.outputs)
+        is_held = np.zeros(2 * n_y, dtype=bool)
         after = [row + 1 for row, _, _ in gaps(log)]
         blocks = block_means(time, values, is_held, seconds=average, after=after, log=log_name(log))
         time, values = (np.concatenate(segments) for segments in zip(*blocks))
-        read, run, inputs = np.split(values, [n_y, 2 * n_y], axis=1)
-    pairs = dict(zip(plant.outputs, zip(read.T, run.T)))
-    return _Pairs(time, pairs, dict(zip(plant.inputs, inputs.T)))
+        read, run = np.split(values, 2, axis=1)
+    return _Pairs(time, dict(zip(plant.outputs, zip(read.T, run.T))))
 
 
 def _unit(log: Log, name: str) -> str:
@@ -380,7 +365,7 @@ def _notes(run: FreeRun, by_inputs: InputEffect | None) -> list[str]:
     outside = _outside(plant, {name: column(log, name) for name in plant.valid if name in log})
     unseen = [name for name in outside if name not in plant.outputs]
     units = {name: _unit(log, name) for name in plant.outputs}
-    notes += _residual_notes(run.whiteness, run.residual, units, run.warmup, unseen, verdict)
+    notes += _residual_notes(run.residual, units, run.warmup, unseen, verdict)
     if by_inputs is not None:
         remaining = ", ".join(f"{name} {rms:.2g} {units[name]}" for name, rms in by_inputs.remaining.items())
         notes.append(f"most of the error is {by_inputs.words()}, which would leave {remaining}")
@@ -389,7 +374,6 @@ def _notes(run: FreeRun, by_inputs: InputEffect | None) -> list[str]:
 
 
 def _residual_notes(
-    whiteness: Mapping[str, Correlation],
     residual: ResidualCorrelations,
     units: Mapping[str, str],
     warmup: float,
@@ -398,10 +382,8 @@ def _residual_notes(
 ) -> list[str]:
     """Return notes on the residuals of each output."""
     notes, small = [], _small(verdict)
-    for name, own in whiteness.items():
-        if not own.independent:
-            notes.append(f"{name}: residuals are not white; intervals from their variance are narrow")
-        significant = {s: f for s, f in residual.tests.get(name, {}).items() if f.significant}
+    for name, tests in residual.tests.items():
+        significant = {signal: found for signal, found in tests.items() if found.significant}
         notes += [
             _correlation_note(name, *item, units[name], unseen, small=small) for item in significant.items()
         ]

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 
 from thermogrip.datasets.schema import Log, make_log
 from thermogrip.report import plant
-from thermogrip.report.html import Picture, Plot, Table, Text
+from thermogrip.report.html import Plot, Table, Text
 from thermogrip.report.plant import _prior_intervals, free_run_section, parameter_table
 from thermogrip.sysid.data.signal_roles import SignalRole
 from thermogrip.sysid.experiment.information import plant_from_prior
@@ -68,7 +68,7 @@ def test_a_free_run_s_page_has_its_scores_band_and_baselines(run: tuple[Plant, L
     assert section.title == f"Free run: {log.attrs['name']}"
     assert free_run_section(found, seen=True).title.endswith(" (in the fit)")
     assert free_run_section(found, seen=True, title="Mine").title == "Mine"
-    picture, table, residuals = section.parts[:3]
+    picture, table = section.parts[:2]
     assert isinstance(picture, Plot)
     assert [panel.label for panel in picture.chart.columns[0]] == ["t [degC]", "error [K]", "inputs"]
     assert f"Readings of the first {found.warmup:.3g} s set the state" in picture.caption
@@ -77,7 +77,6 @@ def test_a_free_run_s_page_has_its_scores_band_and_baselines(run: tuple[Plant, L
         (log.attrs["name"], "t", score.rmse, score.unit, score.fit_percent, score.n,
          naive["no_input"]["t"].rmse, naive["mean"]["t"].rmse, found.one_step["t"].rmse),
     )  # fmt: skip
-    assert isinstance(residuals, Picture)
     tied = free_run_section(replace(found, no_better=("t",), notes=("a note",)))
     assert (tied.tone, tied.parts[-1]) == ("warn", Text("a note."))
     assert "; t no better than a model without input; " in tied.verdict

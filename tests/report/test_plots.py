@@ -30,7 +30,6 @@ from thermogrip.report.plots import (
     grasps_chart,
     loops_chart,
     models_figure,
-    residual_figure,
     steps_chart,
 )
 from thermogrip.rig import Session
@@ -38,7 +37,6 @@ from thermogrip.sysid import free_run, identify
 from thermogrip.sysid.export.dynamics import Estimate
 from thermogrip.sysid.plant.fit_record import PlantScores
 from thermogrip.sysid.validation.prediction_bands import Band
-from thermogrip.sysid.validation.residual_tests import Correlation
 from thermogrip.sysid.validation.verdict import Row
 
 
@@ -102,16 +100,6 @@ def free_run_of(n: int) -> Figure:
     return draw_chart(free_run_chart(run, ("t1", "level"), band))
 
 
-def residuals_of() -> Figure:
-    def correlation(scale: float) -> Correlation:
-        return Correlation(np.arange(6), scale * np.linspace(1.0, -0.5, 6), 0.125)
-
-    whiteness = {name: correlation(scale) for name, scale in (("t1", 1.0), ("level", 0.5), ("t2", 0.25))}
-    left = {name: {"q1": correlation(0.2), "drive": correlation(-0.2)} for name in whiteness}
-    run = {"whiteness": whiteness, "input_correlation": left, "measured": waves(12)}
-    return residual_figure(SimpleNamespace(**run))
-
-
 def models_of() -> Figure:
     rows = [
         Row(model, "order 1", log, output, rmse, 90.0, {"t1": "degC"}.get(output, "V"), 10, 1.0, log != "own")
@@ -163,7 +151,6 @@ def grasps_of(*labels: str) -> Any:
 FIGURES = {
     "free run": lambda: free_run_of(12),
     "free run of many rows": lambda: free_run_of(3001),
-    "residuals": residuals_of,
     "models": models_of,
     "corner": corner_of,
     "loops": loops_of,

@@ -83,7 +83,7 @@ def coupled() -> SimpleNamespace:
 def _fit_one(kind: str, grid: Grid, *, variant: str = "", **orders: Any) -> Model:
     plain: dict[str, dict[str, Any]] = {"subspace": {"terms": ()}}
     plain |= {kind: {"terms": (), "delays": 1} for kind in ("arx", "oe")}
-    plain |= {"sindy": {"degrees": 2, "thresholds": 0.01, "memories": 1, "widths": 0}}
+    plain |= {"sindy": {"degrees": 2, "thresholds": 0.01, "memories": 1}}
     orders = plain.get(kind, {}) | orders
     tried = {name: value if name == "members" else (value,) for name, value in orders.items()}
     found = {s.label: m for s, m in family_of(kind)(grid, **tried).items() if variant in s.label}

@@ -332,12 +332,6 @@ def free_run_section(
             for k in range(0, len(outputs), 2)
         ),
         Table(*run_table([run]), _BASELINES),
-        Picture(
-            plots.residual_figure(run),
-            "Correlation of the residuals with themselves and with the inputs before them; shaded: 95 % of "
-            "the lags of white residuals. Lags of a slow input leave the shade together, by chance too; "
-            "a line below reports the inputs with which they correlate.",
-        ),
     ]
     evidence += [Text(_sentence(note)) for note in run.notes if note != str(run.verdict)]
     title = title or f"Free run: {name}" + (" (in the fit)" if seen else "")

@@ -74,29 +74,6 @@ def free_run_chart(run: FreeRun, outputs: Sequence[str], band: Band | None = Non
     return Chart(tuple(columns))
 
 
-def residual_figure(run: FreeRun) -> Figure:
-    """Draw the correlation of residuals with themselves and with the inputs before them, a row an output; the
-    shaded bands cover 95 % of the lags of white residuals."""
-    outputs = tuple(run.whiteness)
-    row_s = float(np.median(np.diff(run.measured["time"].values)))
-    inputs = tuple(run.input_correlation[outputs[0]])
-    size = (max(6.4, 2.6 * (1 + len(inputs))), 1.7 * len(outputs))
-    figure, axes = panels(len(outputs), 1 + len(inputs), size=size, sharex="col")
-    for row, name in zip(axes, outputs):
-        shown = {f"{name}, own": run.whiteness[name]}
-        shown |= {f"{name} after {u}": correlation for u, correlation in run.input_correlation[name].items()}
-        for axis, (title, correlation) in zip(row, shown.items()):
-            axis.axhspan(-correlation.band, correlation.band, color=MODEL, alpha=0.15, lw=0)
-            axis.vlines(correlation.lags * row_s, 0.0, correlation.values, color=PALETTE[1], lw=1.2)
-            axis.axhline(0, color=TARGET, lw=0.6)
-            axis.set_ylim(-1.05, 1.05)
-            axis.set_title(title, fontsize=8)
-        row[0].set_ylabel("correlation")
-    for axis in axes[-1]:
-        axis.set_xlabel("lag [s]")
-    return figure
-
-
 def models_figure(rows: Sequence[Row]) -> Figure:
     """Draw the held-out free-run error of every model, a panel an output, on a logarithmic scale."""
     held_out = [row for row in rows if row.held_out]

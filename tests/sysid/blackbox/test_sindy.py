@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from itertools import product
 
 import casadi as ca
 import numpy as np
@@ -59,29 +58,6 @@ def test_the_equation_of_the_simulation_is_found_in_degrees_and_runs_free_over_a
     assert np.sqrt(np.mean(free_run_error(linear) ** 2)) > 0.1
 
 
-def test_the_weak_form_is_exact_without_noise(grid, fit_one):
-    model = fit_one("sindy", grid, thresholds=0.0, widths=20)
-    assert coefficient(model, [0, 1]) == pytest.approx(0.5, rel=1e-3)
-    assert coefficient(model, [2, 0]) == pytest.approx(-0.0005, rel=1e-2)
-
-
-def test_under_reading_noise_the_weak_form_runs_free_where_single_increments_do_not(fit_one):
-    log = radiating_log(1500)
-    log["t"].values[:] += 0.3 * np.random.default_rng(7).standard_normal(1500)
-    noisy = make_grid([log], average=1.0)
-    plain, weak = (fit_one("sindy", noisy, thresholds=0.0, widths=width) for width in (0, 36))
-    assert np.linalg.norm(free_run_error(weak)) < 0.5 * np.linalg.norm(free_run_error(plain))
-
-
-@pytest.mark.parametrize(
-    ("rows", "orders"),
-    [(60, {"degrees": (1,), "widths": (100,)}), (30, {"degrees": (3,), "memories": (3,), "widths": (0,)})],
-    ids=["shorter than the bump", "fewer rows than terms"],
-)
-def test_too_few_rows_give_no_model(rows, orders):
-    assert not sindy_family(make_grid([radiating_log(rows)], average=1.0), **orders)
-
-
 def test_several_logs_of_different_length_are_fitted_together(fit_one):
     logs = [radiating_log(300, seed=1, name="a"), radiating_log(500, seed=2, name="b")]
     model = fit_one("sindy", make_grid(logs, average=1.0), thresholds=0.001)
@@ -126,30 +102,28 @@ def test_a_dict_makes_the_model_again_and_a_broken_one_is_refused(grid, fit_one)
         SindyModel.from_dict(model.to_dict() | {"coefficients": [[1.0]]})
 
 
-def test_the_structures_are_degrees_thresholds_memories_and_widths(grid, monkeypatch):
+def test_the_structures_are_degrees_thresholds_and_memories(grid, monkeypatch):
     monkeypatch.setattr(sindy, "_features", lambda grid, degree, memory: (degree, memory))
-    monkeypatch.setattr(sindy, "_fit_terms", lambda grid, terms, threshold, width: (*terms, threshold, width))
+    monkeypatch.setattr(sindy, "_fit_terms", lambda grid, terms, threshold: (*terms, threshold))
     found = sindy_family(grid)
     # monomials of t and q (and of the last t): 3 and 4 of degree 1, 6 and 10 of degree 2
     terms = {(1, 1): 3, (1, 2): 4, (2, 1): 6, (2, 2): 10}
     want = {}
     for (n, m), count in terms.items():
-        for w, (at, h) in product((0, 12, 36) if m == 1 else (0,), enumerate((0.0, 0.01, 0.05))):
-            label = f"degree {n}, memory {m}, threshold {h:g}" + f", weak over {w} rows" * (w > 0)
-            want[Structure(label, count - at)] = n, m, h, w
+        for at, h in enumerate((0.0, 0.01, 0.05)):
+            want[Structure(f"degree {n}, memory {m}, threshold {h:g}", count - at)] = n, m, h
     assert found == want
     (only,) = sindy_family(
         grid,
         degrees=(0,),
         memories=(1,),
-        widths=(0,),
         thresholds=(0.3, 0.2),
         only=[Structure("degree 0, memory 1, threshold 0.3", 1)],
     ).values()
-    assert only == (0, 1, 0.3, 0)
+    assert only == (0, 1, 0.3)
 
 
-def test_rows_are_cut_at_lost_readings_scaled_and_summed_with_bumps():
+def test_rows_are_cut_at_lost_readings_and_scaled():
     y = np.array([1.0, 4.0, 9.0, 16.0, 25.0, 36.0, 49.0, 64.0, *[np.nan] * 6, *[7.0] * 5, np.nan])[:, None]
     q = np.arange(20.0)[:, None]
     part = Segment(np.arange(20.0), y, q, 10 * q, "a")
@@ -166,33 +140,10 @@ def test_rows_are_cut_at_lost_readings_scaled_and_summed_with_bumps():
     scaled = sindy._features(steady, 1, 1)  # the last of the 30 rows has no increment
     np.testing.assert_allclose(scaled.middle, [14, 14 / 29, 3])
     np.testing.assert_allclose(scaled.size, [np.sqrt(70), np.sqrt(14 * 15) / 29, 1])
-    np.testing.assert_allclose(scaled.theta[0][0], [1, -14 / np.sqrt(70), -np.sqrt(14 / 15), 0])
-    terms = sindy._Features(
-        [np.eye(8)[:, :1], np.eye(7)], [np.arange(16.0).reshape(8, 2), np.eye(7)], None, None, None, 1
-    )
-    theta, moved = sindy._bumped(replace(terms, theta=terms.theta[:1], move=terms.move[:1]), 8)
-    # (1 - v^2)^2 at v = 7/8, 5/8, 3/8, 1/8, of norm 1.8029
-    bump = np.array([0.054932, 0.371338, 0.738525, 0.968994]) / 1.802930
-    np.testing.assert_allclose(theta, [[bump[0]]], rtol=1e-4)
-    np.testing.assert_allclose(moved, [[14 * bump.sum(), 16 * bump.sum()]], rtol=1e-4)
-    assert [
-        len(part) for part in sindy._bumped(replace(terms, theta=[np.eye(13)], move=[np.eye(12)]), 8)
-    ] == [3, 3]
-    assert [
-        part.shape for part in sindy._bumped(replace(terms, theta=[np.eye(7)], move=[np.eye(7)]), 8)
-    ] == 2 * [(0, 7)]
+    np.testing.assert_allclose(scaled.theta[0], [1, -14 / np.sqrt(70), -np.sqrt(14 / 15), 0])
 
 
-@pytest.mark.parametrize(
-    ("rows", "width", "fits"), [(24, 0, True), (23, 0, False), (82, 36, True), (81, 36, False)]
-)
-def test_terms_need_rows(rows, width, fits):
-    # 3 * 1 + 20 increments; with a bump of 36 (81 - 36) / 9 + 1 sums, two for each of three terms
-    found = sindy_family(
-        make_grid([radiating_log(rows)], average=1.0),
-        degrees=(1,),
-        thresholds=(0.0,),
-        memories=(1,),
-        widths=(width,),
-    )
-    assert bool(found) == fits
+@pytest.mark.parametrize(("rows", "fits"), [(24, True), (23, False)])  # 3 * 1 + 20 increments
+def test_terms_need_rows(rows, fits):
+    grid = make_grid([radiating_log(rows)], average=1.0)
+    assert bool(sindy_family(grid, degrees=(1,), thresholds=(0.0,), memories=(1,))) == fits

@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
-import pandas as pd
 import pytest
 from scipy.signal import lfilter
-from scipy.stats import binom
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.log_files import read_log, write_log
@@ -20,11 +17,8 @@ from thermogrip.sysid.plant.plant import Plant
 from thermogrip.sysid.validation import free_run as module
 from thermogrip.sysid.validation.free_run import free_run, no_input_baseline, score
 from thermogrip.sysid.validation.residual_tests import (
-    Correlation,
     CorrelationTest,
     ResidualCorrelations,
-    autocorrelation,
-    cross_correlation,
 )
 
 
@@ -53,7 +47,6 @@ def test_the_rmse_of_the_true_plant_is_the_noise():
     run = free_run(lag_plant(), lag_log(4000, noise=0.1, seed=1))
     # sd of a sample standard deviation: 0.1 / sqrt(2 n)
     assert run.scores["t"].rmse == pytest.approx(0.1, abs=4 * 0.1 / np.sqrt(2 * 3995) + 0.002)
-    assert run.whiteness["t"].independent
     assert run.no_better == ()
 
 
@@ -103,18 +96,11 @@ def test_the_score_with_the_last_row_held_stands_beside_that_of_a_run_with_a_gap
     assert free_run(lag_plant(), log).held == {}
 
 
-def test_averages_score_means_and_their_correlation_with_the_inputs_means():
+def test_averages_score_means():
     log = lag_log(2000, noise=0.3, seed=2)
     plain, mean = (free_run(lag_plant(), log, average=seconds).scores["t"] for seconds in (None, 10.0))
     assert mean.n == pytest.approx(plain.n / 10, abs=1)
     assert mean.rmse == pytest.approx(plain.rmse / np.sqrt(10), rel=0.15)
-    fast = np.resize([0.0, 1.0, 1.0, 0.0, 1.0], 2000)
-    log["q"] = ("time", log["q"].values + fast, log["q"].attrs)
-    run = free_run(lag_plant(), log, average=10.0, tests=False)
-    error = log["t"].values - np.where(run.log["scored"] > 0, run.log["t"].values, np.nan)
-    means = pd.DataFrame({"error": error, "q": log["q"].values}).groupby(np.arange(2000) // 10).mean()
-    want = cross_correlation(means["error"].to_numpy(), means["q"].to_numpy())
-    np.testing.assert_allclose(run.input_correlation["t"]["q"].values, want.values, rtol=1e-9)
 
 
 def test_inputs_outside_of_the_fit_are_noted():
@@ -155,41 +141,6 @@ def test_a_plant_file_of_version_0_1_0_knows_no_data_of_its_fit(tmp_path):
     plant = Plant.from_dict(content)
     assert plant.fitted_to == ()
     assert not any("in the fit:" in note for note in free_run(plant, lag_log(), tests=False).notes)
-
-
-@pytest.mark.parametrize("n_lags", [20, 40])
-def test_whiteness_bands_alarm_for_five_percent_of_the_lags_of_white_noise(n_lags):
-    rng = np.random.default_rng(4)
-    runs = [autocorrelation(rng.standard_normal(1000), n_lags) for _ in range(200)]
-    outside = sum(round(run.share_outside * n_lags) for run in runs)
-    low, high = binom.ppf([0.0005, 0.9995], 200 * n_lags, 0.05)
-    assert low <= outside <= high
-    assert np.mean([run.independent for run in runs]) > 0.95
-
-
-def test_correlations_are_the_sums_over_the_known_pairs():
-    rng = np.random.default_rng(4)
-    e, u = rng.standard_normal(37), rng.standard_normal(37)
-    e[[5, 6, 20]] = np.nan
-    known = np.isfinite(e)
-    a, b = (np.where(known, x - x[known].mean(), 0.0) for x in (e, u))
-    auto, cross = autocorrelation(e), cross_correlation(e, u)
-    assert auto.lags.tolist() == list(range(1, 10))  # a quarter of the record at most
-    assert cross.lags.tolist() == list(range(10))
-    np.testing.assert_allclose(auto.values, [a[k:] @ a[:-k] / (a @ a) for k in range(1, 10)], atol=1e-12)
-    want = [a[k:] @ b[: 37 - k] / np.sqrt((a @ a) * (b @ b)) for k in range(10)]
-    np.testing.assert_allclose(cross.values, want, atol=1e-12)
-    assert auto.band == pytest.approx(1.96 / np.sqrt(34))
-
-
-@pytest.mark.parametrize(("outside", "independent"), [(0, True), (5, True), (6, False)])
-def test_of_forty_lags_five_may_lie_outside_of_the_band(outside: int, independent: bool):
-    # 2 are expected; 99 % of a binomial ends at 2 + 2.33 * sqrt(40 * 0.05 * 0.95) + 0.5 = 5.7
-    values = np.where(np.arange(50) < outside, -0.2, 0.05)
-    values[40:] = np.nan
-    run = Correlation(np.arange(50.0), values, 0.1)
-    assert run.independent == independent
-    assert run.share_outside == outside / 40
 
 
 def test_what_cannot_be_scored_is_refused():
@@ -235,16 +186,12 @@ def offset_run(off: float, *, n: int = 101, scored_from: int = 0, q=None):
     return log, log.assign(t=log["t"] + off, scored=("time", 1.0 * (time >= scored_from)))
 
 
-def test_baselines_and_correlations_are_those_of_the_scored_readings():
+def test_baselines_are_those_of_the_scored_readings():
     log = lag_log(noise=0.1, seed=3)
     log["t"].values[40:50] = np.nan
     run = free_run(lag_plant(), log, tests=False)
-    q, y, v = (np.asarray(x) for x in (log["q"].values, log["t"].values.copy(), run.log["t"].values))
+    y, v = log["t"].values.copy(), run.log["t"].values
     y[:5] = np.nan
-    both = run.whiteness["t"], run.input_correlation["t"]["q"]
-    for found, want in zip(both, (autocorrelation(y - v), cross_correlation(y - v, q))):
-        np.testing.assert_allclose(found.values, want.values)
-        assert found.band == want.band
     known = np.isfinite(y)
     one = np.diff(y[known]) - np.diff(v[known])  # from the last reading that came
     assert run.one_step["t"].rmse == pytest.approx(np.sqrt(np.mean(one**2)))
@@ -295,19 +242,17 @@ def test_more_than_one_row_in_a_hundred_beyond_a_twentieth_of_the_range_is_outsi
 
 
 def test_notes_of_the_residual_to_the_letter():
-    white: dict = {"t": SimpleNamespace(independent=False), "r": SimpleNamespace(independent=True)}
     pairs = {"q": CorrelationTest(0.0012, 0.345, True), "w": CorrelationTest(0.0012, 0.345)}
-    residual = ResidualCorrelations({"t": pairs}, {"t": 0.5, "r": 0.123})
+    residual = ResidualCorrelations({"t": pairs, "r": {}}, {"t": 0.5, "r": 0.123})
     units = {"t": "K", "r": "K"}
-    assert module._residual_notes(white, residual, units, 7.5, []) == [
-        "t: residuals are not white; intervals from their variance are narrow",
+    assert module._residual_notes(residual, units, 7.5, []) == [
         "t: the residual correlates with q (rms 0.34 K, p = 0.001): a delay, lag or term is missing, or the "
         "plant is not what it was in the fit",
         "r: 12 % of the squared error is the start, which 7.5 s of readings do not determine; give a longer "
         "warm-up",
     ]
     at_most = ResidualCorrelations({"r": {}}, {"r": 0.1})
-    assert module._residual_notes({"r": white["r"]}, at_most, units, 5.0, []) == []
+    assert module._residual_notes(at_most, units, 5.0, []) == []
 
 
 @pytest.mark.parametrize(

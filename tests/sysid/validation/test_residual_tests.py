@@ -15,11 +15,8 @@ from thermogrip.sysid.plant.log_grid import cut_stretches
 from thermogrip.sysid.plant.plant import Plant
 from thermogrip.sysid.validation.free_run import FreeRun, free_run
 from thermogrip.sysid.validation.residual_tests import (
-    Correlation,
     CorrelationTest,
     ResidualCorrelations,
-    autocorrelation,
-    cross_correlation,
     marked_by_holm,
     residual_correlations,
 )
@@ -196,17 +193,3 @@ def test_one_right_model_in_a_hundred_is_suspected_by_any_of_its_tests(
 ) -> None:
     found = marked_by_holm({f"y{k}": {"u": CorrelationTest(value, 1.0)} for k, value in enumerate(p)})
     assert "".join("x" if row["u"].significant else "-" for row in found.values()) == significant
-
-
-def test_correlations_of_nothing_and_of_huge_values():
-    empty = Correlation(np.zeros(2), np.full(2, np.nan), 0.1)
-    assert (np.isnan(empty.share_outside), empty.independent) == (True, False)
-    e, u = np.random.default_rng(0).standard_normal((2, 200))
-    for none in (np.full(200, np.nan), np.full(200, 3.0)):
-        assert np.isnan(cross_correlation(e, none).values).all()
-        assert np.isnan(cross_correlation(none, u).values).all()
-    auto, cross = autocorrelation(e), cross_correlation(e, u)
-    assert (auto.lags[[0, -1]].tolist(), cross.lags[[0, -1]].tolist()) == ([1, 40], [0, 40])
-    np.testing.assert_allclose(cross_correlation(1e200 * e, 1e-100 * u).values, cross.values, atol=1e-12)
-    ra, ru = (np.correlate(x - x.mean(), x - x.mean(), "full")[200:249] / (200 * x.var()) for x in (e, u))
-    assert cross.band == pytest.approx(1.96 * np.sqrt(max(1 + 2 * ra @ ru, 1.0) / 200))
