@@ -21,7 +21,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,7 +56,7 @@ from thermogrip.sysid.effusivity.laplace_approximation import (
     unexplained,
 )
 from thermogrip.sysid.effusivity.posterior import EffusivityRow
-from thermogrip.sysid.effusivity.quality import NO_CONTACT, check_grasps
+from thermogrip.sysid.effusivity.quality import NO_CONTACT, GraspQuality, check_grasps
 
 if TYPE_CHECKING:
     from thermogrip.datasets.schema import Grasps
@@ -158,13 +158,12 @@ def answer(
     >>> first.material, round(first.probabilities["copper"], 2), first.decided_at, first.notes
     ('copper', 0.85, 10.0, ())
     """
-    names = [str(c) for c in (classifier.classes_ if candidates is None else candidates)]
-    if len(set(names)) < len(names):
-        raise UserError("a candidate is named twice", hint="name each once")
     return [
         one_answer
         for grasps in record_list(X)
-        for one_answer in _answers_of_record(classifier, grasps, names, rule, object_range, nearest=nearest)
+        for one_answer in answer_record(
+            classifier, grasps, candidates, rule, object_range, nearest=nearest
+        ).answers
     ]
 
 
@@ -176,11 +175,21 @@ def classify_grasps(
     return [one_answer.row() for one_answer in answer(classifier, X, candidates, **options)]
 
 
-def _answers_of_record(
-    classifier: GraspClassifier, as_read: Grasps, names: list[str], rule: StopRule | None,
+class AnsweredRecord(NamedTuple):
+    """What the grasps of one record touched, and what of them was usable."""
+
+    answers: list[Answer]
+    quality: GraspQuality
+
+
+def answer_record(
+    classifier: GraspClassifier, as_read: Grasps, candidates: Sequence[str] | None, rule: StopRule | None,
     object_range: tuple[float, float] | None, *, nearest: bool,
-) -> list[Answer]:  # fmt: skip
-    """Return the answers of one record: those that can be given, and what the others get."""
+) -> AnsweredRecord:  # fmt: skip
+    """Return :func:`answer` of one record: answers that can be given, and what the others get."""
+    names = [str(c) for c in (classifier.classes_ if candidates is None else candidates)]
+    if len(set(names)) < len(names):
+        raise UserError("a candidate is named twice", hint="name each once")
     whole, grasps = not classifier.leaves_samples_out, with_object_range(as_read, object_range)
     quality = check_grasps(grasps, longest=classifier.longest_, whole_traces=whole)
     usable, units = quality.read(grasps), unit_names(grasps)
@@ -199,7 +208,7 @@ def _answers_of_record(
         else:
             one = _no_answer(names, quality.reason[i], float(last[i]))
         answers.append(replace(one, grasp_id=grasp_id, notes=notes))
-    return answers
+    return AnsweredRecord(answers, quality)
 
 
 def _answers_of_usable(
@@ -302,18 +311,15 @@ _STRANGE = 0.5  # p_unknown
 
 
 def unexplained_effusivities(
-    device: GripperModel,
-    grasps: Grasps,
-    rows: Sequence[EffusivityRow],
-    stated: tuple[float, float] | None = None,
+    device: GripperModel, grasps: Grasps, rows: Sequence[EffusivityRow]
 ) -> dict[str, tuple[float, str]]:
     """Return the misfit of single touches under their effusivity [standard deviations], and in words why
-    that does not explain them, with unknown object temperatures in the range ``stated`` [degC]."""
+    that does not explain them."""
     ln_e = np.log([row.effusivity for row in rows])
     single = np.flatnonzero((label_values(grasps, "touch_group") == "") & np.isfinite(ln_e))
     if not single.size:
         return {}
-    data = touches(with_object_range(grasps, stated), at=single)
+    data = touches(grasps, at=single)
     hypotheses = free_hypotheses(device, device.found_effusivity(ln_e[single]))
     sd = np.log(10) * np.array([rows[i].log10_effusivity_sd for i in single])
     with_spread, row = hypotheses._replace(ln_e_sd=sd), np.arange(single.size)

@@ -45,7 +45,7 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.grasp_files import Records
 from thermogrip.datasets.parallel import Progress, Workers, run_parallel
 from thermogrip.datasets.schema import Grasps, log_name, unit_names
-from thermogrip.sysid.effusivity.quality import contact_faults
+from thermogrip.sysid.effusivity.quality import check_grasps, contact_faults
 
 LAST_UNTOUCHED = -0.5  # s; contact may precede the "closed" message by 0.3 s
 
@@ -198,7 +198,7 @@ def _session_faults(plan: Plan) -> list[Caution]:
     for fold in plan.folds:
         for record in (fold.train, fold.test):
             name = log_name(record)
-            for words in contact_faults(record) if fold.repeat == 0 else ():
+            for words in contact_faults(record, check_grasps(record)) if fold.repeat == 0 else ():
                 out[
                     Caution(
                         "session_fault",

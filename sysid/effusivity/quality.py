@@ -308,9 +308,9 @@ def longest_contact(records: Sequence[Grasps]) -> float:
     return max(float(end.max()) for end in ends)
 
 
-def contact_faults(grasps: Grasps) -> list[str]:
-    """Return in words what is wrong with the contacts of a record; nothing where all is well."""
-    quality = check_grasps(grasps)
+def contact_faults(grasps: Grasps, quality: GraspQuality) -> list[str]:
+    """Return in words what is wrong with the contacts of a record, by its :func:`check_grasps`; nothing where
+    all is well."""
     trace, spiked = quality._trace, quality.spiked
     clipped, difference = np.isfinite(quality.clipped_at), trace.difference
     still, wrong = trace.stays(LIMITS.odd_share), trace.contradicts()
@@ -336,7 +336,7 @@ def contact_faults(grasps: Grasps) -> list[str]:
     if wrong.any():
         faults.append(f"{named(wrong)}: {CONTRARY}")
     far_apart = (
-        (np.abs(difference) >= LIMITS.telling_difference_K)
+        (trace.away >= LIMITS.telling_difference_K)
         & ~still
         & ~wrong
         & bool(trace.time[-1] >= LIMITS.least_contact_s)

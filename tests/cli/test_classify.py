@@ -51,18 +51,23 @@ def of_files(stand_in: StandIn, records: Callable[[], list[Grasps]]) -> None:
 def gripper(bench: Bench, stand_in: StandIn) -> SimpleNamespace:
     """Return a bench whose grasps, calibration and posteriors are stand-ins."""
 
-    def quality(record: Grasps) -> SimpleNamespace:
-        why = made.why[: record.sizes["grasp"]] or [""] * record.sizes["grasp"]
-        usable = [not reason for reason in why]
-        kept = record.isel(grasp=np.array(usable)) if any(usable) else None
-        return SimpleNamespace(reason=why, usable=usable, usable_grasps=lambda _: kept)
+    def quality(record: Grasps, *, longest: float) -> SimpleNamespace:
+        n = record.sizes["grasp"]
+        why = made.why[:n] or [""] * n
+        usable = np.array([not reason for reason in why])
+        kept = record if usable.all() else record.isel(grasp=usable) if usable.any() else None
+        shortened = np.arange(n) < (made.shortened if longest == 9.0 else n)
+        return SimpleNamespace(reason=why, shortened=shortened, read=lambda _: kept)
 
-    made = SimpleNamespace(bench=bench, why=[])
+    made = SimpleNamespace(bench=bench, why=[], shortened=0, rested=False)
     made.records = [record_of(["a", "b"], "one"), record_of(["c"], "two")]
     of_files(stand_in, lambda: made.records)
     made.warned = stand_in("thermogrip.cli.options.warn_of_contacts")
     made.calibrated = stand_in("thermogrip.cli.classify.calibrated_device", ("device", "coupling", 9.0))
-    stand_in("thermogrip.cli.classify._as_taught", lambda console, record, *_: record)
+    stand_in(
+        "thermogrip.sysid.effusivity.multi_touch.rested_long",
+        lambda record, _: np.full(record.sizes["grasp"], made.rested),
+    )
     made.ranged = stand_in("thermogrip.sysid.effusivity.data.with_object_range", lambda record, _: record)
     stand_in(f"{QUALITY}.check_grasps", quality)
     made.posteriors = stand_in(
@@ -86,7 +91,7 @@ def test_effusivities_are_printed_written_and_answered(gripper: SimpleNamespace)
     assert [call.args[1] for call in gripper.ranged] == [(0.0, 12.0)] * 2
     assert (gripper.posteriors[0].args[0], gripper.posteriors[0].coupling) == ("device", "coupling")
     explained = gripper.explained[0].args
-    assert (explained[0], explained[1] is gripper.records[0], explained[3]) == ("device", True, (0.0, 12.0))
+    assert (explained[0], explained[1] is gripper.records[0]) == ("device", True)
     assert [call.args[1] for call in gripper.warned] == [[record] for record in gripper.records]
     said = words_of(done.out)
     assert "a 1000 500 2000 28" in said
@@ -130,7 +135,7 @@ def test_a_grasp_without_a_contact_has_no_effusivity(gripper: SimpleNamespace) -
     assert answer["without_contact"] == ["a", "c"]
     first = answer["grasps"][0]
     unknown = {key for key, value in first.items() if value is None}
-    assert set(first) - {"grasp_id", "misfit_sd"} == unknown
+    assert set(first) - {"grasp_id"} == unknown
     assert answer["grasps"][1]["effusivity"] == 1000.0
     assert len(gripper.posteriors) == 2  # of the first record alone, twice
 
@@ -195,28 +200,13 @@ def test_a_range_that_is_none_is_refused(text: str, words: str, bench: Bench) ->
     assert (done.code, len(done.said), words in done.said[0]) == (2, 1, True)
 
 
-def test_a_record_says_which_contacts_lasted_longer_than_those_that_taught(
-    stand_in: StandIn, capsys: pytest.CaptureFixture[str]
-) -> None:
-    record = record_of(["a", "b", "c"])
-    rested = stand_in("thermogrip.sysid.effusivity.multi_touch.rested_long", np.array([False, True, False]))
-    until = record["time"].values[-2]
-    longer = SimpleNamespace(shortened=np.array([True, False, True]), until=until)
-    checked = stand_in(f"{QUALITY}.check_grasps", longer)
-    cut = verb._as_taught(Console(), record, until, "coupling")
-    np.testing.assert_array_equal(cut["time"], record["time"].values[:-1])
-    capsys.readouterr()
-    longer.until = 9.5
-    assert verb._as_taught(Console(), record, 9.5, "coupling").equals(record)
-    first, second = capsys.readouterr().err.splitlines()
-    assert "mine: 2 of 3 contacts are read until 9.5 s" in first
-    assert "mine: blocks that rested longer" in second
-    assert (rested[0].args[0] is record, rested[0].args[1]) == (True, "coupling")
-    assert (checked[1].args[0] is record, checked[1].longest) == (True, 9.5)
-    stand_in("thermogrip.sysid.effusivity.multi_touch.rested_long", np.zeros(3, dtype=bool))
-    longer.shortened = np.zeros(3, dtype=bool)
-    verb._as_taught(Console(), record, 9.5, None)
-    assert capsys.readouterr().err == ""
+def test_a_record_says_which_contacts_lasted_longer_than_those_that_taught(gripper: SimpleNamespace) -> None:
+    words = ["effusivity", "grasps.csv", "--out", "e.csv"]
+    assert "warning" not in gripper.bench.run(*words).err
+    gripper.shortened, gripper.rested = 1, True
+    said = gripper.bench.run(*words).err
+    assert "one: 1 of 2 contacts are read until 9 s" in said
+    assert "two: blocks that rested longer" in said
 
 
 def test_a_gripper_is_the_bundled_one_or_calibrated_on_what_touched(
@@ -385,7 +375,9 @@ def named(bench: Bench, stand_in: StandIn) -> SimpleNamespace:
     made.ranged = stand_in("thermogrip.sysid.effusivity.data.with_object_range", lambda *_: "ranged")
     made.loaded = stand_in("thermogrip.classify.estimators.registry.load_classifier", lambda _: made.model)
     made.rules = stand_in("thermogrip.classify.decisions.stopping_rule.load_stop_rule", "a rule")
-    made.asked = stand_in("thermogrip.classify.decisions.predict.answer", lambda *_, **__: [*ANSWERS])
+    made.asked = stand_in(
+        "thermogrip.classify.decisions.predict.answer_record", lambda *_, **__: ([*ANSWERS], "quality")
+    )
     return made
 
 
@@ -394,10 +386,10 @@ def test_answers_are_printed_written_and_answered(named: SimpleNamespace) -> Non
     done = named.bench.run(*words, "--materials", "iron,wood", "--object-range", "0,12")
     assert done.code == 0, done
     [asked] = named.asked
-    assert (asked.args, asked.rule) == (("a model", named.record, ("iron", "wood")), None)
-    assert (asked.object_range, asked.nearest) == ((0.0, 12.0), False)
+    assert asked.args == ("a model", named.record, ("iron", "wood"), None, (0.0, 12.0))
+    assert not asked.nearest
     assert named.loaded[0].args == (Path("m"),)
-    assert named.warned[0].args[1] == [named.record]
+    assert named.warned[0].args[1:] == ([named.record], ["quality"])
     said = words_of(done.out)
     assert "grasp material probability p unknown decided at [s]" in said
     assert "a iron 0.75 0.125 9 b - - 8" in said
@@ -414,7 +406,8 @@ def test_answers_are_printed_written_and_answered(named: SimpleNamespace) -> Non
 
 
 def test_a_single_grasp_is_named(named: SimpleNamespace, stand_in: StandIn) -> None:
-    stand_in("thermogrip.classify.decisions.predict.answer", [replace(ANSWERS[0], deviates="", notes=())])
+    one = replace(ANSWERS[0], deviates="", notes=())
+    stand_in("thermogrip.classify.decisions.predict.answer_record", ([one], "quality"))
     done = named.bench.run("classify", "m", "grasps.csv", "--early", "--out", "p.csv")
     assert (done.code, "a iron 0.75 0.125 9 wrote p.csv" in words_of(done.out)) == (0, True), done
 

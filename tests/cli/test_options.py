@@ -129,6 +129,7 @@ def test_the_first_log_settles_the_roles_and_what_never_moves_is_no_signal(tmp_p
 def test_what_was_repaired_in_grasps_is_reported_five_times_and_then_counted(
     repaired: int, stand_in: StandIn, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    stand_in("thermogrip.sysid.effusivity.quality.check_grasps")
     stand_in("thermogrip.sysid.effusivity.quality.contact_faults", ["no contact?"])
     torn = stand_in("thermogrip.sysid.effusivity.quality.torn_groups", ["a block in two files"])
     lines = [f"row {k} dropped" for k in range(repaired)]

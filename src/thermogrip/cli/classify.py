@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass
 from functools import lru_cache, partial
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, TypeAlias
 
 from thermogrip.classify.estimators import classifier_names
 from thermogrip.cli import options as cli
@@ -20,7 +20,8 @@ if TYPE_CHECKING:
     from thermogrip.classify.estimators.base import GraspClassifier
     from thermogrip.classify.estimators.posterior import PosteriorClassifier
     from thermogrip.datasets.schema import Grasps
-    from thermogrip.sysid.effusivity import Coupling, EffusivityRow, GripperModel
+    from thermogrip.sysid.effusivity import Coupling, GripperModel
+    from thermogrip.sysid.effusivity.quality import GraspQuality
 
 NEEDED = (  # by processes that answer
     "thermogrip.classify.decisions.predict",
@@ -385,7 +386,11 @@ def _serve(console: Console, ask: _Question, port: int | None) -> int:
     """Answer single grasps: from stdin, or over HTTP at a port."""
     from thermogrip.classify.decisions.serve import HOST, listen, reply, serve_lines, server
 
-    answer = _answerer(ask)
+    answer_record = _answerer(ask)
+
+    def answer(record: Grasps) -> list[dict[str, Any]]:
+        return answer_record(record)[0]
+
     if port is None:
         serve_lines(answer, sys.stdin.buffer, sys.stdout.buffer)
         return 0
@@ -397,6 +402,9 @@ def _serve(console: Console, ask: _Question, port: int | None) -> int:
     sys.stderr.write(f"answers at http://{HOST}:{listening.getsockname()[1]}/\n")
     server(partial(reply, answer), listening).run(sockets=[listening])
     return 0
+
+
+_Answerer: TypeAlias = "Callable[[Grasps], tuple[list[dict[str, Any]], GraspQuality]]"
 
 
 @dataclass(frozen=True)
@@ -415,12 +423,13 @@ class _Question:
     def answer(self, record: Grasps) -> dict[str, Any]:
         """Return the rows of a record, and warnings of it."""
         warnings = Said()
-        cli.warn_of_contacts(warnings, [record])
-        return {"rows": _answerer(self)(record), "warnings": warnings.words}
+        rows, quality = _answerer(self)(record)
+        cli.warn_of_contacts(warnings, [record], [quality])
+        return {"rows": rows, "warnings": warnings.words}
 
-    def load(self) -> Callable[[Grasps], list[dict[str, Any]]]:
+    def load(self) -> _Answerer:
         """Return what answers a record with a row a grasp."""
-        from thermogrip.classify.decisions.predict import answer
+        from thermogrip.classify.decisions.predict import answer_record
         from thermogrip.classify.decisions.stopping_rule import load_stop_rule
         from thermogrip.classify.estimators.registry import load_classifier
         from thermogrip.datasets.grasp_files import read_grasp_files
@@ -431,9 +440,9 @@ class _Question:
         if self.known:
             model = _with_gripper(model).for_another_gripper(read_grasp_files(self.known))
 
-        def rows_of(record: Grasps) -> list[dict[str, Any]]:
-            answers = answer(
-                model, record, self.candidates, rule=rule, object_range=self.stated, nearest=self.nearest
+        def rows_of(record: Grasps) -> tuple[list[dict[str, Any]], GraspQuality]:
+            answers, quality = answer_record(
+                model, record, self.candidates, rule, self.stated, nearest=self.nearest
             )
             rows = [one.row() for one in answers]
             if self.next_touch:  # at which temperature another touch of its block would be worth most
@@ -442,13 +451,13 @@ class _Question:
                 ranged = with_object_range(record, self.stated)
                 for row, advice in zip(rows, advise_touches(model, ranged, candidates=self.candidates)):
                     row |= advice
-            return rows
+            return rows, quality
 
         return rows_of
 
 
 @lru_cache(maxsize=1)
-def _answerer(ask: _Question) -> Callable[[Grasps], list[dict[str, Any]]]:
+def _answerer(ask: _Question) -> _Answerer:
     """Return what answers a record, loaded once a process."""
     return ask.load()
 
@@ -482,19 +491,36 @@ class _Effusivity:
     def answer(self, record: Grasps) -> dict[str, Any]:
         """Return the rows of a record, what is not explained or missing, and warnings of it."""
         from thermogrip.classify.decisions.predict import unexplained_effusivities
+        from thermogrip.sysid.effusivity import EffusivityRow, effusivity_posterior
         from thermogrip.sysid.effusivity.data import with_object_range
+        from thermogrip.sysid.effusivity.multi_touch import rested_long
+        from thermogrip.sysid.effusivity.quality import check_grasps
 
-        warnings = Said()
-        cli.warn_of_contacts(warnings, [record])
-        record = _as_taught(warnings, record, self.longest, self.coupling)
-        ranged = with_object_range(record, self.stated)
-        estimates = _effusivities(self.device, ranged, self.coupling)
-        misfits = unexplained_effusivities(self.device, record, estimates, self.stated)
-        rows = [asdict(row) for row in estimates]
-        for row in rows:
-            row["misfit_sd"] = misfits.get(row["grasp_id"], (float("nan"), ""))[0]
+        warnings, ranged = Said(), with_object_range(record, self.stated)
+        quality = check_grasps(ranged, longest=self.longest)
+        cli.warn_of_contacts(warnings, [record], [quality])
+        if (more := quality.shortened).any():
+            warnings.warn(
+                f"{record.attrs['name']}: {int(more.sum())} of {more.size} contacts are read until "
+                f"{self.longest:g} s, as long as those lasted that taught the gripper"
+            )
+        if rested_long(record, self.coupling).any():
+            warnings.warn(
+                f"{record.attrs['name']}: blocks that rested longer than those that taught how they move "
+                "between touches: intervals may be too narrow"
+            )
+        estimates, misfits = list[EffusivityRow](), dict[str, tuple[float, str]]()
+        if (touched := quality.read(ranged)) is not None:
+            estimates = effusivity_posterior(self.device, touched, coupling=self.coupling)
+            misfits = unexplained_effusivities(self.device, touched, estimates)
+        names, unread = map(str, record["grasp"].values), iter(estimates)
+        # one without contact has no numbers, and no part in its block
+        nothing, missed, rows = [float("nan")] * 8, dict[str, str](), list[dict[str, Any]]()
+        for name, why in zip(names, quality.reason):
+            row = EffusivityRow(name, *nothing) if why else next(unread)
+            rows.append(asdict(row) | {"misfit_sd": misfits.get(name, (float("nan"), ""))[0]})
+            missed |= {name: why} if why else {}
         unexplained = {name: words for name, (_, words) in misfits.items() if words}
-        missed = _missed(record, rows)
         return {"rows": rows, "unexplained": unexplained, "missed": missed, "warnings": warnings.words}
 
 
@@ -520,37 +546,6 @@ def materials(
     return 0
 
 
-def _as_taught(console: cli.Warner, record: Grasps, longest: float, coupling: Coupling | None) -> Grasps:
-    """Return a record without what its contacts did later than those that taught the gripper."""
-    from thermogrip.sysid.effusivity.multi_touch import rested_long
-    from thermogrip.sysid.effusivity.quality import check_grasps
-
-    quality = check_grasps(record, longest=longest)
-    if (more := quality.shortened).any():
-        console.warn(
-            f"{record.attrs['name']}: {int(more.sum())} of {more.size} contacts are read until "
-            f"{longest:g} s, as long as those lasted that taught the gripper"
-        )
-    if rested_long(record, coupling).any():
-        console.warn(
-            f"{record.attrs['name']}: blocks that rested longer than those that taught how they move between "
-            "touches: intervals may be too narrow"
-        )
-    return record.sel(time=slice(None, quality.until + 1e-9))
-
-
-def _effusivities(device: GripperModel, record: Grasps, coupling: Coupling | None) -> list[EffusivityRow]:
-    """Return a row a grasp; one without contact has no numbers, and no part in its block."""
-    from thermogrip.sysid.effusivity import EffusivityRow, check_grasps, effusivity_posterior
-
-    quality = check_grasps(record)
-    touched = quality.usable_grasps(record)
-    found = iter([] if touched is None else effusivity_posterior(device, touched, coupling=coupling))
-    names, nothing = map(str, record["grasp"].values), [float("nan")] * 8
-    pairs = zip(names, quality.usable)
-    return [next(found) if usable else EffusivityRow(name, *nothing) for name, usable in pairs]
-
-
 def _range(text: str | None) -> tuple[float, float] | None:
     """Return the ends of a range "A,B" [degC]."""
     if text is None:
@@ -562,16 +557,6 @@ def _range(text: str | None) -> tuple[float, float] | None:
     if not low < high:
         raise UserError(f"--object-range {text!r} is empty", hint="give the lower end first")
     return low, high
-
-
-def _missed(record: Grasps, rows: Sequence[dict[str, Any]]) -> dict[str, str]:
-    """Return why the grasps without an effusivity have none."""
-    from thermogrip.sysid.effusivity.quality import check_grasps
-
-    if all(row["effusivity"] == row["effusivity"] for row in rows):
-        return {}
-    why = zip(record["grasp"].values, check_grasps(record).reason)
-    return {str(name): words for name, words in why if words}
 
 
 def _stop_rule(console: Console, model: GraspClassifier, records: Sequence[Grasps], error: float) -> StopRule:

@@ -23,6 +23,7 @@ from thermogrip.datasets.errors import UserError, as_user_error, known_names
 
 if TYPE_CHECKING:
     from thermogrip.datasets.schema import Grasps, Log
+    from thermogrip.sysid.effusivity.quality import GraspQuality
     from thermogrip.sysid.models.model import GreyModel
     from thermogrip.sysid.plant.plant import Plant
 
@@ -345,14 +346,17 @@ class Warner(Protocol):
         """Take one warning."""
 
 
-def warn_of_contacts(console: Warner, records: Sequence[Grasps]) -> None:
-    """Warn of what was repaired in records while they were read, and of contacts that are missing or late."""
-    from thermogrip.sysid.effusivity.quality import contact_faults, torn_groups
+def warn_of_contacts(
+    console: Warner, records: Sequence[Grasps], qualities: Sequence[GraspQuality] | None = None
+) -> None:
+    """Warn of what was repaired in records while they were read, and of contacts that are missing or late;
+    ``qualities`` are those of the records where a caller has them."""
+    from thermogrip.sysid.effusivity.quality import check_grasps, contact_faults, torn_groups
 
-    for grasps in records:
+    for grasps, quality in zip(records, qualities or map(check_grasps, records)):
         repairs = [line for line in str(grasps.attrs.get("repairs", "")).splitlines() if line]
         more = [f"{len(repairs) - SHOWN_REPAIRS} more like these"] if len(repairs) > SHOWN_REPAIRS else []
-        for words in [*repairs[:SHOWN_REPAIRS], *more, *contact_faults(grasps)]:
+        for words in [*repairs[:SHOWN_REPAIRS], *more, *contact_faults(grasps, quality)]:
             console.warn(f"{grasps.attrs['name']}: {words}")
     for words in torn_groups(records):
         console.warn(words)

@@ -338,9 +338,10 @@ def test_a_stated_range_narrows_effusivities_and_one_that_is_wrong_is_reported(
 ) -> None:
     width = []
     for stated, odd in ((None, 0), ((15.0, 21.0), 0), ((28.0, 34.0), 2)):
-        rows = effusivity_posterior(device, with_object_range(cold, stated))
+        ranged = with_object_range(cold, stated)
+        rows = effusivity_posterior(device, ranged)
         width.append(rows[0].t_object_p95 - rows[0].t_object_p05)
-        found = unexplained_effusivities(device, cold, rows, stated)
+        found = unexplained_effusivities(device, ranged, rows)
         assert list(found) == [row.grasp_id for row in rows]
         assert max(misfit for misfit, _ in found.values()) < 4
         words = {name: why for name, (_, why) in found.items() if why}
@@ -366,8 +367,9 @@ def test_no_contact_of_another_rig_is_put_out_of_the_range_without_a_word() -> N
     grasps = make_grasps(time, skin, names, t_ambient=np.full(len(names), 23.0))
     device = load_default_gripper()
     for stated in (None, (1.0, 25.0)):
-        rows = effusivity_posterior(device, with_object_range(grasps, stated))
-        found = unexplained_effusivities(device, grasps, rows, stated)
+        ranged = with_object_range(grasps, stated)
+        rows = effusivity_posterior(device, ranged)
+        found = unexplained_effusivities(device, ranged, rows)
         reported = {name for name, (_, why) in found.items() if why}
         ends = object_range(grasps, stated)
         outside = [

@@ -40,6 +40,10 @@ def delayed(grasps, seconds):
     return grasps.assign(t_surface=(("grasp", "time"), moved, grasps["t_surface"].attrs))
 
 
+def faults_of(grasps):
+    return contact_faults(grasps, check_grasps(grasps))
+
+
 def bounded(grasps, high=np.inf, low=-np.inf):
     """Return what a sensor of sixteenths of a degree reads between two rails."""
     return grasps.assign(t_surface=np.clip(STEP * np.round(grasps["t_surface"] / STEP), low, high))
@@ -47,7 +51,7 @@ def bounded(grasps, high=np.inf, low=-np.inf):
 
 def test_nothing_is_reported_of_the_example_grasps(files):
     for grasps in files.values():
-        assert contact_faults(grasps) == []
+        assert faults_of(grasps) == []
         for step in (STEP, 0.1, 0.25, 0.5, 1.0):
             coarse = grasps.assign(t_surface=step * np.round(grasps["t_surface"] / step))
             assert not check_grasps(coarse).masked.any()
@@ -61,7 +65,7 @@ def test_nothing_is_reported_of_the_example_grasps(files):
     ],
 )  # fmt: skip
 def test_a_contact_that_is_not_at_time_0_is_reported(seconds, words):
-    found = contact_faults(delayed(load_example_grasps()["exp2_dT20"].isel(time=slice(0, 90)), seconds))
+    found = faults_of(delayed(load_example_grasps()["exp2_dT20"].isel(time=slice(0, 90)), seconds))
     assert len(found) == bool(words)
     assert all(words in fault for fault in found)
 
@@ -70,7 +74,7 @@ def test_a_contact_that_is_not_at_time_0_is_reported(seconds, words):
 def test_a_late_contact_is_reported_from_a_difference_of_10_K_on(warmer, reported):
     time = np.arange(-20, 101) / 8.0
     skin = 32.0 + 0.5 * warmer * -np.expm1(-np.maximum(time - 2.0, 0.0))
-    found = contact_faults(make_grasps(time, [skin] * 3, list("abc"), t_object=[32.0 + warmer] * 3))
+    found = faults_of(make_grasps(time, [skin] * 3, list("abc"), t_object=[32.0 + warmer] * 3))
     assert any("after time 0 (median of 3)" in words for words in found) == reported
 
 
@@ -80,13 +84,13 @@ def test_the_best_insulator_of_the_library_is_an_odd_contact_but_no_missing_one(
         quantum=0.0,
     )  # fmt: skip
     assert check_grasps(touched).usable.all()
-    assert "no contact?" in contact_faults(touched)[0]
+    assert "no contact?" in faults_of(touched)[0]
 
 
 def test_spikes_are_reported():
     spiked = load_example_grasps()["exp2_dT20"].copy(deep=True)
     spiked["t_surface"][3, [50, 51, 90]] = -127.0
-    [words] = contact_faults(spiked)
+    [words] = faults_of(spiked)
     assert words == "3 spikes in 1 grasp are left out, the first of -127 degC in 'g0179'"
 
 
@@ -432,15 +436,13 @@ def test_seven_readings_are_needed_for_a_leap_and_a_coarse_sensor_may_flicker_by
 
 def test_what_contact_faults_says_of_each_fault():
     def faults(*skins, **given):
-        return contact_faults(made(*skins, **given))
+        return faults_of(made(*skins, **given))
 
     [words] = faults(jump(5.0), RISE)
     assert words == "1 grasp ('g1' first) saturate at 33 degC: a sensor at the end of its range?"
     # 1.5 % of the least that the difference may be
     three = made(jump(0.449), jump(0.299), jump(0.301), t_object=[53.0, 43.0, 43.0], t_object_sd=np.nan)
-    assert contact_faults(three) == [
-        "2 grasps ('g0' first) 20 K from their object stay as they are: no contact?"
-    ]
+    assert faults_of(three) == ["2 grasps ('g0' first) 20 K from their object stay as they are: no contact?"]
     two = faults(jump(-1.01), jump(5.0), t_object=43.0)
     assert two == [f"1 grasp ('g0' first): {CONTRARY}"]
 
@@ -473,7 +475,7 @@ WORDS_EARLY = (
     ],
 )  # fmt: skip
 def test_how_a_clock_that_is_off_is_told(skins, words):
-    found = contact_faults(made(*skins, t_object=43.0))
+    found = faults_of(made(*skins, t_object=43.0))
     assert [w for w in found if "time 0 must" in w] == ([] if words is None else [words])
 
 
@@ -505,7 +507,7 @@ def test_a_reading_a_quarter_of_a_second_from_time_0_is_of_neither_side():
     assert check_grasps(both).reason[0] == OUT_OF_RANGE
     # but the last half second before contact is until then
     moved = made(np.where(time > 0, 33.0, 23.0 + 1.7 * (time == -0.25)), time=time, t_object=43.0)
-    assert [w for w in contact_faults(moved) if "1 grasp of 1 move before time 0" in w]
+    assert [w for w in faults_of(moved) if "1 grasp of 1 move before time 0" in w]
 
 
 def test_the_longest_contact_is_that_of_all_records():
