@@ -516,14 +516,7 @@ def _tuning(
     where = "on the search's own draws" if interrupted else "on unseen draws"
     if bench.draws == [0] and not interrupted:
         where = "under fresh noise (the plant has no uncertainty)"
-    missing = [result for result in results[saved] if result.lacks]
-    sentences = [
-        best_of(saved, scored, where, unknown),
-        words,
-        _drive_moves(kept_rows, rows),
-        _lacking_words(missing),
-    ]
-    finding = " ".join(part for part in sentences if part)
+    finding = f"{best_of(saved, scored, where, unknown)} {words}"
     if interrupted:
         finding = f"Interrupted after {len(tried)} designs; this is the best of them. {finding}"
     meets = all(meets_spec(result, spec) for result in bench.counting(results[saved]))
@@ -535,7 +528,7 @@ def _tuning(
         "spec": spec.model_dump(mode="json"),
         "seed": bench.seed,
         "rows": [row.to_dict() for row in rows],
-        "lacking": [result.to_dict() for result in missing],
+        "lacking": [result.to_dict() for result in results[saved] if result.lacks],
     }
     controller = _final(bench, candidates, saved, notes)
     return Tuning(
@@ -609,63 +602,22 @@ def _kind_words(kept: str) -> str:
 
 
 def verdict_of(spec: Spec, least: float, default: float, rows: Sequence[Row]) -> tuple[str, str]:
-    """Return the verdict and its numbers in words, from the least score, that of the default design and the
-    kept controller's rows of steps."""
-    beyond = [row for row in rows if row.bound_s > spec.settle_within_s]
-    if beyond:
-        return "actuator-limited", _beyond_reach(max(beyond, key=lambda row: row.bound_s), spec)
+    """Return the verdict and its reason in a sentence, from the least score, that of the default design and
+    the kept controller's rows of steps."""
+    slowest = max(rows, key=lambda row: row.bound_s)
+    if slowest.bound_s > spec.settle_within_s:
+        step, needs = f"{slowest.start:g} to {slowest.target:g}", f"takes at least {slowest.bound_s:.0f} s"
+        needs = needs if np.isfinite(slowest.bound_s) else "cannot be reached"
+        asked = f"{spec.settle_within_s:g} s are asked"
+        return "actuator-limited", f"{step} {needs} at this drive, and {asked}: no weight changes that."
     won = 1 - least / default
     ratio = float(np.mean([row.settle_mean_s / max(row.bound_s, 1.0) for row in rows]))
-    limits = _settling_beside_bound(rows, spec)
     if won > SEARCH.won:
-        return "improved", f"Its score is {100 * won:.0f} % below the default design's. {limits}"
+        return "improved", f"Its score is {100 * won:.0f} % below the default design's."
     if ratio <= SEARCH.near:
-        return "actuator-limited", f"Tuning wins {100 * won:.1f} %: the drive is the limit. {limits}"
+        return "actuator-limited", f"Tuning wins {100 * won:.1f} %: the drive is the limit."
     few = f"less than the {100 * SEARCH.won:.0f} % that count"
-    return "flat", f"Tuning wins {100 * won:.1f} %, {few}. {limits}"
-
-
-def _beyond_reach(row: Row, spec: Spec) -> str:
-    """Return the sentence about a step that no controller can do in time."""
-    step = f"{row.start:g} to {row.target:g} degC"
-    if not np.isfinite(row.bound_s):
-        return f"{step} cannot be reached at this drive; no weight changes that."
-    takes = f"takes {row.settle_mean_s:.0f} s" if np.isfinite(row.settle_mean_s) else "does not settle"
-    limit = f"{spec.settle_within_s:g} s are asked"
-    return (
-        f"{step} cannot settle under {row.bound_s:.0f} s at this drive, and {limit}; yours {takes}; "
-        f"no weight changes that."
-    )
-
-
-def _settling_beside_bound(rows: Sequence[Row], spec: Spec) -> str:
-    """Return each step's settling beside what the drive allows, and the ramp where there is one."""
-    sentences, allowed = [], "at this drive and ramp" if spec.ramp_per_s else "at this drive"
-    for row in rows:
-        settled = np.isfinite(row.settle_mean_s)
-        takes = f"takes {row.settle_mean_s:.0f} s" if settled else "does not settle on every draw"
-        step = f"{row.start:g} to {row.target:g}"
-        sentences.append(f"{step} cannot settle under {row.bound_s:.0f} s {allowed}, yours {takes}")
-    return "; ".join(sentences) + "."
-
-
-def _drive_moves(kept: Sequence[Row], rows: Sequence[Row]) -> str:
-    """Return how far a step moves the drives, beside the default design."""
-    saved_moves = np.mean([row.travel_mean for row in kept])
-    default = np.mean([row.travel_mean for row in rows if row.controller == "baseline" and not row.load])
-    by_default = f"{default:.1f} with the default design"
-    return f"A step moves the drives by {saved_moves:.1f} times full drive, {by_default}."
-
-
-def _lacking_words(results: Sequence[StepResult]) -> str:
-    """Return what becomes of a plant that has what its model lacks."""
-    sentences = []
-    for words in dict.fromkeys(result.lacks for result in results):
-        of_structure = [result for result in results if result.lacks == words]
-        settled = all(np.isfinite(result.settle_s) for result in of_structure)
-        takes = f"settles in {max(r.settle_s for r in of_structure):.0f} s" if settled else "does not settle"
-        sentences.append(f"with {words} it {takes}, overshoot {max(r.overshoot for r in of_structure):.2f} K")
-    return f"Where the model lacks structure: {'; '.join(sentences)}." if sentences else ""
+    return "flat", f"Tuning wins {100 * won:.1f} %, {few}."
 
 
 def _runs_as_used(
