@@ -580,17 +580,6 @@ class Holding:
     miss: float
 
 
-@dataclass(frozen=True)
-class SteadyCurve:
-    """One output over one drive, in steady state."""
-
-    drive: Array  # (n,) drive in its units, output [degC]; NaN where the plant has no steady state
-    y: Array
-    # the widest range of drive in which the output rises with it (or falls, for a cooler): the safe side
-    rising: tuple[float, float]
-    turns: tuple[float, ...]  # drives at which the gain changes sign, an optimum of the Peltier element
-
-
 def holding_drive(
     model: PredictionModel,
     controlled: tuple[str, ...],
@@ -665,25 +654,3 @@ def _balance(model: PredictionModel, rows: list[int], wanted: Array, d: Array) -
         move = np.linalg.lstsq(by, -off, rcond=None)[0]
         x, u = x + move[: model.n_x], u + move[model.n_x :] * model.span
     return np.full(model.n_x, np.nan), u
-
-
-def steady_curve(
-    model: PredictionModel, drive: str, output: str, d: ArrayLike, *, n: int = 41
-) -> SteadyCurve:
-    """Return the steady output over n points of a drive's range, the other drives at rest, under disturbances
-    d (n_d,)."""
-    j, i = model.drives.index(drive), model.outputs.index(output)
-    grid = np.linspace(model.lowest[j], model.highest[j], n)
-    neutral = model.neutral
-    y = np.empty(n)
-    for k, value in enumerate(grid):
-        u = neutral.copy()
-        u[j] = value
-        y[k] = model.steady_output(u, d)[i]
-    sign = np.sign(np.diff(y))
-    usual = sign[np.argmin(np.abs(0.5 * (grid[1:] + grid[:-1]) - neutral[j]))]
-    turns = tuple(float(grid[k + 1]) for k in np.flatnonzero(sign[1:] * sign[:-1] < 0))
-    below = [turn for turn in turns if turn < neutral[j]]
-    above = [turn for turn in turns if turn > neutral[j]]
-    rising = (max(below, default=float(grid[0])), min(above, default=float(grid[-1])))
-    return SteadyCurve(grid, y, rising if usual else (neutral[j], neutral[j]), turns)

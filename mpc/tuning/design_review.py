@@ -3,11 +3,8 @@ r"""Design review: what would go wrong with this controller, found before the ri
 Each check passes, warns or fails, with its numbers and the fix (``docs/explanation/mpc.md`` lists them).
 None needs the rig.  What a loop does is found by running it, on the plant and on draws of it: every step of
 the spec, the loads that a tuning tries (:mod:`thermogrip.mpc.tuning.objective`), and the first step on plants
-that have what the model lacks.
-
-**What the plant allows.**  The cold face of a Peltier element takes Q = S I T_c - I^2 R / 2 - K (T_h - T_c)
-out, which is largest at I* = S T_c / R; beyond it more current cools less.  With a heatsink that warms up the
-whole plant turns over earlier still; that is what the check of the gain's sign follows.
+that have what the model lacks.  Limits of outputs that the steps must break, and a gain that changes its
+sign, are seen there.
 """
 
 from __future__ import annotations
@@ -18,13 +15,11 @@ from typing import TypeAlias
 
 import numpy as np
 
-from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.limits import LARGEST
 from thermogrip.mpc.controllers.mpc import Controller
 from thermogrip.mpc.controllers.pi import PIController
 from thermogrip.mpc.design.spec import Spec, spec_from_dict
-from thermogrip.mpc.plant.prediction import PredictionModel, holding_drive, steady_curve
+from thermogrip.mpc.plant.prediction import holding_drive
 from thermogrip.mpc.tuning.objective import (
     Case,
     StepResult,
@@ -39,7 +34,6 @@ from thermogrip.mpc.tuning.objective import (
     surroundings_of,
     trial,
 )
-from thermogrip.sysid.models.model import BlackBox
 from thermogrip.sysid.plant.plant import said_not_good
 
 #: A controller of any kind.
@@ -126,8 +120,6 @@ def review(
     usual = controller.design.ambient
     return [
         reachable(controller, span, (usual - 7.0, usual + 5.0) if rooms is None else rooms),
-        gain_sign(controller),
-        limits(controller, span),
         as_asked(controller, swing, draws),
         after_loads(controller, swing, draws),
         lacks_structure(controller, swing),
@@ -288,63 +280,6 @@ def reachable(controller: Reviewed, span: tuple[float, float], rooms: Sequence[f
     if model.rooms.any() or not amid:
         amid = [f"rooms of {', '.join(f'{r:g}' for r in rooms)} degC", *amid]
     return Check(name, "pass", f"{span[0]:g} to {span[1]:g} degC in {', '.join(amid)}")
-
-
-def _known_drives(model: PredictionModel) -> tuple[Array, Array]:
-    """Return the least and the most of each drive (n_u,) that is known: to a black box, of its logs."""
-    if not isinstance(model.model, BlackBox):
-        return model.lowest, model.highest
-    low, high = np.array([model.plant.valid.get(name, (-np.inf, np.inf)) for name in model.drives]).T
-    return np.maximum(model.lowest, low), np.minimum(model.highest, high)
-
-
-def gain_sign(controller: Reviewed) -> Check:
-    """A Peltier element cools less beyond its optimum current: dT/du changes sign there."""
-    design, model = controller.design, controller.model
-    name, d = "gain keeps its sign over the drive", model.undisturbed(design.ambient)
-    ranges, bad = [], []
-    for drive, (low, high) in design.drive_range.items():
-        curve = steady_curve(model, drive, design.controlled[0], d)
-        if not np.isfinite(curve.y).any():
-            finding = f"{drive}: {design.controlled[0]} comes to rest at no drive (it only adds up)"
-            fix = "evaluate by the closed loops of tune: there is no steady state"
-            return Check(name, "warn", finding, fix)
-        least, most = (float(ends[model.drives.index(drive)]) for ends in _known_drives(model))
-        inside = [turn for turn in curve.turns if max(low, least) < turn < min(high, most)]
-        ranges.append(f"{drive}: {np.nanmin(curve.y):.1f} to {np.nanmax(curve.y):.1f} degC in steady state")
-        if inside:
-            bad.append(
-                f"{drive} turns over at {', '.join(f'{turn:.2f}' for turn in inside)} of {low:g} to {high:g}"
-            )
-            ranges.append(f"rising from {curve.rising[0]:.2f} to {curve.rising[1]:.2f}")
-    fix = "set drive_limits to the rising part, or accept it: the prediction sees the turn, a PI does not"
-    return _graded(name, "; ".join(bad + ranges), warn=(bool(bad), fix))
-
-
-def limits(controller: Reviewed, span: tuple[float, float]) -> Check:
-    """A soft limit that the wanted range must break is a conflict, settled by penalty at every sample."""
-    design, model = controller.design, controller.model
-    name = "soft limits agree with the targets"
-    if not design.limits:
-        return Check(name, "pass", "no limits of outputs")
-    d, broken = model.undisturbed(design.ambient), []
-    for target in span:
-        holding = holding_drive(model, design.controlled, np.full(len(design.controlled), target), d)
-        for output, (low, high) in design.limits.items():
-            value = float(holding.y[model.outputs.index(output)])
-            if not low <= value <= high:
-                broken.append(f"{output} is {value:.1f} degC when {target:g} degC is held")
-    ranges = ", ".join(f"{key} {range_text(low, high)} degC" for key, (low, high) in design.limits.items())
-    if broken:
-        return Check(name, "fail", f"{ranges}: {'; '.join(broken)}", "widen the limits or narrow the targets")
-    return Check(name, "pass", ranges)
-
-
-def range_text(low: float, high: float) -> str:
-    """Return a range in words; an end that is open is left out."""
-    if high >= LARGEST:
-        return f"at least {low:g}"
-    return f"at most {high:g}" if low <= -LARGEST else f"{low:g} to {high:g}"
 
 
 def valid_range(controller: Reviewed, span: tuple[float, float]) -> Check:

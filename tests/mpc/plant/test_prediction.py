@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import casadi as ca
 import numpy as np
@@ -20,7 +19,6 @@ from thermogrip.mpc.plant.prediction import (
     held_start,
     holding_drive,
     sample_time,
-    steady_curve,
     step_response,
 )
 from thermogrip.sysid.models.state_space import StateSpaceModel
@@ -358,34 +356,6 @@ def test_no_drive_is_what_is_nearest_to_none_and_a_step_from_there_stays_in_rang
 def test_the_room_is_the_first_of_what_is_measured() -> None:
     model = PredictionModel(lag((0.0, 4.0), disturbances=("t_room", "t_water")), dt=1.0)
     assert [model.room(d) for d in ([21.0, 30.0], [np.nan, 30.0], [21.0, np.nan])] == [21.0, 25.0, 21.0]
-
-
-def test_the_gain_turns_over_where_heat_equals_twice_joule(reversing_tank):
-    curve = steady_curve(PredictionModel(reversing_tank, dt=2.0), "drive", "t_surface", ROOM)
-    assert len(curve.turns) == 1
-    assert curve.turns[0] == pytest.approx(-0.55, abs=0.05)  # heat / (2 joule), on a grid of 0.05
-    assert curve.rising == (curve.turns[0], 1.0)
-
-
-@pytest.mark.parametrize(
-    ("steady", "turns", "rising"),
-    [
-        (lambda u: np.clip(u, -0.5, 0.5), (), (-1.0, 1.0)),  # flat at both ends is no turn
-        (lambda u: -u, (), (-1.0, 1.0)),
-        (lambda u: 0.0 * u, (), (0.0, 0.0)),  # the drive moves nothing
-        (lambda u: -((u - 0.5) ** 2), (0.5,), (-1.0, 0.5)),
-        (lambda u: (u + 0.5) ** 2, (-0.5,), (-0.5, 1.0)),
-        (lambda u: u - 1.5 * np.maximum(np.abs(u) - 0.5, 0) * np.sign(u), (-0.5, 0.5), (-0.5, 0.5)),
-    ],
-)
-def test_the_gain_keeps_its_sign_between_the_turns_beside_the_neutral_drive(steady, turns, rising):
-    model = SimpleNamespace(
-        drives=("q", "drive"), outputs=("t",), neutral=np.zeros(2), lowest=-np.ones(2), highest=np.ones(2),
-        steady_output=lambda u, d: np.array([steady(u[1]) + d[0] + 9.0 * u[0]]),
-    )  # fmt: skip
-    curve = steady_curve(model, "drive", "t", [20.0], n=9)
-    assert curve.turns == pytest.approx(turns)
-    assert curve.rising == pytest.approx(rising)
 
 
 def test_the_holding_drive_holds_and_says_what_it_misses(tank):

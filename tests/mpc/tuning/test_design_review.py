@@ -9,22 +9,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.mpc.makers import crossed, network_plant
-from thermogrip.datasets.limits import LARGEST
 from thermogrip.mpc.controllers.mpc import Controller, design_controller
 from thermogrip.mpc.controllers.pi import PIController
 from thermogrip.mpc.design.design import default_design
 from thermogrip.mpc.design.spec import Spec
-from thermogrip.mpc.plant.prediction import PredictionModel
 from thermogrip.mpc.tuning import design_review as checks
-from thermogrip.mpc.tuning.design_review import Check, review, worst
+from thermogrip.mpc.tuning.design_review import review, worst
 from thermogrip.mpc.tuning.objective import StepResult, apparent_delays
 from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.plant import Plant
 
 NAN = float("nan")
-SIGN, LIMITS = "gain keeps its sign over the drive", "soft limits agree with the targets"
-HELD, LOGS = "targets can be held in steady state", "targets lie where the logs were"
 
 
 @pytest.fixture(scope="module")
@@ -35,41 +30,20 @@ def sound(tank):
 def test_a_sound_design_passes_every_check(sound):
     assert {check.verdict for check in sound} == {"pass"}
     assert worst(sound) == "pass"
-    assert len(sound) == 8
+    assert len(sound) == 6
 
 
 def test_every_finding_has_a_number_and_every_fault_a_fix(sound, reversing_tank):
     faulty = review(design_controller(reversing_tank, dt=2.0), wanted=(2.0, 43.0))
     for check in (*sound, *faulty):
         assert check.verdict == "pass" or check.fix
-        assert any(char.isdigit() for char in check.finding) or check.finding == "no limits of outputs"
+        assert any(char.isdigit() for char in check.finding)
 
 
-def one_check(name: str, controller: Controller, wanted: tuple[float, float] = (8.0, 52.0)) -> Check:
-    """Return one check of a review, made alone."""
-    rooms = (controller.design.ambient - 7.0, controller.design.ambient + 5.0)
-    made = {
-        SIGN: lambda: checks.gain_sign(controller),
-        HELD: lambda: checks.reachable(controller, wanted, rooms),
-        LIMITS: lambda: checks.limits(controller, wanted),
-        LOGS: lambda: checks.valid_range(controller, wanted),
-    }
-    return made[name]()
-
-
-@pytest.mark.parametrize(
-    ("name", "verdict", "plant", "changes", "wanted"),
-    [
-        (SIGN, "warn", "reversing_tank", {}, (8.0, 52.0)),
-        (SIGN, "pass", "reversing_tank", {"drive_range": {"drive": (-0.5, 1.0)}}, (8.0, 52.0)),
-        (HELD, "fail", "reversing_tank", {}, (-5.0, 30.0)),
-        (LIMITS, "fail", "tank", {"limits": {"t_tank": (10.0, 30.0)}}, (18.0, 43.0)),
-        (LOGS, "warn", "tank", {}, (18.0, 60.0)),
-    ],
-)
-def test_a_planted_fault_is_found_by_its_check(request, name, verdict, plant, changes, wanted):
-    controller = design_controller(request.getfixturevalue(plant), dt=2.0, **changes)
-    assert one_check(name, controller, wanted).verdict == verdict
+def test_a_target_that_no_drive_holds_and_one_beyond_the_logs_are_found(tank, reversing_tank):
+    held = checks.reachable(design_controller(reversing_tank, dt=2.0), (-5.0, 30.0), (18.0, 30.0))
+    logged = checks.valid_range(design_controller(tank, dt=2.0), (18.0, 60.0))
+    assert (held.verdict, logged.verdict) == ("fail", "warn")
 
 
 def test_a_target_beyond_the_logs_is_reported_before_a_run(tank):
@@ -93,17 +67,6 @@ def test_half_a_degree_beyond_the_logs_is_forgiven_on_either_side(tank, target: 
         assert check.finding.endswith(f"beyond: t_surface at {target:g} degC") != inside
 
 
-@pytest.mark.parametrize(
-    ("limits", "target", "verdict"),
-    [((20.0, 40.0), 30.0, "pass"), ((31.0, 40.0), 30.0, "fail"), ((20.0, 29.0), 30.0, "fail")],
-)
-def test_a_limit_on_either_side_of_what_a_target_takes_is_a_conflict(
-    tank, limits, target: float, verdict: str
-):
-    controller = design_controller(tank, dt=2.0, limits={"t_tank": limits})
-    assert checks.limits(controller, (target, target)).verdict == verdict
-
-
 def test_a_grasp_by_a_plant_whose_pump_never_stood_is_reported_before_it(tank):
     from thermogrip.mpc.tuning.design_review import beyond_logs
 
@@ -114,31 +77,21 @@ def test_a_grasp_by_a_plant_whose_pump_never_stood_is_reported_before_it(tank):
     assert beyond_logs(design_controller(tank, dt=2.0), 43.0, grasps=True) == []
 
 
-def adder(**changes) -> Controller:
+def adder() -> Controller:
     """A store without losses: a heater of 0.05 degC per sample, through a filter; it stays wherever it is."""
     A, B = [[1.0, 0.05], [0.0, 0.9]], [[0.0], [1.0]]
     model = StateSpaceModel(("q",), (), ("t",), A=A, B=B, C=[[1.0, 0.0]], dt=1.0, y0=[25.0])
     plant = Plant(model, {}, dt=1.0, units={"q": "1"}, valid={"q": (-1.0, 1.0), "t": (20.0, 60.0)})
-    return Controller(plant, default_design(plant, **changes))
+    return Controller(plant, default_design(plant))
 
 
 def test_an_integrator_holds_any_target_with_no_drive_wherever_a_step_starts():
-    controller = adder(limits={"t": (15.0, 65.0)})
+    controller = adder()
     controller.notes["spec"] = {"steps": [[90.0, 30.0], [30.0, 50.0]]}
     checks = {check.name: check for check in review(controller)}
     assert "fail" not in {check.verdict for check in checks.values()}
     assert checks["targets lie where the logs were"].verdict == "pass"
     assert checks["targets can be held in steady state"].finding.startswith("30 to 50 degC")
-    assert checks["soft limits agree with the targets"].verdict == "pass"
-    assert checks["gain keeps its sign over the drive"].verdict == "warn"
-
-
-@pytest.mark.parametrize(
-    ("ends", "words"),
-    [((15.0, 65.0), "15 to 65"), ((-LARGEST, 65.0), "at most 65"), ((15.0, LARGEST), "at least 15")],
-)
-def test_a_limit_that_is_open_at_one_end_is_written_as_the_other(ends: tuple[float, float], words: str):
-    assert one_check(LIMITS, adder(limits={"t": ends}), (20.0, 60.0)).finding == f"t {words} degC"
 
 
 def stub(**design) -> Any:
@@ -148,7 +101,6 @@ def stub(**design) -> Any:
     model = SimpleNamespace(drives=("p", "q"), n_u=2, n_d=1, outputs=("t",), span=np.array([1.0, 4.0]))
     model.disturbances, model.rooms = ("t_room",), np.array([True])
     model.undisturbed = lambda ambient: np.array([ambient])
-    vars(model).update(model=None, lowest=np.array([0.0, -1.0]), highest=np.array([1.0, 3.0]))
     return SimpleNamespace(
         design=SimpleNamespace(**usual | design), model=model, plant=None, dt=2.0, notes={}
     )
@@ -167,35 +119,6 @@ def test_the_worst_of_a_review_is_by_rank_and_steps_are_the_specs_or_the_ends_of
     assert (
         checks.valid_range(controller, (20.0, 30.0)).finding == "the plant does not say where its logs were"
     )
-
-
-@pytest.mark.parametrize(
-    ("y", "turns", "verdict", "finding"),
-    [
-        ([12.0, NAN, 50.55, 31.0], [-1.0, 3.0], "pass", "q: 12.0 to 50.5 degC in steady state"),
-        ([12.0, 50.25, 31.0], [-0.99, 2.5, 3.5], "warn", "q turns over at -0.99, 2.50 of -1 to 3; "
-         "q: 12.0 to 50.2 degC in steady state; rising from -0.25 to 2.50"),
-        ([NAN, NAN], [], "warn", "q: t comes to rest at no drive (it only adds up)"),
-    ],
-)  # fmt: skip
-def test_a_turn_of_the_gain_counts_inside_the_range(monkeypatch, y, turns, verdict, finding):
-    asked = []
-    curve = SimpleNamespace(y=np.array(y), turns=turns, rising=(-0.25, 2.5))
-    monkeypatch.setattr(checks, "steady_curve", lambda *given: asked.append(given[1:]) or curve)
-    check = checks.gain_sign(stub())
-    assert (check.verdict, check.finding) == (verdict, finding)
-    assert [(drive, output, d.tolist()) for drive, output, d in asked] == [("q", "t", [22.0])]
-
-
-def test_of_a_black_box_gains_are_looked_at_where_its_logs_were():
-    boxed = replace(crossed(), valid={"q1": (20.0, 60.0), "q2": (0.0, 120.0)})
-    low, high = checks._known_drives(PredictionModel(boxed, dt=2.0))
-    assert (low.tolist(), high.tolist()) == ([20.0, 0.0], [60.0, 100.0])
-    network = network_plant("tclab", q1=(20.0, 60.0))
-    assert [ends.tolist() for ends in checks._known_drives(PredictionModel(network))] == [
-        [0.0, 0.0],
-        [100.0, 100.0],
-    ]
 
 
 @pytest.mark.parametrize(
