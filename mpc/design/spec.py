@@ -92,11 +92,11 @@ class Spec(BaseModel):
     search_draws: Annotated[int, Field(ge=1, le=50)] = 2  # of the plant, in the search
     check_draws: Annotated[int, Field(ge=1, le=200)] = 5  # of the plant, in the final comparison
     evaluations: Annotated[int, Field(ge=1, le=10000)] = 40  # designs of each kind that the search may try
-    # what the plant may have that the model lacks: a lag of every sensor and a delay of the drives, in its
-    # apparent delays, and a share of the drives that does nothing; 0 is not tried, more than this is expected
-    extra_lag: Annotated[NotNegative, Field(le=10)] = 0.5
-    extra_delay: Annotated[NotNegative, Field(le=10)] = 0.5
-    lost_gain: Annotated[NotNegative, Field(lt=1)] = 0.15
+    # what the plant may have that the model lacks, for which the design is chosen as well: a lag of every
+    # sensor and a delay of the drives, in its apparent delays, and a share of the drives that does nothing
+    extra_lag: Annotated[NotNegative, Field(le=10)] = 0.0
+    extra_delay: Annotated[NotNegative, Field(le=10)] = 0.0
+    lost_gain: Annotated[NotNegative, Field(lt=1)] = 0.0
     limits: dict[str, Ends] | None = None  # soft limits of outputs [degC]
     weights: dict[str, Positive] | None = None  # factor on the errors of an output
     zones: dict[str, Positive] | None = None  # half width about a target in which an output may be anywhere

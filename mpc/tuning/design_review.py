@@ -41,6 +41,8 @@ Reviewed: TypeAlias = Controller | PIController
 _RANK = {"pass": 0, "warn": 1, "fail": 2}
 _FAR_BEYOND = 3.0  # bands
 _PLAY = 0.02  # of a drive's range
+#: What a plant may have that its model lacks, where the spec does not state it: see the keys of a spec.
+_DOUBTS = {"extra_lag": 0.5, "extra_delay": 0.5, "lost_gain": 0.15}
 
 
 @dataclass(frozen=True)
@@ -211,6 +213,7 @@ def lacks_structure(controller: Reviewed, swing: tuple[float, float]) -> Check:
     what nobody stated nothing fails."""
     plant, controlled = controller.plant, controller.design.controlled
     spec, stated = _spec_of(controller, swing)
+    spec = spec.model_copy(update={key: share for key, share in _DOUBTS.items() if not getattr(spec, key)})
     filtered_s = controller.dt if isinstance(controller, Controller) else 0.0
     usual = surroundings_of(spec, controlled, plant, filtered_s=filtered_s)
     draw = draws_of(plant, 1)[0]

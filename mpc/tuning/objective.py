@@ -31,11 +31,8 @@ its whole length besides.  A trial in several noises costs their mean; steps as 
 of their trials plus half of what the worst is above it, since the draws stand for what the plant may be, and
 the score is the sum of both.
 
-All draws have the model's structure.  What that may lack (sensors that are slower, a longer delay, a weaker
-drive) is tried on the first draw, and its mean counts a little; what a spec doubts more than the default does
-is expected, and counts as any other draw.  Beyond five bounds a run that lacks structure counts by its
-logarithm: one that does not settle lasts as long as the spec holds a step, which has nothing to do with the
-plant.
+All draws have the model's structure.  What a spec states that this may lack (sensors that are slower, a
+longer delay, a weaker drive) is tried on the first draw, and counts as any other.
 
 **Bound.**  Before :func:`thermogrip.mpc.tuning.minimum_time.full_drive_bound` no drive inside its limits
 brings the output into the band.  Staying there takes longer still, since the drive must be taken back in
@@ -73,8 +70,6 @@ if TYPE_CHECKING:
 class CostSettings:
     """What trials cost, and how large their loads are: see the module's text."""
 
-    lacking: float = 0.05  # of the mean of runs that lack structure
-    late: float = 5.0  # bounds beyond which such a run counts by its logarithm
     overshoot: float = 3.0  # of the whole allowed overshoot more
     bias: float = 0.5  # of the whole allowed bias more
     moves: float = 3.0  # of the whole allowed moves more
@@ -178,7 +173,7 @@ def apparent_delays(plant: Plant, controlled: tuple[str, ...]) -> tuple[float, .
 
 
 def lacking(plant: Plant, spec: Spec, controlled: Sequence[str]) -> dict[str, dict[str, float]]:
-    """Return what a plant may have that its model lacks: in words, and as changes of the surroundings."""
+    """Return what a spec states that a model may lack: in words, and as changes of the surroundings."""
     delay = max(apparent_delays(plant, tuple(controlled)))
     lag = spec.extra_lag * delay
     late = spec.extra_delay * delay
@@ -189,15 +184,6 @@ def lacking(plant: Plant, spec: Spec, controlled: Sequence[str]) -> dict[str, di
         (lost, f"drive weaker by {100 * lost:.2g} %", {"drive_share": 1.0 - lost}),
     ]
     return {words: changes for value, words, changes in tried if value > 0}
-
-
-def expected(plant: Plant, spec: Spec, controlled: Sequence[str]) -> set[str]:
-    """Return which of :func:`lacking` the spec doubts more than the default does: a user who states that the
-    sensor may be slower by 6 s wants a design for it."""
-    doubts = ("extra_lag", "extra_delay", "lost_gain")  # in the order of lacking
-    tried = [name for name in doubts if getattr(spec, name) > 0]
-    words = zip(tried, lacking(plant, spec, controlled), strict=True)
-    return {structure for name, structure in words if getattr(spec, name) > Spec.model_fields[name].default}
 
 
 def loads_of(plant: Plant, spec: Spec, design: Design) -> list[Load]:
@@ -412,18 +398,16 @@ class Score:
     """What a controller costs; lower is better."""
 
     steps: float
-    loads: float = 0.0
-    lacking: float = 0.0
+    loads: float
 
     @property
     def total(self) -> float:
         """The sum."""
-        return self.steps + self.loads + self.lacking
+        return self.steps + self.loads
 
 
-def score(results: Sequence[StepResult], spec: Spec, scales: Scales, *, expects: Iterable[str] = ()) -> Score:
-    """Return the score of a set of trials, see the module's text; ``expects`` are those of :func:`lacking`
-    that count as any draw."""
+def score(results: Sequence[StepResult], spec: Spec, scales: Scales) -> Score:
+    """Return the score of a set of trials, see the module's text."""
     costs: dict[tuple[CaseKey, str], list[float]] = {}
     for result in results:
         cost = _cost_of_load(result, spec, scales) if result.load else _cost_of_step(result, spec, scales)
@@ -432,20 +416,9 @@ def score(results: Sequence[StepResult], spec: Spec, scales: Scales, *, expects:
         most = (spec.moves_limit or np.inf) * default_moves
         cost += spec.moves_weight * result.travel + COSTS.moves * max(0.0, result.travel / most - COSTS.free)
         costs.setdefault((result.key, result.lacks), []).append(cost)
-    steps: list[float] = []
-    loads: list[float] = []
-    others: list[float] = []
-    planned = {"", *expects}
-    for (case, lacks), noises in costs.items():
-        cost = float(np.mean(noises))
-        if lacks and cost > COSTS.late:
-            cost = COSTS.late * (1 + np.log(cost / COSTS.late))
-        (loads if case.load else steps if lacks in planned else others).append(cost)
-    return Score(
-        _mean_and_worst(steps),
-        _mean_and_worst(loads),
-        COSTS.lacking * float(np.mean(others)) if others else 0.0,
-    )
+    steps = [float(np.mean(noises)) for (case, _), noises in costs.items() if not case.load]
+    loads = [float(np.mean(noises)) for (case, _), noises in costs.items() if case.load]
+    return Score(_mean_and_worst(steps), _mean_and_worst(loads))
 
 
 def _mean_and_worst(costs: Sequence[float]) -> float:

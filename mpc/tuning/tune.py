@@ -3,7 +3,7 @@ r"""Find the best controller of all kinds for what is wanted, and say whether we
 **Search.** An MPC is varied by five factors of its default design, a PI by three of SIMC's settings, each
 by its logarithm, by NLopt's simplex search [1]_ from a factor of 2 on.
 Each design is scored in closed loop on draws of the plant's posterior, never on the model itself, on
-steps and on loads, and on draws that lack structure (:mod:`thermogrip.mpc.tuning.objective`). An MPC that
+steps and on loads (:mod:`thermogrip.mpc.tuning.objective`). An MPC that
 is worse than the default design by more than 3 % on steps or on loads is not taken, whatever it wins on
 the other: trials are the model's word, and on two of eight plants the truth denied it. The default
 design, the best MPC and the best PI are then compared on draws that the search has not seen, and the one
@@ -58,7 +58,6 @@ from thermogrip.mpc.tuning.objective import (
     bounds_of,
     check_steps,
     draws_of,
-    expected,
     lacking,
     load_seconds,
     loads_of,
@@ -103,10 +102,7 @@ MPC_PARAMETERS = {
 PI_PARAMETERS = {"Kc": (0.2, 5.0), "Ti": (0.2, 5.0), "setpoint": (0.1, 1.0)}
 #: Of a PI whose delay is below two steps of the plant: no log shows it, SIMC's gain is the highest tried.
 PI_OF_UNSEEN_DELAY = PI_PARAMETERS | {"Kc": (0.2, 1.0), "Ti": (0.6, 5.0)}
-_SCORED_PARTS = (
-    "steps",
-    "loads",
-)  # of a score, in none of which a tuned MPC may be worse than the default design
+_SCORED_PARTS = ("steps", "loads")  # in none of which a tuned MPC may be worse than the default design
 
 
 @dataclass(frozen=True)
@@ -296,7 +292,6 @@ class Bench:
         check_steps(self.bounds)
         controlled = self.baseline.controlled
         self.lacking = list(lacking(plant, spec, controlled))
-        self.expected = expected(plant, spec, controlled)
         self.loads = loads_of(plant, spec, self.baseline)
         self.load_s = load_seconds(self.baseline)
         unseen_delay = max(apparent_delays(plant, controlled)) < 2 * plant.dt
@@ -397,11 +392,7 @@ class Bench:
 
     def score(self, results: Sequence[StepResult]) -> Score:
         """Return the score of results."""
-        return score(results, self.spec, self.scales, expects=self.expected)
-
-    def counting(self, results: Sequence[StepResult]) -> list[StepResult]:
-        """Return the results of steps whose plant is as its model is, or as the spec expects it to be."""
-        return [r for r in results if not r.load and r.lacks in {"", *self.expected}]
+        return score(results, self.spec, self.scales)
 
     def evaluate(self, kind: str, parameters: Mapping[str, float]) -> Trial:
         """Return the trial of a design on the search's draws."""
@@ -519,7 +510,7 @@ def _tuning(
     finding = f"{best_of(saved, scored, where, unknown)} {words}"
     if interrupted:
         finding = f"Interrupted after {len(tried)} designs; this is the best of them. {finding}"
-    meets = all(meets_spec(result, spec) for result in bench.counting(results[saved]))
+    meets = all(meets_spec(result, spec) for result in results[saved] if not result.load)
     notes = {
         "verdict": verdict,
         "finding": finding,
@@ -588,10 +579,9 @@ def best_of(kept: str, parts: Mapping[str, Score], where: str, unknown: Sequence
     if share < 0:
         because = f"a PI does not know {', '.join(unknown)}"
         return f"The MPC is what is saved, because {because}; it scores {-share:.0f} % worse {where}."
-    names = {"steps": "steps", "loads": "loads", "lacking": "plants that its model lacks"}
-    costs = {name: (getattr(parts[other], name), getattr(parts[best], name)) for name in names}
+    costs = {name: (getattr(parts[other], name), getattr(parts[best], name)) for name in _SCORED_PARTS}
     worst = max(costs, key=lambda name: costs[name][0] - costs[name][1])
-    loses = f"loses most on {names[worst]} ({costs[worst][0]:.2f} for {costs[worst][1]:.2f})"
+    loses = f"loses most on {worst} ({costs[worst][0]:.2f} for {costs[worst][1]:.2f})"
     loser = "MPC" if kept == "PI" else "PI"
     saved = f"The {_kind_words(kept)} is best and is what is saved"
     return f"{saved}: it scores {share:.0f} % better than the best {loser} {where}, which {loses}."

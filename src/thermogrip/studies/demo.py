@@ -148,8 +148,6 @@ def _tune(
     from thermogrip.mpc.tuning.tune import tune
 
     spec = Spec(steps=list(STEPS), evaluations=6, search_draws=1, check_draws=2)
-    # plants that lack structure would take twice the time, to the same design
-    spec = spec.model_copy(update={"extra_lag": 0.0, "extra_delay": 0.0, "lost_gain": 0.0})
     tuning = tune(plant, spec, seed=seed, progress=progress)
     tuning.save(out / "controller.json")
     # what `thermogrip review` will say of the file, which holds some of the posterior's draws
