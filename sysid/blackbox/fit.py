@@ -47,7 +47,7 @@ from thermogrip.sysid.blackbox.order_selection import (
     free_run_misses,
 )
 from thermogrip.sysid.data.data_quality import reading_excess
-from thermogrip.sysid.plant.fit_record import PlantScores, fit_logs
+from thermogrip.sysid.plant.fit_record import SEVERAL, PlantScores, fit_logs
 from thermogrip.sysid.plant.log_grid import Grid, Segment, make_grid, rows_of
 from thermogrip.sysid.plant.plant import Plant
 from thermogrip.sysid.plant.simulation import READING_EVERY
@@ -109,7 +109,6 @@ def fit_black_box(
     average: float | None = None,
     order: int | None = None,
     delay: int | None = None,
-    warmup: float | None = None,
     grid: Grid | None = None,
     progress: Callable[[float, str], None] | None = None,
     beat: Mapping[str, float] | None = None,
@@ -117,13 +116,11 @@ def fit_black_box(
     """Fit one kind of :data:`BLACK_BOXES` to one or several logs.
 
     Where absent, signals are known by role, two steps ``average`` [s] are tried (the chosen one and the logs'
-    own, or means over five rows),
-    ``order`` (poles of each output; states, of ``subspace`` and ``parsim``) and ``delay`` (steps from an
-    input to its effect, of ``arx``, ``oe``, ``armax`` and ``bj``) are searched, and the readings of 5 s for
-    whole logs (they begin at rest), 50 samples for stretches cut out of a log, set the state of what is held
-    out in place of ``warmup`` [s]. ``grid`` has the logs at a step that is known already; ``beat`` are errors
-    by part held out, as shares of the spread, that a fit has to come near to. A UserError where there is no
-    such kind, order or delay, the data are too short, or no structure survives the held-out free run.
+    own, or means over five rows), ``order`` (poles of each output; states, of ``subspace`` and ``parsim``)
+    and ``delay`` (steps from an input to its effect, of ``arx``, ``oe``, ``armax`` and ``bj``) are searched.
+    ``grid`` has the logs at a step that is known already; ``beat`` are errors by part held out, as shares of
+    the spread, that a fit has to come near to. A UserError where there is no such kind, order or delay, the
+    data are too short, or no structure survives the held-out free run.
 
     >>> from scipy.signal import lfilter
     >>> from thermogrip.datasets.schema import make_log
@@ -153,8 +150,7 @@ def fit_black_box(
                 progress((at + done) / len(grids), f"{kind}, {what}")
 
         try:
-            rows = _warmup_rows(tried, warmup)
-            choice = choose(tried, family, warmup=rows, progress=report, beat=beat)
+            choice = choose(tried, family, warmup=_warmup_rows(tried), progress=report, beat=beat)
         except UserError as error:
             refused = refused or error
             continue
@@ -163,7 +159,7 @@ def fit_black_box(
             best = error_of_readings, tried, choice
     if best is None:
         raise refused if refused is not None else UserError(f"{kind} could not be fitted")
-    chosen, choice = _with_convention(kind, *best[1:], logs, family, warmup)
+    chosen, choice = _with_convention(kind, *best[1:], logs, family)
     return BlackBoxFit(kind, _plant(chosen, choice, logs), choice, chosen)
 
 
@@ -229,7 +225,7 @@ def _remembering(
 
 
 def _with_convention(
-    kind: str, grid: Grid, choice: Choice, logs: Sequence[Log], family: Family, warmup: float | None
+    kind: str, grid: Grid, choice: Choice, logs: Sequence[Log], family: Family
 ) -> tuple[Grid, Choice]:
     """Return grid and choice with inputs that were applied up to their rows where that errs clearly less;
     within a step that was averaged over several rows one row makes no difference."""
@@ -239,7 +235,7 @@ def _with_convention(
     # the same structure first: one fit a fold
     for tried in (partial(family, only=(choice.structure,)), family):
         try:
-            other = choose(moved, tried, warmup=_warmup_rows(moved, warmup))
+            other = choose(moved, tried, warmup=_warmup_rows(moved))
         except UserError:  # no structure of it is stable
             return grid, choice
         excess = np.log(choice.errors[choice.structure]) - np.log(other.errors[other.structure])
@@ -328,8 +324,10 @@ def _run_settings(fit: BlackBoxFit) -> dict[str, Any]:
     return {"dt": grid.dt, "scale": scale, "warmup": warmup, "priors": [fit.choice.prior]}
 
 
-def _warmup_rows(grid: Grid, warmup: float | None) -> int:
-    seconds = warmup or (5.0 if len(grid.logs) >= 3 else 50 * grid.native)
+def _warmup_rows(grid: Grid) -> int:
+    """Return how many readings set the state of what is held out: those of 5 s of whole logs, which begin at
+    rest, and 50 samples of parts of a log."""
+    seconds = 5.0 if len(grid.logs) >= SEVERAL else 50 * grid.native
     most = sum(len(segment.time) for segment in grid.segments) // 16  # of a short log, a quarter of a block
     return max(2, min(round(seconds / grid.dt), most))
 

@@ -127,23 +127,17 @@ def folds(grid: Grid, *, blocks: int = _CUTS) -> list[Fold]:
     else:
         parts = [*_cut_blocks(grid, blocks), _last_parts(grid)]
     range_of = np.ptp(np.concatenate([segment.u for segment in grid.segments]), axis=0)
-    excited = [part for part in parts if _moves_all(part.training, than=part.runs, least=MOVED * range_of)]
-    used = excited if len(excited) >= 2 else parts
-    return [Fold(part.label, grid.having(part.training), tuple(part.runs)) for part in used]
+    excited = [part for part in parts if _moves_all(part, least=MOVED * range_of)]
+    return excited if len(excited) >= 2 else parts
 
 
-class _Part(NamedTuple):
-    label: str  # of what is held out
-    training: list[Segment]  # the rest
-    runs: list[Run]
-
-
-def _whole_log(grid: Grid, name: str) -> _Part:
+def _whole_log(grid: Grid, name: str) -> Fold:
     training = [segment for segment in grid.segments if segment.log != name]
-    return _Part(name, training, [Run(segment) for segment in grid.segments if segment.log == name])
+    runs = tuple(Run(segment) for segment in grid.segments if segment.log == name)
+    return Fold(name, grid.having(training), runs)
 
 
-def _cut_blocks(grid: Grid, blocks: int) -> list[_Part]:
+def _cut_blocks(grid: Grid, blocks: int) -> list[Fold]:
     total = sum(len(segment.time) for segment in grid.segments)
     if total < FEWEST * blocks:
         raise UserError(
@@ -152,16 +146,16 @@ def _cut_blocks(grid: Grid, blocks: int) -> list[_Part]:
             hint="give a longer log or average less",
         )
     edges = [round(total * block / blocks) for block in range(blocks + 1)]
-    parts: list[_Part] = []
+    parts = []
     for at, (first, last) in enumerate(pairwise(edges)):
         inside, outside = _split_segments(grid.segments, first, last)
         halves = [segment.part(len(segment.time) // 2, len(segment.time)) for segment in inside]
-        runs = [Run(segment) for segment in (*inside, *halves)]
-        parts.append(_Part(f"block {at + 1} of {blocks}", outside, runs))
+        runs = tuple(Run(segment) for segment in (*inside, *halves))
+        parts.append(Fold(f"block {at + 1} of {blocks}", grid.having(outside), runs))
     return parts
 
 
-def _last_parts(grid: Grid) -> _Part:
+def _last_parts(grid: Grid) -> Fold:
     """Return the last part of each log, to be run from the log's start."""
     training: list[Segment] = []
     runs: list[Run] = []
@@ -172,7 +166,7 @@ def _last_parts(grid: Grid) -> _Part:
             cut = int(np.searchsorted(segment.time, begin + (1 - HELD_OUT_SHARE) * (end - begin)))
             training += [segment.part(0, cut)] if cut >= FEWEST else []
             runs += [Run(segment, cut)] if cut < len(segment.time) else []
-    return _Part(f"{TAIL}{' and '.join(grid.logs)}", training, runs)
+    return Fold(f"{TAIL}{' and '.join(grid.logs)}", grid.having(training), tuple(runs))
 
 
 def priors_of(grid: Grid) -> tuple[StartPrior, ...]:
@@ -444,12 +438,12 @@ def smallest_near_the_best(
     return min(near_best, key=lambda item: (size(item), float(logs[item].mean())))
 
 
-def _moves_all(rest: Sequence[Segment], *, than: Sequence[Run], least: Array) -> bool:
-    """Return whether the rest moves every input that these runs move by more than ``least``."""
-    if not rest or not than:
+def _moves_all(fold: Fold, *, least: Array) -> bool:
+    """Return whether the rest moves every input that what is held out moves by more than ``least``."""
+    if not fold.train.segments or not fold.runs:
         return False
-    held_out_inputs = np.concatenate([run.segment.u[run.scored_from :] for run in than])
-    others = np.concatenate([segment.u for segment in rest])
+    held_out_inputs = np.concatenate([run.segment.u[run.scored_from :] for run in fold.runs])
+    others = np.concatenate([segment.u for segment in fold.train.segments])
     return not np.any((np.ptp(held_out_inputs, axis=0) > least) & (np.ptp(others, axis=0) <= least))
 
 

@@ -22,7 +22,6 @@ from thermogrip.mpc import PIController, simulate_closed_loop
 from thermogrip.mpc.interface import Move
 from thermogrip.report import plot
 from thermogrip.report.control import session_sections
-from thermogrip.report.plant import _per_log
 from thermogrip.report.plots import (
     bode_chart,
     corner_figure,
@@ -35,7 +34,6 @@ from thermogrip.report.plots import (
 from thermogrip.rig import Session
 from thermogrip.sysid import free_run, identify
 from thermogrip.sysid.export.dynamics import Estimate
-from thermogrip.sysid.plant.fit_record import PlantScores
 from thermogrip.sysid.validation.prediction_bands import Band
 from thermogrip.sysid.validation.verdict import Row
 
@@ -56,23 +54,6 @@ def test_the_loop_on_a_session_page_has_the_figures_that_the_command_line_prints
     controller = SimpleNamespace(controlled=("t",), design=design)
     (loop,) = [s for s in session_sections(session, moves, controller, "the twin") if "loop" in s.title]
     assert "settles in 16 s, overshoot 0.25 K, bias -0.125 K" in loop.verdict
-
-
-def test_what_a_log_has_of_its_own_has_a_unit():
-    effects = {
-        "offset of t1": (0.2, 0.01),
-        "bias of t_room": (0.1, 0.05),
-        "flow": (0.03, 0.01),
-        "v0": (0.1, 0.0),
-    }
-    plant = SimpleNamespace(
-        scores=PlantScores(per_log={"one": effects}),
-        units={"t1": "degC", "t_room": "degC", "flow": "W/K", "v0": "V"},
-        scales={"flow": "log", "v0": "linear"},
-    )
-    (table,) = _per_log(plant)
-    assert [row[-1] for row in table.rows] == ["K", "K", "1", "V"]
-    assert not _per_log(SimpleNamespace(scores=PlantScores()))
 
 
 def waves(n: int, shift: float = 0.0) -> Any:

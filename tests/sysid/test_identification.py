@@ -20,13 +20,12 @@ from thermogrip.sysid.blackbox.fit import fit_black_box
 from thermogrip.sysid.blackbox.order_selection import Structure
 from thermogrip.sysid.data import signal_roles
 from thermogrip.sysid.greybox.problem import prior_plant
-from thermogrip.sysid.identification import beyond_reach, choose_black_box
+from thermogrip.sysid.identification import Held, beyond_reach, choose_black_box
 from thermogrip.sysid.models.network import load_network
 from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.fit_record import ExpectedError, HeldOut, PlantScores, fit_logs
-from thermogrip.sysid.validation import held_out, verdict
+from thermogrip.sysid.validation import verdict
 from thermogrip.sysid.validation.free_run import free_run, warm_up_of_fit
-from thermogrip.sysid.validation.held_out import Held
 from thermogrip.sysid.validation.prediction_bands import between_runs, expected_error
 
 REAL = Path(os.environ.get("THERMOGRIP_REAL_DATA", Path(__file__).parents[3] / "shared" / "data" / "real"))
@@ -476,7 +475,7 @@ def test_an_output_that_half_of_the_parts_hardly_excite_is_not_good():
 def table(shares, held=True):
     """Rows by candidate and log, of an error of ``share`` times that of a model without input, 2 K."""
     return [
-        held_out.Row(model, "", log, "t", 2.0 * share, 90.0, "K", 100, 2.0, held)
+        verdict.Row(model, "", log, "t", 2.0 * share, 90.0, "K", 100, 2.0, held)
         for model, logs in shares.items()
         for log, share in logs.items()
     ]
@@ -508,7 +507,7 @@ def test_errors_stated_and_kept_are_those_of_what_was_held_out():
     ]  # fmt: skip
     assert plant.scores.expected == {"t": expected_error([3.0, 2.0], 0.0)}
     assert plant.scores.expected["t"].rmse == pytest.approx(6.0**0.5)
-    assert held_out.relative_error(replace(rows[0], no_input_rmse=0.0)) == 3e12
+    assert identification.relative_error(replace(rows[0], no_input_rmse=0.0)) == 3e12
 
 
 @pytest.mark.parametrize(("off", "doubted"), [(1.1, False), (9.0, True), (1 / 9.0, True)])
@@ -538,11 +537,11 @@ def test_a_heater_that_cools_is_a_doubt(gain, doubts):
 )  # fmt: skip
 def test_a_log_that_begins_warm_has_fifty_rows_of_warm_up(monkeypatch, step, score_from, dt, expected):
     asked = []
-    monkeypatch.setattr(held_out, "free_run", lambda *_, **how: asked.append(how))
+    monkeypatch.setattr(identification, "free_run", lambda *_, **how: asked.append(how))
     log = plant_log()
     held = Held(log.assign_coords(time=log["time"].values * step), "a", score_from)
     plant: Any = SimpleNamespace(dt=dt, model=SimpleNamespace(kind="arx"))
-    held_out.run_held_out(plant, held, unseen=True)
+    identification.run_held_out(plant, held, unseen=True)
     assert asked == [{"warmup": expected[0], "score_from": expected[1], "tests": False}]
 
 

@@ -218,7 +218,6 @@ def parameters_section(plant: Plant, record: Posterior | None = None) -> Section
                 f"Medians lie within {record.off_centre:.2f} standard deviations of the fitted values."
             ),
         ]
-    evidence += _per_log(plant)
     evidence += [Text(_sentence(said)) for said in identifiability_report(plant)]
     return Section("How well are its parameters known?", tuple(evidence), verdict, tone, shown=0)
 
@@ -268,29 +267,6 @@ def parameter_table(plant: Plant, record: Posterior | None = None) -> Cells:
             ess = record.ess.get(row[0])
             row[7:7] = [None if ess is None else round(ess)]
     return tuple(head), tuple(map(tuple, rows))
-
-
-def _per_log(plant: Plant) -> list[Table]:
-    """Return the table of what each log has of its own, empty where nothing is known of it."""
-    effects_by_log = plant.scores.per_log
-    rows = [
-        (log, effect, *number, _unit_of_effect(plant, effect))
-        for log, effects in effects_by_log.items()
-        for effect, number in effects.items()
-    ]
-    head = ("log", "effect", "value", "sd", "unit")
-    return [Table(head, tuple(rows), "Effects of each log, beside the parameters that all share")] * bool(
-        rows
-    )
-
-
-def _unit_of_effect(plant: Plant, effect: str) -> str:
-    """Return the unit of an offset, a bias, or a parameter of one log (relative where it is positive)."""
-    name = effect.split(" of ")[-1]
-    unit = plant.units.get(name, "1")
-    if name != effect:
-        return plots.difference_unit(unit)
-    return "1" if plant.scales.get(name) == "log" else unit
 
 
 def _prior_intervals(plant: Plant) -> dict[str, tuple[float, float]]:

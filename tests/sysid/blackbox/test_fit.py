@@ -78,7 +78,7 @@ def test_refits_of_sparse_equations_spread_as_fits_to_new_logs_do_and_cover_the_
 
     fitted, spread = [], []
     for seed in range(10):
-        fit = fit_of("sindy", curved_log(seed)[0], degrees=2, memories=1, thresholds=0.0, widths=0)
+        fit = fit_of("sindy", curved_log(seed)[0], degrees=2, memories=1, thresholds=0.0)
         plant = with_refits(fit, 8, seed=seed)
         fitted.append(run(fit.choice.model))
         spread.append(np.var([run(plant.draw(k).model) for k in range(1, 9)], axis=0, ddof=1))
@@ -193,17 +193,16 @@ def stub_grid(rows=(400,), dt=1.0, **more):
 
 
 @pytest.mark.parametrize(
-    ("rows", "dt", "wanted", "expected"),
+    ("rows", "dt", "expected"),
     [
-        ((100, 100, 120), 0.5, None, 10),  # 5 s of whole logs
-        ((1000, 900), 2.0, None, 12),  # 50 samples of 0.5 s, 12.5 steps
-        ((111,), 1.0, None, 6),  # a sixteenth of the rows
-        ((20,), 1.0, None, 2),
-        ((1000,), 2.0, 30.0, 15),
+        ((100, 100, 120), 0.5, 10),  # 5 s of whole logs
+        ((1000, 900), 2.0, 12),  # 50 samples of 0.5 s, 12.5 steps
+        ((111,), 1.0, 6),  # a sixteenth of the rows
+        ((20,), 1.0, 2),
     ],
 )
-def test_the_warm_up_is_five_seconds_of_whole_logs_and_fifty_samples_of_parts(rows, dt, wanted, expected):
-    assert fitting._warmup_rows(stub_grid(rows, dt), wanted) == expected
+def test_the_warm_up_is_five_seconds_of_whole_logs_and_fifty_samples_of_parts(rows, dt, expected):
+    assert fitting._warmup_rows(stub_grid(rows, dt)) == expected
 
 
 @pytest.mark.parametrize(
@@ -334,9 +333,10 @@ def test_inputs_up_to_their_rows_are_taken_where_that_errs_clearly_less(
     monkeypatch.setattr(made, lambda *a, average, ends, **n: stub_grid(dt=average, ends=ends))
     monkeypatch.setattr(fitting, "choose", choose_next)
     grid = stub_grid(dt=dt, why="so")
-    found, choice = fitting._with_convention(family, grid, first, [], family_of(family), 9.0)
+    found, choice = fitting._with_convention(family, grid, first, [], family_of(family))
     assert (found.ends, found.dt, found.why, choice is not first) == (moved, dt, "so", moved)
-    assert asked == [(True, {"only": ("s",)}, 9 / dt), (True, None, 9 / dt)][: len(others)]
+    rows = fitting._warmup_rows(stub_grid(dt=dt))
+    assert asked == [(True, {"only": ("s",)}, rows), (True, None, rows)][: len(others)]
 
 
 @pytest.mark.parametrize(("agree", "n"), [(6, 6), (1, 2), (0, 6)])  # of the tries after the first

@@ -12,13 +12,13 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import make_log
 from thermogrip.sysid.greybox.fit import fit_network
 from thermogrip.sysid.greybox.problem import prior_plant
+from thermogrip.sysid.identification import Held, run_held_out
 from thermogrip.sysid.models.network import load_network
 from thermogrip.sysid.models.neural import NeuralModel
 from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.fit_record import HeldOut, PlantScores
 from thermogrip.sysid.plant.plant import Plant
 from thermogrip.sysid.validation.free_run import free_run
-from thermogrip.sysid.validation.held_out import Held, run_held_out
 from thermogrip.sysid.validation.prediction_bands import (
     MOST_DISAGREEMENT,
     between_runs,
@@ -283,12 +283,6 @@ def test_the_share_is_an_rms_over_the_log_at_the_models_own_pace():
     assert share == pytest.approx(0.5 * np.sqrt(np.sum((1 - 0.9**k) ** 2) / 120), rel=0.05)
 
 
-def test_what_comes_after_a_gap_counts_as_much():
-    time = np.concatenate([np.arange(2000.0), 2100.0 + np.arange(2000.0)])
-    share = ensemble_disagreement(pair(1.0), stepped(time, time > 2050))["t"]
-    assert share == pytest.approx(0.5 * np.sqrt(1 / 2), rel=0.02)
-
-
 def test_a_disturbance_is_read_less_its_offset():
     model = NeuralModel(
         ("q",), ("room",), ("t",), (), 1.0,
@@ -306,19 +300,6 @@ def test_a_disturbance_is_read_less_its_offset():
     assert apart(20.0, 5.0) == pytest.approx(apart(15.0, 0.0)) == pytest.approx(0.5, rel=0.05)
 
 
-def test_only_the_outputs_count_of_the_states():
-    plant = pair(1.0)
-    grow = {name: np.zeros((2, 2, 2)) for name in ("A",)} | {"B": np.zeros((2, 2, 1)), "c": np.zeros((2, 2))}
-    grow |= {"V": np.zeros((2, 2, 1)), "W": np.zeros((2, 1, 2)), "spread": np.empty(0)}
-    grow["A"][:, 0, 0], grow["A"][:, 1, 1], grow["B"][:, 0, 0] = 0.9, 0.5, 0.1
-    grow["V"][1, 0, 0] = 0.1
-    grow["c"][1, 1] = 7.0  # a state that nobody reads, 14 apart
-    wide = Plant(replace(plant.model, **grow), {}, dt=1.0)
-    assert ensemble_disagreement(wide, driven(9.0)) == pytest.approx(
-        ensemble_disagreement(plant, driven(9.0)), rel=0.05
-    )
-
-
 def test_members_that_agree_pass_and_those_that_do_not_are_refused_in_words():
     check_ensemble(pair(1.9 * MOST_DISAGREEMENT), driven(9.0))
     with pytest.raises(UserError, match=r"disagree over far: t by 4\d %"):
@@ -326,19 +307,6 @@ def test_members_that_agree_pass_and_those_that_do_not_are_refused_in_words():
     check_ensemble(pair(5.0), driven(0.0))  # no drive, nothing to disagree about
     with pytest.raises(UserError, match=r"disagree over far: t by .* mean is not reliable"):
         check_ensemble(pair(5.0), driven(9.0))
-
-
-def test_readings_after_the_warm_up_do_not_enter():
-    log = driven(9.0)
-    other = log.assign(t=("time", np.where(np.arange(400) < 5, 30.0, 99.0), log["t"].attrs))
-    assert ensemble_disagreement(pair(1.0), log, warmup=4.0) == ensemble_disagreement(
-        pair(1.0), other, warmup=4.0
-    )
-
-
-def test_a_plant_without_members_has_nothing_to_refuse():
-    block = StateSpaceModel(("q",), (), ("t",), A=[[0.9]], B=[[0.1]], C=[[1.0]], dt=1.0)
-    assert ensemble_disagreement(Plant(block, {}, dt=1.0), driven(1.0)) == {}
 
 
 def test_no_held_out_figure_comes_of_members_that_disagree():
