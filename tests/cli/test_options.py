@@ -135,7 +135,7 @@ def test_what_was_repaired_in_grasps_is_reported_five_times_and_then_counted(
     lines = [f"row {k} dropped" for k in range(repaired)]
     record: Any = SimpleNamespace(attrs={"name": "mine", "repairs": "\n\n".join(lines)})
     clean: Any = SimpleNamespace(attrs={"name": "clean"})
-    options.warn_of_contacts(Console(), [record, clean])
+    options.warn_of_contacts(Console().warn, [record, clean])
     more = [f"{repaired - 5} more like these"] if repaired > 5 else []
     said = [f"mine: {words}" for words in (*lines[:5], *more, "no contact?")]
     said += ["clean: no contact?", "a block in two files"]

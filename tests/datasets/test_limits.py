@@ -222,12 +222,10 @@ def test_rows_among_empty_lines_keep_their_line_numbers(tmp_path: Path) -> None:
         assert read_csv_table(tmp_path / "a.csv.xz").lines.tolist() == [3, 6, 7]
 
 
-def test_a_constant_log_of_an_hour_at_100_hz_is_no_attack(tmp_path: Path) -> None:
-    text = io.StringIO()
-    text.write("time_s,drive,t_tank_degC\n")
-    text.writelines(f"{k / 100:.2f},1,25\n" for k in range(360_000))
-    (tmp_path / "a.csv.xz").write_bytes(lzma.compress(text.getvalue().encode(), preset=1))
-    assert read_log(tmp_path / "a.csv.xz").sizes["time"] == 360_000
+def test_a_constant_log_of_an_hour_at_100_hz_is_no_attack() -> None:
+    rows = "".join(f"{k / 100:.2f},1,25\n" for k in range(360_000))
+    packed = lzma.compress(rows.encode(), preset=0)
+    assert len(rows) < limits.most_unpacked(len(packed))
 
 
 def test_every_size_that_is_allowed_grows_with_the_packed_one() -> None:

@@ -31,13 +31,14 @@ def grasps_file(tmp_path: Path) -> Path:
     return tmp_path / "grasps.csv"
 
 
-LOGS: list[Callable[[Plant, Any], Any]] = [
+LOGS: list[Any] = [
     lambda plant, log: plant.simulate(log)["t_tank"].values,
     lambda plant, log: [free_run(plant, log).scores["t_tank"].rmse, free_run(plant, log).band().level],
     lambda plant, log: [len(check_data(log, outputs=["t_tank"]).findings)],
-    lambda plant, log: identify(
-        log, models=["arx"], outputs=["t_tank"], draws=2, order=1
-    ).plant.model.A.ravel(),
+    pytest.param(
+        lambda plant, log: identify(log, models=["arx"], draws=2, order=1).plant.model.A.ravel(),
+        marks=pytest.mark.slow,
+    ),
 ]
 
 

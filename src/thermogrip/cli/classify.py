@@ -56,7 +56,7 @@ def calibrated_device(console: Console, calibrate: Sequence[str], seed: int) -> 
     from thermogrip.sysid.effusivity.quality import longest_contact
 
     labelled = read_grasp_files(calibrate)
-    cli.warn_of_contacts(console, labelled)
+    cli.warn_of_contacts(console.warn, labelled)
     labelled = touched_part(console, labelled)
     with console.progress("calibrate") as progress:
         device = calibrate_gripper(labelled, seed=seed, progress=progress)
@@ -231,7 +231,7 @@ def train(
     model.check_installed()
     console = Console(as_json)
     records = training_part(console, read_grasp_files(grasps), split)
-    cli.warn_of_contacts(console, records)
+    cli.warn_of_contacts(console.warn, records)
     records = touched_part(console, records)
     cli.new_folder(out)
     with console.progress("train") as progress:
@@ -422,10 +422,10 @@ class _Question:
 
     def answer(self, record: Grasps) -> dict[str, Any]:
         """Return the rows of a record, and warnings of it."""
-        warnings = Said()
+        warnings: list[str] = []
         rows, quality = _answerer(self)(record)
-        cli.warn_of_contacts(warnings, [record], [quality])
-        return {"rows": rows, "warnings": warnings.words}
+        cli.warn_of_contacts(warnings.append, [record], [quality])
+        return {"rows": rows, "warnings": warnings}
 
     def load(self) -> _Answerer:
         """Return what answers a record with a row a grasp."""
@@ -468,17 +468,6 @@ def _changed_at(paths: Iterable[str | Path]) -> int:
     return max((file.stat().st_mtime_ns for file in files), default=0)
 
 
-class Said:
-    """Warnings, kept."""
-
-    def __init__(self) -> None:
-        self.words: list[str] = []
-
-    def warn(self, text: str) -> None:
-        """Keep one warning."""
-        self.words.append(text)
-
-
 @dataclass(frozen=True)
 class _Effusivity:
     """Options of the effusivity of each grasp."""
@@ -496,16 +485,16 @@ class _Effusivity:
         from thermogrip.sysid.effusivity.multi_touch import rested_long
         from thermogrip.sysid.effusivity.quality import check_grasps
 
-        warnings, ranged = Said(), with_object_range(record, self.stated)
+        warnings, ranged = list[str](), with_object_range(record, self.stated)
         quality = check_grasps(ranged, longest=self.longest)
-        cli.warn_of_contacts(warnings, [record], [quality])
+        cli.warn_of_contacts(warnings.append, [record], [quality])
         if (more := quality.shortened).any():
-            warnings.warn(
+            warnings.append(
                 f"{record.attrs['name']}: {int(more.sum())} of {more.size} contacts are read until "
                 f"{self.longest:g} s, as long as those lasted that taught the gripper"
             )
         if rested_long(record, self.coupling).any():
-            warnings.warn(
+            warnings.append(
                 f"{record.attrs['name']}: blocks that rested longer than those that taught how they move "
                 "between touches: intervals may be too narrow"
             )
@@ -521,7 +510,7 @@ class _Effusivity:
             rows.append(asdict(row) | {"misfit_sd": misfits.get(name, (float("nan"), ""))[0]})
             missed |= {name: why} if why else {}
         unexplained = {name: words for name, (_, words) in misfits.items() if words}
-        return {"rows": rows, "unexplained": unexplained, "missed": missed, "warnings": warnings.words}
+        return {"rows": rows, "unexplained": unexplained, "missed": missed, "warnings": warnings}
 
 
 def materials(

@@ -93,7 +93,7 @@ def compare(
     console = Console(as_json)
     for line in left_out:
         console.warn(line)
-    cli.warn_of_contacts(console, [*records, *(tests or ())])
+    cli.warn_of_contacts(console.warn, [*records, *(tests or ())])
     records = touched_part(console, records)
     tests = None if tests is None else touched_part(console, tests)
     with console.progress("compare") as progress:

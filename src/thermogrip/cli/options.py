@@ -13,7 +13,7 @@ from functools import cache, wraps
 from importlib import resources
 from inspect import Parameter, signature
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Protocol, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 import typer
 
@@ -339,15 +339,8 @@ def load_logs(
     return logs
 
 
-class Warner(Protocol):
-    """What takes warnings."""
-
-    def warn(self, text: str) -> None:
-        """Take one warning."""
-
-
 def warn_of_contacts(
-    console: Warner, records: Sequence[Grasps], qualities: Sequence[GraspQuality] | None = None
+    warn: Callable[[str], None], records: Sequence[Grasps], qualities: Sequence[GraspQuality] | None = None
 ) -> None:
     """Warn of what was repaired in records while they were read, and of contacts that are missing or late;
     ``qualities`` are those of the records where a caller has them."""
@@ -357,9 +350,9 @@ def warn_of_contacts(
         repairs = [line for line in str(grasps.attrs.get("repairs", "")).splitlines() if line]
         more = [f"{len(repairs) - SHOWN_REPAIRS} more like these"] if len(repairs) > SHOWN_REPAIRS else []
         for words in [*repairs[:SHOWN_REPAIRS], *more, *contact_faults(grasps, quality)]:
-            console.warn(f"{grasps.attrs['name']}: {words}")
+            warn(f"{grasps.attrs['name']}: {words}")
     for words in torn_groups(records):
-        console.warn(words)
+        warn(words)
 
 
 def find_network(text: str) -> GreyModel:

@@ -242,9 +242,8 @@ class Watch:
             over = self._over.wait(WATCH.every_s)
             taken = _drain(self._queue)
             if taken:
-                self._now, self._heard = taken[-1], time.monotonic()
-            for snapshot in taken:
-                self._view.add(snapshot)
+                self._now = self._view.now = taken[-1]
+                self._heard = time.monotonic()
             if over or time.monotonic() - shown > WATCH.refresh_s:
                 shown = time.monotonic()
                 self._view.show(last=over)
@@ -265,7 +264,7 @@ class Watch:
             "columns": ["time_s", "phase", "pump", "target", *names],
             "units": ["s", "1", "1", "degC", *units],
             "rows": [_page_row(snapshot) for snapshot in taken],
-            "now": {} if now is None else _present(now),
+            "now": {} if now is None else asdict(now),
             "posterior": _drain(self._posterior),
             "age": time.monotonic() - self._heard,
             "question": None if question is None else asdict(question),
@@ -275,7 +274,8 @@ class Watch:
         if now is None:
             message |= {"columns": [], "units": []}
         try:
-            page.stdin.write(json.dumps(message, default=plain).encode() + b"\n")  # NaN is left to the page
+            # NaN and infinity are left to the page
+            page.stdin.write(json.dumps(message, default=plain).encode() + b"\n")
             page.stdin.flush()
         except OSError:
             self._reached = False
@@ -356,23 +356,20 @@ class _LineDisplay:
         self._title = title
         self._said_at_s = -float("inf")
         self._last_text = ""
-        self._now: Snapshot | None = None
+        self.now: Snapshot | None = None
         self._paused = False
         self.progress: tuple[float, str] = 0.0, ""
-
-    def add(self, snapshot: Snapshot) -> None:
-        self._now = snapshot
 
     def show(self, *, last: bool) -> None:
         fraction, stage = self.progress
         begin = f"{printable(self._title)} {100 * fraction:3.0f} % {printable(stage)}"
-        text = begin if self._now is None else f"{begin}; {line(self._now)}"
+        text = begin if self.now is None else f"{begin}; {line(self.now)}"
         if self._paused:
             return
         if (
             (last or time.monotonic() - self._said_at_s >= 1.0)
             and text != self._last_text
-            and (stage or self._now)
+            and (stage or self.now)
         ):
             self._said_at_s, self._last_text = time.monotonic(), text
             sys.stderr.write(text + "\n")
@@ -392,13 +389,10 @@ class _Panel:
         from rich.console import Console as RichConsole
 
         self._title = title
-        self._now: Snapshot | None = None
+        self.now: Snapshot | None = None
         self.progress: tuple[float, str] = 0.0, ""
         self._console, self._lock = RichConsole(stderr=True, highlight=False), threading.Lock()
         self._live: Any = None
-
-    def add(self, snapshot: Snapshot) -> None:
-        self._now = snapshot
 
     def show(self, *, last: bool) -> None:
         with self._lock:
@@ -422,7 +416,7 @@ class _Panel:
         fraction, stage = self.progress
         note = f"{100 * fraction:3.0f} %  {stage}" if stage else ""
         width = get_terminal_size().columns
-        return panel(f"thermogrip {self._title}", self._now, note=note, width=width)
+        return panel(f"thermogrip {self._title}", self.now, note=note, width=width)
 
 
 def _drain(waiting: deque[Any]) -> list[Any]:
@@ -439,14 +433,3 @@ def _page_row(now: Snapshot) -> list[float | None]:
     phase = float(PHASES.index(now.phase)) if now.phase else None
     head = [now.time_s, phase, None if now.pump is None else float(now.pump), now.target.get(now.skin)]
     return [*head, *now.values.values(), *now.drive.values()]
-
-
-def _present(now: Snapshot) -> dict[str, Any]:
-    """Return a snapshot as the page shows it."""
-    expires = now.expires_s if now.expires_s < float("inf") else None
-    return {
-        **{name: getattr(now, name) for name in now.__dataclass_fields__ if name not in ("events", "trip")},
-        "events": [{"time_s": e.time_s, "kind": e.kind, "text": e.text} for e in now.events],
-        "trip": None if now.trip is None else now.trip.as_dict(),
-        "expires_s": expires,
-    }

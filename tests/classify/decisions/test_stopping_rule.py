@@ -301,7 +301,7 @@ def test_one_callback_serves_grasp_after_grasp_and_tells_what_it_finds(
         assert [at for at, _ in told] == time[time < 3.0].tolist()
 
 
-@pytest.mark.parametrize("late", [0.0, 0.3])
+@pytest.mark.parametrize("late", [pytest.param(0.0, marks=pytest.mark.slow), 0.3])
 def test_a_record_ends_when_its_stream_did_also_where_the_contact_is_late(
     late: float, known: PosteriorClassifier, fresh: Grasps
 ) -> None:

@@ -52,7 +52,7 @@ def spoilt(reading: dict[str, float], outputs, rng: np.random.Generator) -> dict
     return found
 
 
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("case", CASES)
 def test_a_random_loop_is_answered_alike(case, seed):
     """Targets move, ramp or lead through a trajectory, readings are lost and late; C's moves are applied."""

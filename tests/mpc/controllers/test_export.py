@@ -43,14 +43,13 @@ def run_example(export: Export) -> subprocess.CompletedProcess[str]:
 
 @needs_gcc
 def test_c_and_python_do_the_same_in_random_loops(controller, tmp_path):
-    """In a third of a thousand samples the plan of the program costs more than the last one, and others are
-    tried."""
+    """The plan of the program costs more than the last one in a third of the samples: another is tried."""
     export = export_controller(controller, tmp_path)
-    found = check_export(export, controller, states=1300)
+    found = check_export(export, controller, states=600)
     assert found.difference <= 1e-9
-    assert found.same_status == 1300
+    assert found.same_status == 600
     assert found.passed
-    assert found.free > 300
+    assert found.free > 140
     assert found.ram > 8 * controller.model.n_x**2  # its covariance, for one
     assert found.flash > found.constants > 0
     assert 0 < found.stack < 10_000
@@ -154,13 +153,7 @@ def test_a_wrong_number_in_the_export_is_found(controller, tmp_path):
 @pytest.mark.parametrize(
     ("make", "changes", "sanitize"),
     [
-        (heater, {"limits": {"t": (10.0, 55.0)}}, False),
         (heater, {"ramp_per_s": {"t": 0.1}, "limits": {"t": (22.0, 40.0)}}, False),
-        (
-            heater,
-            {"blocks": (1, 2, 3), "zones": {"t": 1.0}, "energy_price": {"q": 0.3}},
-            False,
-        ),
         (
             kit,
             {
@@ -180,6 +173,8 @@ def test_a_wrong_number_in_the_export_is_found(controller, tmp_path):
             },
             False,
         ),
+        long(heater, {"blocks": (1, 2, 3), "zones": {"t": 1.0}, "energy_price": {"q": 0.3}}, False),
+        long(heater, {"limits": {"t": (10.0, 55.0)}}, False),
         long(heater, {"blocks": (1,)}, True),
         long(kit, {"dt": 10.0, "controlled": ("t2",), "limits": {"t1": (0.0, 50.0)}}, True),
         long(kit, {"blocks": (1, 2, 3)}, True),  # slews that end on ranges, a broken band

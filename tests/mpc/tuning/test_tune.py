@@ -108,6 +108,7 @@ def test_a_pi_is_not_saved_where_the_spec_asks_for_what_it_does_not_know():
     assert found.finding.startswith("The MPC is what is saved, because a PI does not know limits of outputs;")
 
 
+@pytest.mark.slow
 def test_the_same_seed_finds_the_same_controller(tank, tuning):
     again = tune(tank, QUICK)
     assert again.controller.design == tuning.controller.design

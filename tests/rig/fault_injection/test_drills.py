@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import signal
 import sys
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -29,7 +31,23 @@ def test_without_a_fault_nothing_trips_and_every_row_is_right(
     assert outcome.wrong == 0
 
 
-@pytest.mark.parametrize("drill", DRILLS, ids=[drill.name for drill in DRILLS])
+#: A sensor of each kind of fault, a driver either way, a line, a device: the others end by the same checks.
+LONG = {
+    "tank sensor short", "tank sensor stuck, on the way", "tank sensor late by 5 s", "driver gives nothing",
+    "driver stuck at full cooling", "1 % of all lines spoilt", "device browned out", "device deaf",
+    "Ctrl-C", "host asked to end (SIGTERM)", "controller raises an exception",
+}  # fmt: skip
+
+
+def each(drills: Sequence[Drill | HostDrill]) -> list[Any]:
+    """Return the drills as cases, those that others stand for marked as long."""
+    return [
+        pytest.param(drill, id=drill.name, marks=[pytest.mark.slow] * (drill.name in LONG))
+        for drill in drills
+    ]
+
+
+@pytest.mark.parametrize("drill", each(DRILLS))
 def test_a_fault_is_found_in_time_and_the_drive_is_zero(
     drill: Drill, controller: PIController, tmp_path: Path
 ) -> None:
@@ -49,7 +67,7 @@ def test_a_fault_is_found_in_time_and_the_drive_is_zero(
     assert len(outcome.message.splitlines()) == 1
 
 
-@pytest.mark.parametrize("drill", HOST_DRILLS, ids=[drill.name for drill in HOST_DRILLS])
+@pytest.mark.parametrize("drill", each(HOST_DRILLS))
 def test_whatever_happens_to_the_host_the_drive_ends(drill: HostDrill, tmp_path: Path) -> None:
     outcome = run_host_drill(drill, tmp_path / "run")
     assert outcome.off <= 2.1  # 2 s on the device, and one of its samples

@@ -86,6 +86,7 @@ def test_a_search_that_is_cut_short_says_so(monkeypatch):
         calibration._least(narrow, FIRST, n_grasp=7)
 
 
+@pytest.mark.slow
 def test_the_bundled_gripper_is_what_its_training_grasps_make():
     """Within what the ends of its searches leave: one that ends at a change of 0.05 in -2 ln evidence, half
     of it left, is off by at most 0.16 standard deviations along its last step, and a file made by another
