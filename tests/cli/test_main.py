@@ -50,17 +50,6 @@ def test_the_rooms_are_importable_without_their_heavy_packages() -> None:
     )
 
 
-def test_python_dash_m_is_the_command() -> None:
-    done = subprocess.run(
-        [sys.executable, "-m", "thermogrip", "--version"],
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=False,
-    )
-    assert (done.returncode, done.stdout[:10]) == (0, "thermogrip"), done.stderr
-
-
 @pytest.mark.parametrize("verb", VERBS)
 def test_every_verb_has_two_examples_that_its_own_options_understand_and_a_next_one(
     verb: str, capsys: pytest.CaptureFixture[str]

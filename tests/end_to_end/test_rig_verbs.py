@@ -67,6 +67,27 @@ def test_virtual_prints_its_port_and_serves_until_it_is_stopped(protocol: str, p
     assert served.returncode == 130, complaint
 
 
+def test_a_schedule_ends_where_the_guard_trips_and_the_answer_is_no(
+    device: VirtualDevice, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    schedule, guard, out = (tmp_path / name for name in ("schedule.csv", "guard.toml", "log"))
+    rows = [f"{k},100,0" for k in range(60)]
+    schedule.write_text("\n".join(["time_s,q1_percent,q2_percent", *rows]) + "\n")
+    guard.write_text("[limits]\nt1 = [5, 27]\n")
+    words = ["record", str(schedule), "--port", device.port, "--protocol", "tclab", "--speed", "5"]
+    words += ["--sample", "0.5", "--guard", str(guard), "--seed", "3", "--out", str(out), "--json"]
+    assert main(words) == 3
+    answer = json.loads(capsys.readouterr().out)
+    log = read_log(out / "samples.csv", inputs=["q1", "q2"], outputs=["t1", "t2"])
+    assert (answer["rows"], answer["out"]) == (log.sizes["time"], str(out))
+    assert answer["ended"].startswith("limit: t1")
+    assert np.diff(log["time"].values).tolist() == [0.5] * (log.sizes["time"] - 1)
+    assert 25.0 < float(log["t1"][-1]) <= 27.5
+    about = json.loads((out / "run.json").read_text())
+    assert (about["verdict"], about["about"]["sample_s"], about["about"]["seed"]) == ("tripped", 0.5, 3)
+    assert device.applied_drive == {"q1": 0.0, "q2": 0.0}
+
+
 def test_record_writes_what_the_schedule_did(device: VirtualDevice, tmp_path: Path) -> None:
     schedule = tmp_path / "schedule.csv"
     rows = [f"{k},{40 if k >= 5 else 0},{20 if k >= 10 else 0}" for k in range(20)]

@@ -43,13 +43,6 @@ def test_an_lstm_that_cannot_be_trained_is_reported_before_any_work(bench, words
 
 
 @pytest.mark.usefixtures("no_torch")
-def test_beside_others_an_lstm_that_cannot_be_trained_is_left_out_and_said(bench) -> None:
-    done = bench.run("compare", "grasps.csv", "--classifiers", "features-lda,lstm", "--out", "made")
-    assert done.code == 0
-    assert f"warning: left out: {HINT}" in done.err.replace("\n", " ")
-
-
-@pytest.mark.usefixtures("no_torch")
 @pytest.mark.parametrize("name", ["lstm", "rocket"])
 def test_fit_names_the_extra_that_brings_what_it_needs(bench, name: str) -> None:
     with pytest.raises(UserError, match=rf'{name} is trained with .*; pip install "thermogrip\[{name}\]"$'):

@@ -141,7 +141,7 @@ def test_a_question_is_answered_on_the_page(watch: Watch, viewer: Viewer, monkey
     assert answers == ["", "it slipped"]
     page.locator("#question").wait_for(state="hidden")
     os.close(ends[1])
-    watch._typing.join()
+    watch.typing.join()
     terminal.close()
 
 
@@ -185,8 +185,8 @@ def test_where_the_page_is_killed_the_session_goes_on(
     page = viewer(watch.address)
     running = Running(watch, paced_twin(), hold=20.0)
     until(page, "#word", "running")
-    assert watch._page is not None
-    os.kill(watch._page.pid, signal.SIGKILL)
+    assert watch.page is not None
+    os.kill(watch.page.pid, signal.SIGKILL)
     until(page, "#word", "this page's server is gone")
     assert "the session does not need the page" in page.locator("#lost").inner_text().lower()
     assert running.result().verdict == "settled"

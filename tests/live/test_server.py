@@ -201,7 +201,7 @@ def test_a_port_that_is_taken_is_one_line() -> None:
 
 def test_the_process_ends_with_the_session() -> None:
     with Watch("run", Console(), Show(live=0)) as watch:
-        process = watch._page
+        process = watch.page
         assert process is not None
         Running(watch, paced_twin(), settle_timeout=5.0).result()
     assert process.returncode == 0
@@ -209,7 +209,7 @@ def test_the_process_ends_with_the_session() -> None:
 
 def test_the_page_of_a_twin_stays_until_its_viewer_has_left() -> None:
     watch = Watch("run", Console(), Show(live=0, pace=10.0)).__enter__()
-    process = watch._page
+    process = watch.page
     assert process is not None
     Running(watch, paced_twin(), settle_timeout=5.0).result()
     leaving = threading.Thread(target=watch.__exit__, args=(None, None, None))
@@ -220,7 +220,7 @@ def test_the_page_of_a_twin_stays_until_its_viewer_has_left() -> None:
     answer = viewer.getresponse()
     # who comes after the end sees it all the same, in the first message or in one that was on its way
     assert any(b"not settled" in answer.readline() for _ in range(20))
-    assert _soon(lambda: watch._viewers) == 1
+    assert _soon(lambda: watch.viewers) == 1
     assert (leaving.is_alive(), process.poll()) == (True, None)
     answer.close()
     viewer.close()

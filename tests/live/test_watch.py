@@ -26,7 +26,7 @@ from thermogrip.report.console import Console
 def test_a_page_that_hangs_holds_up_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "WATCH", replace(module.WATCH, goodbye_s=0.5))
     with Watch("run", Console(), Show(live=0)) as watch:
-        page = watch._page
+        page = watch.page
         assert page is not None
         os.kill(page.pid, signal.SIGSTOP)
         wide = replace(NOW, values={f"t_{k}": float(k) for k in range(200)})
@@ -62,7 +62,7 @@ def test_a_trip_runs_the_command_while_the_session_ends(monkeypatch: pytest.Monk
     with Watch("run", Console(), Show(on_trip="true")) as watch:
         rig = paced_twin()
         running = Running(watch, rig, hold=10_000.0)
-        while watch._now is None or watch._now.time_s < 5.0:
+        while watch.now is None or watch.now.time_s < 5.0:
             time.sleep(0.01)
         watch.operator.stop("a test")
         session = running.result()
@@ -97,7 +97,7 @@ def test_a_question_on_the_page_may_be_answered_on_the_terminal(
         threading.Timer(0.3, watch.operator.stop, ("the page",)).start()
         assert watch.ask("ready?") == "q"  # a stop that was asked for is an answer
         os.close(ends[1])
-        watch._typing.join()
+        watch.typing.join()
 
 
 @pytest.mark.parametrize(

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -12,16 +10,11 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
+from tests.live.conftest import chromium
 from thermogrip.datasets.charts import Chart, Curve, Panel
 from thermogrip.report.html import Commands, Picture, Plot, Section, Table, Text, write_report
 
-sync_api = pytest.importorskip("playwright.sync_api", reason="not installed: playwright")
-CHROMIUM = os.environ.get("CHROMIUM") or shutil.which("chromium") or shutil.which("chromium-browser")
-pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="not installed: chromium")
-QUIET = (
-    "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking",
-    "--disable-component-update", "--disable-sync",
-)  # fmt: skip
+__all__ = ["chromium"]
 TIME = np.arange(0.0, 1000.0)
 
 
@@ -54,19 +47,13 @@ def page_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    with sync_api.sync_playwright() as playwright:
-        yield playwright.chromium.launch(executable_path=CHROMIUM, args=list(QUIET))
-
-
 @pytest.fixture
-def opened(browser: Any, page_file: Path) -> Iterator[Any]:
+def opened(chromium: Any, page_file: Path) -> Iterator[Any]:
     """Return what opens the page: any complaint of the browser, and any request but for the page, fails."""
     contexts, faults = [], []
 
     def open_page(width: int = 1200, *, folded: bool = False, **options: Any) -> Any:
-        context = browser.new_context(viewport={"width": width, "height": 900}, **options)
+        context = chromium.new_context(viewport={"width": width, "height": 900}, **options)
         contexts.append(context)
         page = context.new_page()
         page.on("console", lambda message: faults.append(message.text))

@@ -126,7 +126,7 @@ def test_every_case_and_every_rate_is_printed(small: Repeated) -> None:
     cells = [f"    {title}: {cell}" for row in rows for title, cell in zip(head[6:], row[6:])]
     assert [line for line in lines if ", bundled: " in line or ", simulated: " in line] == cells
     said = " ".join(small.said.split())
-    assert "leaves open all from 29 % (3 of 3) or 48 % (5 of 5) upwards" in said
+    assert "100 % is 3 of 3 or 5 of 5 grasps: 29 % or 48 % and more" in said
     assert said.endswith(f" {small.found.copies_verdict} wrote {small.out}/report.html")
     assert {path.name for path in small.out.iterdir()} == {"bundled", "simulated", "report.html"}
     page = (small.out / "report.html").read_text(encoding="utf-8")

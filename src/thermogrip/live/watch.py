@@ -88,7 +88,8 @@ class Watch:
     """Show a session; a context manager, whose methods are called from the session's thread.
 
     ``operator`` is handed to the session, as are :meth:`listen` and :meth:`progress`; ``address`` is that of
-    the page, with its token.
+    the page, with its token, ``page`` its process, ``viewers`` how many look at it, ``now`` the newest
+    snapshot, ``typing`` the thread that reads the terminal.
     """
 
     def __init__(self, title: str, console: Console, show: Show | None = None) -> None:
@@ -100,19 +101,19 @@ class Watch:
         self._command = None if self._show.on_trip is None else TripCommand(self._show.on_trip, console.warn)
         self._queue: deque[Snapshot] = deque(maxlen=WATCH.keep)
         self._posterior: deque[list[Any]] = deque(maxlen=WATCH.keep)
-        self._now: Snapshot | None = None
+        self.now: Snapshot | None = None
         self._heard = time.monotonic()
         self._fraction, self._what = 0.0, ""
         self._verdict = ""
         self._question: Question | None = None
         self._asked = 0
         self._answers: queue.Queue[tuple[int, str]] = queue.Queue()
-        self._typing: threading.Thread | None = None
+        self.typing: threading.Thread | None = None
         self._over = threading.Event()
         self.address = ""
-        self._page: subprocess.Popen[bytes] | None = None
+        self.page: subprocess.Popen[bytes] | None = None
         self._reached = False  # whether the page's process takes what is written
-        self._viewers: int | None = None  # who look at the page now; None where nobody has come yet
+        self.viewers: int | None = None  # who look at the page now; None where nobody has come yet
         self._view = _LineDisplay(title) if not sys.stderr.isatty() else _Panel(title)
 
     @property
@@ -141,8 +142,8 @@ class Watch:
 
     def cleared(self) -> None:
         """Show the trip no more."""
-        if self._now is not None:
-            self._queue.append(replace(self._now, trip=None, verdict="cleared"))
+        if self.now is not None:
+            self._queue.append(replace(self.now, trip=None, verdict="cleared"))
 
     def ask(
         self, text: str, keys: str = "", choices: tuple[tuple[str, str], ...] = (), own_words: str = ""
@@ -165,15 +166,15 @@ class Watch:
         self._question = Question(self._asked, text, choices, own_words)
         sys.stderr.write(f"{typed} (here or on the page): ")
         sys.stderr.flush()
-        if self._typing is None:
-            self._typing = threading.Thread(target=self._read_typed, daemon=True)
-            self._typing.start()
+        if self.typing is None:
+            self.typing = threading.Thread(target=self._read_typed, daemon=True)
+            self.typing.start()
         try:
             while True:
                 check_stopped()
                 if self.operator.stop_asked:
                     return "q"
-                if not self._reached and not self._typing.is_alive():
+                if not self._reached and not self.typing.is_alive():
                     raise UserError("nobody can answer any more", hint="run the same command again to go on")
                 with suppress(queue.Empty):
                     number, reply = self._answers.get(timeout=0.2)
@@ -213,8 +214,8 @@ class Watch:
                 self._stay()
         self._over.set()
         self._thread.join(WATCH.goodbye_s)
-        if self._thread.is_alive() and self._page is not None:  # it writes to a process that hangs
-            self._page.kill()
+        if self._thread.is_alive() and self.page is not None:  # it writes to a process that hangs
+            self.page.kill()
             self._thread.join()
         self._view.pause()
         self._close_page()
@@ -229,9 +230,9 @@ class Watch:
         sys.stderr.flush()
         end = time.monotonic() + PAGE.linger_s
         while self._reached and time.monotonic() < end:
-            if self._viewers:
+            if self.viewers:
                 end = float("inf")
-            elif self._viewers == 0:
+            elif self.viewers == 0:
                 end = min(end, time.monotonic() + WATCH.reload_s)
             time.sleep(WATCH.every_s)
 
@@ -242,7 +243,7 @@ class Watch:
             over = self._over.wait(WATCH.every_s)
             taken = _drain(self._queue)
             if taken:
-                self._now = self._view.now = taken[-1]
+                self.now = self._view.now = taken[-1]
                 self._heard = time.monotonic()
             if over or time.monotonic() - shown > WATCH.refresh_s:
                 shown = time.monotonic()
@@ -253,7 +254,7 @@ class Watch:
 
     def _send(self, taken: list[Snapshot], over: bool) -> None:
         """Write what is new to the page's process; one that is gone is let go."""
-        page, now = self._page, self._now
+        page, now = self.page, self.now
         if page is None or page.stdin is None or not self._reached:
             return
         question = self._question
@@ -285,7 +286,7 @@ class Watch:
         """Start the page's process and say where the page is."""
         token = secrets.token_urlsafe(24)
         words = [sys.executable, "-P", "-m", "thermogrip.live.server"]
-        self._page = page = subprocess.Popen(
+        self.page = page = subprocess.Popen(
             words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True
         )
         assert page.stdin is not None
@@ -325,7 +326,7 @@ class Watch:
             request = json.loads(text)
             do = request.get("do")  # it may also say why it ends
             if do == "viewers":
-                self._viewers = request["count"]
+                self.viewers = request["count"]
             elif do == "stop":
                 self.operator.stop("the page")
             elif do == "bad":
@@ -334,7 +335,7 @@ class Watch:
                 self._answers.put((int(request["question"]), request.get("text", "")))
 
     def _close_page(self) -> None:
-        page, self._page = self._page, None
+        page, self.page = self.page, None
         self._reached = False
         if page is None or page.stdin is None or page.stdout is None:
             return

@@ -217,7 +217,7 @@ def effusivity_section(rows: Sequence[tuple[Mapping[str, Any], str]], of: int) -
     if answered:
         strips = [EffusivityRow(**{k: v for k, v in row.items() if k != "misfit_sd"}) for row in answered]
         library = {name: find_material(name).effusivity for name in _WELL_KNOWN}
-        caption = "Posterior of each grasp, median and 90 % interval; lines: a few of `thermogrip materials`."
+        caption = "Posterior of each grasp, median and 90 % interval; lines: some known materials."
         contents.append(Picture(effusivity_figure(strips, library), caption))
     caption = "Effusivity in W s^0.5 m^-2 K^-1, with 90 % intervals"
     contents.append(Table(head, tuple(cells), caption, dense=True))

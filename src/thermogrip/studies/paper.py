@@ -101,9 +101,8 @@ class PaperResult:
         """What the published n supports, in a sentence."""
         low, high = (min(_interval(c)[0] for c in CASES if c.right == c.of == n) for n in (3, 5))
         return (
-            "Read as k of n grasps, one a material, a published 100 % leaves open all from "
-            f"{100 * low:.0f} % (3 of 3) or {100 * high:.0f} % (5 of 5) upwards, and 66.66 % all from 9 to "
-            "99 %: cases that are a grasp apart they cannot rank."
+            f"A published 100 % is 3 of 3 or 5 of 5 grasps: {100 * low:.0f} % or {100 * high:.0f} % and more "
+            "are possible. 66.66 % is 2 of 3: 9 to 99 %. Cases one grasp apart cannot be ranked."
         )
 
     @property
@@ -121,9 +120,9 @@ class PaperResult:
         sure = sum(row["confidence"] * row["others_n"] for row in learnt) / others
         return (
             f"Trained on copies of one grasp a material, the paper's LSTM names {share('copies')} of "
-            f"further copies of those grasps right, {share('one')} of one other grasp a material and "
-            f"{share('others')} of all other grasps of the same blocks, of which it is "
-            f"{100 * sure:.0f} % sure on average, in the {len(learnt)} cases whose copies it learnt."
+            f"further copies right, {share('one')} of one other grasp a material and {share('others')} of "
+            f"all other grasps of the same blocks. Of these it is {100 * sure:.0f} % sure on average, in the "
+            f"{len(learnt)} cases whose copies it learnt."
         )
 
     def _learnt(self) -> list[dict[str, Any]]:
