@@ -16,9 +16,11 @@ from __future__ import annotations
 import gc
 import os
 import re
+import shutil
 import signal
 import sys
 from collections.abc import Generator
+from typing import Any
 
 import pytest
 from hypothesis import settings
@@ -46,6 +48,23 @@ ALLOWED_SKIPS = {
     r"needs POSIX and two processors": "one core shares no work",
     r"no browser: ": "the distribution's chromium, which `.ci/run` installs where it may",
 }
+
+
+@pytest.fixture(scope="session")
+def chromium() -> Generator[Any, None, None]:
+    """Return a browser without a window."""
+    playwright = pytest.importorskip("playwright.sync_api", reason="no browser: playwright is not installed")
+    program = next(filter(None, map(shutil.which, ("chromium", "google-chrome"))), None)
+    if program is None:
+        pytest.skip("no browser: chromium is not installed")
+    flags = (
+        "--no-sandbox --disable-gpu --disable-quic --no-first-run --disable-background-networking "
+        "--disable-component-update --disable-sync"
+    )
+    with playwright.sync_playwright() as started:
+        browser = started.chromium.launch(executable_path=program, args=flags.split())
+        yield browser
+        browser.close()
 
 
 def pytest_collection_finish() -> None:

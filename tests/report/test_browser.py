@@ -10,11 +10,9 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from tests.live.conftest import chromium
 from thermogrip.datasets.charts import Chart, Curve, Panel
 from thermogrip.report.html import Commands, Picture, Plot, Section, Table, Text, write_report
 
-__all__ = ["chromium"]
 TIME = np.arange(0.0, 1000.0)
 
 
