@@ -55,7 +55,7 @@ class EffectSettings:
     most_bins: int = 400  # of a stretch; more are averaged
     least_read: float = 0.5  # of a stretch's bins, that an output must have
     least_mode: float = 0.02  # sd of a bin: a start that moves no bin by more is left out
-    least_bins: int = 3  # of a stretch, or of a piece of one
+    least_bins: int = 3  # of a stretch
 
 
 EFFECTS = EffectSettings()
@@ -166,9 +166,7 @@ class _Column:
     moves: list[list[Array]]
 
 
-def linearise_logs(
-    problem: Problem, z: Array, by_log: Sequence[tuple[Array, Array]], *, pieces: int = 1
-) -> Linearised:
+def linearise_logs(problem: Problem, z: Array, by_log: Sequence[tuple[Array, Array]]) -> Linearised:
     """Return residuals, sensitivities and effects of each log at ``z``."""
     starts, p = problem.start(z), problem.parameters(z[None])
     longest = max(_n_bins(problem, at, k) for at, (s, _) in enumerate(problem.logs) for k in range(len(s)))
@@ -184,21 +182,15 @@ def linearise_logs(
         rows, slopes = _by_stretch(problem, log_index, -r[:, None]), _by_stretch(problem, log_index, jacobian)
         effects = _log_effects(problem, log_index, p, starts[log_index], slopes)
         alike = [_in_residual_units(problem, moves[log_index]) for _, moves in discrepancy]
-        blocks: list[list[Block]] = [[] for _ in range(pieces)]
+        blocks = []
         for k in range(len(rows)):
             columns = [*(moves[k] for moves in alike), *(c.moves[k] for c in effects)]
-            cut = _binned_pieces(problem, log_index, k, merge, pieces, slopes[k], columns, rows[k])
-            for piece, block in zip(blocks, cut):
-                piece.append(block)
-        kind = np.array(shared + [-1] * len(effects), dtype=np.int64)
-        first = _warm_up(problem, log_index, starts[log_index][0], merge, effects)
-        for blocks_of_piece in blocks:
-            if blocks_of_piece:
-                effects_of_logs.append(effects)
-                warm.append(first)
-                logs.append(
-                    LogData(problem.names[log_index], tuple(blocks_of_piece), kind.copy(), len(effects))
-                )
+            blocks += _binned_block(problem, log_index, k, merge, slopes[k], columns, rows[k])
+        if blocks:
+            kind = np.array(shared + [-1] * len(effects), dtype=np.int64)
+            effects_of_logs.append(effects)
+            warm.append(_warm_up(problem, log_index, starts[log_index][0], merge, effects))
+            logs.append(LogData(problem.names[log_index], tuple(blocks), kind, len(effects)))
     kinds = [*signals_of, *dict.fromkeys(c.name for log in effects_of_logs for c in log if c.name)]
     for log, effects in zip(logs, effects_of_logs):
         log.kind[len(shared) :] = [kinds.index(c.name) if c.name else -1 for c in effects]
@@ -326,27 +318,26 @@ def _n_bins(problem: Problem, at: int, k: int) -> int:
     return max((int(place[-1]) + 1 for place in problem.logs[at][1][k].places if place.size), default=0)
 
 
-def _binned_pieces(
+def _binned_block(
     problem: Problem,
     at: int,
     k: int,
     merge: int,
-    pieces: int,
     slopes: list[Array],
     columns: Sequence[list[Array]],
     residual: list[Array],
 ) -> list[Block]:
-    """Return the pieces of stretch k of a log on a regular grid of bins; none where it is too short."""
+    """Return stretch k of a log on a regular grid of bins; none where it is too short."""
     places, n = problem.logs[at][1][k].places, _n_bins(problem, at, k) // merge * merge
     outputs = [j for j, place in enumerate(places) if n and place.size >= EFFECTS.least_read * n]
-    if not outputs or n < EFFECTS.least_bins * merge * pieces:
+    if not outputs or n < EFFECTS.least_bins * merge:
         return []
     grids = []
     for j in outputs:
         stacked = np.column_stack([slopes[j], *(column[j] for column in columns), residual[j]])
         grid = _interpolated(places[j], stacked, n)
         grids.append(grid.reshape(-1, merge, grid.shape[1]).mean(axis=1))
-    return [Block.of(piece, outputs) for piece in np.array_split(np.stack(grids, axis=1), pieces)]
+    return [Block.of(np.stack(grids, axis=1), outputs)]
 
 
 def _interpolated(place: NDArray[np.int64], values: Array, n: int) -> Array:

@@ -26,8 +26,7 @@ learnt model is right. Logs that differ by more, because the plant itself varies
 other inputs, have q_i > 1. Three degrees of freedom determine one q_i poorly, so the parameters share one
 factor phi for V, their mean in ln q_i (that of a chi-squared with L - 1 degrees of freedom over L - 1 is
 digamma((L - 1) / 2) - ln((L - 1) / 2)). Where logs agree better than expected, the error model counts as one
-more log: phi is at least (1 + (L - 1) phi) / L. With one or two logs their quarters stand for logs; quarters
-of one log have much in common, so then phi is at least 1.
+more log: phi is at least (1 + (L - 1) phi) / L. One or two logs say nothing of it.
 
 **Never wider than the prior.** Logs remove no prior knowledge, so no parameter is stated with a larger
 standard deviation than its prior's (1 in units of z). Eigenvalues are not cut: a direction of several
@@ -63,7 +62,6 @@ class ErrorPriors:
     effect_sd: float = 0.7  # of ln s of a random effect
     least_bins: int = 10  # to learn an error from
     least_logs: int = 3  # whose disagreement says something
-    pieces: int = 4  # of each log that stand for logs where there are fewer
 
 
 PRIORS = ErrorPriors()
@@ -116,13 +114,10 @@ def score_covariance(
         width += [PRIORS.effect_sd] * (len(data.kinds) - data.n_responses)
         numbers = learn_error_model(data.logs, z, width=width)
     whole = _log_scores(problem, data, numbers, z.size)
-    pull, pieces = whole.discrepancy.sum(axis=0), whole
-    if len(data.logs) < PRIORS.least_logs:
-        cut = linearise_logs(problem, z, by_log, pieces=PRIORS.pieces)
-        pieces = _log_scores(problem, cut, numbers, z.size) if len(cut.logs) >= PRIORS.least_logs else whole
+    pull = whole.discrepancy.sum(axis=0)
     hessian = np.eye(z.size) + whole.hessian.sum(axis=0)
     inverse = np.linalg.inv(hessian)
-    phi = common_factor(disagreement(pieces, z), len(pieces.score), cut=pieces is not whole)
+    phi = common_factor(disagreement(whole, z), len(whole.score))
     fixed, spread = np.eye(z.size) + pull @ pull.T, phi * whole.spread.sum(axis=0)
     covariance = inverse @ (fixed + spread) @ inverse
     narrower = 1 / np.sqrt(np.maximum(np.diag(covariance), 1.0))  # the prior's variance is 1
@@ -160,14 +155,14 @@ def disagreement(scores: LogScores, z: Array) -> Array:
     return np.asarray(np.mean(ratios, axis=0))
 
 
-def common_factor(q: Array, n_log: int, *, cut: bool = False) -> float:
-    """Return phi of the q_i (n_free,) of ``n_log`` logs; ``cut``: these are quarters of fewer logs."""
+def common_factor(q: Array, n_log: int) -> float:
+    """Return phi of the q_i (n_free,) of ``n_log`` logs."""
     if n_log < PRIORS.least_logs:
         return 1.0
     freedom = n_log - 1
     expected_log = digamma(freedom / 2) - np.log(freedom / 2)  # of ln chi^2 / freedom
     phi = float(np.exp(np.log(np.maximum(q, 1e-9)).mean() - expected_log))
-    return max(phi, 1.0 if cut else (1 + freedom * phi) / n_log)
+    return max(phi, (1 + freedom * phi) / n_log)
 
 
 def _log_scores(problem: Problem, data: Linearised, numbers: ErrorModel, n: int) -> LogScores:

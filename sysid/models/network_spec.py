@@ -13,7 +13,7 @@ from collections.abc import Iterator, Mapping
 from importlib import resources
 from math import exp
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NamedTuple
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
@@ -23,27 +23,19 @@ from thermogrip.datasets.limits import LARGEST, STEP_RANGE
 
 _SHARES = {"1": 1.0, "percent": 100.0, "0_255": 255.0}  # full scale of what is a share of it already
 
-_UNITS = {
-    name: unit
-    for unit, names in {
-        "J/K": "capacity wall_capacity",
-        "W/K": "conductance flow film loss",
-        "s": "delay lag",
-        "W": "power",
-        "degC": "temperature",
-        "m2": "area",
-        "V/K": "seebeck",
-        "ohm": "resistance",
-        "A": "current",
-        "1/K": "seebeck_slope resistance_slope",
-        "1": "emissivity offset heating_gain cooling_gain droop dead_zone bend off film_off",
-    }.items()
-    for name in names.split()
-}
-_SIGNED = (
-    *("offset", "droop", "temperature", "off", "film_off"),
-    *("dead_zone", "seebeck_slope", "resistance_slope", "bend"),
-)
+
+class Quantity(NamedTuple):
+    """What a parameter that an element names must be: its unit, and where it may lie."""
+
+    unit: str
+    sign: Literal["positive", "any", "share"] = "positive"
+
+
+class Refers(NamedTuple):
+    """What a name in an element stands for; a place is a node, a disturbance or a boundary."""
+
+    to: Literal["place", "node", "switch", "input"]
+
 
 Name = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]*$", max_length=100)]
 Number = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
@@ -54,7 +46,14 @@ Step = Annotated[float, Field(ge=STEP_RANGE[0], le=STEP_RANGE[1])]
 Few = Field(max_length=50)
 Many = Field(max_length=200)
 Most = Field(max_length=500)
-Two = Annotated[list[Name], Field(min_length=2, max_length=2)]
+Two = Annotated[list[Name], Field(min_length=2, max_length=2), Refers("place")]
+OfNode = Annotated[Name, Refers("node")]
+Switch = Annotated[Name | None, Refers("switch")]
+Share = Annotated[Name | None, Quantity("1", "share")]  # what is left with the switch off
+Conductance = Annotated[Name, Quantity("W/K")]
+Gain = Annotated[Name | None, Quantity("1")]
+Signed = Annotated[Name | None, Quantity("1", "any")]
+Slope = Annotated[Name | None, Quantity("1/K", "any")]
 
 
 class _Table(BaseModel):
@@ -102,9 +101,9 @@ class Disturbance(_Table):
 class Output(_Table):
     """A sensor on a node."""
 
-    node: Name
+    node: OfNode
     unit: Literal["degC"] = "degC"
-    lag: Name | None = None
+    lag: Annotated[Name | None, Quantity("s")] = None
     sd: Positive = 0.1  # of a mean over the fit's bins about the model
     log_sd: NotNegative = 0.0  # of its offset
     reference: bool = False
@@ -113,41 +112,41 @@ class Output(_Table):
 class Node(_Table):
     """A heat capacity; ``start_sd`` is how unsure its temperature is where a log begins."""
 
-    capacity: Name
+    capacity: Annotated[Name, Quantity("J/K")]
     start_sd: Positive = 1.0
 
 
 class Boundary(_Table):
     """A temperature that nothing moves and nobody measures: a parameter."""
 
-    temperature: Name
+    temperature: Annotated[Name, Quantity("degC", "any")]
 
 
 class Link(_Table):
     """A conductance between two nodes."""
 
     between: Two
-    conductance: Name
-    switch: Name | None = None
-    off: Name | None = None  # the share of it that is left with the switch off
-    bend: Name | None = None  # by which share it grows per 10 K of difference, as natural convection does
+    conductance: Conductance
+    switch: Switch = None
+    off: Share = None
+    bend: Signed = None  # by which share it grows per 10 K of difference, as natural convection does
 
 
 class Pipe(_Table):
     """Water that moves from one node to another: cells in a row, each with a piece of wall."""
 
-    source: Name = Field(alias="from")
-    target: Name = Field(alias="to")
-    flow: Name  # mass flow times the heat capacity of water
-    delay: Name  # the time at full flow
+    source: Annotated[Name, Field(alias="from"), Refers("place")]
+    target: Annotated[Name, Field(alias="to"), Refers("node")]
+    flow: Conductance  # mass flow times the heat capacity of water
+    delay: Annotated[Name, Quantity("s")]  # the time at full flow
     cells: Annotated[int, Field(ge=1, le=60)]
-    switch: Name | None = None
-    off: Name | None = None
-    wall_capacity: Name | None = None  # as film and loss a sum over all cells
-    film: Name | None = None  # water to wall
-    film_off: Name | None = None
-    loss: Name | None = None  # wall, or else water, to the surroundings
-    surroundings: Name | None = None
+    switch: Switch = None
+    off: Share = None
+    wall_capacity: Annotated[Name | None, Quantity("J/K")] = None  # as film and loss a sum over all cells
+    film: Annotated[Name | None, Quantity("W/K")] = None  # water to wall
+    film_off: Share = None
+    loss: Annotated[Name | None, Quantity("W/K")] = None  # wall, or else water, to the surroundings
+    surroundings: Annotated[Name | None, Refers("place")] = None
 
     @model_validator(mode="after")
     def _whole(self) -> Pipe:
@@ -162,35 +161,35 @@ class Radiation(_Table):
     """Grey radiation between two nodes."""
 
     between: Two
-    area: Name
-    emissivity: Name
+    area: Annotated[Name, Quantity("m2")]
+    emissivity: Annotated[Name, Quantity("1")]
 
 
 class Heater(_Table):
     """A resistor; ``power`` at the input's ``full_scale``."""
 
-    node: Name
-    input: Name
-    power: Name
+    node: OfNode
+    input: Annotated[Name, Refers("input")]
+    power: Annotated[Name, Quantity("W")]
 
 
 class Peltier(_Table):
     """A Peltier element that warms ``face`` at positive command and takes the heat from ``sink``."""
 
-    face: Name
-    sink: Name
-    input: Name
-    seebeck: Name
-    resistance: Name
-    current: Name
-    conductance: Name | None = None
-    offset: Name | None = None
-    heating_gain: Name | None = None
-    cooling_gain: Name | None = None
-    droop: Name | None = None
-    dead_zone: Name | None = None
-    seebeck_slope: Name | None = None
-    resistance_slope: Name | None = None
+    face: OfNode
+    sink: OfNode
+    input: Annotated[Name, Refers("input")]
+    seebeck: Annotated[Name, Quantity("V/K")]
+    resistance: Annotated[Name, Quantity("ohm")]
+    current: Annotated[Name, Quantity("A")]
+    conductance: Annotated[Name | None, Quantity("W/K")] = None
+    offset: Signed = None
+    heating_gain: Gain = None
+    cooling_gain: Gain = None
+    droop: Signed = None
+    dead_zone: Signed = None
+    seebeck_slope: Slope = None
+    resistance_slope: Slope = None
     driver: Literal["current", "duty"] = "current"
 
 
@@ -306,22 +305,46 @@ def network_from_dict(content: Mapping[str, Any], *, file: str | None = None) ->
     return network
 
 
-def roles(network: Network) -> Iterator[tuple[str, str, str]]:
-    """Yield (table, key, parameter) for every place where an element names a parameter."""
+class _Named(NamedTuple):
+    """A name that an element mentions."""
+
+    where: str  # table, element and key
+    kind: Quantity | Refers
+    names: list[str]
+
+
+def _mentioned(network: Network) -> list[_Named]:
+    """Return every name that an element mentions."""
+    out = []
     for group in ("outputs", "nodes", "boundaries", "links", "pipes", "radiation", "heaters", "peltiers"):
         for name, element in getattr(network, group).items():
-            for key in type(element).model_fields:
-                value = getattr(element, key)
-                if key in _UNITS and value is not None:
-                    yield f"{group}.{name}", key, value
+            for key, field in type(element).model_fields.items():
+                value, where = getattr(element, key), f"{group}.{name}.{field.alias or key}"
+                names = value if isinstance(value, list) else [value]
+                kinds = [mark for mark in field.metadata if isinstance(mark, (Quantity, Refers))]
+                out += [_Named(where, kind, names) for kind in kinds if value is not None]
+    return out
 
 
 def _network_faults(network: Network) -> Iterator[tuple[str, str]]:
     """Yield (problem, hint) for each contradiction between the tables."""
-    yield from _name_faults(network)
-    yield from _reference_faults(network)
-    yield from _parameter_faults(network)
-    linked = {name for _, _, names in _references(network) for name in names}
+    group_of: dict[str, str] = {}
+    for group in ("inputs", "disturbances", "outputs", "nodes", "boundaries", "pipes"):
+        for name in getattr(network, group):
+            if name in group_of:
+                yield f"{group}.{name}: the name is in {group_of[name]} too", "give each its own name"
+            group_of[name] = group
+    mentioned = _mentioned(network)
+    for where, kind, names in mentioned:
+        if isinstance(kind, Refers):
+            yield from _reference_faults(network, where, kind, names)
+        else:
+            yield from _parameter_faults(network, where, kind, names[0])
+    used = {name for _, _, names in mentioned for name in names}
+    for name in network.parameters:
+        if name not in used:
+            yield f"parameters.{name}: no element names it", "use it or leave it out"
+    linked = {name for _, kind, names in mentioned if isinstance(kind, Refers) for name in names}
     for node in network.nodes:
         if node not in linked:
             yield f"nodes.{node}: no element touches it", "link it or leave it out"
@@ -332,75 +355,30 @@ def _network_faults(network: Network) -> Iterator[tuple[str, str]]:
             yield f"inputs.{name}.range: {list(item.range)} is empty", "write [low, high]"
 
 
-def _name_faults(network: Network) -> Iterator[tuple[str, str]]:
-    group_of: dict[str, str] = {}
-    for group in ("inputs", "disturbances", "outputs", "nodes", "boundaries", "pipes"):
-        for name in getattr(network, group):
-            if name in group_of:
-                yield f"{group}.{name}: the name is in {group_of[name]} too", "give each its own name"
-            group_of[name] = group
-
-
-#: Where elements name something: table, keys, and of what; a place is a node, a disturbance or a boundary.
-_REFERENCES = (
-    ("links", ("between",), "place"),
-    ("radiation", ("between",), "place"),
-    ("pipes", ("from", "surroundings"), "place"),
-    ("pipes", ("to",), "node"),
-    ("heaters", ("node",), "node"),
-    ("peltiers", ("face", "sink"), "node"),
-    ("outputs", ("node",), "node"),
-    ("links", ("switch",), "switch"),
-    ("pipes", ("switch",), "switch"),
-    ("heaters", ("input",), "input"),
-    ("peltiers", ("input",), "input"),
-)
-
-
-def _references(network: Network) -> Iterator[tuple[str, str, list[str]]]:
-    """Yield (table and key, of what, names) for each reference of :data:`_REFERENCES` that is made."""
-    for group, keys, kind in _REFERENCES:
-        for name, element in getattr(network, group).items():
-            for key in keys:
-                named = getattr(element, {"from": "source", "to": "target"}.get(key, key))
-                if named is not None:
-                    yield f"{group}.{name}.{key}", kind, named if isinstance(named, list) else [named]
-
-
-def _reference_faults(network: Network) -> Iterator[tuple[str, str]]:
+def _reference_faults(
+    network: Network, where: str, kind: Refers, names: list[str]
+) -> Iterator[tuple[str, str]]:
     outside = [*network.disturbances, *network.boundaries]
     switches = [name for name, item in network.inputs.items() if item.switch]
     candidates = {"place": [*network.nodes, *outside], "node": [*network.nodes], "switch": switches}
     candidates["input"] = [*network.inputs]
-    for where, kind, names in _references(network):
-        for name in names:
-            if name not in candidates[kind]:
-                lacking = "node" if kind == "place" else kind
-                yield f"{where}: no {lacking} {name!r}", known_names(name, candidates[kind], "there are {}")
-        if len(names) == 2 and (names[0] == names[1] or set(names) <= set(outside)):
-            yield f"{where}: joins {names[0]} and {names[1]}", "join two places, one of them a node"
+    for name in names:
+        if name not in candidates[kind.to]:
+            lacking = "node" if kind.to == "place" else kind.to
+            yield f"{where}: no {lacking} {name!r}", known_names(name, candidates[kind.to], "there are {}")
+    if len(names) == 2 and (names[0] == names[1] or set(names) <= set(outside)):
+        yield f"{where}: joins {names[0]} and {names[1]}", "join two places, one of them a node"
 
 
-def _parameter_faults(network: Network) -> Iterator[tuple[str, str]]:
-    used = set()
-    for table, key, name in roles(network):
-        used.add(name)
-        if name not in network.parameters:
-            yield (
-                f"{table}.{key}: no parameter {name!r}",
-                known_names(name, network.parameters, "there are {}"),
-            )
-            continue
-        parameter = network.parameters[name]
-        if parameter.unit != _UNITS[key]:
-            yield (
-                f"parameters.{name}.unit: {parameter.unit!r}, but {table}.{key} is in {_UNITS[key]}",
-                "correct one",
-            )
-        if key not in _SIGNED and (parameter.value <= 0 or parameter.bounds[0] < 0):
-            yield f"parameters.{name}: {table}.{key} must be positive", "give a value and bounds above 0"
-        if key in ("off", "film_off") and not (parameter.bounds[0] >= 0 and parameter.value <= 1):
-            yield f"parameters.{name}: {table}.{key} is what is left, 0 to 1", "set low = 0.0 and high = 1.0"
-    for name in network.parameters:
-        if name not in used:
-            yield f"parameters.{name}: no element names it", "use it or leave it out"
+def _parameter_faults(network: Network, where: str, kind: Quantity, name: str) -> Iterator[tuple[str, str]]:
+    if name not in network.parameters:
+        yield f"{where}: no parameter {name!r}", known_names(name, network.parameters, "there are {}")
+        return
+    parameter = network.parameters[name]
+    if parameter.unit != kind.unit:
+        said = f"parameters.{name}.unit: {parameter.unit!r}, but {where} is in {kind.unit}"
+        yield said, "correct one"
+    if kind.sign == "positive" and (parameter.value <= 0 or parameter.bounds[0] < 0):
+        yield f"parameters.{name}: {where} must be positive", "give a value and bounds above 0"
+    if kind.sign == "share" and not (parameter.bounds[0] >= 0 and parameter.value <= 1):
+        yield f"parameters.{name}: {where} is what is left, 0 to 1", "set low = 0.0 and high = 1.0"

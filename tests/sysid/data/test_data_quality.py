@@ -434,37 +434,12 @@ def gripper():
     return prior_plant(load_network("gripper"))
 
 
-def test_minutes_of_heating_and_cooling_are_those_of_the_columns(gripper):
-    log = load_example_logs()["step_up_down"]
-    seen = covered(gripper, [log])
-    drive, time = log["drive"].values, log["time"].values
-    cooling = np.sum(np.diff(time)[drive[:-1] < -0.05 * np.abs(drive).max()]) / 60
-    assert seen.minutes["drive < 0"] == pytest.approx(cooling, abs=0.05)
-    assert seen.total == pytest.approx((time[-1] - time[0]) / 60, rel=0.01)
-
-
 def test_a_pump_that_never_stops_is_reported(gripper):
     seen = covered(gripper, [load_example_logs()["step_up_down"]])
     assert "pump off" in seen.thin
     assert "pump off never occurs" in seen.sentence(gripper.units)
     both = covered(gripper, list(load_example_logs().values()))
     assert both.minutes["pump off"] > 5
-
-
-def test_a_gap_does_not_count_as_minutes(gripper):
-    time = np.append(np.arange(0.0, 600.0), np.arange(3600.0, 4200.0))
-    log = load_example_logs()["step_up_down"].isel(time=slice(0, time.size))
-    signals = {name: (log[name].values, log[name].attrs["units"], log[name].attrs["role"]) for name in log}
-    assert covered(gripper, [make_log(time, signals)]).total == pytest.approx(20.0, abs=0.3)
-
-
-def test_rows_of_an_hour_are_no_gaps(gripper):
-    log = load_example_logs()["step_up_down"].isel(time=slice(0, 200))
-    signals = {name: (log[name].values, log[name].attrs["units"], log[name].attrs["role"]) for name in log}
-    time = 3600.0 * np.arange(200)
-    assert covered(gripper, [make_log(time, signals)]).total == pytest.approx(200 * 60)
-    time[100:] += 6 * 3600.0  # a step of seven hours counts as five
-    assert covered(gripper, [make_log(time, signals)]).total == pytest.approx(204 * 60)
 
 
 def test_an_input_of_one_sign_is_described_by_its_halves():

@@ -209,15 +209,6 @@ def test_long_logs_are_averaged_and_a_mean_stands_for_its_bins():
     np.testing.assert_allclose(found.hessian, np.eye(2) + V / (2 * w**2), rtol=1e-3)
 
 
-def test_of_two_logs_their_quarters_stand_for_logs():
-    problem, z, by_log = fitted(1, 2)
-    found = score_covariance(problem, z, by_log, white(problem, z, 0.4))
-    assert found.phi >= 1.0
-    P, V, _ = by_hand(problem, z, by_log, 0.4)
-    np.testing.assert_allclose(found.hessian, P, rtol=1e-6)  # the whole logs all the same
-    np.testing.assert_allclose(found.spread, found.phi * V, rtol=1e-4)
-
-
 def test_what_a_discrepancy_moves_is_uncertain_in_all_logs_alike():
     problem, z, by_log = fitted(1, 2, 3)
     numbers = white(problem, z, 0.4)
@@ -267,7 +258,6 @@ def test_logs_that_agree_better_than_they_should_count_with_the_model_as_one_mor
     low = np.full(6, 1e-4)
     alone = np.exp(np.log(1e-4) - digamma(2) + np.log(2))
     assert common_factor(low, 5) == pytest.approx((1 + 4 * alone) / 5)
-    assert common_factor(low, 5, cut=True) == 1.0  # quarters have much in common
     assert common_factor(np.full(4, 9.0), 5) > 9.0  # the mean of ln q is below the ln of its mean
 
 

@@ -496,16 +496,6 @@ def heater(**more: Any) -> Any:
     return plant
 
 
-def test_commands_are_cut_to_whole_steps_of_their_driver():
-    q = np.array([0.0, 0.3, -0.3, 0.5, 0.74, 1.0])
-    log = log_of(T[:6], 2 * T[:6], q)
-    (plain,) = cut_stretches(heater(), log)
-    (found,) = cut_stretches(heater(command_steps={"q": 0.25}, smooth=3.0), log)
-    assert plain.u[:, 0].tolist() == q[: len(plain.u)].tolist()
-    assert found.u[:, 0].tolist() == [0.0, 0.25, -0.25, 0.5, 0.5, 1.0][: len(found.u)]
-    assert found.d.shape == (len(found.u), 0)
-
-
 @pytest.mark.parametrize(
     ("smooth", "want"),
     [

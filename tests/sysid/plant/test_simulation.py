@@ -18,11 +18,8 @@ from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.log_grid import Stretch, cut_stretches
 from thermogrip.sysid.plant.plant import Plant
 from thermogrip.sysid.plant.simulation import (
-    Start,
     _binned,
     _first_reading,
-    _reading_sd,
-    _through_gap,
     find_starts,
     predict,
 )
@@ -233,46 +230,6 @@ def stretch_of(time: Any, y: Any = None, steps: int = 5, gap: float = 0.0, **hel
     time = np.asarray(time, float)
     u, d = (np.full((steps, 1), held.get(name, 0.0)) for name in ("u", "d"))
     return Stretch(slice(0, time.size), time, np.zeros((time.size, 2)) if y is None else y, u, d, gap, "a")
-
-
-@pytest.mark.parametrize(
-    ("last", "gap", "times", "width", "u", "d"),
-    [
-        (10.0, 8.0, [3.0], 2.0, [[4.0, 1.0, -2.0, -2.0]], [10.5, 12.5, 14.5, 16.5]),
-        (10.0, 8.0, [0.0, 8.0], 2.0, [[-2.0] * 4, [4.0] * 4], [10.5, 12.5, 14.5, 16.5]),
-        (
-            9.0,
-            7.0,
-            [3.0],
-            2.0,
-            [[4.0, 1.0, -2.0]],
-            [10 + 4 / 3 - 0.5, 13.5, 14 + 8 / 3 - 0.5],
-        ),  # of a step 1 s is over
-        (9.0, 1.0, [0.0], 1e-3, [[-2.0]], [13.5]),
-    ],
-)
-def test_through_a_gap_the_input_changes_once_and_what_is_measured_lies_on_a_line(
-    last: float, gap: float, times: list[float], width: float, u: list[list[float]], d: list[float]
-):
-    before, after = stretch_of([0.0, last], u=4.0, d=10.0), stretch_of([0.0], gap=gap, u=-2.0, d=18.0)
-    zero = np.zeros(2)
-    start = Start(zero, zero, zero, np.array([0.5]), None, 0.0, "")
-    got = _through_gap(before, after, start, times, 2.0)
-    np.testing.assert_allclose(got[0][:, :, 0], u, atol=1e-12)
-    np.testing.assert_allclose(got[1][0, :, 0], d, atol=1e-12)
-    assert got[2] == pytest.approx(width)
-
-
-@pytest.mark.parametrize(("dt", "warmup", "rows", "factor"), [
-    (2.0, 10.0, 6, 6 / 2), (2.0, 9.0, 6, 6 / 2), (2.0, 100.0, 6, 6 / 2), (2.0, 0.1, 2, 2 / 1.2),
-    (20.0, 20.0, 2, 1.0),
-])  # fmt: skip
-def test_bins_of_a_warm_up_count_together_as_a_reading_every_ten_seconds(
-    dt: float, warmup: float, rows: int, factor: float
-):
-    made, stretch = plant(dt=dt, noise={"b": 0.0}), stretch_of([0.0])
-    found = _reading_sd(made, stretch, warmup)
-    np.testing.assert_allclose(found, np.tile(np.sqrt(factor) * np.array([0.1, 1e-6]), (rows, 1)))
 
 
 def test_a_first_reading_is_of_two_seconds_or_else_of_the_first_minute():
@@ -514,41 +471,6 @@ def test_a_stretch_behind_a_gap_has_the_inputs_of_its_own_rows():
     assert (first.rows, second.rows) == (slice(0, 51), slice(51, 181))
 
 
-def test_the_last_step_is_whole_and_ends_at_or_behind_the_last_row():
-    made = plant()
-    for last, steps in ((20.0, 10), (20.5, 11), (21.9, 11), (22.0, 11)):
-        t = np.append(np.arange(0.0, 20.0), last)
-        (found,) = cut_stretches(made, log_of(t, 25.0))
-        assert len(found.u) == len(found.d) == steps
-
-
-@pytest.mark.parametrize("middle", [11.0, 59.0, 151.0])
-def test_the_mean_of_a_room_ends_where_its_log_does(middle: float):
-    made = plant()
-    t = np.arange(0.0, 161.0)
-    room = 20.0 + 0.01 * t**1.5 + np.where(t > 6.0, 1.0, 0.0)
-    (found,) = cut_stretches(made, log_of(t, 25.0, room=room))
-    fine = np.arange(0.005, 160.0, 0.01)
-    held = room[fine.astype(int)]
-    for at in (1.0, 5.0, middle, 159.0):
-        about = (fine > max(at - 10.0, 0.0)) & (fine < min(at + 10.0, 160.0))
-        assert found.d[round((at - 1.0) / 2.0), 0] == pytest.approx(held[about].mean(), abs=1e-6)
-
-
-@pytest.mark.parametrize(("seconds", "dt", "window"), [(8.0, 2.0, 8.0), (0.0, 2.0, 2.0), (20.0, 40.0, 40.0)])
-def test_a_model_may_say_over_how_long_a_room_is_averaged_and_a_step_is_the_least(
-    seconds: float, dt: float, window: float
-):
-    made = plant(type("Own", (StateSpaceModel,), {"smooth": seconds}), dt=dt)
-    t = np.arange(0.0, 401.0)
-    room = 20.0 + np.where(t >= 200.0, 4.0, 0.0)
-    (found,) = cut_stretches(made, log_of(t, 25.0, room=room))
-    at = dt * (np.arange(len(found.d)) + 0.5)
-    np.testing.assert_allclose(
-        found.d[:, 0], 20.0 + 4.0 * np.clip((at + window / 2 - 200.0) / window, 0.0, 1.0), atol=1e-9
-    )
-
-
 # ---- a network ----
 
 
@@ -600,30 +522,6 @@ def test_the_switch_inside_a_gap_is_found_from_the_data_after_it(gripper: Plant)
     change = float(filled.attrs["notes"].split("changed ")[1].split(" s")[0])
     assert change == pytest.approx(25.0, abs=1.5)
     assert held["scored"].values[gap["time"].values > 5].all()
-
-
-def test_a_missing_signal_and_an_empty_warm_up_are_refused(gripper: Plant):
-    t = np.arange(0, 60, 0.5)
-    log = gripper_run(gripper, t, np.zeros(t.size))
-    with pytest.raises(UserError, match="column pump: no such column"):
-        gripper.simulate(log.drop_vars("pump"))
-    with pytest.raises(UserError, match="warm-up"):
-        gripper.simulate(log, warmup=0.0)
-
-
-def test_a_drive_in_percent_or_counts_is_the_same_share_of_full_scale(gripper: Plant):
-    t = np.arange(0, 200, 0.5)
-    log = gripper_run(gripper, t, np.full(t.size, 0.4))
-    for unit, full in (("percent", 100.0), ("0_255", 255.0)):
-        other = log.copy(deep=True)
-        other["drive"] = ("time", full * log["drive"].values, {"units": unit, "role": "other"})
-        seen = gripper.simulate(other)
-        np.testing.assert_allclose(seen["t_tank"], gripper.simulate(log)["t_tank"], atol=1e-9)
-        assert f"drive: converted from {unit} to 1" in seen.attrs["notes"]
-        assert other["drive"].attrs["units"] == unit  # the log itself is left as it was
-    bare = replace(gripper, valid=gripper.valid | {"drive": (0.0, 80.0)})  # its 1 is no share
-    with pytest.raises(UserError, match="leave the unit away"):
-        bare.simulate(other)
 
 
 def test_a_batch_of_parameters_ends_where_each_member_alone_does(gripper: Plant):
