@@ -101,7 +101,8 @@ class _Race:
         turned = np.minimum(np.arange(used)[:, None] + self.samples_across, used)
         gain = np.take_along_axis(sums, turned, axis=0) - sums[:-1]
         ends = np.where(gain >= 0, self.high, self.low)
-        return np.concatenate([ends, np.repeat(ends[-1:], self.n - used, axis=0)])[None]
+        whole: Array = np.concatenate([ends, np.repeat(ends[-1:], self.n - used, axis=0)])
+        return whole[None]
 
     def _headed_for(self, ends: Array) -> Array:
         """Return plans (plans, n, n_u) that go where ``ends`` are as fast as the slew allows."""
