@@ -774,38 +774,6 @@ def test_a_log_survives_every_way_of_writing_it(
     assert (names(log, "input"), names(log, "output")) == (("Heater",), ("Plate",))
 
 
-CELLS = st.one_of(
-    st.sampled_from(
-        ["", "nan", "inf", "-1e309", "warm", "1,5", '"', "'", "1e", "0x1F", "٣", "1_0", "#", " "]
-    ),
-    st.text(max_size=8),
-    FLOATS.map(repr),
-)
-
-
-@SLOW
-@given(
-    rows=st.lists(st.lists(CELLS, min_size=1, max_size=5), max_size=8),
-    header=st.sampled_from(["time_s,drive,t_a_degC", "time_s;drive;t_a_degC", "time_ms,t_a_K", "time_s"]),
-)
-def test_a_corrupted_csv_is_a_log_or_one_line(tmp_path, rows, header):
-    path = tmp_path / "log.csv"
-    path.write_text("\n".join([header, "0,1,20", *(",".join(r) for r in rows)]), encoding="utf-8", newline="")
-    assert what_is_wrong(path) == ""
-
-
-def what_is_wrong(path):
-    """Return why a file gave neither a log that is one nor one line with its name in it; "" where it did."""
-    try:
-        log = read_log(path)
-    except UserError as fault:
-        line = str(fault)
-        return "" if "\n" not in line and path.name in line else f"said {line!r}"
-    time = log["time"].values
-    whole = time.size >= 2 and np.isfinite(time).all() and (np.diff(time) > 0).all()
-    return "" if whole and len(log.data_vars) >= 1 else f"gave {log}"
-
-
 def test_a_table_with_a_reading_of_one_signal_in_a_row_has_a_column_for_each_signal(tmp_path):
     path = tmp_path / "long.csv"
     rows = [f"{name},{k},{60 * k}\n" for k in range(10) for name in ("heater", "oven")]

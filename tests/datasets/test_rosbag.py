@@ -27,11 +27,6 @@ from thermogrip.datasets.rosbag import (
     Column,
     Message,
     TopicMap,
-    _Decoders,
-    _field,
-    _held,
-    _nearest,
-    _stamped,
     read_rosbag_table,
     read_topic_map,
 )
@@ -260,6 +255,8 @@ def test_a_damaged_chunk_is_never_read_as_numbers(tmp_path: Path) -> None:
     [
         (('topic = "/skin"', 'topic = "/nose"'), "topic /nose has no message; it has /cmd"),
         (('field = "data"', 'field = "date"'), "has no number 'date'"),
+        (('field = "data"', 'field = "__class__"'), "has no number '__class__'"),
+        (("version = 1", 'version = 1\nstamp = "header"'), "/cmd (std_msgs/msg/Float64) has no header.stamp"),
         (('unit = "K"', 'unit = "Kelvin"'), "unit 'Kelvin' is unknown"),
         (("thermogrip.topics", "thermogrip.topic"), "is no topic map"),
         (('role = "input"', 'role = "in"'), "role 'in' is unknown"),
@@ -283,28 +280,11 @@ def test_a_wrong_map_is_one_line_that_says_what_repairs_it(
     assert "\n" not in str(caught.value)
 
 
-def test_a_map_calls_no_method_of_a_message(tmp_path: Path) -> None:
-    file = write_bag(tmp_path, "bag")
-    (tmp_path / "topics.toml").write_text(MAP.replace('field = "data"', 'field = "__class__"'))
-    with pytest.raises(UserError, match="has no number"):
-        read_log(file)
-
-
 def test_the_header_stamp_may_be_the_time(tmp_path: Path) -> None:
     file = write_bag(tmp_path, "bag")
     text = MAP.split("[columns.drive]")[0].replace("version = 1", 'version = 1\nstamp = "header"')
     (tmp_path / "topics.toml").write_text(text)
     np.testing.assert_allclose(read_log(file)["time"].values, 0.5 * np.arange(60), atol=1e-6)
-
-
-def test_a_message_holds_and_the_nearest_counts_within_half_a_step() -> None:
-    times, values, nan = np.array([1.0, 2.0, 4.0, 5.0]), np.array([10.0, 20.0, 40.0, 50.0]), np.nan
-    held = _held(np.array([0.9, 1.0, 1.9, 2.0, 9.0]), times, values)
-    np.testing.assert_array_equal(held, [nan, 10.0, 10.0, 20.0, 50.0])
-    axis = np.array([0.4, 0.5, 1.4, 1.5, 1.6, 2.6, 3.0, 5.5, 5.5 + 0.8e-6, 5.5 + 1.5e-6])  # a step is 1 s
-    near = _nearest(axis, times, values)
-    np.testing.assert_array_equal(near, [nan, 10.0, 10.0, 20.0, 20.0, nan, nan, 50.0, 50.0, nan])
-    assert _nearest(np.array([0.0, 99.0]), times[:1], values[:1]).tolist() == [10.0, 10.0]
 
 
 def said(topic: str, at: float, content: Any, **attrs: str) -> Message:
@@ -376,24 +356,6 @@ def test_topics_that_make_no_table_are_one_line(
 ) -> None:
     with pytest.raises(UserError, match=re.escape(words)):
         table_of(monkeypatch, messages)
-
-
-def test_a_field_is_a_path_of_names_and_places_and_a_stamp_that_of_its_header() -> None:
-    content = {"joints": SimpleNamespace(effort=[1.5, {"x": 2.5}]), "-": 1}
-    found = [_field(content, path) for path in ("joints.effort.0", "joints.effort.-1.x", "joints.effort.1.x")]
-    assert found == [1.5, 2.5, 2.5]
-    with pytest.raises(KeyError, match="__class__"):
-        _field(content, "joints.__class__")
-    for parts in (("sec", "nanosec"), ("secs", "nsecs")):
-        stamp = dict(zip(parts, (3, 250_000_000)))
-        message = said("/a", 7.5, {"header": {"stamp": stamp}})
-        assert (_stamped(message, "header", Path("a")), _stamped(message, "log", Path("a"))) == (3.25, 7.5)
-    with pytest.raises(UserError, match=re.escape("a: /b (pkg/Kind) has no header.stamp; set stamp = ")):
-        _stamped(said("/b", 7.5, {"header": 1}), "header", Path("a"))
-    for encoding, schema in (("protobuf", 1), ("cdr", None)):
-        channel = SimpleNamespace(message_encoding=encoding, topic="/x")
-        with pytest.raises(UserError, match=f"a: /x is encoded as '{encoding}', which is not read; export"):
-            _Decoders(Path("a")).decode(schema, channel, b"")
 
 
 def test_the_template_is_a_topic_map(tmp_path: Path) -> None:
