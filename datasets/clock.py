@@ -260,7 +260,8 @@ def read_clock(cells: Sequence[str]) -> tuple[Floats, str] | None:
         return None
 
     def numbers(key: int) -> Floats:
-        return np.asarray(pd.to_numeric(fields[key].str.replace(",", "."), errors="coerce"), dtype=float)
+        plain = fields[key].str.replace("[,:]", ".", regex=True)
+        return np.asarray(pd.to_numeric(plain, errors="coerce"), dtype=float)
 
     hour, minute, second = (np.nan_to_num(numbers(key)) for key in (4, 5, 6))
     half = fields[7].str.lower()

@@ -166,7 +166,7 @@ def assign_roles(
         if all(len(values) >= _ROLES.fewest_rows for values in columns.values()):
             guesses |= _copied_columns(columns, guesses, units)
             guesses |= _unlike_inputs(columns, guesses, [n for n, role in stated.items() if role == "input"])
-        guesses |= _controllers(guesses, units)
+        guesses |= _controllers(guesses, units, columns)
         evidence |= _followed_levels(columns, guesses)
         guesses |= evidence
         fixed = {name: role for name, (role, why) in guesses.items() if why != NO_CLUE} | stated
@@ -189,12 +189,13 @@ def assign_roles(
 
 
 def _controllers(
-    guesses: Mapping[str, tuple[str, str]], units: Mapping[str, str]
+    guesses: Mapping[str, tuple[str, str]], units: Mapping[str, str], columns: Mapping[str, Floats]
 ) -> dict[str, tuple[str, str]]:
     """Return the columns that are what a controller calls them, where a set point shows that it does: what it
     reads, what it drives, and its terms."""
     by_name = {name.lower(): name for name in guesses}
-    if not any(_SETPOINT.search(_name_words(name)) for name in units):
+    goals = {_name_words(name) for name in units if _SETPOINT.search(_name_words(name))}
+    if not goals:
         return {}
     of_controller = "beside a set point it is the controller's:"
     out: dict[str, tuple[str, str]] = {}
@@ -204,6 +205,11 @@ def _controllers(
     if drives and (reads or any(role == "output" for role, _ in guesses.values())):
         out |= {by_name[name]: ("output", f"{of_controller} what it reads") for name in reads}
         out |= {by_name[name]: ("input", f"{of_controller} what it drives") for name in drives}
+    without_clue = {_name_words(name): name for name, (_, why) in guesses.items() if why == NO_CLUE}
+    moving = [name for name, (role, _) in guesses.items() if role == "input" and np.nanstd(columns[name]) > 0]
+    for name in {_SETPOINT.sub("", goal) for goal in goals} & without_clue.keys():
+        if _is_moved(columns, without_clue[name], moving):
+            out[without_clue[name]] = "output", "its set point stands beside it, and a drive moves it"
     out |= {by_name[n]: ("other", f"{of_controller} its mode") for n in by_name.keys() & _MODES}
     terms = by_name.keys() & {"p", "i", "d"}
     if len(terms) > 1:
@@ -377,8 +383,7 @@ def _unnamed_causes(
 
 
 def _is_moved(columns: Mapping[str, Floats], name: str, drives: Sequence[str]) -> bool:
-    """Tell whether the past of a drive helps to predict a column, row by row or in means over many rows, as
-    long as the column is not stuck."""
+    """Tell whether the past of a drive helps to predict a column, as long as the column is not stuck."""
     is_sound = np.isfinite(drop_stuck(name, columns[name], [columns[n] for n in drives])[0])
     if is_sound.sum() < _ROLES.fewest_rows:
         return True  # nothing of it speaks against

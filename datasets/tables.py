@@ -21,6 +21,7 @@ import zipfile
 import zlib
 from collections import Counter
 from collections.abc import Callable, Container, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from itertools import chain, count, islice
 from pathlib import Path
@@ -45,6 +46,7 @@ _LOST_CELLS = frozenset(
     ["", "nan", "NaN", "NAN", "NA", "na", "N/A", "null", "NULL", "None", "-nan", "#N/A", "<NA>", "NaT",
      "-", "--", "---", "?", "*", "unknown", "unavailable"]
 )  # fmt: skip
+_CODINGS = {"cp1252": "Windows-1252", "cp932": "Shift-JIS", "gb18030": "GB 18030"}
 _COMMENT = ("#", "%", "//")  # how a line begins that is no row
 _LEFT_OUT = "\x1f"  # how the name of a column begins that is not kept
 _NAMELESS = "columns named c1 to c{} by position; --columns a,b,... names them"
@@ -52,9 +54,9 @@ _HEAD_LINES = 200  # of a file, that show how it is a table: the longest preambl
 #: A date, a time of day, or both, as a whole cell.
 STAMP = re.compile(
     r"()(?:(\d{1,4})[-/.](\d{1,2}|[A-Za-z]{3})[-/.](\d{1,4})(?:,?\s+|T|$))?"
-    r"(?:(\d{1,2}):(\d{2})(?::(\d{2}(?:[.,]\d+)?))?)?\s*([AaPp][Mm])?\s*(Z|UTC|[+-]\d{2}:?\d{2})?$"
+    r"(?:(\d{1,2}):(\d{2})(?::(\d{2}(?:[.,:]\d+)?))?)?\s*([AaPp][Mm])?\s*(Z|UTC|[+-]\d{2}:?\d{2})?$"
 )
-_TIME_OF_DAY = r"((?:\d{1,4}[-/.]\d{1,2}[-/.]\d{1,4}[ T]+)?\d{1,2}:\d{2}:\d{2}(?:[.,]\d+)?)"
+_TIME_OF_DAY = r"((?:\d{1,4}[-/.]\d{1,2}[-/.]\d{1,4}[ T]+)?\d{1,2}:\d{2}:\d{2}(?:[.,:]\d+)?)"
 _LINE_STAMP = re.compile(
     r"\W{0,2}" + _TIME_OF_DAY + r"|Stats (\d+\.\d+):"
 )  # how a line of a program's log begins: a stamp, or Klipper's seconds
@@ -74,6 +76,8 @@ _SWITCH = {
 _NUMBER_CELL = re.compile(
     r"[+-]?(\d+\.?\d*([eE][+-]?\d+)?|\.\d+([eE][+-]?\d+)?|inf|infinity)", re.ASCII | re.IGNORECASE
 )
+# what spreadsheets print within numbers: a minus that is no hyphen, a mark between thousands
+_PRINTED_MINUS, _THOUSANDS = "\u2212", re.compile(r"(?<=\d)[\s'\u2019](?=\d{3}(?!\d))")
 _WITH_UNIT = re.compile(r"([+-]?[\d.,]+(?:[eE][+-]?\d+)?)\s*([^\W\d_]{1,4}|%|[°º]\s?[CFK])")
 
 
@@ -227,7 +231,10 @@ def _best_separator(lines: Sequence[str]) -> tuple[str, int | None]:
         values = sum(_number_share(row, separator) for row in rows if len(row) == n > 1)
         if n and values > most_values + 1e-9:
             most_values = values
-            best, best_first = separator, lengths.index(n)
+            places = [place for place, length in enumerate(lengths) if length == n]
+            # one that is alone, without names above it, is of a preamble
+            of_table = (k for k in places if k + 1 in places or (k and len(rows[k - 1]) == n))
+            best, best_first = separator, next(of_table, places[0])
     return best, best_first
 
 
@@ -246,6 +253,7 @@ def _split_cells(line: str, separator: str) -> list[str]:
 
 
 def _is_value(cell: str, separator: str) -> bool:
+    cell = _THOUSANDS.sub("", cell.replace(_PRINTED_MINUS, "-"))
     plain = cell if separator == "," else cell.replace(",", ".")
     if (
         _NUMBER_CELL.fullmatch(plain)
@@ -270,15 +278,22 @@ def _names_above(lines: Sequence[str], n: int, separator: str) -> tuple[list[str
         cells = _split_cells(line.lstrip("#%/ ") if comment else line, separator)
         if separator == " " and len(cells) != n:
             cells = [cell.strip() for cell in re.split(r"\s{2,}|\t|,|;", line.strip("#%/ "))]
-        if len(cells) in (n, n - 1) and any(cells) and len(headers) < 2 and not (comment and headers):
+        fits = len(cells) == n or len(cells) == n - 1 > 1
+        of_words = _number_share([*filter(None, cells)], separator) < 0.5
+        if fits and any(cells) and of_words and not (comment and headers):
             headers.append([*cells, ""][:n])
-        if headers and not all(_is_unit(cell) for cell in headers[0] if cell):
+        words = [cell for cell in headers[0] if cell] if headers else []
+        # a line of units has another word above what counts rows or times
+        if len(headers) == 2 or (words and np.mean([_is_unit(word) for word in words]) <= 0.5):
             break
     if not headers:
         return [""] * n, 0
     names = headers[-1]
     if len(headers) == 2:
-        names = [f"{name} [{unit.strip('[]()')}]" if unit else name for name, unit in zip(names, headers[0])]
+        pairs = [
+            (name, unit.strip("[]()") if _is_unit(unit) else "") for name, unit in zip(names, headers[0])
+        ]
+        names = [f"{name} [{unit}]" if unit else name for name, unit in pairs]
     used = sum(not line.startswith(_COMMENT) for line in lines[-len(headers) :])
     return [from_csv(name) for name in names], used
 
@@ -352,6 +367,8 @@ def _labelled_cells(line: str) -> dict[str, str]:
     stamp = _LINE_STAMP.match(line)
     section = last = ""
     cells: dict[str, str] = {}
+    if line.startswith("{"):  # JSON, an object a line
+        line = re.sub(r'[{}"]', "", line)
     if stamp is not None:
         cells["time" if stamp[1] else "time_s"] = (stamp[1] or stamp[2]).replace(",", ".")
         line = line[stamp.end() :]
@@ -452,7 +469,7 @@ def read_column(
     number among more numbers than are tolerated."""
     if (plain := _plain_numbers(cells)) is not None:
         return Column(name, plain)
-    cells = [cell.strip() for cell in cells]
+    cells = [_THOUSANDS.sub("", cell.strip().replace(_PRINTED_MINUS, "-")) for cell in cells]
     values = _to_numbers(cells)
     notes: list[str] = []
     wrong = _not_numbers(cells, values)
@@ -749,10 +766,19 @@ def _decoded(data: bytes, file: str, *, strict: bool = False) -> tuple[str, tupl
         if strict:
             row = data.count(b"\n", 0, error.start) + 1
             raise UserError("is not UTF-8 text", file=file, row=row, hint="save the file as UTF-8") from error
-        text, notes = data.decode("cp1252", "replace"), ("text is not UTF-8: read as Windows-1252",)
+        text, coding = _first_coding(data)
+        notes = (f"text is not UTF-8: read as {coding}",)
     if not text.strip():
         raise UserError("is empty", file=file, hint="give a header and at least two rows")
     return text if "\n" in text else text.replace("\r", "\n"), notes
+
+
+def _first_coding(data: bytes) -> tuple[str, str]:
+    """Return bytes as text by the first coding of spreadsheets that has all of them, and its name."""
+    for coding, name in _CODINGS.items():
+        with suppress(UnicodeDecodeError):
+            return data.decode(coding), name
+    return data.decode("cp1252", "replace"), "Windows-1252"
 
 
 def _iterate_lines(text: str) -> Iterator[str]:

@@ -192,6 +192,15 @@ def test_beside_a_set_point_input_and_output_are_the_controllers():
     assert assign_roles(units, columns=columns).of["input"] == "input"
 
 
+def test_what_has_a_set_point_of_its_own_name_beside_it_is_read():
+    bed = 20 + 5 * plant_of(HELD)
+    columns = {"T": bed + NOISY, "B": bed, "B_target": np.full(bed.size, 60.0), "@": HELD}
+    roles = assign_roles(dict.fromkeys(columns, "1"), columns=columns)
+    assert (roles.of["B"], roles.reasons["B"].split(",")[0]) == ("output", "its set point stands beside it")
+    cold = columns | {"B": 20 + 0.1 * NOISY}
+    assert assign_roles(dict.fromkeys(cold, "1"), columns=cold).of["B"] == "other"
+
+
 def test_one_column_beside_the_weather_is_the_output():
     columns = {"oat": ROOM, "meter": 2 * NOISY}
     roles = assign_roles({"oat": "1", "meter": "W"}, columns=columns).of

@@ -67,7 +67,8 @@ def test_the_ending_is_the_format_and_the_rest_is_the_name(name, kind, stem):
         ("x,y\nINF,Inf\n1,2\n", "x|y", 1, ",", ""),
         ("x,y\n٣,٤\n1,2\n", "٣|٤", 2, ",", "1 line(s) before the table passed over"),
         ("a,b,3\n1,2,3\n", "a|b|3", 1, ",", ""),
-        ("t u\n0.5\t1\n1.5\t2\n", "t u|c2", 1, "\t", "without a name: c2"),
+        ("t u v\n0.5\t1\n1.5\t2\n", "c1|c2", 1, "\t",
+         BY_POSITION.format(2) + "; 1 line(s) before the table passed over"),
         ("a,b,\n1,2,\n3,4,\n", "a|b|\x1fend", 1, ",", ""),
         ("1,2,\n3,4,\n", "c1|c2|\x1fend", 0, ",", BY_POSITION.format(2)),
         ("a,b,\n1,2,\n3,4,5\n", "a|b|c3", 1, ",", "without a name: c3"),
@@ -89,8 +90,12 @@ def test_the_ending_is_the_format_and_the_rest_is_the_name(name, kind, stem):
         ("# Time of day\tHeater\n0 1\n1 2\n", "Time of day|Heater", 1, " ", ""),
         ("Time of day, Heater\n0 1\n1 2\n", "Time of day|Heater", 1, " ", ""),
         ("\n'=x,\"y,1\"\n\n1,2\n3,4\n", "=x|y,1", 3, ",", ""),
-        ("2026,1\nx,y\n3,4\n5,6\n", "c1|c2", 0, ",", BY_POSITION.format(2)),  # the first line has numbers
-        ("12\n1,2\n3,4\n", "12|c2", 1, ",", "without a name: c2"),
+        ("2026,1\nx,y\n3,4\n5,6\n", "x|y", 2, ",", "1 line(s) before the table passed over"),
+        ("12\n1,2\n3,4\n", "c1|c2", 1, ",",
+         BY_POSITION.format(2) + "; 1 line(s) before the table passed over"),
+        ("channel names:\nHeater\tTank 1\ndt:\n0.5\t0.5\ndata:\n1\t2\n3\t4\n", "Heater|Tank 1", 5, "\t",
+         "4 line(s) before the table passed over"),
+        ("Nr,U,T\nNO.,%,degC\n1,2,3\n2,2,3\n", "Nr|U [%]|T [degC]", 2, ",", ""),
         ("a,b,c\n1,x,\n2,,5\n", "a|b|c", 1, ",", ""),  # half of the cells
         ("a;b,c\n", "a;b|c", 1, ",", ""),
         ("Log\nversion\t2\nby\tme\n\nTime\tU\tT (C)\n" + "0\t1\t2\n" * 40, "Time|U|T (C)", 5, "\t",
@@ -199,6 +204,10 @@ def test_a_table_has_4096_columns_at_most():
         ("a,b\xb5\n1,2\n", {"a": "1", "b\xb5": "2"}, [2], []),
         (b"a,b\xb5\n1,2\n3,4\n", {"a": "1 3", "b\xb5": "2 4"}, [2, 3],
          ["text is not UTF-8: read as Windows-1252"]),
+        ("a,番号\n1,2\n3,4\n".encode("cp932"), {"a": "1 3", "番号": "2 4"}, [2, 3],
+         ["text is not UTF-8: read as Shift-JIS"]),
+        ("a;b\n1;\u22122,5\n2;2\u202f400,0\n3;12'345,5\n", {"a": "1 2 3", "b": "-2.5 2400 12345.5"},
+         [2, 3, 4], ["numbers have a decimal comma"]),
     ],
 )  # fmt: skip
 def test_cells_are_numbers_switches_times_or_words(text, cells, lines, notes):
@@ -214,6 +223,7 @@ def test_cells_are_numbers_switches_times_or_words(text, cells, lines, notes):
         ("t = 0, T hot = nan\r\nt = 1, T hot = 5\r\n", {"t": "0 1", "T hot": "- 5"}),
         ("a:1\tb:2\na:3\tb:4\n", {"a": "1 3", "b": "2 4"}),
         ("a:1 b:2\n\na:3 b:4\n", {"a": "1 3", "b": "2 4"}),
+        ('{"a":1,"b":2.5}\n{"a": 3, "b": 4}\n', {"a": "1 3", "b": "2.5 4"}),
     ],
 )
 def test_cells_that_begin_with_the_names_of_their_columns(text, cells):
