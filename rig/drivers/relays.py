@@ -98,27 +98,8 @@ class Switch:
 class RelayRig:
     """A rig some of whose drives are relays, behind the interface of one whose drives are graded.
 
-    A reading has the requested drive where the device applies what was switched, else what it applies.
-
-    Parameters
-    ----------
-    rig : Rig
-        Its inputs that no relay names are handed through.
-    relays : mapping of str to Relay
-        By the drive as the controller knows it.
-    clock : callable
-        Time by which relays are switched [s].
-
-    Examples
-    --------
-    >>> from thermogrip.rig.simulation.twin import Twin
-    >>> from thermogrip.rig.simulation.virtual_device import example_plant
-    >>> twin = Twin(example_plant("tclab"))
-    >>> rig = RelayRig(twin, {"q1": Relay("q1", on_s=10.0, off_s=10.0)}, lambda: twin.time)
-    >>> rig.apply({"q1": 25.0, "q2": 0.0}, 1)
-    >>> rig.wait(120.0)
-    >>> sum(row["q1"] for row in twin.history) / 120.0
-    25.0
+    Inputs that no relay names are handed through.  A reading has the requested drive where the device applies
+    what was switched, else what it applies.
     """
 
     def __init__(self, rig: Rig, relays: Mapping[str, Relay], clock: Callable[[], float]) -> None:
@@ -175,18 +156,13 @@ class RelayRig:
                 if relay.cooler not in ("", relay.heater):
                     share -= applied[relay.cooler] / self._full(relay.cooler)
                 drive[name] = share * UNIT_RANGES[self.units[name]][1]
-        return replace(reading, drive=drive, mean_drive=self._mean_drive())
-
-    def _mean_drive(self) -> dict[str, float] | None:
-        """Return what was applied on average since it was asked for last; None where no time has passed."""
         self._pass_time()
         seconds, self._read_at = self._now - self._read_at, self._now
-        means = {
-            name: on_s / seconds * UNIT_RANGES[self.units[name]][1] if seconds > 0 else 0.0
-            for name, on_s in self._on_s.items()
-        }
-        self._on_s = dict.fromkeys(self.relays, 0.0)
-        return self._requested | means if seconds > 0 else None
+        on_s, self._on_s = self._on_s, dict.fromkeys(self.relays, 0.0)
+        if seconds <= 0:
+            return replace(reading, drive=drive, mean_drive=None)
+        means = {name: on_s[name] / seconds * UNIT_RANGES[self.units[name]][1] for name in self.relays}
+        return replace(reading, drive=drive, mean_drive=self._requested | means)
 
     def apply(self, drive: Mapping[str, float], pump: int) -> None:
         """Request drives from now on; with the pump off all relays are off at once."""
@@ -272,16 +248,7 @@ class RelayRig:
 
 
 def read_relays(path: str | Path) -> dict[str, Relay]:
-    """Return the relays of a TOML file: a table by drive, with the keys of :class:`Relay`.
-
-    Examples
-    --------
-    >>> from tempfile import mkdtemp
-    >>> path = Path(mkdtemp()) / "relays.toml"
-    >>> n = path.write_text("[q1]\\non_s = 10\\noff_s = 10\\n")
-    >>> read_relays(path)
-    {'q1': Relay(heater='q1', cooler='', on_s=10.0, off_s=10.0, dead_s=0.0)}
-    """
+    """Return the relays of a TOML file: a table by drive, with the keys of :class:`Relay`."""
     hint = "write [q1] and below it on_s = 10"
     content = read_toml(path, hint=hint)
     if not content:

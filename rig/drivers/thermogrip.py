@@ -9,8 +9,7 @@ decide.  A drive that was not confirmed raises, because it must not count as app
 **The conversation.**  A question that is met with silence, or whose answer came damaged, is repeated with the
 same number, and the device does nothing twice.  A lost port is tried again (with back-off) at each question;
 a device that answers again after it was lost or reset is greeted anew, which switches everything off.  It
-must be the same board: by its own serial number or, of firmware that has none, by its count of resets.
-Another one is never driven.
+must be the same board, by its own serial number: another one is never driven.
 """
 
 from __future__ import annotations
@@ -150,12 +149,6 @@ class DeviceRig(NoticeBook):
         raise PortError("absent", "nothing here speaks our protocol", file=self.port.url, hint=hint)
 
     def _ask(self, request: protocol.Request) -> protocol.State:
-        state = self._content(request)
-        assert isinstance(state, protocol.State)
-        self._compare(state)
-        return state
-
-    def _content(self, request: protocol.Request) -> protocol.Identity | protocol.State:
         """Return what answers a question, greeting the device first where it is a new one."""
         if self.closed:
             raise PortError("lost", "is closed", file=self.port.url, hint="open the rig again")
@@ -171,17 +164,14 @@ class DeviceRig(NoticeBook):
             self._lost = False
             self._note("link", "answers again")
         if isinstance(answer, protocol.Refused):
-            latched = self._faults() if answer.code in ("latched", "active") else ()
+            latched: tuple[str, ...] = ()
+            if answer.code in ("latched", "active"):  # a refusal does not have the faults
+                latched = self._ask(protocol.Read()).faults
             raise DeviceRefusedError(answer.code, protocol.REFUSALS[answer.code], latched)
-        return answer.content
-
-    def _faults(self) -> tuple[str, ...]:
-        """Return the latched faults, which a refusal does not have."""
-        answer = self._exchange(protocol.Read())
-        if not isinstance(answer, protocol.Answer) or not isinstance(answer.content, protocol.State):
-            return ()
-        self._compare(answer.content)
-        return answer.content.faults
+        state = answer.content
+        assert isinstance(state, protocol.State)
+        self._compare(state)
+        return state
 
     def _greet_if_new(self) -> None:
         """Open a lost port if that is due, and say hello on a new connection, after a silence or a reset."""
@@ -191,19 +181,9 @@ class DeviceRig(NoticeBook):
             return
         self._host.reset()
         answer = self._exchange(protocol.Hello())
-        if not isinstance(answer, protocol.Answer) or not self._is_same(answer.content):
+        if not isinstance(answer, protocol.Answer) or answer.content != self.identity:
             raise PortError("lost", "is another device now", file=self.port.url, hint="start anew")
         self._greeted_at = self.port.opened
-
-    def _is_same(self, identity: protocol.Identity | protocol.State) -> bool:
-        """Say whether what has answered to hello is the board of the first hello."""
-        if self.identity.serial or identity != self.identity:
-            return identity == self.identity
-        if self._known is None:  # a reset was announced, which ends the session
-            return True
-        answer = self._exchange(protocol.Read())
-        state = answer.content if isinstance(answer, protocol.Answer) else None
-        return isinstance(state, protocol.State) and state.boot == self._known.boot
 
     def _exchange(self, request: protocol.Request) -> protocol.Answer | protocol.Refused:
         """Repeat a question until it is answered."""

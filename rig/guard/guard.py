@@ -282,6 +282,7 @@ class Guard:
 
     def refuse(self, drive: Mapping[str, float], pump: int, time: float) -> Trip | None:
         """Return the trip of a move that must not go out, None where it may."""
+        has_pump = self.model is None or "pump" in self.model.plant.inputs
         for name, value in drive.items():
             if not isfinite(value):
                 return Trip(
@@ -292,7 +293,7 @@ class Guard:
                     measured=f"{value}",
                     figures={"drive": value},
                 )
-            if pump == 0 and value != 0.0 and self._has_pump:
+            if pump == 0 and value != 0.0 and has_pump:
                 return Trip(
                     kind="interlock",
                     time_s=time,
@@ -306,10 +307,6 @@ class Guard:
     def model_share(self) -> float:
         """The largest deviation from the plant, as a share of what is allowed; NaN without a plant."""
         return float("nan") if self.model is None else self.model.share
-
-    @property
-    def _has_pump(self) -> bool:
-        return self.model is None or "pump" in self.model.plant.inputs
 
     def ready(self, time: float) -> bool:
         """Say whether the skin has been compared with the model for long enough to be grasped with.
@@ -496,9 +493,9 @@ class Guard:
     ) -> Trip | None:
         if self.model is None:
             outputs = {n: v for n, v in outputs.items() if n not in masked}
-            share = [self._share(name, value) for name, value in self._mean_drive.items()]
-            mean = max(share, key=abs, default=0.0)
-            return self.rules.check(time, mean, outputs, room=room)
+            full = {name: max(map(abs, self._ranges.get(name, (-1.0, 1.0)))) for name in self._mean_drive}
+            shares = [value / full[name] for name, value in self._mean_drive.items()]
+            return self.rules.check(time, max(shares, key=abs, default=0.0), outputs, room=room)
         alarms = self.model.update(time, outputs, masked)
         if not self.model.compared_now:  # a grasp is sampled faster than the model steps
             return None
@@ -537,10 +534,6 @@ class Guard:
                 "window_s": alarm.window,
             },
         )
-
-    def _share(self, name: str, value: float) -> float:
-        low, high = self._ranges.get(name, (-1.0, 1.0))
-        return value / max(abs(low), abs(high))
 
     def _plausible(self, values: Mapping[str, float]) -> dict[str, float]:
         return {name: value for name, value in values.items() if self.sensors.plausible(value)}

@@ -51,8 +51,8 @@ from thermogrip.datasets.schema import Grasps, Log
 from thermogrip.rig.guard.sensor_checks import room_sensors
 from thermogrip.rig.interface import Event
 from thermogrip.rig.records.mcap_export import write_mcap
-from thermogrip.rig.session.loop import PHASES, log_of_rows
-from thermogrip.rig.session.session import Session, grasp_of_rows
+from thermogrip.rig.session.loop import log_of_rows
+from thermogrip.rig.session.session import Session
 from thermogrip.rig.session.signals import hold_signals
 
 SCHEMA, VERSION = "thermogrip.run", 1
@@ -110,7 +110,8 @@ class RunFolder:
             self._write(self._samples, csv_text([self._header]).encode())
         if tuple(row) != self._header:
             raise ValueError(f"columns changed from {self._header} to {tuple(row)}")
-        line = ",".join(_csv_number(value) for value in row.values())
+        # an empty cell where a reading is lost
+        line = ",".join(f"{value:.9g}" if value == value else "" for value in row.values())
         due = self._clock() - self._forced >= 1.0
         self._write(self._samples, line.encode() + b"\n", force=due)
         self._disk.check(_AT_ONCE_S)
@@ -336,11 +337,6 @@ def _write_bytes(file: int, data: memoryview) -> int:
     return os.write(file, data)
 
 
-def _csv_number(value: float) -> str:
-    """Return a number as the CSV has it; an empty cell where it is lost."""
-    return f"{value:.9g}" if value == value else ""
-
-
 _CSV_NUMBER = re.compile(rb"-?(?:\d+(?:\.\d+)?(?:e[+-]?\d+)?|inf)")
 
 
@@ -351,7 +347,7 @@ class Run:
     about: dict[str, Any]  # ``run.json``
     log: Log | None  # every whole row; None where there are fewer than two
     events: tuple[Event, ...]
-    grasps: Grasps | None  # as written, or cut from the samples where the run ended before it was written
+    grasps: Grasps | None  # as the run wrote them; None where it was ended before
     lost: tuple[str, ...]  # what of the files could not be read, a line each
 
     @property
@@ -402,30 +398,21 @@ def read_run(folder: str | Path) -> Run:
     path = Path(folder)
     if not (path / "samples.csv").is_file() and not (path / "run.json").is_file():
         raise UserError("is no run folder", file=path, hint="give the folder of --out")
-    about = _about(path)
+    about: dict[str, Any] = {"about": {}, "verdict": "running"}  # where it is lost
+    if (path / "run.json").is_file():
+        about = read_json(path / "run.json", SCHEMA, VERSION)
     header, rows, samples = _read_samples(path / "samples.csv")
     events, whole = _events(path / "events.jsonl")
-    written, unread = _written_grasps(path)
-    lost = samples.lost + whole.lost + unread
+    lost = samples.lost + whole.lost
     rooms = _rooms(header, events)
     log = log_of_rows(rows, rooms, name=path.name, repairs=samples.lost) if len(rows) > 1 else None
-    grasps = written
-    if written is None:
+    grasps = None
+    if all((path / name).is_file() for name in _GRASPS):
         try:
-            grasps = _grasp(header, rows, events, rooms)
-        except (KeyError, TypeError, ValueError) as error:
-            lost = (*lost, f"events.jsonl: what it says of the grasp makes none ({str(error)[:200]})")
+            grasps = read_grasps(path / "grasps.csv")
+        except UserError as error:
+            lost = (*lost, f"{Path(error.file or _GRASPS[0]).name}: {error.problem}")
     return Run(about, log, events, grasps, lost)
-
-
-def _written_grasps(path: Path) -> tuple[Grasps | None, tuple[str, ...]]:
-    """Return the grasps as the run wrote them, None where it did not, and why they cannot be read."""
-    if not all((path / name).is_file() for name in _GRASPS):
-        return None, ()
-    try:
-        return read_grasps(path / "grasps.csv"), ()
-    except UserError as error:
-        return None, (f"{Path(error.file or _GRASPS[0]).name}: {error.problem}",)
 
 
 def recover(folder: str | Path) -> Recovery:
@@ -446,11 +433,6 @@ def recover(folder: str | Path) -> Recovery:
             damaged_name = _keep(path / name)
             findings.append(f"{name} as it was found is kept as {damaged_name}")
             write_atomic(path / name, b"".join(line + b"\n" for line in whole.lines))
-    if run.grasps is not None and _written_grasps(path)[0] is None:
-        half_written = [name for name in _GRASPS if (path / name).is_file()]
-        findings += [f"{name} as it was found is kept as {_keep(path / name)}" for name in half_written]
-        write_grasps(run.grasps, path / "grasps.csv")
-        findings.append("the grasp that was not written whole was cut from the samples")
     verdict = run.about.get("verdict", "running")
     if verdict == "running":
         findings.append("the run did not end by itself: its verdict is now interrupted")
@@ -499,13 +481,6 @@ def sums_agree(folder: Path) -> list[str] | None:
         elif not (folder / name).is_file() or file_hash(folder / name) != digest:
             wrong.append(name)
     return wrong
-
-
-def _about(path: Path) -> dict[str, Any]:
-    """Return run.json, or its least content where it is lost."""
-    if not (path / "run.json").is_file():
-        return {"about": {}, "verdict": "running"}
-    return read_json(path / "run.json", SCHEMA, VERSION)
 
 
 def _whole_lines(path: Path, good: Any) -> _Whole:
@@ -594,29 +569,6 @@ def _rooms(header: list[str], events: tuple[Event, ...]) -> frozenset[str]:
         if isinstance(recorded, list)
         else room_sensors(readings)
     )
-
-
-def _grasp(
-    header: list[str], rows: list[dict[str, float]], events: tuple[Event, ...], rooms: frozenset[str]
-) -> Grasps | None:
-    """Return the grasp of the last "closed" message, None where none was made or it has no samples."""
-    message = next((e for e in reversed(events) if e.kind == "closed" and e.data), None)
-    if message is None or not rows:
-        return None
-    output = next((h for h in header if h == "t_surface_degC"), "")
-    target = next((h for h in header if h.startswith("target_") and h.endswith("_degC")), "")
-    output = output.removesuffix("_degC") or target.removeprefix("target_").removesuffix("_degC")
-    start = PHASES.index("lead_in")
-    mine = [row for row in rows if row.get("phase", 0.0) >= start]
-    after = [
-        row
-        for row in mine
-        if row["time_s"] >= message.time_s and row[f"{output}_degC"] == row[f"{output}_degC"]
-    ]
-    if len(after) < 2:
-        return None
-    about: Mapping[str, Any] = message.data
-    return grasp_of_rows(mine, message.time_s, output, about, rooms)
 
 
 def _keep(path: Path) -> str:

@@ -135,10 +135,6 @@ def _switch(text: str) -> int:
     return int(text)
 
 
-def _temperature_fields(words: Sequence[str]) -> tuple[int | str, ...]:
-    return tuple(word if word in LOST else integer(word) for word in words)
-
-
 def _check(sound: bool) -> None:
     if not sound:
         raise ValueError("malformed")
@@ -241,11 +237,6 @@ class Identity:
     drives: tuple[Channel, ...]
     pump: bool  # whether a pump is to run before anything is driven
     sensors: tuple[str, ...]  # names of the temperatures, in the order of every state
-
-    @property
-    def serial(self) -> str:
-        """The board's serial number, "" of firmware before 0.2.0."""
-        return self.version.partition("+")[2]
 
     def words(self) -> tuple[str, ...]:
         """Return the words after ``ok``."""
@@ -369,14 +360,10 @@ class HostEnd:
             self.identity = parse_identity(words)
             return self.identity
         state = parse_state(words)
-        _check(self._fits(state))
+        if self.identity is not None:
+            numbers = (len(state.drive), len(state.temperatures))
+            _check(numbers == (len(self.identity.drives), len(self.identity.sensors)))
         return state
-
-    def _fits(self, heard: State) -> bool:
-        """Say whether it has as many numbers as the device has drives and sensors, where known."""
-        identity = self.identity
-        shape = (len(heard.drive), len(heard.temperatures))
-        return identity is None or shape == (len(identity.drives), len(identity.sensors))
 
 
 def request_words(request: Request) -> tuple[str, ...]:
@@ -413,9 +400,8 @@ def parse_state(words: Sequence[str]) -> State:
     uptime_ms, boots = integer(uptime), integer(boot)
     _check(uptime_ms >= 0 and 0 <= boots <= 0xFFFF)
     applied = (_switch(pump), _switch(grip), integers(drive))
-    return State(
-        mode, uptime_ms, cause, boots, latched, *applied, _temperature_fields(temperatures.split(","))
-    )
+    readings = tuple(word if word in LOST else integer(word) for word in temperatures.split(","))
+    return State(mode, uptime_ms, cause, boots, latched, *applied, readings)
 
 
 def _announcement(line: Line) -> Event:

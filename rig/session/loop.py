@@ -16,7 +16,7 @@ from __future__ import annotations
 from bisect import bisect_left
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from math import ceil
 from typing import Any, Protocol
@@ -33,7 +33,7 @@ from thermogrip.rig.guard.trip import ENDLESS, Trip, TripError
 from thermogrip.rig.interface import DeviceRefusedError, Event, Reading, Rig
 from thermogrip.rig.serial.port import PortError
 from thermogrip.rig.session.profile import Profile
-from thermogrip.rig.session.signals import check_stopped, hold_signals
+from thermogrip.rig.session.signals import check_stopped, hold_signals, stop_signals
 from thermogrip.rig.session.snapshot import MOST_MARKS, Listener, Operator, Snapshot
 
 #: Longest time between two looks at a rig [s].  A drive lives 2 s on the device
@@ -83,11 +83,26 @@ class Loop:
     phase: str = ""
     ends: float = np.inf
     dt: float = np.nan
+    trip: Trip | None = None  # what ended it
 
     def __post_init__(self) -> None:
         self.rig.notices()  # what happened before is not of this session
         self.accepted: dict[str, float] = {}
         self.read(self.rig.read)
+
+    @contextmanager
+    def powered(self) -> Iterator[None]:
+        """Switch off on every way out of the block, which a trip ends; that is kept, recorded and noted."""
+        with stop_signals():
+            try:
+                yield
+            except TripError as tripped:
+                self.trip = tripped.trip
+            finally:
+                self.power_off()
+        if self.trip is not None:
+            self.record_last()
+            self.note("tripped", self.trip.line(), self.trip.as_dict())
 
     def now(self) -> float:
         """Return the host's time [s]; the rig's own where there is no other, as in a simulation."""

@@ -64,20 +64,6 @@ def tracking_error(log: Log, outputs: Iterable[str]) -> tuple[float, float]:
 def read_profile(path: str | Path, outputs: Sequence[str], *, preview_s: float = 0.0) -> Profile:
     """Return the profile of a CSV table: ``time_s`` (or ``time_min``) and a column of each regulated output
     (``t1_degC``), or one ``target_degC`` for all of them.
-
-    Raises
-    ------
-    UserError
-        Naming the column or the row that is wrong.
-
-    Examples
-    --------
-    >>> from tempfile import mkdtemp
-    >>> path = Path(mkdtemp()) / "profile.csv"
-    >>> n = path.write_text("time_min,target_degC\\n0,25\\n2,45\\n3,45\\n")
-    >>> profile = read_profile(path, ["t_surface"])
-    >>> profile.seconds, profile.at(60.0)
-    (180.0, {'t_surface': 35.0})
     """
     table, columns = read_csv_table(path), {}
     for header, values in table.numbers.items():

@@ -45,11 +45,10 @@ from thermogrip.datasets.errors import UserError, known_names
 from thermogrip.datasets.schema import GRASP_LABELS, GRASP_NUMBERS, Grasps, Log, make_grasps
 from thermogrip.mpc.interface import Controller, Move, Readings, Target
 from thermogrip.rig.guard.guard import Guard
-from thermogrip.rig.guard.trip import Trip, TripError
+from thermogrip.rig.guard.trip import Trip
 from thermogrip.rig.interface import UNIT_RANGES, Event, Rig
 from thermogrip.rig.session.loop import PHASES, Loop, Recorder
 from thermogrip.rig.session.profile import Profile
-from thermogrip.rig.session.signals import stop_signals
 from thermogrip.rig.session.snapshot import Listener, Operator
 from thermogrip.sysid.effusivity.quality import find_contact
 
@@ -238,36 +237,22 @@ def run_session(
     run = Loop(rig, controller, recorder, progress, watch, clock, listener, requests, band)
     thing = Object(*grasp) if isinstance(grasp, tuple) else grasp
     _check_object(thing, run)
-    verdict = "tripped"
-    touched = None
-    trip = None
-    with stop_signals():
-        try:
-            run.start(target if isinstance(target, Mapping) else {output: float(target)})
-            if profile is not None:
-                _follow(run, profile)
-                verdict = "followed"
-            elif _settle(run, settle_timeout, band):
-                verdict = "settled"
-            else:
-                verdict = "not settled"
-            if verdict == "settled":
-                for _ in run.regulate("hold", hold):
-                    pass
-                if thing is not None:
-                    touched = _grasp_object(
-                        run, thing, output=output, seconds=grasp_time, dt=grasp_dt, stop=stop
-                    )
-        except TripError as ended:
-            verdict, trip = "tripped", ended.trip
-        finally:
-            run.power_off()
-    if trip is not None:
-        run.record_last()
-        run.note("tripped", trip.line(), trip.as_dict())
+    verdict, touched = "not settled", None
+    with run.powered():
+        run.start(target if isinstance(target, Mapping) else {output: float(target)})
+        if profile is not None:
+            _follow(run, profile)
+            verdict = "followed"
+        elif _settle(run, settle_timeout, band):
+            verdict = "settled"
+            for _ in run.regulate("hold", hold):
+                pass
+            if thing is not None:
+                touched = _grasp_object(run, thing, output=output, seconds=grasp_time, dt=grasp_dt, stop=stop)
+    verdict = verdict if run.trip is None else "tripped"
     run.note("verdict", verdict)
-    run.show(run.no_drive(), verdict=verdict, trip=trip)
-    return _session_of(run, verdict, touched, band, trip)
+    run.show(run.no_drive(), verdict=verdict, trip=run.trip)
+    return _session_of(run, verdict, touched, band)
 
 
 def _check_object(thing: Object | None, run: Loop) -> None:
@@ -374,9 +359,8 @@ def grasp_of_rows(
     )
 
 
-def _session_of(
-    run: Loop, verdict: str, grasps: Grasps | None, band: float, trip: Trip | None = None
-) -> Session:
+def _session_of(run: Loop, verdict: str, grasps: Grasps | None, band: float) -> Session:
+    trip = run.trip
     if len(run.rows) < 2:
         raise UserError("the session ended at its first reading", hint="" if trip is None else trip.line())
     contact: float | None = np.nan
@@ -494,23 +478,14 @@ def play(
     player = Playback(schedule, rig.units, dt) if isinstance(schedule, Log) else schedule
     watch = Guard() if guard is None else guard
     run = Loop(rig, player, recorder, progress, watch, clock, listener, operator or Operator())
-    ended, trip = "", None
-    with stop_signals():
-        try:
-            run.start({})
-            for passed in run.regulate("hold", player.seconds):
-                run.report(passed / player.seconds, "playing the schedule")
-                if player.done:
-                    break
-        except TripError as tripped:
-            trip = tripped.trip
-            ended = trip.line()
-        finally:
-            run.power_off()
-    if ended:
-        run.record_last()
-        run.note("tripped", ended)
-    run.show(run.no_drive(), verdict="tripped" if ended else "played", trip=trip)
+    with run.powered():
+        run.start({})
+        for passed in run.regulate("hold", player.seconds):
+            run.report(passed / player.seconds, "playing the schedule")
+            if player.done:
+                break
+    ended = "" if run.trip is None else run.trip.line()
+    run.show(run.no_drive(), verdict="tripped" if ended else "played", trip=run.trip)
     if len(run.rows) < 2:
         raise UserError("the rig ended at its first reading", hint=ended)
     return run.log(), ended

@@ -23,20 +23,9 @@ PUMP = "pump"
 
 
 class StepTest:
-    """The test as a controller.
+    """The test as a controller: drives of these ranges, by name, until ``targets`` are half reached [degC].
 
-    Parameters
-    ----------
-    ranges : mapping of str to (float, float)
-        Of each drive, by name.
-    targets : mapping of str to float
-        Of the sensors that may not go beyond half of their way there [degC].
-    seconds : float
-        At most.
-    has_pump : bool, optional
-        Whether there is a pump, which is off for a while too, after the drives.
-    dt : float, optional
-        Sample time [s].
+    It takes at most ``seconds``; where there is a pump, it is off for a while too, after the drives.
     """
 
     def __init__(
@@ -77,7 +66,9 @@ class StepTest:
     def step(self, reading: Readings, target: Target) -> Move:
         """Return the drive of the turn."""
         passed = reading["time_s"] - self._on_at
-        if self._is_over(passed):
+        # off for as long as on, but for the last turn and the pump's
+        once = len(self._turns) == 1 or self._turns[0][0] == PUMP
+        if passed >= (1 if once else 2) * self._on_s:
             on_s = self._on_s
             del self._turns[0]
             self.done = not self._turns
@@ -92,11 +83,6 @@ class StepTest:
         if passed < self._on_s and self._has_moved(reading, passed):
             self._on_s = passed
         return Move(drive=off | ({name: full} if passed < self._on_s else {}))
-
-    def _is_over(self, passed: float) -> bool:
-        """Return whether a turn is over: off for as long as on, but for the last one and the pump's."""
-        once = len(self._turns) == 1 or self._turns[0][0] == PUMP
-        return passed >= (1 if once else 2) * self._on_s
 
     def _has_moved(self, reading: Readings, passed: float) -> bool:
         """Return whether a drive has been on for long enough; UserError where it has moved nothing."""

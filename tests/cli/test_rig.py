@@ -224,7 +224,7 @@ def test_words_reach_the_session_on_a_port(ran: SimpleNamespace) -> None:
     assert "twin" not in folder.args[1]
     assert not ran.beyond[0].grasps
     said = words_of(done.out)
-    assert said.startswith("socket://rig, to t_surface 40 degC verdict")
+    assert said.startswith("socket://rig, to t_surface=40 degC verdict")
     assert said.endswith("not settled - 0.125 - wait longer wrote r")
     assert json.loads(ran.bench.run(*words, "--json").out) == {
         "verdict": "not settled", "advice": "wait longer", "settle_time": None, "overshoot": 0.125,
@@ -254,11 +254,11 @@ PORT = ["--port", "socket://rig", "--speed", "3", "--protocol", "tclab"]
          False, False),
     ],
 )  # fmt: skip
-@pytest.mark.parametrize(("left", "code"), [(0, 0), (1, 3)])
 def test_a_batch_keeps_on_what_it_ran_and_fails_while_a_trial_is_left(
-    where: list[str], about: dict[str, object], asks: bool, on_rig: bool, left: int, code: int,
-    bench: Bench, stand_in: StandIn,
-) -> None:  # fmt: skip
+    where: list[str], about: dict[str, object], asks: bool, on_rig: bool, bench: Bench, stand_in: StandIn
+) -> None:
+    left, code = (1, 3) if asks else (0, 0)
+
     def ran(opened: Any, *_: Any, progress: Any, **__: Any) -> Batch:
         progress(0.5, "trial 1")
         rigs.append(opened())
@@ -426,16 +426,6 @@ def test_a_guard_file_that_is_wrong_is_refused_before_a_port_is_opened(
     assert (done.code, len(done.said), opened) == (2, 1, [])
     assert done.said[0].startswith("thermogrip: g.toml: stale_ms: no such key")
     assert not (bench.path / "r").exists()
-
-
-def test_a_guard_has_its_file_or_the_defaults(stand_in: StandIn) -> None:
-    read = stand_in("thermogrip.rig.guard.settings.read_guard", "of a file")
-    guards = stand_in("thermogrip.rig.guard.guard.Guard", "a guard")
-    stand_in("thermogrip.rig.guard.guard.GuardSettings.of", lambda plant: f"of {plant}")
-    assert verbs.guard_of(None, None) == "a guard"
-    verbs.guard_of(Path("g.toml"), "a plant")
-    assert [call.args for call in guards] == [(None, "of None"), ("a plant", "of a file")]
-    assert [call.args for call in read] == [(Path("g.toml"),)]
 
 
 def test_of_a_faster_virtual_device_the_program_may_be_as_late_in_seconds_of_the_computer() -> None:

@@ -156,10 +156,11 @@ def test_a_session_starts_without_its_room_and_not_without_an_output() -> None:
 
 def test_a_sessions_log_and_grasp_have_the_rooms_of_the_plant_and_read_back_so(tmp_path: Path) -> None:
     rig = Twin(PLANT, ambient=25.0, contact=Grip())
-    with RunFolder(tmp_path / "run") as folder:  # killed before it could write the grasp
+    with RunFolder(tmp_path / "run") as folder:
         session = run_session(
             rig, Constant(), 25.0, guard=Guard(PLANT), grasp=("wood", 20.0), grasp_time=2.0, recorder=folder
         )
+        folder.finish(session)
     for made in (session, read_run(tmp_path / "run")):
         assert made.log is not None
         assert names(made.log, "disturbance") == (ROOM,)

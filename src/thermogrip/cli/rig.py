@@ -219,7 +219,10 @@ def run(
     Drive and pump are switched off on every way out, Ctrl-C included. With --object and --material it grasps
     after settling; without them it only regulates.
     """
-    grasp = _what_to_grasp(obj, material)
+    if (obj is None) != (material is None):
+        problem = "one of --object and --material is missing"
+        raise UserError(problem, hint="give both, or none to regulate only")
+    grasp = None if obj is None or material is None else (material, obj)
     rig.check()
     wanted = _one_goal(target, profile, grasp is not None)
     cli.choices("--target", wanted if isinstance(wanted, dict) else (), controller, "outputs")
@@ -278,7 +281,7 @@ def run(
     if report is not None:
         lead = f"One session on {rig.name}: what was read, asked and answered, sample by sample."
         write_report(report, "A session", lead, session_sections(session, regulator.moves, loaded, rig.name))
-    goal = f"to {_said(wanted)} degC" if profile is None else f"along {profile.name}"
+    goal = f"to {target} degC" if profile is None else f"along {profile.name}"
     errors = None if profile is None else tracking_error(session.log, loaded.controlled)
     return _session_code(console, session, f"{rig.name}, {goal}", out, errors)
 
@@ -574,24 +577,6 @@ def _for_outputs(target: float | dict[str, float], controlled: tuple[str, ...]) 
     if isinstance(target, float) and len(controlled) > 1:
         return dict.fromkeys(controlled, target)
     return target
-
-
-def _said(target: float | dict[str, float]) -> str:
-    """Return targets in words."""
-    if isinstance(target, dict):
-        return ", ".join(f"{name} {value:g}" for name, value in target.items())
-    return f"{target:g}"
-
-
-def _what_to_grasp(obj: float | None, material: str | None) -> tuple[str, float] | None:
-    """Return material and object temperature, checked, None where nothing is grasped."""
-    if (obj is None) != (material is None):
-        raise UserError(
-            "one of --object and --material is missing", hint="give both, or none to regulate only"
-        )
-    if obj is None or material is None:
-        return None
-    return material, obj
 
 
 @contextmanager

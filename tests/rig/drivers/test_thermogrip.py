@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
-from contextlib import nullcontext
 from unittest.mock import Mock
 
 import numpy as np
@@ -14,7 +13,6 @@ from tests.rig.makers import Bench, Constant, DirectPort, SteppedClock, make_lab
 from thermogrip.datasets.errors import UserError
 from thermogrip.rig.drivers.connect import open_rig, recognise
 from thermogrip.rig.drivers.thermogrip import TTL_S, DeviceRig
-from thermogrip.rig.firmware.reference import DeviceCore
 from thermogrip.rig.guard.guard import Guard
 from thermogrip.rig.interface import DeviceRefusedError
 from thermogrip.rig.serial.port import PortError
@@ -206,24 +204,6 @@ def test_a_board_that_comes_back_is_driven_on_where_its_number_says_so(direct: B
     direct.device.clear()
     direct.rig.apply(DRIVE, 1)
     assert direct.device.applied_drive == DRIVE
-
-
-@pytest.mark.parametrize(("boot", "driven"), [(7, True), (8, False)])
-def test_older_firmware_is_known_by_its_resets(
-    boot: int, driven: bool, plant: Plant, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(DeviceCore, "version", "0.1.0")
-    bench = Bench(plant, options={"timeout": 0.05})
-    bench.device.core.boot = 7
-    bench.rig.read()
-    bench.device.fault("cable_pulled")
-    bench.rig.read()
-    bench.device.clear()
-    bench.device.core.boot = boot
-    with nullcontext() if driven else pytest.raises(PortError, match="another device"):
-        bench.rig.apply(DRIVE, 1)
-    assert (bench.device.applied_drive == DRIVE) == driven
-    bench.close()
 
 
 @pytest.mark.parametrize(

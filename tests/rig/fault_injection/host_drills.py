@@ -102,7 +102,7 @@ def _send(number: int) -> Callable[[int, str], str]:
 
 def _freeze(process: int, port: str) -> str:
     os.kill(process, signal.SIGSTOP)
-    time.sleep(10.0 / SPEED)
+    time.sleep(5.0 / SPEED)  # its drive lives 2 s
     os.kill(process, signal.SIGCONT)
     return ""
 
@@ -122,7 +122,7 @@ def _second(process: int, port: str) -> str:
 #: Every way that is tried.
 HOST_DRILLS: tuple[HostDrill, ...] = (
     HostDrill("host killed (kill -9)", _send(signal.SIGKILL), dead=True),
-    HostDrill("host frozen for 10 s (SIGSTOP)", _freeze, dead=True),
+    HostDrill("host frozen for 5 s (SIGSTOP)", _freeze, dead=True),
     HostDrill("host asked to end (SIGTERM)", _send(signal.SIGTERM)),
     HostDrill("Ctrl-C", _send(signal.SIGINT)),
     HostDrill("controller raises an exception", None, how="raise"),

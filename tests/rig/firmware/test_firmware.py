@@ -78,7 +78,7 @@ def conversations(draw: st.DrawFn) -> list[str]:
     return [*script, "pins"]
 
 
-@settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=50, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(script=conversations())
 def test_whatever_comes_both_cores_say_the_same(firmware: Path, script: list[str]) -> None:
     assert compiled(firmware, script) == reference(script)

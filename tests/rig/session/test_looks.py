@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.rig.fault_injection.limits import LIMITS, SAMPLES_S, drive_into
+from tests.rig.fault_injection.limits import LIMITS, drive_into
 from tests.rig.makers import SteppedClock
 from tests.rig.session.test_loop import rig_of, shown, started, told, trip_of
 from thermogrip.mpc.interface import Move
@@ -16,16 +16,12 @@ from thermogrip.rig.interface import Event, Reading
 from thermogrip.rig.session.loop import LOOK_S
 
 
-@pytest.mark.parametrize("dt", [SAMPLES_S[0], SAMPLES_S[-1]])
 @pytest.mark.parametrize(("device", "limit"), LIMITS)
-def test_no_limit_is_exceeded_by_two_kelvin_however_long_a_sample_is(
-    device: str, limit: float, dt: float
-) -> None:
-    beyond = drive_into(device, limit, dt)
+def test_no_limit_is_exceeded_by_two_kelvin_though_a_sample_is_an_hour(device: str, limit: float) -> None:
+    beyond = drive_into(device, limit, 3600.0)
     assert beyond.ended.startswith("limit:")
     assert 0.0 < beyond.at_off <= beyond.highest < LIMIT_MARGIN
     assert beyond.driven < 5.0
-    assert np.diff(beyond.log["time"].values[:-1]) == pytest.approx(dt)
 
 
 @pytest.mark.parametrize("dt", [0.1, 0.5, 1.5, 60.0])

@@ -70,10 +70,10 @@ def test_skin_to_38_settles_holds_and_grasps(plant: Plant, controller: Any) -> N
 
 
 def test_a_settled_verdict_is_true_of_the_real_skin(plant: Plant, controller: Any) -> None:
-    for seed in range(10):
-        twin = Twin(plant, seed=seed)
-        assert run_session(twin, controller, 30.0 + seed).verdict == "settled"
-        assert abs(twin.truth()["t_surface"] - 30.0 - seed) < 0.25
+    for seed in range(3):
+        twin, target = Twin(plant, seed=seed), 28.0 + 4 * seed
+        assert run_session(twin, controller, target).verdict == "settled"
+        assert abs(twin.truth()["t_surface"] - target) < 0.25
 
 
 def test_a_loop_that_comes_round_late_settles_as_one_that_does_not(plant: Plant) -> None:
@@ -233,7 +233,12 @@ def test_of_several_targets_the_worst_figures_are_the_sessions() -> None:
     columns |= {"target_a_degC": np.full(t.size, 30.0), "target_b_degC": np.full(t.size, 20.0)}
     columns |= {name: np.where(t <= 180, columns[name], 99.0) for name in ("a_degC", "b_degC")}
     run = SimpleNamespace(
-        rows=[{}, {}], target={"a": 30.0, "b": 20.0}, column=columns.__getitem__, events=[], log=lambda: None
+        rows=[{}, {}],
+        target={"a": 30.0, "b": 20.0},
+        column=columns.__getitem__,
+        events=[],
+        trip=None,
+        log=lambda: None,
     )
     found = _session_of(run, "not settled", None, 0.25)
     assert (found.settle_time, found.bias) == (pytest.approx(50, abs=3), pytest.approx(0.2))
