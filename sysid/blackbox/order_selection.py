@@ -343,18 +343,17 @@ def _give_up_hopeless(
 def _fit_to_all(
     grid: Grid, family: Family, structure: Structure, errors: _Errors, warmup: int
 ) -> tuple[Model, float] | None:
-    """Return the structure fitted to all data and its error on them; None if it is unstable."""
+    """Return the structure fitted to all data and its error on them, of runs that start as held-out ones do;
+    None if it is unstable."""
     fitted = family(grid, only=(structure,)).get(structure)
-    return None if fitted is None else (fitted, _error_on_all(fitted, grid, errors.prior, warmup))
-
-
-def _error_on_all(model: Model, grid: Grid, prior: StartPrior, warmup: int) -> float:
-    """Return the error over the data of the fit, of runs that start as held-out ones do."""
+    if fitted is None:
+        return None
     scale = np.maximum(grid.output_spread(), 1e-9)
     halves = [s.part(len(s.time) // 2, len(s.time)) for s in grid.segments if len(grid.logs) < SEVERAL]
     runs = [Run(segment) for segment in (*grid.segments, *halves)]
-    errors = free_run_errors(model, runs, dt=grid.dt, scale=scale, warmup=warmup, priors=[prior])
-    return float(np.mean(errors / scale))
+    priors = [errors.prior]
+    on_all = free_run_errors(fitted, runs, dt=grid.dt, scale=scale, warmup=warmup, priors=priors)
+    return fitted, float(np.mean(on_all / scale))
 
 
 def drives(grid: Grid, terms: Sequence[str]) -> list[Array]:

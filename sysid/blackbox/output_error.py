@@ -246,7 +246,9 @@ def fit_rest(found: Filter, records: Records) -> tuple[Filter, list[Array]]:
 
 def real_pole_starts(records: Records, na: int) -> list[Array]:
     """Return denominators of real poles with time constants tau, tau / 4, ... for several tau [rows]."""
-    return [_real_poles(tau, na) for tau in np.geomspace(3.0, max(records.longest / 3, 4.0), 6)]
+    taus = np.geomspace(3.0, max(records.longest / 3, 4.0), 6)
+    roots = [[np.exp(-1 / max(tau / 4**i, 0.5)) for i in range(na)] for tau in taus]
+    return [np.asarray(np.poly(poles)[1:]) for poles in roots]
 
 
 def with_pole(a: Array) -> Array:
@@ -282,11 +284,6 @@ def columns_of(
     if not lost and not is_read.all():
         X *= is_read
     return X
-
-
-def _real_poles(tau: float, na: int) -> Array:
-    roots = [np.exp(-1 / max(tau / 4**i, 0.5)) for i in range(na)]
-    return np.asarray(np.poly(roots)[1:])
 
 
 def is_stable(a: Array) -> bool:

@@ -78,7 +78,8 @@ def subspace_family(
     longest = max(len(segment.time) for segment in grid.segments)
     sets = default_terms(grid) if terms is None else terms
     n_drive, n_y = len(grid.inputs) + len(grid.disturbances), len(grid.outputs)
-    few = 1.5 * _count_columns(3, n_drive, n_y) > sum(max(len(s.time) - 5, 0) for s in grid.segments)
+    n_columns = 2 * 3 * (n_drive + n_y) + 1  # of windows of three block rows
+    few = 1.5 * n_columns > sum(max(len(s.time) - 5, 0) for s in grid.segments)
     sizes = rows or (2, 3, 5, 8, 15, 30)
     if rows is None and only is None:
         sizes = [f for f in sizes if 6 * f < longest and (few or f > 2)]
@@ -91,10 +92,6 @@ def subspace_family(
         wanted = {of: name for of, name in names.items() if only is None or name in only}
         models |= {wanted[of]: model for of, model in _realised(grid, wanted, some, triangles).items()}
     return models
-
-
-def _count_columns(f: int, n_drive: int, n_y: int) -> int:
-    return 2 * f * (n_drive + n_y) + 1
 
 
 def _structure(n: int, f: int, weighting: str, some: Sequence[str], n_drive: int, n_y: int) -> Structure:

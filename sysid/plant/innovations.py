@@ -46,7 +46,11 @@ def innovation_noise(plant: PlantData, logs: Sequence[Log]) -> InnovationNoise |
     outputs, model = plant.outputs, plant.model
     reading_sd = plant.noise | plant.scores.reading_sd
     sd = np.array([reading_sd.get(name, 0.0) for name in outputs])
-    stretches = _as_long([stretch for log in logs for stretch in cut_stretches(plant, log)])
+    stretches, steps = [], 0
+    for stretch in (stretch for log in logs for stretch in cut_stretches(plant, log)):
+        if steps < _MOST_STEPS:
+            stretches.append(stretch)
+        steps += len(stretch.u)
     moves = np.ptp(np.concatenate([stretch.u for stretch in stretches]), axis=0) if stretches else []
     graded = [j for j, move in enumerate(moves) if move > 0 and plant.inputs[j] not in model.switches]
     if not (np.all(sd > 0) and graded):
@@ -75,16 +79,6 @@ def _fastest(logs: Sequence[Log], name: str) -> float:
         rates = np.abs(np.diff(values)) / np.diff(time)
         most = max(most, float(rates.max(initial=0.0)))
     return most
-
-
-def _as_long(stretches: Sequence[Stretch]) -> list[Stretch]:
-    """Return the first stretches, as many as are needed."""
-    taken, steps = [], 0
-    for stretch in stretches:
-        if steps < _MOST_STEPS:
-            taken.append(stretch)
-        steps += len(stretch.u)
-    return taken
 
 
 @dataclass(frozen=True, eq=False)

@@ -26,7 +26,7 @@ tenth of its time constant to show; no run spends more than a tenth of its log o
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NamedTuple
@@ -160,14 +160,13 @@ def free_run(
     if gaps(log):
         through = plant.simulate(log, warmup=warmup, score_from=score_from, gaps="hold")
         held = _scores(plant, log, _beside(plant, log, through, average))
-    tested = _test_residual(plant, log, simulated, warmup) if tests else _NOT_TESTED
     run = FreeRun(
         log=simulated,
         scores=scores,
         one_step=_one_step(plant, log, pairs),
         naive=naive,
         held=held,
-        residual=tested.residual,
+        residual=ResidualCorrelations({}, {}),
         no_better=tuple(
             name for name in plant.outputs if not scores[name].rmse < NO_BETTER * naive["no_input"][name].rmse
         ),
@@ -175,10 +174,16 @@ def free_run(
         warmup=warmup,
         plant=plant,
         measured=log,
-        verdict=tested.verdict,
-        stated=tested.band,
     )
-    notes = [*said_of_fit(plant.fitted_to, *fit_logs([log])), *converted, *_notes(run, tested.by_inputs)]
+    by_inputs = None
+    if tests:
+        from thermogrip.sysid.validation.prediction_bands import effect_of_run  # scipy.special
+
+        is_scored = column(simulated, "scored")[:, None] > 0
+        error = np.where(is_scored, columns(log, plant.outputs) - columns(simulated, plant.outputs), np.nan)
+        by_inputs = effect_of_run(plant, error, log)
+        run = _judged(run, error, by_inputs)
+    notes = [*said_of_fit(plant.fitted_to, *fit_logs([log])), *converted, *_notes(run, by_inputs)]
     return replace(run, notes=tuple(notes))
 
 
@@ -210,52 +215,32 @@ def warm_up_of_fit(plant: Plant, log: Log) -> float:
     return warm_up_of(log["time"].values) if black_box and 0 < len(plant.logs) < SEVERAL else 0.0
 
 
-@dataclass(frozen=True, eq=False)
-class _Tested:
-    """What tests of a run find."""
+def _judged(run: FreeRun, error: Array, by_inputs: InputEffect | None) -> FreeRun:
+    """Return the run with tests of its error (n, n_y), NaN where not scored, and the verdict on the plant."""
+    from thermogrip.sysid.validation.prediction_bands import free_run_band  # scipy.special
 
-    residual: ResidualCorrelations
-    verdict: Verdict | None = None
-    band: Band | None = None
-    by_inputs: InputEffect | None = None
-
-
-_NOT_TESTED = _Tested(ResidualCorrelations({}, {}))
-
-
-def _test_residual(
-    plant: Plant,
-    log: Log,
-    simulated: Log,
-    warmup: float,
-) -> _Tested:
-    """Test the residual of a run, and judge the plant by its readings."""
-    from thermogrip.sysid.validation.prediction_bands import effect_of_run, free_run_band  # scipy.special
-
-    run, scored = columns(simulated, plant.outputs), column(simulated, "scored") > 0
-    residual = residual_correlations(plant, cut_stretches(plant, log), run, scored, warmup=warmup)
-    error = np.where(scored[:, None], columns(log, plant.outputs) - run, np.nan)
-    by_inputs = effect_of_run(plant, error, log)
-    band = free_run_band(plant, log, simulated, warmup=warmup)
-    time, readings = log["time"].values, _beside(plant, log, simulated)
+    plant, log = run.plant, run.measured
+    simulated, scored = columns(run.log, plant.outputs), column(run.log, "scored") > 0
+    residual = residual_correlations(plant, cut_stretches(plant, log), simulated, scored, warmup=run.warmup)
+    with np.errstate(over="ignore", invalid="ignore"):
+        offsets = np.nanmean(error, axis=0) ** 2 / np.maximum(np.nanmean(error**2, axis=0), 1e-300)
+    causes: dict[str, dict[Cause, float]] = {
+        name: {"start": residual.start.get(name, 0.0), "offset": float(share)}
+        for name, share in zip(plant.outputs, offsets)
+    }
+    band = free_run_band(plant, log, run.log, warmup=run.warmup)
+    readings = _beside(plant, log, run.log)
     scores, naive = _scores(plant, log, readings), _baselines(plant, log, readings)
-    rows = replace(fit_logs([log])[0], start_s=float(time[np.argmax(scored)]))
+    rows = replace(fit_logs([log])[0], start_s=float(log["time"].values[np.argmax(scored)]))
     verdict = judge(
         band,
         {name: each.rmse for name, each in scores.items()},
         {name: each.rmse for name, each in naive["no_input"].items()},
-        causes=_causes(error, plant.outputs, residual.start),
+        causes=causes,
         by_inputs=by_inputs,
         seen=bool(said_of_fit(plant.fitted_to, rows)),
     )
-    return _Tested(residual, verdict, band, by_inputs)
-
-
-def _causes(miss: Array, outputs: Sequence[str], start: Mapping[str, float]) -> dict[str, dict[Cause, float]]:
-    """Return by output which share of the squared error is the start, and which a constant offset."""
-    with np.errstate(over="ignore", invalid="ignore"):
-        offsets = np.nanmean(miss, axis=0) ** 2 / np.maximum(np.nanmean(miss**2, axis=0), 1e-300)
-    return {n: {"start": start.get(n, 0.0), "offset": float(share)} for n, share in zip(outputs, offsets)}
+    return replace(run, residual=residual, verdict=verdict, stated=band)
 
 
 def score(measured: Array, simulated: Array, unit: str = "degC") -> Score:
@@ -381,7 +366,8 @@ def _residual_notes(
     verdict: Verdict | None = None,
 ) -> list[str]:
     """Return notes on the residuals of each output."""
-    notes, small = [], _small(verdict)
+    notes = []
+    small = verdict is not None and verdict.standing not in ("worse", "another plant")
     for name, tests in residual.tests.items():
         significant = {signal: found for signal, found in tests.items() if found.significant}
         notes += [
@@ -394,11 +380,6 @@ def _residual_notes(
                 "readings do not determine; give a longer warm-up"
             )
     return notes
-
-
-def _small(verdict: Verdict | None) -> bool:
-    """Return whether a run is known to err by no more than was stated."""
-    return verdict is not None and verdict.standing not in ("worse", "another plant")
 
 
 def _correlation_note(

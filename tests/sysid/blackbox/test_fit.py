@@ -304,41 +304,6 @@ def test_errors_of_means_are_compared_as_errors_of_the_readings_that_were_averag
     assert fitting._within_steps(coarse, [fine, coarse]) == pytest.approx(0.98, abs=0.03)
 
 
-@pytest.mark.parametrize(
-    ("dt", "family", "others", "moved"),  # errors of the same structure and of any, which were 0.2
-    [
-        (0.75, "oe", [0.1, 0.1], True),
-        (0.8, "oe", [], False),
-        (0.5, "sindy", [], False),
-        (0.5, "neural", [], False),
-        (0.5, "oe", [0.2], False),
-        (0.5, "oe", [0.1, 0.2], False),
-        (0.5, "oe", [None], False),
-    ],
-)
-def test_inputs_up_to_their_rows_are_taken_where_that_errs_clearly_less(
-    monkeypatch, dt, family, others, moved
-):
-    def choice_of(error):
-        return SimpleNamespace(structure="s", errors={"s": error * np.array([1.0, 1.0, 1.0])})
-
-    def choose_next(grid, family, *, warmup):
-        asked.append((grid.ends, getattr(family, "keywords", None), warmup))
-        if others[len(asked) - 1] is None:
-            raise UserError("unstable")
-        return choice_of(others[len(asked) - 1])
-
-    asked, first = [], choice_of(0.2)
-    made = "thermogrip.sysid.plant.log_grid.make_grid"
-    monkeypatch.setattr(made, lambda *a, average, ends, **n: stub_grid(dt=average, ends=ends))
-    monkeypatch.setattr(fitting, "choose", choose_next)
-    grid = stub_grid(dt=dt, why="so")
-    found, choice = fitting._with_convention(family, grid, first, [], family_of(family))
-    assert (found.ends, found.dt, found.why, choice is not first) == (moved, dt, "so", moved)
-    rows = fitting._warmup_rows(stub_grid(dt=dt))
-    assert asked == [(True, {"only": ("s",)}, rows), (True, None, rows)][: len(others)]
-
-
 @pytest.mark.parametrize(("agree", "n"), [(6, 6), (1, 2), (0, 6)])  # of the tries after the first
 def test_refits_that_err_more_than_half_as_much_again_are_left_out(monkeypatch, agree, n):
     made = []

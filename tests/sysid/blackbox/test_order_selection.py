@@ -45,20 +45,6 @@ def spans(segments):
     return [(s.log, int(s.time[0]), int(s.time[-1]) + 1) for s in segments]
 
 
-@pytest.mark.parametrize(
-    ("first", "last", "inside", "outside"),  # of 50 rows of a and 40 of b; what remains has 20 rows at least
-    [
-        (10, 60, [("a", 10, 50), ("b", 0, 10)], [("b", 10, 40)]),
-        (20, 30, [("a", 20, 30)], [("a", 0, 20), ("a", 30, 50), ("b", 0, 40)]),
-        (19, 31, [("a", 19, 31)], [("b", 0, 40)]),
-        (50, 70, [("b", 0, 20)], [("a", 0, 50), ("b", 20, 40)]),
-    ],
-)
-def test_a_block_is_cut_out_of_the_rows_of_all_segments(first, last, inside, outside):
-    found = selection._split_segments([rows(50), rows(40, "b")], first, last)
-    assert [spans(part) for part in found] == [inside, outside]
-
-
 def runs_of(fold):
     """Return what is run of a fold: log, first row, last row, first row that is scored."""
     return [(*span, run.scored_from) for run, span in zip(fold.runs, spans([r.segment for r in fold.runs]))]

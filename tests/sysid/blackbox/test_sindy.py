@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import casadi as ca
 import numpy as np
 import pytest
@@ -14,7 +12,7 @@ from thermogrip.sysid.blackbox import sindy
 from thermogrip.sysid.blackbox.order_selection import Structure
 from thermogrip.sysid.blackbox.sindy import sindy_family
 from thermogrip.sysid.models.polynomial import SindyModel
-from thermogrip.sysid.plant.log_grid import Grid, Segment, make_grid
+from thermogrip.sysid.plant.log_grid import make_grid
 
 
 def radiating_log(n: int = 1500, seed: int = 0, name: str = "a"):
@@ -121,26 +119,6 @@ def test_the_structures_are_degrees_thresholds_and_memories(grid, monkeypatch):
         only=[Structure("degree 0, memory 1, threshold 0.3", 1)],
     ).values()
     assert only == (0, 1, 0.3)
-
-
-def test_rows_are_cut_at_lost_readings_and_scaled():
-    y = np.array([1.0, 4.0, 9.0, 16.0, 25.0, 36.0, 49.0, 64.0, *[np.nan] * 6, *[7.0] * 5, np.nan])[:, None]
-    q = np.arange(20.0)[:, None]
-    part = Segment(np.arange(20.0), y, q, 10 * q, "a")
-    assert sindy._whole_rows(part) == [(0, 8), (14, 19)]
-    two = Grid(("q",), ("room",), ("t",), (), 1.0, (part,), 1.0, {})
-    (run,) = sindy._trajectories(two, 2)  # runs of 7 rows at least
-    states = [[4, 1], [9, 4], [16, 9], [25, 16], [36, 25], [49, 36]]
-    assert run.variables.tolist() == [[*state, k + 1, 10 * (k + 1)] for k, state in enumerate(states)]
-    assert run.move[:, 0].tolist() == [5, 7, 9, 11, 13, 15]
-    short = sindy._trajectories(replace(two, segments=(part.part(0, 7), part.part(0, 6))), 2)
-    assert [len(run.move) for run in short] == [5]
-    t = np.arange(30.0)[:, None]
-    steady = replace(two, segments=(Segment(t[:, 0], t, t % 2, 0 * t + 3, "a"),))
-    scaled = sindy._features(steady, 1, 1)  # the last of the 30 rows has no increment
-    np.testing.assert_allclose(scaled.middle, [14, 14 / 29, 3])
-    np.testing.assert_allclose(scaled.size, [np.sqrt(70), np.sqrt(14 * 15) / 29, 1])
-    np.testing.assert_allclose(scaled.theta[0], [1, -14 / np.sqrt(70), -np.sqrt(14 / 15), 0])
 
 
 @pytest.mark.parametrize(("rows", "fits"), [(24, True), (23, False)])  # 3 * 1 + 20 increments

@@ -18,7 +18,6 @@ from thermogrip.sysid.validation import free_run as module
 from thermogrip.sysid.validation.free_run import free_run, no_input_baseline, score
 from thermogrip.sysid.validation.residual_tests import (
     CorrelationTest,
-    ResidualCorrelations,
 )
 
 
@@ -239,20 +238,6 @@ def test_more_than_one_row_in_a_hundred_beyond_a_twentieth_of_the_range_is_outsi
         for name, where, part in [*found, ("t", "5 to 6", 100)]
     ]
     assert list(outside) == [*(["q"] if share else []), "t"]
-
-
-def test_notes_of_the_residual_to_the_letter():
-    pairs = {"q": CorrelationTest(0.0012, 0.345, True), "w": CorrelationTest(0.0012, 0.345)}
-    residual = ResidualCorrelations({"t": pairs, "r": {}}, {"t": 0.5, "r": 0.123})
-    units = {"t": "K", "r": "K"}
-    assert module._residual_notes(residual, units, 7.5, []) == [
-        "t: the residual correlates with q (rms 0.34 K, p = 0.001): a delay, lag or term is missing, or the "
-        "plant is not what it was in the fit",
-        "r: 12 % of the squared error is the start, which 7.5 s of readings do not determine; give a longer "
-        "warm-up",
-    ]
-    at_most = ResidualCorrelations({"r": {}}, {"r": 0.1})
-    assert module._residual_notes(at_most, units, 5.0, []) == []
 
 
 @pytest.mark.parametrize(
