@@ -38,7 +38,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -49,7 +48,6 @@ from thermogrip.mpc.design.design import Design
 from thermogrip.mpc.estimator.observer import DisturbanceModel, Observer
 from thermogrip.mpc.optimiser.drive_limits import DriveLimits
 from thermogrip.mpc.optimiser.qp import CondensedQP
-from thermogrip.mpc.plant.along_plan import AlongPlan
 from thermogrip.mpc.plant.prediction import PredictionModel
 
 SHARES = (0.5, 0.25, 0.1, 0.0)
@@ -232,10 +230,6 @@ class Optimiser:
             time_limit_s=max(design.deadline_s, 1e-3),
         )
 
-    @cached_property
-    def _along(self) -> AlongPlan | None:
-        return self.model.along(self.design.blocks, self.model.span)
-
     def solve(self, sample: Sample) -> Outcome:
         """Improve a plan."""
         model, problem = self.model, self._problem(sample)
@@ -277,9 +271,6 @@ class Optimiser:
 
     def _linearised(self, x: Array, plan: Array, d: Array) -> tuple[Array, Array]:
         """Return the outputs along a plan, and G (N, n_y, n) by drives in their ranges."""
-        if self._along is not None:
-            y, G = self._along.trajectory(x, plan, d)
-            return y, G.reshape(self.N, self.model.n_y, -1)
         y, G = self.model.trajectory(x, plan, d, self.design.blocks)
         if self._G is None or self.model.affine is None:
             self._G = G.reshape(self.N, self.model.n_y, -1) * self._spans
@@ -363,8 +354,6 @@ class Optimiser:
 
     def _simulate(self, x: Array, plans: Array, d: Array) -> Array:
         """Return the outputs (B, N, n_y) of plans (B, n_b, n_u)."""
-        if self._along is not None:
-            return self._along.outputs(x, plans, d)
         states = np.repeat(x[None, :], len(plans), axis=0)
         y, _ = self.model.run(states, np.repeat(plans, self.design.blocks, axis=1), d)
         return y[:, 1:]

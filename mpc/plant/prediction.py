@@ -37,7 +37,6 @@ from scipy.optimize import least_squares
 
 from thermogrip.datasets.arrays import Array, Mask, Values
 from thermogrip.datasets.errors import UserError
-from thermogrip.mpc.plant.along_plan import AlongPlan, LinearStep, SampleDerivatives
 from thermogrip.sysid.models.model import Sizes
 
 if TYPE_CHECKING:
@@ -77,6 +76,15 @@ SPIKE = 6.0
 _FAR, _CLOSE = 10.0, 0.02
 _UNBOUNDED = 1e30
 _KNOWN_BEYOND_LOGS = 5.0  # units from what the logs showed, where a black box still knows what it does
+
+
+class LinearStep(NamedTuple):
+    """One sample, linearised."""
+
+    after: Array  # (n_x,) the state after it
+    A: Array  # (n_x, n_x) its derivative by the state
+    B: Array  # (n_x, n_u) by the drives
+    E: Array  # (n_x, n_d) by the disturbances
 
 
 class Response(NamedTuple):
@@ -231,7 +239,12 @@ class PredictionModel:
         """Return one sample's next state (n_x,), and its derivatives A, B, E by x, u (n_x, n_u) and d."""
         if self.affine is not None:
             return self.affine._replace(after=self.next_state(x, u, d))
-        return self._by_casadi(x, u, d) if self._sample is None else self._sample(x, u, d)
+        if self._kernel is None:
+            return self._by_casadi(x, u, d)
+        by_x, by_u, by_d = np.split(np.eye(self.n_x + self.n_u + self.n_d), self._ends, axis=1)
+        by_u, by_d = (np.repeat(by[:, None], self.sub, axis=1) for by in (by_u, by_d))
+        _, ends = self._along(self._kernel, x, np.tile(u, (self.sub, 1)), d, by_x, by_u, by_d)
+        return LinearStep(ends[0, : self.n_x], *np.split(ends[:, self.n_x :].T, self._ends, axis=1))
 
     @cached_property
     def affine(self) -> LinearStep | None:
@@ -257,9 +270,23 @@ class PredictionModel:
         steps = _TangentSteps(self)
         return Kernel(steps) if steps.are_arithmetic else None
 
-    @cached_property
-    def _sample(self) -> SampleDerivatives | None:
-        return None if self._kernel is None else SampleDerivatives(self, self._kernel)
+    @property
+    def _ends(self) -> list[int]:
+        """Where the derivatives by the states end, and those by the drives."""
+        return [self.n_x, self.n_x + self.n_u]
+
+    def _along(
+        self, kernel: Kernel, x: Array, u: Array, d: Array, by_x: Array, by_u: Array, by_d: Array
+    ) -> tuple[Array, Array]:
+        """Return the outputs (B, n + 1, 2 n_y) and last states (B, 2 n_x) of a run from x (n_x,) under drives
+        u (n, n_u) of the model's steps and disturbances d (n_d,), each followed by its derivatives in
+        directions by_x (B, n_x), by_u (B, n, n_u), by_d (B, n, n_d)."""
+        start = np.hstack([np.broadcast_to(x, by_x.shape), by_x])
+        drives, disturbances = (
+            np.concatenate([np.broadcast_to(value, by.shape), by], axis=2)
+            for value, by in ((u, by_u), (d, by_d))
+        )
+        return kernel.rollout(start, drives, disturbances, np.zeros((1, 0)), self.dt / self.sub)
 
     @cached_property
     def C(self) -> Array:
@@ -277,17 +304,15 @@ class PredictionModel:
             by_x, by_rest, G = self.response(tuple(blocks))
             y = by_x @ x + by_rest @ (from_zero.E @ d + from_zero.after) + np.tensordot(G, plan, axes=2)
             return y + self.output(np.zeros(self.n_x)), G
-        along = self.along(blocks, np.ones(self.n_u))
-        return (
-            self._trajectory_by_casadi(x, plan, d, blocks) if along is None else along.trajectory(x, plan, d)
-        )
-
-    def along(self, blocks: Sequence[int], unit: Array) -> AlongPlan | None:
-        """Return what runs plans of these blocks again and again, its derivatives by drives in these units;
-        None where the step is linear or more than arithmetic."""
-        if self.affine is not None or self._kernel is None:
-            return None
-        return AlongPlan(self, self._kernel, blocks, unit)
+        if self._kernel is None:
+            return self._trajectory_by_casadi(x, plan, d, blocks)
+        block = np.repeat(np.arange(len(blocks)), np.asarray(blocks) * self.sub)  # of each step
+        n = plan.size
+        by_u = np.eye(n).reshape(n, *plan.shape)[:, block]
+        by_d = np.zeros((n, len(block), self.n_d))
+        y, _ = self._along(self._kernel, x, plan[block], d, np.zeros((n, self.n_x)), by_u, by_d)
+        y = y[:, self.sub :: self.sub]
+        return y[0, :, : self.n_y], y[:, :, self.n_y :].transpose(1, 2, 0).reshape(-1, self.n_y, *plan.shape)
 
     def response(self, blocks: tuple[int, ...]) -> Response:
         """Return how a linear plant's outputs answer, made once for these blocks."""
