@@ -12,12 +12,8 @@ at most four, entry i of block c at [4 i + c], and ``tangent`` over n groups of 
 direction c at [c / 4][i][c % 4]: a compiler takes four at once.
 
 A dense Jacobian of an implicit step takes ten times the work of the step for every sample; a dozen tangents
-that share their partial derivatives take two or three.  Where the Jacobian is sparse it is the other way
-about.  A step that is linear in state and disturbances while the drives stand still, as that of a Peltier
-element is, x+ = A(u) x + E(u) d + a(u), can be written in that form, row by row: a plan of ten blocks then
-takes ten times the work of A, not as many times as there are samples.  Of all these forms the shortest is
-written.  Rows of many constants, as of a black box of 20 states, are tables that loops run over: unrolled, a
-step of 60 states is half a megabyte.
+that share their partial derivatives take two or three.  Rows of many constants, as of a black box of 20
+states, are tables that loops run over: unrolled, a step of 60 states is half a megabyte.
 
 A quotient by something known earlier becomes a product with its reciprocal.  The code needs ``math.h`` and
 nothing else.
@@ -98,17 +94,6 @@ _FUNCTION_HEADS = {
     }.items()
 }
 _LONG, _MANY = 8, 250  # constants in a row, and in all of them, from which on they are a table
-#: How much longer than a product these take.
-_SLOW = {
-    "OP_DIV": 4,
-    "OP_INV": 4,
-    "OP_SQRT": 4,
-    "OP_POW": 20,
-    "OP_CONSTPOW": 20,
-    "OP_EXP": 10,
-    "OP_LOG": 10,
-    "OP_TANH": 20,
-}
 
 
 @dataclass
@@ -223,13 +208,13 @@ class ModelCode:
 
 def write_model(model: Model, drives: Sequence[int], h: float) -> ModelCode:
     """Return the C of a model's step of length h [s]; inputs that are no drives are switches, and on."""
-    table, graphs = _graphs(model, drives, h)
-    return _write_model_code(min((_straight(form) for form in graphs), key=_work), table)
+    table, function = _graph(model, drives, h)
+    return _write_model_code(_straight(function), table)
 
 
-def _graphs(model: Model, drives: Sequence[int], h: float) -> tuple[_LinearRows, list[Any]]:
-    """Return what is a table, and each form of the rest as a function (p, x, u, d, sx, su, sd) -> (x+,
-    tangents along sx, with su, with sd)."""
+def _graph(model: Model, drives: Sequence[int], h: float) -> tuple[_LinearRows, Any]:
+    """Return what is a table, and the rest as a function (p, x, u, d, sx, su, sd) -> (x+, tangents along sx,
+    with su, with sd)."""
     import casadi as ca
 
     n_d = len(model.disturbances)
@@ -243,24 +228,10 @@ def _graphs(model: Model, drives: Sequence[int], h: float) -> tuple[_LinearRows,
     after = ca.vertcat(*model.step(lists[0], full, lists[1], lists[2], h))
     table = _tabulate(after, x, u, d)
     after = ca.vertcat(*(0 if i in table.rows else after[i] for i in range(model.n_x)))
-    moving, along = ca.vertcat(x, d), (sx, su, sd)
-    bent = ca.which_depends(after, moving, 2, True)
-    none = ca.DM.zeros(moving.numel(), 1)
-    at_zero, slopes = ca.substitute([after, ca.jacobian(after, moving)], [moving], [none])
-    straight = at_zero + ca.mtimes(slopes, moving)
-    rows = [after[i] if bent[i] else straight[i] for i in range(model.n_x)]
-    rewritten = ca.vertcat(*rows)
-    steps = [after] if all(bent) else [after, rewritten]
-    functions = []
-    for step in steps:
-        A, B, E = (ca.jacobian(step, item) for item in (x, u, d))
-        products = [ca.mtimes(product_of, by) for product_of, by in zip((A, B, E), along)]
-        tangents = [products[0], products[0] + products[1], products[0] + products[1] + products[2]]
-        others = [ca.jtimes(step, ca.vertcat(*(x, u, d)[:n]), ca.vertcat(*along[:n])) for n in range(1, 4)]
-        for three in (tangents, others):
-            results = ca.cse([ca.densify(item) for item in (step, *three)])
-            functions.append(ca.Function("model", [p, x, u, d, *along], results))
-    return table, functions
+    along = (sx, su, sd)
+    tangents = [ca.jtimes(after, ca.vertcat(*(x, u, d)[:n]), ca.vertcat(*along[:n])) for n in range(1, 4)]
+    results = ca.cse([ca.densify(item) for item in (after, *tangents)])
+    return table, ca.Function("model", [p, x, u, d, *along], results)
 
 
 def _tabulate(after: Any, x: Any, u: Any, d: Any) -> _LinearRows:
@@ -338,20 +309,6 @@ def _needed(line: _Line, roots: Sequence[int]) -> set[int]:
             needed.add(number)
             waiting.extend(line.values[number].uses)
     return needed
-
-
-def _work(line: _Line) -> float:
-    """Return the instructions of a sample: a step of the plan, another one with partial derivatives, a dozen
-    tangents, four side by side; drives change in every other sample."""
-    step, tangent = (_needed(line, list(line.outputs[n].values())) for n in (0, 1))
-
-    def count(found: set[int], stage: int) -> float:
-        made = (line.values[number] for number in found if line.values[number].uses)
-        return float(sum(_SLOW.get(value.what, 1) for value in made if value.stage == stage))
-
-    both = step | tangent
-    once = count(step, _STATE) + count(both, _STATE) + 3 * count(tangent, _DIRECTION)
-    return once + 0.5 * (count(step, _DRIVES) + count(both, _DRIVES))
 
 
 def _write_model_code(line: _Line, table: _LinearRows) -> ModelCode:

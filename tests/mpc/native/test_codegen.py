@@ -143,16 +143,6 @@ def test_the_step_in_c_is_the_models_with_its_switches_on(
         assert model.model.switches  # the pump
 
 
-def test_a_step_that_is_linear_while_its_drives_stand_still_is_made_once_for_them():
-    """x+ = x (1 - u/4)^4 + d: after `hold` a product and a sum, however long its powers are."""
-    model: Any = SimpleNamespace(disturbances=("room",), parameters=(), n_x=1, inputs=("q",))
-    model.step = lambda x, u, d, p, h: [x[0] * (1.0 - u[0] / 4.0) ** 4 + d[0]]
-    code = write_model(model, [0], 1.0)
-    step = code.source.split("tg_model_step(", 1)[1].split("\n}\n", 1)[0]
-    assert step.count("const double v") == 2
-    assert "/ (4.0)" not in code.source  # a product with 0.25
-
-
 def test_a_state_that_parameters_alone_decide_is_handed_over():
     model: Any = SimpleNamespace(disturbances=(), parameters=("a",), n_x=1, inputs=("q",))
     model.step = lambda x, u, d, p, h: [2.0 * p[0]]
