@@ -7,7 +7,7 @@ here, with the same noise from the same seed; a search for weights spends its ti
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -60,7 +60,7 @@ def compiled_loop(
     run = _Run(truth, len(target))
     if isinstance(controller, Controller):
         _run_mpc(controller.c, controller, run, target, drives_known=truth.known)
-    elif len(schedule) > 1 or not _run_pi(controller.c, controller, run, target[0], begun):
+    elif len(schedule) > 1 or not _run_pi(controller.c, controller, run, target[0]):
         return simulate_closed_loop(controller, plant, schedule, **about)
     truth.y = list(run.y)
     status = tuple(STATUSES[code] for code in run.status)
@@ -117,16 +117,10 @@ def _run_mpc(
     )
 
 
-def _run_pi(
-    c: CompiledController, controller: PIController, run: _Run, target: Array, begun: Mapping[str, float]
-) -> bool:
+def _run_pi(c: CompiledController, controller: PIController, run: _Run, target: Array) -> bool:
     """Run PI loops that were reset at a reading to a target (n_controlled,) [degC]; return whether all
     readings were plausible."""
-    model = controller.model
-    d = np.array([begun[name] for name in model.disturbances])
-    if not ((d >= model.least_d) & (d <= model.most_d)).all():
-        return False
-    loops, arrays = _loops_at(controller, target, d)
+    loops, arrays = _loops_at(controller, target)
     places = [ctypes.byref(struct) for struct in (loops, run.plant, run.around)]
     written = [address(values) for values in (run.y, run.reading, run.drive)]
     done = c.library.tg_host_loop_pi(*places, len(run.status), *written)
@@ -135,7 +129,7 @@ def _run_pi(
 
 
 class _Loops(ctypes.Structure):
-    _arrays_ = "drive output Kc Ti target kept ahead lowest highest slew uncut integral u"
+    _arrays_ = "drive output Kc Ti target kept lowest highest slew uncut integral u"
     _fields_ = [
         ("n", ctypes.c_int),
         *((name, ctypes.c_double) for name in ("dt", "coldest", "hottest")),
@@ -143,20 +137,17 @@ class _Loops(ctypes.Structure):
     ]
 
 
-def _loops_at(controller: PIController, target: Array, d: Array) -> tuple[_Loops, Any]:
-    """Return PI loops that were reset, for a target (n_controlled,) and disturbances (n_d,), and what the C
-    struct points to."""
+def _loops_at(controller: PIController, target: Array) -> tuple[_Loops, Any]:
+    """Return PI loops that were reset, for a target (n_controlled,), and what the C struct points to."""
     model, loops = controller.model, controller.loops
     rows = [model.outputs.index(controller.controlled[i]) for _, i in controller.ends]
-    ahead, setpoint_share = controller.terms(target, d)
     places = [np.array(values, dtype=np.int32) for values in ([j for j, _ in controller.ends], rows)]
     numbers = [
         [loop.Kc for loop in loops],
         [loop.Ti for loop in loops],
         target[[i for _, i in controller.ends]],
         *(
-            setpoint_share,
-            ahead,
+            controller.left_out(target),
             controller.drives.lowest,
             controller.drives.highest,
             controller.drives.slew,

@@ -1,7 +1,6 @@
 """PI loops as C99: three files and a README, and the proof that they do what Python does.
 
-The C is called once a sample and has no feed-forward, since the drive that holds a target is a program to
-solve; ``tune`` makes loops without.
+The C is called once a sample.
 """
 
 from __future__ import annotations
@@ -34,10 +33,6 @@ _LOST_SHARE = 0.05  # of readings, and of targets
 
 def export_pi(controller: PIController, folder: str | Path) -> Export:
     """Write PI loops as C99 into a folder, made where absent."""
-    ahead = [loop.output for loop in controller.loops if loop.feedforward]
-    if ahead:
-        problem = f"feedforward of {', '.join(ahead)}: C does not work out the drive that holds a target"
-        raise UserError(problem, hint="tune again, or set feedforward to 0 in the file")
     if len(controller.loops) < len(controller.controlled):
         raise UserError("an output has no loop, and C has no drive for it", hint="export the MPC")
     folder = Path(folder)

@@ -1,16 +1,15 @@
-"""The baseline: PI control with feed-forward and anti-windup, behind the same interface as the MPC.
+"""The baseline: PI control with anti-windup, behind the same interface as the MPC.
 
 One loop for each controlled output, on the drive that moves it most:
 
-    v = u_ff(r, d) + Kc (b r + (1 - b) r_0 - y) + I,      u = v inside range and slew,
+    v = Kc (b r + (1 - b) r_0 - y) + I,      u = v inside range and slew,
     I+ = I + dt Kc/Ti (r - y),  but I where u is limited and this would take v further out.
 
 So the integrator stands while the drive is limited, which is most of the time after a step of the target
-(taken to the limit by back-calculation, it overshoots).  ``u_ff`` is the drive that holds the target in
-steady state, from the plant, weighted; r_0 is where the loop began, and b below 1 answers a new target less
-than a reading, against overshoot.  Where readings have a time, dt is what really passed, for the integrator
-and for the slew alike, and a call before a move is due (:mod:`thermogrip.mpc.estimator.call_times`) holds the
-last one.
+(taken to the limit by back-calculation, it overshoots).  r_0 is where the loop began, and b below 1 answers a
+new target less than a reading, against overshoot.  Where readings have a time, dt is what really passed, for
+the integrator and for the slew alike, and a call before a move is due
+(:mod:`thermogrip.mpc.estimator.call_times`) holds the last one.
 
 Its loops are tuned by :mod:`thermogrip.mpc.design.design`.
 """
@@ -42,12 +41,12 @@ if TYPE_CHECKING:
 
 
 class PIController(SampledController):
-    """PI with feed-forward and anti-windup.
+    """PI with anti-windup.
 
     Parameters
     ----------
     plant : Plant
-        Gives the holding drive.
+        Gives the drive that holds a start.
     design : Design, optional
         Its loops, limits and patience; by default that of
         :func:`thermogrip.mpc.design.design.default_design`.
@@ -94,7 +93,6 @@ class PIController(SampledController):
         # of each loop its drive and its controlled output, counted from 0
         self.ends = [(model.drives.index(p.drive), self.controlled.index(p.output)) for p in self.loops]
         self.integral, self._begun = np.zeros(len(self.loops)), np.full(len(self.controlled), np.nan)
-        self._room, self._usual_d = np.full(model.n_d, np.nan), model.undisturbed(ROOM)
         #: An MPC of the same plant and drives in C, in whose library trials of these loops can run.
         self.c: CompiledController | None = None
 
@@ -111,13 +109,11 @@ class PIController(SampledController):
         self._u = self._applied(reading, self._u)
         y, room = self._read(reading)
         self._target = self._begun = y[self._rows]
-        self._room = np.full(self.model.n_d, np.nan)
-        if np.isfinite(self._target).all():  # what the feed-forward leaves of the drive that holds this
-            holding = self._held(self._target, np.where(np.isfinite(room), room, self._usual_d))
-            applied = self._applied(reading, holding)
-            self.integral = np.array(
-                [applied[j] - p.feedforward * holding[j] for p, (j, _) in zip(self.loops, self.ends)]
-            )
+        if np.isfinite(self._target).all():
+            d = np.where(np.isfinite(room), room, self.model.undisturbed(ROOM))
+            places = tuple(self._target.tolist()), tuple(d.tolist())
+            holding = self.drives.cut(held_drive(self.model, self.controlled, *places))
+            self.integral = self._applied(reading, holding)[[j for j, _ in self.ends]]
         self.times.reset()
 
     def step(self, reading: Readings, target: Trajectory) -> Move:
@@ -129,17 +125,14 @@ class PIController(SampledController):
             return self._held_move(started)
         wanted, wrong = self._wanted(target)
         self._target = wanted
-        y, room = self._read(reading)
-        y = y[self._rows]
+        y = self._read(reading)[0][self._rows]
         if self.times.stale:  # a stale reading is none
             y, wrong = np.full(len(y), np.nan), wrong or STALE
-        self._room = np.where(np.isfinite(room), room, self._room)
         usable = np.isfinite(y) & np.isfinite(wanted).all()
         self._unread_s = np.where(usable, 0.0, self._unread_s + self.times.waited_s)
         status, advice = "fallback_plan", wrong or "reading lost: the drive is held"
         if usable.any():
-            d = np.where(np.isfinite(self._room), self._room, self._usual_d)
-            self._u = self.propose(y, wanted, d, seconds=self.times.slew_s)
+            self._u = self.propose(y, wanted, seconds=self.times.slew_s)
             lost = [name for name, is_usable in zip(self.controlled, usable) if not is_usable]
             status, advice = "ok", wrong
             if lost:
@@ -149,37 +142,31 @@ class PIController(SampledController):
             status, advice = "off", wrong or "reading lost: drive to zero"
         return self._answer(status, advice, started)
 
-    def propose(self, y: Array, target: Array, d: Array, *, seconds: float | None = None) -> Array:
+    def propose(self, y: Array, target: Array, *, seconds: float | None = None) -> Array:
         """Return the limited drives (n_u,) after so many seconds, and integrate; readings y (n_controlled,)
-        are NaN where lost, d (n_d,) feeds the holding drive [degC]."""
+        are NaN where lost."""
         seconds = self.dt if seconds is None else seconds
         error = target - y
         self._begun = np.where(np.isfinite(self._begun), self._begun, y)
-        ahead, without_setpoint = self.terms(target, d)
-        v = ahead.copy()
-        for k, (loop, (j, i)) in enumerate(zip(self.loops, self.ends)):
+        v = np.zeros(self.model.n_u)
+        loops = list(zip(self.loops, self.ends, self.left_out(target).tolist()))
+        for k, (loop, (j, i), left_out) in enumerate(loops):
             if np.isfinite(error[i]):
-                v[j] = ahead[j] + loop.Kc * (error[i] - without_setpoint[k]) + self.integral[k]
+                v[j] = loop.Kc * (error[i] - left_out) + self.integral[k]
             else:
                 v[j] = self.drives.safe[j] if self._lost[i] else self._u[j]
         u = self.drives.follow(v, self._u, seconds / self.dt)
-        for k, (loop, (j, i)) in enumerate(zip(self.loops, self.ends)):
+        for k, (loop, (j, i), _) in enumerate(loops):
             if np.isfinite(error[i]):
                 inward = (u[j] - v[j]) * loop.Kc * error[i] > 0
                 if inward or abs(u[j] - v[j]) <= UNCUT * self.model.span[j]:
                     self.integral[k] += seconds * loop.Kc / loop.Ti * error[i]
         return u
 
-    def terms(self, target: Array, d: Array) -> tuple[Array, Array]:
-        """Return the feed-forward (n_u,), weighted where a loop is, and of each loop the part of its error
-        that its setpoint weight leaves out."""
-        ahead = self._feedforward(target, d).copy()
-        for loop, (j, _) in zip(self.loops, self.ends):
-            ahead[j] *= loop.feedforward
-        without_setpoint = [
-            (1 - loop.setpoint) * (target[i] - self._begun[i]) for loop, (_, i) in zip(self.loops, self.ends)
-        ]
-        return ahead, np.array(without_setpoint)
+    def left_out(self, target: Array) -> Array:
+        """Return of each loop the part of its error that its setpoint weight leaves out."""
+        weights = np.array([loop.setpoint for loop in self.loops])
+        return np.asarray((1 - weights) * (target - self._begun)[[i for _, i in self.ends]])
 
     @property
     def applied(self) -> Array:
@@ -190,24 +177,13 @@ class PIController(SampledController):
         """Note the drives (n_u,) that were applied, from which the slew limit counts."""
         self._u = np.asarray(u, dtype=float)
 
-    def follow(self, u: Array, y: Array, target: Array, d: Array) -> None:
+    def follow(self, u: Array, y: Array, target: Array) -> None:
         """Set the integrators so that the next proposal, with the arguments of :meth:`propose`, starts from
         drives u (n_u,): a bumpless take-over."""
         self._u, self._begun = np.asarray(u, dtype=float), target
-        ahead, error = self._feedforward(target, d), target - y
+        error = target - y
         for k, (loop, (j, i)) in enumerate(zip(self.loops, self.ends)):
-            self.integral[k] = self._u[j] - loop.feedforward * ahead[j] - loop.Kc * error[i]
-
-    def _feedforward(self, target: Array, d: Array) -> Array:
-        """Return the drives that hold the target, where a loop uses them."""
-        if not any(loop.feedforward for loop in self.loops):
-            return np.zeros(self.model.n_u)
-        return self._held(target, d)
-
-    def _held(self, target: Array, d: Array) -> Array:
-        """Return the drives that hold the target; worked out once for a target and half a degree of room."""
-        wanted, room = tuple(np.round(target, 2).tolist()), self.model.rounded_d(d)
-        return np.asarray(self.drives.cut(held_drive(self.model, self.controlled, wanted, room)))
+            self.integral[k] = self._u[j] - loop.Kc * error[i]
 
 
 @lru_cache(maxsize=1024)

@@ -94,7 +94,7 @@ class ReferenceController(SampledController):
         self.optimiser = Optimiser(model, design)
         super().__init__(model, design.controlled, self.optimiser.drives, design.patience_s, clock)
         self.observer = design.observer(model)
-        self.pi = PIController(plant, design, loops=tuple(replace(p, feedforward=0.0) for p in design.loops))
+        self.pi = PIController(plant, design)
         self.monitor = ReadingMonitor(model.n_y, spike=model.spike)
         lost = np.full(model.n_y, np.nan)
         self._start(lost, model.undisturbed(design.ambient), self.observer.reset)
@@ -365,8 +365,8 @@ class ReferenceController(SampledController):
         if not self.pi.loops or not np.isfinite(y).all():
             return _Choice(self.drives.safe, "off", why)
         if not self._follows.on_pi:
-            self.pi.follow(self._u, y, self._target, self._past.d)
+            self.pi.follow(self._u, y, self._target)
         self._follows.on_pi = True
         self.pi.hold(self.drives.cut(self._u))
-        u = self.pi.propose(y, self._target, self._past.d, seconds=self.times.slew_s)
+        u = self.pi.propose(y, self._target, seconds=self.times.slew_s)
         return _Choice(u, "fallback_pi" if status == "fallback_plan" else status, why)

@@ -79,7 +79,6 @@ class PILoop:
     output: str
     Kc: Finite  # gain [drive units per degC]
     Ti: Positive  # integral time [s]
-    feedforward: Finite = 1.0  # share of the holding drive that is fed forward, 0 to 1
     setpoint: Share = 1.0  # share of a change of the target that Kc answers to
 
 
@@ -301,9 +300,11 @@ class Design:
     def from_dict(cls, content: Mapping[str, Any]) -> Design:
         """Return the design that :meth:`to_dict` wrote; a missing or wrong field is a :class:`UserError`."""
         values = {key: value for key, value in content.items() if _WITHOUT.get(key, ...) != value}
-        if isinstance(loops := values.get("loops"), list):  # 0.1.0 kept an anti-windup time Tt too
+        if isinstance(loops := values.get("loops"), list):  # those of an MPC never fed a target forward
             values["loops"] = [
-                {key: value for key, value in loop.items() if key != "Tt"} if isinstance(loop, dict) else loop
+                {key: value for key, value in loop.items() if key not in ("Tt", "feedforward")}
+                if isinstance(loop, dict)
+                else loop
                 for loop in loops
             ]
         noise, ranges = values.get("noise"), values.get("drive_range")

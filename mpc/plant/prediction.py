@@ -401,11 +401,6 @@ class PredictionModel:
         room_read = np.asarray(d, float).reshape(-1)[self.rooms][:1]
         return float(room_read[0]) if np.isfinite(room_read).any() else ROOM
 
-    def rounded_d(self, d: Array) -> tuple[float, ...]:
-        """Return measured disturbances (n_d,) to the step within which what holds a target is the same."""
-        steps: list[float] = (np.round(d / self.close_d) * self.close_d).tolist()
-        return tuple(steps)
-
 
 def _symbols(model: PredictionModel, prefix: str = "") -> list[Any]:
     """Return CasADi's symbols for x, u, d."""

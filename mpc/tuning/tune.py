@@ -339,7 +339,6 @@ class Bench:
                     Kc=parameters.get("Kc", 1.0) * loop.Kc,
                     Ti=parameters.get("Ti", 1.0) * loop.Ti,
                     setpoint=parameters.get("setpoint", 1.0),
-                    feedforward=0.0,
                 )
                 for loop in base.loops
             )

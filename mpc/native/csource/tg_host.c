@@ -219,24 +219,23 @@ void tg_host_loop(tg_controller *c, const tg_design *design, tg_truth *plant, co
     }
 }
 
-/* PI loops, see thermogrip.mpc.controllers.pi: n of them, each on a drive and an output; ahead: feed-forward
- * of each drive; kept: what setpoint weights leave out; slew: of a sample; uncut: by which a drive may be cut
+/* PI loops, see thermogrip.mpc.controllers.pi: n of them, each on a drive and an output; kept: what setpoint
+ * weights leave out; slew: of a sample; uncut: by which a drive may be cut
  * and not be limited; u: drives before the first sample. */
 typedef struct {
     int n;
     double dt, coldest, hottest; /* readings beyond these are none */
     const int *drive, *output;
-    const double *Kc, *Ti, *target, *kept, *ahead, *lowest, *highest, *slew, *uncut;
+    const double *Kc, *Ti, *target, *kept, *lowest, *highest, *slew, *uncut;
     double *integral, *u;
 } tg_loops;
 
 static void step_pi(const tg_loops *p, const double *shown, double *drive)
 {
-    double wanted[TG_NU];
-    memcpy(wanted, p->ahead, sizeof wanted);
+    double wanted[TG_NU] = {0.0};
     for (int l = 0; l < p->n; l++)
         wanted[p->drive[l]] =
-            p->ahead[p->drive[l]] + p->Kc[l] * (p->target[l] - shown[p->output[l]] - p->kept[l]) + p->integral[l];
+            p->Kc[l] * (p->target[l] - shown[p->output[l]] - p->kept[l]) + p->integral[l];
     for (int j = 0; j < TG_NU; j++) {
         double before = fmin(fmax(p->u[j], p->lowest[j]), p->highest[j]);
         double slewed = fmin(fmax(wanted[j], before - p->slew[j]), before + p->slew[j]);

@@ -194,7 +194,7 @@ GONE = {
     "move_delay": 1,
 }
 UNUSED = {"travel": 0.0, "tariff": [], "on_off": {}, "offset_free": True, "move_delay": 0}
-LOOP = {"drive": "drive", "output": "t_surface", "Kc": 0.1, "Ti": 50.0, "feedforward": 0.0}
+LOOP = {"drive": "drive", "output": "t_surface", "Kc": 0.1, "Ti": 50.0}
 
 
 @pytest.fixture(scope="module")
@@ -300,7 +300,7 @@ def test_simc_of_a_delayed_lag_is_its_closed_form(delay, lag, tau_c, closed, int
     assert loop.Kc == pytest.approx(100 * answer.lag / (answer.gain * (closed + late)), rel=1e-4)
     assert answer.lag / answer.gain == pytest.approx((lag + 1) / 50, rel=2e-3)
     assert loop.Ti == pytest.approx(integral, rel=1e-3)
-    assert (loop.drive, loop.output, loop.feedforward) == ("q", "t", 1.0)
+    assert (loop.drive, loop.output) == ("q", "t")
 
 
 def test_a_drive_of_the_other_sign_has_a_loop_of_the_other_sign_and_one_of_no_gain_has_none():

@@ -139,7 +139,7 @@ def test_a_loop_is_the_same_in_python_with_steps_in_c_and_wholly_in_c(pair, tank
         assert (one.overshoot, one.travel, one.bias) == pytest.approx((two.overshoot, two.travel, two.bias))
 
 
-LOOP = {"setpoint": 0.4, "feedforward": 0.7}
+LOOP = {"setpoint": 0.4}
 
 
 @pytest.mark.parametrize("held", [(), ("t_surface",)])

@@ -80,7 +80,6 @@ def test_the_mpc_is_saved_where_it_is_best_with_the_tuned_pi_behind_it(tuning, t
     assert loaded.notes["verdict"] == tuning.verdict
     assert loaded.notes["spec"]["steps"] == [[28.0, 36.0]]
     assert loaded.design == tuning.controller.design
-    assert loaded.design.loops[0].feedforward == 0.0
     assert min(tuning.scores, key=lambda name: tuning.scores[name]) != "PI"
     assert "MPC is best and is what is saved: it scores" in tuning.finding
 
