@@ -57,7 +57,6 @@ class Surroundings:
     held: tuple[str, ...] = ()
     # measured disturbances by name; where absent, what the plant has where nobody reads them
     disturbances: dict[str, float] = field(default_factory=dict)
-    play: float = 0.0  # share of its range by which every drive moves before what it drives follows
     # what a load adds to the outputs (n, n_y), at the plant's own steps from the start on; its last row stays
     load: Array | None = field(default=None, compare=False)
 
@@ -215,16 +214,6 @@ class Truth:
         self.rng = np.random.default_rng(seed)
         self.late = round(around.move_delay_s / native.dt)
         self.sees = native.dt / (native.dt + around.sensor_lag_s)  # share of a change that is shown at once
-        if holding_drive is None and (
-            self.late or around.drive_share != 1
-        ):  # what was applied before counts: what holds the start
-            pushed = native.neutral + np.diag(0.01 * native.span)
-            plans = np.vstack([native.neutral[None], pushed])[:, None]
-            _, after = native.run(np.repeat(self.x[None], len(plans), axis=0), plans, self.d)
-            by_drive = (after[1:] - after[0]).T / (0.01 * native.span)
-            drive_before = native.neutral + np.linalg.lstsq(by_drive, self.x - after[0], rcond=None)[0]
-            self.before = np.clip(drive_before, native.lowest, native.highest)
-        self.stem = self.before  # what follows the drives
         self.y = [native.output(self.x) + self.offset]  # without the load
         self.time = 0.0
 
@@ -263,8 +252,6 @@ class Truth:
         self.moves.append(np.array(move.drives(self.model.drives), dtype=float))
         moves_in_force = np.arange(first, first + self.sub) // self.sub
         u = np.stack([self.moves[k] if k >= 0 else drive_before for k in moves_in_force])
-        if self.around.play:
-            u = self._behind_play(u)
         y, x = self.model.run(
             self.x[None, :], (drive_before + self.around.drive_share * (u - drive_before))[None], self.d
         )
@@ -272,14 +259,6 @@ class Truth:
         for row in y[0, 1:] + self.offset:
             self.y.append(row if self.sees == 1 else self.y[-1] + self.sees * (row - self.y[-1]))
         self.time += self.dt
-
-    def _behind_play(self, u: Array) -> Array:
-        """Return what follows drives u (n, n_u), step by step."""
-        half, follows = 0.5 * self.around.play * self.model.span, []
-        for row in u:
-            self.stem = np.clip(self.stem, row - half, row + half)
-            follows.append(self.stem)
-        return np.stack(follows)
 
 
 @dataclass(frozen=True)

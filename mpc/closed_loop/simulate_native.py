@@ -43,14 +43,11 @@ def compiled_loop(
 ) -> ClosedLoop:
     """Run a compiled controller (else a ValueError) as :func:`simulate_closed_loop` does, with the same
     arguments, against a plant of the same signals whose equations and step may be others; the record has no
-    advices and no step times.  PI loops, which go to one target, run in Python where a reading is absurd, and
-    all do where drives have play."""
+    advices and no step times.  PI loops, which go to one target, run in Python where a reading is absurd."""
     if controller.c is None:
         raise ValueError("the controller is not compiled")
     around = Surroundings() if surroundings is None else surroundings
     about: dict[str, Any] = {"start": start, "surroundings": around, "band": band, "seed": seed}
-    if around.play:
-        return simulate_closed_loop(controller, plant, schedule, **about)
     truth = Truth(plant, controller.dt, around, start, seed)
     begun, controlled = truth.reading(), tuple(controller.controlled)
     controller.reset(begun | truth.begun())

@@ -10,12 +10,11 @@ sign, are seen there.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TypeAlias
 
 import numpy as np
 
-from thermogrip.datasets.errors import UserError
 from thermogrip.mpc.controllers.mpc import Controller
 from thermogrip.mpc.controllers.pi import PIController
 from thermogrip.mpc.design.spec import Spec, spec_from_dict
@@ -28,11 +27,8 @@ from thermogrip.mpc.tuning.objective import (
     lacking,
     load_seconds,
     loads_of,
-    result_of,
     run_trials,
     steps_on,
-    surroundings_of,
-    trial,
 )
 from thermogrip.sysid.plant.plant import said_not_good
 
@@ -40,7 +36,6 @@ from thermogrip.sysid.plant.plant import said_not_good
 Reviewed: TypeAlias = Controller | PIController
 _RANK = {"pass": 0, "warn": 1, "fail": 2}
 _FAR_BEYOND = 3.0  # bands
-_PLAY = 0.02  # of a drive's range
 #: What a plant may have that its model lacks, where the spec does not state it: see the keys of a spec.
 _DOUBTS = {"extra_lag": 0.5, "extra_delay": 0.5, "lost_gain": 0.15}
 
@@ -116,38 +111,37 @@ def review(
     warn settles where the model lacks structure
     warn targets lie where the logs were
     """
-    starts, targets = _steps(controller)
-    span = (min(targets), max(targets)) if wanted is None else wanted
-    swing = (min(starts + targets), max(starts + targets)) if wanted is None else wanted
+    spec, noted = spec_of(controller, wanted)
+    steps = np.array(spec.steps)
+    targets = steps[:, 1] if noted else steps
+    span = (float(targets.min()), float(targets.max())) if wanted is None else wanted
     usual = controller.design.ambient
     return [
         reachable(controller, span, (usual - 7.0, usual + 5.0) if rooms is None else rooms),
-        as_asked(controller, swing, draws),
-        after_loads(controller, swing, draws),
-        lacks_structure(controller, swing),
+        as_asked(controller, spec, draws, noted=noted),
+        after_loads(controller, spec, draws),
+        lacks_structure(controller, spec),
         valid_range(controller, span),
         called_good(controller),
     ]
 
 
-def _steps(controller: Reviewed) -> tuple[list[float], list[float]]:
-    """Return where the spec's steps start and where they go, else the ends of what the logs showed."""
-    spec = controller.notes.get("spec")
-    steps = spec.get("steps", []) if isinstance(spec, Mapping) else []
-    try:
-        starts, targets = ([float(value) for value in ends] for ends in zip(*steps)) if steps else ([], [])
-    except (TypeError, ValueError) as error:
-        raise UserError("notes: spec: steps are no pairs of numbers", hint="tune again") from error
-    if targets:
-        return starts, targets
-    low, high = controller.plant.valid.get(controller.controlled[0], (20.0, 40.0))
-    return [], [float(low), float(high)]
+def spec_of(controller: Reviewed, wanted: tuple[float, float] | None) -> tuple[Spec, bool]:
+    """Return the spec that the controller was tuned for, and whether there is one: else a step over the
+    wanted range [degC], or over what the logs showed."""
+    notes = controller.notes.get("spec")
+    if isinstance(notes, Mapping):
+        # a file that tells every default may have one that is longer than its steps, or a key that is gone
+        long = "settle_within_s" in notes and notes["settle_within_s"] > notes.get("hold_s", np.inf)
+        known = Spec.model_fields.keys() - ({"settle_within_s"} if long else set())
+        return spec_from_dict({key: value for key, value in notes.items() if key in known}), True
+    low, high = wanted or controller.plant.valid.get(controller.controlled[0], (20.0, 40.0))
+    return Spec(steps=[(low, max(low + 1.0, high))]), False
 
 
-def as_asked(controller: Reviewed, swing: tuple[float, float], draws: int) -> Check:
+def as_asked(controller: Reviewed, spec: Spec, draws: int, *, noted: bool) -> Check:
     """Where the model is right, on the plant itself and on draws of it, every step of the spec must settle as
     asked; of targets that nobody asked for nothing fails."""
-    spec, noted = _spec_of(controller, swing)
     numbers = sorted({0, *draws_of(controller.plant, draws)})
     results_of_all = run_trials(_again(controller), controller.plant, spec, steps_on(spec, numbers))
     words, verdicts = [], []
@@ -164,11 +158,11 @@ def as_asked(controller: Reviewed, swing: tuple[float, float], draws: int) -> Ch
     return _graded(name, finding, fail=("fail" in verdicts, fix), warn=(set(verdicts) != {"pass"}, fix))
 
 
-def after_loads(controller: Reviewed, swing: tuple[float, float], draws: int) -> Check:
+def after_loads(controller: Reviewed, spec: Spec, draws: int) -> Check:
     """After a load on each drive and each output, on the plant itself and on draws of it, the loop must come
     back into the band: one that swings or keeps an offset does not."""
-    spec, plant = _spec_of(controller, swing)[0], controller.plant
-    numbers, target = sorted({0, *draws_of(plant, draws)}), spec.steps[0][1]
+    plant, target = controller.plant, spec.steps[0][1]
+    numbers = sorted({0, *draws_of(plant, draws)})
     loads = loads_of(plant, spec, controller.design)
     seconds = 2 * load_seconds(controller.design)
     cases = [Case(target, target, draw, load=load, seconds=seconds) for load in loads for draw in numbers]
@@ -176,16 +170,12 @@ def after_loads(controller: Reviewed, swing: tuple[float, float], draws: int) ->
     words = []
     for load in loads:
         of_load = [result for result in results if result.load == load.words]
-        back = max(result.settle_s for result in of_load) if all(_settled(r) for r in of_load) else np.inf
+        back = np.max([result.settle_s for result in of_load])  # NaN where one does not settle
         ends = f"back in {back:.0f} s" if np.isfinite(back) else f"not back after {seconds:.0f} s"
         words.append(f"{load.words}: {ends}, {max(result.overshoot for result in of_load):.2f} off at most")
     fix = "tune again: a load that stays must be met"
-    lost = not all(_settled(result) for result in results)
+    lost = not all(np.isfinite(result.settle_s) for result in results)
     return _graded("comes back after a load", "; ".join(words), fail=(lost, fix))
-
-
-def _settled(result: StepResult) -> bool:
-    return bool(np.isfinite(result.settle_s))
 
 
 def _again(controller: Reviewed) -> Reviewed:
@@ -195,43 +185,23 @@ def _again(controller: Reviewed) -> Reviewed:
     return Controller(controller.plant, as_tried(controller.design, controller.plant))
 
 
-def _spec_of(controller: Reviewed, swing: tuple[float, float]) -> tuple[Spec, bool]:
-    """Return the spec that the controller was tuned for, and whether there is one: else a step over the
-    swing."""
-    noted = controller.notes.get("spec")
-    if isinstance(noted, Mapping):
-        # a file that tells every default may have one that is longer than its steps, or a key that is gone
-        long = "settle_within_s" in noted and noted["settle_within_s"] > noted.get("hold_s", np.inf)
-        known = Spec.model_fields.keys() - ({"settle_within_s"} if long else set())
-        return spec_from_dict({key: value for key, value in noted.items() if key in known}), True
-    return Spec(steps=[(swing[0], max(swing[0] + 1.0, swing[1]))]), False
-
-
-def lacks_structure(controller: Reviewed, swing: tuple[float, float]) -> Check:
-    """A plant may have what its model lacks, and a valve or gear play that no log shows: the spec's first
-    step, with each of that in turn, must settle without more overshoot and offset than the spec allows.  Of
-    what nobody stated nothing fails."""
+def lacks_structure(controller: Reviewed, spec: Spec) -> Check:
+    """A plant may have what its model lacks: the spec's first step, with each of that in turn, must settle
+    without more overshoot and offset than the spec allows.  Of what the spec does not state nothing fails."""
     plant, controlled = controller.plant, controller.design.controlled
-    spec, stated = _spec_of(controller, swing)
-    spec = spec.model_copy(update={key: share for key, share in _DOUBTS.items() if not getattr(spec, key)})
-    filtered_s = controller.dt if isinstance(controller, Controller) else 0.0
-    usual = surroundings_of(spec, controlled, plant, filtered_s=filtered_s)
-    draw = draws_of(plant, 1)[0]
-    tried = {words: replace(usual, **changes) for words, changes in lacking(plant, spec, controlled).items()}  # type: ignore[arg-type]
-    tried[play := f"play of {100 * _PLAY:g} % of each drive"] = replace(usual, play=_PLAY)
-    words = []
-    verdicts = []
-    case = Case(*spec.steps[0], draw)
-    for structure, around in tried.items():
-        run = trial(_again(controller), plant, spec, case, around=around)
-        ends, verdict = _stepped(result_of(run, case), spec)
-        words.append(f"{structure}: {ends}")
-        verdicts.append("warn" if verdict == "fail" and (structure == play or not stated) else verdict)
-    fix = "identify on a log of the closed loop and tune again; a design that moves less bears more"
-    finding = f"{case.start:g} to {case.target:g} degC, each alone: {'; '.join(words)}"
-    failed = "fail" in verdicts
+    doubts = {key: share for key, share in _DOUBTS.items() if not getattr(spec, key)}
+    doubted, stated = spec.model_copy(update=doubts), lacking(plant, spec, controlled)
+    (start, target), (draw,) = spec.steps[0], draws_of(plant, 1)
+    cases = [Case(start, target, draw, structure) for structure in lacking(plant, doubted, controlled)]
+    words, verdicts = [], []
+    for result in run_trials(_again(controller), plant, doubted, cases):
+        ends, verdict = _stepped(result, spec)
+        words.append(f"{result.lacks}: {ends}")
+        verdicts.append(verdict if result.lacks in stated else min(verdict, "warn", key=_RANK.__getitem__))
+    fix = "identify on a log of the closed loop and tune again; a design that moves less tolerates more"
+    finding = f"{start:g} to {target:g} degC, each alone: {'; '.join(words)}"
     name = "settles where the model lacks structure"
-    return _graded(name, finding, fail=(failed, fix), warn=(set(verdicts) != {"pass"}, fix))
+    return _graded(name, finding, fail=("fail" in verdicts, fix), warn=(set(verdicts) != {"pass"}, fix))
 
 
 def _stepped(result: StepResult, spec: Spec, *, timed: bool = False) -> tuple[str, str]:

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.charts import INK, PALETTE, SOFT, Chart, Curve, Panel, draw_chart
 from thermogrip.datasets.limits import LARGEST
 from thermogrip.mpc.closed_loop.simulate import ClosedLoop
@@ -21,9 +20,8 @@ def closed_loop_figure(
     title: str = "",
     *,
     limits: Mapping[str, tuple[float, float]] | None = None,
-    slew_per_s: Mapping[str, float] | None = None,
 ) -> Figure:
-    """Draw the regulated outputs with target and band, the others with their limits, drive and slew.
+    """Draw the regulated outputs with target and band, the others with their limits, and the drives.
 
     Parameters
     ----------
@@ -31,8 +29,6 @@ def closed_loop_figure(
     title : str, optional
     limits : mapping of str to (float, float), optional
         Of outputs, e.g. the tank's [degC].
-    slew_per_s : mapping of str to float, optional
-        What each drive may change by [its units per s]; with it a panel shows what it did change by.
 
     Returns
     -------
@@ -51,7 +47,7 @@ def closed_loop_figure(
     >>> [axis.get_ylabel() for axis in closed_loop_figure(run).axes]
     ['regulated [degC]', 'drive']
     """
-    return draw_chart(closed_loop_chart(run, title, limits=limits, slew_per_s=slew_per_s))
+    return draw_chart(closed_loop_chart(run, title, limits=limits))
 
 
 def closed_loop_chart(
@@ -59,7 +55,6 @@ def closed_loop_chart(
     title: str = "",
     *,
     limits: Mapping[str, tuple[float, float]] | None = None,
-    slew_per_s: Mapping[str, float] | None = None,
 ) -> Chart:
     """Return what :func:`closed_loop_figure` draws as a chart."""
     t, called = run.time, run.sample_time
@@ -94,17 +89,4 @@ def closed_loop_chart(
         first = next(iter(run.drive.values()))
         driven.append(Curve("status not ok", called[odd], first[odd], "#a3262a", dash=""))
     rows.append(Panel("drive", tuple(driven)))
-    if slew_per_s:
-        rows.append(Panel("slew [1/s]", tuple(_slewed(run, called, slew_per_s)), height=0.9))
     return Chart((tuple(rows),), wide=8.6)
-
-
-def _slewed(run: ClosedLoop, called: Array, slew_per_s: Mapping[str, float]) -> Iterator[Curve]:
-    """Yield what each drive changed by a second, and what it may change by."""
-    dt = float(np.median(np.diff(run.sample_time))) if run.sample_time.size > 1 else 1.0
-    for k, (name, values) in enumerate(run.drive.items()):
-        first = min(max(0.0, run.drive_range[name][0]), run.drive_range[name][1])
-        change = np.diff(values, prepend=first) / dt
-        yield Curve(f"slew of {name}", called, change, PALETTE[(1 + k) % 5], 1.0, step=True)
-        for end in (-slew_per_s[name], slew_per_s[name]):
-            yield Curve("limit of slew", called[[0, -1]], np.full(2, end), SOFT, 0.9)

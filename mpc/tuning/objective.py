@@ -302,16 +302,12 @@ def trial(
     case: Case,
     *,
     seed: int = 0,
-    around: Surroundings | None = None,
-    called: bool = False,
 ) -> ClosedLoop:
-    """Run a case, wholly in C where the controller is in C, unless it is to be ``called`` step by step, which
-    its record has the times and the advice of; in the surroundings of the spec where there are no others."""
+    """Run a case, wholly in C where the controller is in C."""
     seconds = spec.hold_s if case.seconds is None else case.seconds
     truth, controlled = drawn(plant, case.draw), tuple(controller.controlled)
-    if around is None:
-        filtered_s = controller.dt if isinstance(controller, Controller) else 0.0
-        around = surroundings_of(spec, controlled, plant, filtered_s=filtered_s)
+    filtered_s = controller.dt if isinstance(controller, Controller) else 0.0
+    around = surroundings_of(spec, controlled, plant, filtered_s=filtered_s)
     if case.lacks:
         around = replace(around, **lacking(plant, spec, controlled)[case.lacks])  # type: ignore[arg-type]
     if case.load is not None:
@@ -325,7 +321,7 @@ def trial(
         "seed": 1000 * seed + case.draw,
     }
     schedule = [(case.target, seconds)]
-    if isinstance(controller, Controller | PIController) and controller.c is not None and not called:
+    if isinstance(controller, Controller | PIController) and controller.c is not None:
         from thermogrip.mpc.closed_loop.simulate_native import compiled_loop
 
         return compiled_loop(controller, truth, schedule, **about)

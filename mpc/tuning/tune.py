@@ -122,46 +122,45 @@ class Row(Record):
     energy_worst_s: float
     travel_mean: float
     full_share: float
-    bound_s: (
-        float  # before this no drive within the limits is in the band [s], mean over the draws; NaN of a load
-    )
+    bound_s: float  # before this no drive is in the band [s], mean over the draws; NaN of a load
     load: str = ""  # in words
     iae_mean: float = 0.0  # [degC s]
 
 
 def rows_of(name: str, results: Sequence[StepResult], bounds: Bounds) -> list[Row]:
     """Return a controller's rows, one a step or load."""
-    of: dict[Any, list[StepResult]] = {}
+    of_case: dict[Any, list[StepResult]] = {}
     for result in results:
         if not result.lacks:
-            of.setdefault((result.step, result.load), []).append(result)
-    return [_score_row(name, of_case, bounds) for of_case in of.values()]
+            of_case.setdefault((result.step, result.load), []).append(result)
+    return [_score_row(name, part, bounds) for part in of_case.values()]
 
 
 def _score_row(name: str, part: Sequence[StepResult], bounds: Bounds) -> Row:
-    first = part[0]
-    settle = np.array([result.settle_s for result in part])
-    bias = np.array([result.bias for result in part])
-    energy = np.array([result.energy_s for result in part])
-    overshoot = np.array([result.overshoot for result in part])
-    bound = [np.nan if result.load else bound_of(bounds, result) for result in part]
+    def mean(figure: str) -> float:
+        return float(np.mean([getattr(result, figure) for result in part]))
+
+    def most(figure: str) -> float:
+        return float(np.max([getattr(result, figure) for result in part]))
+
+    first, biases = part[0], [result.bias for result in part]
     return Row(
         controller=name,
         start=first.start,
         target=first.target,
-        settle_mean_s=float(np.mean(settle)),
-        settle_worst_s=float(np.max(settle)),
-        overshoot_mean=float(np.mean(overshoot)),
-        overshoot_worst=float(np.max(overshoot)),
-        bias_mean=float(np.mean(np.abs(bias))),
-        bias_worst=float(bias[np.argmax(np.abs(bias))]),
-        energy_mean_s=float(np.mean(energy)),
-        energy_worst_s=float(np.max(energy)),
-        travel_mean=float(np.mean([result.travel for result in part])),
-        full_share=float(np.mean([result.full_share for result in part])),
-        bound_s=float(np.mean(bound)),
+        settle_mean_s=mean("settle_s"),
+        settle_worst_s=most("settle_s"),
+        overshoot_mean=mean("overshoot"),
+        overshoot_worst=most("overshoot"),
+        bias_mean=float(np.mean(np.abs(biases))),
+        bias_worst=max(biases, key=abs),
+        energy_mean_s=mean("energy_s"),
+        energy_worst_s=most("energy_s"),
+        travel_mean=mean("travel"),
+        full_share=mean("full_share"),
+        bound_s=float(np.mean([np.nan if first.load else bound_of(bounds, result) for result in part])),
         load=first.load,
-        iae_mean=float(np.mean([result.iae for result in part])),
+        iae_mean=mean("iae"),
     )
 
 
@@ -612,24 +611,19 @@ def verdict_of(spec: Spec, least: float, default: float, rows: Sequence[Row]) ->
 def _runs_as_used(
     bench: Bench, candidates: Mapping[str, Trial], controller: Controller | PIController
 ) -> dict[str, ClosedLoop]:
-    """Return every step and load on the first unseen draw by the controller as it is used, and by the best
-    of the other kind."""
+    """Return every step and load on the first unseen draw by the controller that is saved, and by the best of
+    the other kind."""
     saved = "PI" if isinstance(controller, PIController) else "MPC"
-    shown: dict[str, Controller | PIController] = {saved: controller}
-    if saved == "MPC":
-        shown[saved] = bench.made(saved, controller.design)
-    other = candidates.get("tuned" if saved == "PI" else "PI")
-    if other is not None:
-        shown[other.controller] = bench.made(
-            other.controller, bench.design(other.controller, other.parameters)
-        )
+    designs = {saved: controller.design}
+    if other := candidates.get("tuned" if saved == "PI" else "PI"):
+        designs[other.controller] = bench.design(other.controller, other.parameters)
     draws = bench.unseen[:1]
     cases = {f"{case.start:g} to {case.target:g}": case for case in steps_on(bench.spec, draws)}
     cases |= {case.load.words: case for case in bench.loads_on(draws) if case.load}
     return {
         f"{title}, {kind}": trial(
-            made, bench.plant, bench.spec, case, seed=bench.check_seed, called=kind == saved
+            bench.made(kind, design), bench.plant, bench.spec, case, seed=bench.check_seed
         )
         for title, case in cases.items()
-        for kind, made in shown.items()
+        for kind, design in designs.items()
     }

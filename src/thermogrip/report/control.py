@@ -81,9 +81,6 @@ def tuning_sections(tuning: Tuning) -> list[Section]:
     for title, run in runs.items():
         tone = _tone(tuning.spec, run) if title in steps else ""
         sections.append(loop_section(run, design, steps.get(title, f"A load on {title}"), tone=tone))
-    seconds = [float(step_s) for run in runs.values() for step_s in run.seconds]
-    if seconds:
-        sections.append(timing_section(seconds, design))
     return [*sections, spec_section(tuning)]
 
 
@@ -123,8 +120,8 @@ def tuning_section(tuning: Tuning) -> Section:
 
 
 def loop_section(run: ClosedLoop, design: Design, title: str, *, tone: str = "") -> Section:
-    """Return the section of one closed loop: temperatures with band and the design's limits, drive, slew;
-    where no tone is given, the run's settling decides it."""
+    """Return the section of one closed loop: temperatures with band and the design's limits, and drives; its
+    settling decides the tone where none is given."""
     words = "; ".join(
         f"{s.output} from {s.start:.1f} to {s.target:g} degC "
         + (f"settles in {s.settle_s:.0f} s" if np.isfinite(s.settle_s) else "does not settle")
@@ -133,33 +130,16 @@ def loop_section(run: ClosedLoop, design: Design, title: str, *, tone: str = "")
     )
     statuses = {status: run.status.count(status) for status in dict.fromkeys(run.status)}
     counts = ", ".join(f"{count} {status}" for status, count in statuses.items())
-    chart = closed_loop_chart(run, limits=design.limits, slew_per_s=design.slew_per_s)
+    chart = closed_loop_chart(run, limits=design.limits)
     caption = (
         f"Shaded: the band of \N{PLUS-MINUS SIGN}{run.band:g} degC; dotted across: settled. "
-        f"Grey: limits of drive and slew. By status: {counts}."
+        f"Grey: limits of the drives. By status: {counts}."
     )
     evidence: list[Any] = [Plot(chart, caption)]
     advices = [text for text in dict.fromkeys(run.advice) if text]
     evidence += [Text(f"Advice of the controller: {'; '.join(advices[:5])}.")] if advices else []
     whole = all(np.isfinite(segment.settle_s) for segment in run.segments)
     return Section(title, tuple(evidence), f"{words}.", tone or ("good" if whole else "warn"))
-
-
-def timing_section(seconds: Sequence[float], design: Design) -> Section:
-    """Return the section of how long steps took, against the deadline."""
-    times = np.asarray(seconds, dtype=float)
-    late = int(np.sum(times > design.deadline_s))
-    slowest = 1e3 * float(times.max())
-    verdict = (
-        f"{late} of {times.size} steps took longer than their deadline of {design.deadline_s:g} s."
-        if late
-        else f"The slowest of {times.size} steps took {slowest:.2g} ms of the {design.deadline_s:g} s it had."
-    )
-    words = (
-        f"Median {1e3 * float(np.median(times)):.2g} ms on this machine, whatever else it did; an answer "
-        "after the deadline does not count, and the last plan goes on."
-    )
-    return Section("Is it fast enough?", (Text(words),), verdict, "warn" if late else "good")
 
 
 def spec_section(tuning: Tuning) -> Section:
@@ -209,7 +189,6 @@ def session_sections(
         figures = _figures_of(session, controller.controlled)
         run = session_loop(session.log, moves, drive_range=design.drive_range, figures=figures)
         sections.append(loop_section(run, design, "The closed loop, as its sensors read it", tone=tone))
-        sections.append(timing_section([move.seconds for _, move in moves], design))
     return sections
 
 

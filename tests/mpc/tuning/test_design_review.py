@@ -112,10 +112,11 @@ def test_the_worst_of_a_review_is_by_rank_and_steps_are_the_specs_or_the_ends_of
     assert worst([found[0], found[2]]) == "warn"
     controller = stub()
     controller.controlled, controller.notes = ("t",), {"spec": {"steps": [[20, 30], [35.5, 10]]}}
-    assert checks._steps(controller) == ([20.0, 35.5], [30.0, 10.0])
-    for notes, valid in (({}, {"t": (5.0, 50.0)}), ({"spec": {}}, {"u": (5.0, 50.0)})):
-        controller.notes, controller.plant = notes, SimpleNamespace(valid=valid)
-        assert checks._steps(controller) == ([], [5.0, 50.0] if "t" in valid else [20.0, 40.0])
+    assert checks.spec_of(controller, None)[0].steps == [(20.0, 30.0), (35.5, 10.0)]
+    for valid, steps in (({"t": (5.0, 50.0)}, (5.0, 50.0)), ({"u": (5.0, 50.0)}, (20.0, 40.0))):
+        controller.notes, controller.plant = {}, SimpleNamespace(valid=valid)
+        assert checks.spec_of(controller, None) == (Spec(steps=[steps]), False)
+    assert checks.spec_of(controller, (12.0, 13.5))[0].steps == [(12.0, 13.5)]
     assert (
         checks.valid_range(controller, (20.0, 30.0)).finding == "the plant does not say where its logs were"
     )
@@ -150,14 +151,14 @@ def test_a_target_is_held_well_inside_the_drives(monkeypatch, u, y, miss, verdic
 def test_a_plant_that_has_what_its_model_lacks_settles_or_is_warned_of(tank: Any, move: float, verdict: str):
     notes = {"spec": {"steps": [[18.0, 43.0]], "lost_gain": 0.1}}
     controller = Controller(tank, default_design(tank, dt=4.0, move=move), notes=notes)
-    found = checks.lacks_structure(controller, (20.0, 30.0))
+    found = checks.lacks_structure(controller, checks.spec_of(controller, None)[0])
     assert found.verdict == verdict
     lead, seen = found.finding.split(", each alone: ")
     assert lead == "18 to 43 degC"
     words = [part.split(":")[0] for part in seen.split("; ")]
     (delay,) = apparent_delays(tank, ("t_surface",))
     late = [f"sensors slower by {0.5 * delay:.2g} s", f"delay longer by {0.5 * delay:.2g} s"]
-    assert words == [*late, "drive weaker by 10 %", "play of 2 % of each drive"]
+    assert words == [*late, "drive weaker by 10 %"]
     assert ("never" in found.finding or "(asked" in found.finding) == (verdict == "warn")
 
 
@@ -197,18 +198,23 @@ def test_every_step_of_the_spec_must_settle_where_the_model_is_right(
     tank: Any, changes: dict[str, float], said: str, verdict: str, monkeypatch: pytest.MonkeyPatch
 ):
     design = default_design(tank, dt=4.0)
+
+    def asked_of(notes: dict[str, Any]) -> checks.Check:
+        controller = Controller(tank, design, notes={"spec": notes})
+        spec, noted = checks.spec_of(controller, None)
+        return checks.as_asked(controller, spec, 2, noted=noted)
+
     last = replace(STEP, start=43.0, target=30.0)
     # the worst draw of the last step counts
     monkeypatch.setattr(checks, "run_trials", lambda *given: [STEP, last, replace(last, **changes)])
     for steps in ({"settle_within_s": 450.0}, {}):  # of the defaults
         spec = {"steps": [[18.0, 43.0], [43.0, 30.0]], **steps}
-        found = checks.as_asked(Controller(tank, design, notes={"spec": spec}), (18.0, 43.0), 2)
+        found = asked_of(spec)
         assert (found.verdict, bool(found.fix)) == (verdict, verdict != "pass")
         assert found.finding.endswith(f"overshoot 0.10, offset 0.02; 43 to 30 degC: {said}")
     # a file that tells the default beside shorter steps is read
     short = spec | {"settle_within_s": 450.0, "hold_s": 90.0}
-    found = checks.as_asked(Controller(tank, design, notes={"spec": short}), (18.0, 43.0), 2)
-    assert found.verdict == verdict
+    assert asked_of(short).verdict == verdict
 
 
 def test_a_pi_is_reviewed_by_its_loops_and_by_what_it_does(tank):

@@ -32,9 +32,7 @@ def test_each_figure_shows_what_it_should_in_the_colours_widths_and_units_of_the
     """``figures.txt`` has every artist; THERMOGRIP_FIGURES=write writes it anew: read the difference."""
     alone: Any = SimpleNamespace(**{**vars(run()), "outputs": {"skin": run().outputs["skin"]}})
     figures: dict[str, Figure] = {
-        "closed loop": closed_loop_figure(
-            run(), "a run", limits={"tank": (20.0, 45.0)}, slew_per_s={"q": 0.01}
-        ),
+        "closed loop": closed_loop_figure(run(), "a run", limits={"tank": (20.0, 45.0)}),
         "closed loop of one output": closed_loop_figure(alone),
     }
     found = [line for name, figure in figures.items() for line in (f"# {name}", *described(figure))]
