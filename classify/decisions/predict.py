@@ -206,7 +206,12 @@ def answer_record(
             one = of_unit[str(units[i])]
             notes = (Note("other_touches", f"{quality.note[i]}: the answer of its block's other touches"),)
         else:
-            one = _no_answer(names, quality.reason[i], float(last[i]))
+            # without contact it is none of the candidates for certain
+            p_unknown = 1.0 if quality.reason[i] == NO_CONTACT else None
+            one = Answer(
+                grasp_id="", material="", probabilities=dict.fromkeys(names), p_unknown=p_unknown,
+                decided_at=float(last[i]),
+            )  # fmt: skip
         answers.append(replace(one, grasp_id=grasp_id, notes=notes))
     return AnsweredRecord(answers, quality)
 
@@ -234,14 +239,6 @@ def _answers_of_usable(
             )
         )  # fmt: skip
     return out
-
-
-def _no_answer(names: list[str], why: str, last: float) -> Answer:
-    """Return the answer of an unusable grasp; without contact it is none of the candidates for certain."""
-    return Answer(
-        grasp_id="", material="", probabilities=dict.fromkeys(names), decided_at=last,
-        p_unknown=1.0 if why == NO_CONTACT else None,
-    )  # fmt: skip
 
 
 def _stopped(

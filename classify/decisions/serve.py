@@ -7,8 +7,7 @@ The answer is the row that ``classify`` writes, or ``error``, one line.  Over pi
 Over HTTP a request is the body of a POST; the server has a loopback address, takes only requests that call it
 by one, and none of a web page: a page elsewhere, opened in a browser here, must not learn what is touched.  A
 body must come within some seconds: one that never ends would hold up the end of the server.
-Requests wait for one thread, in the order of their arrival: an answer is all arithmetic.  With several
-processes as many are answered at once; one that is lost is replaced, and what it had in hand is asked again.
+Requests wait for one thread, in the order of their arrival: an answer is all arithmetic.
 """
 
 from __future__ import annotations
@@ -50,7 +49,10 @@ def reply(answer: Rows, request: bytes) -> dict[str, Any]:
     try:
         content = _content(request)
         (row,) = answer(grasp_of(content))
-        response = {key: _json_cell(value) for key, value in row.items() if key != "grasp_id"}
+        response = {
+            key: None if isinstance(value, float) and not math.isfinite(value) else value  # JSON has no NaN
+            for key, value in row.items() if key != "grasp_id"
+        }  # fmt: skip
     except UserError as error:
         response = {"error": str(error)}
     return ({"id": content["id"]} if "id" in content else {}) | response
@@ -190,11 +192,6 @@ def _request_number(name: str, value: Any) -> float:
             f"{name} has {str(value)[:20]!r}, which is no finite number", hint="write one or null"
         )
     return number
-
-
-def _json_cell(value: Any) -> Any:
-    """Return a cell of an answer as JSON has it."""
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _too_long() -> dict[str, Any]:

@@ -238,21 +238,16 @@ def learn_from_windows(
             f"{n} training grasps cannot show an error of {error:g}",
             hint=f"give more, or state at least {1 / (n + 2):.2g}",
         )
-    rule = StopRule(sure=1.0, times=tuple(times), end=end, error=error, n_grasp=n)
-    return _with_sure(rule, parts)
-
-
-def _with_sure(rule: StopRule, parts: Sequence[tuple[Windows, NDArray[np.int64]]]) -> StopRule:
-    """Return the rule with the least threshold from which on all that enough reach keep the stated error."""
-    least_sure = 1.0
+    best = StopRule(sure=1.0, times=tuple(times), end=end, error=error, n_grasp=n)
     for sure in _SURE[::-1]:
-        wrong, p_wrong = _early(replace(rule, sure=float(sure)), parts)
-        if 1 / (wrong.size + 2) > rule.error:
+        rule = replace(best, sure=float(sure))
+        wrong, p_wrong = _early(rule, parts)
+        if 1 / (wrong.size + 2) > error:
             continue  # so few are that confident: even with none of them wrong they show nothing
-        if (wrong.sum() + 1) / (wrong.size + 2) > rule.error or p_wrong.mean() > rule.error:
+        if (wrong.sum() + 1) / (wrong.size + 2) > error or p_wrong.mean() > error:
             break
-        least_sure = float(sure)
-    return replace(rule, sure=least_sure)
+        best = rule
+    return best
 
 
 def _early(
@@ -330,7 +325,9 @@ class Stream:
         self._evaluated = 0
         self.decided_at: float | None = None
         self.log_p: Floats = normalised(self._odds[None])[0]
-        self._warm()
+        # a made-up contact, so that no sample waits for the compiler
+        made_up = make_grasps([-1.0, -0.5, 0.5], [[23.0, 23.0, 23.0]], ["warm"])
+        material_fit(self._model.device_, made_up, self.candidates[:1])
 
     def update(self, time_s: float, t_surface: float) -> dict[str, float]:
         """Take one sample and return the probability of each candidate.
@@ -348,7 +345,8 @@ class Stream:
             raise UserError(f"time {time_s:g} s{after}", hint="give samples in order, each once")
         if abs(t_surface) > HOTTEST:
             raise UserError(f"a reading of {t_surface:g} degC", hint="give degC, and NaN where one was lost")
-        if time_s > _CONTACT_END_S and not self._has_level():
+        before = (y for t, y in zip(self._time, self._reading) if t < -_CONTACT_END_S)
+        if time_s > _CONTACT_END_S and not any(map(np.isfinite, before)):
             raise UserError(f"no reading before contact, and now it is {time_s:g} s", hint="start at -1 s")
         self._time.append(float(time_s))
         self._reading.append(float(t_surface))
@@ -376,14 +374,6 @@ class Stream:
     def _answer(self, log_p: Floats) -> dict[str, float]:
         return dict(zip(self.candidates, np.exp(log_p).tolist()))
 
-    def _has_level(self) -> bool:
-        return any(t < -_CONTACT_END_S and np.isfinite(y) for t, y in zip(self._time, self._reading))
-
-    def _warm(self) -> None:
-        """Look at a made-up contact once, so that no sample waits for the compiler."""
-        made_up = make_grasps([-1.0, -0.5, 0.5], [[23.0, 23.0, 23.0]], ["warm"])
-        material_fit(self._model.device_, made_up, self.candidates[:1])
-
     def _evaluate(self) -> None:
         """Take what was read so far for what it is."""
         grasp = self.grasps()
@@ -407,9 +397,7 @@ class Stream:
         if due <= self._evaluated:
             return
         self._evaluated = due
-        if quality.undecided[0]:
-            return
-        if np.exp(self.log_p.max()) >= rule.sure:
+        if not quality.undecided[0] and np.exp(self.log_p.max()) >= rule.sure:
             self.decided_at = now
 
 

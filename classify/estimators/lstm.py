@@ -136,12 +136,10 @@ class LstmClassifier(JoinedClassifier):
         self, real: Floats, target: NDArray[np.int64]
     ) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
         """Return augmented series of traces, and their classes."""
-        size = self.series_per_class
-        noise = self.noise_sd
-        shift = self.shift_sd
         made = augment(
-            real, target, series_per_class=size, noise_sd=noise, shift_sd=shift, seed=self.random_state
-        )
+            real, target, series_per_class=self.series_per_class, noise_sd=self.noise_sd,
+            shift_sd=self.shift_sd, seed=self.random_state,
+        )  # fmt: skip
         return self._series(made.traces), target[made.source]
 
     def _check_params(self) -> None:
@@ -183,7 +181,8 @@ class LstmClassifier(JoinedClassifier):
         self.loss_curve_ = arrays["loss_curve"]
         n, k = self.times_.size * (getattr(self, "sensors_", None) or 1), self.classes_.size
         check_shapes(arrays, mean=(n,), sd=(n,))
-        self.weights_ = _part(arrays, "weights.")
+        prefix = "weights."
+        self.weights_ = {k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)}
         check_shapes(self.weights_, **{"readout.weight": (k, self.hidden), "readout.bias": (k,)})
 
 
@@ -314,7 +313,3 @@ def _logits(weights: Mapping[str, NDArray[Any]], series: NDArray[np.float32]) ->
         cell = expit(f) * cell + expit(i) * np.tanh(g)
         state = expit(o) * np.tanh(cell)
     return np.asarray(state @ weights["readout.weight"].T + weights["readout.bias"], dtype=float)
-
-
-def _part(named: dict[str, Any], prefix: str) -> dict[str, Any]:
-    return {key[len(prefix) :]: value for key, value in named.items() if key.startswith(prefix)}

@@ -12,7 +12,7 @@ from collections.abc import Iterable
 from contextlib import suppress
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,9 +23,6 @@ from thermogrip.datasets.atomic_files import make_folder, read_bytes, read_json,
 from thermogrip.datasets.errors import UserError, known_names, reading
 from thermogrip.datasets.limits import array_within
 from thermogrip.datasets.schema import make_grasps
-
-if TYPE_CHECKING:
-    pass
 
 _SAVED = "posterior, bayes, features-lda, pca-lda, lstm, lstm-paper"
 _NETWORKS = ("lstm", "lstm-paper")

@@ -309,12 +309,13 @@ class Comparison(Shown):
         """Write every table as CSV and ``comparison.json`` into a folder; return the folder."""
         path = Path(folder)
         make_folder(path)
+        conditions = dict.fromkeys(score["condition"] for score in self.scores())
         tables = {
             "scores": self.scores(),
             "predictions": list(self.predictions),
             "confusion": self._each(self._confusion_rows),
             "calibration": self._each(self.calibration),
-            "differences": [row for c in self._groups() for row in self.differences(c)],
+            "differences": [row for condition in conditions for row in self.differences(condition)],
             "leaks": list(self.leaks),
             "cautions": [caution.to_json() for caution in self.cautions],
             "open_set": self.open_set(),
@@ -334,9 +335,6 @@ class Comparison(Shown):
         }
         write_json(path / "comparison.json", summary, schema="thermogrip.comparison", version=1)
         return path
-
-    def _groups(self) -> list[str]:
-        return list(dict.fromkeys(row["condition"] for row in self.scores()))
 
     def _each(self, rows_of: Callable[[str, str], list[Row]]) -> list[Row]:
         """Return the rows of every classifier and condition, which each row names first."""

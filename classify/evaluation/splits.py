@@ -234,7 +234,9 @@ def _rounds(
 def _from_files(records: Sequence[Grasps], tests: Sequence[Grasps]) -> Plan:
     """Return a fold for each test record, trained on the condition at its temperatures."""
     _refuse_repeated(tests)
-    trains = _training_grasps(records)
+    # of each record what is marked, or all of one that marks none
+    marked = [_marked(record, "train") for record in records]
+    trains = [record if of_it is None else of_it for record, of_it in zip(records, marked)]
     _refuse_shared(trains, tests)
     folds, notes = [], []
     for test in tests:
@@ -242,12 +244,6 @@ def _from_files(records: Sequence[Grasps], tests: Sequence[Grasps]) -> Plan:
         notes.append(f"{log_name(test)}: candidates and training grasps are those of {log_name(like)}")
         folds.append(Fold(log_name(test), 0, like, test, scored_apart(test)))
     return Plan(tuple(folds), (tuple(trains),), tuple(notes))
-
-
-def _training_grasps(records: Sequence[Grasps]) -> list[Grasps]:
-    """Return of each record what is marked ``train``, or all of one that marks none."""
-    marked = [_marked(g, "train") for g in records]
-    return [g if marked_part is None else marked_part for g, marked_part in zip(records, marked)]
 
 
 def _like_it(test: Grasps, trains: Sequence[Grasps]) -> Grasps:

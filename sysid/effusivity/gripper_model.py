@@ -133,11 +133,6 @@ class GripperSpread:
     transit_loss: float = 0.005
     bias: float = 0.20  # [K] two thermistors of 1 %
 
-    def __post_init__(self) -> None:
-        for spread in fields(self):
-            if not 0 <= getattr(self, spread.name) < np.inf:
-                raise ValueError(f"{spread.name} must be >= 0 and finite, got {getattr(self, spread.name):g}")
-
     def covariance(self, names: Sequence[str]) -> Array:
         """Return the covariance that another gripper adds to the estimates called ``names``, (n, n)."""
         by_cause = np.array(
@@ -163,7 +158,7 @@ class GripperSpread:
         return [*out, {"ln_h": self.contact}]
 
 
-def another_gripper(gripper: GripperModel, spread: GripperSpread | None = None) -> GripperModel:
+def another_gripper(gripper: GripperModel) -> GripperModel:
     """Return what one gripper's calibration leaves open about another one of its kind: the same numbers, less
     well known, from which a calibration on a few known grasps of the other one starts.  Where its file keeps
     no covariance its own numbers count as exact."""
@@ -171,10 +166,10 @@ def another_gripper(gripper: GripperModel, spread: GripperSpread | None = None) 
     if covariance is None:
         names = (*SHARED_NAMES, *block_names(gripper.materials))
         covariance = ParameterCovariance(names, np.zeros((len(names), len(names))))
-    extra = (spread or GripperSpread()).covariance(covariance.names) * (WIDER**2 if spread is None else 1.0)
+    extra = WIDER**2 * GripperSpread().covariance(covariance.names)
     return replace(
         gripper, uncertainty=ParameterCovariance(covariance.names, covariance.covariance + extra),
-        second=None if gripper.second is None else another_gripper(gripper.second, spread),
+        second=None if gripper.second is None else another_gripper(gripper.second),
     )  # fmt: skip
 
 

@@ -74,24 +74,15 @@ class Asked(NamedTuple):
         return self._replace(row=self.row[index], beyond=self.beyond[index])
 
 
-def readings(asked: Asked, u: Array, vary: Mask, *, alike: bool = False) -> tuple[Array, Array]:
+def readings(asked: Asked, u: Array, vary: Mask) -> tuple[Array, Array]:
     """Return the bin means (n, n_bin) that ``u`` (n, 7) predicts, and their derivatives (n, 8, n_bin), zero
-    where not ``vary`` (n, 7), with what is left of the data in the last row; ``alike`` says that many
-    contacts are the same but for onset and temperatures."""
+    where not ``vary`` (n, 7), with what is left of the data in the last row."""
     data, row = asked.data, asked.row
     wanted = np.ones((row.size, RATE + 1), dtype=bool)
     wanted[:, 1:] = vary[:, _CURVES]
     onset = np.minimum(np.maximum(u[:, _ONSET], EARLIEST_ONSET), LATEST_ONSET)
     wanted[:, RATE] &= onset == u[:, _ONSET]  # past the range nothing moves
-    numbers, which = u.take(_CONTACT, axis=1), np.arange(row.size)
-    stepped = wanted[:, :N_STEPPED].copy()  # for arrays of another layout kernels are compiled anew
-    if alike:
-        key = numbers.view(f"V{numbers.itemsize * numbers.shape[1]}").ravel()
-        _, first, which = np.unique(key, return_index=True, return_inverse=True)
-        numbers, every = numbers[first], np.zeros((first.size, N_STEPPED), dtype=bool)
-        np.logical_or.at(every, which, stepped)
-        stepped = every
-    means = _bin_means(asked, numbers, stepped, which, onset, wanted)
+    means = _bin_means(asked, u.take(_CONTACT, axis=1), onset, wanted)
     n_bin = data.y.shape[1]
     y, slopes = np.empty((row.size, n_bin)), np.empty((row.size, _LEFT + 1, n_bin))
     scratch = np.empty((16, n_bin))
@@ -102,39 +93,26 @@ def readings(asked: Asked, u: Array, vary: Mask, *, alike: bool = False) -> tupl
     return y, slopes
 
 
-def _bin_means(
-    asked: Asked, numbers: Array, stepped: Mask, which: NDArray[np.int64], onset: Array, wanted: Mask
-) -> Array:
-    """Return the bin means (n, 6, n_bin) of the ``wanted`` curves of contacts of logarithms ``numbers`` (k,
-    4), ``which`` of these belongs to each pair; before contact zero."""
+def _bin_means(asked: Asked, numbers: Array, onset: Array, wanted: Mask) -> Array:
+    """Return the bin means (n, 6, n_bin) of the ``wanted`` curves of contacts of logarithms ``numbers`` (n,
+    4); before contact zero."""
     nodes, gripper, data, row, _ = asked
     out = np.empty((row.size, RATE + 1, data.y.shape[1]))
+    stepped = wanted[:, :N_STEPPED].copy()  # for arrays of another layout kernels are compiled anew
     rise, slope, _ = contacts(nodes, gripper, np.exp(numbers), stepped)
     room = np.empty((7, data.sample_t.shape[1]))
     bin_means(
-        nodes[2],
-        rise,
-        slope,
-        wanted,
-        which,
-        onset,
-        row,
-        data.sample_t,
-        data.sample_bin,
-        data.count,
-        room,
-        out,
+        nodes[2], rise, slope, wanted, onset, row, data.sample_t, data.sample_bin, data.count, room, out
     )
     return out
 
 
 @numba.njit(**COMPILED)  # type: ignore[untyped-decorator]
 def bin_means(
-    nodes: Array, rise: Array, slope: Array, wanted: Mask, which: NDArray[np.int64], onset: Array,
-    row: NDArray[np.int64], times: Array, bins: NDArray[np.int64], count: Array, room: Array, means: Array,
+    nodes: Array, rise: Array, slope: Array, wanted: Mask, onset: Array, row: NDArray[np.int64],
+    times: Array, bins: NDArray[np.int64], count: Array, room: Array, means: Array,
 ) -> None:  # fmt: skip
-    """Fill ``means`` (n, 6, n_bin) of the ``wanted`` curves, ``which`` of these belongs to each pair, the
-    last of them the slope of the first."""
+    """Fill ``means`` (n, 6, n_bin) of the ``wanted`` curves, the last of them the slope of the first."""
     last = nodes.size - 1
     n_curve = wanted.shape[1]
     n_bin = count.shape[1]
@@ -164,7 +142,7 @@ def bin_means(
             if not wanted[p, c]:
                 continue
             rates, values = c == n_curve - 1, 0 if c == n_curve - 1 else c
-            r, v = rise[which[p], values], slope[which[p], values]
+            r, v = rise[p, values], slope[p, values]
             for j in range(begin, times.shape[1]):
                 if room[0, j] >= 0.0:
                     k = int(room[0, j])
@@ -273,7 +251,7 @@ def predicted(
                 derivatives[nuisance, m] = scale * curves[c, m] + passed * extra
 
 
-def products(asked: Asked, whitener: Array, u: Array, sd: Array, *, alike: bool = False) -> Array:
+def products(asked: Asked, whitener: Array, u: Array, sd: Array) -> Array:
     """Return J' J, and J' r and r' r in the last row and column, (n, 8, 8): J in units of ``sd`` (n, 7), r
     the readings less those that ``u`` predicts, both whitened."""
     blocks = []
@@ -282,7 +260,7 @@ def products(asked: Asked, whitener: Array, u: Array, sd: Array, *, alike: bool 
     ):  # so many at once that they stay in the processor's cache
         chunk = slice(begin, begin + SEARCH.pairs_at_once)
         some = asked.take(chunk)
-        columns = readings(some, u[chunk], sd[chunk] > 0.0, alike=alike)[1]
+        columns = readings(some, u[chunk], sd[chunk] > 0.0)[1]
         blocks.append(squares(whitener, some.row, columns))
     matrix = blocks[0] if len(blocks) == 1 else np.concatenate(blocks)
     scale = np.ones((len(u), _LEFT + 1))
@@ -397,7 +375,7 @@ def search(
         damping=np.full(n, 1e-2), part=none, slope_gain=none, bend=none, stale=ended.settled,
     )  # fmt: skip
     for step in range(SEARCH.most_steps + 1):
-        tried = products(asked.take(state.at), whitener, state.trial, state.sd, alike=step == 0)
+        tried = products(asked.take(state.at), whitener, state.trial, state.sd)
         state = _search_moved(*_refitted(state, tried), step)
         rhs, curved = state.matrix[:, :m, m] - state.slope, state.matrix[:, :m, :m].copy()
         curved[:, diagonal, diagonal] += state.bound

@@ -80,17 +80,6 @@ def test_expected_information_is_the_mean_over_the_drawn_readings() -> None:
     assert [list(v) for v in nothing] == [[0, 0], [0.6, 0.5], [0, 0]]
 
 
-def test_each_draw_is_used_with_both_signs_so_that_a_mirror_image_adds_as_much() -> None:
-    rng = np.random.default_rng(0)
-    root = rng.standard_normal((3, 4, 2, 2))
-    covariance, mean = root @ root.transpose(0, 1, 3, 2) + 0.1 * np.eye(2), rng.standard_normal((3, 4, 2))
-    log_p = np.log(rng.dirichlet(np.ones(4), 3))
-    found, mirrored = (
-        expected_information(PosteriorPredictive(log_p, m, covariance), draws=5) for m in (mean, -mean)
-    )
-    np.testing.assert_allclose(mirrored, found, atol=1e-12)
-
-
 @settings(max_examples=40, deadline=None)
 @given(st.integers(2, 5), st.integers(1, 4), st.integers(0, 10_000))
 def test_readings_never_cost_accuracy_nor_add_more_than_is_missing(m: int, width: int, seed: int) -> None:

@@ -16,11 +16,8 @@ from thermogrip.classify.decisions import stopping_rule
 from thermogrip.classify.decisions.stopping_rule import (
     TIMES,
     Windows,
-    _read_by,
-    contact_end,
     growing_windows,
     learn_from_windows,
-    silent_windows,
     stop_callback,
     stops,
 )
@@ -28,9 +25,8 @@ from thermogrip.classify.estimators.base import pick
 from thermogrip.classify.estimators.posterior import PosteriorClassifier
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.examples import load_example_grasps
-from thermogrip.datasets.schema import Grasps, make_grasps
+from thermogrip.datasets.schema import Grasps
 from thermogrip.sysid.effusivity.gripper_model import load_default_gripper
-from thermogrip.sysid.effusivity.quality import check_grasps
 
 THREE = ["copper", "iron", "wood"]
 
@@ -61,17 +57,6 @@ def test_the_error_of_sure_contacts_is_as_stated_on_fresh_ones(boast: float) -> 
     # 600 training contacts leave the threshold's error uncertain by 0.01, 6000 tests by 0.003
     assert 0.015 < (found.answer != true)[sure].mean() < 0.05 + 0.02
     assert found.time.mean() < 9
-
-
-def test_a_smaller_error_waits_longer() -> None:
-    seen = _walks(2000, 3)
-    times = [stops(learn_from_windows([seen], error=e), seen[0]).time.mean() for e in (0.2, 0.05, 0.01)]
-    assert times[0] < times[1] < times[2]
-
-
-def test_few_grasps_cannot_guarantee_a_small_error() -> None:
-    with pytest.raises(UserError, match=r"10 training grasps cannot show an error of 0\.01"):
-        learn_from_windows([_walks(10, 1)], error=0.01)
 
 
 @pytest.mark.parametrize(
@@ -150,17 +135,6 @@ def test_a_silent_contact_ends_at_the_end_and_its_error_is_what_is_left() -> Non
     assert stops(StopRule(sure=0.9), sure).p_wrong.min() == 0.0  # never less than nothing
 
 
-def test_readings_of_a_contact_begin_after_a_quarter_of_a_second() -> None:
-    time = np.array([-0.5, 0.25, 0.1 * 3, 0.5])  # 0.1 * 3 is a little more than 0.3
-    rows = [[23.0, 24.0, 25.0, 26.0], [23.0, 24.0, np.nan, 26.0]]
-    grasps = make_grasps(time, rows, ["a", "b"], t_object=[43.0, 43.0])
-    read = [_read_by(grasps, t).tolist() for t in (0.25, 0.3, 0.5)]
-    assert read == [[False, False], [True, False], [True, True]]
-    flat = make_grasps(np.arange(-10, 41) * 0.1, np.full((1, 51), 23.0), ["a"], t_object=[43.0])
-    seen = [check_grasps(flat.sel(time=slice(None, t + 1e-6))).undecided[0] for t in (0.3, 1.0, 3.3)]
-    assert silent_windows(flat, [0.3, 1.0, 3.3]).tolist() == [seen]
-
-
 def test_records_are_followed_to_their_end_among_their_own_materials(
     known: PosteriorClassifier, fresh: Grasps, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -186,11 +160,6 @@ def test_records_are_followed_to_their_end_among_their_own_materials(
     for wrong in ({"error": 0.0}, {"error": 1.0}):
         with pytest.raises(UserError, match="is no share"):
             learn_stop_rule(known, fresh, **wrong)
-
-
-def test_contact_ends_as_asked_or_with_the_record(fresh: Grasps) -> None:
-    assert contact_end(fresh, 4.0) == 4.0
-    assert contact_end(fresh.isel(time=fresh["time"].values <= 3.0), 4.0) == pytest.approx(3.0)
 
 
 def test_windows_end_once_and_count_the_prior_odds(known: PosteriorClassifier, fresh: Grasps) -> None:
@@ -358,24 +327,6 @@ def stream(
     for t, y in zip(time[time <= until], readings):
         touch.update(float(t), float(y))
     return touch
-
-
-def test_readings_count_from_a_quarter_of_a_second_to_the_end_of_the_training() -> None:
-    touch = stream(np.array([23.0]), np.array([-1.0]))
-    prior = dict(zip(touch.candidates, np.exp(touch.log_p).tolist()))
-    touch._model.longest_ = last = 10.0
-    taken: list[float] = []
-    touch._evaluate = lambda: taken.append(touch._time[-1])  # type: ignore[method-assign]
-    assert touch.nothing_because == ""
-    for time in (0.25, 0.2500001, 5.0, last, last + 5e-7, last + 2e-6, 12.0):
-        assert touch.update(time, np.nan if time == 5.0 else -200.0 if time == 12 else 24.0) == prior
-    assert taken == [0.2500001, last, last + 5e-7]
-    with pytest.raises(UserError, match=r"a reading of 200\.1 degC"):
-        touch.update(13.0, 200.1)
-    early = stream(np.array([23.0, np.nan]), np.array([-0.25, -0.3 + 0.2]))  # no level before -0.25 s
-    early.update(0.25, 24.0)
-    with pytest.raises(UserError, match="no reading before contact"):
-        early.update(0.26, 24.0)
 
 
 def test_no_contact_ends_nothing_and_names_nothing() -> None:

@@ -18,8 +18,6 @@ from thermogrip.classify.estimators.bayes import (
     _log_evidence_of_feature,
     _log_t,
     _usable,
-    _weighted_mean,
-    _within_class_sd,
 )
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.examples import load_example_grasps
@@ -186,17 +184,6 @@ def test_evidence_is_that_of_the_grasps_one_after_another() -> None:
     priors = [(0.5, 0.1), (4.0, 0.02), (30.0, 2.0)]
     got = np.diff([_log_evidence_of_feature(within, means, counts, *prior) for prior in priors])
     np.testing.assert_allclose(got, np.diff([in_turn(*prior) for prior in priors]))
-
-
-def test_the_spread_within_classes_falls_back_on_that_of_all_and_on_one() -> None:
-    x = np.array([[1.0, 5.0, 2.0], [4.0, 5.0, 2.0], [9.0, 7.0, 2.0]])
-    weight = np.array([[1.0, 1.0, 1.0], [3.0, 0.5, 1.0], [0.0, 0.5, 1.0]])
-    center = _weighted_mean(x, weight)
-    np.testing.assert_allclose(center, [3.25, 5.5, 2.0])
-    np.testing.assert_array_equal(_weighted_mean(x, 0 * weight, center), center)
-    classes = np.array([[2.0, 5.0, 2.0], [2.0, 5.0, 2.0], [9.0, 7.0, 2.0]])
-    # (1 + 3 * 4) / (4 - 2); (2.25 * 0.5 + 0.25 * 1.5) / 2 of the others; nothing differs
-    np.testing.assert_allclose(_within_class_sd(x, weight, classes, center), [6.5**0.5, 0.75**0.5, 1.0])
 
 
 def test_an_unknown_temperature_is_integrated_over_what_it_may_be(make_touches: Maker) -> None:

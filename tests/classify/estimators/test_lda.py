@@ -35,16 +35,6 @@ def test_components_of_one_spread_are_told_apart_at_equal_priors(which: list[int
     assert PcaLda().fit(three).axes_.shape == (4, 51)
 
 
-def test_what_does_not_vary_is_divided_by_one(three: Grasps) -> None:
-    model = PcaLda(components=2)
-    model.classes_ = np.array(["a", "b"])
-    rows = np.column_stack([np.arange(6.0) ** 2, np.full(6, 5.0)])
-    model._fit_rows(rows, np.array(list("aababb")))
-    assert model.scale_.tolist() == [rows[:, 0].std(), 1.0]
-    with pytest.raises(UserError, match=r"components must be >= 1, got 0"):
-        PcaLda(components=0).fit(three)
-
-
 def test_discriminants_of_features_count_by_the_share_that_is_not_noise(make_touches: Maker) -> None:
     train = make_touches(("copper", "iron", "wood", "zinc"), each=5)
     labels = train["material"].values.astype(str)
@@ -71,14 +61,6 @@ def test_discriminants_of_features_count_by_the_share_that_is_not_noise(make_tou
     expected -= np.logaddexp.reduce(expected, axis=1, keepdims=True)
     np.testing.assert_allclose(model.predict_log_proba(asked), expected, atol=1e-9)
     assert np.exp(expected[2]).tolist() == pytest.approx([0.25] * 4)
-
-
-def test_the_spread_of_discriminants_survives_its_file(three: Grasps) -> None:
-    model, copy = FeaturesLda().fit(three), FeaturesLda()
-    copy.classes_ = model.classes_
-    copy.set_state(*model.get_state())
-    assert copy.spread_ == model.spread_
-    np.testing.assert_array_equal(copy.coef_, model.coef_)
 
 
 def test_a_class_without_probabilities_is_as_likely_as_so_many_grasps_can_show(three: Grasps) -> None:

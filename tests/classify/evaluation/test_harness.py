@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import json
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -115,14 +114,6 @@ def test_every_score_has_an_interval_in_the_table_and_its_file(found: Comparison
             assert row[f"{key}_low"] <= row[key] <= row[f"{key}_high"]
             assert float(cells[f"{key}_high"]) == pytest.approx(row[f"{key}_high"], rel=1e-5)
         assert row["low"] <= row["boot_low"] <= row["accuracy"] <= row["boot_high"] <= row["high"]
-
-
-def test_confusion_counts_every_test_once_a_split(found: Comparison) -> None:
-    names, counts = found.confusion("bayes", "touches")
-    assert names == ["copper", "iron", "wood"]
-    np.testing.assert_allclose(counts.sum(axis=1), 3.0)
-    [row] = [r for r in found.scores() if r["classifier"] == "bayes"]
-    assert np.trace(counts) / counts.sum() == pytest.approx(row["accuracy"])
 
 
 @pytest.mark.parametrize("workers", [1, pytest.param(2, marks=pytest.mark.slow)])
@@ -254,28 +245,6 @@ def test_base_rates_are_those_of_the_training(three: Grasps) -> None:
     assert row["log_loss_base"] == pytest.approx(-np.log([4 / 14, 3 / 14, 7 / 14]).mean())
 
 
-def test_a_row_is_what_was_said_of_one_grasp(three: Grasps) -> None:
-    test = pick(three, [0, 9, 17])
-    p = np.array([[0.2, 0.5, 0.3], [0.1, 0.6, 0.3], [0.7, 0.2, 0.1]])
-    names, unknown = ("copper", "iron", "tin"), np.array([0.4, np.nan, 0.1])
-    rows = harness._fold_rows(test, np.array(["u", "v", "w"]), p, unknown, names)
-    head = {"candidates": 3, "p_copper": 0.2, "p_iron": 0.5, "p_tin": 0.3}
-    assert rows[0] == {
-        "grasp_id": "u", "material": "copper", "predicted": "iron", "known": True, "correct": False,
-        "confidence": 0.5, "log_loss": pytest.approx(-np.log(0.2)), "p_unknown": 0.4,
-        "brier": pytest.approx(0.64 + 0.25 + 0.09),
-    } | head  # fmt: skip
-    assert (rows[1]["correct"], rows[1]["p_unknown"], rows[1]["confidence"]) == (True, None, 0.6)
-    said = [rows[2][key] for key in ("known", "correct", "log_loss", "brier", "predicted", "p_unknown")]
-    assert said == [False, False, None, None, "copper", 0.1]
-
-
-def test_three_readings_from_before_any_contact_can_be_probed() -> None:
-    for last, there in ((-0.25, True), (-0.24, False)):
-        g = make_grasps([-0.5, -0.4, last, 0.0], np.full((1, 4), 23.0), ["g"])
-        assert harness.has_before(g) is there
-
-
 def test_the_probe_is_the_one_sided_binomial_test() -> None:
     from scipy.stats import binomtest
 
@@ -357,19 +326,6 @@ def test_what_is_learnt_from_all_conditions_never_sees_a_test_grasp(make_touches
     # by the fit of its own repeat alone: one of another repeat may have seen it
     answered = [(r["repeat"], r["grasp_id"]) for r in found.predictions]
     assert len(answered) == len(set(answered))
-
-
-def test_every_table_is_a_file(found: Comparison, three: Grasps, tmp_path: Path) -> None:
-    found.save(tmp_path / "out")
-    names = {p.name for p in (tmp_path / "out").iterdir()}
-    tables = {"scores", "predictions", "confusion", "calibration", "differences"}
-    assert names == {f"{table}.csv" for table in tables} | {"comparison.json"}
-    with open(tmp_path / "out" / "predictions.csv", newline="") as file:
-        rows = list(csv.DictReader(file))
-    assert len(rows) == len(found.predictions)
-    assert sum(float(rows[0][f"p_{m}"]) for m in ("copper", "iron", "wood")) == pytest.approx(1, abs=1e-4)
-    summary = json.loads((tmp_path / "out" / "comparison.json").read_text())
-    assert summary["scores"][0]["n"] == found.scores()[0]["n"]
 
 
 @pytest.mark.parametrize(
@@ -455,17 +411,6 @@ def test_what_no_training_grasp_is_of_is_reported_as_unscored() -> None:
     assert "a: nothing to score, as no training grasp is of z" in notes
     some = grasps("xxxyyyzx", split=["train"] * 6 + ["test"] * 2)
     assert plan_folds([some]).notes == ()
-
-
-def test_a_copy_under_another_name_is_reported_in_splits_and_refused_between_files() -> None:
-    whole = grasps("xxxyyy")
-    named = whole.assign_coords(grasp=[f"q{i}" for i in range(6)]).assign_attrs(name="b")
-    with pytest.raises(UserError, match=r"b.* q0 of a/a0 first: a copy in training and in test"):
-        plan_folds([whole], test=[named])
-    cautions = plan_folds([whole, named], split="random", train_per_class=2, repeats=1).cautions
-    assert [(c.code, c.condition, c.words.split()[0]) for c in cautions] == [("leak", "b", "6")]
-    still = whole.assign(t_surface=whole["t_surface"] * 0 + 23.0)  # a coarse sensor, no difference
-    assert plan_folds([still], split="random", train_per_class=2, repeats=1).cautions == ()
 
 
 def test_where_sessions_cannot_be_held_out_grasps_are() -> None:

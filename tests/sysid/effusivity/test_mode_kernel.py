@@ -49,17 +49,6 @@ def test_the_penalty_is_the_priors_density_beside_its_peak():
         assert here.bound[a] == pytest.approx(here.slope[a] / w[a] if w[a] else 1.0)
 
 
-@pytest.mark.parametrize("n_column", [8, 3])
-def test_products_are_those_of_whitened_columns(n_column):
-    rng = np.random.default_rng(1)
-    whitener, columns = rng.normal(size=(3, 5, 5)), rng.normal(size=(4, n_column, 5))
-    row = np.array([1, 0, 1, 2])
-    found = kernel.squares(whitener, row, columns)
-    for p in range(4):
-        white = columns[p] @ whitener[row[p]].T
-        np.testing.assert_allclose(found[p], white @ white.T, atol=1e-12)
-
-
 def test_products_are_in_units_of_each_spread_and_none_of_what_is_known():
     gripper, record = load_default_gripper(), load_example_grasps()["exp1A_obj43_grip23"]
     data = touches(record.isel(grasp=[0, 1]))
@@ -86,7 +75,7 @@ def means_of(nodes, rise, slope, times, bins, *, onset=0.0, late=-1.0):
     curves[0, 0], bent[0, 0] = rise, slope
     wanted, at = np.array([[True, False, False, False, False, True]]), np.array([0])
     kernel.bin_means.py_func(
-        np.array(nodes, dtype=float), curves, bent, wanted, at, np.array([onset]), at, times, bins, count,
+        np.array(nodes, dtype=float), curves, bent, wanted, np.array([onset]), at, times, bins, count,
         np.empty((7, n)), means,
     )  # fmt: skip
     u, numbers = np.zeros((1, 7)), np.zeros((1, 7))
