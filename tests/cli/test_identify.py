@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -360,6 +361,15 @@ def test_a_plant_is_scored_log_by_log_beside_its_baselines(bench: Bench, stand_i
     assert [(call.warmup, call.score_from) for call in runs[2:]] == [(5.0, 5.0)] * 2
 
 
+@pytest.fixture
+def runs_stand_in(stand_in: StandIn) -> Callable[[Any], None]:
+    """Return what makes each free run this one, of which nothing is shown but the verdict."""
+    stand_in("thermogrip.report.plant.band_words", "a band")
+    stand_in("thermogrip.report.plant.run_table", ((), ()))
+    stand_in("thermogrip.cli.identify.run_answer", {})
+    return lambda run: stand_in("thermogrip.sysid.validation.free_run.free_run", run) and None
+
+
 def verdict_of(what: str) -> Verdict:
     """Return a verdict of this standing, or for this cause."""
     standing: dict[str, Standing] = {"seen": "no test", "start": "worse"}
@@ -381,17 +391,14 @@ def verdict_of(what: str) -> Verdict:
     ],
 )
 def test_what_comes_after_validate_follows_from_what_it_found(
-    bench: Bench, stand_in: StandIn, verdicts: tuple[str, ...], code: int, then: str
+    bench: Bench, runs_stand_in: Callable[[Any], None], verdicts: tuple[str, ...], code: int, then: str
 ) -> None:
     found = iter(verdicts)
 
     def run(*_args: Any, **_options: Any) -> SimpleNamespace:
         return SimpleNamespace(notes=(), band=lambda: None, verdict=verdict_of(next(found)))
 
-    stand_in("thermogrip.sysid.validation.free_run.free_run", run)
-    stand_in("thermogrip.report.plant.band_words", "a band")
-    stand_in("thermogrip.report.plant.run_table", ((), ()))
-    stand_in("thermogrip.cli.identify.run_answer", {})
+    runs_stand_in(run)
     logs = ["good.csv", "good.csv@100:200"][: len(verdicts)]
     done = bench.run("validate", "plant.json", *logs)
     assert done.code == code, done
@@ -433,13 +440,9 @@ def test_after_a_plant_that_has_changed_the_fit_is_typed_once_more_with_the_new_
     ],
 )
 def test_a_plant_that_is_not_good_is_identified_anew_whatever_a_run_says(
-    bench: Bench, stand_in: StandIn, standing: str, then: str
+    bench: Bench, runs_stand_in: Callable[[Any], None], standing: str, then: str
 ) -> None:
-    run = SimpleNamespace(notes=(), band=lambda: None, verdict=verdict_of(standing))
-    stand_in("thermogrip.sysid.validation.free_run.free_run", run)
-    stand_in("thermogrip.report.plant.band_words", "a band")
-    stand_in("thermogrip.report.plant.run_table", ((), ()))
-    stand_in("thermogrip.cli.identify.run_answer", {})
+    runs_stand_in(SimpleNamespace(notes=(), band=lambda: None, verdict=verdict_of(standing)))
     file = bench.path / "plant.json"
     content = json.loads(file.read_text(encoding="utf-8"))
     file.write_text(
@@ -450,15 +453,11 @@ def test_a_plant_that_is_not_good_is_identified_anew_whatever_a_run_says(
     assert done.err.endswith(f"next: thermogrip {then}\n")
 
 
-def test_a_warm_up_shorter_than_that_of_the_fit_is_told(bench: Bench, stand_in: StandIn) -> None:
+def test_a_warm_up_shorter_than_that_of_the_fit_is_told(
+    bench: Bench, stand_in: StandIn, runs_stand_in: Callable[[Any], None]
+) -> None:
     stand_in("thermogrip.sysid.validation.free_run.warm_up_of_fit", 50.0)
-    stand_in(
-        "thermogrip.sysid.validation.free_run.free_run",
-        SimpleNamespace(notes=(), band=lambda: None, verdict=None),
-    )
-    stand_in("thermogrip.report.plant.band_words", "a band")
-    stand_in("thermogrip.report.plant.run_table", ((), ()))
-    stand_in("thermogrip.cli.identify.run_answer", {})
+    runs_stand_in(SimpleNamespace(notes=(), band=lambda: None, verdict=None))
     done = bench.run("validate", "plant.json", "good.csv", "--warmup", "8", "--score-from", "9")
     assert "good: 8 s of readings set the state, the fit was scored with 50 s" in words_of(done.err)
     assert "--warmup 50 --score-from 50" in words_of(done.err)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -74,33 +73,6 @@ def test_how_many_members_are_trained(monkeypatch, readings, how, last, sizes, e
     assert not neural.neural_family(grid_of(y), only=[Structure("3 states, 8 units", 101)])
 
 
-def test_data_are_scaled_by_their_spread_and_what_never_moves_is_zero():
-    y = [[[1.0, 10.0], [3.0, np.nan]], [[1.0, 30.0], [3.0, 20.0]]]
-    u = [[[0.0, 5.0, 20.0], [2.0, 5.0, 20.0]], [[4.0, 5.0, 20.0], [2.0, 5.0, 28.0]]]
-    data = neural._scaled_data(grid_of(*y, u=u))
-    assert (data.y_middle.tolist(), data.w_middle.tolist()) == ([2.0, 20.0], [2.0, 5.0, 22.0])
-    np.testing.assert_allclose(
-        [*data.y_size, *data.w_size], [1, np.sqrt(200 / 3), np.sqrt(2), 1, np.sqrt(12)]
-    )
-    np.testing.assert_allclose(data.y[1], [[-1, np.sqrt(1.5)], [1, 0]])
-    np.testing.assert_allclose(data.w[1], [[np.sqrt(2), 0, -np.sqrt(1 / 3)], [0, 0, np.sqrt(3)]], atol=1e-15)
-    np.testing.assert_allclose(data.reach, [1.25 * np.sqrt(2), 0, 1.25 * np.sqrt(3)])
-    assert (data.low.tolist(), data.high.tolist()) == ([-np.inf] * 2, [np.inf] * 2)
-    railed = np.column_stack([[0.0, 4.0] * 2 + [7.0] * 8, np.arange(12.0)])
-    data = neural._scaled_data(grid_of(railed))
-    assert data.high[0] * data.y_size[0] + data.y_middle[0] == pytest.approx(7.0)
-
-
-def test_padding_keeps_every_number_in_its_place():
-    # A 1 x 1, B 1 x 2, c, V 1 x 2, W 2 x 1, U 2 x 2, b 2
-    one = _Member(np.array([[0.5]]), np.arange(1.0, 14.0), np.array([[7.0], [8.0]]), 2, 0.3)
-    more = one.padded(2, 3)
-    want = [1, 2, 0, 0, 3, 0, 4, 5, 0, 0, 0, 0, 6, 0, 7, 0, 0, 0, 8, 9, 10, 11, 0, 0, 12, 13, 0]
-    assert more.weights.tolist() == want
-    assert (more.A.tolist(), more.x0.tolist()) == ([[0.5, 0], [0, 0]], [[7, 0], [8, 0]])
-    assert (more.h, more.miss) == (3, 0.3)
-
-
 def data_of(w, y=()):
     one, none = np.ones(1), -np.full(1, np.inf)
     return _Data(
@@ -150,29 +122,6 @@ def test_a_linear_record_keeps_its_linear_fit_and_random_weights_are_drawn_to_ze
     assert off.weights[1] == pytest.approx(0.1, abs=0.02)  # drawn back by the readings
     run = run_states(np.array(2 * [[[0.5]]]), np.tile(off.weights, (2, 1)), 2, off.x0, w, data.low, data.high)
     assert off.miss == pytest.approx(np.nansum((run[:, :-1] - y) ** 2))
-
-
-def test_steps_end_at_the_least_squares_and_stop_where_none_lowers_the_cost():
-    target, calls = np.array([3.0, -2.0]), []
-
-    def linearise(z):
-        calls.append(z)
-        return np.array([2.0, 1.0]) * (z - target), np.diag([2.0, 1.0])
-
-    found = neural._levenberg_marquardt(linearise, lambda z: np.array([2.0, 1.0]) * (z - target), np.zeros(2))
-    np.testing.assert_allclose(found, target, atol=1e-2)
-    # damped by 0.1, 0.01, ...: 2 * 3 / 41 and 2 / 11 are left of it, then hardly anything
-    np.testing.assert_allclose(calls[1], target * [1 - 0.1 / 4.1, 1 - 0.1 / 1.1])
-    np.testing.assert_allclose(target - calls[2], (target - calls[1]) * [0.01 / 4.01, 0.01 / 1.01])
-    stuck = neural._levenberg_marquardt(linearise, lambda z: np.full((len(z), 2), 9.0), np.zeros(2))
-    assert stuck.tolist() == [0.0, 0.0]
-
-
-@pytest.mark.parametrize(("rows", "head"), [(4, 3), (16, 4), (199, 49), (400, 50)])
-def test_a_start_is_that_of_a_quarter_of_the_readings_of_three_to_fifty(rows, head):
-    asked = SimpleNamespace(start=lambda *parts: [len(part) for part in parts] + [part[0] for part in parts])
-    signals = (np.full(rows, k) for k in (1, 2, 3))
-    assert neural._head_start(asked, *signals) == [head] * 3 + [1, 2, 3]
 
 
 def test_linear_starts_run_as_the_best_subspace_model_in_scaled_units(coupled):
