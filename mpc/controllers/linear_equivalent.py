@@ -102,7 +102,7 @@ def linear_law(controller: ControllerParts) -> LinearLaw:
 
 def augmented(controller: ControllerParts) -> AugmentedModel:
     """Return the model with its disturbance states, about rest in the design's room."""
-    model, chosen = controller.model, controller.disturbance
+    model, chosen = controller.model, controller.observer.disturbance
     _, A, B, E = model.linearise(*model.at_rest(controller.design.ambient))
     n_w = chosen.n_w
     into = B @ (chosen.on_drive * model.span[:, None]) + E @ chosen.on_disturbance

@@ -25,8 +25,7 @@ a jump, for as long as the loop takes to arrive: a draw is over by then.  Beside
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from functools import lru_cache
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -34,7 +33,7 @@ from thermogrip.datasets.arrays import Array
 from thermogrip.mpc.design.design import Design, PILoop
 from thermogrip.mpc.estimator.call_times import RESTART_S, SAME
 from thermogrip.mpc.estimator.fault_monitors import GainMonitor, StuckMonitor
-from thermogrip.mpc.estimator.oscillation import NOISE_SD, OscillationMonitor
+from thermogrip.mpc.estimator.oscillation import NOISE_SD, Oscillation
 from thermogrip.mpc.estimator.reading_checks import follows
 from thermogrip.mpc.interface import Move, Readings, Trajectory, number, target_now
 from thermogrip.mpc.optimiser.rti import BREAKS
@@ -46,18 +45,6 @@ if TYPE_CHECKING:
 _CONSTANTS = 4.0  # time constants until a loop is there
 _OUTSIDE = 0.01  # of a range, by which what balances an integrator may be beyond it
 _REMEMBER = 0.3  # share of the newest distance in their mean
-
-
-class _Answer(NamedTuple):
-    gain: float  # for the whole range
-    delay: float  # s, a sample at least
-    lag: float
-
-
-@lru_cache(maxsize=64)
-def _step_answer(plant: Plant, drive: str, output: str, dt: float) -> _Answer:
-    response = step_response(plant, drive, output)
-    return _Answer(response.gain, max(response.delay, dt), response.lag)
 
 
 def settling_time(gain: float, delay: float, lag: float, Kc: float, Ti: float) -> float:
@@ -102,14 +89,16 @@ class LoopMonitor:
         self.controlled = design.controlled
         self._rows = [model.outputs.index(p.output) for p in self.loops]
         self._drives = [model.drives.index(p.drive) for p in self.loops]
-        answers = [_step_answer(plant, p.drive, p.output, model.dt) for p in self.loops]
-        spans = model.span[self._drives].tolist()
-        answers_of_loops = zip(answers, spans, self.loops)
+        answers = [step_response(plant, p.drive, p.output) for p in self.loops]
+        delays = [max(a.delay, model.dt) for a in answers]
+        spans = model.span[[model.drives.index(p.drive) for p in self.loops]].tolist()
         self._promised = np.array(
-            [settling_time(a.gain / s, *a[1:], p.Kc, p.Ti) for a, s, p in answers_of_loops]
+            [
+                settling_time(a.gain / span, delay, a.lag, p.Kc, p.Ti)
+                for a, delay, span, p in zip(answers, delays, spans, self.loops)
+            ]
         )
-        self._look_s = max((a.delay + a.lag for a in answers), default=np.inf)
-        delays = [a.delay for a in answers]
+        self._look_s = max((delay + a.lag for a, delay in zip(answers, delays)), default=np.inf)
         self._zone = np.array([design.zones.get(p.output, 0.0) for p in self.loops])
         self._ranges = np.array([design.drive_range[name] for name in model.drives], dtype=float).T
         self._limits = dict(design.limits)
@@ -120,7 +109,7 @@ class LoopMonitor:
         self.observer = design.observer(model)
         noise = NOISE_SD * np.sqrt(self.observer.R[self._rows])
         self._near = np.maximum(2.0 * design.overshoot, noise)  # of its target an output is there
-        self.swings = OscillationMonitor(self.names, model.dt, delays, self._near.tolist())
+        self._signals = [Oscillation(model.dt, *of) for of in zip(delays, self._near.tolist())]
         self.forget()
 
     def forget(self) -> None:
@@ -136,7 +125,8 @@ class LoopMonitor:
     def _restart(self) -> None:
         """Begin anew, as towards a new target."""
         n = len(self.loops)
-        self.swings.restart()
+        for signal in self._signals:
+            signal.restart()
         self._target = np.full(n, np.nan)
         self._error = np.full(n, np.nan)  # mean of the last errors
         self._strange_s = 0.0
@@ -193,7 +183,7 @@ class LoopMonitor:
             self._restart()
             self._target = target.copy()
         error = target - y
-        swings = self.swings.note(-np.sign(error) * np.maximum(np.abs(error) - self._zone, 0.0), seconds)
+        swings = self._swings(-np.sign(error) * np.maximum(np.abs(error) - self._zone, 0.0), seconds)
         begun = np.where(np.isfinite(self._error), self._error, error)
         self._error = np.where(np.isfinite(error), begun + _REMEMBER * (error - begun), begun)
         self._strange_s = self._strange_s + seconds if strange else 0.0
@@ -204,6 +194,22 @@ class LoopMonitor:
         if swings:
             return "; ".join(filter(None, (swings, strange)))
         return self.gain.said or (f"{strange} or is it a load?" if strange and lasts else "")
+
+    def _swings(self, error: Array, seconds: float) -> str:
+        """Note the errors (n,), so many seconds after the last; return which output swings most."""
+        found = [
+            (signal.amplitude / signal.least, name, signal)
+            for name, signal, each in zip(self.names, self._signals, error.tolist())
+            if signal.note(each, seconds)
+        ]
+        if not found:
+            return ""
+        _, name, signal = max(found, key=lambda swing: swing[0])
+        return (
+            f"{name} swings about its target by {signal.amplitude:.2g} with a period of about "
+            f"{signal.period:.2g} s: the plant is not the model, its valve or relay sticks, or a load comes "
+            "and goes"
+        )
 
     def _look(self, target: Array, d: Array, seconds: float) -> None:
         """Seek the drives that hold the targets of the loops (n,), where they are new or have been missed for

@@ -21,7 +21,7 @@ from thermogrip.mpc.controllers.linear_equivalent import to_control
 from thermogrip.mpc.controllers.pi import PIController
 from thermogrip.mpc.controllers.reference import ReferenceController
 from thermogrip.mpc.design.design import Design, check_design, default_design
-from thermogrip.mpc.estimator.observer import DisturbanceModel, Observer
+from thermogrip.mpc.estimator.observer import Observer
 from thermogrip.mpc.interface import Move, Readings, Trajectory
 from thermogrip.mpc.native.runtime import CompiledController, wanted
 from thermogrip.mpc.optimiser.rti import Optimiser
@@ -90,11 +90,6 @@ class Controller(Shown):
     def observer(self) -> Observer:
         """The filter of the design."""
         return self.reference.observer
-
-    @property
-    def disturbance(self) -> DisturbanceModel:
-        """Where the filter's disturbance states enter."""
-        return self.reference.disturbance
 
     @property
     def optimiser(self) -> Optimiser:

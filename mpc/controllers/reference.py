@@ -36,7 +36,6 @@ from thermogrip.mpc.controllers.base import SampledController, targets_ahead
 from thermogrip.mpc.controllers.pi import PIController
 from thermogrip.mpc.design.design import Design
 from thermogrip.mpc.estimator.call_times import RESTART_S, opening, shifted
-from thermogrip.mpc.estimator.observer import DisturbanceModel
 from thermogrip.mpc.estimator.reading_checks import ReadingMonitor, is_off
 from thermogrip.mpc.interface import Move, Readings, Trajectory
 from thermogrip.mpc.native.shared_constants import STAYS, WEAK
@@ -108,11 +107,6 @@ class ReferenceController(SampledController):
     def last_iterations(self) -> int:
         """Changes of the program's active set in the last step."""
         return self._follows.iterations
-
-    @property
-    def disturbance(self) -> DisturbanceModel:
-        """Where the disturbance states enter."""
-        return self.observer.disturbance
 
     @property
     def plan(self) -> Array | None:

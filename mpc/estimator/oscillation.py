@@ -27,11 +27,8 @@ References
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
 from math import isfinite, pi
 from typing import NamedTuple
-
-from thermogrip.datasets.arrays import Array
 
 NOISE_SD = 3.0  # standard deviations of a reading that are no swing
 _SWINGS = 6  # half swings in a row
@@ -48,19 +45,19 @@ class _Half(NamedTuple):
 
 
 class Oscillation:
-    """One signal whose loop swings in ``shortest`` [s] a period or slower; a half swing lasts ``longest`` [s]
-    at most, and ``least`` is the amplitude from which on it counts.
+    """One signal of sample time ``dt`` whose loop has an apparent ``delay`` [s]; ``least`` is the amplitude
+    from which on a swing counts.
 
     >>> from math import sin
-    >>> signal = Oscillation(shortest=6.0, longest=100.0, least=0.3)
+    >>> signal = Oscillation(dt=1.0, delay=10.0, least=0.3)
     >>> swings = [signal.note(sin(0.2 * k), 1.0) for k in range(130)]
     >>> sum(swings) > 0, round(signal.amplitude), round(signal.period)
     (True, 1, 31)
     """
 
-    def __init__(self, shortest: float, longest: float, least: float) -> None:
-        self._shortest = shortest
-        self._longest = longest
+    def __init__(self, dt: float, delay: float, least: float) -> None:
+        self._shortest = _SHORTEST_PERIOD * dt
+        self._longest = _LONGEST_HALF_SWING * 4.0 * max(delay, 2.0 * dt)
         self.least = least
         self.restart()
 
@@ -113,40 +110,3 @@ class Oscillation:
         seconds = half.end - half.begin
         large = half.iae >= max(self.least * self._shortest / pi, 2.0 / pi * self.least * seconds)
         return self._arrived and large and seconds <= self._longest
-
-
-class OscillationMonitor:
-    """Controlled outputs, ``names``, whose loops have apparent ``delays`` [s] and are ``least`` (n,) off
-    their targets where they swing."""
-
-    def __init__(
-        self, names: Sequence[str], dt: float, delays: Sequence[float], least: Sequence[float]
-    ) -> None:
-        self._signals = {
-            name: Oscillation(
-                _SHORTEST_PERIOD * dt, _LONGEST_HALF_SWING * 4.0 * max(delay, 2.0 * dt), amplitude
-            )
-            for name, delay, amplitude in zip(names, delays, least, strict=True)
-        }
-
-    def restart(self) -> None:
-        """Begin anew, as towards a new target."""
-        for signal in self._signals.values():
-            signal.restart()
-
-    def note(self, error: Array, seconds: float) -> str:
-        """Note the errors (n,), so many seconds after the last; return which output swings most."""
-        swings = [
-            name
-            for (name, signal), each in zip(self._signals.items(), error.tolist(), strict=True)
-            if signal.note(each, seconds)
-        ]
-        if not swings:
-            return ""
-        name = max(swings, key=lambda each: self._signals[each].amplitude / self._signals[each].least)
-        signal = self._signals[name]
-        return (
-            f"{name} swings about its target by {signal.amplitude:.2g} with a period of about "
-            f"{signal.period:.2g} s: the plant is not the model, its valve or relay sticks, or a load comes "
-            "and goes"
-        )

@@ -153,7 +153,7 @@ def sizes_of(controller: ControllerParts, code: ModelCode, *, room: bool) -> Siz
         NU=model.n_u,
         ND=model.n_d,
         NY=n_y,
-        NW=controller.disturbance.n_w,
+        NW=controller.observer.disturbance.n_w,
         NB=len(design.blocks),
         NH=most,
         NC=controlled,
@@ -234,7 +234,6 @@ def numbers_of(controller: ControllerParts, k: Array) -> dict[str, Any]:
     design = controller.design
     optimiser = controller.optimiser
     observer = controller.observer
-    disturbance = controller.disturbance
     loops = design.loops
     resting = observer.rest_in_room()
     rows = [model.outputs.index(name) for name in (*design.controlled, *design.limits)]
@@ -247,7 +246,7 @@ def numbers_of(controller: ControllerParts, k: Array) -> dict[str, Any]:
         (optimiser.weights, "dear zone"),
         (optimiser.at_rest, "strongest seen"),
         (observer, "fixed offset R Q load P0 R_start"),
-        (disturbance, "on_drive on_disturbance on_output"),
+        (observer.disturbance, "on_drive on_disturbance on_output"),
     )
     return {name: getattr(source, name) for source, names in same_names for name in names.split()} | {
         "n_b": len(design.blocks),

@@ -45,7 +45,7 @@ from numpy.typing import NDArray
 
 from thermogrip.datasets.arrays import Array, Mask
 from thermogrip.mpc.design.design import Design
-from thermogrip.mpc.estimator.observer import DisturbanceModel, Observer
+from thermogrip.mpc.estimator.observer import Observer
 from thermogrip.mpc.optimiser.drive_limits import DriveLimits
 from thermogrip.mpc.optimiser.qp import CondensedQP
 from thermogrip.mpc.plant.prediction import PredictionModel
@@ -476,8 +476,6 @@ class ControllerParts(Protocol):
     def model(self) -> PredictionModel: ...
     @property
     def design(self) -> Design: ...
-    @property
-    def disturbance(self) -> DisturbanceModel: ...
     @property
     def observer(self) -> Observer: ...
     @property

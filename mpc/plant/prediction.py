@@ -530,11 +530,12 @@ class StepResponse:
     y: Array
 
 
+@lru_cache(maxsize=256)  # a design and its monitor ask for the same ones
 def step_response(
     plant: Plant, drive: str, output: str, *, ambient: float = ROOM, longest: float = 14400.0
 ) -> StepResponse:
     """Simulate a step of a twentieth of a drive's range from rest at ``ambient`` [degC], for ``longest`` s at
-    most, and read gain, delay and lag off it."""
+    most, and read gain, delay and lag off it. Shared: read it."""
     model = PredictionModel(plant, dt=plant.dt)
     j, i = model.drives.index(drive), model.outputs.index(output)
     x_rest, start, d = model.at_rest(ambient)

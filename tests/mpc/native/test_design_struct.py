@@ -29,7 +29,7 @@ def test_a_search_has_room_for_its_variants_and_an_export_for_itself():
     model = controller.model
     assert (model.n_x, 2, model.n_d, 2) == (tight.NX, tight.NU, tight.ND, tight.NY)
     assert (tight.NK, tight.NF, tight.NM) == (5, 7, 6)
-    assert model.n_x + controller.disturbance.n_w == tight.NZ
+    assert model.n_x + controller.observer.disturbance.n_w == tight.NZ
 
 
 def test_rows_of_the_response_are_as_long_as_the_last_of_four_samples_in_whole_groups_of_four():
