@@ -19,8 +19,10 @@ from tests.end_to_end.conftest import small_plant
 from thermogrip.cli.identify import _starts
 from thermogrip.cli.verbs import Verb
 from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.log_files import read_log
 from thermogrip.datasets.schema import make_log
-from thermogrip.report.console import Console
+from thermogrip.report.console import Console, short
+from thermogrip.report.plant import band_words
 from thermogrip.sysid.data.data_quality import Finding
 from thermogrip.sysid.data.signal_roles import SignalRole
 from thermogrip.sysid.experiment.information import plant_from_prior
@@ -32,7 +34,7 @@ from thermogrip.sysid.plant.fit_record import ExpectedError, PlantScores
 from thermogrip.sysid.plant.linearise import linearise_plant
 from thermogrip.sysid.plant.log_grid import roles_of
 from thermogrip.sysid.plant.plant import Plant
-from thermogrip.sysid.validation.free_run import Score
+from thermogrip.sysid.validation.free_run import free_run
 from thermogrip.sysid.validation.prediction_bands import Band
 from thermogrip.sysid.validation.verdict import Row, Standing, Verdict
 
@@ -307,58 +309,35 @@ def test_a_model_that_runs_slowly_says_why(room: SimpleNamespace) -> None:
     assert "warning: own model not compiled, and so slower: it calls print" in done.err
 
 
-def test_a_plant_is_scored_log_by_log_beside_its_baselines(bench: Bench, stand_in: StandIn) -> None:
-    def score(rmse: float) -> dict[str, Score]:
-        return {"t_tank": Score(90.0, rmse, "degC", 12)}
-
-    run = SimpleNamespace(
-        log=SimpleNamespace(attrs={"name": "good@:100"}), scores=score(0.1), one_step=score(0.2),
-        naive={"no_input": score(0.3), "mean": score(0.4)},
-        residual=SimpleNamespace(to_json=lambda: {"minutes": 1.0}), notes=("a note",),
-        band=lambda: Band(0.9, {}, {"t_tank": 0.875, "t_lost": np.nan}, 12, "its errors", {"t_tank": 0.3},
-                          {"t_tank": (0.1, 0.9)}),
-        verdict=Verdict("as stated", {"t_tank": 0.33}),
-    )  # fmt: skip
-    runs = stand_in("thermogrip.sysid.validation.free_run.free_run", run)
-    sections = stand_in("thermogrip.report.plant.free_run_section", "a section")
-    pages = stand_in("thermogrip.report.html.write_report")
-    words = ["validate", "plant.json", "good.csv@:100", "good.csv@100:200"]
-    options = ["--warmup", "7", "--score-from", "9", "--report", "v.html"]
-    done = bench.run(*words, *options)
+def test_a_plant_is_scored_log_by_log_beside_its_baselines(bench: Bench) -> None:
+    words = ["validate", "plant.json", "good.csv@:100", "good.csv@100:250"]
+    options = ["--warmup", "7", "--score-from", "9"]
+    done = bench.run(*words, *options, "--report", "v.html")
     assert done.code == 0, done
-    assert [(call.warmup, call.score_from) for call in runs] == [(7.0, 9.0)] * 2
-    assert all(
-        (call.args[0].inputs, call.args[1].attrs["name"][:4]) == (("drive", "pump"), "good") for call in runs
-    )
-    assert sections[0].args[0] is run
-    assert sections[0].args[1].draws == 12
-    assert len(sections) == 2
-    assert pages[0].args[:2] == (Path("v.html"), "Free runs of plant.json")
-    assert pages[0].args[2].endswith("scored from 9 s on.")
-    assert pages[0].args[3] == ["a section"] * 2
     said = words_of(done.out)
-    assert "good@:100 t_tank 0.1 degC 90 12 0.3 0.4 0.2" in said
-    band = (
-        "90 % band from 12 draws of the parameters and its errors; it covers 88 % of t_tank, nan % of t_lost "
-        "and has an expected RMSE of t_tank 0.3 (0.1 to 0.9)"
-    )
-    assert said.endswith(f"good@:100: {band} good@:100: a note good@100:200: {band} good@100:200: a note")
+    answer = json.loads(bench.run(*words, *options, "--json").out)
+    assert answer["repairs"] == {
+        "good@:100": ["taken from the start to 100 s"], "good@100:250": ["taken from 100 s to 250 s"]
+    }  # fmt: skip
+    plant = Plant.load("plant.json")
+    for found, cut in zip(answer["logs"], ("@:100", "@100:250"), strict=True):
+        run = free_run(plant, read_log(f"good.csv{cut}"), warmup=7.0, score_from=9.0)
+        assert found["log"] == f"good{cut}"
+        for key, scores in (("outputs", run.scores), ("one_step", run.one_step)):
+            assert found[key] == {name: asdict(score) for name, score in scores.items()}
+        assert set(found["naive"]) == {"no_input", "mean"}
+        assert found["verdict"]["standing"] == run.verdict.standing
+        band = run.band()
+        assert (found["band"]["coverage"], found["band"]["draws"]) == (band.inside, 0)
+        for name, score in run.scores.items():
+            naive = [run.naive[kind][name].rmse for kind in ("no_input", "mean")]
+            shown = (score.rmse, "degC", score.fit_percent, score.n, *naive, run.one_step[name].rmse)
+            assert f"good{cut} {name} {' '.join(map(short, shown))}" in said
+        assert f"good{cut}: {band_words(band)}" in said
     assert shares(done.err, "validate") == [0, 50]
-
-    def table(rmse: float) -> dict[str, Any]:
-        return {"t_tank": {"fit_percent": 90.0, "rmse": rmse, "unit": "degC", "n": 12}}
-
-    one = {"log": "good@:100", "outputs": table(0.1), "one_step": table(0.2), "left": {"minutes": 1.0},
-           "naive": {"no_input": table(0.3), "mean": table(0.4)}, "notes": ["a note"],
-           "verdict": {"standing": "as stated", "over_stated": {"t_tank": 0.33}, "cause": "",
-                       "gain": None},
-           "band": {"level": 0.9, "coverage": {"t_tank": 0.875, "t_lost": None}, "own_error": "its errors",
-                    "expected_rmse": {"t_tank": 0.3}, "likely_rmse": {"t_tank": [0.1, 0.9]},
-                    "draws": 12}}  # fmt: skip
-    repairs = {"good@:100": ["taken from the start to 100 s"], "good@100:200": ["taken from 100 s to 200 s"]}
-    logs = [one, one | {"log": "good@100:200"}]
-    assert json.loads(bench.run(*words, "--json").out) == {"logs": logs, "repairs": repairs}
-    assert [(call.warmup, call.score_from) for call in runs[2:]] == [(5.0, 5.0)] * 2
+    page = Path("v.html").read_text(encoding="utf-8")
+    assert "scored from 9 s on." in page
+    assert all(f"Free run: good{cut}" in page for cut in ("@:100", "@100:250"))
 
 
 @pytest.fixture

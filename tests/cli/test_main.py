@@ -173,13 +173,6 @@ def command_of(verb: str) -> Any:
     return Verbs(name="thermogrip").get_command(None, verb)
 
 
-def test_an_option_that_is_like_none_is_refused_in_plain_words(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["materials", "--draws", "3"]) == 2
-    assert capsys.readouterr().err == (
-        "thermogrip: No such option: --draws; see thermogrip materials --help\n"
-    )
-
-
 def test_help_is_as_wide_as_the_terminal_and_at_most_100_columns_of_a_pipe(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -223,31 +216,6 @@ def test_a_shell_completes_verbs_and_options() -> None:
 def test_no_words_show_the_help(capsys: pytest.CaptureFixture[str]) -> None:
     assert main([]) == 0
     assert "On the rig:" in capsys.readouterr().out
-
-
-@pytest.mark.parametrize(
-    ("words", "says"),
-    [
-        (["nope"], "No such command 'nope'"),
-        (["identfy", "a.csv"], "Did you mean 'identify'"),
-        (["--nope"], "No such option"),
-        (["identify"], "Missing argument 'LOG...'; for example thermogrip identify log.csv --out plant.json"),
-        (["tune", "a.json"], "Missing option '--out'"),
-        (["demo", "--seed", "many"], "'--seed'"),
-        (["run", "c.json", "--target", "warm", "--out", "x"], "'--target'"),
-        (["init", "everything"], "template 'everything' is unknown"),
-        (["identify", "a.csv", "--out", "x.json", "--models", "arx,magic"], "'magic' is unknown"),
-    ],
-)
-def test_a_bad_option_is_one_line_and_code_2(
-    words: list[str], says: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(words) == 2
-    out, err = capsys.readouterr()
-    assert out == ""
-    assert err.count("\n") == 1
-    assert err.startswith("thermogrip: ")
-    assert says in err
 
 
 def test_help_of_a_verb_is_its_help(capsys: pytest.CaptureFixture[str]) -> None:

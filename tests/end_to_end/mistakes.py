@@ -63,7 +63,7 @@ MISTAKES = {
     "run controller.json --target t_surfce=38 --twin plant.json --out r": "did you mean 't_surface'?",
     "excite --kind optimal --minutes 5 --plant plant.json --hold pmup --out s.csv": "did you mean 'pump'?",
     "tune plant.json --spec typo.toml --out c.json": "did you mean 'band_degC'?",
-    "run controller.json --target 38 --twin plant.json --guard loose.toml --out r": "key; write stale_s",
+    "run controller.json --target 38 --twin plant.json --guard loose.toml --out r": "did you mean 'stale_s'?",
     "validate plant.json bare.csv": "time_s,drive,pump,t_ambient,t_tank,t_surface (-: left out)",
     # files
     "validate plnt.json log.csv": "did you mean 'plant.json'?",

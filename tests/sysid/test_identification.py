@@ -198,6 +198,7 @@ def test_inputs_of_the_row_are_said_and_the_warm_up_of_a_fit_is_that_of_its_logs
     assert found.plant.inputs_end_at_row
     assert any("an input moves its own row's reading" in note for note in found.notes)
     assert warm_up_of_fit(found.plant, log) == 50.0
+    assert warm_up_of_fit(found.plant, log.isel(time=slice(0, None, 2))) == 60.0  # of rows of 2 s
     assert warm_up_of_fit(replace(found.plant, logs=("a", "b", "c")), log) == 0.0
     network = Plant(found.plant.model, {}, dt=1.0, logs=("a",))  # no errors of folds
     assert warm_up_of_fit(network, log) == 0.0

@@ -452,7 +452,7 @@ def run_answer(name: str, run: FreeRun, band: Band) -> dict[str, Any]:
         "left": run.residual.to_json(),
         "band": {
             "level": band.level,
-            "coverage": {output: share if share == share else None for output, share in band.inside.items()},
+            "coverage": band.inside,
             "expected_rmse": band.expected,
             "likely_rmse": band.likely,
             "own_error": band.own_error,

@@ -136,3 +136,17 @@ def test_signals_of_the_discrepancy_are_about_the_air_or_the_mean():
     model.disturbances = ()
     still = random_effects.signals(model, u, np.zeros((2, 0)), np.array([[25.0], [18.0], [23.0]]))
     assert still["v |v|"].tolist() == [9.0, -16.0]
+
+
+def test_all_responses_of_the_discrepancy_have_the_stated_size_together():
+    model, rng = load_network("tclab"), np.random.default_rng(0)
+    signals = {name: (rng.uniform(0, 100, 300), "percent", "input") for name in model.inputs}
+    signals |= {name: (25 + rng.normal(size=300), "degC", "output") for name in model.outputs}
+    problem = make_problem(model, [make_log(np.arange(300.0), signals)], average=5.0, independent=5.0)
+    run = rng.normal(25.0, 3.0, (len(problem.logs[0][0][0].u) + 1, 2))
+    squares = [
+        np.mean([np.square(bins / sd) for bins, sd in zip(moves[0][0], problem.sd)])
+        for _, moves in random_effects.discrepancy_responses(problem, [[run]])
+    ]
+    assert len(squares) == 5 * len(random_effects.EFFECTS.lags)
+    np.testing.assert_allclose(np.sqrt(np.sum(squares)), random_effects.EFFECTS.discrepancy_rms)
