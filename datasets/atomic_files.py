@@ -1,13 +1,9 @@
 """Whole files or none: atomic writing, and JSON that says what it is.
 
-A file is written beside its target, forced to disk, then renamed over it.  A rename within one folder is
-atomic on POSIX and Windows, so a reader sees the old file or the new one, never half of it, and Ctrl-C, a
-full disk or ``kill -9`` leave the old one in place.  Nothing is written through a symbolic link: one that has
-the target's name is replaced, where it leads to is left alone.
-
-Every JSON file of the toolkit is an object with the keys ``schema`` (what it is), ``version`` (an
-integer) and ``provenance`` (:mod:`thermogrip.datasets.provenance`). Reading one runs no code, whatever the
-file holds.
+A file is written beside its target, forced to disk, then renamed over it, which is atomic on POSIX and
+Windows: Ctrl-C, a full disk or ``kill -9`` leave the old one in place.  A symbolic link of the target's name
+is replaced, where it leads to is left alone.  Every JSON file of the toolkit has the keys ``schema``,
+``version`` (an integer) and ``provenance`` (:mod:`thermogrip.datasets.provenance`); reading it runs no code.
 """
 
 from __future__ import annotations
@@ -143,7 +139,7 @@ def read_json(path: str | Path, schema: str, version: int) -> dict[str, Any]:
     too_deep = as_user_error(RecursionError, "is nested too deeply", **place)
     with too_deep, as_user_error(ValueError, "is not JSON ({error})", **place):
         try:
-            content: dict[str, Any] = parse_json(text, parse_constant=_refuse_constant)
+            content: dict[str, Any] = parse_json(text)
         except json.JSONDecodeError as error:
             problem = f"is not JSON ({error.msg}, column {error.colno})"
             raise UserError(problem, **place, row=error.lineno) from error
@@ -172,10 +168,6 @@ def check_json(content: Any, schema: str, version: int, *, file: str | Path | No
     if not isinstance(stated, int) or isinstance(stated, bool) or not 1 <= stated <= version:
         problem = f"version {repr(stated)[:20]} is not between 1 and {version}"
         raise UserError(problem, file=file, hint="update thermogrip or write the file anew")
-
-
-def _refuse_constant(name: str) -> float:
-    raise ValueError(f"{name} is not a JSON number")
 
 
 def _sync_file(path: Path, mode: int) -> None:

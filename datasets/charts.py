@@ -1,12 +1,7 @@
-"""Charts: curves over a shared axis in panels, as data, so that a page can zoom in them and paper show them.
+"""Charts: curves over a shared axis in panels, as data.
 
 A :class:`Chart` is what a page draws anew at every zoom (:mod:`thermogrip.report.html`) and what
-:func:`draw_chart` sets as a matplotlib figure for print and for readers without scripts.  Both show the same
-curves in the same colours and dashes.
-
-**Thinning.**  A log has more rows than a screen has columns of pixels, and every n-th row would miss the
-peaks.  :func:`thin` cuts the rows into bins and keeps of each the last row and those of the least and the
-largest value of every column, and one of its gaps.
+:func:`draw_chart` sets as a matplotlib figure, for print and for readers without scripts.
 """
 
 from __future__ import annotations

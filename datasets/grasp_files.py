@@ -1,13 +1,11 @@
-"""Grasps to and from disk.
+"""Grasps to and from disk; ``docs/reference/files.md`` has their columns.
 
-As CSV a condition is two files, ``NAME.csv``, long, one row a sample, and ``NAME_meta.csv``, one row a grasp:
-``docs/reference/files.md`` has their columns.  In a Parquet file or a DataFrame each row repeats what is
-known of its grasp.  A missing ``session`` is the file, a missing ``block`` the material: so blocks are never
-split between training and test by accident of a missing column.
+As CSV a condition is two files, ``NAME.csv``, long, one row a sample, and ``NAME_meta.csv``, one row a grasp;
+in a Parquet file or a DataFrame each row repeats what is known of its grasp.  A missing ``session`` is the
+file, a missing ``block`` the material: so no block is split between training and test by accident.
 
-The grasps of one file share one time axis.  Where their stamps agree they are taken as they are; where they
-jitter each grasp is interpolated linearly onto the common step, which is noted in ``attrs["repairs"]``, and
-left NaN where the nearest samples are more than 1.5 steps apart.
+The grasps of one file share one time axis.  Where their stamps jitter each grasp is interpolated linearly
+onto the common step, and left NaN where the nearest samples are more than 1.5 steps apart.
 """
 
 from __future__ import annotations
@@ -129,9 +127,7 @@ def as_grasps(grasps: Records) -> list[Grasps]:
     from pandas import DataFrame
 
     records = list(grasps) if isinstance(grasps, Sequence) and not isinstance(grasps, str) else [grasps]
-    read: list[Any] = [
-        read_grasps(record) if isinstance(record, str | Path) else record for record in records
-    ]
+    read: list[Any] = [read_grasps(each) if isinstance(each, str | Path) else each for each in records]
     return [from_frame(record) if isinstance(record, DataFrame) else record for record in read]
 
 
@@ -431,9 +427,8 @@ def _first_rows(table: Table, order: Sequence[str]) -> list[int]:
             first = cells[rows[0]]
             other = rows[(cells[rows] != first) & ~((cells[rows] != cells[rows]) & (first != first))]
             if other.size:
-                problem = (
-                    f"{cells[other[0]]!s} of grasp {grasp!r} was {first!s} in row {table.lines[rows[0]]}"
-                )
+                earlier = f"was {first!s} in row {table.lines[rows[0]]}"
+                problem = f"{cells[other[0]]!s} of grasp {grasp!r} {earlier}"
                 hint, row = "repeat in each row what is known of its grasp", int(table.lines[other[0]])
                 raise UserError(problem, file=table.file, row=row, column=header, hint=hint)
     return [int(rows[0]) for rows in rows_of]

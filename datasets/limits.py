@@ -1,12 +1,9 @@
 """How large a file may be, and how far it may unpack: one limit for all readers, checked before the memory.
 
-A few kilobytes can claim gigabytes: a compressed line of blanks, an array that was never written, a table of
-one value.  Every reader therefore asks here, with what a file declares, before it allocates anything; the
-limits are listed in ``docs/reference/files.md``.  What is packed may grow 200 times: a log of 500 000 rows
-whose sensors never move, packed with xz, grows 104 times.
-
-``THERMOGRIP_MAX_MB`` sets the first limit in MB for files that are large for a reason; documents keep their
-share of it, and the second limit is then left to it.
+A few kilobytes can claim gigabytes (a compressed line of blanks, an array that was never written), so every
+reader asks here, with what a file declares, before it allocates anything; ``docs/reference/files.md`` lists
+the limits.  What is packed may grow 200 times: a log of 500 000 rows whose sensors never move grows 104 times
+with xz.  ``THERMOGRIP_MAX_MB`` sets the first limit in MB, and the second is then left to it.
 """
 
 from __future__ import annotations
@@ -152,27 +149,23 @@ def _unpacked(unpacker: Any, data: bytes, most: int) -> bytes:
 _PACKINGS: dict[str, Callable[[bytes, int], bytes]] = {"bz2": _bz2, "lz4": _lz4, "zstd": _zstd}
 
 
-def check_content(content: dict[str, Any] | list[Any], *, file: str | Path | None = None) -> None:
-    """Raise :class:`UserError` where a document is nested too deeply or has a number beyond all use."""
-    waiting: list[tuple[Any, Any, int]] = [(None, content, 1)]  # a place is (place around it, key)
-    while waiting:  # no call a level: depth is what is looked for
-        place, value, depth = waiting.pop()
-        for key, inner in value.items() if isinstance(value, dict) else enumerate(value):
-            if isinstance(inner, dict | list):
-                if depth == MOST_DEPTH:
-                    problem = f"is nested more than {MOST_DEPTH} levels deep"
-                    raise UserError(problem, file=file, hint="write it anew")
-                if inner:
-                    waiting.append(((place, key), inner, depth + 1))
-            elif isinstance(inner, int | float) and not abs(inner) <= MOST_NUMBER:
-                shown = f"{inner:g}" if isinstance(inner, float) else f"{str(inner)[:8]}..."
-                unlike = (
-                    f"beyond {MOST_NUMBER:g}"
-                    if isinstance(inner, int) or math.isfinite(inner)
-                    else "not a finite number"
-                )
-                problem = f"{_place((place, key))} is {shown}, {unlike}"
-                raise UserError(problem, file=file, hint="write a number that can be")
+def check_content(
+    content: dict[str, Any] | list[Any], *, file: str | Path | None = None, place: tuple[object, ...] = ()
+) -> None:
+    """Raise :class:`UserError` where a document is nested too deeply or has a number beyond all use;
+    ``place`` are the keys above it."""
+    for key, inner in content.items() if isinstance(content, dict) else enumerate(content):
+        if isinstance(inner, dict | list):
+            if len(place) + 1 == MOST_DEPTH:
+                problem = f"is nested more than {MOST_DEPTH} levels deep"
+                raise UserError(problem, file=file, hint="write it anew")
+            check_content(inner, file=file, place=(*place, key))
+        elif isinstance(inner, int | float) and not abs(inner) <= MOST_NUMBER:
+            shown = f"{inner:g}" if isinstance(inner, float) else f"{str(inner)[:8]}..."
+            finite = isinstance(inner, int) or math.isfinite(inner)
+            keys = ".".join(str(each)[:40] for each in (*place, key))
+            problem = f"{keys} is {shown}, {f'beyond {MOST_NUMBER:g}' if finite else 'not a finite number'}"
+            raise UserError(problem, file=file, hint="write a number that can be")
 
 
 def number_within(content: Mapping[str, Any], key: str, low: float, high: float) -> float:
@@ -194,14 +187,6 @@ def array_within(content: Mapping[str, Any], key: str, largest: float = LARGEST)
     if not (np.abs(values) <= largest).all():
         raise ValueError(f"{key} has an entry that is not within +-{largest:g}")
     return values
-
-
-def _place(place: Any) -> str:
-    keys = []
-    while place is not None:
-        place, key = place
-        keys.append(str(key)[:40])
-    return ".".join(reversed(keys))
 
 
 def _chosen() -> int | None:

@@ -1,15 +1,8 @@
-"""Logs and grasps to and from disk: CSV with units in the header, NetCDF, Parquet; logs from bags.
-
-A CSV file is a table with one row a sample; the header has the units (:mod:`thermogrip.datasets.units`)::
-
-    time_s,drive,pump,t_tank_K,t_surface_degC,t_ambient_degC
+"""Logs to and from disk: text with units in the header, NetCDF, Parquet, MATLAB, Excel; bags.
 
 Temperatures become degC and times s while reading, and nowhere else.  Findings and repairs
 (:mod:`thermogrip.datasets.repair`) are in ``attrs["repairs"]``, a line each.  A record that thermogrip
 itself wrote as NetCDF or Parquet is marked in its metadata and is read back exactly, without repairs.
-
-A log may be cut: ``run.csv@120:1800`` is its seconds 120 <= t < 1800 and either end may be empty, so that
-``run.csv@:1350`` and ``run.csv@1350:`` share no sample.
 """
 
 from __future__ import annotations
@@ -294,9 +287,7 @@ def _convert(table: Table, dt: float | None) -> _Columns:
     read |= {h: Header(h, attrs["units"], 1.0) for h, attrs in table.attrs.items() if "units" in attrs}
     clock = clock_of(table, read, dt)
     table = _states_as_columns(table, clock)
-    read |= {
-        header: Header(read_header(header).name, "1", 1.0) for header in table.numbers if header not in read
-    }
+    read |= {h: Header(read_header(h).name, "1", 1.0) for h in table.numbers if h not in read}
     columns: dict[str, Floats] = {}
     units: dict[str, str] = {}
     names_of = dict.fromkeys(clock.columns, "time")
@@ -339,17 +330,13 @@ def _states_as_columns(table: Table, clock: Clock) -> Table:
         if not 2 <= len(counts) <= MOST_STATES or counts.total() < 5 * len(counts):
             continue
         cells = text.pop(header)
-        resting_state = next(
-            (word for word in counts if word.lower() in ("off", "idle", "0")),
-            max(counts, key=counts.__getitem__),
-        )
+        resting_state = max(counts, key=lambda word: (word.lower() in ("off", "idle", "0"), counts[word]))
         made = []
         for state in sorted(counts.keys() - {resting_state}):
             made.append(unused(f"{header}_{state}", numbers))
             numbers[made[-1]] = np.array([float(cell == state) if cell else np.nan for cell in cells])
-        notes.append(
-            f"{header}: words read as columns of 0 and 1 ({', '.join(made)}), all 0 in {resting_state}"
-        )
+        as_columns = f"columns of 0 and 1 ({', '.join(made)}), all 0 in {resting_state}"
+        notes.append(f"{header}: words read as {as_columns}")
     return replace(table, numbers=numbers, text=text, notes=(*table.notes, *notes))
 
 
@@ -451,9 +438,8 @@ def _without_half_lost(roles: Roles, time: Floats, columns: Mapping[str, Floats]
         log_cut = f"LOG@{first:.6g}:{last:.6g}"
         doubts.append(f"{name} is left out: {why}; to fit it too, cut the log to where it reads: {log_cut}")
         reasons[name] = why
-    return Roles(
-        roles.of | dict.fromkeys(reasons, "other"), roles.reasons | reasons, (*roles.doubts, *doubts)
-    )
+    roles_left = roles.of | dict.fromkeys(reasons, "other")
+    return Roles(roles_left, roles.reasons | reasons, (*roles.doubts, *doubts))
 
 
 def _repair_column(
@@ -469,9 +455,8 @@ def _repair_column(
         return values, []
     lost = int(np.isnan(values).sum())
     repairs = [f"{name}: {lost} lost sample{'' if lost == 1 else 's'} left empty"] if lost else []
-    values, spikes = repair.reject_spikes(
-        name, values, time, floor=repair.SPIKE_FLOOR_K if unit == "degC" else None
-    )
+    floor = repair.SPIKE_FLOOR_K if unit == "degC" else None
+    values, spikes = repair.reject_spikes(name, values, time, floor=floor)
     return values, repairs + spikes + (repair.check_plausible(name, values, file) if unit == "degC" else [])
 
 

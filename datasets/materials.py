@@ -5,10 +5,8 @@ What a touch feels is the effusivity (the paper's sqrt(lambda rho c)),
     e = sqrt(k rho c_p)   [W s^0.5 m^-2 K^-1].
 
 Handbooks disagree about it by 2 to 5 % for pure metals, by 10 % for alloys and plastics, and by a quarter
-for wood, rubber and foams, whose grade and moisture the name does not state.  The spread matters as much
-as the value: zinc and brass are 8 % apart, iron in two handbooks 4 %. So every row has the relative
-standard deviation of e, one sigma, estimated from the spread of the sources where there are several, and
-from the kind of material where there is one.
+for wood, rubber and foams; zinc and brass are 8 % apart. So every row has the relative standard deviation of
+e, from the spread of the sources where there are several, and from the kind of material where there is one.
 """
 
 from __future__ import annotations

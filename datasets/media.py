@@ -1,16 +1,9 @@
 """Text of others, written so that no medium takes it for its own language.
 
-Names of columns, files, grasps, materials and experiments, notes, and what a device sends are anybody's text.
-A terminal obeys an ESC sequence, a spreadsheet computes ``=1+1``, matplotlib sets ``$x$`` as a formula, and
-Markdown makes a link of ``[a](b)``.  One function a medium takes that meaning away, and is called where the
-medium is written, so that records keep the text as it was:
-
-* :func:`printable` for terminals and pages (:mod:`thermogrip.report.console`, ``cli``, ``report``; HTML's own
-  characters are escaped by the template),
-* :func:`csv_text` for every CSV with a cell of text, undone by :func:`from_csv` when one is read,
-* :func:`markdown` for the README of an export,
-* :func:`thermogrip.report.html.literal` for figures, whose axes :func:`panels` makes,
-* :class:`Shown` for results at the prompt of Python and in notebooks.
+Names of columns, files, materials, and what a device sends are anybody's text.  A terminal obeys an ESC
+sequence, a spreadsheet computes ``=1+1``, and Markdown makes a link of ``[a](b)``.  One function a medium
+takes that meaning away where the medium is written, so that records keep the text as it was; HTML's own
+characters are escaped by the template, and ``$x$`` in figures by :func:`thermogrip.report.html.literal`.
 """
 
 from __future__ import annotations

@@ -1,14 +1,9 @@
 """Many independent pieces of work on local processes or on a Dask cluster.
 
 Local processes are those of loky: each is a new interpreter, not a fork that would copy locks which numerical
-libraries hold; they stay for the next call, for each takes seconds to import.
-Only the user's own processes unpickle functions and items: those that this one started or those of the
-cluster that was named.  Results come back in the order of the items, whatever the order of finishing.  What
-a killed process had in hand is done again, by another one.
-
-A cluster (``tcp://HOST:PORT`` of its scheduler, extra ``cluster``) runs the same functions on the same items,
-so it gives the same bits where its machines' arithmetic does; every worker needs the versions of thermogrip,
-Python and the numerical packages that are here.  Workers may join at any time, and leave.
+libraries hold; they stay for the next call, for each takes seconds to import.  Only the user's own processes
+unpickle functions and items: those that this one started, or those of the cluster that was named
+(``tcp://HOST:PORT`` of its scheduler, extra ``cluster``).  What a killed process had in hand is done again.
 """
 
 from __future__ import annotations

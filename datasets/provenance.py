@@ -1,9 +1,8 @@
 """Where a result comes from: version, date, command, repository, seed, and the SHA-256 of what was read.
 
-Every JSON file has it under the key ``provenance``, every page in its foot.  It is gathered here and nowhere
-else: the command line opens a :func:`work` with its words, readers and writers of files report to it, and a
-writer asks :func:`provenance`.  Two runs of one command with one seed differ in this alone; with
-``SOURCE_DATE_EPOCH`` the date is that one [1]_.
+Every JSON file has it under the key ``provenance``, every page in its foot: the command line opens a
+:func:`work` with its words, readers and writers of files report to it, and a writer asks :func:`provenance`.
+Two runs of one command with one seed differ in this alone; ``SOURCE_DATE_EPOCH`` sets the date [1]_.
 
 References
 ----------
@@ -100,7 +99,7 @@ def provenance() -> dict[str, Any]:
             now.read[name] = now.read[name] or (hash_file(name) if os.path.isfile(name) else "")
     return {
         "thermogrip": __version__,
-        "written": _date(),
+        "written": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(_epoch())),
         "command": shlex.join(now.words),
         "git": _commit_of(folder) if folder else None,
         "seed": now.seed,
@@ -108,11 +107,10 @@ def provenance() -> dict[str, Any]:
     }
 
 
-def _date() -> str:
-    """Return the time in UTC, of the environment where that sets one."""
+def _epoch() -> int | None:
+    """Return the seconds since 1970 that the environment sets, None where it sets none."""
     epoch = os.environ.get("SOURCE_DATE_EPOCH", "")
-    moment = time.gmtime(int(epoch) if _EPOCH.fullmatch(epoch) else None)
-    return time.strftime("%Y-%m-%dT%H:%M:%SZ", moment)
+    return int(epoch) if _EPOCH.fullmatch(epoch) else None
 
 
 def hash_file(path: str | Path) -> str:

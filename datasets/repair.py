@@ -1,21 +1,15 @@
-"""What a reader may repair in a log, and how it reports it.
+"""What a reader may repair in a log; each function returns the values and one line a finding.
 
-Nothing is repaired silently: each function returns the values and one line a finding.
-
-Repeated time stamps are dropped (the first row stays); where a clock is so coarse that more than a quarter
-repeat, the rows are spread evenly between its stamps.  Single rows out of order are sorted, time that runs
-backward otherwise is refused.  Uneven stamps stay as they are and are reported.  A **spike** is a run of at
-most three samples of an output that leaves the running median of 21 samples and comes back.  With d the
-deviation from that median, a sample is a candidate where
+A **spike** is a run of at most three samples of an output that leaves the running median of 21 samples and
+comes back.  With d the deviation from that median, a sample is a candidate where
 
     |d| > max(floor, 6 s),   s = 1.4826 median |d| over the whole channel,
 
 floor is 0.6 K for a temperature and 2 % of the channel's 1-99 % range (at least five of its smallest
 increments) otherwise; and the run is a spike only if it is entered and left by jumps of opposite sign, each
-larger than the same threshold and than five times the 70 % quantile of the increments around it.  A step is
-entered but not left; the tip of a ramp of any slope is entered and left by increments like those around it:
-both stay.  In rows of a minute or more a plant moves and comes back by itself: there a spike lies outside of
-all other samples as well, by more than their range.
+larger than the same threshold and than five times the 70 % quantile of the increments around it: a step is
+not left, the tip of a ramp is entered by increments like those around it.  In rows of a minute or more a
+plant moves and comes back by itself: there a spike is beyond all other samples by more than their range.
 
 What a sensor writes when it has no reading (:data:`SENSOR_CODES`) is lost, in whatever number of rows, where
 it is entered and left by jumps of more than five times what the other rows rarely move (their 99 %
@@ -27,8 +21,8 @@ within all other runs but for the first of each (a row's reading is from before 
 stays through a move with a chance of about p = (k + 1) / (M - m + 2) (Laplace's rule); the run is stuck
 where p^(m - 1) is below 1e-3.
 
-All of these become NaN, as lost samples are: an output is never filled.  A lost input is held from the last
-row, since that is what an actuator does; a lost disturbance is interpolated.
+An output is never filled.  A lost input is held from the last row, since that is what an actuator does; a
+lost disturbance is interpolated.
 """
 
 from __future__ import annotations
@@ -99,7 +93,7 @@ def order_rows(time: Floats, lines: NDArray[np.int64], file: str) -> OrderedRows
         rows = rows[order]
     first = np.concatenate([[True], np.diff(time[rows]) > 0])
     starts, repeats = np.flatnonzero(first), int((~first).sum())
-    if repeats > 0.25 * rows.size and starts.size > 1:
+    if repeats > 0.25 * rows.size and starts.size > 1:  # a coarse clock
         stamps = time[rows[starts]]
         ends = np.append(starts, rows.size), np.append(stamps, stamps[-1] + np.median(np.diff(stamps)))
         repairs.append(f"time has {starts.size} stamps for {rows.size} rows: rows spread evenly between them")

@@ -1,13 +1,11 @@
 """Cuts, gaps and means of logs.
 
-An input is applied from its row until the next (zero-order hold), so its mean over a cell [a, b) is an
-integral of a staircase.  With t_i the rows and U(t) the integral of the held input up to t, which is
-piecewise linear,
+An input is applied from its row until the next (zero-order hold), so with t_i the rows and U(t) the integral
+of the held input up to t, which is piecewise linear, its mean over a cell is exactly
 
     mean over [a, b) = (U(b) - U(a)) / (b - a)
 
-exactly, whatever the jitter of the rows.  Outputs are samples: their mean is over the samples in the cell
-that are there.
+whatever the jitter of the rows.  Outputs are samples: their mean is over those in the cell that are there.
 """
 
 from __future__ import annotations

@@ -14,14 +14,8 @@ A column is left out as a copy of another only where the two are one signal with
 multiple of the other and a constant, over more than two levels.  Of two states every pair would be.  Two
 inputs that always move together cannot be told apart by any fit: one stays for both.
 
-Physics decides between the rest.  What a reading comes to and stays at, level after level, while another
-column drives it, is its set point.  No drive moves the weather: a temperature that none helps to predict, row
-by row or in means over many rows, is a disturbance beside one that is moved.  What is held and helps to
-predict an output beside the known inputs is one more of them.
-
-**Doubts.**  A guess that decides what a fit sees is reported as a doubt: a role that the course of a column
-alone shows, a column that is left out although it helps to predict an output, inputs that move together, a
-room that is heated.  Whoever states the roles has none.
+A guess that decides what a fit sees (a role that the course of a column alone shows, a column left out that
+helps to predict an output) is reported as a doubt.  Whoever states the roles has none.
 """
 
 from __future__ import annotations
@@ -199,9 +193,7 @@ def _controllers(
         return {}
     of_controller = "beside a set point it is the controller's:"
     out: dict[str, tuple[str, str]] = {}
-    reads, drives = (
-        by_name.keys() & set(words) for words in (("input", "pv"), ("output", "op", "out", "co"))
-    )
+    reads, drives = by_name.keys() & {"input", "pv"}, by_name.keys() & {"output", "op", "out", "co"}
     if drives and (reads or any(role == "output" for role, _ in guesses.values())):
         out |= {by_name[name]: ("output", f"{of_controller} what it reads") for name in reads}
         out |= {by_name[name]: ("input", f"{of_controller} what it drives") for name in drives}
@@ -328,18 +320,14 @@ def _followed_levels(
     held_names = [n for n in likely if _is_held(columns[n])]
     out: dict[str, tuple[str, str]] = {}
     for goal in held_names:
-        read = [
-            n
-            for n in columns
-            if n not in held_names and guesses.get(n, ("output", ""))[0] in ("output", "other")
-        ]
+        moving = [n for n in columns if n not in held_names]
+        read = [n for n in moving if guesses.get(n, ("output", ""))[0] in ("output", "other")]
         reading = next((n for n in read if _comes_to(columns[n], columns[goal])), None)
         if reading is None:
             continue
         drives = [n for n, (role, why) in guesses.items() if role == "input" or why == NO_CLUE]
-        gains = _predictive_gain(
-            [columns[reading], *(columns[n] for n in drives if n not in (goal, reading))]
-        )
+        others = [columns[n] for n in drives if n not in (goal, reading)]
+        gains = _predictive_gain([columns[reading], *others])
         if gains[1:, 0].max(initial=0.0) > _ROLES.strong_gain:
             out[goal] = "other", f"{reading} {FOLLOWED}"
             if guesses.get(reading, ("", ""))[1] == NO_CLUE:
@@ -352,12 +340,10 @@ def _comes_to(reading: Floats, goal: Floats) -> bool:
     the last half of each hold."""
     bounds = [0, *(np.flatnonzero(np.diff(goal)) + 1), goal.size]
     holds = [(goal[a], reading[(a + b) // 2 : b]) for a, b in pairwise(bounds) if b - a >= _ROLES.fewest_rows]
-    pairs = [
-        (level, np.median(second_half)) for level, second_half in holds if np.isfinite(second_half).all()
-    ]
-    levels = np.array([level for level, _ in pairs])
-    off = [abs(level - value) <= _ROLES.held_size * np.ptp(levels) for level, value in pairs]
-    return np.unique(levels).size >= 3 and float(np.mean(off)) > 0.5
+    holds = [(level, second_half) for level, second_half in holds if np.isfinite(second_half).all()]
+    levels = np.array([level for level, _ in holds])
+    reached = [abs(level - np.median(half)) <= _ROLES.held_size * np.ptp(levels) for level, half in holds]
+    return np.unique(levels).size >= 3 and float(np.mean(reached)) > 0.5
 
 
 def _unnamed_causes(
@@ -387,11 +373,9 @@ def _is_moved(columns: Mapping[str, Floats], name: str, drives: Sequence[str]) -
     is_sound = np.isfinite(drop_stuck(name, columns[name], [columns[n] for n in drives])[0])
     if is_sound.sum() < _ROLES.fewest_rows:
         return True  # nothing of it speaks against
-    some = [columns[n][is_sound] for n in (name, *drives)]
-    reading, *moves = _standardised(some)
-    return any(
-        _gain(reading, drive, (), lags) > _ROLES.strong_gain for drive in moves for lags in _ROLES.lags
-    )
+    reading, *moves = _standardised([columns[n][is_sound] for n in (name, *drives)])
+    gains = (_gain(reading, drive, (), lags) for drive in moves for lags in _ROLES.lags)
+    return any(gain > _ROLES.strong_gain for gain in gains)
 
 
 def _name_words(name: str) -> str:

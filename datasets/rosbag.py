@@ -1,12 +1,8 @@
 """Logs out of robots: ROS 1 .bag, ROS 2 .db3 and .mcap, and MCAP files of JSON, without ROS installed.
 
-A bag holds messages, each topic at its own times; a Log has one time axis.  A topic map says which field of
-which topic is which column (as in ``data/topics.toml``): it is read from ``<name>.topics.toml`` or
-``topics.toml`` beside the bag.  Without one, every topic of a single number becomes a column: a
-``sensor_msgs/Temperature`` a temperature, ``std_msgs`` numbers what their name's suffix says.
-
-A ROS 2 bag is a folder: ``metadata.yaml`` names its files, which may be split and are read as one.  Its
-writer makes that file last; where it is missing, all ``.mcap`` and ``.db3`` files of the folder are the bag.
+A topic map says which field of which topic is which column (as in ``data/topics.toml``): it is read from
+``<name>.topics.toml`` or ``topics.toml`` beside the bag.  Without one, every topic of a single number becomes
+a column: a ``sensor_msgs/Temperature`` a temperature, others what their name's suffix says.
 
 **One axis.**  Rows are the times of one topic, the *clock* (by default the output with the most messages).
 An input has the value of its last message at or before the row, for a command holds until the next.  Anything
@@ -14,8 +10,9 @@ else has its nearest message if that is within half a usual step of its own topi
 nothing is interpolated.
 
 **Cut-off files.**  An MCAP whose writer died has no index and no end; its messages are read up to the first
-damage, and what is missing is noted.  Damage inside a chunk costs that chunk.  A .bag without its index must
-be reindexed by ROS (``rosbag reindex``), a .db3 is SQLite, which repairs itself.
+damage, and what is missing is noted.  A .bag without its index must be reindexed by ROS (``rosbag reindex``),
+a .db3 is SQLite, which repairs itself.  A folder without ``metadata.yaml``, which the writer makes last, is
+all of its ``.mcap`` and ``.db3`` files.
 """
 
 from __future__ import annotations
@@ -110,9 +107,8 @@ def _column(name: str, entry: Any, path: str | Path) -> Column:
         raise UserError(problem, file=path, column=name, hint=f"use {' '.join(UNITS)} or 1")
     if role not in (*ROLES, ""):
         raise UserError(f"role {role!r} is unknown", file=path, column=name, hint=known_names(role, ROLES))
-    return Column(
-        str(entry["topic"]), str(entry.get("field", "data")), unit, role, str(entry.get("type", ""))
-    )
+    field, kind = str(entry.get("field", "data")), str(entry.get("type", ""))
+    return Column(str(entry["topic"]), field, unit, role, kind)
 
 
 def read_rosbag_table(path: str | Path, topics: TopicMap | None = None) -> Table:
@@ -268,11 +264,8 @@ def _stamped(message: Message, stamp: str, file: Path) -> float:
         return message.time
     try:
         of_header = _field(message.content, "header.stamp")
-        ros_2 = _has(of_header, "sec")
-        seconds, nanoseconds = (
-            _field(of_header, f) for f in (("sec", "nanosec") if ros_2 else ("secs", "nsecs"))
-        )
-        return float(seconds) + 1e-9 * float(nanoseconds)
+        parts = ("sec", "nanosec") if _has(of_header, "sec") else ("secs", "nsecs")  # ROS 2, ROS 1
+        return float(_field(of_header, parts[0])) + 1e-9 * float(_field(of_header, parts[1]))
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         problem = f"{message.topic} ({message.type}) has no header.stamp"
         raise UserError(problem, file=file, hint='set stamp = "log" in the topic map') from error
@@ -298,9 +291,8 @@ def _bag_table(
     clock: str,
     notes: list[str],
 ) -> Table:
-    sorted_series = {
-        name: np.asarray(sorted(zip(*pair), key=itemgetter(0))).T for name, pair in series.items()
-    }
+    in_time = itemgetter(0)
+    sorted_series = {name: np.asarray(sorted(zip(*pair), key=in_time)).T for name, pair in series.items()}
     units = {name: to_record_unit(v, columns[name].unit)[1] for name, (_, v) in sorted_series.items()}
     roles = {name: column.role or guess_role(name, units[name]) for name, column in columns.items()}
     if not clock:
@@ -393,9 +385,8 @@ def _bound_chunks(reader: Any, file: Path) -> Callable[[bytes], bytes]:
     for bag in reader.readers:
         for offset, chunk in bag.chunks.items():
             if chunk.decompressor in packings:
-                bag.chunks[offset] = chunk._replace(
-                    decompressor=partial(unpack, packings[chunk.decompressor])
-                )
+                bounded = partial(unpack, packings[chunk.decompressor])
+                bag.chunks[offset] = chunk._replace(decompressor=bounded)
     return lambda raw: raw
 
 

@@ -1,17 +1,14 @@
 """The two records that every stage exchanges: ``Log`` and ``Grasps``.
 
-Both are :class:`xarray.Dataset` objects that passed the check in this module, so every tool that
-reads a dataset reads them.  Temperatures are degC, time is s; the unit of a variable is in its
-``units`` attribute (``"1"`` for a dimensionless one).
+Both are :class:`xarray.Dataset` objects that passed the check in this module.  Temperatures are degC, time is
+s; the unit of a variable is in its ``units`` attribute (``"1"`` for a dimensionless one).
 
-A **Log** has the dimension ``time`` [s].  Each variable has a ``role``: ``input`` (what a controller moves,
-held from its row until the next), ``disturbance`` (measured, not moved), ``output`` (measured, to be
-predicted), or ``other``.  An output may be NaN where the sample was lost; an input and a disturbance may
-not.
+A **Log** has the dimension ``time``.  Each variable has a ``role``: ``input`` (what a controller moves, held
+from its row until the next), ``disturbance`` (measured, not moved), ``output`` (measured, to be predicted),
+or ``other``.  An output may be NaN where the sample was lost; an input and a disturbance may not.
 
 A **Grasps** record has the dimensions ``grasp`` and ``time`` (0 s is the "closed" message of the gripper)
-and the variable ``t_surface``; per grasp it may have a material, temperatures, a split, a session.  One
-record is one condition (one file).
+and the variable ``t_surface``; per grasp it may have a material, temperatures, a split, a session.
 """
 
 from __future__ import annotations

@@ -1,11 +1,8 @@
 """Training and test grasps that share nothing.
 
-The samples of one grasp are not independent, nor are the two touches of one ``touch_group``: a split by
-sample measures memory.  The unit here is the touch group, or the grasp where there is none, and every
-split keeps a unit whole.  Splits by session and by block (:mod:`thermogrip.classify.evaluation.splits`)
-answer harder questions: does it work tomorrow, does it work on another block of the same material.
-
-A split is two index arrays into the record's ``grasp`` dimension, (train, test), sorted and disjoint.
+The samples of one grasp are not independent, nor are the touches of one ``touch_group``: the unit here is the
+group, or the grasp where there is none, and every split keeps a unit whole.  A split is two index arrays into
+the record's ``grasp`` dimension, (train, test), sorted and disjoint.
 """
 
 from __future__ import annotations

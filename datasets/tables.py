@@ -1,11 +1,9 @@
 """Tables of numbers on disk: text (plain, gzip or xz), Parquet, MATLAB, Excel, read without running code.
 
-:func:`read_csv_table` reads what thermogrip writes.  :func:`read_text_table` reads what any logger writes:
-the separator is the one of comma, semicolon, tab, bar and blanks that makes the first lines rows of equal
-length whose cells are numbers; the header is the last line of words before them.  What it passes over or
-takes for something is noted; a row or a cell that is broken is left out as long as they are few.  A last line
-that was cut off (a logger that lost power) is dropped and noted.  What is in a column is decided in one place
-(:func:`read_column`), for text as for the columns of text in a DataFrame or a Parquet file.
+:func:`read_csv_table` reads what thermogrip writes, and refuses what is broken.  :func:`read_text_table`
+reads what any logger writes: the separator is the one of comma, semicolon, tab, bar and blanks whose rows of
+equal length hold most numbers; the header is the last line of words before them.  What it passes over or
+takes for something is noted; broken rows and cells are left out as long as they are few.
 """
 
 from __future__ import annotations
@@ -290,10 +288,8 @@ def _names_above(lines: Sequence[str], n: int, separator: str) -> tuple[list[str
         return [""] * n, 0
     names = headers[-1]
     if len(headers) == 2:
-        pairs = [
-            (name, unit.strip("[]()") if _is_unit(unit) else "") for name, unit in zip(names, headers[0])
-        ]
-        names = [f"{name} [{unit}]" if unit else name for name, unit in pairs]
+        above = zip(*reversed(headers))
+        names = [f"{name} [{unit.strip('[]()')}]" if _is_unit(unit) else name for name, unit in above]
     used = sum(not line.startswith(_COMMENT) for line in lines[-len(headers) :])
     return [from_csv(name) for name in names], used
 
@@ -586,17 +582,15 @@ def frame_table(
     for place, name in enumerate(map(str, frame.columns)):
         values = frame.iloc[:, place]
         if text is not None and text(name):
-            columns.append(
-                Column(name, text=values.astype(object).where(values.notna(), "").astype(str).tolist())
-            )
+            words = values.astype(object).where(values.notna(), "").astype(str)
+            columns.append(Column(name, text=words.tolist()))
         elif values.dtype.kind == "m":
             columns.append(Column(f"{name}_s", values.dt.total_seconds().to_numpy(dtype=float)))
         elif values.dtype.kind in "fiub":
             columns.append(Column(name, values.to_numpy(dtype=float, na_value=np.nan)))
         else:
-            columns.append(
-                read_column(name, [str(cell) for cell in values], lines, file, tolerated=tolerated)
-            )
+            words = [str(cell) for cell in values]
+            columns.append(read_column(name, words, lines, file, tolerated=tolerated))
     return _table_of(columns, file, lines, ())
 
 

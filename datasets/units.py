@@ -1,14 +1,12 @@
 """Units in column headers.
 
 A header is ``name`` or ``name_unit``; the units are ``_degC _K _degF _percent _V _A _W _s _ms _min
-_0_255``.  A header without one of them is dimensionless.  Kelvin and Fahrenheit become degC here, and only
-here; ms and min become s::
+_0_255``, none is dimensionless.  Kelvin and Fahrenheit become degC here, and only here; ms and min become s::
 
     T[degC] = T[K] - 273.15 = (T[degF] - 32) / 1.8
 
-A suffix like another unit (``_C``, ``_mV``, ``_sec``) is refused by :func:`split_header`, which reads what
-thermogrip writes.  Logs come from anywhere: :func:`read_header` reads units as people write them, in brackets
-or after a comma, and their multiples.
+:func:`split_header`, which reads what thermogrip writes, refuses a suffix like another unit (``_C``,
+``_mV``); :func:`read_header` reads units as people write them, in brackets or after a comma.
 """
 
 from __future__ import annotations
@@ -27,23 +25,20 @@ _SUFFIXES = " ".join(f"_{unit}" for unit in UNITS)
 
 _TIME_UNITS, _TEMPERATURE_UNITS = ("s", "ms", "min"), ("degC", "K", "degF")
 
-# suffix as people write it -> what to write instead ("" where the toolkit has no such unit)
-_FOREIGN = {
-    "C": "_degC", "F": "_degF", "celsius": "_degC", "Celsius": "_degC", "degK": "_K", "kelvin": "_K",
-    "Kelvin": "_K", "fahrenheit": "_degF", "Fahrenheit": "_degF", "deg": "_degC", "pct": "_percent",
-    "perc": "_percent", "%": "_percent", "sec": "_s", "secs": "_s", "seconds": "_s", "second": "_s",
-    "degCelsius": "_degC", "milliseconds": "_ms", "msec": "_ms", "minutes": "_min", "minute": "_min",
-    "mins": "_min", "h": "_s", "hr": "_s", "hours": "_s", "hour": "_s", "us": "_s", "ns": "_s", "days": "_s",
-    "mV": "_V", "kV": "_V", "volt": "_V", "volts": "_V",
-    "mA": "_A", "uA": "_A", "amp": "_A", "amps": "_A", "ampere": "_A", "mW": "_W", "kW": "_W", "watt": "_W",
-    "watts": "_W", "mK": "_K", "Hz": "", "kHz": "", "Pa": "", "kPa": "", "bar": "", "rpm": "", "kg": "",
-    "mm": "", "Ohm": "", "ohm": "", "kOhm": "", "J": "", "kJ": "", "N": "", "lpm": "", "LPM": "",
+# suffix as people write it -> unit, "" where the toolkit has none, and the factor to it
+_SPELT = {
+    "degC": "C celsius Celsius deg degCelsius", "degF": "F fahrenheit Fahrenheit", "K": "degK kelvin Kelvin",
+    "percent": "pct perc %", "s": "sec secs seconds second", "ms": "milliseconds msec",
+    "min": "minutes minute mins", "V": "volt volts", "A": "amp amps ampere", "W": "watt watts",
+    "": "Hz kHz Pa kPa bar rpm kg mm Ohm ohm kOhm J kJ N lpm LPM",
 }  # fmt: skip
-# those of them that are other units, not other spellings
-_TO_CONVERT = {
-    "h": 3600.0, "hr": 3600.0, "hour": 3600.0, "hours": 3600.0, "us": 1e-6, "ns": 1e-9, "days": 86400.0,
-    "mV": 1e-3, "kV": 1e3, "mA": 1e-3, "uA": 1e-6, "mW": 1e-3, "kW": 1e3, "mK": 1e-3,
+_MULTIPLES = {
+    "s": {"h": 3.6e3, "hr": 3.6e3, "hour": 3.6e3, "hours": 3.6e3, "us": 1e-6, "ns": 1e-9, "days": 86.4e3},
+    "V": {"mV": 1e-3, "kV": 1e3}, "A": {"mA": 1e-3, "uA": 1e-6}, "W": {"mW": 1e-3, "kW": 1e3},
+    "K": {"mK": 1e-3},
 }  # fmt: skip
+_FOREIGN = {word: (unit, 1.0) for unit, words in _SPELT.items() for word in words.split()}
+_FOREIGN |= {word: (unit, factor) for unit, those in _MULTIPLES.items() for word, factor in those.items()}
 _ANY_CASE = {word.lower(): word for word in (*_FOREIGN, *UNITS) if len(word) > 2 or word == "ms"}
 _UNIT_AT_END = re.compile(
     r"(?P<name>.*?)\s*(?:[\[({](?P<inside>[^\])}]*)[\])}]"
@@ -71,7 +66,7 @@ def split_header(header: str, *, file: str | None = None) -> tuple[str, str]:
         rename = f"rename the column to {read.name}_{read.unit}"
         hint = rename if read.scale == 1 else f"convert it and {rename}"
         raise UserError("unit is spelt another way", file=file, column=header, hint=hint)
-    if _BRACKETED.search(header) or _FOREIGN.get(header.rpartition("_")[2]) == "":
+    if _BRACKETED.search(header) or _FOREIGN.get(header.rpartition("_")[2]) == ("", 1.0):
         raise UserError("unit is unknown", file=file, column=header, hint=f"use one of {_SUFFIXES}, or none")
     return _checked_unit(header, header, file), "1"
 
@@ -118,8 +113,9 @@ def any_unit(word: str) -> tuple[str, float]:
     word = re.sub(r"[°º˚\s]", "", word).replace("℃", "C").replace("µ", "u").replace("μ", "u")
     word = {"0-255": "0_255", "c": "C", "f": "F", "k": "K"}.get(word, word)
     word = word if word in UNITS or word in _FOREIGN else _ANY_CASE.get(word.lower(), word)
-    unit = word if word in UNITS else _FOREIGN.get(word, "_degC" if degrees and not word else "").lstrip("_")
-    return unit, _TO_CONVERT.get(word, 1.0)
+    if word in UNITS:
+        return word, 1.0
+    return _FOREIGN.get(word, ("degC" if degrees and not word else "", 1.0))
 
 
 def _bare_name(name: str) -> str:

@@ -5,15 +5,12 @@ from __future__ import annotations
 import math
 import os
 import pickle
-import re
 import signal
 import subprocess
 import sys
 import threading
-import time
 import weakref
 from concurrent.futures import ThreadPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
 
 import numpy as np
 import pytest
@@ -82,51 +79,6 @@ def test_no_more_processes_are_started_than_there_are_processors(pools, monkeypa
     monkeypatch.setattr(parallel.os, "cpu_count", lambda: None)
     run_parallel(abs, [-1] * 20, workers=99)
     assert pools == [3, 8]
-
-
-def test_a_fault_stops_what_has_not_begun_and_a_killed_process_is_one_line(pools):
-    done = []
-
-    def work(n):
-        time.sleep(0.01)
-        done.append(n)
-        if n == 1:
-            raise BrokenProcessPool
-        return n
-
-    with pytest.raises(UserError, match=r"killed again and again; lower --workers; memory may be short"):
-        run_parallel(work, [1] * 200, workers=2)
-    assert len(done) < 100
-
-
-class Cluster:
-    def __init__(self, workers, versions):
-        self.workers, self.versions = workers, versions
-
-    def scheduler_info(self):
-        return {"workers": self.workers}
-
-    def run(self, _function):
-        if self.versions is None:
-            raise ModuleNotFoundError
-        return {str(k): parallel._versions() | {"thermogrip": v} for k, v in enumerate(self.versions)}
-
-
-@pytest.mark.parametrize(
-    ("workers", "versions", "words"),
-    [
-        ({}, {}, "the cluster at tcp://a:1 has no workers; run 'dask worker tcp://a:1'"),
-        ({"w": 1}, None, f"a worker of tcp://a:1 has no thermogrip; install thermogrip {__version__} on all"),
-        ({"w": 1}, ["0.3", __version__, "0.2"], f"has thermogrip 0.2, 0.3 for {__version__}; install"),
-        ({"w": 1}, [__version__], ""),
-    ],
-)
-def test_a_cluster_has_workers_of_this_version(workers, versions, words):
-    if not words:
-        parallel._check_cluster(Cluster(workers, versions), "tcp://a:1")
-        return
-    with pytest.raises(UserError, match=re.escape(words)):
-        parallel._check_cluster(Cluster(workers, versions), "tcp://a:1")
 
 
 @pytest.mark.parametrize("workers", [4, "tcp://127.0.0.1:9"])
