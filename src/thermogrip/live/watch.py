@@ -44,7 +44,8 @@ class WatchSettings:
     """How often a session is shown, and how long anything is waited for."""
 
     every_s: float = 0.1  # between two looks at the queue
-    refresh_s: float = 0.5  # of the terminal
+    refresh_s: float = 0.5  # between two pictures on a terminal ...
+    line_s: float = 1.0  # ... and two lines elsewhere
     keep: int = 4096  # snapshots that wait
     switch_s: float = 5e-4  # after which a thread that shows passes Python's lock on (5 ms elsewhere)
     patience_s: float = 10.0  # for the page's process to start
@@ -245,9 +246,9 @@ class Watch:
             if taken:
                 self.now = self._view.now = taken[-1]
                 self._heard = time.monotonic()
-            if over or time.monotonic() - shown > WATCH.refresh_s:
+            if over or time.monotonic() - shown > self._view.every_s:
                 shown = time.monotonic()
-                self._view.show(last=over)
+                self._view.show()
             self._send(taken, over)
             if over:
                 return
@@ -351,28 +352,23 @@ class Watch:
 
 
 class _LineDisplay:
-    """What is no terminal: one line a second at most."""
+    """What is no terminal: a line where something is new."""
+
+    every_s = WATCH.line_s
 
     def __init__(self, title: str) -> None:
         self._title = title
-        self._said_at_s = -float("inf")
         self._last_text = ""
         self.now: Snapshot | None = None
         self._paused = False
         self.progress: tuple[float, str] = 0.0, ""
 
-    def show(self, *, last: bool) -> None:
+    def show(self) -> None:
         fraction, stage = self.progress
         begin = f"{printable(self._title)} {100 * fraction:3.0f} % {printable(stage)}"
         text = begin if self.now is None else f"{begin}; {line(self.now)}"
-        if self._paused:
-            return
-        if (
-            (last or time.monotonic() - self._said_at_s >= 1.0)
-            and text != self._last_text
-            and (stage or self.now)
-        ):
-            self._said_at_s, self._last_text = time.monotonic(), text
+        if not self._paused and text != self._last_text and (stage or self.now):
+            self._last_text = text
             sys.stderr.write(text + "\n")
             sys.stderr.flush()
 
@@ -386,6 +382,8 @@ class _LineDisplay:
 class _Panel:
     """A terminal: a panel that is drawn anew in its place, by the thread that shows."""
 
+    every_s = WATCH.refresh_s
+
     def __init__(self, title: str) -> None:
         from rich.console import Console as RichConsole
 
@@ -395,7 +393,7 @@ class _Panel:
         self._console, self._lock = RichConsole(stderr=True, highlight=False), threading.Lock()
         self._live: Any = None
 
-    def show(self, *, last: bool) -> None:
+    def show(self) -> None:
         with self._lock:
             if self._live is not None:
                 self._live.update(self._drawn(), refresh=True)
