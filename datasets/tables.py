@@ -589,8 +589,8 @@ def frame_table(
         elif values.dtype.kind in "fiub":
             columns.append(Column(name, values.to_numpy(dtype=float, na_value=np.nan)))
         else:
-            words = [str(cell) for cell in values]
-            columns.append(read_column(name, words, lines, file, tolerated=tolerated))
+            cells = [str(cell) for cell in values]
+            columns.append(read_column(name, cells, lines, file, tolerated=tolerated))
     return _table_of(columns, file, lines, ())
 
 
