@@ -33,7 +33,7 @@ from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.errors import UserError, known_names
 from thermogrip.datasets.log_files import Logs, as_logs
 from thermogrip.datasets.media import Shown
-from thermogrip.datasets.parallel import Workers, run_parallel
+from thermogrip.datasets.parallel import Workers, run_parallel, sub_progress
 from thermogrip.datasets.schema import Log, log_name
 from thermogrip.sysid.blackbox.fit import (
     BLACK_BOXES,
@@ -757,7 +757,4 @@ class _Steps:
     def start(self, what: str, of: int = 1) -> Progress | None:
         """Return where a step reports to that counts as so many."""
         begin, self._done = self._done, self._done + of
-        if self._progress is None:
-            return None
-        whole, steps = self._progress, self._steps
-        return lambda done, detail: whole((begin + of * done) / steps, f"{what}: {detail}")
+        return sub_progress(self._progress, begin / self._steps, self._done / self._steps, what)

@@ -97,11 +97,7 @@ class Choice:
     @property
     def error(self) -> float:
         """Geometric mean of the chosen structure's errors over the folds."""
-        return self.error_of(self.structure)
-
-    def error_of(self, structure: Structure) -> float:
-        """Return the geometric mean of a structure's errors over the folds."""
-        return float(np.exp(np.mean(np.log(np.maximum(self.errors[structure], 1e-12)))))
+        return float(np.exp(np.mean(np.log(np.maximum(self.errors[self.structure], 1e-12)))))
 
 
 class Run(NamedTuple):
