@@ -3,15 +3,9 @@
 The columns of a plan and the folder of a batch are described in ``docs/reference/files.md``.  A trial that
 was not good (tripped, did not settle, marked bad, cut off) is kept as it is and done again in ``0002-2``.
 
-A batch that was stopped, by whatever, goes on where it was: :func:`run_batch` with the same plan and folder
-skips every trial that has a good grasp on disk.  The plan is kept in ``batch.json``; another plan in the same
-folder is refused.
-
-After a trip the batch stops, unless its kind is one of ``again``: a cable that was out and is in, a device
-that was reset; or unless somebody who is asked has cleared its cause.  Then the trial is done once more, at
-most ``tries`` times.
-
-The grasps of all good trials are :func:`collect` -ed into one record, labelled for ``classify``.
+A batch that was stopped, by whatever, goes on where it was: every trial that has a good grasp on disk is
+skipped.  After a trip it stops, unless its kind is one of ``AGAIN`` or somebody who is asked has cleared its
+cause; then the trial is done once more, at most ``TRIES`` times.
 """
 
 from __future__ import annotations
@@ -43,6 +37,7 @@ from thermogrip.rig.session.snapshot import Operator
 SCHEMA, VERSION = "thermogrip.batch", 1
 #: Trips after which a trial may simply be done again: what they say is over once the rig answers.
 AGAIN = ("cable", "device", "stale", "frozen")
+TRIES = 3  # of a trial
 
 _LABELS = {name: name for name in (*GRASP_LABELS, "repeat", "touch") if name != "material"} | {
     "rest_s": "rest"
@@ -155,9 +150,6 @@ def run_batch(
     stop: Callable[[Grasps], bool] | None = None,
     guard: Guard | None = None,
     about: Mapping[str, Any] | None = None,
-    files: Mapping[str, Path] | None = None,
-    again: Sequence[str] = AGAIN,
-    tries: int = 3,
     first_touch: Callable[[Grasps], tuple[float, float]] | None = None,
     progress: Callable[[float, str], None] | None = None,
     operator: Operator | None = None,
@@ -168,7 +160,7 @@ def run_batch(
     Parameters
     ----------
     rig : Rig, or a function that opens it
-        A function is called again after a trip whose kind is in ``again``; the rig that it replaces is closed
+        A function is called again after a trip whose kind is in ``AGAIN``; the rig that it replaces is closed
         first, and the last one at the end.
     controller : Controller
     plan : sequence of Trial
@@ -181,7 +173,7 @@ def run_batch(
         Asked after each good grasp that is not marked bad already: why the operator calls it bad, "" to keep
         it.
     cleared : callable, optional
-        Asked after a trip of another kind than those of ``again``, but for a stop that was asked for: whether
+        Asked after a trip of another kind than those of ``AGAIN``, but for a stop that was asked for: whether
         its cause is cleared.  Then the device's latch is cleared and the trial done again.
     through : callable, optional
         Handed each run folder, and returns for that run what records in its place, e.g.
@@ -190,12 +182,8 @@ def run_batch(
         As of :func:`~thermogrip.rig.session.session.run_session`: ends a contact early.
     guard : Guard, optional
         One for the whole batch: what it has learnt lasts from session to session.
-    about, files : mapping, optional
+    about : mapping, optional
         As of :class:`~thermogrip.rig.records.run_folder.RunFolder`.
-    again : sequence of str, optional
-        Kinds of trips after which the trial is done again at once.
-    tries : int, optional
-        So many times at most.
     first_touch : callable, optional
         The temperature of a block from an earlier touch of it, (degC, standard deviation): asked for a
         trial without a temperature whose ``touch_group`` has a good grasp already.
@@ -234,14 +222,14 @@ def run_batch(
                 continue
             if progress is not None:
                 progress(k / len(plan), f"trial {k + 1} of {len(plan)}: {trial.material or 'unknown'}")
-            for attempt in range(tries):
+            for attempt in range(TRIES):
                 stopped = operator is not None and operator.stop_asked
                 if stopped or (ready is not None and not ready(k, trial)):
                     return _batch(path, plan, "stopped", "run the same command again to go on", sessions)
                 run = next_folder(path, k)
                 warmed = _with_temperature(trial, k, plan, path, first_touch)
                 described = {**(about or {}), "trial": k + 1, **asdict(warmed)}
-                with RunFolder(run, described, files=files) as run_folder, through(run_folder) as recorder:
+                with RunFolder(run, described) as run_folder, through(run_folder) as recorder:
                     session_args: dict[str, Any] = {"stop": stop, "guard": guard, "recorder": recorder}
                     session_args |= {"operator": operator, **options}
                     thing = _object(warmed, k)
@@ -252,7 +240,7 @@ def run_batch(
                 if verdict == "done":
                     break
                 trip = session.trip
-                may = trip is None or trip.kind in again
+                may = trip is None or trip.kind in AGAIN
                 if trip is not None and may:
                     source.open_again()
                 elif trip is not None and trip.kind != "operator" and cleared is not None:
@@ -260,7 +248,7 @@ def run_batch(
                     if may:
                         source.open_again()
                         source.clear()
-                if not may or (trip is None and attempt + 1 >= tries):
+                if not may or (trip is None and attempt + 1 >= TRIES):
                     return _batch(path, plan, verdict, advice, sessions)
             else:
                 return _batch(path, plan, verdict, advice, sessions)

@@ -10,9 +10,8 @@ here::
 :class:`Bridge` sends them from a thread of its own: a slow or dead network never delays the loop.  What
 cannot be sent is dropped, oldest first; the run folder is the record, the bridge is a view.
 
-A lost connection is opened again after 0.1 s, then after twice as long each time, up to 5 s.  That it was
-lost, that it is back and how much was dropped between is in the record behind the bridge and on
-``/thermogrip/status``.
+That a connection was lost, that it is back and how much was dropped between is in the record behind the
+bridge and on ``/thermogrip/status``.
 
 Nothing is subscribed to, and nothing that comes in is taken.  Nothing is encrypted: use it on a network of
 your own.

@@ -71,8 +71,7 @@ class RunFolder:
     """Write a session as it happens; a context manager.
 
     The folder is made if absent, refused if it is a symbolic link, or holds one, a run, or a file of a run's
-    names. ``about`` is what is run (JSON-able), ``files`` what it depends on, whose hashes go into
-    ``run.json``.
+    names. ``about`` is what is run (JSON-able); which files were read is in the provenance of ``run.json``.
     """
 
     def __init__(
@@ -80,13 +79,13 @@ class RunFolder:
         path: str | Path,
         about: Mapping[str, Any] | None = None,
         *,
-        files: Mapping[str, Path] | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.path, self.about = Path(path), dict(about or {})
         if self.path.is_symlink():
             raise UserError("is a link", file=self.path, hint="name the folder that it leads to")
-        self._made = made_with(files or {})
+        began = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
+        self._made = {"began": began, "versions": _versions()}
         # a run that cannot begin leaves no file behind
         with ExitStack() as undo, os_faults(self.path):
             make_folder(self.path)
@@ -188,17 +187,13 @@ class RunFolder:
         write_json(self.path / "run.json", content, schema=SCHEMA, version=VERSION)
 
 
-def made_with(files: Mapping[str, Path]) -> dict[str, Any]:
-    """Return when a run began, the versions of what it runs on, and the hashes of its files by their role."""
-    versions = {}
+def _versions() -> dict[str, str]:
+    """Return the versions of what a run runs on."""
+    versions = {"python": platform.python_version()}
     for name in _PACKAGES:
         with suppress(PackageNotFoundError):
             versions[name] = version(name)
-    return {
-        "began": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
-        "versions": {"python": platform.python_version(), **versions},
-        "files": {name: {"path": str(path), "sha256": file_hash(path)} for name, path in files.items()},
-    }
+    return versions
 
 
 def write_sums(folder: Path) -> Path:

@@ -1,7 +1,7 @@
 """The loop of a session: read, guard, ask the controller, apply, record, let time pass.
 
 :class:`Loop` takes one sample and records it; the phases are those of :mod:`~thermogrip.rig.session.session`.
-It keeps no clock of its own: time is the rig's, and the host's is an argument.
+Time is the rig's, and the host's is an argument.
 
 Time passes in *looks* of at most :data:`LOOK_S`, however long a sample is: at each the rig is read, the guard
 checks the reading, the drive is renewed and the session is shown.  The controller's step and the recorded row

@@ -5,7 +5,7 @@ applied during it (what the fit did to its logs), a switch takes the value that 
 two steps the outputs are interpolated towards a provisional step, so the twin can be read at any time.
 
 A reading is  truth + offset + slow noise + white noise, rounded to the quantum;  slow noise is an
-Ornstein-Uhlenbeck process (standard deviation ``slow_noise``, memory ``slow_time``).
+Ornstein-Uhlenbeck process (standard deviation ``slow_noise``, memory ``SLOW_S``).
 
 **Contact.**  Heat conduction is linear, so what an object does to the skin adds to what the skin would have
 done alone: with y(t) the plant's skin, t_c the true time of contact and F the step response of
@@ -17,7 +17,7 @@ done alone: with y(t) the plant's skin, t_c the true time of contact and F the s
 G being what the room does by the far face of the block.  The integral is Duhamel's: the object answers to the
 difference as it is, not as it was at contact.
 
-On release the addition dies out with the time constant ``recovery``; it is the heat that soaks into the
+On release the addition dies out with the time constant ``RECOVERY_S``; it is the heat that soaks into the
 finger and the water, which the plant's states do not know.
 """
 
@@ -36,6 +36,9 @@ from thermogrip.sysid.contact.simulation import ContactModel, Touch
 from thermogrip.sysid.effusivity.gripper_model import load_default_gripper
 from thermogrip.sysid.plant.plant import Plant
 
+SLOW_S = 4.0  # memory of the slow sensor noise
+RECOVERY_S = 20.0  # time constant with which a grasp is forgotten after release
+
 
 @dataclass
 class _Contact:
@@ -50,10 +53,10 @@ class _Contact:
     times: list[float] = field(default_factory=list)
     alone: list[float] = field(default_factory=list)
 
-    def addition(self, time: float, alone: float, recovery: float) -> float:
+    def addition(self, time: float, alone: float) -> float:
         """Return what the object adds to the skin's reading [K], which alone would be at ``alone``."""
         if time > self.opened:
-            return self.left * float(np.exp((self.opened - time) / recovery))
+            return self.left * float(np.exp((self.opened - time) / RECOVERY_S))
         since_closed = np.array([time - self.closed])
         share, room = float(self.touch.response(since_closed)[0]), float(self.touch.by_room(since_closed)[0])
         return (self.touch.t_object - self.skin) * share + room - self._undone(time, alone)
@@ -92,8 +95,8 @@ class Twin:
         Temperature of everything at the start [degC]; default ambient.
     noise : float, optional
         White sensor noise, standard deviation [K].
-    slow_noise, slow_time : float, optional
-        Standard deviation [K] and memory [s] of the slow sensor noise.
+    slow_noise : float, optional
+        Standard deviation of the slow sensor noise [K].
     quantum : float, optional
         Step of the sensors [K]; 0 for none.
     offsets : dict of str to float, optional
@@ -102,8 +105,6 @@ class Twin:
         Range of an input; default -1 to 1, or what the plant's unit says (percent 0 to 100, 0_255 0 to 255).
     skin : str, optional
         The output that touches.
-    recovery : float, optional
-        Time constant with which a grasp is forgotten after release [s].
     pace : callable, optional
         Called with the seconds of each wait once they are simulated; the ``wait`` of a
         :class:`~thermogrip.rig.clock.Metronome` lets somebody watch.
@@ -134,21 +135,17 @@ class Twin:
         t_start: float | None = None,
         noise: float = 0.04,
         slow_noise: float = 0.018,
-        slow_time: float = 4.0,
         quantum: float = 1 / 16,
         offsets: Mapping[str, float] | None = None,
         limits: Mapping[str, tuple[float, float]] | None = None,
         skin: str = "t_surface",
-        recovery: float = 20.0,
         pace: Callable[[float], None] | None = None,
     ) -> None:
         self.plant = plant
         self.ambient = ambient
         self.skin = skin
-        self.recovery = recovery
         self.noise = noise
         self.slow_noise = slow_noise
-        self.slow_time = slow_time
         self.quantum = quantum
         self._pace = pace
         self.offsets = dict(plant.offsets if offsets is None else offsets)
@@ -243,7 +240,7 @@ class Twin:
     def rehearse(self, material: str, t_object: float) -> None:
         """Load and compile what :meth:`grasp` needs, so that a host on a cable does not wait for it."""
         touch = self._draw(material, t_object, np.random.default_rng(0))
-        _Contact(touch, self.time, self.ambient).addition(self.time + 1.0, self.ambient, self.recovery)
+        _Contact(touch, self.time, self.ambient).addition(self.time + 1.0, self.ambient)
 
     def _draw(self, material: str, t_object: float, rng: np.random.Generator) -> Touch:
         if self._contact_model is None:
@@ -333,11 +330,11 @@ class Twin:
 
     def _added(self, alone: float) -> float:
         """Return what an object adds now to a skin that alone would be at ``alone`` [K]."""
-        return 0.0 if self._contact is None else self._contact.addition(self.time, alone, self.recovery)
+        return 0.0 if self._contact is None else self._contact.addition(self.time, alone)
 
     def _sensor(self, name: str, true: float) -> float:
         if name == self.plant.outputs[0]:  # the slow noise of all sensors moves on once a sample
-            keep = float(np.exp(-(self.time - self._slow_at) / self.slow_time))
+            keep = float(np.exp(-(self.time - self._slow_at) / SLOW_S))
             for sensor in self._slow:
                 fresh = self.slow_noise * np.sqrt(1 - keep**2) * self._noise_rng.standard_normal()
                 self._slow[sensor] = keep * self._slow[sensor] + fresh

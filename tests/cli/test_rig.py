@@ -193,8 +193,6 @@ def test_words_reach_the_session_on_a_twin(ran: SimpleNamespace, stand_in: Stand
         {"controller": "c.json", "target_degC": 40.0, "twin": "plant.json", "draw": 2, "from_degC": 28.0,
          "hold_s": 30.0, "object_degC": 18.0, "material": "copper", "seed": 5},
     )  # fmt: skip
-    files = {"controller": "c.json", "plant": "plant.json", "guard": "g.toml"}
-    assert folder.files == {name: Path(file) for name, file in files.items()}
     assert (ran.beyond[0].args[1], ran.beyond[0].grasps) == (40.0, True)
     assert "warning: 40 degC is beyond the logs" in done.err
     assert shares(done.err, "run") == [50]
@@ -282,10 +280,6 @@ def test_a_batch_keeps_on_what_it_ran_and_fails_while_a_trial_is_left(
     assert [getattr(call, name) is not None for name in ("ready", "judge", "clock")] == [asks, asks, on_rig]
     assert (type(call.args[1]), len(call.args[2]), call.args[3]) == (Controller, 2, Path("out"))
     assert guards[0].args == (Path("g.toml"), call.args[1].plant)
-    files = {"controller": "c.json", "plan": "plan.csv", "guard": "g.toml"} | (
-        {} if on_rig else {"plant": "plant.json"}
-    )
-    assert call.files == {name: Path(file) for name, file in files.items()}
     [rig] = opened
     on_port = RigOptions(port="socket://rig", protocol="tclab", speed=3.0)
     assert rig.args[0] == (on_port if on_rig else RigOptions(twin=Path("plant.json"), draw=3))

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator
+from hashlib import sha256
 from pathlib import Path
 
 import numpy as np
@@ -114,4 +115,6 @@ def test_run_drives_the_rig_on_a_port_and_leaves_it_off(
     assert answer["verdict"] == "not settled", answer
     assert max(moment.drive["q1"] for moment in device.trace) > 0.0
     assert device.applied_drive == {"q1": 0.0, "q2": 0.0}
-    assert json.loads((tmp_path / "run" / "run.json").read_text())["about"]["port"] == device.port
+    made = json.loads((tmp_path / "run" / "run.json").read_text())
+    assert made["about"]["port"] == device.port
+    assert made["provenance"]["inputs"][str(controller)] == sha256(controller.read_bytes()).hexdigest()

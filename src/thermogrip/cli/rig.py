@@ -252,14 +252,13 @@ def run(
     about = {"controller": controller.name, "target_degC": wanted, **rig.about()}
     about |= {} if profile is None else {"profile": profile.name}
     about |= {"from_degC": rig.start, "hold_s": hold, "object_degC": obj, "material": material, "seed": seed}
-    files = files_of(controller=controller, plant=rig.twin, guard=guard, profile=profile, relays=rig.relays)
     clock = rig.clock(pace)
     opened = rig.open(clock, loaded, pace=pace, seed=seed)
     try:
         furthest = wanted if path is None else path.highest()
         for line in beyond_logs(loaded, furthest, grasps=grasp is not None):
             console.warn(line)
-        with _recorded(out, about, files, bridge, watch) as (folder, recorder):
+        with _recorded(out, about, bridge, watch) as (folder, recorder):
             session = run_session(
                 opened,
                 regulator,
@@ -350,7 +349,6 @@ def batch(
             guard=checks,
             first_touch=_first_touch,
             about=rig.about() | ({} if rig.twin is None else {"seed": seed}),
-            files=files_of(controller=controller, plan=plan, plant=rig.twin, guard=guard, relays=rig.relays),
             output=loaded.controlled[0],
             clock=None if rig.port is None else clock,
             **watch.hooks,
@@ -401,7 +399,7 @@ def record(
         except UserError as error:
             raise UserError(error.problem, file=schedule, hint=error.hint) from error
         about = {"schedule": schedule, "port": port, "sample_s": dt, "seed": seed}
-        with _recorded(out, about, files_of(guard=guard), bridge, watch) as (folder, recorder):
+        with _recorded(out, about, bridge, watch) as (folder, recorder):
             log, ended = play(
                 rig,
                 plan,
@@ -525,11 +523,6 @@ def virtual(
     return 0
 
 
-def files_of(**named: Path | None) -> dict[str, Path]:
-    """Return the files that a run is made from, those that are named."""
-    return {name: path for name, path in named.items() if path is not None}
-
-
 def guard_of(
     path: Path | None, plant: Plant | None, *, speed: float = 1.0, limit: float | None = None
 ) -> Guard:
@@ -581,7 +574,7 @@ def _for_outputs(target: float | dict[str, float], controlled: tuple[str, ...]) 
 
 @contextmanager
 def _recorded(
-    out: Path, about: dict[str, Any], files: dict[str, Path], bridge: str | None, watch: Watch
+    out: Path, about: dict[str, Any], bridge: str | None, watch: Watch
 ) -> Iterator[tuple[RunFolder, Recorder]]:
     """Yield the run folder of a session that is watched, and what records into it."""
     from thermogrip.rig.records.run_folder import RunFolder
@@ -589,7 +582,7 @@ def _recorded(
     with (
         _bridge(bridge) as through,
         watch,
-        RunFolder(out, about, files=files) as folder,
+        RunFolder(out, about) as folder,
         through(folder) as recorder,
     ):
         yield folder, recorder

@@ -225,20 +225,18 @@ BOTH = [Trial("copper", 32.0, 18.0, 0.4, {"block": "c1"}), Trial("", 30.0)]
 
 
 @pytest.mark.parametrize(
-    ("outcomes", "options", "verdict", "sessions", "left", "opened"),
-    [("settled settled", {}, "done", 2, 0, 1), ("cable device settled settled", {}, "done", 4, 0, 3),
-     ("cable stale frozen", {}, "tripped", 3, 2, 4), ("lost", {}, "tripped", 1, 2, 1),
-     ("settled jump", {}, "tripped", 2, 1, 1),
-     ("lost settled settled", {"again": ("lost",)}, "done", 3, 0, 2),
-     ("cable", {"again": ()}, "tripped", 1, 2, 1), ("cable", {"tries": 1}, "tripped", 1, 2, 2)],
+    ("outcomes", "verdict", "sessions", "left", "opened"),
+    [("settled settled", "done", 2, 0, 1), ("cable device settled settled", "done", 4, 0, 3),
+     ("cable stale frozen", "tripped", 3, 2, 4), ("lost", "tripped", 1, 2, 1),
+     ("settled jump", "tripped", 2, 1, 1)],
 )  # fmt: skip
 def test_a_trial_is_done_again_after_what_is_over_at_most_three_times(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, outcomes: str, options: dict[str, Any],
-    verdict: str, sessions: int, left: int, opened: int,
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, outcomes: str, verdict: str, sessions: int, left: int,
+    opened: int,
 ) -> None:  # fmt: skip
     words = outcomes.split()
     source = scripted(monkeypatch, list(words))
-    found = run_batch(source, None, BOTH, tmp_path, **options)
+    found = run_batch(source, None, BOTH, tmp_path)
     assert (found.verdict, found.sessions, found.left) == (verdict, sessions, left)
     assert found.advice == ("" if verdict == "done" else f"after {words[-1]}")
     assert (source.opened, source.closed) == (opened, opened)
@@ -363,7 +361,7 @@ def test_what_is_collected_are_the_good_grasps_on_one_grid(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     scripted(monkeypatch, ["lost"])
-    run_batch(Source(), None, [*BOTH, *BOTH], tmp_path, again=())
+    run_batch(Source(), None, [*BOTH, *BOTH], tmp_path)
     with pytest.raises(UserError, match="no good grasp yet"):
         collect(tmp_path)
     made = [small_grasp(), small_grasp(-0.1, 6, block="b", touch=2.0), small_grasp(), small_grasp()]

@@ -295,17 +295,6 @@ def test_power_goes_off_or_the_rig_is_let_go(
     assert (said or "") in run.events[-1].text
 
 
-def test_progress_is_at_most_whole() -> None:
-    seen = []
-    run = Loop(rig_of(), Asked(), None, lambda *given: seen.append(given), Guard())
-    run.report(0.4, "a")
-    run.report(1.4, "b")
-    assert seen == [(0.4, "a"), (1.0, "b")]
-    assert run.now() == 10.0
-    run.clock = lambda: 77.0
-    assert run.now() == 77.0
-
-
 def test_a_log_has_a_role_for_each_column_and_none_for_what_was_never_read() -> None:
     rows = [
         {"time_s": k, "q_percent": 1.0, "t_tank_degC": 25.0, "t_room_degC": room, "t_gone_degC": nan,

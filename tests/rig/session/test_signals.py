@@ -138,7 +138,7 @@ def test_wherever_a_second_ctrl_c_comes_the_run_is_closed_as_with_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     came: list[int] = []
-    monkeypatch.setattr(recorder, "made_with", lambda files: {})  # this and the disk take the time here
+    monkeypatch.setattr(recorder, "_versions", dict)  # this and the disk take the time here
     monkeypatch.setattr(os, "fsync", lambda file: None)
 
     def interrupted(path: Path, n: int) -> None:
