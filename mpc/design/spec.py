@@ -139,7 +139,8 @@ class Spec(BaseModel):
             times.popitem()
         else:
             return cls()
-        below, above = _rounded(low + 0.3 * (high - low), low + 0.7 * (high - low))
+        digits = 1 - math.floor(math.log10(0.4 * (high - low)))  # those of a hundredth of the step
+        below, above = (round(low + share * (high - low), digits) for share in (0.3, 0.7))
         wanted: dict[str, Any] = {"steps": [(below, above), (above, below)]}
         if {*times} != {*usual}:
             wanted["output"] = list(times)
@@ -243,12 +244,6 @@ def _own_times(plant: Plant) -> dict[str, float]:
         if name and answers[name].gain:
             times[name] = answers[name].delay + answers[name].lag
     return times
-
-
-def _rounded(low: float, high: float) -> tuple[float, float]:
-    """Return both to the digits that a hundredth of their difference has."""
-    digits = 1 - math.floor(math.log10(high - low))
-    return round(low, digits), round(high, digits)
 
 
 def _check_sample(spec: Spec, plant: Plant) -> None:

@@ -9,7 +9,7 @@ sign, are seen there.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TypeAlias
 
@@ -69,12 +69,6 @@ def _graded(
         if holds:
             return Check(name, verdict, finding, fix)
     return Check(name, "pass", finding)
-
-
-def worst(checks: Sequence[Check]) -> str:
-    """Return the worst verdict of a review."""
-    rank: Callable[[str], int] = _RANK.__getitem__
-    return max((check.verdict for check in checks), key=rank, default="pass")
 
 
 def review(

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from thermogrip.mpc.design.design import Design
     from thermogrip.mpc.design.spec import Spec
     from thermogrip.mpc.interface import Move
-    from thermogrip.mpc.tuning.tune import Row, Tuning
+    from thermogrip.mpc.tuning.tune import Tuning
     from thermogrip.rig.session.session import Session
 
 _STEPS_CAPTION = (
@@ -43,7 +43,7 @@ def tuning_table(tuning: Tuning) -> Cells:
     """Return the comparison of baseline, tuned and PI, step by step and load by load."""
     columns: Columns = (
         ("controller", lambda row: row.controller),
-        ("step [degC] or load", _case),
+        ("step [degC] or load", lambda row: row.load or f"{row.start:g} to {row.target:g}"),
         ("settles in [s], mean", lambda row: _seconds_cell(row.settle_mean_s)),
         ("worst", lambda row: _seconds_cell(row.settle_worst_s)),
         ("overshoot [K], mean", lambda row: _rounded_cell(row.overshoot_mean)),
@@ -59,17 +59,12 @@ def tuning_table(tuning: Tuning) -> Cells:
     return cells(columns, ordered)
 
 
-def _case(row: Row) -> str:
-    """Return what a row is of, in words."""
-    return row.load or f"{row.start:g} to {row.target:g}"
-
-
 def tuning_caption(tuning: Tuning) -> str:
     """Return what the comparison ran on."""
-    count = tuning.spec.check_draws
-    several = f"{count} draw{'' if count == 1 else 's'} of the plant"
-    draws = several if _uncertain(tuning) else "the plant"
-    return f"Closed loops on {draws}"
+    plant, count = tuning.controller.plant, tuning.spec.check_draws
+    if plant.samples is None and plant.covariance is None:
+        return "Closed loops on the plant, which has no uncertainty, under noise that the search did not have"
+    return f"Closed loops on {count} draw{'' if count == 1 else 's'} of the plant that the search did not see"
 
 
 def tuning_sections(tuning: Tuning) -> list[Section]:
@@ -104,10 +99,10 @@ def tuning_section(tuning: Tuning) -> Section:
         Table(*tuning_table(tuning), tuning_caption(tuning)),
         Text(f"{tuning.verdict.capitalize()}. {tuning.finding}"),
         Text(
-            f"Band {tuning.spec.band_degC:g} degC. "
-            f"{_unseen_words(tuning)}; "
-            f"noise, quantum and a sensor offset of {tuning.spec.sensor_offset_degC:g} degC are unknown to "
-            f"the controllers. {_before_the_last_column(tuning.spec)}"
+            f"Band {tuning.spec.band_degC:g} degC. Noise, quantum and a sensor offset of "
+            f"{tuning.spec.sensor_offset_degC:g} degC are unknown to the controllers. Before the minimum "
+            "time no drive inside its limits brings the output into the band, or the ramp has not brought "
+            "the target there; a PI takes the target at once."
         ),
         Text(
             f"Scores on these draws, lower is better: {scores}. At most {tuning.spec.evaluations} designs of "
@@ -212,30 +207,6 @@ def _contact_section(grasps: Grasps, contact: float) -> Section:
     caption = "The grasp as recorded; dotted: the message."
     evidence = (Plot(grasps_chart({"": [grasps]}), caption),)
     return Section("What did the skin feel?", evidence, felt, "good" if np.isfinite(contact) else "warn")
-
-
-def _uncertain(tuning: Tuning) -> bool:
-    plant = tuning.controller.plant
-    return plant.samples is not None or plant.covariance is not None
-
-
-def _before_the_last_column(spec: Spec) -> str:
-    """Return what the minimum time means."""
-    if spec.ramp_per_s:
-        return (
-            "Before the last column no drive inside its limits brings the output into the band, or the ramp "
-            "has not brought the target there; a PI takes the target at once."
-        )
-    return (
-        "Before the last column no drive inside its limits brings the output into the band, whatever the "
-        "controller."
-    )
-
-
-def _unseen_words(tuning: Tuning) -> str:
-    if _uncertain(tuning):
-        return "The draws of this table were not used in the search"
-    return "The plant has no uncertainty, so the table is of the plant itself, under noise of its own"
 
 
 def _seconds_cell(value: float | None) -> Any:

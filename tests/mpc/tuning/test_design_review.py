@@ -14,7 +14,7 @@ from thermogrip.mpc.controllers.pi import PIController
 from thermogrip.mpc.design.design import default_design
 from thermogrip.mpc.design.spec import Spec
 from thermogrip.mpc.tuning import design_review as checks
-from thermogrip.mpc.tuning.design_review import review, worst
+from thermogrip.mpc.tuning.design_review import review
 from thermogrip.mpc.tuning.objective import StepResult, apparent_delays
 from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.plant import Plant
@@ -29,7 +29,6 @@ def sound(tank):
 
 def test_a_sound_design_passes_every_check(sound):
     assert {check.verdict for check in sound} == {"pass"}
-    assert worst(sound) == "pass"
     assert len(sound) == 6
 
 
@@ -106,10 +105,7 @@ def stub(**design) -> Any:
     )
 
 
-def test_the_worst_of_a_review_is_by_rank_and_steps_are_the_specs_or_the_ends_of_the_logs():
-    found = [checks.Check("a", verdict, "1") for verdict in ("warn", "fail", "pass")]
-    assert [worst(found[k:]) for k in (0, 2, 3)] == ["fail", "pass", "pass"]
-    assert worst([found[0], found[2]]) == "warn"
+def test_steps_are_the_specs_or_the_ends_of_the_logs():
     controller = stub()
     controller.controlled, controller.notes = ("t",), {"spec": {"steps": [[20, 30], [35.5, 10]]}}
     assert checks.spec_of(controller, None)[0].steps == [(20.0, 30.0), (35.5, 10.0)]
