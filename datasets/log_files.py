@@ -157,7 +157,7 @@ def read_log(
     for header, name in read.names_of.items():
         if (words := table.attrs.get(header, {}).get("flag_meanings")) and name in log:
             log[name].attrs["flag_meanings"] = words
-    return _cut(log, start, stop, file) if (start, stop) != (-np.inf, np.inf) else log
+    return _cut(log, start, stop) if (start, stop) != (-np.inf, np.inf) else log
 
 
 def _made(
@@ -405,9 +405,13 @@ def _repair(
                 roles[name] = "other"
         columns[name], findings = _repair_column(name, values, time, units[name], roles[name], table.file)
         repairs += findings
-    known = _drop_unknown_start(time, columns, roles, table.file)
-    time, columns = known.time, known.columns
-    repairs += known.repairs
+    inputs = [values for name, values in columns.items() if roles[name] == "input"]
+    if unknown := max((int(np.isfinite(values).argmax()) for values in inputs), default=0):  # nothing to hold
+        if time.size - unknown < 2:
+            problem = "an input is unknown until the last row"
+            raise UserError(problem, file=table.file, hint="give its value from the start")
+        repairs.append(f"{unknown} row(s) before the first value of an input dropped")
+        time, columns = time[unknown:], {name: values[unknown:] for name, values in columns.items()}
     finite_outputs = [np.isfinite(v) for n, v in columns.items() if roles[n] == "output"]
     read = np.any(finite_outputs or [np.ones(time.size, dtype=bool)], axis=0)
     if stuck and not (read[0] and read[-1]):  # a held-out part without any reading has no error
@@ -460,21 +464,7 @@ def _repair_column(
     return values, repairs + spikes + (repair.check_plausible(name, values, file) if unit == "degC" else [])
 
 
-def _drop_unknown_start(
-    time: Floats, columns: dict[str, Floats], roles: dict[str, str], file: str
-) -> _Repaired:
-    """Drop the rows before every input has its first value: there is nothing to hold."""
-    first = max((int(np.isfinite(v).argmax()) for n, v in columns.items() if roles[n] == "input"), default=0)
-    if first == 0:
-        return _Repaired(time, columns, [])
-    if time.size - first < 2:
-        problem = "an input is unknown until the last row"
-        raise UserError(problem, file=file, hint="give its value from the start")
-    columns = {name: values[first:] for name, values in columns.items()}
-    return _Repaired(time[first:], columns, [f"{first} row(s) before the first value of an input dropped"])
-
-
-def _cut(log: Log, start: float, stop: float, file: Path) -> Log:
+def _cut(log: Log, start: float, stop: float) -> Log:
     from thermogrip.datasets.resample import cut  # it loads xarray
 
     log_part = cut(log, start, stop)

@@ -108,10 +108,8 @@ def _in_memory(variable: Any) -> int:
 def write_netcdf(data: xr.Dataset, path: str | Path) -> Path:
     """Write a record as NetCDF-4 in one step, and return the path."""
     packed = {"zlib": True, "complevel": 4, "fletcher32": True, "_FillValue": np.nan}
-    numbers = [
-        name for name, variable in data.data_vars.items() if variable.dtype.kind == "f" and variable.ndim
-    ]
-    encoding: dict[Any, Any] = dict.fromkeys(numbers, packed)
+    floats = [name for name, values in data.data_vars.items() if values.dtype.kind == "f" and values.ndim]
+    encoding: dict[Any, Any] = dict.fromkeys(floats, packed)
     encoding |= {name: {"_FillValue": None} for name in data.coords}
     with atomic_path(path) as temporary:
         data.to_netcdf(temporary, engine="h5netcdf", encoding=encoding)

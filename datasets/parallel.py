@@ -251,12 +251,9 @@ def _check_cluster(client: Any, address: str) -> None:
     hint = f"install thermogrip {__version__} on all of them"
     with as_user_error(ModuleNotFoundError, f"a worker of {address} has no thermogrip", hint=hint):
         theirs = client.run(_versions).values()
-    differ = {name: {versions[name] for versions in theirs} - {ours[name]} for name in ours}
-    if any(differ.values()):
-        words = (
-            f"{name} {', '.join(sorted(those))} for {ours[name]}" for name, those in differ.items() if those
-        )
-        problem = f"a worker of {address} has {'; '.join(words)}"
+    others = {name: sorted({versions[name] for versions in theirs} - {own}) for name, own in ours.items()}
+    if differ := [f"{name} {', '.join(those)} for {ours[name]}" for name, those in others.items() if those]:
+        problem = f"a worker of {address} has {'; '.join(differ)}"
         raise UserError(problem, hint="install the same versions on all of them")
 
 

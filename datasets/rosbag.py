@@ -26,6 +26,7 @@ from functools import partial
 from importlib.util import find_spec
 from operator import itemgetter
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -414,23 +415,13 @@ def _mcap_records(data: bytes, file: Path) -> Iterator[Any]:
 
 def _mcap_contents(data: bytes, file: Path) -> Iterator[tuple[Any, Any, Any]]:
     """Yield (schema or None, channel, message) in the order of the file."""
-    from mcap.exceptions import McapError
-    from mcap.records import Channel, Message, Schema
+    from mcap.reader import NonSeekingReader
 
-    schemas: dict[int, Any] = {}
-    channels: dict[int, Any] = {}
-    for record in _mcap_records(data, file):
-        if isinstance(record, Schema):
-            schemas[record.id] = record
-        elif isinstance(record, Channel):
-            if record.schema_id and record.schema_id not in schemas:
-                raise McapError(f"no schema record found with id {record.schema_id}")
-            channels[record.id] = record
-        elif isinstance(record, Message):
-            if record.channel_id not in channels:
-                raise McapError(f"no channel record found with id {record.channel_id}")
-            channel = channels[record.channel_id]
-            yield schemas.get(channel.schema_id), channel, record
+    reader: Any = NonSeekingReader(io.BytesIO())
+    reader._stream_reader = SimpleNamespace(
+        records=_mcap_records(data, file)
+    )  # its own unpacks without limits
+    yield from reader.iter_messages(log_time_order=False)
 
 
 def _mcap_messages(file: Path, notes: list[str]) -> Iterator[Message]:

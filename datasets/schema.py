@@ -98,41 +98,35 @@ def make_log(
 
 def check_log(log: Log) -> None:
     """Raise :class:`UserError` naming the variable of a log and the rule it breaks."""
+    for column, problem, hint in _log_faults(log):
+        raise UserError(problem, file=log_name(log), column=column, hint=hint)
+
+
+def _log_faults(log: Log) -> Iterator[tuple[str | None, str, str | None]]:
+    """Yield (variable, problem, hint) of a log; each check needs those before it."""
     if "time" not in log.coords or log["time"].dims != ("time",):
-        hint = "give the record a dimension 'time' in seconds"
-        raise UserError("no time axis", file=log_name(log), hint=hint)
-    for problem, hint in _time_faults(log["time"].values):
-        raise UserError(problem, file=log_name(log), hint=hint)
-    for name, variable in log.data_vars.items():
-        for problem, advice in _variable_faults(variable):
-            raise UserError(problem, file=log_name(log), column=str(name), hint=advice)
-
-
-def _time_faults(time: NDArray[np.float64]) -> Iterator[tuple[str, str]]:
-    """Yield (problem, hint) of a log's time axis; each check needs those before it."""
+        yield None, "no time axis", "give the record a dimension 'time' in seconds"
+    time = log["time"].values
     if time.size < 2:
-        yield f"{time.size} row(s) are not a log", "give at least two rows"
+        yield None, f"{time.size} row(s) are not a log", "give at least two rows"
     if not np.all(np.isfinite(time)):
-        yield "time is not finite everywhere", "remove the rows without a time"
+        yield None, "time is not finite everywhere", "remove the rows without a time"
     if np.any(np.diff(time) <= 0):
         row = int(np.argmax(np.diff(time) <= 0))
-        yield f"time does not increase after {time[row]:g} s", "sort the rows by time"
-
-
-def _variable_faults(variable: xr.DataArray) -> Iterator[tuple[str, str | None]]:
-    """Yield (problem, hint) of a log's variable; each check needs those before it."""
-    if variable.dims != ("time",):
-        yield f"dims are {variable.dims}, not ('time',)", None
-    if "units" not in variable.attrs:
-        yield "no unit", "set attrs['units'], '1' if dimensionless"
-    role = variable.attrs.get("role")
-    if role not in ROLES:
-        yield f"role {role!r} is unknown", f"use one of {ROLES}"
-    finite = np.isfinite(variable.values)
-    if not finite.any():
-        yield "has no finite value", "leave the column out"
-    if role in ("input", "disturbance") and not finite.all():
-        yield f"{role} is unknown in {int((~finite).sum())} row(s)", "fill or cut them"
+        yield None, f"time does not increase after {time[row]:g} s", "sort the rows by time"
+    for name, variable in ((str(key), variable) for key, variable in log.data_vars.items()):
+        if variable.dims != ("time",):
+            yield name, f"dims are {variable.dims}, not ('time',)", None
+        if "units" not in variable.attrs:
+            yield name, "no unit", "set attrs['units'], '1' if dimensionless"
+        role = variable.attrs.get("role")
+        if role not in ROLES:
+            yield name, f"role {role!r} is unknown", f"use one of {ROLES}"
+        finite = np.isfinite(variable.values)
+        if not finite.any():
+            yield name, "has no finite value", "leave the column out"
+        if role in ("input", "disturbance") and not finite.all():
+            yield name, f"{role} is unknown in {int((~finite).sum())} row(s)", "fill or cut them"
 
 
 def names(log: Log, role: str) -> tuple[str, ...]:
