@@ -149,7 +149,7 @@ def check_export(
             shutil.copyfile(export.folder / name, build.folder / name)
         _make(build.folder, "all", *(("sanitized",) if sanitize else ()))
         (ram, constants), answers = _answers_in_c(build, played, sanitize)
-        flash, stack = _footprint(build.folder)
+        flash, stack = footprint(build.folder)
     pairs = list(zip(played, answers, strict=True))
     return Agreement(
         states=states,
@@ -275,7 +275,7 @@ def _make(folder: Path, *targets: str) -> None:
         raise UserError(f"the export does not build: {problem}", hint="report it: it must")
 
 
-def _footprint(folder: Path) -> tuple[int, int]:
+def footprint(folder: Path) -> tuple[int, int]:
     """Return the flash of the library's objects, and the largest frame on the stack [bytes]."""
     objects = sorted(str(path) for path in folder.glob("tg_*.o"))
     sizes = subprocess.run(["size", *objects], capture_output=True, text=True, check=False).stdout

@@ -18,7 +18,7 @@ from thermogrip.datasets.atomic_files import write_atomic
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.media import markdown
 from thermogrip.datasets.parallel import Progress
-from thermogrip.mpc.controllers.export import Agreement, Export
+from thermogrip.mpc.controllers.export import Agreement, Export, footprint
 from thermogrip.mpc.controllers.pi import PIController
 from thermogrip.mpc.estimator.call_times import SAME
 from thermogrip.mpc.interface import STATUSES
@@ -105,15 +105,10 @@ def check_pi(
     if gcc is None:
         raise UserError("no gcc here to build the export with", hint="install gcc, or leave --check out")
     with tempfile.TemporaryDirectory() as place:
-        library = Path(place) / "pi.so"
-        source = str(export.folder / "tg_pi.c")
+        library, source = Path(place) / "pi.so", str(export.folder / "tg_pi.c")
         _run_gcc([gcc, *_WARN, "-shared", "-fPIC", source, "-o", str(library), "-lm"])
         _run_gcc([gcc, *_WARN, "-fstack-usage", "-c", source, "-o", str(Path(place) / "tg_pi.o")])
-        stack = max(int(line.split()[1]) for line in (Path(place) / "tg_pi.su").read_text().splitlines())
-        sizes = subprocess.run(
-            ["size", str(Path(place) / "tg_pi.o")], capture_output=True, text=True, check=False
-        ).stdout.splitlines()
-        flash = sum(int(word) for word in sizes[1].split()[:2]) if len(sizes) > 1 else 0
+        flash, stack = footprint(Path(place))
         loops = ctypes.CDLL(str(library))
         compared = _differences_from_c(loops, controller, states, seed, progress)
     difference, free, same = compared.T

@@ -12,8 +12,7 @@ at most four, entry i of block c at [4 i + c], and ``tangent`` over n groups of 
 direction c at [c / 4][i][c % 4]: a compiler takes four at once.
 
 A dense Jacobian of an implicit step takes ten times the work of the step for every sample; a dozen tangents
-that share their partial derivatives take two or three.  Rows of many constants, as of a black box of 20
-states, are tables that loops run over: unrolled, a step of 60 states is half a megabyte.
+that share their partial derivatives take two or three.
 
 A quotient by something known earlier becomes a product with its reciprocal.  The code needs ``math.h`` and
 nothing else.
@@ -26,10 +25,6 @@ import re
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
-
-import numpy as np
-
-from thermogrip.datasets.arrays import Array
 
 if TYPE_CHECKING:
     from thermogrip.sysid.models.model import Model
@@ -93,7 +88,6 @@ _FUNCTION_HEADS = {
         "tangent_d": f"{_COLUMNS}, {_SU}, {_SD}, double *restrict out",
     }.items()
 }
-_LONG, _MANY = 8, 250  # constants in a row, and in all of them, from which on they are a table
 
 
 @dataclass
@@ -114,59 +108,6 @@ class _Line:
     outputs: list[dict[int, int]] = field(default_factory=list)  # by output: entry -> value
     n_u: int = 0
     n_d: int = 0
-
-
-@dataclass(frozen=True)
-class _LinearRows:
-    """Rows of a step that are constants times state, drives and disturbances, and a constant."""
-
-    rows: list[int]
-    slopes: dict[str, Array]  # of "x", "u" and "d"
-    added: Array
-
-    def define(self) -> list[str]:
-        """Return the arrays in C."""
-        if not self.rows:
-            return []
-        arrays = {"slope_" + of: values.ravel() for of, values in self.slopes.items() if values.size}
-        lines = [_array("double", name, values) for name, values in (arrays | {"added": self.added}).items()]
-        return [_array("int", "table", np.array(self.rows)), *lines]
-
-    def step(self) -> list[str]:
-        """Return the statements of the state one step later."""
-        lines = ["double sum = added[i];"]
-        for of, values in self.slopes.items():
-            if n := values.shape[1]:
-                lines += [f"for (int j = 0; j < {n}; j++)", f"    sum += slope_{of}[{n} * i + j] * {of}[j];"]
-        return self._loop([*lines, "xn[table[i]] = sum;"])
-
-    def tangent(self, along: str) -> list[str]:
-        """Return the statements of a group's four tangents, along directions of x, u, d or some of them."""
-        lines = ["double sum[4] = {0.0};"]
-        for of in along:
-            if n := self.slopes[of].shape[1]:
-                lines += [
-                    f"for (int j = 0; j < {n}; j++)",
-                    "    for (int c = 0; c < 4; c++)",
-                    f"        sum[c] += slope_{of}[{n} * i + j] * s{of}[4 * j + c];",
-                ]
-        return self._loop([*lines, "for (int c = 0; c < 4; c++)", "    out[4 * table[i] + c] = sum[c];"])
-
-    def _loop(self, lines: Sequence[str]) -> list[str]:
-        if not self.rows:
-            return []
-        return [
-            f"    for (int i = 0; i < {len(self.rows)}; i++) {{",
-            *("        " + text for text in lines),
-            "    }",
-        ]
-
-
-def _array(kind: str, name: str, values: Array) -> str:
-    """Return a constant array in C."""
-    texts = [repr(value) for value in values.tolist()]
-    rows = [", ".join(texts[first : first + 5]) for first in range(0, len(texts), 5)]
-    return f"static const {kind} {name}[{len(texts)}] = {{\n    " + ",\n    ".join(rows) + "};\n"
 
 
 @dataclass(frozen=True)
@@ -208,13 +149,11 @@ class ModelCode:
 
 def write_model(model: Model, drives: Sequence[int], h: float) -> ModelCode:
     """Return the C of a model's step of length h [s]; inputs that are no drives are switches, and on."""
-    table, function = _graph(model, drives, h)
-    return _write_model_code(_straight(function), table)
+    return _write_model_code(_straight(_graph(model, drives, h)))
 
 
-def _graph(model: Model, drives: Sequence[int], h: float) -> tuple[_LinearRows, Any]:
-    """Return what is a table, and the rest as a function (p, x, u, d, sx, su, sd) -> (x+, tangents along sx,
-    with su, with sd)."""
+def _graph(model: Model, drives: Sequence[int], h: float) -> Any:
+    """Return the step as a function (p, x, u, d, sx, su, sd) -> (x+, tangents along sx, with su, with sd)."""
     import casadi as ca
 
     n_d = len(model.disturbances)
@@ -226,34 +165,10 @@ def _graph(model: Model, drives: Sequence[int], h: float) -> tuple[_LinearRows, 
         full[place] = value
     lists = [ca.vertsplit(item) if item.numel() else [] for item in (x, d, p)]
     after = ca.vertcat(*model.step(lists[0], full, lists[1], lists[2], h))
-    table = _tabulate(after, x, u, d)
-    after = ca.vertcat(*(0 if i in table.rows else after[i] for i in range(model.n_x)))
     along = (sx, su, sd)
     tangents = [ca.jtimes(after, ca.vertcat(*(x, u, d)[:n]), ca.vertcat(*along[:n])) for n in range(1, 4)]
     results = ca.cse([ca.densify(item) for item in (after, *tangents)])
-    return table, ca.Function("model", [p, x, u, d, *along], results)
-
-
-def _tabulate(after: Any, x: Any, u: Any, d: Any) -> _LinearRows:
-    """Return the rows of a step whose slopes are many constants."""
-    import casadi as ca
-
-    arguments = ca.vertcat(x, u, d)
-    n_x = x.numel()
-    n_u = u.numel()
-    slopes = ca.jacobian(after, arguments)
-    count = slopes.sparsity().T.colind()
-    long = [i for i in range(n_x) if count[i + 1] - count[i] >= _LONG]
-    if long and any(bent := ca.which_depends(after, arguments, 2, True)):
-        long = [i for i in long if not bent[i]]
-    added = ca.substitute(after, arguments, ca.DM.zeros(arguments.numel(), 1))
-    long = [i for i in long if not ca.symvar(ca.vertcat(slopes[i, :].T, added[i]))]
-    if sum(count[i + 1] - count[i] for i in long) < _MANY:
-        long = []
-    dense = np.array(ca.DM(ca.evalf(ca.densify(slopes[long, :])))).reshape(len(long), arguments.numel())
-    slope_parts = np.split(dense, [n_x, n_x + n_u], axis=1)
-    level = np.array(ca.DM(ca.evalf(ca.densify(added[long])))).ravel()
-    return _LinearRows(long, dict(zip("xud", slope_parts, strict=True)), level)
+    return ca.Function("model", [p, x, u, d, *along], results)
 
 
 def _straight(function: Any) -> _Line:
@@ -311,8 +226,8 @@ def _needed(line: _Line, roots: Sequence[int]) -> set[int]:
     return needed
 
 
-def _write_model_code(line: _Line, table: _LinearRows) -> ModelCode:
-    outputs = [[pair for pair in entries.items() if pair[0] not in table.rows] for entries in line.outputs]
+def _write_model_code(line: _Line) -> ModelCode:
+    outputs = [list(entries.items()) for entries in line.outputs]
     roots = [[number for _, number in entries] for entries in outputs]
     everything = _needed(line, [number for name in roots for number in name])
     k = _hand_over(line, everything, _PARAMETERS, "k")
@@ -331,31 +246,29 @@ def _write_model_code(line: _Line, table: _LinearRows) -> ModelCode:
         "prepare": _body(line, _PARAMETERS, k, into["k"]),
         "hold": _over_drives(_body(line, _DRIVES, read, into["h"][: len(read)]), line.n_u),
         "hold_slopes": _over_drives(_body(line, _DRIVES, h, into["h"]), line.n_u),
-        "step": [*_body(line, _STATE, roots[0], into["xn"]), *table.step()],
+        "step": _body(line, _STATE, roots[0], into["xn"]),
         "next": [
             f"    double h[{4 * max(1, len(read))}];",
             "    tg_model_hold(1, u, k, h);",
             "    tg_model_step(x, u, d, k, h, xn);",
         ],
-        "partials": [*_body(line, _STATE, roots[0] + m, into["xn"] + into["m"]), *table.step()],
+        "partials": _body(line, _STATE, roots[0] + m, into["xn"] + into["m"]),
         "tangent": _body(line, _DIRECTION, roots[1], out[0]),
         "tangent_u": _body(line, _DIRECTION, roots[2], out[1]),
         "tangent_d": _body(line, _DIRECTION, roots[3], out[2]),
     }
-    source = table.define()
+    source = []
     n_x = len(line.outputs[0])
     sizes = {"sx": n_x, "su": line.n_u, "sd": line.n_d, "out": n_x}
-    along = {"tangent": "x", "tangent_u": "xu", "tangent_d": "xud"}
     for name, lines in bodies.items():
         head = _FUNCTION_HEADS[name]
         arguments = [item.split()[-1].lstrip("*") for item in head[head.index("(") + 1 : -1].split(",")]
-        more = table.tangent(along[name]) if name in along else []
-        body = "\n".join([*lines, *more])
+        body = "\n".join(lines)
         unused = [f"    (void){item};" for item in arguments if not re.search(rf"\b{item}\b", body)]
         if name.startswith("tangent"):
             unused = [text for text in unused if text != "    (void)n;"]
             moving = [item for item in arguments if item in sizes]
-            lines = _over_groups(lines, more, moving, sizes)
+            lines = _over_groups(lines, moving, sizes)
         source.append("\n".join([head, "{", *unused, *lines, "}", ""]))
     heads = [_FUNCTION_HEADS[name].replace(" restrict ", " ").replace("*restrict ", "*") for name in bodies]
     header = ";\n".join([*heads, ""])  # C++ has no such word, and to C it is the same declaration
@@ -369,14 +282,11 @@ def _over_drives(lines: Sequence[str], n_u: int) -> list[str]:
     return [f"    for (; n > 0; n--, u += {n_u}, h++) {{", *("    " + item for item in lines), "    }"]
 
 
-def _over_groups(
-    lines: Sequence[str], more: Sequence[str], moving: Sequence[str], sizes: Mapping[str, int]
-) -> list[str]:
-    """Return statements for one direction, and more for four, repeated over groups of four."""
+def _over_groups(lines: Sequence[str], moving: Sequence[str], sizes: Mapping[str, int]) -> list[str]:
+    """Return statements for one direction, repeated over groups of four."""
     steps = ", ".join(["g++", *(f"{item} += {4 * sizes[item]}" for item in moving if sizes[item])])
     inner = ["        for (int c = 0; c < 4; c++) {", *("        " + item for item in lines), "        }"]
-    inner = [*(inner if lines else []), *("    " + item for item in more)]
-    return [f"    for (int g = 0; g < n; {steps}) {{", *inner, "    }"]
+    return [f"    for (int g = 0; g < n; {steps}) {{", *(inner if lines else []), "    }"]
 
 
 def _hand_over(

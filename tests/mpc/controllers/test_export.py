@@ -282,4 +282,4 @@ def test_the_stack_is_the_largest_frame_of_the_library(tmp_path: Path):
     (tmp_path / "tg_b.su").write_text("b.c:1:2:h\t320\tstatic\n")
     (tmp_path / "check.su").write_text("check.c:1:2:main\t9000\tstatic\n")  # not of the library
     if shutil.which("size") is not None:
-        assert exports._footprint(tmp_path)[1] == 1200
+        assert exports.footprint(tmp_path)[1] == 1200
