@@ -23,7 +23,7 @@ from thermogrip.sysid.greybox.problem import prior_plant
 from thermogrip.sysid.identification import Held, beyond_reach, choose_black_box
 from thermogrip.sysid.models.network import load_network
 from thermogrip.sysid.models.state_space import StateSpaceModel
-from thermogrip.sysid.plant.fit_record import ExpectedError, HeldOut, PlantScores, fit_logs
+from thermogrip.sysid.plant.fit_record import ExpectedError, HeldOut, fit_logs
 from thermogrip.sysid.validation import verdict
 from thermogrip.sysid.validation.free_run import free_run, warm_up_of_fit
 from thermogrip.sysid.validation.prediction_bands import between_runs, expected_error
@@ -544,13 +544,6 @@ def test_a_log_that_begins_warm_has_fifty_rows_of_warm_up(monkeypatch, step, sco
     plant: Any = SimpleNamespace(dt=dt, model=SimpleNamespace(kind="arx"))
     identification.run_held_out(plant, held, unseen=True)
     assert asked == [{"warmup": expected[0], "score_from": expected[1], "tests": False}]
-
-
-def test_notes_of_a_black_box_name_its_step():
-    plant: Any = SimpleNamespace(
-        scores=PlantScores(average_s=2.3456, average_why="w"), inputs_end_at_row=False
-    )
-    assert identification._plant_notes("arx", plant) == ["arx: steps of 2.35 s (w)"]
 
 
 def test_columns_are_what_was_named_what_the_network_has_or_what_was_guessed():

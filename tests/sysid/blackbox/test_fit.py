@@ -206,20 +206,6 @@ def test_the_warm_up_is_five_seconds_of_whole_logs_and_fifty_samples_of_parts(ro
     assert fitting._warmup_rows(stub_grid(rows, dt)) == expected
 
 
-@pytest.mark.parametrize(
-    ("rows", "warmup"), [((100, 62), 15), ((400,), 50), ((4,), 2)]
-)  # a quarter of the shortest, 2 to 50
-def test_a_refit_errs_by_its_worst_output(monkeypatch, rows, warmup):
-    def errors_of(model, runs, *, dt, scale, warmup, priors):
-        asked.append((model, len(runs), dt, scale.tolist(), warmup, priors))
-        return np.array([[0.3, 0.1]])
-
-    asked, fit = [], SimpleNamespace(grid=stub_grid(rows, 2.0), choice=SimpleNamespace(prior="p"))
-    monkeypatch.setattr(fitting, "free_run_errors", errors_of)
-    assert fitting._error(fit, "m") == 0.3
-    assert asked == [("m", len(rows), 2.0, [2.0, 10.0], warmup, ["p"])]
-
-
 @pytest.mark.parametrize(("dt", "share"), [(2.0, 0.24), (20.0, 1.0)])  # (1 + 19 dt / 10) of 20 readings
 def test_a_plant_keeps_what_the_choice_found(monkeypatch, dt, share):
     monkeypatch.setattr(fitting, "reading_excess", lambda logs, names, dt: {names[0]: dt, names[1]: 0.0})

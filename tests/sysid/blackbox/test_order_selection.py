@@ -267,12 +267,6 @@ def test_drives_are_inputs_disturbances_and_products_of_which_still_ones_are_non
     np.testing.assert_array_equal(second, [[3.0, 0.0, 7.0, 20.0, 3.0, 9.0]])
 
 
-@pytest.mark.parametrize(("lowest", "highest", "terms"), [(-1, 1, [("|q|",)]), (0, 1, []), (-1, 0, [])])
-def test_magnitudes_of_signed_inputs_are_tried(lowest, highest, terms):
-    grid = grid_of(segment(np.zeros((2, 1)), np.array([[lowest], [highest]])), inputs=("q",))
-    assert list(selection.default_terms(grid)) == [(), *terms]  # two levels show no square
-
-
 def test_the_spread_of_the_states_is_that_of_the_run_and_a_trace_more():
     parts = {"A": np.diag([0.5, 0.0]), "B": [[2.0], [0.0]], "C": [[1.0, 0.0]], "c": [0.0, 0.0]}
     grid = grid_of(
