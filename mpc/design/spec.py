@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
@@ -166,10 +166,8 @@ class Spec(BaseModel):
     def widened(self, plant: Plant) -> Plant:
         """Return the plant with the drives of the spec: those that it switches, and as wide as it has them
         where only the logs showed how wide; and with its measured disturbances."""
-        for name in self.disturbances or ():
-            if name not in plant.disturbances:
-                hint = known_names(name, plant.disturbances, "these are: {}")
-                raise UserError(f"disturbances: the plant has no measured disturbance {name}", hint=hint)
+        problem = "disturbances: the plant has no measured disturbance {}"
+        _check_known(self.disturbances, plant.disturbances, problem)
         plant = replace(plant, nominal=plant.nominal | (self.disturbances or {}))
         ranges = dict(plant.valid)
         for name, (low, high) in _by_drive("drive_limits", self.drive_limits, drive_names(plant)).items():
@@ -195,10 +193,7 @@ class Spec(BaseModel):
     def design(self, plant: Plant, **changes: Any) -> Design:
         """Return the plant's default design under this spec; a key that does not fit it is a UserError."""
         wanted = [self.output] if isinstance(self.output, str) else self.output
-        for name in wanted or ():
-            if name not in plant.outputs:
-                hint = known_names(name, plant.outputs, "it has {}")
-                raise UserError(f"output: the plant has no output {name}", hint=hint)
+        _check_known(wanted, plant.outputs, "output: the plant has no output {}")
         _check_sample(self, plant)
         design = default_design(
             plant,
@@ -213,10 +208,7 @@ class Spec(BaseModel):
         if self.patience_s is not None:
             values["patience_s"] = self.patience_s
         values |= {"limits": _soft_limits(self, plant, design), "overshoot": 0.5 * self.overshoot_degC}
-        for name in self.weights or ():
-            if name not in design.controlled:
-                hint = known_names(name, design.controlled, "these are: {}")
-                raise UserError(f"weights: {name} is not regulated", hint=hint)
+        _check_known(self.weights, design.controlled, "weights: {} is not regulated")
         for name, half in (self.zones or {}).items():
             for key in ("band_degC", "overshoot_degC", "bias_degC"):
                 most = getattr(self, key)
@@ -290,10 +282,8 @@ def _soft_limits(spec: Spec, plant: Plant, design: Design) -> dict[str, Range]:
     if spec.limits is None:
         free = "t_tank" in plant.outputs and "t_tank" not in design.controlled
         return {"t_tank": _WATER} if free else {}
+    _check_known(spec.limits, plant.outputs, "limits: the plant has no output {}")
     for name, (low, high) in spec.limits.items():
-        if name not in plant.outputs:
-            hint = known_names(name, plant.outputs, "it has {}")
-            raise UserError(f"limits: the plant has no output {name}", hint=hint)
         beyond = [target for _, target in spec.steps if not low <= target <= high]
         if name in design.controlled and beyond:
             wrong = f"{name} is to stay in {low:g} to {high:g} degC, and a step goes to {beyond[0]:g}"
@@ -345,8 +335,12 @@ def _by_drive(key: str, value: Any, drives: tuple[str, ...]) -> dict[str, Any]:
         return {}
     if not isinstance(value, dict):
         return dict.fromkeys(drives, value)
-    for name in value:
-        if name not in drives:
-            hint = known_names(name, drives, "it has {}")
-            raise UserError(f"{key}: the plant has no drive {name}", hint=hint)
+    _check_known(value, drives, f"{key}: the plant has no drive {{}}")
     return dict(value)
+
+
+def _check_known(names: Iterable[str] | None, known: Sequence[str], problem: str) -> None:
+    """Refuse a name that the plant does not know."""
+    for name in names or ():
+        if name not in known:
+            raise UserError(problem.format(name), hint=known_names(name, known, "these are: {}"))

@@ -83,17 +83,6 @@ class CostSettings:
 COSTS = CostSettings()
 
 
-class Record:
-    """What is written into a controller's notes."""
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return plain JSON, None for what is not finite."""
-        return {
-            key: None if isinstance(value, float) and not np.isfinite(value) else value
-            for key, value in vars(self).items()
-        }
-
-
 @dataclass(frozen=True)
 class Load:
     """What disturbs a plant at rest."""
@@ -130,7 +119,7 @@ class CaseKey(NamedTuple):
 
 
 @dataclass(frozen=True)
-class StepResult(Record):
+class StepResult:
     """What one case came to; of the worst output where several are controlled."""
 
     start: float  # [degC]
@@ -374,11 +363,6 @@ def result_of(run: ClosedLoop, case: Case) -> StepResult:
 Bounds = dict[tuple[float, float, int], float]
 
 
-def bound_of(bounds: Bounds, result: StepResult) -> float:
-    """Return the shortest time [s] of what a result is of."""
-    return bounds[result.start, result.target, result.draw]
-
-
 @dataclass(frozen=True)
 class Scales:
     """What trials are counted in."""
@@ -423,7 +407,7 @@ def _mean_and_worst(costs: Sequence[float]) -> float:
 
 
 def _cost_of_step(result: StepResult, spec: Spec, scales: Scales) -> float:
-    bound = bound_of(scales.bounds, result)
+    bound = scales.bounds[(*result.step, result.draw)]
     unit = max(bound if np.isfinite(bound) else result.length_s, 1.0)
     if np.isfinite(result.settle_s):
         cost = result.settle_s / unit + COSTS.bias * max(0.0, abs(result.bias) / spec.bias_degC - COSTS.free)

@@ -48,13 +48,11 @@ from thermogrip.mpc.tuning.objective import (
     Bounds,
     Case,
     CaseKey,
-    Record,
     Scales,
     Score,
     StepResult,
     apparent_delays,
     as_tried,
-    bound_of,
     bounds_of,
     check_steps,
     draws_of,
@@ -106,7 +104,7 @@ _SCORED_PARTS = ("steps", "loads")  # in none of which a tuned MPC may be worse 
 
 
 @dataclass(frozen=True)
-class Row(Record):
+class Row:
     """One line of the comparison: a controller on one step or load, over the draws."""
 
     controller: str  # ``"baseline"``, ``"tuned"`` or ``"PI"``
@@ -125,6 +123,13 @@ class Row(Record):
     bound_s: float  # before this no drive is in the band [s], mean over the draws; NaN of a load
     load: str = ""  # in words
     iae_mean: float = 0.0  # [degC s]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain JSON, None for what is not finite."""
+        return {
+            key: None if isinstance(value, float) and not np.isfinite(value) else value
+            for key, value in vars(self).items()
+        }
 
 
 def rows_of(name: str, results: Sequence[StepResult], bounds: Bounds) -> list[Row]:
@@ -158,7 +163,7 @@ def _score_row(name: str, part: Sequence[StepResult], bounds: Bounds) -> Row:
         energy_worst_s=most("energy_s"),
         travel_mean=mean("travel"),
         full_share=mean("full_share"),
-        bound_s=float(np.mean([np.nan if first.load else bound_of(bounds, result) for result in part])),
+        bound_s=np.nan if first.load else float(np.mean([bounds[(*first.step, of.draw)] for of in part])),
         load=first.load,
         iae_mean=mean("iae"),
     )
@@ -305,14 +310,13 @@ class Bench:
     def _lengths(self, draws: Sequence[int]) -> dict[tuple[float, float], float]:
         """Return how long each step is run [s]."""
         made = self.made("MPC", self.baseline)
-        settled: dict[tuple[float, float], float] = {}
-        for result in run_trials(made, self.plant, self.spec, steps_on(self.spec, draws), seed=self.seed):
-            seconds = float(np.nan_to_num(result.settle_s, nan=self.spec.hold_s))
-            settled[result.step] = max(seconds, settled.get(result.step, 0.0))
-        least = min(self.load_s, self.spec.hold_s)
-        return {
-            step: float(np.clip(2 * seconds, least, self.spec.hold_s)) for step, seconds in settled.items()
-        }
+        results = run_trials(made, self.plant, self.spec, steps_on(self.spec, draws), seed=self.seed)
+        least, most = min(self.load_s, self.spec.hold_s), self.spec.hold_s
+        lengths = {}
+        for step in self.spec.steps:
+            slowest = np.max([result.settle_s for result in results if result.step == step])  # or NaN
+            lengths[step] = float(np.clip(2 * np.nan_to_num(slowest, nan=most), least, most))
+        return lengths
 
     def _scales(self) -> Scales:
         """Return what trials count in, of all draws."""
@@ -517,7 +521,6 @@ def _tuning(
         "spec": spec.model_dump(mode="json"),
         "seed": bench.seed,
         "rows": [row.to_dict() for row in rows],
-        "lacking": [result.to_dict() for result in results[saved] if result.lacks],
     }
     controller = _final(bench, candidates, saved, notes)
     return Tuning(

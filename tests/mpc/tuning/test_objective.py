@@ -214,7 +214,3 @@ def test_a_score_does_not_depend_on_the_unit_of_the_outputs():
     big = {(1000 * start, 1000 * end, draw): bound for (start, end, draw), bound in BOUNDS.items()}
     for pair in zip(results, milli, strict=True):
         assert total([pair[0]]) == pytest.approx(total([pair[1]], small, big), rel=1e-12)
-
-
-def test_a_note_has_none_for_what_is_no_number():
-    assert replace(ONE, settle_s=np.nan).to_dict() == vars(ONE) | {"settle_s": None}
