@@ -41,7 +41,7 @@ class Desk:
         self.said: list[str] = []
 
     def open(self) -> Rig:
-        self.clock.sleep(300.0)  # of work between sessions, in which it cools
+        self.clock.sleep(100.0)  # of work between sessions, in which it cools
         return TCLabRig(DirectPort(self.device), clock=self.clock, sleep=self.clock.sleep)
 
     def autotune(self, target: float = TARGET, **options: Any) -> Autotune:
