@@ -70,12 +70,8 @@ class Chart:
 
 
 def thin(columns: Sequence[Array], most: int) -> NDArray[np.intp]:
-    """Return at most ``most`` rows that show what all do: of each bin its last, of every column the extremes
-    and a gap.
-
-    >>> thin([np.array([0.0, 0, 0, 9, 0, 0, 0, 0, -5, 0, 0, 0])], 7).tolist()
-    [0, 3, 5, 6, 8, 11]
-    """
+    """Return at most ``most`` rows that show what all do, peaks too, as every n-th row would not: of each bin
+    its last, of every column the extremes and a gap."""
     n = len(columns[0])
     if n <= most:
         return np.arange(n)

@@ -11,13 +11,8 @@ _OF_OTHERS = 0o022  # may be written by the group, or by anybody
 
 
 def code_cache() -> Path:
-    """Return the folder ``thermogrip`` of the user's cache folder, made where absent.
-
-    Raises
-    ------
-    UserError
-        If it belongs to somebody else.
-    """
+    """Return the folder ``thermogrip`` of the user's cache folder, made where absent; UserError where it
+    belongs to somebody else."""
     base = Path(os.environ.get("XDG_CACHE_HOME", ""))
     if not base.is_absolute():  # the XDG specification has these ignored
         base = Path.home() / ".cache"

@@ -112,11 +112,8 @@ def reading(problem: str, *, file: str | Path | None = None, hint: str) -> Itera
 
 
 def known_names(name: object, known: Iterable[str], words: str = "use {}") -> str:
-    """Return a hint with the known names in place of the braces, and at its end the one most like ``name``.
-
-    >>> known_names("Drvie", ["drive", "pump"], "it has {}")
-    "it has drive, pump; did you mean 'drive'?"
-    """
+    """Return a hint with the known names in place of the braces, and at its end the one most like ``name``
+    (``it has drive, pump; did you mean 'drive'?``)."""
     by_lower = {known_name.lower(): known_name for known_name in known}
     nearest = get_close_matches(str(name).lower(), by_lower, 1, 0.65)
     meant = f"did you mean {by_lower[nearest[0]]!r}?" if nearest and by_lower[nearest[0]] != name else ""

@@ -57,10 +57,7 @@ def example_path(name: str) -> Path:
 
 def copy_examples(folder: str | Path) -> list[Path]:
     """Write the bundled logs into a folder, the grasps into ``grasps`` in it and what each file is into
-    ``EXAMPLES.md``, and return their paths.
-
-    A file that is there already is left alone; UserError before any is written where it is another one.
-    """
+    ``EXAMPLES.md``, and return their paths; UserError before any is written where another file is there."""
     folder, source = Path(folder), _folder()
     files_of_grasps = [f"{name}{end}.csv.xz" for name in example_grasps() for end in ("", "_meta")]
     places = {folder / f"{name}.csv.xz": source / f"{name}.csv.xz" for name in EXAMPLE_LOGS}

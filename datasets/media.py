@@ -35,11 +35,7 @@ def printable(text: str) -> str:
 
 
 def without_password(address: str) -> str:
-    """Return an address without the user and the password that it may name.
-
-    >>> without_password("ws://me:secret@robot:9090")
-    'ws://...@robot:9090'
-    """
+    """Return an address without the user and the password that it may name (``ws://me:secret@robot``)."""
     return _USER.sub("...", address)
 
 

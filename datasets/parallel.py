@@ -52,10 +52,9 @@ def run_parallel(
 ) -> list[_Result]:
     """Return ``[function(item) for item in items]``, computed on so many processes or on a cluster.
 
-    The first exception that ``function`` raises stops the rest and is raised here.  With one worker it runs
-    in this process, and so does a single item; more processes are never started than there are processors.
-    ``progress`` is called with the fraction done and ``what``. UserError if processes are killed again and
-    again, or the cluster cannot be reached, has no workers, or has other versions.
+    The first exception that ``function`` raises stops the rest and is raised here.  A single item runs in
+    this process; more processes are never started than there are processors.  ``progress`` is called with
+    the fraction done and ``what``.
     """
     return list(in_order(function, items, workers, progress, what=what))
 

@@ -120,11 +120,9 @@ def hash_file(path: str | Path) -> str:
 
 
 def _commit_of(folder: str) -> str | None:
-    """Return the commit that is checked out in the repository around a folder, None where there is none.
-
-    Of Git's commands this one reads names and their commits alone [2]_: it starts none of the programs that a
-    repository's configuration, which an unpacked archive may bring, can name.
-    """
+    """Return the commit that is checked out in the repository around a folder, None where there is none."""
+    # of Git's commands rev-parse reads names and their commits alone [2]: it starts none of the programs that
+    # a repository's configuration, which an unpacked archive may bring, can name
     git = shutil.which("git")
     if git is None or Path(git).parent == Path(folder):  # on Windows the working folder is searched first
         return None

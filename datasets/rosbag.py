@@ -146,10 +146,8 @@ def column_value(message: Message, column: Column, name: str, source: str | Path
 
 
 def write_bag(folder: str | Path, messages: Iterable[tuple[str, str, float, float]]) -> Path:
-    """Write numbers as a ROS 2 bag (MCAP) and return its folder, which must not be there yet.
-
-    ``messages`` have topic, type (of ``std_msgs``), time [s] and value.
-    """
+    """Write messages (topic, type of ``std_msgs``, time [s], value) as a ROS 2 bag (MCAP) and return its
+    folder, which must not be there yet."""
     place = Path(folder)
     _need("rosbags", place)
     from rosbags.rosbag2 import StoragePlugin, Writer

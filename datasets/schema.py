@@ -231,16 +231,13 @@ def as_record(data: xr.Dataset) -> Grasps:
 
 
 def with_lead_in(grasps: Grasps) -> Grasps:
-    """Return a record that begins at contact with its stated level before it.
-
-    Where no sample is before 0 s and ``t_gripper`` is known of every grasp, that level stands as readings
-    from 3 to 2 s before the message (so that contact may have been before it), which ``attrs["repairs"]``
-    notes; any other record is returned as it is.
-    """
+    """Return a record that begins at contact with its stated level ``t_gripper`` before it, which
+    ``attrs["repairs"]`` notes; any other record is returned as it is."""
     time = grasps["time"].values
     if time[0] < 0 or "t_gripper" not in grasps or bool(np.isnan(grasps["t_gripper"].values).any()):
         return grasps
     step = float(np.median(np.diff(time)))  # on the grid of the others
+    # from 3 to 2 s before the message, so that contact may have been before it
     lead = time[0] - step * np.unique(np.round(np.linspace(3.0, 2.0, 5) / step))[::-1]
     level = np.repeat(grasps["t_gripper"].values[:, None], lead.size, axis=1)
     out = grasps.drop_dims("time").assign_coords(time=("time", np.concatenate([lead, time]), {"units": "s"}))

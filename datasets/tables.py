@@ -114,12 +114,8 @@ class Column:
 
 
 def read_csv_table(path: str | Path, *, text: Callable[[str], bool] | None = None) -> Table:
-    """Return the columns of a CSV file, plain, ``.gz`` or ``.xz``.
-
-    Lines that start with ``#`` before the header are skipped. The separator is a comma, or a semicolon or tab
-    if the header has no comma; then numbers may have a decimal comma, which is noted. ``text`` tells which
-    headers are those of text.  Nothing that is broken is passed over.
-    """
+    """Return the columns of a CSV file, plain, ``.gz`` or ``.xz``, of which nothing that is broken is passed
+    over; ``text`` tells which headers are those of text."""
     file = str(path)
     content, _ = _decoded(_bytes_of(path), file, strict=True)
     with as_user_error(csv.Error, "the header is no line of names", file=file, hint="correct it"):
