@@ -254,26 +254,13 @@ def valid_range(controller: Reviewed, span: tuple[float, float]) -> Check:
     name, valid = "targets lie where the logs were", controller.plant.valid
     if not all(output in valid for output in controller.controlled):
         return Check(name, "warn", "the plant does not say where its logs were", "identify it again")
-    ranges = {output: valid[output] for output in controller.controlled}
-    logged = "; ".join(
-        f"{output} was {low:.1f} to {high:.1f} degC in the logs" for output, (low, high) in ranges.items()
-    )
-    beyond = [
-        f"{output} at {target:g} degC"
-        for output in ranges
-        for target in span
-        if _outside_logs(controller, output, target)
-    ]
+    beyond = dict.fromkeys(words for target in span for words in beyond_logs(controller, target))
     if beyond:
         fix = "record a log that goes there, or treat the result with care"
-        return Check(name, "warn", f"{logged}; beyond: {', '.join(beyond)}", fix)
-    return Check(name, "pass", logged)
-
-
-def _outside_logs(controller: Reviewed, output: str, target: float) -> bool:
-    """Return whether a target lies more than half a degree outside of the plant's logs."""
-    low, high = controller.plant.valid.get(output, (-np.inf, np.inf))
-    return not low - 0.5 <= target <= high + 0.5
+        return Check(name, "warn", "; ".join(beyond), fix)
+    ends = [(output, *valid[output]) for output in controller.controlled]
+    logged = (f"{output} was {low:.1f} to {high:.1f} degC in the logs" for output, low, high in ends)
+    return Check(name, "pass", "; ".join(logged))
 
 
 def called_good(controller: Reviewed) -> Check:
@@ -294,8 +281,8 @@ def beyond_logs(
     wanted = target if isinstance(target, Mapping) else dict.fromkeys(controller.controlled, float(target))
     sentences = []
     for output, value in wanted.items():
-        if _outside_logs(controller, output, value):
-            low, high = controller.plant.valid[output]
+        low, high = controller.plant.valid.get(output, (-np.inf, np.inf))
+        if not low - 0.5 <= value <= high + 0.5:
             logged = f"{output} was {low:.1f} to {high:.1f} degC in them"
             sentences.append(
                 f"{value:g} degC lies outside the logs that the plant was identified from: {logged}"

@@ -270,7 +270,7 @@ def tune(
         results = _compare_on_unseen(bench, candidates, show)
         interrupted = False
     except KeyboardInterrupt:
-        if {trial_so_far.controller for trial_so_far in tried} != {"MPC", "PI"}:
+        if {trial_so_far.controller for trial_so_far in tried} != set(bench.ranges):
             raise
         candidates = _best_of_each_kind(bench, tried)
         results = {name: list(trial_so_far.results) for name, trial_so_far in candidates.items()}
@@ -299,7 +299,9 @@ class Bench:
         self.loads = loads_of(plant, spec, self.baseline)
         self.load_s = load_seconds(self.baseline)
         unseen_delay = max(apparent_delays(plant, controlled)) < 2 * plant.dt
-        self.pi_parameters = PI_OF_UNSEEN_DELAY if unseen_delay else PI_PARAMETERS
+        self.ranges = {"MPC": MPC_PARAMETERS}  # of the kinds that are searched
+        if self.baseline.loops and not unknown_to_pi(spec):
+            self.ranges["PI"] = PI_OF_UNSEEN_DELAY if unseen_delay else PI_PARAMETERS
         show(0.5 * SEARCH.scaled, "compiling the trials")
         self._c = Controller(plant, self.baseline).c  # in whose library trials of PI loops can run
         show(0.7 * SEARCH.scaled, "default design and the PI by SIMC")
@@ -421,7 +423,7 @@ class Bench:
 def _search_designs(bench: Bench, tried: list[Trial], show: Progress) -> None:
     """Try designs of MPC and PI, into ``tried``; the defaults of both first."""
     most = bench.spec.evaluations
-    ranges = {"MPC": MPC_PARAMETERS, "PI": bench.pi_parameters if bench.baseline.loops else {}}
+    ranges = bench.ranges
     counts = dict.fromkeys(ranges, 0)
 
     def evaluate(kind: str, parameters: Mapping[str, float]) -> Trial:
@@ -472,7 +474,7 @@ def _best_of_each_kind(bench: Bench, tried: Sequence[Trial]) -> dict[str, Trial]
     of: dict[str, list[Trial]] = {kind: [t for t in tried if t.controller == kind] for kind in ("MPC", "PI")}
     best = {kind: min(trials, key=lambda each: each.score) for kind, trials in of.items() if trials}
     candidates = {"baseline": of["MPC"][0], "tuned": best["MPC"]}
-    return candidates | ({"PI": best["PI"]} if bench.baseline.loops else {})
+    return candidates | ({"PI": best["PI"]} if "PI" in best else {})
 
 
 def _compare_on_unseen(
@@ -500,8 +502,7 @@ def _tuning(
     """Return what was found, with the best of the candidates for its controller."""
     spec, scored = bench.spec, {name: bench.score(part) for name, part in results.items()}
     scores = {name: part.total for name, part in scored.items()}
-    unknown = unknown_to_pi(spec)
-    saved = kept_of(scores, unknown)
+    saved = kept_of(scores)
     rows = tuple(row for name, part in results.items() for row in rows_of(name, part, bench.bounds))
     kept_rows = [row for row in rows if row.controller == saved and not row.load]
     least = min(scores[saved], scores["tuned"])
@@ -509,7 +510,7 @@ def _tuning(
     where = "on the search's own draws" if interrupted else "on unseen draws"
     if bench.draws == [0] and not interrupted:
         where = "under fresh noise (the plant has no uncertainty)"
-    finding = f"{best_of(saved, scored, where, unknown)} {words}"
+    finding = f"{best_of(scored, where, unknown_to_pi(spec))} {words}"
     if interrupted:
         finding = f"Interrupted after {len(tried)} designs; this is the best of them. {finding}"
     meets = all(meets_spec(result, spec) for result in results[saved] if not result.load)
@@ -551,12 +552,11 @@ def _final(
     return Controller(bench.plant, design, notes=notes)
 
 
-def kept_of(scores: Mapping[str, float], unknown: Sequence[str] = ()) -> str:
+def kept_of(scores: Mapping[str, float]) -> str:
     """Return which controller is saved: a tuned MPC only where it wins what counts against the default one, a
-    PI where it knows all that the spec asks for and scores less than both."""
+    PI where it scores less than the MPC that would be."""
     mpc = "tuned" if scores["tuned"] < (1 - SEARCH.won) * scores["baseline"] else "baseline"
-    least = min(scores["tuned"], scores["baseline"])
-    return "PI" if scores.get("PI", np.inf) < least and not unknown else mpc
+    return "PI" if scores.get("PI", np.inf) < scores[mpc] else mpc
 
 
 def unknown_to_pi(spec: Spec) -> list[str]:
@@ -570,26 +570,21 @@ def unknown_to_pi(spec: Spec) -> list[str]:
     return [wish for wish, value in wishes.items() if value]
 
 
-def best_of(kept: str, parts: Mapping[str, Score], where: str, unknown: Sequence[str] = ()) -> str:
+def best_of(parts: Mapping[str, Score], where: str, unknown: Sequence[str] = ()) -> str:
     """Return the sentence that names the best controller, by how much, and where the other kind loses."""
+    scores = {name: part.total for name, part in parts.items()}
+    kept, mpc = kept_of(scores), kept_of({name: scores[name] for name in ("baseline", "tuned")})
+    words = {"baseline": "default MPC", "tuned": "tuned MPC", "PI": "PI"}[kept]
     if "PI" not in parts:
-        return f"The {_kind_words(kept)} is what is saved: no PI can be made."
-    mpc = kept if kept != "PI" else min(("baseline", "tuned"), key=lambda name: parts[name].total)
-    best, other = ("PI", mpc) if kept == "PI" else (mpc, "PI")
-    share = 100 * (1 - parts[best].total / parts[other].total)
-    if share < 0:
-        because = f"a PI does not know {', '.join(unknown)}"
-        return f"The MPC is what is saved, because {because}; it scores {-share:.0f} % worse {where}."
-    costs = {name: (getattr(parts[other], name), getattr(parts[best], name)) for name in _SCORED_PARTS}
+        because = f"a PI does not know {', '.join(unknown)}" if unknown else "no PI can be made"
+        return f"The {words} is what is saved: {because}."
+    other, loser = (mpc, "MPC") if kept == "PI" else ("PI", "PI")
+    share = 100 * (1 - scores[kept] / scores[other])
+    costs = {name: (getattr(parts[other], name), getattr(parts[kept], name)) for name in _SCORED_PARTS}
     worst = max(costs, key=lambda name: costs[name][0] - costs[name][1])
     loses = f"loses most on {worst} ({costs[worst][0]:.2f} for {costs[worst][1]:.2f})"
-    loser = "MPC" if kept == "PI" else "PI"
-    saved = f"The {_kind_words(kept)} is best and is what is saved"
+    saved = f"The {words} is best and is what is saved"
     return f"{saved}: it scores {share:.0f} % better than the best {loser} {where}, which {loses}."
-
-
-def _kind_words(kept: str) -> str:
-    return {"baseline": "default MPC", "tuned": "tuned MPC", "PI": "PI"}[kept]
 
 
 def verdict_of(spec: Spec, least: float, default: float, rows: Sequence[Row]) -> tuple[str, str]:
