@@ -182,8 +182,8 @@ class RigFilter:
 
     def begin(self, seconds: float) -> Estimate | None:
         """Return the newest estimate that is so old; None where there is none or inputs since are lost."""
-        at = self.estimates[-1].time - seconds
-        begin = next((one for one in reversed(self.estimates) if one.time <= at + 1e-6), None)
+        begin_s = self.estimates[-1].time - seconds
+        begin = next((one for one in reversed(self.estimates) if one.time <= begin_s + 1e-6), None)
         return begin if begin is not None and begin.step >= self.done - len(self.applied) else None
 
     def applied_since(self, step: int) -> tuple[Array, Array]:

@@ -228,12 +228,12 @@ def _instead(place: str) -> str:
     tables: dict[str, type[_Table]] = {
         "sensors": SensorSettings, "model": ModelSettings, "no_model": RuleSettings,
     }  # fmt: skip
-    known = [*GuardSettings.model_fields]
+    every_key = [*GuardSettings.model_fields]
     for table, kind in tables.items():
         if place == key and key in kind.model_fields:
             return f"write it below [{table}]"
-        known += kind.model_fields
-    return known_names(key, known, "`thermogrip init guard` shows every key with its unit")
+        every_key += kind.model_fields
+    return known_names(key, every_key, "`thermogrip init guard` shows every key with its unit")
 
 
 def read_guard(path: str | Path) -> GuardSettings:
