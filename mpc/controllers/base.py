@@ -116,14 +116,6 @@ class SampledController:
             self._move, advice=self._move.advice or advice.TOO_EARLY, seconds=self.clock() - started
         )
 
-    def _unseen(self, parked: Sequence[str], unread_s: Array) -> str:
-        """Return what becomes of the loops whose sensors were not read for so long (n_controlled,) while
-        others are, drives parked."""
-        lost = unread_s > self._patience_s
-        gone = bool(lost.any())
-        names = [name for name, is_out in zip(self.controlled, lost if gone else unread_s > 0) if is_out]
-        return advice.unseen(names, parked, float(unread_s.max()), lost=gone)
-
 
 def targets_ahead(
     target: Trajectory, controlled: Sequence[str], now: Array, at: NDArray[np.int_], low: float, high: float

@@ -148,7 +148,10 @@ def check_export(
         for name in export.files:
             shutil.copyfile(export.folder / name, build.folder / name)
         _make(build.folder, "all", *(("sanitized",) if sanitize else ()))
-        (ram, constants), answers = _answers_in_c(build, played, sanitize)
+        text = "".join(f"{sample.given}\n" for sample in played)
+        head, *answers = _run_program(build.folder / "check", text)
+        if sanitize:
+            _run_program(build.folder / "sanitized", text)  # it must live
         flash, stack = footprint(build.folder)
     pairs = list(zip(played, answers, strict=True))
     return Agreement(
@@ -157,8 +160,8 @@ def check_export(
         free=sum(sample.free for sample in played),
         same_status=sum(sample.status == STATUSES[int(answer.split()[0])] for sample, answer in pairs),
         flash=flash,
-        ram=ram,
-        constants=constants,
+        ram=int(head.split()[1]),
+        constants=int(head.split()[3]),
         stack=stack,
         tolerance=_HARD_TOLERANCE if controller.design.hard else _TOLERANCE,
     )
@@ -193,7 +196,7 @@ def _random_loop(controller: Controller, samples: int, seed: int, progress: Prog
     model = twin.model
     rng = np.random.default_rng(seed)
     played = list[_Sample]()
-    low, high = _range_of(controller)
+    low, high = controller.plant.valid.get(controller.controlled[0], (15.0, 45.0))
     span = twin.drives.highest - twin.drives.lowest
     rows = [model.outputs.index(name) for name in twin.controlled]
     for k in range(samples):
@@ -232,11 +235,6 @@ def _random_loop(controller: Controller, samples: int, seed: int, progress: Prog
     return played
 
 
-def _range_of(controller: Controller) -> tuple[float, float]:
-    low, high = controller.model.plant.valid.get(controller.controlled[0], (15.0, 45.0))
-    return float(low), float(high)
-
-
 def _drive_difference(sample: _Sample, answer: str, span: Array) -> float:
     """Return the largest difference of a drive, now or in the plan, in fractions of its range."""
     numbers = np.array([float.fromhex(word) for word in answer.split()[1:]])
@@ -252,16 +250,6 @@ def _run_program(program: Path, text: str) -> list[str]:
         why = done.stderr.strip()[:300] or f"exit code {done.returncode}"  # a trap says nothing
         raise UserError(f"the export stopped: {why}", hint="report it: it must not")
     return done.stdout.splitlines()
-
-
-def _answers_in_c(export: Export, played: list[_Sample], sanitize: bool) -> tuple[tuple[int, int], list[str]]:
-    """Return the bytes of a controller and of a design, and what the C program answers to these samples."""
-    text = "".join(f"{sample.given}\n" for sample in played)
-    head, *answers = _run_program(export.folder / "check", text)
-    if sanitize:
-        _run_program(export.folder / "sanitized", text)  # it must live
-    _, ram, _, constants = head.split()
-    return (int(ram), int(constants)), answers
 
 
 def _make(folder: Path, *targets: str) -> None:

@@ -292,7 +292,10 @@ class ReferenceController(SampledController):
         """Return what is said where controlled outputs were not read for so long (n_controlled,)."""
         lost = unread_s > self._patience_s
         parked = [name for name, pair in zip(self.model.drives, self.optimiser.pair) if lost[pair]]
-        return self._unseen(parked, unread_s)
+        gone = bool(lost.any())
+        out = lost if gone else unread_s > 0
+        names = [name for name, is_out in zip(self.controlled, out) if is_out]
+        return advice.unseen(names, parked, float(unread_s.max()), lost=gone)
 
     def _optimise(self, wanted: Array, ahead: Array | None) -> Outcome:
         last = self.drives.cut(self._u)
