@@ -15,6 +15,7 @@ import numpy as np
 
 from thermogrip.datasets.roles import guess_role, is_room_temperature
 from thermogrip.datasets.schema import Log, column
+from thermogrip.sysid.data.signal_roles import moves
 from thermogrip.sysid.models.network import NetworkModel
 from thermogrip.sysid.models.network_spec import (
     Network,
@@ -38,7 +39,7 @@ def shipped_network(logs: Sequence[Log]) -> NetworkModel | None:
             continue
         model = NetworkModel(renamed(network, columns))
         moved = [name for name in model.inputs if name not in model.switches]
-        if all(misfit(model, log) is None for log in logs) and all(_moves(logs, name) for name in moved):
+        if all(misfit(model, log) is None for log in logs) and all(moves(logs, name) for name in moved):
             return model
     return None
 
@@ -141,8 +142,3 @@ def _by_name(network: Network, log: Log, *, needs_inputs: bool = True) -> dict[s
     return (
         {name: same[0] for name, same in columns_of.items()} if all(map(len, columns_of.values())) else None
     )
-
-
-def _moves(logs: Sequence[Log], name: str) -> bool:
-    values = np.concatenate([column(log, name) for log in logs if name in log])
-    return bool(np.nanmax(values, initial=-np.inf) > np.nanmin(values, initial=np.inf))

@@ -31,7 +31,7 @@ def without_still(logs: list[Log]) -> list[Log]:
     guesses = _guesses(logs)
     for role in ("input", "output"):
         group = names(logs[0], role)
-        still = [name for name in group if not _moves(logs, name)]
+        still = [name for name in group if not moves(logs, name)]
         if len(still) < len(group):
             changed = [name for name in still if name in guesses]
             logs = [
@@ -43,14 +43,14 @@ def without_still(logs: list[Log]) -> list[Log]:
 
 def still_inputs(network: GreyModel | None, logs: Sequence[Log], u: Sequence[str]) -> list[str]:
     """Return the inputs of a network, switches aside, that never move, if others of them do."""
-    still = [name for name in u if not _moves(logs, name)] if network is not None else []
+    still = [name for name in u if not moves(logs, name)] if network is not None else []
     if not still or network is None:
         return []
     still = [name for name in still if name not in network.switches]
     return still if len(still) < len(u) else []
 
 
-def _moves(logs: Sequence[Log], name: str) -> bool:
+def moves(logs: Sequence[Log], name: str) -> bool:
     """Tell whether the readings of a column, if it has any, differ over the logs."""
     values = np.concatenate([column(log, name) for log in logs if name in log])
     return not np.isfinite(values).any() or bool(np.nanmax(values) > np.nanmin(values))
@@ -101,7 +101,7 @@ def signal_roles(
             taken_for = why.startswith(
                 ("its name is that of a drive", "its name is that of a read", "its unit")
             )
-            if role == "left out" and taken_for and not _moves(logs, name):
+            if role == "left out" and taken_for and not moves(logs, name):
                 why += ", but it never moves"
         elif role == "left out":
             why = "not named"

@@ -45,29 +45,6 @@ class ReportSettings:
 REPORT = ReportSettings()
 
 
-class WeakestDirection(NamedTuple):
-    """The direction in which a scaled Hessian says least."""
-
-    condition: float
-    eigenvalue: float
-    words: str
-
-
-def weakest_direction(jacobian: Array, names: Sequence[str]) -> WeakestDirection:
-    """Return condition and smallest eigenvalue of the scaled Hessian, and its direction in words."""
-    values, axes = _spectrum(jacobian)
-    least = max(float(values[0]), 0.0)
-    return WeakestDirection(float(values[-1] / max(least, 1e-18)), least, _in_words(axes[:, 0], names))
-
-
-def _spectrum(jacobian: Array) -> tuple[Array, Array]:
-    """Return eigenvalues (n,), rising, and eigenvectors (n, n) of the scaled Hessian."""
-    size = np.linalg.norm(jacobian, axis=0)
-    scaled = jacobian / np.where(size > 0, size, 1.0)
-    values, axes = np.linalg.eigh(scaled.T @ scaled)
-    return np.asarray(values), np.asarray(axes)
-
-
 def _in_words(axis: Array, names: Sequence[str]) -> str:
     """Return which parameters a direction moves, and which way."""
     axis = axis * np.sign(axis[np.argmax(np.abs(axis))])
@@ -166,13 +143,15 @@ def describe(
     names: Sequence[str], jacobian: Array, covariance: Array, widening: Array, on_bound: Mapping[str, str]
 ) -> Identifiability:
     """Return the identifiability report of a fit."""
-    condition, least, words = weakest_direction(jacobian, names)
-    values, axes = _spectrum(jacobian)
+    size = np.linalg.norm(jacobian, axis=0)
+    scaled = jacobian / np.where(size > 0, size, 1.0)
+    values, axes = np.linalg.eigh(scaled.T @ scaled)  # rising
+    least = max(float(values[0]), 0.0)
     sd = np.sqrt(np.diag(covariance))
     return Identifiability(
-        condition=condition,
+        condition=float(values[-1] / max(least, 1e-18)),
         spectrum=[float(f"{max(value, 0.0):.3g}") for value in values],
-        weakest=words,
+        weakest=_in_words(axes[:, 0], names),
         flat=[
             _in_words(axis, names) for value, axis in zip(values, axes.T) if value < REPORT.flat_eigenvalue
         ],

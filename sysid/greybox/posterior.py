@@ -74,7 +74,6 @@ class DrawSettings:
     """Numbers of the draws and of the chain."""
 
     difference_step: float = 1e-4  # of z
-    draws_at_once: int = 12  # whose slopes are taken: the runs of more do not fit a cache
     longest_step: float = 1.0  # prior sd that one step may move a parameter
     least_error: float = 1e-3  # of A: the least that V may be in any direction
     unseen_slope: float = 1e-9  # of the largest one: what moves the runs by less is lost in the differences
@@ -205,12 +204,6 @@ class RandomizedMap:
 
     def _slopes(self, z: Array, xi: Array, noise: Array, moving: NDArray[np.int_]) -> tuple[Array, Array]:
         """Return gradient (n, n_moving) and Gauss-Newton Hessian (n, n_moving, n_moving)."""
-        if len(z) > DRAW.draws_at_once:
-            blocks = [slice(k, k + DRAW.draws_at_once) for k in range(0, len(z), DRAW.draws_at_once)]
-            slopes_by_block = [self._slopes(z[rows], xi[rows], noise[rows], moving) for rows in blocks]
-            return np.concatenate([g for g, _ in slopes_by_block]), np.concatenate(
-                [h for _, h in slopes_by_block]
-            )
         n, d = len(z), moving.size
         sign = np.where(z[:, moving] + DRAW.difference_step > self.high[moving], -1.0, 1.0)
         ahead = z[:, None] + DRAW.difference_step * sign[:, :, None] * np.eye(self.z.size)[moving]

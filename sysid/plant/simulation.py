@@ -206,10 +206,8 @@ def _corrected(
     along = np.divide(root, size**2, out=np.zeros_like(root), where=size > START.rounding * size.max())
     for _ in range(2):
         residual, response = _warm(plant, p, stretch, start, start.x0[None], warmup)
-        blocks = [response @ root]
-        blocks.append(
-            np.concatenate([np.diag(free / noise) for noise in _reading_sd(plant, stretch, warmup)])
-        )
+        offsets_of_bin = np.diag(free / _reading_sd(plant, stretch, warmup))
+        blocks = [response @ root, np.tile(offsets_of_bin, (len(response) // free.size, 1))]
         is_read = np.isfinite(residual[0])
         A, r = np.hstack(blocks)[is_read], residual[0][is_read]
         # the prior is about the first guess, so what was moved before counts
@@ -284,7 +282,7 @@ def _warm(
     around = np.vstack([x0, x0[0] + np.diag(size)])
     u, d = stretch.u[None, :n], stretch.d[None, :n] - start.d_offset
     run = plant.model.rollout(around, u, d, p[None], plant.dt)[0]
-    sd = _reading_sd(plant, stretch, warmup)[0]
+    sd = _reading_sd(plant, stretch, warmup)
     residual = ((y - run[: len(x0)]) / sd).reshape(len(x0), -1)
     response = ((run[len(x0) :] - run[0]) / sd).reshape(len(size), -1).T / size
     return residual, response
@@ -304,8 +302,8 @@ def _binned(stretch: Stretch, dt: float, n: int, warmup: float) -> Array:
 
 
 def _reading_sd(plant: PlantData, stretch: Stretch, warmup: float) -> Array:
-    """Return the sd (n + 1, n_y) to give each bin of the warm-up: together one reading per 10 s."""
+    """Return the sd (n_y,) to give each bin of the warm-up: together one reading per 10 s."""
     n = min(len(stretch.u), max(1, int(np.ceil(warmup / plant.dt - 1e-9))))
     sd = np.array([max(plant.noise.get(name, 0.1), START.least_noise) for name in plant.outputs])
     readings = 1 + n * plant.dt / READING_EVERY
-    return np.tile(sd * np.sqrt((n + 1) / min(readings, n + 1)), (n + 1, 1))
+    return np.asarray(sd * np.sqrt((n + 1) / min(readings, n + 1)))

@@ -69,19 +69,6 @@ def test_a_schedule_is_its_shape_between_the_limits_behind_a_rest():
     assert slow.tolist() == [0.0] * 2 + prbs(298, hold=6, seed=3).tolist()  # 5.5 rows, and 6 s are two
 
 
-@pytest.mark.parametrize(("bits", "tap"), [(3, 1), (4, 1), (5, 2), (6, 1), (7, 1), (9, 4), (10, 3)])
-def test_a_prbs_is_the_sequence_of_its_polynomial(bits: int, tap: int):
-    n = 2**bits - 1
-    found = prbs(n, hold=1) > 0
-    assert found[:bits].tolist() == [False] * (bits - 1) + [True]
-    assert (np.roll(found, -bits) == (found ^ np.roll(found, -tap))).all()
-    begin = {3: 4, 4: 9, 5: 19, 6: 39, 7: 78, 9: 316, 10: 632}[bits]  # 0.618 of it
-    assert (
-        prbs(n, hold=1, seed=1).tolist()
-        == prbs(n, hold=1).tolist()[begin:] + prbs(n, hold=1).tolist()[:begin]
-    )
-
-
 @pytest.mark.parametrize(("n", "hold", "period"), [
     (4, 2, 7), (28, 2, 7), (29, 2, 7), (30, 2, 15), (40, 2, 15), (2046, 2, 1023), (9000, 2, 1023)
 ])  # fmt: skip

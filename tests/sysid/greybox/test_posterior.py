@@ -372,24 +372,6 @@ def test_the_density_has_the_bins_and_weights_of_the_fit(fitted: tuple[Plant, li
     assert posterior.fit_problem(free, logs).tau.tolist() == [15.0]
 
 
-def test_the_error_that_was_learnt_is_taken_for_the_fits_own_logs_alone(
-    fitted: tuple[Plant, list[Log]], monkeypatch: pytest.MonkeyPatch
-):
-    plant, logs = fitted
-    given: list[Any] = []
-    whole = posterior.score_covariance
-
-    def watched(problem: Any, z: Any, numbers: Any = None) -> Any:
-        given.append(numbers)
-        return whole(problem, z, numbers=numbers)
-
-    monkeypatch.setattr(posterior, "score_covariance", watched)
-    with_draws(plant, fit_problem(plant, logs), 2)
-    with_draws(plant, fit_problem(plant, [logs[0], a_log(7)]), 2)
-    with_draws(plant, fit_problem(plant, logs[:1]), 2)
-    assert [numbers is not None for numbers in given] == [True, False, False]
-
-
 @pytest.mark.parametrize("what", ["moves from one start", "starts", "draws"])
 def test_a_seed_decides(fitted: tuple[Plant, list[Log]], what: str):
     make: Any = {
@@ -429,24 +411,3 @@ def test_the_density_is_that_of_the_prior_of_moves_along_the_slopes_and_off_them
     np.testing.assert_allclose(target.information, 25 / 1.001 * np.array([[1, -1], [-1, 1]]), rtol=1e-6)
     np.testing.assert_allclose(target.covariance, np.linalg.inv(np.eye(2) + target.information))
     assert np.isneginf(target.log_profile(np.array([[9.1], [-9.1]]), [0])).all()
-
-
-def test_draws_tell_how_far_they_are(
-    fitted: tuple[Plant, list[Log]], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    told: list[tuple[float, str]] = []
-
-    def progress(share: float, what: str) -> None:
-        told.append((share, what))
-
-    drawn = with_draws(fitted[0], fit_problem(*fitted), 2, progress=progress)
-    assert told == [(k / 8, "plants that agree with the logs") for k in range(8)]
-    assert np.asarray(drawn.samples).shape == (2, 2)
-    assert np.asarray(with_draws(fitted[0], fit_problem(*fitted)).samples).shape == (24, 2)
-    told.clear()
-    monkeypatch.setattr(posterior, "DRAW", replace(posterior.DRAW, check_steps=2))
-    sample_posterior(*fitted, max_steps=4, n_samples=3, progress=progress)
-    assert [what for _, what in told][:2] == ["averaging the logs", "learning the model error"]
-    assert told[-2] == (0.95, "completing the samples")
-    sampling = [share for share, what in told if what.startswith("sampling, ")]
-    assert sampling == pytest.approx([0.525, 0.95])
