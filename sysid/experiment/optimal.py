@@ -1,11 +1,10 @@
 """The input schedule that shrinks a plant's posterior most, inside its limits.
 
-Schedules are lists of cells of equal length, one level per input in each.  Starting from the best of the
-given schedules (PRBS, multisine, staircase), from constants and from slow square waves, a search exchanges
-one block of cells of random length after the other and keeps what gains information
+Schedules are lists of cells of equal length, one level per input in each.  Starting from the best of
+constants and slow square waves, a search exchanges one block of cells of random length after the other, for
+one level or for two in turn, and keeps what gains information
 (:mod:`thermogrip.sysid.experiment.information`) without leaving the limits: coordinate exchange of D-optimal
-design [1]_.  A block gets one level, or two in turn; is copied from another schedule; shifts, so that its
-switch times move; or swings further out or less far.
+design [1]_.
 
 Limits that are kept at the search's step are checked again at the plant's own; a schedule that violates them
 there is shrunk towards the start's level until it keeps them.
@@ -91,7 +90,6 @@ def optimal_schedule(
     minutes: float,
     *,
     ranges: Mapping[str, tuple[float, float]],
-    begin: Mapping[str, Log] | None = None,
     shortest: float = 10.0,
     lowest: float = -np.inf,
     highest: float = np.inf,
@@ -103,8 +101,8 @@ def optimal_schedule(
 ) -> Log:
     """Return the schedule expected to gain most information, a row every ``plant.dt``.
 
-    ``ranges`` (low, high) are hard, of each input that is not a switch. The result is at least as good as
-    those schedules of ``begin`` that keep the limits: ``shortest`` seconds between two changes of an input,
+    ``ranges`` (low, high) are hard, of each input that is not a switch, and so are ``shortest`` seconds
+    between two changes of an input,
     ``slew`` shares of its range in a second at most, 30 s in each position of a switch, and every output in
     degC between ``lowest`` and ``highest``, of the plant and of eight draws of it. Inputs on ``hold`` stay
     as at the start, in a room of 25 degC: a switch on, any other at 0 or what is nearest to it.
@@ -121,26 +119,19 @@ def optimal_schedule(
     report = progress or (lambda fraction, what: None)
     fine = ExperimentForecast(plant, lowest=lowest, highest=highest)
     coarse = ExperimentForecast(plant, lowest=lowest, highest=highest, dt=frame.dt)
-    pool = [
-        np.where(frame.low < frame.high, inputs_of(plant, log), frame.still) for log in (begin or {}).values()
-    ]
-    cells = _search_cells(
-        frame, coarse, [frame.to_cells(u) for u in pool], seed, evaluations or EVALUATIONS, report
-    )
+    cells = _search_cells(frame, coarse, seed, evaluations or EVALUATIONS, report)
     report(0.97, "checking the limits")
 
     def bits(cells: Array) -> float:
         return fine.evaluate(frame.inputs(cells, coarse=False))
 
     within, _ = _shrunk(frame, bits, cells, SEARCH.halvings)
-    best_found = frame.inputs(within, coarse=False)
-    allowed = [u for u in (*pool, best_found) if len(u) == frame.n and fine.stays(u)]
-    if not allowed:
+    best = frame.inputs(within, coarse=False)
+    if not fine.stays(best):
         raise UserError(
             f"no schedule keeps the plant and {fine.n_draws} draws of it from {lowest:g} to {highest:g} degC",
             hint="widen --lowest and --highest",
         )
-    best = allowed[int(np.argmax([fine.bits(u) for u in allowed]))]
     report(1.0, "found")
     time = plant.dt * np.arange(frame.n)
     columns = {name: (best[:, k], plant.units.get(name, "1"), "input") for k, name in enumerate(plant.inputs)}
@@ -195,22 +186,9 @@ class _Frame:
                 u[k] = u[k - 1] + np.clip(u[k] - u[k - 1], -most, most)
         return u
 
-    def to_cells(self, u: Array) -> Array:
-        """Return the cells (n_cell, n_u) nearest to inputs on the plant's step."""
-        width = self.ratio * self.cell
-        middles = np.minimum(self.rest + width * np.arange(self.n_cell) + width // 2, len(u) - 1)
-        cells = np.clip(np.where(self.switch, np.round(u[middles]), u[middles]), self.low, self.high)
-        first = (np.arange(self.n_cell)[:, None] // self.together) * self.together
-        return np.take_along_axis(cells, first, axis=0)
-
 
 def _search_cells(
-    frame: _Frame,
-    forecast: ExperimentForecast,
-    pool: list[Array],
-    seed: int,
-    evaluations: int,
-    report: Progress,
+    frame: _Frame, forecast: ExperimentForecast, seed: int, evaluations: int, report: Progress
 ) -> Array:
     """Return the best cells found."""
 
@@ -218,14 +196,13 @@ def _search_cells(
         return forecast.evaluate(frame.inputs(cells, coarse=True), margin=SEARCH.margin)
 
     rng = np.random.default_rng(seed)
-    pool = [*pool, *_plain_shapes(frame)]
     best, gain = np.tile(frame.still, (frame.n_cell, 1)), -np.inf
-    for cells in [best, *pool]:
+    for cells in [best, *_plain_shapes(frame)]:
         shrunk, value = _shrunk(frame, evaluate, cells, SEARCH.coarse_halvings)
         if value > gain:
             best, gain = shrunk, value
     for k in range(evaluations):
-        trial = _exchanged(frame, best, pool, rng)
+        trial = _exchanged(frame, best, rng)
         value = evaluate(trial)
         if value > gain:
             best, gain = trial, value
@@ -271,34 +248,18 @@ def _shrunk(
     return best, value
 
 
-def _exchanged(frame: _Frame, cells: Array, pool: list[Array], rng: np.random.Generator) -> Array:
-    """Return the cells with one block of one input exchanged."""
+def _exchanged(frame: _Frame, cells: Array, rng: np.random.Generator) -> Array:
+    """Return the cells with one block of one input exchanged for one level, or for two in turn."""
     out, n = cells.copy(), frame.n_cell
     i = int(rng.choice(np.flatnonzero(frame.low < frame.high)))
     unit = int(frame.together[i])
     length = unit * int(np.ceil(np.exp(rng.uniform(0.0, np.log(max(n / (2 * unit), 1.0))))))
-    a = unit * int(rng.integers(-(-n // unit)))
-    block = slice(a, min(a + length, n))
-    old = out[block, i]
-    low = frame.low[i]
-    high = frame.high[i]
-    move = rng.random()
-    if move < 0.45 or (frame.switch[i] and move > 0.9):
-        out[block, i] = _random_level(frame, i, rng)
-    elif move < 0.6:
-        period = unit * int(rng.integers(1, max(2, old.size // (2 * unit)) + 1))
-        first, second = _random_level(frame, i, rng), _random_level(frame, i, rng)
-        out[block, i] = np.where((np.arange(old.size) // period) % 2 == 0, first, second)
-    elif move < 0.75:
-        out[block, i] = pool[int(rng.integers(len(pool)))][block, i]
-    elif move < 0.9:
-        by = unit * int(rng.integers(-4, 5))
-        out[block, i] = out[np.clip(np.arange(n) + by, 0, n - 1)[block] // unit * unit, i]
-    else:
-        middle, swing = old.mean(), rng.uniform(0.5, 1.5)
-        out[block, i] = np.clip(
-            middle + swing * (old - middle) + 0.1 * rng.normal() * (high - low), low, high
-        )
+    first = unit * int(rng.integers(-(-n // unit)))
+    block = np.arange(first, min(first + length, n))
+    period = unit * int(rng.integers(1, max(2, block.size // (2 * unit)) + 1))
+    levels = _random_level(frame, i, rng), _random_level(frame, i, rng)
+    in_turn = rng.integers(3) == 0  # copies, shifts and stretched swings beside these two gained no bits
+    out[block, i] = np.where(in_turn & ((block - first) // period % 2 == 1), levels[1], levels[0])
     return out
 
 

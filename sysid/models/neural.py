@@ -70,17 +70,15 @@ class NeuralModel(BlackBox):
         h = self.b.shape[1]
         m = len(self.inputs) + len(self.disturbances)
         n_y = len(self.outputs)
-        shapes = {"A": (n, n), "B": (n, m), "c": (n,), "V": (n, h), "W": (h, n), "U": (h, m), "b": (h,)}
+        shapes: dict[str, tuple[int, ...]] = {"A": (n, n), "B": (n, m), "c": (n,), "V": (n, h)}
+        shapes |= {"W": (h, n), "U": (h, m), "b": (h,)}
+        shapes = {name: (members, *shape) for name, shape in shapes.items()}
+        shapes |= dict.fromkeys(("y_middle", "y_size", "low", "high"), (n_y,))
+        shapes |= dict.fromkeys(("w_middle", "w_size", "reach"), (m,))
         for name, shape in shapes.items():
             value = getattr(self, name)
-            if value.shape != (members, *shape) or not np.isfinite(value).all():
-                raise ValueError(f"{name} has shape {value.shape}, expected finite {(members, *shape)}")
-        for name in ("y_middle", "y_size", "low", "high"):
-            if getattr(self, name).shape != (n_y,):
-                raise ValueError(f"{name} must have {n_y} entries")
-        for name in ("w_middle", "w_size", "reach"):
-            if getattr(self, name).shape != (m,):
-                raise ValueError(f"{name} must have {m} entries")
+            if value.shape != shape or (name not in _RAILS and not np.isfinite(value).all()):
+                raise ValueError(f"{name} has shape {value.shape}, expected finite {shape}")
         if n < n_y:
             raise ValueError(f"{n} states cannot hold {n_y} outputs")
         if not (np.abs(np.linalg.eigvals(self.A)) < 1).all():

@@ -177,8 +177,6 @@ def optimal_for(
     """Return the most informative schedule; ``slew`` is a drive's greatest change in a second, in its unit
     (the plain ones are compared without it), ``hold`` names inputs that do not move.  The plant needs a
     covariance, else UserError."""
-    from math import isinf
-
     from thermogrip.sysid.experiment.optimal import expect, optimal_schedule
     from thermogrip.sysid.experiment.schedules import KINDS as PLAIN
 
@@ -199,7 +197,6 @@ def optimal_for(
         plant,
         minutes,
         ranges=ranges,
-        begin=plain if isinf(slew) else None,
         shortest=min(_time_constants(plant, drive)[0] for drive in ranges),
         lowest=lowest,
         highest=highest,
