@@ -42,10 +42,6 @@ class CallTimes:
         self.seconds = self.since = self._assumed = self._spent = 0.0
         self.stale = False
 
-    def begin(self, now: float) -> None:
-        """Take a call before the first one to have been at this time [s]."""
-        self._time = now
-
     def call(self, reading: Mapping[str, float]) -> None:
         """Note a call with this reading."""
         now, before = number(reading, "time_s"), self._time
@@ -67,11 +63,6 @@ class CallTimes:
         else:
             self._interval, self._repeats = self.seconds / (1 + self._repeats), 0
             self.since += self.seconds
-
-    @property
-    def now(self) -> float:
-        """The time of the newest reading [s], NaN where none had one."""
-        return self._time
 
     @property
     def due(self) -> bool:

@@ -149,7 +149,53 @@ class ModelCode:
 
 def write_model(model: Model, drives: Sequence[int], h: float) -> ModelCode:
     """Return the C of a model's step of length h [s]; inputs that are no drives are switches, and on."""
-    return _write_model_code(_straight(_graph(model, drives, h)))
+    line = _straight(_graph(model, drives, h))
+    outputs = [list(entries.items()) for entries in line.outputs]
+    roots = [[number for _, number in entries] for entries in outputs]
+    everything = _needed(line, [number for name in roots for number in name])
+    k = _hand_over(line, everything, _PARAMETERS, "k")
+    # what a step reads comes first
+    h = _hand_over(line, everything, _DRIVES, "h", first=_needed(line, roots[0]))
+    m = _hand_over(line, everything, _STATE, "m")
+    read = [number for number in h if number in _needed(line, roots[0])]
+    into = {
+        "k": [f"k[{entry}] = {{}};" for entry in range(len(k))],
+        "h": [f"h[{4 * entry}] = {{}};" for entry in range(len(h))],
+        "m": [f"m[{entry}] = {{}};" for entry in range(len(m))],
+        "xn": [f"xn[{entry}] = {{}};" for entry, _ in outputs[0]],
+    }
+    out = [[f"out[{4 * entry} + c] = {{}};" for entry, _ in outputs[n]] for n in (1, 2, 3)]
+    bodies = {
+        "prepare": _body(line, _PARAMETERS, k, into["k"]),
+        "hold": _over_drives(_body(line, _DRIVES, read, into["h"][: len(read)]), line.n_u),
+        "hold_slopes": _over_drives(_body(line, _DRIVES, h, into["h"]), line.n_u),
+        "step": _body(line, _STATE, roots[0], into["xn"]),
+        "next": [
+            f"    double h[{4 * max(1, len(read))}];",
+            "    tg_model_hold(1, u, k, h);",
+            "    tg_model_step(x, u, d, k, h, xn);",
+        ],
+        "partials": _body(line, _STATE, roots[0] + m, into["xn"] + into["m"]),
+        "tangent": _body(line, _DIRECTION, roots[1], out[0]),
+        "tangent_u": _body(line, _DIRECTION, roots[2], out[1]),
+        "tangent_d": _body(line, _DIRECTION, roots[3], out[2]),
+    }
+    source = []
+    n_x = len(line.outputs[0])
+    sizes = {"sx": n_x, "su": line.n_u, "sd": line.n_d, "out": n_x}
+    for name, lines in bodies.items():
+        head = _FUNCTION_HEADS[name]
+        arguments = [item.split()[-1].lstrip("*") for item in head[head.index("(") + 1 : -1].split(",")]
+        body = "\n".join(lines)
+        unused = [f"    (void){item};" for item in arguments if not re.search(rf"\b{item}\b", body)]
+        if name.startswith("tangent"):
+            unused = [text for text in unused if text != "    (void)n;"]
+            moving = [item for item in arguments if item in sizes]
+            lines = _over_groups(lines, moving, sizes)
+        source.append("\n".join([head, "{", *unused, *lines, "}", ""]))
+    heads = [_FUNCTION_HEADS[name].replace(" restrict ", " ").replace("*restrict ", "*") for name in bodies]
+    header = ";\n".join([*heads, ""])  # C++ has no such word, and to C it is the same declaration
+    return ModelCode("\n".join(source), header, len(k), len(h), len(m), line)
 
 
 def _graph(model: Model, drives: Sequence[int], h: float) -> Any:
@@ -224,55 +270,6 @@ def _needed(line: _Line, roots: Sequence[int]) -> set[int]:
             needed.add(number)
             waiting.extend(line.values[number].uses)
     return needed
-
-
-def _write_model_code(line: _Line) -> ModelCode:
-    outputs = [list(entries.items()) for entries in line.outputs]
-    roots = [[number for _, number in entries] for entries in outputs]
-    everything = _needed(line, [number for name in roots for number in name])
-    k = _hand_over(line, everything, _PARAMETERS, "k")
-    # what a step reads comes first
-    h = _hand_over(line, everything, _DRIVES, "h", first=_needed(line, roots[0]))
-    m = _hand_over(line, everything, _STATE, "m")
-    read = [number for number in h if number in _needed(line, roots[0])]
-    into = {
-        "k": [f"k[{entry}] = {{}};" for entry in range(len(k))],
-        "h": [f"h[{4 * entry}] = {{}};" for entry in range(len(h))],
-        "m": [f"m[{entry}] = {{}};" for entry in range(len(m))],
-        "xn": [f"xn[{entry}] = {{}};" for entry, _ in outputs[0]],
-    }
-    out = [[f"out[{4 * entry} + c] = {{}};" for entry, _ in outputs[n]] for n in (1, 2, 3)]
-    bodies = {
-        "prepare": _body(line, _PARAMETERS, k, into["k"]),
-        "hold": _over_drives(_body(line, _DRIVES, read, into["h"][: len(read)]), line.n_u),
-        "hold_slopes": _over_drives(_body(line, _DRIVES, h, into["h"]), line.n_u),
-        "step": _body(line, _STATE, roots[0], into["xn"]),
-        "next": [
-            f"    double h[{4 * max(1, len(read))}];",
-            "    tg_model_hold(1, u, k, h);",
-            "    tg_model_step(x, u, d, k, h, xn);",
-        ],
-        "partials": _body(line, _STATE, roots[0] + m, into["xn"] + into["m"]),
-        "tangent": _body(line, _DIRECTION, roots[1], out[0]),
-        "tangent_u": _body(line, _DIRECTION, roots[2], out[1]),
-        "tangent_d": _body(line, _DIRECTION, roots[3], out[2]),
-    }
-    source = []
-    n_x = len(line.outputs[0])
-    sizes = {"sx": n_x, "su": line.n_u, "sd": line.n_d, "out": n_x}
-    for name, lines in bodies.items():
-        head = _FUNCTION_HEADS[name]
-        arguments = [item.split()[-1].lstrip("*") for item in head[head.index("(") + 1 : -1].split(",")]
-        body = "\n".join(lines)
-        unused = [f"    (void){item};" for item in arguments if not re.search(rf"\b{item}\b", body)]
-        if name.startswith("tangent"):
-            unused = [text for text in unused if text != "    (void)n;"]
-            moving = [item for item in arguments if item in sizes]
-            lines = _over_groups(lines, moving, sizes)
-        source.append("\n".join([head, "{", *unused, *lines, "}", ""]))
-    heads = [_FUNCTION_HEADS[name].replace(" restrict ", " ").replace("*restrict ", "*") for name in bodies]
-    header = ";\n".join([*heads, ""])  # C++ has no such word, and to C it is the same declaration
-    return ModelCode("\n".join(source), header, len(k), len(h), len(m), line)
 
 
 def _over_drives(lines: Sequence[str], n_u: int) -> list[str]:

@@ -119,14 +119,9 @@ def _machine(gcc: str) -> str:
 QP_STATUS = ("solved", "infeasible", "iteration limit", "not convex", "not finite", "time limit")
 
 
-_codes: dict[tuple[_ByStructure, tuple[int, ...], float], ModelCode] = {}
-
-
+@cache
 def _model_code(model: _ByStructure, drives: tuple[int, ...], h: float) -> ModelCode:
-    key = (model, drives, h)
-    if key not in _codes:
-        _codes[key] = write_model(model.model, drives, h)
-    return _codes[key]
+    return write_model(model.model, drives, h)
 
 
 def _code_of(model: PredictionModel) -> ModelCode:
@@ -194,10 +189,6 @@ class CompiledController:
         self._step, self._seconds = self.library.tg_host_step, ctypes.c_double(controller.design.deadline_s)
         self._places = ctypes.byref(self.given), ctypes.byref(self.answer)
         self._until = ctypes.c_double()
-        self.ask_late(late)
-
-    def ask_late(self, late: Callable[[], bool] | None) -> None:
-        """Ask ``late``, or the clock of the C, whether a step has taken too long."""
         if late is None:
             self._late: Any = self.library.tg_host_clock
         else:
