@@ -15,7 +15,6 @@ from tests.end_to_end.conftest import small_plant
 from thermogrip.datasets.errors import UserError
 from thermogrip.mpc.controllers.export import Agreement, Export
 from thermogrip.mpc.controllers.mpc import Controller
-from thermogrip.mpc.design.spec import Spec
 from thermogrip.mpc.tuning.design_review import Check
 from thermogrip.mpc.tuning.tune import Row
 
@@ -23,57 +22,14 @@ ROW = Row("tuned", 28.0, 38.0, 90.0, 95.0, 0.1, 0.2, 0.01, 0.01, 7.0, 7.0, 2.0, 
 ROWS = (("tuned", "28 to 38", 90.0, 95.0, 0.1, 0.2, 0.01, 7.0, 80.0),)
 
 
-@pytest.fixture
-def tuned(stand_in: StandIn) -> SimpleNamespace:
-    """Return a tuning that is a stand-in, with what asked for it and what its pages were made of."""
-
-    def tune(*_: Any, progress: Any, **__: Any) -> SimpleNamespace:
-        progress(0.5, "search")
-        return found
-
+def test_an_interrupted_tuning_is_written_and_ends_with_130(bench: Bench, stand_in: StandIn) -> None:
     found = SimpleNamespace(
         save=lambda out: out.write_text("{}"), verdict="tuned", finding="faster", meets_spec=True,
-        scores={"tuned": 1.5}, rows=(ROW,), interrupted=False, controller=None,
+        scores={"tuned": 1.5}, rows=(ROW,), interrupted=True, controller=None,
     )  # fmt: skip
-    found.asked = stand_in("thermogrip.mpc.tuning.tune.tune", tune)
+    stand_in("thermogrip.mpc.tuning.tune.tune", found)
     stand_in("thermogrip.report.control.tuning_table", (tuple("abcdefghi"), ROWS))
     stand_in("thermogrip.report.control.tuning_caption", "Closed loops on 5 draws of the plant")
-    stand_in("thermogrip.report.control.tuning_sections", ["a section"])
-    found.pages = stand_in("thermogrip.report.html.write_report")
-    return found
-
-
-@pytest.mark.parametrize(("meets", "code", "words"), [(True, 0, "meets"), (False, 3, "does not meet")])
-def test_a_tuning_is_an_answer_of_yes_where_it_meets_the_spec(
-    meets: bool, code: int, words: str, bench: Bench, tuned: SimpleNamespace
-) -> None:
-    tuned.meets_spec = meets
-    bench.write("spec.toml", "steps = [[25, 29]]\nhold_s = 77\n")
-    options = ["--spec", "spec.toml", "--seed", "3", "--out", "c.json"]
-    done = bench.run("tune", "plant.json", *options, "--report", "t.html")
-    assert done.code == code, done
-    [call] = tuned.asked
-    assert (call.args[0].inputs, call.args[1].hold_s) == (("drive", "pump"), 77.0)
-    assert call.seed == 3
-    said = words_of(done.out)
-    assert "tuned 28 to 38 90 95 0.1 0.2 0.01 7 80 tuned: faster" in said
-    assert said.endswith(f"The MPC {words} the spec on every draw; wrote c.json")
-    assert shares(done.err, "tune") == [50]
-    [page] = tuned.pages
-    assert page.args == (
-        Path("t.html"), "Tuning",
-        "The best controller for plant.json is an MPC, by simulations on its draws.", ["a section"],
-    )  # fmt: skip
-    assert json.loads(bench.run("tune", "plant.json", "--out", "c.json", "--json").out) == {
-        "kind": "MPC", "verdict": "tuned", "finding": "faster", "meets_spec": meets, "interrupted": False,
-        "scores": {"tuned": 1.5}, "rows": [asdict(ROW)],
-        "out": "c.json", "report": None,
-    }  # fmt: skip
-    assert (tuned.asked[1].args[1], len(tuned.pages)) == (Spec(), 1)
-
-
-def test_an_interrupted_tuning_is_written_and_ends_with_130(bench: Bench, tuned: SimpleNamespace) -> None:
-    tuned.interrupted = True
     done = bench.run("tune", "plant.json", "--out", "c.json")
     assert (done.code, Path("c.json").exists()) == (130, True)
     assert "wrote c.json" in words_of(done.out)

@@ -17,7 +17,7 @@ from thermogrip.classify.estimators.base import GraspClassifier
 from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.datasets.schema import Grasps
 from thermogrip.mpc.interface import Move
-from thermogrip.report.html import Section, Table
+from thermogrip.report.html import Table
 from thermogrip.rig import Session
 from thermogrip.rig.simulation.twin import Twin
 from thermogrip.studies import demo
@@ -120,103 +120,26 @@ def test_classifiers_are_scored_on_test_grasps_and_trained_for_the_twins_on_trai
     assert len((tmp_path / "predictions.csv").read_text().splitlines()) == 6
 
 
-@pytest.mark.parametrize(("workers", "compared"), [(1, (0.87, "x")), (3, (0.76, "train and test"))])
-def test_every_stage_has_its_share_of_the_progress_and_its_section(
-    workers: int, compared: tuple[float, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.mark.slow
+def test_the_whole_demo_leaves_a_page_whose_every_question_is_answered(tmp_path: Path) -> None:
     seen: list[tuple[float, str]] = []
-    asked: dict[str, tuple[Any, ...]] = {}
-    session = SimpleNamespace(grasps="a grasp")
-    results = {
-        "_identify": SimpleNamespace(
-            identification="found", plant="plant", posterior="record", held_out="run"
-        ),
-        "_tune": ("tuning", "checks"),
-        "_grasp_on_twin": [("one", session), ("two", SimpleNamespace(grasps=None))],
-        "_compare": ("comparison", "model"),
-    }  # fmt: skip
-    for name, result in results.items():
-
-        def stage(*args: Any, name: str = name, result: Any = result) -> Any:
-            asked[name] = args[:-1]
-            if args[-1] is not None:  # while this process identifies, others compare
-                args[-1](0.5, "x")
-            return result
-
-        monkeypatch.setattr(demo, name, stage)
-    for name in ("identification", "free_run", "parameters", "tuning", "review", "session"):
-        monkeypatch.setattr(
-            demo, f"{name}_section",
-            lambda *args, name=name, **_: Section(f"{name} of {' '.join(map(str, args))}", ()),
-        )  # fmt: skip
-    monkeypatch.setattr(
-        demo, "_touch", lambda out, model, touched: Section(f"touch of {model} {touched}", ())
-    )
-    monkeypatch.setattr(demo, "comparison_sections", lambda *args: [Section(" ".join(args), ())])
-    done = demo.run_demo(
-        tmp_path, seed=SEED, workers=workers, progress=lambda fraction, what: seen.append((fraction, what))
-    )
-    assert seen == [
-        (pytest.approx(0.3), "identify: x"), (pytest.approx(0.665), "tune: x"),
-        (pytest.approx(0.745), "run: x"), (pytest.approx(compared[0]), f"compare: {compared[1]}"),
-        (1.0, "done"),
-    ]  # fmt: skip
-    assert asked == {
-        "_identify": (tmp_path, SEED), "_tune": (tmp_path, "plant", SEED, workers),
-        "_grasp_on_twin": (tmp_path, "tuning", "plant", SEED), "_compare": (tmp_path, SEED, workers),
-    }  # fmt: skip
-    assert [section.title for section in done.sections] == [
-        "identification of found", "free_run of run", "parameters of plant record",
-        "tuning of tuning", "review of checks",
-        f"session of {results['_grasp_on_twin']} the twin (posterior draw 3)", "touch of model ['a grasp']",
-        "shipped comparison", "The same with your files",
-    ]  # fmt: skip
-    assert done.report == tmp_path / "report.html"
-    assert "identification of found" in done.report.read_text()
-
-
-def test_a_plant_is_fitted_to_three_logs_and_the_first_half_of_the_fourth(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    seen: list[tuple[float, str]] = []
-    calls: dict[str, Any] = {}
-    fitted, sampled = (
-        SimpleNamespace(plant="a plant"),
-        SimpleNamespace(save=lambda path: calls.update(saved=path)),
-    )
-
-    def identify(logs: Any, *, progress: Any, **options: Any) -> Any:
-        progress(0.5, "x")
-        calls["identify"] = (
-            [log.attrs["name"] for log in logs],
-            [log.sizes["time"] for log in logs],
-            options,
-        )
-        return fitted
-
-    def sample(plant: Any, logs: Any, *, seed: int, progress: Any) -> Any:
-        progress(0.5, "y")
-        calls["sample"] = (plant, len(logs), seed)
-        return sampled, "a record"
-
-    monkeypatch.setattr("thermogrip.sysid.identification.identify", identify)
-    monkeypatch.setattr("thermogrip.sysid.greybox.posterior.sample_posterior", sample)
-    monkeypatch.setattr(
-        "thermogrip.sysid.validation.free_run.free_run",
-        lambda plant, log, *, score_from: (plant, log.sizes["time"], score_from),
-    )
-    found = demo._identify(tmp_path, SEED, lambda fraction, what: seen.append((fraction, what)))
-    names, rows, options = calls["identify"]
-    assert (len(names), options) == (
-        4, {"network": "gripper", "models": ("arx", "oe", "sindy", "network"), "draws": 0, "seed": SEED},
-    )  # fmt: skip
-    plant, n, score_from = found.held_out
-    assert (plant is sampled, score_from) == (True, 1350)
-    [cut] = [rows for name, rows in zip(names, rows) if name.startswith("pump_on_off")]
-    assert 0.4 < cut / n < 0.6
-    assert (calls["sample"], calls["saved"]) == (
-        ("a plant", 4, SEED),
-        tmp_path / "plant.json",
-    )
-    assert (found.identification, found.plant, found.posterior) == (fitted, sampled, "a record")
-    assert seen == [(pytest.approx(0.3), "x"), (pytest.approx(0.8), "posterior: y")]
+    done = demo.run_demo(tmp_path, seed=SEED, workers=2, progress=lambda *step: seen.append(step))
+    shares = [share for share, _ in seen]
+    assert shares == sorted(shares)
+    assert shares[-1] == 1.0
+    stages = list(dict.fromkeys(what.partition(":")[0] for _, what in seen))
+    assert stages == ["identify", "tune", "run", "compare", "done"]
+    questions = [section for section in done.sections if section.title.endswith("?")]
+    assert len(questions) >= 6
+    assert all(section.verdict for section in questions)
+    page = done.report.read_text(encoding="utf-8")
+    assert all(section.title in page for section in done.sections)
+    made = {path.name for path in tmp_path.iterdir()}
+    assert made >= {
+        "plant.json",
+        "controller.json",
+        "comparison",
+        "classifier",
+        "predictions.csv",
+        "report.html",
+    }

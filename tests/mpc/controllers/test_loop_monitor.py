@@ -136,10 +136,11 @@ def test_a_drive_that_comes_to_do_another_share_is_told_after_some_targets(share
     assert words[-1].startswith(said) if said else not any(words)
 
 
-def test_a_reading_that_stays_while_its_drive_moves_is_told_of_and_one_at_rest_is_not():
+@pytest.mark.parametrize("share", [1.0, 0.7])  # what a drive lacks is a disturbance that the filter knows
+def test_a_reading_that_stays_while_its_drive_moves_is_told_of_and_one_at_rest_is_not(share):
     design = default_design(KIT, dt=4.0)
     controller, monitor = Controller(KIT, design), LoopMonitor(KIT, design)
-    truth = Truth(KIT, 4.0, Surroundings(noise=0.01, quantum=0.5), None, 0)
+    truth = Truth(KIT, 4.0, Surroundings(noise=0.01, quantum=0.5, drive_share=share), None, 0)
     words, shown = [], {}
     for k in range(600):
         target = 40.0 if k < 400 else 46.0
