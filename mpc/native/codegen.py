@@ -155,12 +155,12 @@ def write_model(model: Model, drives: Sequence[int], h: float) -> ModelCode:
     everything = _needed(line, [number for name in roots for number in name])
     k = _hand_over(line, everything, _PARAMETERS, "k")
     # what a step reads comes first
-    h = _hand_over(line, everything, _DRIVES, "h", first=_needed(line, roots[0]))
+    held = _hand_over(line, everything, _DRIVES, "h", first=_needed(line, roots[0]))
     m = _hand_over(line, everything, _STATE, "m")
-    read = [number for number in h if number in _needed(line, roots[0])]
+    read = [number for number in held if number in _needed(line, roots[0])]
     into = {
         "k": [f"k[{entry}] = {{}};" for entry in range(len(k))],
-        "h": [f"h[{4 * entry}] = {{}};" for entry in range(len(h))],
+        "h": [f"h[{4 * entry}] = {{}};" for entry in range(len(held))],
         "m": [f"m[{entry}] = {{}};" for entry in range(len(m))],
         "xn": [f"xn[{entry}] = {{}};" for entry, _ in outputs[0]],
     }
@@ -168,7 +168,7 @@ def write_model(model: Model, drives: Sequence[int], h: float) -> ModelCode:
     bodies = {
         "prepare": _body(line, _PARAMETERS, k, into["k"]),
         "hold": _over_drives(_body(line, _DRIVES, read, into["h"][: len(read)]), line.n_u),
-        "hold_slopes": _over_drives(_body(line, _DRIVES, h, into["h"]), line.n_u),
+        "hold_slopes": _over_drives(_body(line, _DRIVES, held, into["h"]), line.n_u),
         "step": _body(line, _STATE, roots[0], into["xn"]),
         "next": [
             f"    double h[{4 * max(1, len(read))}];",
@@ -195,7 +195,7 @@ def write_model(model: Model, drives: Sequence[int], h: float) -> ModelCode:
         source.append("\n".join([head, "{", *unused, *lines, "}", ""]))
     heads = [_FUNCTION_HEADS[name].replace(" restrict ", " ").replace("*restrict ", "*") for name in bodies]
     header = ";\n".join([*heads, ""])  # C++ has no such word, and to C it is the same declaration
-    return ModelCode("\n".join(source), header, len(k), len(h), len(m), line)
+    return ModelCode("\n".join(source), header, len(k), len(held), len(m), line)
 
 
 def _graph(model: Model, drives: Sequence[int], h: float) -> Any:
