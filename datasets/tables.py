@@ -75,7 +75,7 @@ _NUMBER_CELL = re.compile(
     r"[+-]?(\d+\.?\d*([eE][+-]?\d+)?|\.\d+([eE][+-]?\d+)?|inf|infinity)", re.ASCII | re.IGNORECASE
 )
 # what spreadsheets print within numbers: a minus that is no hyphen, a mark between thousands
-_PRINTED_MINUS, _THOUSANDS = "\u2212", re.compile(r"(?<=\d)[\s'\u2019](?=\d{3}(?!\d))")
+_PRINTED_MINUS, _THOUSANDS = "\u2212", re.compile(r"(?<=\d)[\xa0\u2009\u202f'\u2019](?=\d{3}(?!\d))")
 _WITH_UNIT = re.compile(r"([+-]?[\d.,]+(?:[eE][+-]?\d+)?)\s*([^\W\d_]{1,4}|%|[°º]\s?[CFK])")
 
 
@@ -461,12 +461,13 @@ def read_column(
     number among more numbers than are tolerated."""
     if (plain := _plain_numbers(cells)) is not None:
         return Column(name, plain)
-    cells = [_THOUSANDS.sub("", cell.strip().replace(_PRINTED_MINUS, "-")) for cell in cells]
+    printed = [cell.strip() for cell in cells]
+    cells = [_THOUSANDS.sub("", cell.replace(_PRINTED_MINUS, "-")) for cell in printed]
     values = _to_numbers(cells)
-    notes: list[str] = []
+    notes = [] if cells == printed else ["numbers are as printed: a long minus, marks between thousands"]
     wrong = _not_numbers(cells, values)
     if wrong.size and separator != "," and _has_decimal_comma(cells):
-        values, notes = _to_numbers([cell.replace(",", ".") for cell in cells]), [_COMMAS]
+        values, notes = _to_numbers([cell.replace(",", ".") for cell in cells]), [*notes, _COMMAS]
         wrong = _not_numbers(cells, values)
     cells_known = len(cells) - sum(cell in _LOST_CELLS for cell in cells)
     if tolerated and wrong.size and (united := _without_unit(name, cells)) is not None:

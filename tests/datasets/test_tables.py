@@ -207,7 +207,8 @@ def test_a_table_has_4096_columns_at_most():
         ("a,番号\n1,2\n3,4\n".encode("cp932"), {"a": "1 3", "番号": "2 4"}, [2, 3],
          ["text is not UTF-8: read as Shift-JIS"]),
         ("a;b\n1;\u22122,5\n2;2\u202f400,0\n3;12'345,5\n", {"a": "1 2 3", "b": "-2.5 2400 12345.5"},
-         [2, 3, 4], ["numbers have a decimal comma"]),
+         [2, 3, 4],
+         ["numbers are as printed: a long minus, marks between thousands", "numbers have a decimal comma"]),
     ],
 )  # fmt: skip
 def test_cells_are_numbers_switches_times_or_words(text, cells, lines, notes):
