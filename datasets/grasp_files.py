@@ -283,8 +283,7 @@ def _onto_one_axis(samples: _Samples, order: Sequence[str], file: str) -> tuple[
     """Return the common time axis (n_time,) and the channels (n_grasp, n_time); what is repaired is added to
     the samples' repairs."""
     time, rows_of = samples.time, []
-    ids = np.asarray(samples.grasp_ids)
-    for grasp, rows in zip(order, _rows_of(ids, order)):
+    for grasp, rows in zip(order, _rows_of(samples.grasp_ids, order)):
         steps = np.diff(time[rows])
         if (back := np.flatnonzero(steps < 0)).size:
             begin, end = time[rows[back[0] : back[0] + 2]]
@@ -305,11 +304,12 @@ def _onto_one_axis(samples: _Samples, order: Sequence[str], file: str) -> tuple[
     }
 
 
-def _rows_of(ids: NDArray[np.str_], order: Sequence[str]) -> list[Rows]:
+def _rows_of(ids: Sequence[str], order: Sequence[str]) -> list[Rows]:
     """Return the rows of each grasp, in the order of the file."""
-    names, index = np.unique(ids, return_inverse=True)
-    by_name = np.split(np.argsort(index, kind="stable"), np.cumsum(np.bincount(index))[:-1])
-    return [by_name[place] for place in np.searchsorted(names, order)]
+    import pandas as pd
+
+    rows = pd.Series(ids).groupby(ids).indices
+    return [rows[grasp] for grasp in order]
 
 
 def _is_even(axis: Floats, step: float) -> bool:
@@ -418,7 +418,7 @@ def _rows_of_meta(table: Table, order: Sequence[str], file: str) -> list[int]:
 
 def _first_rows(table: Table, order: Sequence[str]) -> list[int]:
     """Return the first row of each grasp in a table that repeats its facts; UserError where they differ."""
-    rows_of = _rows_of(np.asarray(table.text["grasp_id"]), order)
+    rows_of = _rows_of(table.text["grasp_id"], order)
     for header, column in {**table.text, **table.numbers}.items():
         if _name_of_fact(header)[0] not in (*GRASP_LABELS, *GRASP_NUMBERS):
             continue

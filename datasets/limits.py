@@ -12,7 +12,8 @@ import io
 import math
 import os
 import stat
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
@@ -110,7 +111,7 @@ class Unpacker:
 
     def __call__(self, packing: str, data: bytes) -> bytes:
         """Return what ``data``, packed with bz2, lz4 or zstd, holds; KeyError if it is with another."""
-        unpacked = _PACKINGS[packing](data, most_unpacked(self._packed) - self._found + 1)
+        unpacked = _unpacked(packing, data, most_unpacked(self._packed) - self._found + 1)
         self._found += len(unpacked)
         check_unpacked(self._packed, self._found, file=self._file)
         return unpacked
@@ -120,33 +121,23 @@ class Unpacker:
         check_unpacked(self._packed, self._found + size, file=self._file, what="declares")
 
 
-def _bz2(data: bytes, most: int) -> bytes:
-    import bz2
+def _unpacked(packing: str, data: bytes, most: int) -> bytes:
+    """Return what a chunk holds, ``most`` bytes of it at most."""
+    if packing == "zstd":
+        import zstandard
 
-    return _unpacked(bz2.BZ2Decompressor(), data, most)
-
-
-def _lz4(data: bytes, most: int) -> bytes:
-    from lz4.frame import LZ4FrameDecompressor
-
-    return _unpacked(LZ4FrameDecompressor(), data, most)
-
-
-def _zstd(data: bytes, most: int) -> bytes:
-    import zstandard
-
-    with zstandard.ZstdDecompressor().stream_reader(io.BytesIO(data)) as stream:
-        return bytes(stream.read(most))
-
-
-def _unpacked(unpacker: Any, data: bytes, most: int) -> bytes:
+        with zstandard.ZstdDecompressor().stream_reader(io.BytesIO(data)) as stream:
+            return bytes(stream.read(most))
+    if packing == "bz2":
+        unpacker: Any = import_module("bz2").BZ2Decompressor()
+    elif packing == "lz4":
+        unpacker = import_module("lz4.frame").LZ4FrameDecompressor()
+    else:
+        raise KeyError(packing)
     unpacked: bytes = unpacker.decompress(data, max_length=most)
     if len(unpacked) < most and not unpacker.eof:
         raise EOFError("the chunk is cut off")
     return unpacked
-
-
-_PACKINGS: dict[str, Callable[[bytes, int], bytes]] = {"bz2": _bz2, "lz4": _lz4, "zstd": _zstd}
 
 
 def check_content(
