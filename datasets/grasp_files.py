@@ -308,8 +308,8 @@ def _rows_of(ids: Sequence[str], order: Sequence[str]) -> list[Rows]:
     """Return the rows of each grasp, in the order of the file."""
     import pandas as pd
 
-    rows = pd.Series(ids).groupby(ids).indices
-    return [rows[grasp] for grasp in order]
+    rows = pd.Series(ids).groupby([*ids]).indices
+    return [np.asarray(rows[grasp]) for grasp in order]
 
 
 def _is_even(axis: Floats, step: float) -> bool:
@@ -413,7 +413,7 @@ def _rows_of_meta(table: Table, order: Sequence[str], file: str) -> list[int]:
         if grasp not in rows:
             problem = f"no row for grasp {grasp!r} of {Path(file).name}"
             raise UserError(problem, file=table.file, hint="add it")
-    return [rows[grasp] for grasp in order]
+    return [np.asarray(rows[grasp]) for grasp in order]
 
 
 def _first_rows(table: Table, order: Sequence[str]) -> list[int]:
