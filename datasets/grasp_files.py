@@ -413,7 +413,7 @@ def _rows_of_meta(table: Table, order: Sequence[str], file: str) -> list[int]:
         if grasp not in rows:
             problem = f"no row for grasp {grasp!r} of {Path(file).name}"
             raise UserError(problem, file=table.file, hint="add it")
-    return [np.asarray(rows[grasp]) for grasp in order]
+    return [rows[grasp] for grasp in order]
 
 
 def _first_rows(table: Table, order: Sequence[str]) -> list[int]:
