@@ -315,14 +315,6 @@ def test_linear_algebra_has_one_thread_unless_somebody_says_otherwise(
         monkeypatch.setenv(name, "1")
 
 
-def test_the_words_of_the_process_are_the_default(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(sys, "argv", ["thermogrip", "--version"])
-    assert main() == 0
-    assert capsys.readouterr().out.startswith("thermogrip 0")
-
-
 def test_json_is_one_object_and_nothing_else(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["materials", "copper", "--json"]) == 0
     (row,) = json.loads(capsys.readouterr().out)["materials"]

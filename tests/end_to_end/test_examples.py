@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -44,10 +42,3 @@ def test_the_benchmarks_table_becomes_two_logs(tmp_path: Path, monkeypatch: pyte
     assert train["level"].values.tolist() == [5.205, 5.2154]
     assert test["pump"].values.tolist() == [1.5, 1.6]
     assert (train["pump"].attrs["role"], test["level"].attrs["units"]) == ("input", "V")
-
-
-def test_without_a_log_the_tanks_say_how_they_are_run() -> None:
-    words = [sys.executable, str(EXAMPLES / "cascaded_tanks.py")]
-    done = subprocess.run(words, capture_output=True, text=True, timeout=120, check=False)
-    assert done.returncode == 1
-    assert done.stderr.startswith("usage: ")

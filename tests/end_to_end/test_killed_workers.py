@@ -83,7 +83,8 @@ def identify(bench: Bench) -> tuple[list[str], str]:
     return words.split(), "answer.json"
 
 
-@pytest.mark.parametrize("verb", [effusivity, pytest.param(identify, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("verb", [effusivity, identify])
 def test_a_killed_worker_changes_no_byte(bench: Bench, monkeypatch, verb) -> None:
     monkeypatch.chdir(bench.path)
     (bench.path / "many").mkdir(exist_ok=True)

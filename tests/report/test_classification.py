@@ -50,13 +50,6 @@ def test_a_confusion_says_what_it_counts(split: str, repeats: int, said: str) ->
     assert any(said in text for text in captions(comparison_sections(split, found)))
 
 
-@pytest.mark.parametrize(("name", "title"), [("session", "Sessions held out"), ("files", "Other files")])
-def test_each_kind_of_split_has_its_title(name: str, title: str) -> None:
-    models = {"features-lda": make_classifier("features-lda")}
-    found = evaluate(models, [load_example_grasps()["exp2_dT20"]], seed=0, probe=False)
-    assert [s.title for s in comparison_sections(name, found)] == [f"Which material? {title}"]
-
-
 def test_touches_are_counted_by_what_was_taught_and_what_was_not() -> None:
     record = load_example_grasps()["exp2_dT20"].isel(grasp=[0, 16])
     row = {"p_copper": 1.0, "p_wood": 0.0, "decided_at_s": 10.0}
