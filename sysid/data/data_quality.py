@@ -389,14 +389,17 @@ def _set_points(log: Log) -> list[Finding]:
     by_course = [
         line.partition(": ")[0] for line in log.attrs.get("guesses", "").splitlines() if FOLLOWED in line
     ]
-    found = [n for n, unit in units.items() if explain_role(n, unit)[1] == IS_SET_POINT or n in by_course]
+    set_points = [
+        n for n, unit in units.items() if explain_role(n, unit)[1] == IS_SET_POINT or n in by_course
+    ]
     says = (
         "{} is a set point: recorded in closed loop, if its controller was on; noise is in the input too, so "
         "trust simulation-error fits and not one-step fits"
     )
     nothing = float("nan")
     return [
-        Finding("feedback", log_name(log), name, nothing, "1", "warn", says.format(name)) for name in found
+        Finding("feedback", log_name(log), name, nothing, "1", "warn", says.format(name))
+        for name in set_points
     ]
 
 
@@ -483,8 +486,8 @@ def evidence(plant: Plant, logs: Sequence[Rows]) -> Evidence:
     """Return what ``logs``, in the plant's signals, cover of its inputs and outputs."""
     spent = []  # seconds that each row's input was held; beyond a gap it is unknown
     for rows in logs:
-        held = np.append(np.diff(rows.time), rows.step)
-        spent.append(np.minimum(held, max(GAP_SECONDS, GAP_STEPS * rows.step)))
+        until_next = np.append(np.diff(rows.time), rows.step)
+        spent.append(np.minimum(until_next, max(GAP_SECONDS, GAP_STEPS * rows.step)))
     total = float(sum(seconds.sum() for seconds in spent)) / 60
     minutes: dict[str, float] = {}
     thin = []

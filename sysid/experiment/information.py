@@ -148,8 +148,10 @@ class ExperimentForecast:
         rows[:, columns] = np.array([self.plant.natural(row) for row in theta])
         first = self._rest(rows[0])
         # at rest with an ambient that is measured the start is known
-        known = self.plant.reference is not None and bool(self.plant.disturbances)
-        return Members(rows, np.array([first, *(first if known else self._rest(row) for row in rows[1:])]))
+        start_known = self.plant.reference is not None and bool(self.plant.disturbances)
+        return Members(
+            rows, np.array([first, *(first if start_known else self._rest(row) for row in rows[1:])])
+        )
 
     @cached_property
     def _cautious(self) -> Members:

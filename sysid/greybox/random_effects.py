@@ -169,7 +169,7 @@ class _Column:
 def linearise_logs(problem: Problem, z: Array, by_log: Sequence[tuple[Array, Array]]) -> Linearised:
     """Return residuals, sensitivities and effects of each log at ``z``."""
     starts, p = problem.start(z), problem.parameters(z[None])
-    longest = max(_n_bins(problem, at, k) for at, (s, _) in enumerate(problem.logs) for k in range(len(s)))
+    longest = max(_n_bins(problem, i, k) for i, (s, _) in enumerate(problem.logs) for k in range(len(s)))
     merge = max(1, int(np.ceil(longest / EFFECTS.most_bins)))  # bins averaged to one
     runs = [_simulations(problem, log_index, p, begin) for log_index, begin in enumerate(starts)]
     discrepancy = discrepancy_responses(problem, runs)

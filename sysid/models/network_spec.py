@@ -376,8 +376,8 @@ def _parameter_faults(network: Network, where: str, kind: Quantity, name: str) -
         return
     parameter = network.parameters[name]
     if parameter.unit != kind.unit:
-        said = f"parameters.{name}.unit: {parameter.unit!r}, but {where} is in {kind.unit}"
-        yield said, "correct one"
+        problem = f"parameters.{name}.unit: {parameter.unit!r}, but {where} is in {kind.unit}"
+        yield problem, "correct one"
     if kind.sign == "positive" and (parameter.value <= 0 or parameter.bounds[0] < 0):
         yield f"parameters.{name}: {where} must be positive", "give a value and bounds above 0"
     if kind.sign == "share" and not (parameter.bounds[0] >= 0 and parameter.value <= 1):

@@ -172,8 +172,12 @@ class OwnCode:
             problem = f"states {' '.join(place)}: {first['msg'].removeprefix('Value error, ')}"
             example = _EXAMPLES.get(place[0])
             raise self.fault(problem, hint=f"write {example}" if example else "give seconds") from error
-        self.inputs, self.outputs, self.disturbances = tables.inputs, tables.outputs, tables.disturbances
-        self.parameters, self.states, self.dt = tables.parameters, tables.states, tables.dt
+        self.inputs = tables.inputs
+        self.outputs = tables.outputs
+        self.disturbances = tables.disturbances
+        self.parameters = tables.parameters
+        self.states = tables.states
+        self.dt = tables.dt
         self.average, self.warmup = tables.average or 5 * self.dt, tables.warmup or 50 * self.dt
         self.limits = np.array([tables.limits.get(name, (-np.inf, np.inf)) for name in self.states])
         groups = ("states", "inputs", "disturbances", "parameters", "outputs")
@@ -264,10 +268,10 @@ class OwnCode:
         """Refuse a class without equations, or one that seems to misspell an attribute."""
         if not callable(getattr(self.made, "rhs", None)):
             raise self.fault("has no function rhs", hint=f"write {_EXAMPLES['rhs']}")
-        known = (*_Attributes.model_fields, "rhs", "output", "rest")
+        attributes = (*_Attributes.model_fields, "rhs", "output", "rest")
         for name in vars(type(self.made)):
-            meant = get_close_matches(name, known, n=1, cutoff=0.8)
-            if meant and name not in known and not hasattr(self.made, meant[0]):
+            meant = get_close_matches(name, attributes, n=1, cutoff=0.8)
+            if meant and name not in attributes and not hasattr(self.made, meant[0]):
                 raise self.fault(f"has {name!r}, which nothing reads", hint=f"call it {meant[0]!r}")
 
 
