@@ -127,7 +127,9 @@ def as_grasps(grasps: Records) -> list[Grasps]:
     from pandas import DataFrame
 
     records = list(grasps) if isinstance(grasps, Sequence) and not isinstance(grasps, str) else [grasps]
-    read: list[Any] = [read_grasps(each) if isinstance(each, str | Path) else each for each in records]
+    read: list[Any] = [
+        read_grasps(record) if isinstance(record, str | Path) else record for record in records
+    ]
     return [from_frame(record) if isinstance(record, DataFrame) else record for record in read]
 
 
@@ -226,12 +228,12 @@ def check_apart(out: str | Path, paths: Sequence[str | Path]) -> None:
     """Refuse an output that is among the files that are read, or would be the next time."""
     place, hint = Path(os.path.realpath(out)), "choose another name or folder for --out"
     for pattern in paths:
-        given = [Path(name).resolve() for name in matching_files(pattern)]
-        if any(place.parent == path for path in given if path.is_dir()):
+        paths_meant = [Path(name).resolve() for name in matching_files(pattern)]
+        if any(place.parent == path for path in paths_meant if path.is_dir()):
             raise UserError("is in a folder that is read", file=out, hint=hint)
-        of_csv = [_meta_path(path) for path in given if path.is_file() and file_format(path) == "csv"]
+        of_csv = [_meta_path(path) for path in paths_meant if path.is_file() and file_format(path) == "csv"]
         matches = place.match(os.path.realpath(pattern)) and not os.path.isdir(pattern)
-        if matches or place in (*given, *of_csv):
+        if matches or place in (*paths_meant, *of_csv):
             raise UserError("is to be read and written", file=out, hint=hint)
 
 
@@ -350,8 +352,8 @@ def _on_axis(axis: Floats, time: Floats, values: Floats, step: float) -> Floats:
     after = np.clip(np.searchsorted(t, axis), 0, t.size - 1)
     before = np.clip(np.searchsorted(t, axis, side="right") - 1, 0, t.size - 1)
     inside = (axis >= t[0] - 0.5 * step) & (axis <= t[-1] + 0.5 * step)
-    near = inside & (t[after] - t[before] <= 1.5 * step)
-    return np.where(near, np.interp(axis, t, values[finite]), np.nan)
+    has_neighbours = inside & (t[after] - t[before] <= 1.5 * step)
+    return np.where(has_neighbours, np.interp(axis, t, values[finite]), np.nan)
 
 
 def _meta_path(path: str | Path) -> Path:

@@ -154,7 +154,7 @@ def check_content(
         elif isinstance(inner, int | float) and not abs(inner) <= MOST_NUMBER:
             shown = f"{inner:g}" if isinstance(inner, float) else f"{str(inner)[:8]}..."
             finite = isinstance(inner, int) or math.isfinite(inner)
-            keys = ".".join(str(each)[:40] for each in (*place, key))
+            keys = ".".join(str(step)[:40] for step in (*place, key))
             problem = f"{keys} is {shown}, {f'beyond {MOST_NUMBER:g}' if finite else 'not a finite number'}"
             raise UserError(problem, file=file, hint="write a number that can be")
 

@@ -139,8 +139,8 @@ def read_log(
     lists = {"inputs": inputs, "outputs": outputs, "disturbances": disturbances}
     in_file = {name: table.attrs.get(header, {}).get("role", "") for header, name in read.names_of.items()}
     of_known = {name: role for name, role in (known or {}).items() if name in read.units}
-    given = {name: role for name, role in in_file.items() if role} | of_known
-    roles = assign_roles(read.units, given=given, columns=read.values, file=str(file), **lists)
+    stated = {name: role for name, role in in_file.items() if role} | of_known
+    roles = assign_roles(read.units, given=stated, columns=read.values, file=str(file), **lists)
     if table.meta.get("schema") == "thermogrip.log":
         repairs = [line for line in table.meta.get("repairs", "").splitlines() if line]
         log = _made(read.clock.seconds, read.values, repairs, read, roles, file)

@@ -250,7 +250,10 @@ def _check_cluster(client: Any, address: str) -> None:
     hint = f"install thermogrip {__version__} on all of them"
     with as_user_error(ModuleNotFoundError, f"a worker of {address} has no thermogrip", hint=hint):
         theirs = client.run(_versions).values()
-    others = {name: sorted({versions[name] for versions in theirs} - {own}) for name, own in ours.items()}
+    others = {
+        name: sorted({versions[name] for versions in theirs} - {our_version})
+        for name, our_version in ours.items()
+    }
     if differ := [f"{name} {', '.join(those)} for {ours[name]}" for name, those in others.items() if those]:
         problem = f"a worker of {address} has {'; '.join(differ)}"
         raise UserError(problem, hint="install the same versions on all of them")

@@ -263,8 +263,8 @@ def _stamped(message: Message, stamp: str, file: Path) -> float:
         return message.time
     try:
         of_header = _field(message.content, "header.stamp")
-        parts = ("sec", "nanosec") if _has(of_header, "sec") else ("secs", "nsecs")  # ROS 2, ROS 1
-        return float(_field(of_header, parts[0])) + 1e-9 * float(_field(of_header, parts[1]))
+        fields = ("sec", "nanosec") if _has(of_header, "sec") else ("secs", "nsecs")  # ROS 2, ROS 1
+        return float(_field(of_header, fields[0])) + 1e-9 * float(_field(of_header, fields[1]))
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         problem = f"{message.topic} ({message.type}) has no header.stamp"
         raise UserError(problem, file=file, hint='set stamp = "log" in the topic map') from error
