@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import json
 import os
 import re
 import shlex
@@ -313,10 +312,3 @@ def test_linear_algebra_has_one_thread_unless_somebody_says_otherwise(
     assert [os.environ[name] for name in names] == ["3", "1", "1"]
     for name in names[1:]:
         monkeypatch.setenv(name, "1")
-
-
-def test_json_is_one_object_and_nothing_else(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["materials", "copper", "--json"]) == 0
-    (row,) = json.loads(capsys.readouterr().out)["materials"]
-    assert row["name"] == "copper"
-    assert row["effusivity"] == pytest.approx(3.64e4, rel=0.05)

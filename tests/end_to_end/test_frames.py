@@ -13,7 +13,7 @@ import pytest
 from tests.end_to_end.conftest import HEADER, small_grasps, small_log_rows, small_plant
 from thermogrip.classify import classify_grasps, evaluate, make_classifier
 from thermogrip.datasets import read_grasps
-from thermogrip.sysid import Plant, calibrate_gripper, check_data, free_run, identify, read_log
+from thermogrip.sysid import Plant, check_data, free_run, identify, read_log
 from thermogrip.sysid.effusivity import effusivity_posterior, load_default_gripper
 
 
@@ -65,8 +65,3 @@ def test_grasps_are_a_record_a_path_or_a_frame(use: Callable[[Any], Any], grasps
     ours = use(read_grasps(grasps_file))
     for other in (grasps_file, pd.read_csv(grasps_file).merge(meta, on="grasp_id")):
         np.testing.assert_allclose(use(other), ours, rtol=1e-9, strict=True)
-
-
-@pytest.mark.slow
-def test_a_gripper_is_calibrated_from_a_file(grasps_file: Path) -> None:
-    assert calibrate_gripper(grasps_file).materials == ("copper", "wood")

@@ -21,12 +21,6 @@ def other_tank() -> Plant:
 
 
 @pytest.fixture(scope="session")
-def weak_tank() -> Plant:
-    """The tank with a third less power: a model that is plainly wrong."""
-    return make_tank(heat=0.075, joule=0.012, loss=1 / 500)
-
-
-@pytest.fixture(scope="session")
 def reversing_tank() -> Plant:
     """A tank whose cooling turns into heating beyond drive = -0.55."""
     return make_tank(heat=0.11, joule=0.1)

@@ -203,11 +203,3 @@ def test_every_text_can_be_read_by_day_and_by_night(opened: Any, scheme: str) ->
     assert (int(ground[4:].split(",")[0]) < 60) == (scheme == "dark")
     turned = page.locator(".uplot").first.evaluate("e => getComputedStyle(e).filter")
     assert (turned != "none") == (scheme == "dark")
-
-
-def test_a_command_is_copied(opened: Any) -> None:
-    page = opened(permissions=["clipboard-read", "clipboard-write"])
-    page.locator(".commands button").first.click()
-    page.get_by_text("Copied").wait_for(timeout=5000)
-    copied = page.evaluate("navigator.clipboard.readText()")
-    assert copied == page.locator(".commands pre").first.inner_text()

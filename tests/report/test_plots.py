@@ -19,9 +19,7 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.log_files import read_log
 from thermogrip.datasets.schema import make_grasps, make_log
 from thermogrip.mpc import PIController, simulate_closed_loop
-from thermogrip.mpc.interface import Move
 from thermogrip.report import plot
-from thermogrip.report.control import session_sections
 from thermogrip.report.plots import (
     bode_chart,
     corner_figure,
@@ -31,29 +29,10 @@ from thermogrip.report.plots import (
     models_figure,
     steps_chart,
 )
-from thermogrip.rig import Session
 from thermogrip.sysid import free_run, identify
 from thermogrip.sysid.export.dynamics import Estimate
 from thermogrip.sysid.validation.prediction_bands import Band
 from thermogrip.sysid.validation.verdict import Row
-
-
-def test_the_loop_on_a_session_page_has_the_figures_that_the_command_line_prints():
-    t = np.arange(0.0, 60.0, 2.0)
-    log = make_log(
-        t,
-        {
-            "drive": (np.full(t.size, 0.5), "1", "input"),
-            "t": (38 - 10 * np.exp(-t / 5), "degC", "output"),
-            "target_t": (np.full(t.size, 38.0), "degC", "other"),
-        },
-    )
-    moves = [(float(at), Move(0.5, seconds=1e-3)) for at in t]
-    design = SimpleNamespace(drive_range={"drive": (-1, 1)}, limits={}, slew_per_s={}, deadline_s=1.0, dt=2.0)
-    session = Session(log, None, (), "settled", "", 16.0, 0.25, -0.125)
-    controller = SimpleNamespace(controlled=("t",), design=design)
-    (loop,) = [s for s in session_sections(session, moves, controller, "the twin") if "loop" in s.title]
-    assert "settles in 16 s, overshoot 0.25 K, bias -0.125 K" in loop.verdict
 
 
 def waves(n: int, shift: float = 0.0) -> Any:
