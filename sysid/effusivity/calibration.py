@@ -591,25 +591,24 @@ class _Fit:
 
 def _discrepant(bare: _Fit, progress: Progress) -> _Fit:
     """Return the fit with a discrepancy in a smooth noise where its evidence is greater, else as it was; a
-    first look at twice three steps decides whether a search is worth it.  The evidence has a maximum for
-    contacts that build up fast, near the fit without one, and a greater one for slow ones, where the search
-    begins."""
-    noise, least = bare.noise, _log_evidence(bare)
-    problem, theta = _with_discrepancy(bare.problem, bare.step.theta)
-    begin = replace(_SMOOTH, white=noise.white)  # from elsewhere a search may end without misfit
-    near = theta, bare.w, bare.spread, (noise, begin)
-    if _search_discrepancy(problem, *near, (3, 3), least, progress) is None:
+    first look at twice three steps decides whether a search is worth it.  The evidence has several maxima, so
+    that the search begins from contacts that build up fast, near the fit without one, and from slow ones."""
+    least = _log_evidence(bare)
+    problem, near = _with_discrepancy(bare.problem, bare.step.theta)
+    begin = replace(_SMOOTH, white=bare.noise.white)  # from elsewhere a search may end without misfit
+    fast = near, bare.w, bare.spread, (bare.noise, begin)
+    if _search_discrepancy(problem, *fast, (3, 3), least, progress) is None:
         return bare
-    theta = problem.prior.mean.copy()
-    theta[SHARED_NAMES.index("ln_build_up")] = SETTINGS.slow_ln_build_up
-    begin = replace(_SMOOTH, white=max(noise.white, SETTINGS.least_white_K))
-    start = theta, np.zeros(bare.w.shape), dict(problem.prior.spread), (begin, begin)
-    return (
-        _search_discrepancy(
-            problem, *start, (SETTINGS.steps, SETTINGS.steps, SETTINGS.steps), least, progress
-        )
-        or bare
-    )
+    slow, spread = problem.prior.mean.copy(), dict(problem.prior.spread)
+    slow[SHARED_NAMES.index("ln_build_up")] = SETTINGS.slow_ln_build_up
+    begin = replace(_SMOOTH, white=max(bare.noise.white, SETTINGS.least_white_K))
+    starts = [fast, (slow, np.zeros(bare.w.shape), spread, (begin, begin))]
+    if not problem.known.all():  # objects as warm as the skin may show nothing, as far beyond too much
+        starts.append((slow, _first_nuisances(problem, slow, spread), spread, (begin, begin)))
+    looks = (SETTINGS.steps, SETTINGS.steps, SETTINGS.steps)
+    searched = [_search_discrepancy(problem, *start, looks, least, progress) for start in starts]
+    found = [fit for fit in searched if fit is not None]
+    return max(found, key=_log_evidence, default=bare)
 
 
 def _search_discrepancy(
