@@ -117,7 +117,7 @@ def test_a_draw_is_no_other_plant_and_half_the_power_is():
 
 @pytest.mark.parametrize(
     ("share", "said"),
-    [(1.0, ""), (0.9, ""), (0.6, "q1 does 6"), (1.5, "q1 does 1")],
+    [pytest.param(1.0, "", marks=pytest.mark.slow), (0.9, ""), (0.6, "q1 does 6"), (1.5, "q1 does 1")],
 )
 def test_a_drive_that_comes_to_do_another_share_is_told_after_some_targets(share: float, said: str):
     design = default_design(KIT, dt=4.0)
