@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -375,15 +374,6 @@ def test_live_may_stand_alone(words: list[str], shown: str, ran: SimpleNamespace
     assert (made[0].args[1], made[0].args[3:]) == ("run", (Path("r"), 10.0))
     ran.bench.run(*given, "--foxglove")
     assert made[1].args[0] == ShowOptions(foxglove=8765, on_trip="mail me")
-
-
-def test_what_is_published_goes_through_the_bridge(stand_in: StandIn) -> None:
-    made = stand_in("thermogrip.rig.records.rosbridge.Bridge", nullcontext(SimpleNamespace(before="before")))
-    with verbs._bridge(None) as through, through("a folder") as recorder:
-        assert recorder == "a folder"
-    with verbs._bridge("ws://robot:9090") as through:
-        assert through == "before"
-    assert made[0].args == ("ws://robot:9090",)
 
 
 def test_a_first_touch_reports_median_and_sd_of_its_90_percent_interval(

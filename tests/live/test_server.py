@@ -199,14 +199,6 @@ def test_a_port_that_is_taken_is_one_line() -> None:
             raise AssertionError
 
 
-def test_the_process_ends_with_the_session() -> None:
-    with Watch("run", Console(), Show(live=0)) as watch:
-        process = watch.page
-        assert process is not None
-        Running(watch, paced_twin(), settle_timeout=5.0).result()
-    assert process.returncode == 0
-
-
 def test_the_page_of_a_twin_stays_until_its_viewer_has_left() -> None:
     watch = Watch("run", Console(), Show(live=0, pace=10.0)).__enter__()
     process = watch.page

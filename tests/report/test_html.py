@@ -182,11 +182,6 @@ def test_every_text_is_escaped_and_has_no_control_characters() -> None:
     assert not set(page) & set("\x1b\u202e\x00")
 
 
-def test_an_unknown_tone_is_refused() -> None:
-    with pytest.raises(ValueError, match="tone"):
-        Section("a", (), "b", "rosy")
-
-
 def test_a_number_that_is_missing_stands_under_the_others_and_words_do_not() -> None:
     table = Table(("model", "RMSE", "why"), (("arx", 1.0, None), ("neural", None, None)))
     assert [number for _, number in table.heads] == [False, True, False]
