@@ -137,15 +137,12 @@ def _confusion(axis: Axes, names: list[str], counts: NDArray[np.float64]) -> Non
     for (i, j), n in np.ndenumerate(counts):
         if n > 0:
             ink = "white" if share[i, j] > 0.55 else _INK
-            axis.text(j, i, _count_words(float(n)), ha="center", va="center", fontsize=7, color=ink)
+            # a mean of counts with as many digits as one reads
+            count = f"{n:.0f}" if n == round(n) else f"{n:.1f}" if n > 1 else f"{n:.2g}"
+            axis.text(j, i, count, ha="center", va="center", fontsize=7, color=ink)
     axis.set_xticks(range(len(names)), names, rotation=45, ha="right", fontsize=7)
     axis.set_yticks(range(len(names)), names, fontsize=7)
     axis.grid(False)
-
-
-def _count_words(n: float) -> str:
-    """Return a count, or a mean of counts with as many digits as one reads."""
-    return f"{n:.0f}" if n == round(n) else f"{n:.1f}" if n > 1 else f"{n:.2g}"
 
 
 def _library_lines(axis: Axes, library: Mapping[str, float]) -> None:

@@ -248,13 +248,8 @@ def _stopped(
     if has_touch_groups(grasps):
         problem = "touches of one block are answered together, no rule ends one of them"
         raise UserError(problem, file=log_name(grasps), hint="leave --early out, or the column touch_group")
-    windows = growing_windows(
-        classifier,
-        grasps,
-        candidates=names,
-        times=rule.times,
-        end=contact_end(grasps, rule.end),
-    )
+    end = contact_end(grasps, rule.end)
+    windows = growing_windows(classifier, grasps, candidates=names, times=rule.times, end=end)
     ended = stops(rule, windows, silent_windows(grasps, windows.times)).time
     out = Answered.nothing(ended.size, len(names))
     for time in np.unique(ended):

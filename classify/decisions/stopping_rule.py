@@ -152,9 +152,12 @@ def growing_windows(
     names = model.asked(candidates)
     window_ends = np.array([*(t for t in sorted(times) if t < end), end])
     odds, log_p = model.log_prior(names), []
+    time = np.asarray(grasps["time"].values, dtype=float)
     start: Floats | None = None
     for t in window_ends:
-        read = _read_by(grasps, float(t)) | (t >= end)  # where none comes the fit refuses the grasp
+        in_contact = (time > _CONTACT_END_S) & (time <= t + 1e-9)
+        read = np.isfinite(grasps["t_surface"].values[:, in_contact]).any(axis=1)
+        read |= t >= end  # where none comes the fit refuses the grasp
         # before a first reading those of the prior
         log_p.append(normalised(np.tile(odds, (read.size, 1))))
         if read.any():
@@ -169,13 +172,6 @@ def silent_windows(grasps: Grasps, times: ArrayLike) -> NDArray[np.bool_]:
     """Return at which times each contact is too short for a decision, shape (n, n_time)."""
     windows = [grasps.sel(time=slice(None, float(t) + 1e-9)) for t in np.asarray(times, dtype=float)]
     return np.stack([check_grasps(window).undecided for window in windows], axis=1)
-
-
-def _read_by(grasps: Grasps, t: float) -> NDArray[np.bool_]:
-    """Return which grasps have a reading of their contact by a time [s], (n,)."""
-    time = np.asarray(grasps["time"].values, dtype=float)
-    in_contact = (time > _CONTACT_END_S) & (time <= t + 1e-9)
-    return np.asarray(np.isfinite(grasps["t_surface"].values[:, in_contact]).any(axis=1))
 
 
 def stops(rule: StopRule, windows: Windows, silent: NDArray[np.bool_] | None = None) -> Stops:
@@ -241,25 +237,15 @@ def learn_from_windows(
     best = StopRule(sure=1.0, times=tuple(times), end=end, error=error, n_grasp=n)
     for sure in _SURE[::-1]:
         rule = replace(best, sure=float(sure))
-        wrong, p_wrong = _early(rule, parts)
+        ended = [(stops(rule, windows), true) for windows, true in parts]
+        wrong = np.concatenate([(stopped.answer != true)[stopped.early] for stopped, true in ended])
+        p_wrong = np.concatenate([stopped.p_wrong[stopped.early] for stopped, _ in ended])
         if 1 / (wrong.size + 2) > error:
             continue  # so few are that confident: even with none of them wrong they show nothing
         if (wrong.sum() + 1) / (wrong.size + 2) > error or p_wrong.mean() > error:
             break
         best = rule
     return best
-
-
-def _early(
-    rule: StopRule, parts: Sequence[tuple[Windows, NDArray[np.int64]]]
-) -> tuple[NDArray[np.bool_], Floats]:
-    """Return which of the contacts that the rule ends early are wrong, and the stated probability of that."""
-    wrong, p_wrong = [], []
-    for windows, true in parts:
-        stopped = stops(rule, windows)
-        wrong.append((stopped.answer != true)[stopped.early])
-        p_wrong.append(stopped.p_wrong[stopped.early])
-    return np.concatenate(wrong), np.concatenate(p_wrong)
 
 
 def contact_end(grasps: Grasps, end: float) -> float:

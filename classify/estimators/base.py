@@ -496,9 +496,7 @@ def two_or_more(labels: Labels, where: str) -> Labels:
     classes = np.unique(labels)
     if classes.size < 2:
         raise UserError(
-            f"all grasps are of {str(classes[0])!r}",
-            file=where,
-            hint="give at least two classes",
+            f"all grasps are of {str(classes[0])!r}", file=where, hint="give at least two classes"
         )
     return np.asarray(classes)
 

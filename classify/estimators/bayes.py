@@ -5,9 +5,8 @@ The equations of a touch are linear, so the features of a grasp in kelvin are :m
 :math:`\delta \sim N(0, \sigma_T^2)` (a warmer's setting is not the block's temperature), and noise
 :math:`\epsilon \sim N(0, N)` that follows from the sensor's
 (:func:`~thermogrip.classify.estimators.features.feature_noise`). The normalised features :math:`x` of
-material
-:math:`m` scatter as :math:`x \sim N(\mu_m, \Sigma)` with one covariance for all materials, since it comes
-from the grasping (contact, onset) and not from the block. To first order in the scatter,
+material :math:`m` scatter as :math:`x \sim N(\mu_m, \Sigma)` with one covariance for all materials, since
+it comes from the grasping (contact, onset) and not from the block. To first order in the scatter,
 
 .. math:: y \sim N(\Delta T \mu_m,\; \Delta T^2 \Sigma + \sigma_T^2 \mu_m \mu_m^T + N).
 
@@ -143,11 +142,7 @@ class FeatureReader:
     end: float  # median end of the training grasps, up to 10 s
 
     @classmethod
-    def learn(
-        cls,
-        records: Sequence[Grasps],
-        labels: Labels,
-    ) -> LearntFeatures:
+    def learn(cls, records: Sequence[Grasps], labels: Labels) -> LearntFeatures:
         """Return a reader of the features that most grasps of any record have, and what it reads.
 
         Not learnt from are, where features are normalised, grasps of unknown temperature, and materials that
@@ -169,10 +164,11 @@ class FeatureReader:
         reader = cls(names, any(map(features.can_normalise, records)) and bool(usable.any()), end)
         if not reader.normalise:
             usable = np.ones(labels.size, dtype=bool)
-        readings = [
+        parts = [
             reader._readings(record, table.reindex(feature=names)) for record, table in zip(records, tables)
         ]
-        return LearntFeatures(reader, _concatenated(readings), usable, notes)
+        readings = {key: np.concatenate([getattr(p, key) for p in parts]) for key in vars(parts[0])}
+        return LearntFeatures(reader, Readings(**readings), usable, notes)
 
     def to_dict(self) -> dict[str, Any]:
         """Return a JSON-able description."""
@@ -252,19 +248,15 @@ class BayesClassifier(GraspClassifier):
         self.center_ = _weighted_mean(x, weight)
         means = np.array([_weighted_mean(x[at == m], weight[at == m], self.center_) for m in range(k)])
         self.scale_ = _within_class_sd(x, weight, means[at], self.center_)
-        x = np.where(
-            has_feature, (x - self.center_) / self.scale_, ((means - self.center_) / self.scale_)[at]
-        )
+        x = (np.where(has_feature, x, means[at]) - self.center_) / self.scale_
         self.shrinkage_, self.mean_shrinkage_ = self._shrinkages(x, weight.max(axis=1), at)
         y, noise = self._scaled(read)
         own_sd, knows_sd = read.t_object_sd, np.isfinite(read.t_object_sd)
         typical = DENSITY.t_object_sd_K if self.reader_.normalise else 0.0
         zero = self.center_ / self.scale_
         # A missing feature is one that noise drowns: its precision is 0, and so are its row and column.
-        lost = np.where(has_feature, 0.0, DENSITY.drowned)
-        noise = np.where(has_feature[:, :, None] & has_feature[:, None, :], noise, 0.0) + lost[
-            :, :, None
-        ] * np.eye(d)
+        has_both = has_feature[:, :, None] & has_feature[:, None, :]
+        noise = np.where(has_both, noise, DENSITY.drowned * np.eye(d))
         y, gain = np.where(has_feature, y, 0.0), np.where(has_feature, read.gain, 0.0)
         means, covariance = np.zeros((k, d)), np.eye(d)
         for _ in range(DENSITY.steps):
@@ -374,8 +366,7 @@ class BayesClassifier(GraspClassifier):
         off = self.means_ - middle
         strange = (k + 1) / (k * (k - 1)) * off.T @ off
         kinds = [
-            (mean, mean_covariance, self.dof_)
-            for mean, mean_covariance in zip(self.means_, self.mean_covariance_)
+            (mean, covariance, self.dof_) for mean, covariance in zip(self.means_, self.mean_covariance_)
         ]
         out = np.zeros((y.shape[0], k + 1))
         for has in np.unique(np.isfinite(y), axis=0):
@@ -413,7 +404,9 @@ class BayesClassifier(GraspClassifier):
 
 def _usable(difference: Floats, labels: Labels) -> tuple[NDArray[np.bool_], list[str]]:
     """Return which grasps have normalised features of at least two materials, and in words which have not."""
-    seen_materials = _seen(difference, labels)
+    clear = np.abs(difference) >= features.LEAST_DIFFERENCE
+    weight = np.where(clear, difference**2 / (difference**2 + DENSITY.half_weight_K2), 0.0)
+    seen_materials = [str(m) for m in np.unique(labels) if weight[labels == m].sum() >= DENSITY.least_weight]
     if len(seen_materials) < 2:
         return np.zeros(labels.size, dtype=bool), [
             "features stay in kelvin: object temperatures are unknown, or within 1 K of the skin's"
@@ -427,19 +420,8 @@ def _usable(difference: Floats, labels: Labels) -> tuple[NDArray[np.bool_], list
     return usable, notes
 
 
-def _seen(difference: Floats, labels: Labels) -> list[str]:
-    """Return the materials whose normalised features grasps at these differences [K] show."""
-    clear = np.abs(difference) >= features.LEAST_DIFFERENCE
-    weight = np.where(clear, difference**2 / (difference**2 + DENSITY.half_weight_K2), 0.0)
-    return [str(m) for m in np.unique(labels) if weight[labels == m].sum() >= DENSITY.least_weight]
-
-
 def _rows_of_readings(read: Readings, at: NDArray[np.bool_]) -> Readings:
     return Readings(**{key: value[at] for key, value in vars(read).items()})
-
-
-def _concatenated(parts: Sequence[Readings]) -> Readings:
-    return Readings(**{key: np.concatenate([getattr(p, key) for p in parts]) for key in vars(parts[0])})
 
 
 def _times(grasps: Grasps, end: float) -> list[float]:

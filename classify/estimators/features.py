@@ -88,16 +88,12 @@ def feature_noise(grasps: Grasps, names: Sequence[str]) -> Floats:
     """Return the covariance that the noise of the sensor, read from a trace's second differences, gives
     features in kelvin, (n_grasp, n, n)."""
     time = tuple(np.asarray(grasps["time"].values, dtype=float).tolist())
-    return np.asarray(_sample_noise(grasps)[:, None, None] ** 2 * _noise_shape(time, tuple(names)))
-
-
-def _sample_noise(grasps: Grasps) -> Floats:
-    """Return the sd of the noise of one sample [K], (n_grasp,)."""
     second = np.abs(np.diff(grasps["t_surface"].values, n=2, axis=1))
     has_difference = np.isfinite(second).any(axis=1)
     middle = np.full(second.shape[0], 0.0)
     middle[has_difference] = np.nanmedian(second[has_difference], axis=1)
-    return np.asarray(np.maximum(middle / (0.6745 * np.sqrt(6.0)), _LEAST_NOISE))
+    sample_sd = np.maximum(middle / (0.6745 * np.sqrt(6.0)), _LEAST_NOISE)
+    return np.asarray(sample_sd[:, None, None] ** 2 * _noise_shape(time, tuple(names)))
 
 
 @lru_cache(maxsize=16)

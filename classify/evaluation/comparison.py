@@ -43,10 +43,6 @@ class Caution:
     def __post_init__(self) -> None:
         object.__setattr__(self, "brief", self.brief or self.code.replace("_", " "))
 
-    def to_json(self) -> dict[str, str]:
-        """Return its fields."""
-        return asdict(self)
-
 
 @dataclass(frozen=True, repr=False)
 class Comparison(Shown):
@@ -317,7 +313,7 @@ class Comparison(Shown):
             "calibration": self._each(self.calibration),
             "differences": [row for condition in conditions for row in self.differences(condition)],
             "leaks": list(self.leaks),
-            "cautions": [caution.to_json() for caution in self.cautions],
+            "cautions": [asdict(caution) for caution in self.cautions],
             "open_set": self.open_set(),
         }
         for name, rows in tables.items():

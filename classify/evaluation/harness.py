@@ -17,7 +17,6 @@ chance; one that is not has found the label elsewhere: in the gripper's temperat
 order of the grasps, in a column of the record.  On public touch data such a probe reached 0.83 where chance
 is 0.17.  Its test is one-sided binomial: how likely are k or more right of n grasps, at the share of the
 commonest material.
-
 """
 
 from __future__ import annotations
@@ -199,13 +198,8 @@ def _session_faults(plan: Plan) -> list[Caution]:
         for record in (fold.train, fold.test):
             name = log_name(record)
             for words in contact_faults(record, check_grasps(record)) if fold.repeat == 0 else ():
-                out[
-                    Caution(
-                        "session_fault",
-                        fold.condition,
-                        f"{name}: {words}" if name != fold.condition else words,
-                    )
-                ] = None
+                of_record = f"{name}: {words}" if name != fold.condition else words
+                out[Caution("session_fault", fold.condition, of_record)] = None
     return list(out)
 
 

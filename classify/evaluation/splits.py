@@ -78,8 +78,12 @@ def plan_folds(
         raise UserError(f"split {split!r} is unknown", hint="use 'shipped', 'random', 'session' or 'block'")
     to_compare = records if test is None else []  # of test files no copy is let in
     copies = [Caution("leak", name, words) for name, words in _copied_records(to_compare).items()]
-    notes = (*plan.notes, *_strangers(plan.folds))
-    return replace(plan, notes=notes, cautions=(*plan.cautions, *copies))
+    nothing_to_score = dict.fromkeys(
+        f"{fold.condition}: nothing to score, as no training grasp is of {', '.join(sorted(tested))}"
+        for fold in plan.folds
+        if not (tested := set(grasp_labels(fold.test))) & set(fold.candidates)
+    )
+    return replace(plan, notes=(*plan.notes, *nothing_to_score), cautions=(*plan.cautions, *copies))
 
 
 def scored_apart(grasps: Grasps) -> bool:
@@ -240,22 +244,16 @@ def _from_files(records: Sequence[Grasps], tests: Sequence[Grasps]) -> Plan:
     _refuse_shared(trains, tests)
     folds, notes = [], []
     for test in tests:
-        like = _like_it(test, trains)
+        like = trains[0] if len(trains) == 1 else _alike(test, trains)
+        if like is None:
+            raise UserError(
+                "no training condition has its object and gripper temperatures",
+                file=log_name(test),
+                hint=f"the training files are {', '.join(map(log_name, trains))}",
+            )
         notes.append(f"{log_name(test)}: candidates and training grasps are those of {log_name(like)}")
         folds.append(Fold(log_name(test), 0, like, test, scored_apart(test)))
     return Plan(tuple(folds), (tuple(trains),), tuple(notes))
-
-
-def _like_it(test: Grasps, trains: Sequence[Grasps]) -> Grasps:
-    """Return the training condition that a test record is scored on."""
-    like = trains[0] if len(trains) == 1 else _alike(test, trains)
-    if like is None:
-        raise UserError(
-            "no training condition has its object and gripper temperatures",
-            file=log_name(test),
-            hint=f"the training files are {', '.join(map(log_name, trains))}",
-        )
-    return like
 
 
 def _refuse_shared(trains: Sequence[Grasps], tests: Sequence[Grasps]) -> None:
@@ -313,17 +311,6 @@ def _copied_records(records: Sequence[Grasps]) -> dict[str, str]:
         "in test is a leak"
         for name, pairs in copies.items()
     }
-
-
-def _strangers(folds: Sequence[Fold]) -> list[str]:
-    """Return a note on each fold that has no grasp to score: all are of materials it did not train on."""
-    notes = [
-        f"{fold.condition}: nothing to score, as no training grasp is of "
-        f"{', '.join(sorted(set(grasp_labels(fold.test))))}"
-        for fold in folds
-        if not set(grasp_labels(fold.test)) & set(fold.candidates)
-    ]
-    return list(dict.fromkeys(notes))
 
 
 def _marked(grasps: Grasps, split: str) -> Grasps | None:

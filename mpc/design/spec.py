@@ -325,7 +325,7 @@ def spec_from_dict(content: Mapping[str, Any], *, file: str | Path | None = None
         key = problem.partition(":")[0].partition(".")[0]
         hint = known_names(key, Spec.model_fields, "the template of 'init spec' shows every key")
         if key == "settling":  # of 0.2.0
-            hint = "what is asked is of every output now; ramp_per_s slows the target of one"
+            hint = "the requirement is of every output now; ramp_per_s slows the target of one"
         raise UserError(problem, file=file, hint=hint) from error
 
 

@@ -325,8 +325,8 @@ def _run_settings(fit: BlackBoxFit) -> dict[str, Any]:
 
 
 def _warmup_rows(grid: Grid) -> int:
-    """Return how many readings set the state of what is held out: those of 5 s of whole logs, which begin at
-    rest, and 50 samples of parts of a log."""
+    """Return the number of readings that set the state of what is held out: those of 5 s of whole logs, which
+    begin at rest, and 50 samples of parts of a log."""
     seconds = 5.0 if len(grid.logs) >= SEVERAL else 50 * grid.native
     most = sum(len(segment.time) for segment in grid.segments) // 16  # of a short log, a quarter of a block
     return max(2, min(round(seconds / grid.dt), most))

@@ -126,7 +126,9 @@ def skin_temperature(
     """
     t, y = _time_and_root(t, e_dev, e_obj, h_c)
     share = e_obj / (e_dev + e_obj)  # of the initial difference, at perfect contact
-    return np.asarray(T_dev0 + (T_obj0 - T_dev0) * share * _drop(y))
+    # 1 - erfcx(y) without cancellation
+    drop = np.where(y < 0.5, -_series(np.minimum(y, 0.5), 1), 1 - erfcx(y))
+    return np.asarray(T_dev0 + (T_obj0 - T_dev0) * share * drop)
 
 
 def object_surface_temperature(
@@ -219,7 +221,9 @@ def contact_heat(
     series = 1 / (1 / e_dev + 1 / e_obj)
     if np.isinf(h_c):
         return np.asarray((T_obj0 - T_dev0) * series * 2 * np.sqrt(t / np.pi))
-    return np.asarray((T_obj0 - T_dev0) * series**2 / h_c * _excess(y))
+    # erfcx(y) - 1 + 2 y / sqrt(pi) without cancellation
+    excess = np.where(y < 0.5, _series(np.minimum(y, 0.5), 2), erfcx(y) - 1 + 2 * y / np.sqrt(np.pi))
+    return np.asarray((T_obj0 - T_dev0) * series**2 / h_c * excess)
 
 
 def sensor_temperature(
@@ -465,18 +469,6 @@ def _series(y: Array, first: int) -> Array:
     """Return the terms of erfcx(y) = sum (-y)^n / Gamma(n/2 + 1) from ``first`` on, for y below 1/2."""
     n = np.arange(first, first + 40)
     return np.asarray(((-y[..., None]) ** n * rgamma(n / 2 + 1)).sum(axis=-1))
-
-
-def _drop(y: ArrayLike) -> Array:
-    """Return 1 - erfcx(y) without cancellation."""
-    y = np.asarray(y, dtype=float)
-    return np.where(y < 0.5, -_series(np.minimum(y, 0.5), 1), 1 - erfcx(y))
-
-
-def _excess(y: ArrayLike) -> Array:
-    """Return erfcx(y) - 1 + 2 y / sqrt(pi) without cancellation."""
-    y = np.asarray(y, dtype=float)
-    return np.where(y < 0.5, _series(np.minimum(y, 0.5), 2), erfcx(y) - 1 + 2 * y / np.sqrt(np.pi))
 
 
 def _erfcx_difference(xi: Array, y: Array) -> Array:

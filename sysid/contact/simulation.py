@@ -106,32 +106,12 @@ def time_nodes(end: float, *, first: float = 0.01, per_group: int = 10) -> TimeN
 @lru_cache(maxsize=64)
 def stack_modes(stack: Stack) -> StackModes:
     """Return the gripper's modes: rise at face and sensor per unit flux into the face."""
-    cells = _assembled(stack)
-    half = cells.conductance
-    lam, vectors = np.linalg.eigh(cells.matrix)
-    shape = vectors / cells.root_capacity[:, None]
-    outer_conductance, right = half[_N_OUTER - 1], half[_N_OUTER]
-    sensor = (outer_conductance * shape[_N_OUTER - 1] + right * shape[_N_OUTER]) / (outer_conductance + right)
-    # the time stepping needs the sensor per unit of modal rise at the face; a mode that leaves the face still
-    # is never excited
-    still = np.abs(shape[0]) <= 1e-9 * np.abs(shape[0]).max()
-    face = np.where(still, np.inf, shape[0])
-    return StackModes(np.maximum(lam, 0.0), shape[0] ** 2, sensor / face, float(1 / half[0]))
-
-
-class _Cells(NamedTuple):
-    matrix: Array  # (32, 32), symmetric
-    root_capacity: Array  # (32,)
-    conductance: Array  # (31,) of half a cell
-
-
-def _assembled(stack: Stack) -> _Cells:
     # cells grow inwards: fast changes live near the face
     growth = 1.22 ** np.arange(_N_INNER)
     outer = np.ones(_N_OUTER)
     dz = np.concatenate([stack.z_outer / _N_OUTER * outer, growth / growth.sum() * stack.z_inner])
     e = np.concatenate([stack.e_outer * outer, stack.e_inner * np.ones(_N_INNER)])
-    half = 2 * e / dz
+    half = 2 * e / dz  # conductance of half a cell
     link = half[:-1] * half[1:] / (half[:-1] + half[1:])
     matrix = np.zeros((dz.size + 1, dz.size + 1))
     cell = np.arange(dz.size)
@@ -142,8 +122,16 @@ def _assembled(stack: Stack) -> _Cells:
     matrix[_N_OUTER, _N_OUTER] += stack.g_side
     matrix[-1, -1] = stack.g_side
     matrix[_N_OUTER, -1] = matrix[-1, _N_OUTER] = -stack.g_side
-    root = np.sqrt(np.concatenate([e * dz, [stack.c_side]]))
-    return _Cells(matrix / root[:, None] / root[None, :], root, half)
+    root_capacity = np.sqrt(np.concatenate([e * dz, [stack.c_side]]))
+    lam, vectors = np.linalg.eigh(matrix / root_capacity[:, None] / root_capacity[None, :])
+    shape = vectors / root_capacity[:, None]
+    outer_conductance, right = half[_N_OUTER - 1], half[_N_OUTER]
+    sensor = (outer_conductance * shape[_N_OUTER - 1] + right * shape[_N_OUTER]) / (outer_conductance + right)
+    # the time stepping needs the sensor per unit of modal rise at the face; a mode that leaves the face still
+    # is never excited
+    still = np.abs(shape[0]) <= 1e-9 * np.abs(shape[0]).max()
+    face = np.where(still, np.inf, shape[0])
+    return StackModes(np.maximum(lam, 0.0), shape[0] ** 2, sensor / face, float(1 / half[0]))
 
 
 @lru_cache(maxsize=64)
@@ -152,9 +140,8 @@ def gripper_modes(stack: Stack) -> Any:
     from thermogrip.sysid.contact.time_stepping import grippers
 
     modes = stack_modes(stack)
-    return grippers(
-        modes.lam[None], modes.face[None], modes.sensor[None], contact_numbers(stack, modes)[None]
-    )
+    numbers = [modes.resistance, stack.lag, stack.first, stack.creep, stack.settle, stack.g_far, stack.leak]
+    return grippers(modes.lam[None], modes.face[None], modes.sensor[None], np.array([numbers]))
 
 
 class ContactResponse(NamedTuple):
@@ -198,12 +185,6 @@ def far_response(
     since = np.maximum(nodes.t - (c**2 / (6 * e**2))[:, None], 0.0)
     total = [make_interp_spline(nodes.t, f, k=1).antiderivative()(s) for f, s in zip(rise, since)]
     return np.asarray((stack.g_far / c)[:, None] * np.array(total))
-
-
-def contact_numbers(stack: Stack, modes: StackModes) -> Array:
-    """Return resistance, lag, first, creep, settle, far loss and leak, which are beside the modes, (7,)."""
-    numbers = (stack.lag, stack.first, stack.creep, stack.settle, stack.g_far, stack.leak)
-    return np.array([modes.resistance, *numbers])
 
 
 #: A foam finger with a graphite sheet on a copper-filled silicone pipe, of the size of the example rig's.

@@ -88,36 +88,13 @@ class Slabs(NamedTuple):
 
 def slabs(effusivity: Array, capacity: Array, far: float | Array) -> Slabs:
     """Return the modes of slabs that lose ``far`` [W m^-2 K^-1] by their far faces."""
-    modes, _, series = _slabs(effusivity, capacity, far, moved=False)
-    return Slabs(modes[:, 0], modes[:, 1], series[:, 0])
-
-
-def slab_moves(effusivity: Array, capacity: Array, far: float | Array) -> tuple[Array, Array]:
-    """Return derivatives (n, 4, N_MODE) of ln rate and ln weight by ln e, then by ln C, and those (n, 2) of
-    the series resistance."""
-    _, moves, series = _slabs(effusivity, capacity, far, moved=True)
-    return moves, series[:, 1:]
-
-
-def _slabs(
-    effusivity: Array, capacity: Array, far: float | Array, *, moved: bool
-) -> tuple[Array, Array, Array]:
-    """Return what :func:`slab_modes` fills for slabs alone."""
     n, numbers = effusivity.size, np.zeros((np.size(far), 7))
     numbers[:, 5] = far
-    modes, moves = np.empty((n, 4, N_MODE)), np.empty((n if moved else 0, 4, N_MODE))
+    modes, moves = np.empty((n, 4, N_MODE)), np.empty((0, 4, N_MODE))
     series = np.empty((n, 3))
-    slab_modes(
-        np.stack([effusivity, capacity], axis=1),
-        numbers,
-        1.0,
-        _NODE_PLACE,
-        _NODE_WEIGHT,
-        modes,
-        moves,
-        series,
-    )
-    return modes, moves, series
+    contact = np.stack([effusivity, capacity], axis=1)
+    slab_modes(contact, numbers, 1.0, _NODE_PLACE, _NODE_WEIGHT, modes, moves, series)
+    return Slabs(modes[:, 0], modes[:, 1], series[:, 0])
 
 
 @numba.njit(**COMPILED)  # type: ignore[untyped-decorator]
@@ -135,20 +112,19 @@ def slab_modes(
     for p in range(contact.shape[0]):
         e = contact[p, 0]
         c = contact[p, 1]
-        gripper_numbers = numbers[min(p, numbers.shape[0] - 1)]
-        unit, biot = (e / c) ** 2, gripper_numbers[5] * c / (e * e)
+        k = min(p, numbers.shape[0] - 1)
+        unit, biot = (e / c) ** 2, numbers[k, 5] * c / (e * e)
         top = np.sqrt(_FASTEST / unit) / np.pi
         # past it modes are too fast to count; a slab whose first dozen are has groups of a fixed span
         free = top > 3.0 * start
         top = top if free else 3.0 * start
         span, beyond = np.log(top / start), 2.0 / (c * np.pi**2 * unit * top)
-        series[p, 0] = gripper_numbers[0] + beyond
+        series[p, 0] = numbers[k, 0] + beyond
         series[p, 1], series[p, 2] = (-beyond, 0.0) if free else (-2.0 * beyond, beyond)
         for j in range(N_MODE):
             y = N_MODE - 1.0 - j
             share = 2.0
-            along = 0.0
-            by_span = 0.0
+            along = by_span = 0.0
             if j < _N_GROUPED:
                 y = start * np.exp(0.5 * span * (1.0 + node[j]))
                 share = span * shares[j] * y
@@ -157,10 +133,9 @@ def slab_modes(
             elif j < _N_GROUPED + 2:  # next Euler-Maclaurin term, f'(start)/24 as a difference of modes
                 share = 2.0 / 24.0 if j == _N_GROUPED else 2.0 - 2.0 / 24.0
             beta = np.pi * y
-            damping = 1.0
-            place = 1.0
-            by_biot = 0.0
             square = beta * beta
+            damping = place = 1.0
+            by_biot = 0.0
             if biot > 0.0:
                 if j == N_MODE - 1:
                     # from the left of the root Newton's steps on a concave function never pass it
@@ -177,11 +152,9 @@ def slab_modes(
             elif j == N_MODE - 1:
                 damping = 0.5  # a mode that nothing damps counts half
             rate = beta * beta * unit
-            modes[p, 0, j], modes[p, 1, j], modes[p, 3, j] = (
-                rate,
-                share * damping / c,
-                -np.expm1(-rate * step),
-            )
+            modes[p, 0, j] = rate
+            modes[p, 1, j] = share * damping / c
+            modes[p, 3, j] = -np.expm1(-rate * step)
             if moves.shape[0] > 0:
                 by_e, by_c = -along * place - 2.0 * by_biot, along * place + by_biot
                 moves[p, 0, j], moves[p, 2, j] = 2.0 * by_e + 2.0, 2.0 * by_c - 2.0
@@ -254,7 +227,7 @@ def step_contacts(
 
     ``modes`` (n, 4, n_mode + 1) are rate, weight at face and sensor and 1 - E of the first step: the slab's
     from fast to slow, the gripper's from slow to fast, so that those that keep a state are neighbours, and
-    the sensor's lag; ``moves`` are those of :func:`slab_moves`; ``series`` (n, 3) is the resistance, and its
+    the sensor's lag; ``moves`` are those of :func:`slab_modes`; ``series`` (n, 3) is the resistance, and its
     derivatives by ln e and ln C.
     """
     last = modes.shape[2] - 1

@@ -299,9 +299,8 @@ def noise_fit(data: Touches, noise: Noise, extra: Array, left: Array) -> tuple[f
     shared = np.stack([g[which == k].sum(axis=0) for k in range(len(axes))])
     x = np.abs(axes[:, :, None] - axes[:, None, :]) / noise.correlation_time
     by_slow = shared * (noise.slow**2 * noise.correlation(x))
-    steep = (
-        3 * x**2 / (1 + np.sqrt(3.0) * x) if noise.smooth else x
-    )  # slope of -ln correlation by ln distance
+    # slope of -ln correlation by ln distance
+    steep = 3 * x**2 / (1 + np.sqrt(3.0) * x) if noise.smooth else x
     g *= parts.misfit
     by_misfit = g.sum(axis=2)
     longer = np.log1p(np.maximum(data.t, 0.0) / 10)

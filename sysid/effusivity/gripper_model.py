@@ -197,13 +197,7 @@ _OF_STACK = {
     "g_back": _CONDUCTANCE, "lag": _SECONDS, "first": (0.0, 1.0), "build_up": _SECONDS, "creep": (-0.2, 10.0),
     "leak": _RATIO, "g_side": _CONDUCTANCE, "c_side": _STORE, "settle": _SECONDS, "g_far": _CONDUCTANCE,
 }  # fmt: skip
-_OF_NOISE = {
-    "white": _SD,
-    "slow": _SD,
-    "correlation_time": _SECONDS,
-    "misfit": _SD,
-    "growth": _RATIO,
-}
+_OF_NOISE = {"white": _SD, "slow": _SD, "correlation_time": _SECONDS, "misfit": _SD, "growth": _RATIO}
 _OF_SPREADS = {
     "ln_h": _SD, "ln_effusivity": _SD, "ln_h_of_blocks": _SD, "dof": _STORE, "insulator_dof": _STORE,
     **dict.fromkeys(("ln_build_up", "onset", "t_object"), (1e-12, 100.0)),  # whose precision is needed

@@ -298,14 +298,13 @@ def fit_pairs(
     start: Array | None = None, noise: Whitened | None = None,
     prior: Prior | None = None, rivals: bool = False,
 ) -> Mode:  # fmt: skip
-    """Return the modes of pairs, hypothesis i against touch ``row[i]``, a second sensor used; ``noise`` and
-    ``prior`` are
-    :func:`~thermogrip.sysid.effusivity.data.whiten` and :func:`prior_of` where a caller has them."""
+    """Return the modes of pairs, hypothesis i against touch ``row[i]``, a second sensor used; ``noise``
+    (:func:`whitened`) and ``prior`` (:func:`prior_of`) where a caller has them."""
     prior = prior_of(gripper, data.known(row), hypotheses) if prior is None else prior
     # what else counts may bring another one up
     rivals = rivals and gripper.discrepancy is None and (gripper.second is None or data.second is None)
     mode = _own_modes(gripper, data, row, hypotheses, prior, start, noise, rivals)
-    mode = with_second(gripper, data, row, hypotheses, prior, mode)
+    mode = with_second(gripper, data, row, hypotheses, mode)
     n = (data.count[row] > 0).sum(axis=1)
     if gripper.second is not None and data.second is not None:
         n = n + (data.second.count[row] > 0).sum(axis=1)
@@ -315,15 +314,14 @@ def fit_pairs(
 
 
 def with_second(
-    gripper: GripperModel, data: Touches, row: NDArray[np.int64], hypotheses: Hypotheses, prior: Prior,
-    mode: Mode,
-) -> Mode:  # fmt: skip
+    gripper: GripperModel, data: Touches, row: NDArray[np.int64], hypotheses: Hypotheses, mode: Mode
+) -> Mode:
     """Return the modes of pairs by the first sensor with what the second one saw, if there is one."""
     second = gripper.second
     if second is None or data.second is None:
         return mode
     beside, second_prior = second_modes(gripper, data, row, hypotheses, mode)
-    return joined_modes(mode, prior, beside, second_prior, second.bias - gripper.bias)
+    return joined_modes(mode, beside, second_prior, second.bias - gripper.bias)
 
 
 def second_modes(
@@ -351,10 +349,7 @@ def _own_modes(
     """Return the modes of pairs by the first sensor alone."""
     noise = whitened(gripper, data) if noise is None else noise
     beyond = None if gripper.discrepancy is None else gripper.beyond(data.t[row], prior.mean[:, EFFUSIVITY])
-    return find_modes(
-        gripper.stack, data, row, noise, prior, start=start, beyond=beyond,
-        rivals=rivals,
-    )  # fmt: skip
+    return find_modes(gripper.stack, data, row, noise, prior, start=start, beyond=beyond, rivals=rivals)
 
 
 def hypotheses_of_second(gripper: GripperModel, second: GripperModel, one: Hypotheses) -> Hypotheses:
@@ -370,7 +365,7 @@ def hypotheses_of_second(gripper: GripperModel, second: GripperModel, one: Hypot
     return Hypotheses(*other)
 
 
-def joined_modes(first: Mode, prior: Prior, second: Mode, own: Prior, apart: float) -> Mode:
+def joined_modes(first: Mode, second: Mode, own: Prior, apart: float) -> Mode:
     r"""Return the modes of one object that two sensors touched, with its temperature x common to both: what
     the second saw of x is its posterior over its prior, a normal likelihood of precision :math:`1/V_2 -
     1/V_{02}`, its thermometer ``apart`` [K] above the first one's, within +-0.3 K; all else is each
@@ -564,16 +559,8 @@ def fit_rivals(
     begin = mode.u[likeliest[row[again_for]]]
     begin[:, EFFUSIVITY] = mode.u[again_for, EFFUSIVITY]
     some = Hypotheses(*(field[again_for] for field in hypotheses))
-    again = fit_pairs(
-        gripper,
-        data,
-        row[again_for],
-        some,
-        start=begin,
-        noise=noise,
-        prior=prior.take(again_for),
-        rivals=True,
-    )
+    prior = prior.take(again_for)
+    again = fit_pairs(gripper, data, row[again_for], some, start=begin, noise=noise, prior=prior, rivals=True)
     better = again.log_evidence > mode.log_evidence[again_for]
     for whole, field in zip(mode, again):
         whole[again_for[better]] = field[better]

@@ -65,9 +65,8 @@ class Asked(NamedTuple):
     gripper: Gripper
     data: Any  # Touches; kernels import nothing that is not in the digest of their sources
     row: NDArray[np.int64]  # (n,)
-    beyond: (
-        Array  # (n, 2, n_bin), the gripper's discrepancy: always [K], and per degree between object and skin
-    )
+    # (n, 2, n_bin), the gripper's discrepancy: always [K], and per degree between object and skin
+    beyond: Array
 
     def take(self, index: Any) -> Asked:
         """Return some of the pairs, of one gripper."""
@@ -255,9 +254,7 @@ def products(asked: Asked, whitener: Array, u: Array, sd: Array) -> Array:
     """Return J' J, and J' r and r' r in the last row and column, (n, 8, 8): J in units of ``sd`` (n, 7), r
     the readings less those that ``u`` predicts, both whitened."""
     blocks = []
-    for begin in range(
-        0, len(u), SEARCH.pairs_at_once
-    ):  # so many at once that they stay in the processor's cache
+    for begin in range(0, len(u), SEARCH.pairs_at_once):
         chunk = slice(begin, begin + SEARCH.pairs_at_once)
         some = asked.take(chunk)
         columns = readings(some, u[chunk], sd[chunk] > 0.0)[1]
@@ -356,9 +353,7 @@ class Found(NamedTuple):
     settled: Mask
 
 
-def search(
-    asked: Asked, whitener: Any, law: Law, sd: Array, u: Array, *, rivals: bool
-) -> Found:  # fmt: skip
+def search(asked: Asked, whitener: Any, law: Law, sd: Array, u: Array, *, rivals: bool) -> Found:
     """Return where damped Gauss-Newton steps from ``u`` (n, 7) end, under priors of a ``law`` and of ``sd``
     (n, 7): where the next step would gain less than 0.005 nat, which then counts as taken.
 
@@ -391,9 +386,8 @@ def search(
         if not going_on.all():
             done = ~going_on
             finished = state.at[done]
-            ended.u[finished] = state.point[done] + np.where(
-                settled[done, None], last[done] * state.sd[done], 0.0
-            )
+            last_move = np.where(settled[done, None], last[done] * state.sd[done], 0.0)
+            ended.u[finished] = state.point[done] + last_move
             ended.cost[finished] = state.cost[done] - np.where(settled[done], decrease[done], 0.0)
             ended.matrix[finished], ended.settled[finished] = state.matrix[done], settled[done]
             if done.all():
@@ -401,11 +395,11 @@ def search(
             state = state.take(going_on)
             curved = curved[going_on]
             rhs = rhs[going_on]
+            decrease = decrease[going_on]
+            last = last[going_on]
         gain = decrease
         damping_loss = np.zeros(1)
         move = last
-        if not going_on.all():
-            gain, move = decrease[going_on], last[going_on]
         damped = state.damping > SEARCH.no_damping
         if damped.any():
             own_curvature = curved[:, diagonal, diagonal]

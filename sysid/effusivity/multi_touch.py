@@ -559,7 +559,7 @@ def _group_factors(
     mode = find_modes(
         view.gripper.stack, view.data, row, view.whitener, Prior(prior.mean, prior.sd), beyond=beyond
     )
-    whole = factor_of(with_second(view.gripper, view.data, row, hypotheses, prior, mode), prior)
+    whole = factor_of(with_second(view.gripper, view.data, row, hypotheses, mode), prior)
     # away from a mode there is nothing to expand: such a hypothesis keeps its (hopeless) value everywhere
     lost = ~mode.converged
     whole.log_size[lost], whole.eta[lost], whole.precision[lost] = mode.log_evidence[lost], 0.0, 0.0

@@ -74,7 +74,8 @@ def next_touch(
     evidence = prior.log_evidence
     n, m = temperature.size, evidence.size
     room = float(grasps["t_ambient"].values[-1]) if "t_ambient" in grasps else np.nan
-    data = _coming(np.repeat(temperature, m), room, end, _sample_time(grasps))
+    sample_s = float(np.median(np.diff(np.asarray(grasps["time"].values, dtype=float))))
+    data = _coming(np.repeat(temperature, m), room, end, sample_s)
     u, spread = np.zeros((n * m, N_NUISANCE)), np.zeros((n * m, N_NUISANCE, N_NUISANCE))
     u[:, BUILD_UP], u[:, ONSET], u[:, LEVEL] = np.log(gripper.stack.build_up), gripper.onset, data.level
     own_nuisances = [BUILD_UP, ONSET, LEVEL]
@@ -91,10 +92,6 @@ def next_touch(
     covariance = slopes @ spread @ slopes.transpose(0, 2, 1) + noise
     log_p = np.tile(evidence - logsumexp(evidence), (n, 1))
     return PosteriorPredictive(log_p, y.reshape(n, m, -1), covariance.reshape(n, m, *covariance.shape[1:]))
-
-
-def _sample_time(grasps: Grasps) -> float:
-    return float(np.median(np.diff(np.asarray(grasps["time"].values, dtype=float))))
 
 
 def _coming(level: Array, room: float, end: float, dt: float) -> Touches:

@@ -172,14 +172,11 @@ def check_grasps(grasps: Grasps, *, longest: float = np.inf, whole_traces: bool 
     first_clipped = clipped.argmax(axis=1)
     row = np.arange(len(clipped))
     ever = np.asarray(clipped.any(axis=1))
-    since, reading = (
-        np.where(ever, time[first_clipped], np.nan),
-        np.where(ever, raw[row, first_clipped], np.nan),
-    )
+    since = np.where(ever, time[first_clipped], np.nan)
+    reading = np.where(ever, raw[row, first_clipped], np.nan)
     single = not has_touch_groups(grasps)
-    shortened = np.asarray(
-        (_last_sample_times(time, np.isfinite(raw)) > LIMITS.read_whole * longest) & single
-    )
+    last = _last_sample_times(time, np.isfinite(raw))
+    shortened = np.asarray((last > LIMITS.read_whole * longest) & single)
     note = list(reason)
     for i in range(len(note)):
         if not note[i] and ever[i]:
@@ -190,10 +187,8 @@ def check_grasps(grasps: Grasps, *, longest: float = np.inf, whole_traces: bool 
             note[i] = f"read until {longest:g} s, as long as contacts of the training lasted"
     until = float(longest) if single else np.inf
     used = np.asarray(read & (time <= until + 1e-9))
-    start, stop = (
-        np.where(used.any(axis=1), t, np.nan)
-        for t in (time[used.argmax(axis=1)], _last_sample_times(time, used))
-    )
+    start = np.where(used.any(axis=1), time[used.argmax(axis=1)], np.nan)
+    stop = np.where(used.any(axis=1), _last_sample_times(time, used), np.nan)
     return GraspQuality(reason, note, masked, spiked, reading, start, stop, shortened, until, trace)
 
 
@@ -228,19 +223,19 @@ class _Trace:
         """How far each skin is above its level in its last second (n,) [K]."""
         return _row_means(self.clean[:, self.time > self.time[-1] - 1.0]) - self.level
 
+    @property
+    def telling(self) -> Flags:
+        """Which grasps are long enough, and far enough from their object, to show a contact, (n,)."""
+        return (self.away >= LIMITS.telling_difference_K) & bool(self.time[-1] >= LIMITS.least_contact_s)
+
     def stays(self, share: float) -> Flags:
         """Return which grasps move by less than this share of a difference that would show contact, (n,)."""
-        moves = np.abs(self.moved) < share * self.away
-        return np.asarray(
-            (self.away >= LIMITS.telling_difference_K) & moves & (self.time[-1] >= LIMITS.least_contact_s)
-        )
+        return np.asarray(self.telling & (np.abs(self.moved) < share * self.away))
 
     def contradicts(self) -> Flags:
         """Return which grasps move away from an object that is stated to be 10 K off or more, (n,)."""
         against = -np.sign(self.difference) * self.moved > LIMITS.contrary_share * self.away
-        return np.asarray(
-            (self.away >= LIMITS.telling_difference_K) & against & (self.time[-1] >= LIMITS.least_contact_s)
-        )
+        return np.asarray(self.telling & against)
 
     def unmoved(self) -> Flags:
         """Return which grasps, 10 K from their object, have not moved towards it yet, however short, (n,)."""
@@ -301,11 +296,8 @@ def find_contact(
 
 def longest_contact(records: Sequence[Grasps]) -> float:
     """Return how long the longest contact of some records was read [s]."""
-    ends = [
-        _last_sample_times(record["time"].values, np.isfinite(record["t_surface"].values))
-        for record in records
-    ]
-    return max(float(end.max()) for end in ends)
+    readings = [(record["time"].values, np.isfinite(record["t_surface"].values)) for record in records]
+    return max(float(_last_sample_times(*times_and_read).max()) for times_and_read in readings)
 
 
 def contact_faults(grasps: Grasps, quality: GraspQuality) -> list[str]:
@@ -335,12 +327,7 @@ def contact_faults(grasps: Grasps, quality: GraspQuality) -> list[str]:
         faults.append(f"{named(still)} {off:.0f} K from their object stay as they are: no contact?")
     if wrong.any():
         faults.append(f"{named(wrong)}: {CONTRARY}")
-    far_apart = (
-        (trace.away >= LIMITS.telling_difference_K)
-        & ~still
-        & ~wrong
-        & bool(trace.time[-1] >= LIMITS.least_contact_s)
-    )
+    far_apart = trace.telling & ~still & ~wrong
     mistimed = _mistimed(trace.time, trace.clean[far_apart], np.abs(difference[far_apart]))
     if mistimed:  # a contact before time 0 moves the skin too
         faults.append(mistimed)
@@ -418,10 +405,7 @@ def _spiked(data: Floats) -> Flags:
         spiked[i] = find_spikes(data[i], floor=max(SPIKE_FLOOR_K, 2.5 * step))
     for i in np.flatnonzero((np.abs(jumps) > LIMITS.leap_K).any(axis=1)):
         read_at = np.flatnonzero(np.isfinite(data[i]))
-        for order in (
-            read_at,
-            read_at[::-1],
-        ):  # the few samples at either end that lie a leap away from the rest
+        for order in (read_at, read_at[::-1]):  # the few samples at either end a leap away from the rest
             leaps = np.flatnonzero(np.abs(np.diff(data[i][order[: SPIKE_LENGTH + 1]])) > LIMITS.leap_K)
             if leaps.size and read_at.size > 2 * SPIKE_LENGTH:
                 spiked[i, order[: leaps[-1] + 1]] = True
@@ -472,16 +456,15 @@ def _rests(grasps: Grasps, left_out: Flags) -> Floats:
     rest_s, order = np.array(number_values(grasps, "rest")), number_values(grasps, "touch")
     group, time = label_values(grasps, "touch_group"), grasps["time"].values
     has_reading = np.isfinite(grasps["t_surface"].values)
+    known_rest_s = np.where(np.isfinite(rest_s), rest_s, LIMITS.unknown_rest_s)
     for name in np.unique(group[left_out & (group != "")]):
         group_rows = np.flatnonzero(group == name)
         more = 0.0
         for i in group_rows[np.argsort(order[group_rows], kind="stable")]:
             if left_out[i]:
-                more += (rest_s[i] if np.isfinite(rest_s[i]) else LIMITS.unknown_rest_s) + float(
-                    time[has_reading[i]][-1]
-                )
+                more += known_rest_s[i] + float(time[has_reading[i]][-1])
             elif more > 0:
-                rest_s[i], more = (rest_s[i] if np.isfinite(rest_s[i]) else LIMITS.unknown_rest_s) + more, 0.0
+                rest_s[i], more = known_rest_s[i] + more, 0.0
     return rest_s
 
 
@@ -497,9 +480,8 @@ def _row_means(block: Floats) -> Floats:
     """Return the mean of each row but for lost samples, NaN where all are lost."""
     has_reading = np.isfinite(block)
     n = has_reading.sum(axis=1)
-    return np.asarray(
-        np.where(n > 0, np.where(has_reading, block, 0.0).sum(axis=1) / np.maximum(n, 1), np.nan)
-    )
+    total = np.where(has_reading, block, 0.0).sum(axis=1)
+    return np.asarray(np.where(n > 0, total / np.maximum(n, 1), np.nan))
 
 
 def _last_sample_times(time: Floats, seen: Flags) -> Floats:

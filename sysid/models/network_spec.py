@@ -32,7 +32,7 @@ class Quantity(NamedTuple):
 
 
 class Refers(NamedTuple):
-    """What a name in an element stands for; a place is a node, a disturbance or a boundary."""
+    """What a name in an element refers to; a place is a node, a disturbance or a boundary."""
 
     to: Literal["place", "node", "switch", "input"]
 

@@ -199,7 +199,7 @@ def make_grid(
     return Grid(u, d, y, switches, step, tuple(segments), native, units, why, ends)
 
 
-def cut_stretches(plant: PlantData, log: Log, *, gaps: str = "mend") -> list[Stretch]:
+def cut_stretches(plant: PlantData, log: Log, *, gaps: str = "restart") -> list[Stretch]:
     """Return the stretches of a log, which is in the plant's units, on the plant's grid."""
     rows = rows_of(log, plant.inputs, plant.outputs, plant.disturbances)
     for name, values in zip((*plant.inputs, *plant.disturbances), (*rows.u.T, *rows.d.T)):

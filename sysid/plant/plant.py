@@ -125,7 +125,7 @@ class Plant(Shown, plant_data.PlantData):
         warmup: float = WARMUP,
         *,
         score_from: float | None = None,
-        gaps: str = "mend",
+        gaps: str = "restart",
     ) -> Log:
         """Return the free run over the log (:mod:`thermogrip.sysid.plant.simulation`).
 
@@ -137,7 +137,7 @@ class Plant(Shown, plant_data.PlantData):
             Seconds at the start (and after each gap) whose outputs set the state and the sensor offsets.
         score_from : float, optional
             Samples before this many seconds are marked unscored; the warm-up where absent.
-        gaps : {"mend", "hold"}, optional
+        gaps : {"restart", "hold"}, optional
             After a gap start afresh from its own warm-up, or hold the last row through it.
 
         Returns
@@ -160,8 +160,8 @@ class Plant(Shown, plant_data.PlantData):
         >>> Plant(block, {}, dt=10.0).simulate(log, warmup=50.0)["t"].values[[59, -1]].round(1).tolist()
         [0.0, 39.9]
         """
-        if gaps not in ("mend", "hold"):
-            raise ValueError(f"gaps is 'mend' or 'hold', not {gaps!r}")
+        if gaps not in ("restart", "hold"):
+            raise ValueError(f"gaps is 'restart' or 'hold', not {gaps!r}")
         if not warmup > 0:
             raise UserError(f"a warm-up of {warmup:g} s says nothing", hint="give it a few seconds")
         (log,), notes = match_logs(self, [log])

@@ -89,7 +89,7 @@ class Watch:
     """Show a session; a context manager, whose methods are called from the session's thread.
 
     ``operator`` is handed to the session, as are :meth:`listen` and :meth:`progress`; ``address`` is that of
-    the page, with its token, ``page`` its process, ``viewers`` how many look at it, ``now`` the newest
+    the page, with its token, ``page`` its process, ``viewers`` the number that look at it, ``now`` the newest
     snapshot, ``typing`` the thread that reads the terminal.
     """
 

@@ -276,7 +276,7 @@ def test_a_run_keeps_name_units_and_roles_of_its_log():
     assert said == {
         "q": ("input", "1"), "t_room": ("disturbance", "degC"), "a": ("output", "K"), "b": ("output", "degC"),
     }  # fmt: skip
-    with pytest.raises(ValueError, match="gaps is 'mend' or 'hold'"):
+    with pytest.raises(ValueError, match="gaps is 'restart' or 'hold'"):
         made.simulate(log, gaps="bridge")
 
 
