@@ -31,9 +31,8 @@ class ScaledClock:
 class Metronome:
     """The ends of consecutive waits, on a grid whatever the work between them takes.
 
-    A loop that works 3 ms and then waits 10 ms would sample every 13 ms.  Work of less than the wait itself
-    (and than half a second) is taken off the next wait; after more the grid starts anew, and nothing is
-    caught up.
+    Work of less than the wait itself (and than half a second) is taken off the next wait; after more the grid
+    starts anew, and nothing is caught up.
     """
 
     def __init__(self, clock: Callable[[], float], sleep: Callable[[float], None]) -> None:

@@ -6,8 +6,7 @@ session runs on the twin much faster than on hardware, with the same lines.
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Protocol, runtime_checkable
 
@@ -67,34 +66,13 @@ class Reading:
 class Event:
     """Something that happened: when [s, the rig's clock], of which kind, in words, and as data (JSON).
 
-    What happens on the line or the device is of the kinds ``link`` (lost, found), ``reset``, ``latched``,
-    ``expired``, ``damaged``, ``repeated``, ``refused`` and ``unexpected``.
+    Of the line or the device: ``link``, ``reset``, ``latched``, ``expired``, ``damaged``, ``repeated`` ...
     """
 
     time_s: float
     kind: str
     text: str
     data: Mapping[str, Any] = field(default_factory=dict)
-
-
-class NoticeBook:
-    """The notices of a rig, whose clock starts at 0 when it is made."""
-
-    def __init__(self, clock: Callable[[], float]) -> None:
-        self._clock, self._start = clock, clock()
-        self._notices: deque[Event] = deque(maxlen=1000)
-
-    def notices(self) -> list[Event]:
-        """Return what happened since the last call, and forget it."""
-        happened = list(self._notices)
-        self._notices.clear()
-        return happened
-
-    def _now(self) -> float:
-        return round(self._clock() - self._start, 9)
-
-    def _note(self, kind: str, text: str) -> None:
-        self._notices.append(Event(self._now(), kind, text))
 
 
 def check_order(drive: Mapping[str, float], pump: int, ranges: Mapping[str, tuple[float, float]]) -> None:

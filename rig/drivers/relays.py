@@ -15,9 +15,6 @@ period to choose: at a share d it is the shortest that the least times allow.
 A heater and a cooler are two such relays of one drive from -1 to 1, each asked for its own sign.  One comes
 on only when the other has been off for a dead time; what it owes by then beyond its bound is forgiven.  A
 request of the other sign takes back what is owed.
-
-The end of a session (a pump that is off, :meth:`RelayRig.close`) switches off at once, whatever the least
-times say.
 """
 
 from __future__ import annotations

@@ -13,9 +13,8 @@ here:
   on still is, to the last digit.  With the heaters off nothing tells one board from another: it is not driven
   any more.
 
-A temperature that is too high, or lost, is the guard's matter (:mod:`~thermogrip.rig.guard.guard`).  What
-cannot be done: **nothing ends the heaters when the program is dead or the cable out**; they stay as they
-were until the board loses its power.  ``Q2B`` is never used: firmware 2.0.1 sets heater 1 with it.
+What cannot be done: **nothing ends the heaters when the program is dead or the cable out**; they stay as they
+were until the board loses its power.
 """
 
 from __future__ import annotations
@@ -28,9 +27,8 @@ from dataclasses import dataclass
 from statistics import median
 
 from thermogrip.datasets.errors import UserError
-from thermogrip.rig.clock import Metronome
-from thermogrip.rig.interface import NoticeBook, Reading, check_order
-from thermogrip.rig.serial.port import Port, PortError
+from thermogrip.rig.interface import Reading, check_order
+from thermogrip.rig.serial.port import Port, PortError, SerialRig
 
 HEATERS, SENSORS = ("q1", "q2"), ("t1", "t2")
 _DECIMAL_LINE = re.compile(rb"(-?(?:0|[1-9][0-9]{0,3})\.[0-9]{3})\r?\n")
@@ -53,7 +51,7 @@ class BoardSettings:
 BOARD = BoardSettings()
 
 
-class TCLabRig(NoticeBook):
+class TCLabRig(SerialRig):
     """A TCLab behind the rig's interface; inputs ``q1``, ``q2`` in percent, outputs ``t1``, ``t2``.
 
     A change of ``jump`` [K] between two scans is asked again; ``timeout`` of each line of an answer, of which
@@ -73,8 +71,7 @@ class TCLabRig(NoticeBook):
         self.port = port
         self.jump = jump
         self.timeout = timeout
-        super().__init__(clock)
-        self._beat = Metronome(clock, sleep)
+        super().__init__(clock, sleep)
         self._set = [0.0, 0.0]
         self._pump = 0
         self._last: tuple[float, list[float]] | None = None
@@ -111,8 +108,7 @@ class TCLabRig(NoticeBook):
     def apply(self, drive: Mapping[str, float], pump: int) -> None:
         """Set both heaters and have the board confirm them; there is no pump, its state is only kept.
 
-        Raises PortError where the board does not confirm (a heater may be as it was), ValueError for an
-        unknown input or a value outside 0 to 100, RuntimeError where closed.
+        PortError where the board does not confirm: a heater may be as it was.
         """
         check_order(drive, pump, dict.fromkeys(HEATERS, (0.0, 100.0)))
         if self.closed:
@@ -121,10 +117,6 @@ class TCLabRig(NoticeBook):
             return
         self._set_heaters([float(drive[name]) for name in HEATERS])
         self._pump = pump
-
-    def wait(self, seconds: float) -> None:
-        """Let time pass; waits that follow each other end on a grid."""
-        self._beat.wait(seconds)
 
     def grasp(self, material: str, t_object: float) -> None:
         """Raise UserError: a TCLab has no gripper."""

@@ -1,8 +1,5 @@
 """Our firmware as a rig: every request is confirmed, every drive has a time to live, every oddity is noted.
 
-A drive is sent with :data:`TTL_S` to live, so it ends by itself within that time when the program freezes,
-dies, or loses its cable.  Who wants it to hold applies it again before, as the loop of a session does.
-
 **What fails how.**  A reading that cannot be had is a reading, so a session sees it, records it and can
 decide.  A drive that was not confirmed raises, because it must not count as applied.
 
@@ -17,16 +14,15 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping
 
-from thermogrip.rig.clock import Metronome
-from thermogrip.rig.interface import DeviceRefusedError, NoticeBook, Reading, check_order
+from thermogrip.rig.interface import DeviceRefusedError, Reading, check_order
 from thermogrip.rig.serial import protocol
-from thermogrip.rig.serial.port import Port, PortError
+from thermogrip.rig.serial.port import Port, PortError, SerialRig
 
 TTL_S = protocol.MAX_TTL_MS / 1000
 MOST_TRIES = 12  # of one question on a line that spoils half of it
 
 
-class DeviceRig(NoticeBook):
+class DeviceRig(SerialRig):
     """A device with our firmware, behind the rig's interface.
 
     ``timeout`` and ``greeting`` are real seconds: how long an answer may take, and an Arduino that starts
@@ -44,11 +40,10 @@ class DeviceRig(NoticeBook):
         clock: Callable[[], float] = time.monotonic,
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
-        super().__init__(clock)
+        super().__init__(clock, sleep)
         self.port = port
         self.timeout = timeout
         self.tries = tries
-        self._beat = Metronome(clock, sleep)
         self._host = protocol.HostEnd()
         self._known: protocol.State | None = None
         self._heard, self._silent = 0, False  # bytes so far; whether the last question was met with none
@@ -95,9 +90,8 @@ class DeviceRig(NoticeBook):
     def apply(self, drive: Mapping[str, float], pump: int) -> None:
         """Drive from now on, for :data:`TTL_S` or until the next call; returns when the device has confirmed.
 
-        Raises PortError where it cannot be reached (what it did last ends by itself), DeviceRefusedError
-        where it refuses (a latched fault, a drive while the pump is off, a reset since it was greeted),
-        ValueError for an unknown input or a value outside its range, RuntimeError where the rig is closed.
+        PortError where it cannot be reached (what it did last ends by itself), DeviceRefusedError where it
+        refuses (a latched fault, a drive while the pump is off, a reset since it was greeted).
         """
         check_order(drive, pump, {c.name: (c.low / 1e4, c.high / 1e4) for c in self.identity.drives})
         counts = tuple(round(1e4 * drive[channel.name]) for channel in self.identity.drives)
@@ -107,10 +101,6 @@ class DeviceRig(NoticeBook):
             return
         idle = not pump and not any(counts)
         self._ask(protocol.Off() if idle else protocol.Drive(protocol.MAX_TTL_MS, pump, counts))
-
-    def wait(self, seconds: float) -> None:
-        """Let time pass; waits that follow each other end on a grid."""
-        self._beat.wait(seconds)
 
     def grasp(self, material: str, t_object: float) -> None:
         """Close the gripper."""
@@ -238,8 +228,6 @@ class DeviceRig(NoticeBook):
                 self._greeted_at, self._known = 0, None
             case protocol.Unexpected(why=why):
                 self._note("unexpected", f"a line came that answers nothing ({why})")
-            case _:
-                pass
 
     def _compare(self, state: protocol.State) -> None:
         """Compare with the last state: a reset whose line was lost, a new latch, an expired drive."""

@@ -140,15 +140,11 @@ class DeviceCore:
         """Take one sample of every sensor, and whether the pump turns."""
         self._expire(now_ms)
         self._values = tuple(values)
-        bad = [
-            count.add(_sensor_fault(sensor, value))
-            for count, sensor, value in zip(self._bad_counts, self.board.sensors, values)
-        ]
-        latched = [
-            f"{count.kind}:{sensor.name}"
-            for count, sensor, latch in zip(self._bad_counts, self.board.sensors, bad)
-            if latch and not any(fault.endswith(f":{sensor.name}") for fault in self.faults)
-        ]
+        latched = []
+        for count, sensor, value in zip(self._bad_counts, self.board.sensors, values):
+            known = any(fault.endswith(f":{sensor.name}") for fault in self.faults)
+            if count.add(_sensor_fault(sensor, value)) and not known:
+                latched.append(f"{count.kind}:{sensor.name}")
         if flow or not any(self._drive) or not self._pump:
             self._flow_ms = now_ms
         still_ms = (now_ms - self._flow_ms) % 2**32  # the device's clock wraps after 49 days

@@ -2,22 +2,17 @@
 
 It asks, in this order:
 
-    time      was the drive renewed in time, and did readings and the computer's own clock move on together?
-              (frozen, stale, clock)
+    time      was the drive renewed in time, do readings keep up with our clock?  (frozen, stale, clock)
     driver    does the rig apply what was asked?  (driver, device)
-    sensors   is each reading plausible?  (lost, jump, stuck, disagree;
-              :mod:`~thermogrip.rig.guard.sensor_checks`)
+    sensors   is each reading plausible?  (lost, jump, stuck, disagree)
     limits    is everything inside its limits?  (limit)
-    model     does the rig follow its identified model?  (model, stuck, driver, drift;
-              :mod:`~thermogrip.rig.guard.model_checks`), or, without a model, the rule below
+    model     does the rig follow its model or, without one, the rule below?  (model, stuck, driver, drift)
     operator  has somebody asked to stop?  (operator)
 
 and of a move, before it goes out: is it finite, and does it pump heat into standing water?  (drive,
 interlock)
 
-A suspect reading never reaches the controller; the last good one takes its place, for two looks.  The
-guard keeps no clock and opens nothing: a reading, the host's time, and what was asked come in, accepted
-values and a :class:`~thermogrip.rig.guard.trip.Trip` come out.  The loop switches off.
+A suspect reading never reaches the controller; the last good one takes its place, for two looks.
 
 **The time of a reading** by the computer's clock lies between ``asked`` and ``now``, when it was asked for
 and when it was there; the rig's clock is wrong where no moments between these allow what it says.  The
@@ -40,9 +35,8 @@ such a drive holds it:
 
     |T - T_room| >= far_K min(1, 2 |mean drive|) - least_K,    T on the drive's side of the room.
 
-By ``least_K`` sensors may disagree as well: a drive that holds no more than that apart, with the defaults
-1/16 of its range, is not judged.  Where no sensor reads the room, the output must stand ``least_K`` beyond
-what it read before in the session.
+By ``least_K`` sensors may disagree as well: a drive that holds no more than that apart is not judged.  Where
+no sensor reads the room, the output must stand ``least_K`` beyond what it read before in the session.
 """
 
 from __future__ import annotations
@@ -134,7 +128,6 @@ class RuleMonitor:
             f"in {seconds:.0f} s of drive {mean:+.2f}",
             measured=f"{change:+.1f} K",
             check=_to_check(["drift", kind]),
-            figures={"moved": change},
         )
 
     def _beyond_room(self, name: str, value: float, room: float, heats: bool) -> float:
@@ -221,9 +214,9 @@ class Guard:
     def start(
         self, reading: Reading, now: float, units: Mapping[str, str], *, asked: float | None = None
     ) -> None:
-        """Begin a session at a reading, with its times as in :meth:`check` and the drives' units, nothing
-        driven yet and what the model knows of the rig from a session that ended well a few minutes ago."""
+        """Begin a session at a reading, with its times as in :meth:`check` and the drives' units."""
         age_s = reading.time_s - self._time_s
+        # the model still knows the rig from a session that ended well a few minutes ago
         continues = not self.trips and 0 <= age_s <= self.settings.known_s
         self._ranges = {
             name: range_of(unit, self._logged.get(name)) or (-1.0, 1.0) for name, unit in units.items()
@@ -266,8 +259,7 @@ class Guard:
         self._renewed_s = now
 
     def late(self, now: float) -> Trip | None:
-        """Return the trip of a drive that has stood without being renewed until the host's time ``now`` [s],
-        None where that was in time, or nothing was driven."""
+        """Return the trip of a drive that has stood without being renewed until the host's time [s]."""
         silence_s = now - self._renewed_s
         if not any(self._drive.values()) or silence_s <= self.settings.expiry_s:
             return None
@@ -277,7 +269,6 @@ class Guard:
             subject="this program",
             expected=f"a drive renewed within {self.settings.expiry_s:g} s",
             measured=f"after {silence_s:.1f} s",
-            figures={"seconds": silence_s},
         )
 
     def refuse(self, drive: Mapping[str, float], pump: int, time: float) -> Trip | None:
@@ -291,7 +282,6 @@ class Guard:
                     subject=name,
                     expected="a number",
                     measured=f"{value}",
-                    figures={"drive": value},
                 )
             if pump == 0 and value != 0.0 and has_pump:
                 return Trip(
@@ -381,7 +371,6 @@ class Guard:
                 subject="readings",
                 expected=f"a new one within {self.settings.stale_s:g} s",
                 measured=f"none for {least_s:.1f} s",
-                figures={"seconds": least_s},
             )
         host_s = min(max(rig_s, least_s), most_s)
         if rig_s < 0 or (rig_s > 0 and abs(rig_s - host_s) > self.settings.clock_slack_s):
@@ -391,7 +380,6 @@ class Guard:
                 subject="the rig's clock",
                 expected=f"{host_s:+.2f} s since the last reading",
                 measured=f"{rig_s:+.2f} s",
-                figures={"here": host_s, "there": rig_s},
             )
         return None
 
@@ -413,7 +401,6 @@ class Guard:
             subject=wrong,
             expected=f"{self._drive[wrong]:+.3g}, as asked",
             measured="0: the device has switched off" if is_off else f"{reading.drive[wrong]:+.3g}",
-            figures={"applied": reading.drive[wrong]},
         )
 
     def _limits(self, time: float, outputs: Mapping[str, float]) -> Trip | None:
@@ -432,7 +419,6 @@ class Guard:
                     subject=name,
                     expected=f"{low:g} to {high:g} degC",
                     measured=f"{value:.2f} degC",
-                    figures={"measured": value},
                 )
         return None
 
@@ -446,15 +432,6 @@ class Guard:
         """Return the sensors that are taken for the room's by their names alone."""
         stated = () if self.model is None else room_disturbances(self.model.plant)
         return sorted(self.rooms(names).difference(stated)) if self.settings.room_sensors is None else []
-
-    def unread(self, names: Collection[str]) -> dict[str, float]:
-        """Return the plant's measured disturbances that are none of these sensors' and no temperature of the
-        room, and what they are taken for."""
-        if self.model is None:
-            return {}
-        plant = self.model.plant
-        taken = zip(plant.disturbances, plant.undisturbed(0.0).tolist(), strict=True)
-        return {name: value for name, value in taken if name not in names and not plant.is_room(name)}
 
     def limits_of(self, name: str) -> tuple[float, float]:
         """Return between which temperatures a sensor may read [degC]."""
@@ -527,12 +504,6 @@ class Guard:
             measured=measured,
             # a sensor may drift, whichever bias shows it
             check=_to_check([kind, "drift"]) if alarm.kind == "bias" else "",
-            figures={
-                "expected": alarm.expected,
-                "measured": alarm.measured,
-                "allowed": alarm.allowed,
-                "window_s": alarm.window,
-            },
         )
 
     def _plausible(self, values: Mapping[str, float]) -> dict[str, float]:

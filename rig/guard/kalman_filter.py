@@ -66,11 +66,9 @@ class Estimate:
 class RigFilter:
     """Estimate state x (n_x,), drive biases w (n_w,) and output biases b (n_y,) of a rig.
 
-    A drive has a range by its unit, not by what the logs covered.  With ``half`` that range a bias w of each
-    drive is a fraction, and the input that the rig really gets is u + w * half.  ``expected`` (n_y,) are the
-    readings predicted for now [degC], ``u`` and ``d`` what was applied and read last, ``biased`` the outputs
-    that may have a bias: all but the reference.  ``applied`` are inputs and disturbances of the newest
-    ``keep`` native steps, of which ``done`` are complete, ``estimates`` those of as many seconds.
+    ``half`` is half the range of each drive: the input that the rig really gets is u + w * half.
+    ``expected`` (n_y,) are the readings predicted for now [degC], ``u`` and ``d`` what was applied and read
+    last; ``applied`` are those of the newest ``keep`` native steps, of ``done`` that are complete.
     """
 
     def __init__(self, plant: Plant, settings: ModelSettings, keep: int) -> None:

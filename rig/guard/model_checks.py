@@ -23,9 +23,6 @@ e being what the largest drive of the longest window does in such a window, and 
 drive, but more of it where more drive barely does more, near a Peltier element's optimum.  From run to run
 the effect of inputs differs by 5 % of itself (:data:`~thermogrip.sysid.plant.fit_record.RUN_GAIN_SD`), so
 ``drive_limit`` is three of that.
-
-**A rig that has drifted** a little from its plant (its water, its paste) needs a larger ``share`` and
-``drive_limit``: docs/howto/rig.md.
 """
 
 from __future__ import annotations
@@ -64,11 +61,7 @@ class Residual:
 
 
 class ModelMonitor:
-    """Follow a rig with its plant; pure: times are passed in.
-
-    ``compared_from`` is when windows may begin [s]; ``compared_now`` says whether the last reading was
-    compared: it completed a native step of the model, and a second had passed since the last one that was.
-    """
+    """Follow a rig with its plant; pure: times are passed in."""
 
     def __init__(self, plant: Plant, settings: ModelSettings | None = None) -> None:
         self.plant = plant
@@ -82,6 +75,7 @@ class ModelMonitor:
         """Start at rest at these readings."""
         y = _values_of(self.plant.outputs, values)
         self._filter.reset(time, y, _values_of(self.plant.disturbances, values))
+        # when windows may begin [s]
         self.compared_from = time + (0.0 if self._filter.at_rest else self.settings.warm_up_s)
         self._masked: frozenset[str] = frozenset()
         self._since = np.full(len(self.plant.outputs), self.compared_from)
@@ -115,6 +109,7 @@ class ModelMonitor:
         y[[name in masked for name in self.plant.outputs]] = np.nan
         self._filter.correct(time, y)
         done = self._filter.done
+        # whether this reading completed a native step of the model, a second after the last one that did
         self.compared_now = (
             done != self._compared and time >= self._compared_at + self.settings.compared_every_s - 1e-6
         )

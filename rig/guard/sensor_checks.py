@@ -21,9 +21,7 @@ has to).  q is the smallest step seen.
 *Pairs.*  Two sensors of one temperature, ``x`` and ``x_2``, may differ by ``pair_limit_K`` for ``pair_s``, no
 longer.
 
-**The room's sensors.**  Losing one is no reason to stop, and no limit holds for it.  They are the plant's
-disturbances that are temperatures, and of the sensors that the plant does not know those that the guard file
-states, or else those that are called so (:func:`~thermogrip.datasets.roles.guess_role`).
+**The room's sensors.**  Losing one is no reason to stop, and no limit holds for it.
 """
 
 from __future__ import annotations
@@ -140,8 +138,7 @@ class SensorMonitor:
     ) -> CheckedReadings:
         """Return which readings are accepted, and the trip, if any.
 
-        Sensors that are ``touching`` may jump now, those that have ``jumped`` did against the model; those of
-        the ``rooms`` may jump, stand still and be lost.
+        Those ``touching`` may jump, others have ``jumped`` against the model; ``rooms`` may be lost, too.
         """
         accepted: dict[str, float] = {}
         suspect: dict[str, str] = {}
@@ -180,7 +177,7 @@ class SensorMonitor:
         measured = f"{value:g} degC, {memory.bad} readings in a row"
         if memory.bad < self.settings.bad_in_a_row:
             measured = f"{value:g} degC, and suspect for {memory.lost_share:.0%} of the last minute"
-        return Trip(why, time, name, expected, measured, figures={"measured": value, "last": memory.good})
+        return Trip(why, time, name, expected, measured)
 
     def _stuck(self, name: str, value: float, time: float, memory: _Memory) -> Trip | None:
         if value != memory.last:
@@ -197,8 +194,7 @@ class SensorMonitor:
         seconds = time - memory.since
         expected = f"a change of {memory.quantum:.3g} degC every few readings"
         measured = f"{value:g} degC {memory.same + 1} times in a row, for {seconds:.0f} s"
-        figures = {"measured": value, "seconds": seconds}
-        return Trip("stuck", time, name, expected, measured, figures=figures)
+        return Trip("stuck", time, name, expected, measured)
 
     def _pairs(self, time: float, accepted: Mapping[str, float]) -> Trip | None:
         limit = self.settings.pair_limit_K
@@ -218,6 +214,5 @@ class SensorMonitor:
                     subject=f"{name} and {twin}",
                     expected=f"within {limit:g} K of each other",
                     measured=f"{accepted[name]:.2f} and {accepted[twin]:.2f} degC for {seconds:.0f} s",
-                    figures={"apart": apart},
                 )
         return None

@@ -1,8 +1,7 @@
 """What the guard allows, read from TOML: every key with its unit, its default, and the range it may have.
 
-The template, ``guard.toml``, is the documentation; ``thermogrip init guard`` writes it.  A file that
-is wrong anywhere is refused as a whole: a limit that is not understood would be a limit that is not kept.
-No file can switch a check off: each number has a range in which the check still works.
+A file that is wrong anywhere is refused as a whole: a limit that is not understood would be a limit that is
+not kept.  No file can switch a check off: each number has a range in which the check still works.
 """
 
 from __future__ import annotations
@@ -167,7 +166,14 @@ class GuardSettings(_Table):
             settings = cls.model_validate(dict(content))
         except ValidationError as error:
             problem = problem_of(error)
-            raise UserError(problem, file=file, hint=_instead(problem.partition(": ")[0])) from error
+            place, hint = problem.partition(": ")[0], "`thermogrip init guard` shows every key with its unit"
+            tables: dict[str, type[_Table]]
+            tables = {"sensors": SensorSettings, "model": ModelSettings, "no_model": RuleSettings}
+            keys = [f"{table}.{key}" for table, kind in tables.items() for key in kind.model_fields]
+            above = [table for table, kind in tables.items() if place in kind.model_fields]
+            hint = known_names(place, [*cls.model_fields, *keys], hint)
+            hint = f"write it below [{above[0]}]" if above else hint
+            raise UserError(problem, file=file, hint=hint) from error
         settings._file = "" if file is None else str(file)
         return settings
 
@@ -220,20 +226,6 @@ class GuardSettings(_Table):
             if name not in rooms:
                 problem = f"the rig has no sensor {name!r} that may read the room"
                 raise UserError(problem, file=self.file, hint="name none that the plant has")
-
-
-def _instead(place: str) -> str:
-    """Return what to do about a wrong key: the table that it is of, or the key that is most like it."""
-    key = place.rpartition(".")[2]
-    tables: dict[str, type[_Table]] = {
-        "sensors": SensorSettings, "model": ModelSettings, "no_model": RuleSettings,
-    }  # fmt: skip
-    every_key = [*GuardSettings.model_fields]
-    for table, kind in tables.items():
-        if place == key and key in kind.model_fields:
-            return f"write it below [{table}]"
-        every_key += kind.model_fields
-    return known_names(key, every_key, "`thermogrip init guard` shows every key with its unit")
 
 
 def read_guard(path: str | Path) -> GuardSettings:

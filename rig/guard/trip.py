@@ -1,18 +1,14 @@
 """What the guard reports when it ends a session: expected against measured, what to check, how to clear.
 
 A trip without its two numbers is what people work around: "not heating at expected rate" has been answered
-for years by weakening the check.  So every trip has what was expected and what was measured, with their
-units, the likely causes in the order in which they are worth checking, and what clears it.  A trip is data:
-one JSON object in ``events.jsonl``, one line on the terminal.
+for years by weakening the check.
 """
 
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass
 from importlib.resources import files
-from typing import Any
 
 _WORDS = tomllib.loads((files(__package__) / "trips.toml").read_text(encoding="utf-8"))
 
@@ -34,7 +30,6 @@ class Trip:
     measured: str  # with its unit
     check: str = ""  # what to look at; the kind's own where not given
     clear: str = ""  # what makes a new start possible; the kind's own where not given
-    figures: Mapping[str, float] = field(default_factory=dict)  # the numbers behind the words, for a program
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS:
@@ -49,13 +44,6 @@ class Trip:
             f"{self.kind}: {self.subject}: expected {self.expected}, measured {self.measured}; "
             f"check {self.check}; to clear: {self.clear}"
         )
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return plain JSON; a number that is not finite becomes None."""
-        numbers = {
-            key: float(value) if abs(value) < float("inf") else None for key, value in self.figures.items()
-        }
-        return {**asdict(self), "figures": numbers}
 
 
 class TripError(Exception):

@@ -17,8 +17,8 @@ PRBS lasts half of one, the time in which the loop answers a change of its targe
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -71,9 +71,8 @@ class Tripped(Exception):
 class Autotune:
     """An autotune in its folder: what was asked, how a rig is had, and how it is shown.
 
-    ``open_rig`` is called for each session, whose rig is closed after it; ``make_guard`` for each session
-    with the plant that the guard may trust, None before there is one.  ``shown`` are the ``listener`` and
-    ``operator`` of sessions.
+    ``open_rig`` and ``make_guard`` are called for each session, the latter with the plant that the guard may
+    trust, None before there is one; ``shown`` are the ``listener`` and ``operator`` of sessions.
     """
 
     folder: Path
@@ -93,7 +92,7 @@ class Autotune:
 
     def __post_init__(self) -> None:
         self.known: dict[str, Any] = {}  # figures by stage, as they are in the file
-        self.found: Identification | None = None
+        self.found: Identification  # in the logs so far
         self.tuning: Tuning | None = None
         self.session: Session | None = None
         self.moves: list[tuple[float, Move]] = []
@@ -106,7 +105,7 @@ class Autotune:
         if not self.logs():
             self._test()
         self._identify()
-        while not (self.identified.good and "pi" in self.known) and self._loop():
+        while not (self.found.good and "pi" in self.known) and self._loop():
             self._identify()
         self._tune()
         self._check()
@@ -160,20 +159,9 @@ class Autotune:
         logs = [read_run(path).log for kind in ("step", "loop") for path in self._folders(kind)]
         return sum(float(np.ptp(log["time"].values)) for log in logs if log is not None)
 
-    @property
-    def left_s(self) -> float:
-        """How much of its time is left [s]."""
-        return 60 * self.minutes - self.spent_s
-
-    @property
-    def identified(self) -> Identification:
-        """What identify found in the logs so far."""
-        assert self.found is not None
-        return self.found
-
     def _test(self) -> None:
         """Play the step test."""
-        with _opened(self.open_rig) as rig:
+        with closing(self.open_rig()) as rig:
             reading, guard = rig.read(), self.make_guard(None)
             rooms = guard.rooms(reading.values)
             begin = {name: value for name, value in reading.values.items() if name not in rooms}
@@ -243,18 +231,18 @@ class Autotune:
         """Record a loop under the PI; False where there is no time for one."""
         from thermogrip.mpc.controllers.pi import PIController
 
-        plant = self.identified.plant
+        plant = self.found.plant
         targets = self._targets(plant)
         loop = PIController(plant, controlled=tuple(targets))
         slowest = max(loop_of_pi.Ti for loop_of_pi in loop.loops)
-        seconds = min(self.left_s, (LOG.hold + 0.5 * LOG.bits) * slowest)
+        seconds = min(60 * self.minutes - self.spent_s, (LOG.hold + 0.5 * LOG.bits) * slowest)
         if seconds < LOG.least_s:
             return False
         if "first" not in self.known:
             loops = [f"{p.drive} on {p.output}, Kc {p.Kc:.3g}, Ti {p.Ti:.3g} s" for p in loop.loops]
             self.say(f"first loop after {self.spent_s / 60:.1f} min: {'; '.join(loops)}")
             self._note(first={"minutes": round(self.spent_s / 60, 1), "loops": loops})
-        with _opened(self.open_rig) as rig:
+        with closing(self.open_rig()) as rig:
             guard = self.make_guard(None)
             profile = self._excited(targets, slowest, seconds, guard)
             with RunFolder(self._next("loop"), self._asked) as folder:
@@ -290,7 +278,7 @@ class Autotune:
         from thermogrip.mpc.design.spec import Spec
         from thermogrip.mpc.tuning.tune import tune
 
-        plant = self.identified.plant
+        plant = self.found.plant
         targets, spec = self._targets(plant), self.spec
         if spec is None:
             begin = [self.known["start"].get(name, goal) for name, goal in targets.items()]
@@ -301,7 +289,7 @@ class Autotune:
         self.tuning.save(self.folder / "controller.json")
         if self.tuning.interrupted:
             raise KeyboardInterrupt
-        figures_so_far = {"minutes": round(self.spent_s / 60, 1), "good": self.identified.good}
+        figures_so_far = {"minutes": round(self.spent_s / 60, 1), "good": self.found.good}
         self._note(tuned=figures_so_far | {"verdict": self.tuning.verdict})
         self.say(f"{self.tuning.verdict}: {self.tuning.finding}")
 
@@ -310,9 +298,9 @@ class Autotune:
         from thermogrip.mpc.closed_loop.simulate import RecordedController
 
         assert self.tuning is not None
-        plant, regulator = self.identified.plant, RecordedController(self.tuning.controller)
+        plant, regulator = self.found.plant, RecordedController(self.tuning.controller)
         targets = self._targets(plant)
-        with _opened(self.open_rig) as rig, RunFolder(self._next("check"), self._asked) as folder:
+        with closing(self.open_rig()) as rig, RunFolder(self._next("check"), self._asked) as folder:
             self.session = run_session(
                 rig, regulator, targets, output=next(iter(targets)), hold=120.0,
                 guard=self.make_guard(plant), clock=self.clock, recorder=folder,
@@ -354,13 +342,3 @@ def _rig_drive_ranges(rig: Rig) -> dict[str, tuple[float, float]]:
             raise UserError(problem, hint="record a log of it, and go on with identify and tune")
         ranges[name] = ends
     return ranges
-
-
-@contextmanager
-def _opened(open_rig: Callable[[], Rig]) -> Iterator[Rig]:
-    """Yield a rig that is closed at the end."""
-    rig = open_rig()
-    try:
-        yield rig
-    finally:
-        rig.close()

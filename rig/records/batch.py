@@ -324,14 +324,14 @@ def good_run(folder: Path, k: int) -> Path | None:
 
 def next_folder(folder: Path, k: int) -> Path:
     """Return a folder for trial k that does not exist yet."""
-    n = len(_attempts(folder, k))
-    return folder / (f"{k + 1:04d}-{n + 1}" if n else f"{k + 1:04d}")
+    return _attempts(folder, k)[-1]
 
 
 def _attempts(folder: Path, k: int) -> list[Path]:
-    attempts: list[Path] = []
-    while (run := folder / (f"{k + 1:04d}-{len(attempts) + 1}" if attempts else f"{k + 1:04d}")).is_dir():
-        attempts.append(run)
+    """Return the folders of trial k's runs, and as the last one that of its next."""
+    attempts = [folder / f"{k + 1:04d}"]
+    while attempts[-1].is_dir():
+        attempts.append(folder / f"{k + 1:04d}-{len(attempts) + 1}")
     return attempts
 
 

@@ -10,9 +10,6 @@ here::
 :class:`Bridge` sends them from a thread of its own: a slow or dead network never delays the loop.  What
 cannot be sent is dropped, oldest first; the run folder is the record, the bridge is a view.
 
-That a connection was lost, that it is back and how much was dropped between is in the record behind the
-bridge and on ``/thermogrip/status``.
-
 Nothing is subscribed to, and nothing that comes in is taken.  Nothing is encrypted: use it on a network of
 your own.
 """
@@ -43,11 +40,7 @@ _LOOK_S = 0.1  # how often the sender looks whether a try is due, or the server 
 
 
 class Messages:
-    """The protocol: rows and events to JSON texts.
-
-    >>> [json.loads(text)["op"] for text in Messages().row({"time_s": 0.0, "drive": 0.5}, stamp=0.0)]
-    ['advertise', 'publish']
-    """
+    """The protocol: rows and events to JSON texts."""
 
     def __init__(self) -> None:
         self._advertised: set[str] = set()
@@ -58,13 +51,14 @@ class Messages:
 
     def row(self, row: Mapping[str, float], *, stamp: float) -> list[str]:
         """Return the messages of one row of this date [s since 1970]; JSON has no number that is lost."""
-        texts = []
+        texts, (seconds, nanoseconds) = [], divmod(round(stamp * 1e9), 1_000_000_000)
+        head = {"stamp": {"sec": seconds, "nanosec": nanoseconds}, "frame_id": "thermogrip"}
         for header, value in row.items():
             name, unit = split_header(header)
             if header == "time_s" or not isfinite(value):
                 continue
             if unit == "degC":
-                content: dict[str, Any] = {"header": _header(stamp), "temperature": value, "variance": 0.0}
+                content: dict[str, Any] = {"header": head, "temperature": value, "variance": 0.0}
                 texts += self._publish(name, "sensor_msgs/Temperature", content)
             else:
                 texts += self._publish(name, "std_msgs/Float64", {"data": value})
@@ -283,12 +277,6 @@ class Bridge:
             for text in self.reports[self._n_recorded :]:
                 self._n_recorded += 1
                 self.behind.event(Event(self._time_s, "bridge", text))
-
-
-def _header(stamp: float) -> dict[str, Any]:
-    nanoseconds = round(stamp * 1e9)
-    stamped = {"sec": nanoseconds // 1_000_000_000, "nanosec": nanoseconds % 1_000_000_000}
-    return {"stamp": stamped, "frame_id": "thermogrip"}
 
 
 def _text(**message: Any) -> str:

@@ -26,8 +26,9 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from importlib.metadata import PackageNotFoundError, version
+from itertools import count
 from math import isfinite
 from pathlib import Path
 from types import TracebackType
@@ -142,7 +143,7 @@ class RunFolder:
             "contact_s": session.contact,
         }
         finite = {key: value if value == value else None for key, value in figures.items()}  # JSON has no NaN
-        trip = {} if session.trip is None else {"trip": session.trip.as_dict()}
+        trip = {} if session.trip is None else {"trip": asdict(session.trip)}
         self._end({"verdict": session.verdict, "advice": session.advice, **finite, **trip})
 
     def played(self, ended: str) -> None:
@@ -229,10 +230,7 @@ def event_line(event: Event) -> bytes:
 
 
 class _Disk:
-    """Two threads that wait for the disk, so that a session does not.
-
-    They are two because a disk that takes seconds to force what it has still takes lines meanwhile.
-    """
+    """Two threads that wait for the disk: one that takes seconds to force lines takes others meanwhile."""
 
     def __init__(self, *files: _Lines) -> None:
         self._files = files
@@ -253,8 +251,7 @@ class _Disk:
             self._fault = OSError(errno.ETIMEDOUT, f"the disk has not taken the last {MOST_WAITING} lines")
 
     def check(self, wait_s: float | None = None) -> None:
-        """Wait so long at most until every line is written; OSError where the disk refused one since the last
-        call, could not be forced, or took none any more."""
+        """Wait so long at most until every line is written; OSError where the disk has refused one."""
         self._wait(wait_s)
         fault, self._fault = self._fault, None
         if fault is not None:
@@ -568,9 +565,7 @@ def _rooms(header: list[str], events: tuple[Event, ...]) -> frozenset[str]:
 
 def _keep(path: Path) -> str:
     """Copy a file beside itself, byte for byte, under a name that is free; return the name."""
-    for k in range(1, 1000):
-        name = f"{path.name}.damaged" + ("" if k == 1 else f"-{k}")
-        if not (path.parent / name).exists():
-            write_atomic(path.parent / name, read_bytes(path))
-            return name
-    raise UserError("has been recovered too often", file=path, hint="look at the .damaged files")
+    names = (f"{path.name}.damaged" + ("" if k == 1 else f"-{k}") for k in count(1))
+    name = next(name for name in names if not (path.parent / name).exists())
+    write_atomic(path.parent / name, read_bytes(path))
+    return name

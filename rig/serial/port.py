@@ -11,8 +11,6 @@ serial port twice, and a virtual device serves one socket at a time.
 **Coming back.**  A lost port is opened again after 0.1 s, then after twice as long each time, up to 5 s.  USB
 devices may return under another number: a name of ``/dev/serial/by-id`` stays the same.  Whether it is the
 same device the driver has to ask.
-
-Clock and sleep are arguments.  What pyserial itself waits for is real time: a serial line has no other.
 """
 
 from __future__ import annotations
@@ -21,12 +19,14 @@ import contextlib
 import select
 import sys
 import time
+from collections import deque
 from collections.abc import Callable
 from importlib.util import find_spec
 from typing import Any
 
 from thermogrip.datasets.errors import UserError
-from thermogrip.rig.clock import BackOff
+from thermogrip.rig.clock import BackOff, Metronome
+from thermogrip.rig.interface import Event
 
 FIRST_WAIT_S, LONGEST_WAIT_S = 0.1, 5.0  # of the back-off
 BAUDRATE = 115200
@@ -168,3 +168,28 @@ def port_error(url: str, error: Exception) -> PortError:
         hint = "write /dev/ttyACM0 or socket://HOST:PORT"
         return PortError("absent", f"is no port ({text})", file=url, hint=hint)
     return PortError("absent", f"cannot be opened ({text})", file=url, hint="check name, cable and power")
+
+
+class SerialRig:
+    """Time and notices of a rig behind a port; its clock starts at 0 when it is made."""
+
+    def __init__(self, clock: Callable[[], float], sleep: Callable[[float], None]) -> None:
+        self._clock, self._start = clock, clock()
+        self._beat = Metronome(clock, sleep)
+        self._notices: deque[Event] = deque(maxlen=1000)
+
+    def wait(self, seconds: float) -> None:
+        """Let time pass; waits that follow each other end on a grid."""
+        self._beat.wait(seconds)
+
+    def notices(self) -> list[Event]:
+        """Return what happened since the last call, and forget it."""
+        happened = list(self._notices)
+        self._notices.clear()
+        return happened
+
+    def _now(self) -> float:
+        return round(self._clock() - self._start, 9)
+
+    def _note(self, kind: str, text: str) -> None:
+        self._notices.append(Event(self._now(), kind, text))

@@ -17,9 +17,7 @@ the usual damage of a serial line, an overrun that drops bytes so that the head 
 the next, and the grammar (single spaces, printable words, whole numbers in one spelling) finds most of the
 rest.
 
-Bytes go in, in pieces of any size, and events come out.  A line that is cut, damaged or overlong becomes a
-:class:`Damaged` event; after it the parser goes on at the next end of line.  Empty lines mean nothing: a host
-sends one to end what the other side has received by half.
+Empty lines mean nothing: a host sends one to end what the other side has received by half.
 """
 
 from __future__ import annotations

@@ -1,14 +1,8 @@
 """The loop of a session: read, guard, ask the controller, apply, record, let time pass.
 
-:class:`Loop` takes one sample and records it; the phases are those of :mod:`~thermogrip.rig.session.session`.
-Time is the rig's, and the host's is an argument.
-
 Time passes in *looks* of at most :data:`LOOK_S`, however long a sample is: at each the rig is read, the guard
 checks the reading, the drive is renewed and the session is shown.  The controller's step and the recorded row
 alone are of the sample time.
-
-Whatever is not safe any more ends it with a :class:`~thermogrip.rig.guard.trip.TripError`: a reading or a
-move that the guard rejects (:mod:`~thermogrip.rig.guard.guard`), a cable that is out, a disk that is full.
 """
 
 from __future__ import annotations
@@ -17,7 +11,7 @@ from bisect import bisect_left
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from math import ceil
 from typing import Any, Protocol
 
@@ -102,7 +96,7 @@ class Loop:
                 self.power_off()
         if self.trip is not None:
             self.record_last()
-            self.note("tripped", self.trip.line(), self.trip.as_dict())
+            self.note("tripped", self.trip.line(), asdict(self.trip))
 
     def now(self) -> float:
         """Return the host's time [s]; the rig's own where there is no other, as in a simulation."""
@@ -139,9 +133,6 @@ class Loop:
         if guessed := self.guard.guessed_rooms(self.reading.values):
             text = f"{', '.join(guessed)} by name taken for the room's; state room_sensors in the guard file"
             self.note("room", text)
-        if unread := self.guard.unread(self.reading.values):
-            taken = ", ".join(f"{name} as {value:.4g}" for name, value in unread.items())
-            self.note("room", f"the rig does not read {', '.join(unread)}: the controller takes {taken}")
         self.accepted = {**self.reading.values, **self.guard.sensors.last_good()}
         self.controller.reset(self.controller_reading())
         self.check()
@@ -215,7 +206,12 @@ class Loop:
         if refused is not None:
             raise TripError(refused)
         if (late := self.guard.late(self.now())) is not None:
-            self._come_late(late)
+            # a device that ends its drives itself has the last word: it goes on where that one has held
+            self.ask(self.rig.read)
+            self._note_notices()
+            if self.rig.expires_s == np.inf:
+                raise TripError(self.of_this_rig(late))
+            self.note("late", f"{late.subject} was late: expected {late.expected}, measured {late.measured}")
         try:
             self.ask(lambda: self.rig.apply(drive, self.move.pump))
         except ValueError as error:
@@ -224,14 +220,6 @@ class Loop:
             raise TripError(trip) from error
         self.guard.applied(drive, self.move.pump, self.now())
         return drive
-
-    def _come_late(self, late: Trip) -> None:
-        """Go on only where the device, which ends its drives itself, does not say that it ended this one."""
-        self.ask(self.rig.read)
-        self._note_notices()
-        if self.rig.expires_s == np.inf:
-            raise TripError(self.of_this_rig(late))
-        self.note("late", f"{late.subject} was late: expected {late.expected}, measured {late.measured}")
 
     def record(self, phase: str) -> None:
         """Apply the present move and write the row; inputs of a row hold from it until the next."""
@@ -242,7 +230,13 @@ class Loop:
         row = {"time_s": self.reading.time_s, **self._orders(drive), **_measured(self.reading)}
         row |= {f"target_{name}_degC": value for name, value in self.target.items()}
         self.rows.append(row | {"phase": float(PHASES.index(phase))})
-        self._write(self.rows[-1])
+        if self.recorder is not None and not self.disk_fault:
+            try:
+                self.recorder.sample(self.rows[-1])
+            except OSError as error:
+                self.disk_fault = error.strerror or str(error)
+                trip = Trip("disk", self.reading.time_s, "the run folder", "to be written", self.disk_fault)
+                raise TripError(trip) from error
         self.show(drive)
 
     def show(self, drive: Mapping[str, float], *, verdict: str = "", trip: Trip | None = None) -> None:
@@ -298,20 +292,16 @@ class Loop:
         begin = self.reading.time_s
         passed = 0
         while True:
-            self._look(seconds / looks)
+            check_stopped()
+            self.ask(lambda: self.rig.wait(seconds / looks))
+            self.read(lambda: self.ask(self.rig.read))
+            self._note_notices()
+            self.check()
             # a look that came late by whole ones counts as those: the sample keeps its time
             passed = max(passed + 1, round((self.reading.time_s - begin) / seconds * looks))
             if passed >= looks:
                 return
             self.show(self.apply())
-
-    def _look(self, seconds: float) -> None:
-        """Let time pass, read, and have the reading checked."""
-        check_stopped()
-        self.ask(lambda: self.rig.wait(seconds))
-        self.read(lambda: self.ask(self.rig.read))
-        self._note_notices()
-        self.check()
 
     def ask(self, call: Callable[[], Any]) -> Any:
         """Ask the rig; a lost connection, or a device that refuses, is a trip."""
@@ -342,17 +332,6 @@ class Loop:
                 trip = Trip("frozen", time_s, "this program", "a drive renewed within 2 s", text)
         if trip is not None:
             raise TripError(trip)
-
-    def _write(self, row: Mapping[str, float]) -> None:
-        """Record a row; a disk that refuses is a trip, the first time."""
-        if self.recorder is None or self.disk_fault:
-            return
-        try:
-            self.recorder.sample(row)
-        except OSError as error:
-            self.disk_fault = error.strerror or str(error)
-            trip = Trip("disk", self.reading.time_s, "the run folder", "to be written", self.disk_fault)
-            raise TripError(trip) from error
 
     def single(self, drive: float) -> dict[str, float]:
         """Return the drive by name where the controller gave a number."""

@@ -1,8 +1,5 @@
 """One session: settle, stop the pump, grasp, record; or play a schedule.
 
-The same loop runs the twin and hardware: it asks the rig for a reading, the controller for a move, and lets
-the rig pass one sample time.
-
     settle    regulate until the target has settled (below) and the guard has compared the skin with the
               model for long enough, or the time-out is over
     hold      keep regulating for ``hold`` seconds
@@ -26,9 +23,6 @@ The temperature has settled if level and drift are inside the band even at two s
     |a| + 2 se(a) <= band    and    window (|b| + 2 se(b)) <= band.
 
 The rule errs towards waiting: with noise that could hide a drift of the size of the band it is never met.
-
-**A schedule** is played by a session without a controller: the drive is the schedule's row that is in force,
-and the log, sampled every ``dt`` seconds, is what a plant is identified from.
 """
 
 from __future__ import annotations
@@ -91,7 +85,10 @@ def step_figures(
     t, y = t[np.isfinite(y)], y[np.isfinite(y)]
     if t.size == 0:
         return StepFigures(np.nan, 0.0, np.nan)
-    error = _moving_mean(t, y, smooth) - target
+    # the mean over the ``smooth`` seconds round each time, fewer at the ends
+    total = np.concatenate([[0.0], np.cumsum(y)])
+    lo, hi = np.searchsorted(t, t - smooth / 2, "left"), np.searchsorted(t, t + smooth / 2, "right")
+    error = (total[hi] - total[lo]) / (hi - lo) - target
     outside = np.flatnonzero(np.abs(error) > band)
     approach = np.sign(target - y[0])
     beyond = approach * error if abs(y[0] - target) > band else np.abs(error)
@@ -112,13 +109,6 @@ def _standard_error(residual: Array, quantum: float) -> float:
     # 1/n and 3/n undo the bias of a lag-one correlation about a fitted line
     r = min(max(lag_one + (1 + 3 * max(lag_one, 0.0)) / n, 0.0), 0.95)
     return float(sd / np.sqrt(max(n * (1 - r) / (1 + r), 2.0)))
-
-
-def _moving_mean(t: Array, y: Array, width: float) -> Array:
-    """Return the mean of y over the ``width`` seconds round each time (shorter at the ends)."""
-    total = np.concatenate([[0.0], np.cumsum(y)])
-    lo, hi = np.searchsorted(t, t - width / 2, "left"), np.searchsorted(t, t + width / 2, "right")
-    return np.asarray((total[hi] - total[lo]) / (hi - lo))
 
 
 LEAD_S = 1.0  # of fast samples before, and after, the pump stops
@@ -400,15 +390,10 @@ def _figures(run: Loop, name: str, band: float) -> StepFigures:
 
 
 class Player(Controller, Protocol):
-    """A controller without a target, which ends: after so many seconds, or when it is done."""
+    """A controller without a target, which ends."""
 
-    @property
-    def seconds(self) -> float:
-        """How long it plays at most [s]."""
-
-    @property
-    def done(self) -> bool:
-        """Whether nothing is left to play."""
+    seconds: float  # how long it plays at most
+    done: bool  # whether nothing is left to play
 
 
 class Playback:
@@ -420,6 +405,8 @@ class Playback:
         self.dt, self._begin = dt, 0.0  # sample time [s]
         self._time = np.asarray(schedule["time"].values, dtype=float)
         self._time = self._time - self._time[0]
+        # the last row holds as long as the one before it
+        self.seconds = float(self._time[-1] + (np.diff(self._time)[-1] if self._time.size > 1 else dt))
         for name, unit in units.items():
             if name not in schedule or str(schedule[name].attrs.get("units", "1")) != unit:
                 hint = f"the rig needs a column of {name} in {unit}; excite --plant writes it"
@@ -439,11 +426,6 @@ class Playback:
             row, hint = int(wrong[0]), allowed or f"{span[0]:g} to {span[1]:g}"
             problem = f"the schedule's {name} is {values[row]:g} at {self._time[row]:g} s"
             raise UserError(problem, hint=f"write {hint}")
-
-    @property
-    def seconds(self) -> float:
-        """How long the schedule is; its last row holds as long as the one before it [s]."""
-        return float(self._time[-1] + (self._time[-1] - self._time[-2] if self._time.size > 1 else self.dt))
 
     def reset(self, reading: Readings) -> None:
         """Begin at this reading's time."""

@@ -7,8 +7,6 @@ what the first one began, which is to switch off and to close the run folder.  A
 a callback of C code), and then no later signal would raise another: the loop asks :func:`check_stopped` at
 every sample.
 
-:func:`hold_signals` keeps a first signal, too, from a block that must be done whole.
-
 ``kill -9``, a crash of the interpreter and a frozen computer run no line of ours.  Then the device's own 2 s
 switch off, or nothing does (a TCLab has no such time).
 """
@@ -44,9 +42,7 @@ class _Stop:
 def stop_signals() -> Iterator[None]:
     """Make the first SIGINT, SIGTERM or SIGHUP a KeyboardInterrupt inside, and ignore those that follow it.
 
-    Inside of another one, and elsewhere than in the main thread, it does nothing.  A signal that is ignored
-    stays so: under ``nohup`` a night's batch goes on when its terminal is closed.  A SIGINT that somebody
-    else handles is left to them.
+    A signal that is ignored stays so: under ``nohup`` a night's batch goes on when its terminal is closed.
     """
     if _in_force() is not None:
         yield

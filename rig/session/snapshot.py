@@ -1,11 +1,10 @@
 """What a session shows of itself at each look, and what an operator may ask of it meanwhile.
 
-The loop makes one :class:`Snapshot` a look and calls its listener with it.  It waits for nobody: a listener
-returns at once (it appends to a bounded queue, whose oldest snapshots are dropped), and one that raises gets
-nothing more.  A snapshot stands alone, so that whoever missed some shows the present all the same.
+The loop waits for nobody: a listener returns at once, and one that raises gets nothing more.  A snapshot
+stands alone, so that whoever missed some shows the present all the same.
 
-An :class:`Operator` is the way back: requests come from any thread, the loop sees them at each look.  A stop
-is a trip of the guard; a mark is an event.  Neither is an emergency stop: a loop that hangs looks at nothing.
+A stop of an :class:`Operator` is a trip of the guard, a mark is an event.  Neither is an emergency stop: a
+loop that hangs looks at nothing.
 """
 
 from __future__ import annotations

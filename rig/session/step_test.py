@@ -23,10 +23,7 @@ PUMP = "pump"
 
 
 class StepTest:
-    """The test as a controller: drives of these ranges, by name, until ``targets`` are half reached [degC].
-
-    It takes at most ``seconds``; where there is a pump, it is off for a while too, after the drives.
-    """
+    """The test as a controller: drives of these ranges until ``targets`` are half reached [degC]."""
 
     def __init__(
         self,

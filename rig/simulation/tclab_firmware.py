@@ -15,8 +15,6 @@ end in ``B`` (four bytes, a little-endian float), which no client here uses, are
 | ``LED v`` | | ``%.2f`` |
 | ``VER`` | | name and version |
 | anything else | heaters off | the word |
-
-There is no checksum, no number, no time-out and no trip: heaters stay on for good when the host dies.
 """
 
 from __future__ import annotations
@@ -45,7 +43,6 @@ class TCLabCore:
         self._pending = b""
         self._power, self._ceilings = [0.0, 0.0], list(CEILINGS)
         self._values: Sequence[Value] = (25_000, 25_000)
-        self._led = 0.0
 
     @property
     def outputs(self) -> Outputs:
@@ -90,8 +87,7 @@ class TCLabCore:
                 temperatures = [self._temperature(0), self._temperature(1)]
                 return [f"{number:.3f}" for number in (*temperatures, *self._power)]
             case "LED":
-                self._led = _clip(value, 100.0)
-                return [f"{self._led:.2f}"]
+                return [f"{_clip(value, 100.0):.2f}"]
             case "VER":
                 return [TCLAB_VERSION]
             case _:

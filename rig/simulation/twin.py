@@ -59,20 +59,17 @@ class _Contact:
             return self.left * float(np.exp((self.opened - time) / RECOVERY_S))
         since_closed = np.array([time - self.closed])
         share, room = float(self.touch.response(since_closed)[0]), float(self.touch.by_room(since_closed)[0])
-        return (self.touch.t_object - self.skin) * share + room - self._undone(time, alone)
+        # the object undoes the skin's own way since it closed; what that did before the touch from then on
+        times, skin_alone = np.array([*self.times, time]), np.array([*self.alone, alone])
+        onset = self.touch.onset
+        since = np.maximum(0.5 * (times[1:] + times[:-1]), self.closed + onset)
+        undone = float(self.touch.response(time - since + onset) @ np.diff(skin_alone))
+        return (self.touch.t_object - self.skin) * share + room - undone
 
     def follow(self, time: float, alone: float) -> None:
         """Note where the skin would be without the object."""
         self.times.append(time)
         self.alone.append(alone)
-
-    def _undone(self, time: float, alone: float) -> float:
-        """Return what the object undoes of the skin's own way since it closed [K]."""
-        times, skin_alone = np.array([*self.times, time]), np.array([*self.alone, alone])
-        onset = self.touch.onset
-        # what the skin did before it was touched is answered from then on
-        since = np.maximum(0.5 * (times[1:] + times[:-1]), self.closed + onset)
-        return float(self.touch.response(time - since + onset) @ np.diff(skin_alone))
 
 
 class Twin:

@@ -1,11 +1,10 @@
 """A device without hardware: either protocol on a pty or a socket, a simulated plant, faults on demand.
 
 The device lives in a thread of its own and moves its plant and its firmware ten times a second of its own
-clock: the computer's, many times that, or one that the host steps.  On the computer's its time stands still
-while the computer has no time for it: no board is held up, and what a host sent meanwhile came in time.
-:meth:`VirtualDevice.exchange` leaves out thread and cable: the quickest.
+clock.  On the computer's its time stands still while the computer has no time for it: no board is held up,
+and what a host sent meanwhile came in time.
 
-The plant is a :class:`~thermogrip.rig.simulation.twin.Twin`.  A fault sits where the real one would: a
+A fault sits where the real one would: a
 sensor's between the true temperature and the device, a stuck driver's between the device and the plant (only
 the supply cuts it), a stalled pump's in the pump, whatever was commanded.
 """
@@ -119,17 +118,11 @@ class Bench:
 
     def sample(self) -> tuple[Value, ...]:
         """Return the readings, faults included [1e-3 degC], and keep the true ones for late sensors."""
-        self._past.append((self.time, self._true_readings()))
-        return self.readings()
-
-    def readings(self) -> tuple[Value, ...]:
-        """Return the readings, faults included [1e-3 degC]."""
-        self._shown = {name: self._show(name, value) for name, value in self._true_readings().items()}
-        return tuple(self._shown.values())
-
-    def _true_readings(self) -> dict[str, int]:
         reading = self.twin.read().values
-        return {s.name: round(1000 * reading[s.name]) for s in self.board.sensors}
+        true = {s.name: round(1000 * reading[s.name]) for s in self.board.sensors}
+        self._past.append((self.time, true))
+        self._shown = {name: self._show(name, value) for name, value in true.items()}
+        return tuple(self._shown.values())
 
     def _driven(self) -> dict[str, float]:
         """Return what drives the plant: the pins, or a stuck driver while it has a supply."""
@@ -415,7 +408,10 @@ class VirtualDevice:
         elif name in ("silence", "deaf", "cable_pulled"):
             self._lost.add(name)
         elif name == "reset":
-            self._reset(str(options.get("cause", "external")))
+            boot = self.core.boot + 1 if isinstance(self.core, DeviceCore) else 1
+            self.core = self._fresh_core(str(options.get("cause", "external")), boot)
+            self._sample(self._now_ms())
+            self._answer += self.core.announcement()
         elif name == "pump_stall":
             self.bench.pump_stalled = True
         elif name == "driver_stuck":
@@ -423,12 +419,6 @@ class VirtualDevice:
         else:
             self.bench.set_fault(name, sensor, **options)
         self.bench.apply(self.core.outputs)
-
-    def _reset(self, cause: str) -> None:
-        boot = self.core.boot + 1 if isinstance(self.core, DeviceCore) else 1
-        self.core = self._fresh_core(cause, boot)
-        self._sample(self._now_ms())
-        self._answer += self.core.announcement()
 
     def _fresh_core(self, cause: str, boot: int) -> DeviceCore | TCLabCore:
         if self.protocol == "tclab":
@@ -475,9 +465,8 @@ class VirtualDevice:
 def example_plant(protocol: str = "thermogrip", *, room: float | None = None) -> Plant:
     """Return a plant for a device that is given none: the gripper's or the TCLab's network as it is bundled.
 
-    Its numbers are no identified rig's: the gripper's are the network file's engineering guesses, the TCLab's
-    are off them, as any board's are, so that a fit has something to find.  A TCLab does not measure its room,
-    so the ``room`` [degC] is one of its numbers.
+    The TCLab's numbers are off the network file's, so that a fit has something to find; as it does not
+    measure its ``room`` [degC], that is one of them.
     """
     from thermogrip.sysid.models.network import load_network
 

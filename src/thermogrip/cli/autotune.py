@@ -111,7 +111,6 @@ def _write_page(work: Autotune, page: Path, rig: str) -> None:
 
     assert work.session is not None
     assert work.tuning is not None
-    assert work.found is not None
     head, rows = _stage_table(work)
     table = Table(tuple(head), tuple(map(tuple, rows)), "Time on the rig, and what the loops did there")
     stages = Section("What came of it?", (table,), work.found.verdict, "good" if work.found.good else "warn")

@@ -18,6 +18,7 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import asdict
 from typing import IO
 
 from thermogrip.datasets.errors import UserError, as_user_error
@@ -44,7 +45,7 @@ class TripCommand:
 
     def start(self, trip: Trip) -> None:
         """Begin to run it for this trip."""
-        content = json.dumps(trip.as_dict(), ensure_ascii=False, allow_nan=False).encode("utf-8", "replace")
+        content = json.dumps(asdict(trip), ensure_ascii=False, allow_nan=False).encode("utf-8", "replace")
         self._threads.append(threading.Thread(target=self._run, args=(content,), daemon=True))
         self._threads[-1].start()
 

@@ -62,9 +62,7 @@ def test_every_kind_of_trip_says_what_to_check_and_how_to_clear_it(name: str) ->
     assert "\n" not in line
 
 
-def test_a_trip_is_plain_json_even_where_a_number_is_not_finite() -> None:
-    found = Trip("lost", 1.0, "t", "a", "b", figures={"x": nan, "y": 2.0, "z": -inf}).as_dict()
-    assert found["figures"] == {"x": None, "y": 2.0, "z": None}
+def test_a_trip_is_of_a_known_kind() -> None:
     with pytest.raises(ValueError, match="no kind of trip"):
         Trip("gremlins", 0.0, "t", "a", "b")
 
@@ -92,10 +90,6 @@ def test_readings_and_the_programs_clock_move_on_together(
     *before, trip = [guard.check(reading(t, 25.0), now).trip for now, t in polls]
     assert before == [None] * (len(polls) - 1)
     assert said(trip) == want
-    if want is not None:
-        since, there = polls[-1][0] - 100.0 - (want[0] == "stale"), polls[-1][1] - 10.0
-        figures = {"here": since, "there": there} if want[0] == "clock" else {"seconds": since}
-        assert trip.figures == pytest.approx(figures)
 
 
 @pytest.mark.parametrize(
@@ -161,7 +155,6 @@ def test_of_two_heaters_each_may_differ_by_the_slack_and_only_both_off_is_the_de
     assert kind(check(guard, at(1.0))) == ""
     trip = check(guard, at(2.0)).trip
     assert said(trip) == want
-    assert trip is None or trip.figures == {"applied": applied[trip.subject == "q2"]}
 
 
 @pytest.mark.parametrize("unit", ["1", "V"])
@@ -191,7 +184,6 @@ def test_no_drive_while_the_pump_is_off_and_none_that_is_no_number(
     for guard in (guard_at(), Guard(plant)):
         trip = guard.refuse(drives, pump, 1.5)
         assert said(trip) == want
-        assert trip is None or trip.figures == ({"drive": inf} if pump else {})
     assert Guard(make_heater()).refuse({"q": 0.5}, 0, 0.0) is None  # no pump, no standing water
 
 
@@ -214,7 +206,6 @@ def test_the_second_reading_beyond_a_limit_trips(
     *before, trip = (one.trip for one in found)
     assert before == [None] * (len(skins) - 1)
     assert said(trip) == (("limit", "t_surface", "3 to 55 degC", f"{measured} degC") if measured else None)
-    assert trip is None or trip.figures == {"measured": skins[-1]}
 
 
 class OffItsPlace(Twin):
@@ -281,7 +272,7 @@ def test_without_a_model_each_minute_of_full_drive_is_answered_or_trips(
         kind, output, moved = want
         words = AT_LEAST.format("warmer" if sign > 0 else "colder", end, f"{sign * drive:+.2f}")
         assert said(trip)[:3] == (kind, output, words)
-        assert trip.figures["moved"] == pytest.approx(sign * moved, rel=0.15)
+        assert float(trip.measured.removesuffix(" K")) == pytest.approx(sign * moved, rel=0.15, abs=0.05)
 
 
 @pytest.mark.parametrize("start", [21.0, 45.0])
@@ -399,7 +390,6 @@ def test_the_largest_alarm_is_the_trip(plant: Plant) -> None:
     trip = check(guard, reading(1.0, 25.0)).trip
     assert said(trip) == ("model", "t_surface", "t_surface +4.00 +- 1.00 K in 30 s", "+6.50 K")
     assert trip.check == KINDS["model"][0]
-    assert trip.figures == {"expected": 4.0, "measured": 6.5, "allowed": 1.0, "window_s": 30.0}
 
 
 @pytest.mark.parametrize(
@@ -416,7 +406,6 @@ def test_a_bias_is_of_the_driver_or_of_the_sensor(
     model.update.return_value = [bias]
     trip = check(guard, reading(1.0, 25.0)).trip
     assert said(trip) == want
-    assert trip.figures["window_s"] == 0.0
 
 
 @pytest.mark.parametrize(
