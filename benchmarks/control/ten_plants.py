@@ -25,7 +25,7 @@ import time
 import warnings
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol
 
@@ -290,8 +290,8 @@ def players(
             found.append(("mpc", Ours(case, controller)))
         if "pi" not in without:
             # under the limits of the spec, as it was tuned: the MPC may have been given less of a drive
-            wide = spec.design(controller.plant)
-            found.append(("pi", Ours(case, PIController(plant, wide, loops=controller.design.loops))))
+            wide = replace(spec.design(controller.plant), loops=controller.design.loops)
+            found.append(("pi", Ours(case, PIController(plant, wide))))
         if "do-mpc" not in without and importlib.util.find_spec("do_mpc") is not None:
             found.append(("do-mpc", DoMPC(controller.plant, spec.design(controller.plant), case.rest)))
     except UserError as error:

@@ -13,9 +13,7 @@ For each target of the schedule:
 * **energy**: the integral of the squared drive, in seconds at full drive;  **travel**: the sum of its
   changes, that to the first drive included.
 
-The log of a session on hardware has what was read and applied, without the controller's status, its advice
-and its step times.  :class:`RecordedController` keeps these, and :func:`session_loop` puts both together as
-the same :class:`ClosedLoop`.
+Of a session on hardware :class:`RecordedController` keeps what its log lacks: status, advice and step times.
 """
 
 from __future__ import annotations
@@ -355,12 +353,11 @@ def segment_of(
 
 
 class RecordedController:
-    """A controller that keeps its ``moves``, each with the time of its reading [s], counted in sample times
-    where the reading has none, beside a monitor of its loop, whose words are the advice of a move that is
-    ok."""
+    """A controller that keeps its ``moves``, beside a monitor whose words advise where one is ok."""
 
     def __init__(self, controller: Controller, monitor: LoopMonitor | None = None) -> None:
         self.controller, self.monitor = controller, monitor
+        # each with the time of its reading [s], counted in sample times where the reading has none
         self.moves: list[tuple[float, Move]] = []
 
     @property
@@ -396,12 +393,8 @@ def session_loop(
     band: float = 0.25,
     figures: Mapping[str, Mapping[str, float]] | None = None,
 ) -> ClosedLoop:
-    """Return a session's log (drives, ``pump``, outputs, ``target_<output>``) as the record of a closed loop.
-
-    The moves are those of :class:`RecordedController`; what comes after the last (a grasp) is left out, and
-    fewer than two are a ValueError. Of an output whose noisy readings were evaluated otherwise than sample by
-    sample, ``figures`` has ``settle_s``, ``overshoot`` or ``bias``. Times count from the log's start.
-    """
+    """Return a session's log and the moves of its :class:`RecordedController` as a closed loop, up to the
+    last move; ``figures`` of an output replace those of its readings sample by sample."""
     if len(moves) < 2:
         raise ValueError(f"{len(moves)} moves are no loop")
     logged = np.asarray(log["time"].values, dtype=float)

@@ -41,9 +41,8 @@ def compiled_loop(
     band: float = 0.25,
     seed: int = 0,
 ) -> ClosedLoop:
-    """Run a compiled controller (else a ValueError) as :func:`simulate_closed_loop` does, with the same
-    arguments, against a plant of the same signals whose equations and step may be others; the record has no
-    advices and no step times.  PI loops, which go to one target, run in Python where a reading is absurd."""
+    """Run a compiled controller as :func:`simulate_closed_loop` does; the record has no advices and no step
+    times."""
     if controller.c is None:
         raise ValueError("the controller is not compiled")
     around = Surroundings() if surroundings is None else surroundings
@@ -57,6 +56,7 @@ def compiled_loop(
     run = _Run(truth, len(target))
     if isinstance(controller, Controller):
         _run_mpc(controller.c, controller, run, target, drives_known=truth.known)
+    # PI loops, which go to one target in C, run in Python where a reading is absurd
     elif len(schedule) > 1 or not _run_pi(controller.c, controller, run, target[0]):
         return simulate_closed_loop(controller, plant, schedule, **about)
     truth.y = list(run.y)

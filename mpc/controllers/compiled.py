@@ -52,14 +52,13 @@ class CompiledStep:
 
     def __init__(self, reference: ReferenceController) -> None:
         self.reference, model = reference, reference.model
-        self.clock = reference.clock
+        self.clock, self._started = reference.clock, 0.0
         # a clock of the caller's own, which the C cannot read, is asked
-        ask = None if self.clock is time.perf_counter else self._is_late
+        deadline_s = reference.design.deadline_s
+        ask = None if self.clock is time.perf_counter else lambda: self.clock() - self._started >= deadline_s
         self.c = CompiledController(reference, ask)
-        self.last_iterations = 0
         self._names = (*model.outputs, *model.disturbances, *model.drives, "time_s")
         self._switches = [name for name in model.model.switches if name not in model.drives]
-        self._started = 0.0
         self._move = Move(as_drive(model.drives, reference.safe_drives))
         self.reset({})
 
@@ -67,9 +66,6 @@ class CompiledStep:
     def plan(self) -> Array | None:
         """The plan that is still ahead, (N, n_u)."""
         return self.c.plan()
-
-    def _is_late(self) -> bool:
-        return self.clock() - self._started >= self.reference.design.deadline_s
 
     def reset(self, reading: Readings) -> None:
         """Forget the past; the plant is at rest at this reading."""
@@ -99,8 +95,7 @@ class CompiledStep:
         c.step(bool(self._switches) and is_off(self._switches, reading))
         if ahead is not None:
             c.library.tg_host_goals(c.state, None)
-        *drive, over, pump, status, code, which, iterations, due = c.answer[:]
-        self.last_iterations = int(iterations)
+        *drive, over, pump, status, code, which, _, due = c.answer[:]
         if not due:
             again = self._move.advice or advice.TOO_EARLY
             return replace(self._move, advice=again, seconds=self.clock() - started)

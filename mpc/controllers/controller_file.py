@@ -30,17 +30,14 @@ class Parts(NamedTuple):
     design: Design
     notes: dict[str, Any]
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return the file's content as plain JSON."""
+    def save(self, path: str | Path) -> Path:
+        """Write the file and return its path."""
         content: dict[str, Any] = {"schema": SCHEMA, "version": FILE_VERSIONS[self.kind]}
         if self.kind != "MPC":
             content["kind"] = self.kind
         plant = self.plant.to_dict(draws=_KEPT_DRAWS)
-        return content | {"design": self.design.to_dict(), "notes": self.notes, "plant": plant}
-
-    def save(self, path: str | Path) -> Path:
-        """Write the file and return its path."""
-        return write_json(path, self.to_dict(), schema=SCHEMA, version=FILE_VERSIONS[self.kind])
+        content |= {"design": self.design.to_dict(), "notes": self.notes, "plant": plant}
+        return write_json(path, content, schema=SCHEMA, version=FILE_VERSIONS[self.kind])
 
 
 def read_parts(path: str | Path, *, model: Model | None = None) -> Parts:

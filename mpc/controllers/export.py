@@ -1,10 +1,8 @@
 """A controller as C99 without malloc, and the proof that it does what Python does; its headers are C++, too.
 
 ``export_controller`` writes a folder that needs nothing but a C compiler: the model's step and its tangents
-(:mod:`thermogrip.mpc.native.codegen`), the numbers of the design, and the solver, observer and loop that
-every export shares (``csource/``).  ``check_export`` builds it with every warning an error, runs it under
-the sanitizers of gcc, and compares what it answers with Python in random loops: the drives, now and in the
-plan, and the status.
+(:mod:`thermogrip.mpc.native.codegen`), the numbers of the design, and what every export shares
+(``csource/``).  ``check_export`` compares drives, now and in the plan, and status with Python's.
 
 In a loop C is given what was applied, Python's moves.  Of two controllers on the readings of one loop only
 one has its moves applied; without them the other's estimate goes on under moves that never were, and what a
@@ -74,10 +72,7 @@ class Agreement:
 
 
 def export_controller(controller: Controller, folder: str | Path, *, arduino: bool = False) -> Export:
-    """Write a controller as C99 into a folder, made where absent; files of the same names are replaced.
-
-    With ``arduino`` the folder is a library of the Arduino IDE, its example a loop to fill in.
-    """
+    """Write a controller as C99 into a folder, with ``arduino`` as a library of the Arduino IDE."""
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     model = controller.model
@@ -104,12 +99,13 @@ def export_controller(controller: Controller, folder: str | Path, *, arduino: bo
 def _as_library(controller: Controller, files: dict[str, str]) -> dict[str, str]:
     """Return these files as the Arduino IDE wants them; it refuses boards of four-byte doubles."""
     ends = ", ".join(controller.controlled)
+    ends = "".join(letter if letter.isprintable() else " " for letter in ends)  # on one line
     lines = {
         "name": "thermogrip_controller",
         "version": __version__,
         "author": "thermogrip",
         "maintainer": "thermogrip",
-        "sentence": f"Model-predictive controller of {_one_line(ends)}.",
+        "sentence": f"Model-predictive controller of {ends}.",
         "paragraph": f"Written for one plant; a step each {controller.dt:g} s.",
         "category": "Device Control",
         "url": "https://arxiv.org/abs/2111.15344",
@@ -124,11 +120,6 @@ def _as_library(controller: Controller, files: dict[str, str]) -> dict[str, str]
     return library | {f"src/{name}": content for name, content in sources.items()}
 
 
-def _one_line(text: str) -> str:
-    """Return a text whose characters may stand in a properties file."""
-    return "".join(letter if letter.isprintable() else " " for letter in text)
-
-
 def check_export(
     export: Export,
     controller: Controller,
@@ -138,8 +129,7 @@ def check_export(
     sanitize: bool = True,
     progress: Progress | None = None,
 ) -> Agreement:
-    """Build an export (with sanitizers too), run it for so many samples of random loops, and compare with
-    Python; a UserError where there is no gcc, or it refuses the code."""
+    """Build an export (with sanitizers too), run it in random loops, and compare with Python."""
     if compiler() is None:
         raise UserError("no gcc here to build the export with", hint="install gcc, or leave --check out")
     played = _random_loop(controller, states, seed, progress)
@@ -147,7 +137,8 @@ def check_export(
         build = replace(export, folder=Path(place))
         for name in export.files:
             shutil.copyfile(export.folder / name, build.folder / name)
-        _make(build.folder, "all", *(("sanitized",) if sanitize else ()))
+        make = ["make", "-s", "-C", str(build.folder), "all"]
+        run_build([*make, "sanitized"] if sanitize else make)
         text = "".join(f"{sample.given}\n" for sample in played)
         head, *answers = _run_program(build.folder / "check", text)
         if sanitize:
@@ -189,8 +180,7 @@ class _Sample:
 
 
 def _random_loop(controller: Controller, samples: int, seed: int, progress: Progress | None) -> list[_Sample]:
-    """Return what a controller in Python does in loops on its own model, from rest to far targets and near
-    ones, with readings that are lost, deadlines that pass, and drives that somebody else moved."""
+    """Return what a controller in Python does on its own model, from rest to far targets and near ones."""
     clock = _Clock()
     twin = ReferenceController(controller.plant, replace(controller.design, deadline_s=1.0), clock=clock)
     model = twin.model
@@ -252,12 +242,13 @@ def _run_program(program: Path, text: str) -> list[str]:
     return done.stdout.splitlines()
 
 
-def _make(folder: Path, *targets: str) -> None:
-    command = ["make", "-s", "-C", str(folder), *targets]
+def run_build(command: list[str]) -> None:
+    """Build an export; what refuses it is a UserError with its first line."""
     try:
         done = subprocess.run(command, capture_output=True, text=True, check=False)
     except FileNotFoundError:
-        raise UserError("no make here to build the export with", hint="install make") from None
+        program = Path(command[0]).name
+        raise UserError(f"no {program} here to build the export with", hint=f"install {program}") from None
     if done.returncode:
         problem = done.stderr.strip().splitlines()[0] if done.stderr.strip() else "without a message"
         raise UserError(f"the export does not build: {problem}", hint="report it: it must")

@@ -6,7 +6,6 @@ The C is called once a sample.
 from __future__ import annotations
 
 import ctypes
-import subprocess
 import tempfile
 from pathlib import Path
 
@@ -18,7 +17,7 @@ from thermogrip.datasets.atomic_files import write_atomic
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.media import markdown
 from thermogrip.datasets.parallel import Progress
-from thermogrip.mpc.controllers.export import Agreement, Export, footprint
+from thermogrip.mpc.controllers.export import Agreement, Export, footprint, run_build
 from thermogrip.mpc.controllers.pi import PIController
 from thermogrip.mpc.estimator.call_times import SAME
 from thermogrip.mpc.interface import STATUSES
@@ -99,15 +98,14 @@ def check_pi(
     seed: int = 0,
     progress: Progress | None = None,
 ) -> Agreement:
-    """Build an export and run it beside Python for so many samples, from one reset to the next, with readings
-    and targets that are lost; a UserError where there is no gcc, or it refuses the code."""
+    """Build an export and run it beside Python, with readings and targets that are lost."""
     gcc = compiler()
     if gcc is None:
         raise UserError("no gcc here to build the export with", hint="install gcc, or leave --check out")
     with tempfile.TemporaryDirectory() as place:
         library, source = Path(place) / "pi.so", str(export.folder / "tg_pi.c")
-        _run_gcc([gcc, *_WARN, "-shared", "-fPIC", source, "-o", str(library), "-lm"])
-        _run_gcc([gcc, *_WARN, "-fstack-usage", "-c", source, "-o", str(Path(place) / "tg_pi.o")])
+        run_build([gcc, *_WARN, "-shared", "-fPIC", source, "-o", str(library), "-lm"])
+        run_build([gcc, *_WARN, "-fstack-usage", "-c", source, "-o", str(Path(place) / "tg_pi.o")])
         flash, stack = footprint(Path(place))
         loops = ctypes.CDLL(str(library))
         compared = _differences_from_c(loops, controller, states, seed, progress)
@@ -124,13 +122,6 @@ def check_pi(
         stack=stack,
         tolerance=_PI_TOLERANCE,
     )
-
-
-def _run_gcc(command: list[str]) -> None:
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    if done.returncode:
-        first = (done.stderr.strip().splitlines() or ["without a message"])[0]
-        raise UserError(f"the export does not build: {first}", hint="report it: it must")
 
 
 def _differences_from_c(

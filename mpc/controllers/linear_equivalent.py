@@ -16,7 +16,7 @@ what is reviewed tracks the middle of a zone.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -41,33 +41,14 @@ class LinearLaw:
     dt: float  # sample time [s]
 
 
-class AugmentedModel(NamedTuple):
-    """The model with its disturbance states: z^+ = F z + B u + E d, y = H z."""
-
-    F: Array
-    B: Array
-    E: Array
-    H: Array
-
-
-class PlanGains(NamedTuple):
-    """Gains of the plan (n, .)."""
-
-    on_z: Array  # on the estimate
-    on_r: Array  # on the target
-    on_d: Array  # on the disturbances
-    on_last: Array  # on the last move
-
-
 def linear_move(controller: ControllerParts) -> LinearGains:
-    """Return H of the QP and the plan's gains on the free response and on the drive before, as
-    :meth:`thermogrip.mpc.optimiser.rti.Optimiser.linear_gains`, linearised where the plant settles without
-    drive, or where it rests if it settles nowhere."""
+    """Return the plan without limits, linearised where the plant settles without drive."""
     model = controller.model
     design = controller.design
     optimiser = controller.optimiser
     x_rest, u, d = model.at_rest(design.ambient)
     x = model.steady_state(u, d)
+    # what settles nowhere is linearised where it rests
     x = x_rest if not np.isfinite(x).all() else x
     plan = np.repeat(u[None, :], optimiser.n_b, axis=0)
     _, G = model.trajectory(x, plan, d, design.blocks)
@@ -77,14 +58,30 @@ def linear_move(controller: ControllerParts) -> LinearGains:
 
 def linear_law(controller: ControllerParts) -> LinearLaw:
     """Return the controller as a linear system, about rest in the design's room."""
-    model, n_u = controller.model, controller.model.n_u
-    F, B, E, H = augmented(controller)
+    model, chosen = controller.model, controller.observer.disturbance
+    n_u, n_w = model.n_u, chosen.n_w
+    # the model with its disturbance states: z^+ = F z + B u + E d, y = H z
+    _, A, by_u, by_d = model.linearise(*model.at_rest(controller.design.ambient))
+    into = by_u @ (chosen.on_drive * model.span[:, None]) + by_d @ chosen.on_disturbance
+    F = np.block([[A, into], [np.zeros((n_w, model.n_x)), np.eye(n_w)]])
+    B, E = (np.pad(matrix, ((0, n_w), (0, 0))) for matrix in (by_u, by_d))
+    H = np.hstack([model.C, chosen.on_output])
     n_z, L = len(F), controller.observer.settled_gain(F)
     rows = [model.outputs.index(name) for name in controller.design.controlled]
-    first = PlanGains(*(gain[:n_u] for gain in plan_gains(controller)))
+    # the free response of the controlled outputs to z and to d, sample by sample
+    by_z, by_held_d = list[Array](), list[Array]()
+    power, held_d = np.eye(n_z), np.zeros_like(E)
+    for _ in range(sum(controller.design.blocks)):
+        held_d, power = F @ held_d + E, F @ power
+        by_z.append(H[rows] @ power)
+        by_held_d.append(H[rows] @ held_d)
+    move = linear_move(controller)
+    on_free = move.on_free[:n_u]
+    K_z, K_d = on_free @ np.vstack(by_z), on_free @ np.vstack(by_held_d)
+    K_r = -on_free @ np.tile(np.eye(len(rows)), (len(by_z), 1))
     uncorrected = np.eye(n_z) - L @ H
-    to_drive = np.hstack([first.on_z @ uncorrected, first.on_last])
-    straight = np.hstack([first.on_z @ L, first.on_r, first.on_d])
+    to_drive = np.hstack([K_z @ uncorrected, move.on_last[:n_u]])
+    straight = np.hstack([K_z @ L, K_r, K_d])
     after = np.hstack([F @ uncorrected, np.zeros((n_z, model.n_u))])
     into_z = np.hstack([F @ L, np.zeros((n_z, len(rows))), E])
     targets = tuple(f"target_{name}" for name in controller.design.controlled)
@@ -97,39 +94,6 @@ def linear_law(controller: ControllerParts) -> LinearLaw:
         outputs=model.drives,
         states=(*(f"z{k}" for k in range(n_z)), *(f"last_{name}" for name in model.drives)),
         dt=model.dt,
-    )
-
-
-def augmented(controller: ControllerParts) -> AugmentedModel:
-    """Return the model with its disturbance states, about rest in the design's room."""
-    model, chosen = controller.model, controller.observer.disturbance
-    _, A, B, E = model.linearise(*model.at_rest(controller.design.ambient))
-    n_w = chosen.n_w
-    into = B @ (chosen.on_drive * model.span[:, None]) + E @ chosen.on_disturbance
-    F = np.block([[A, into], [np.zeros((n_w, model.n_x)), np.eye(n_w)]])
-    B, E = (np.vstack([matrix, np.zeros((n_w, matrix.shape[1]))]) for matrix in (B, E))
-    return AugmentedModel(F, B, E, np.hstack([model.C, chosen.on_output]))
-
-
-def plan_gains(controller: ControllerParts) -> PlanGains:
-    """Return the gains of the plan on the estimate, the target, the disturbances, the last move."""
-    move = linear_move(controller)
-    F, _, E, H = augmented(controller)
-    H = H[[controller.model.outputs.index(name) for name in controller.design.controlled]]
-    by_z = []
-    by_d = []
-    power = np.eye(len(F))
-    by_held_d = np.zeros_like(E)
-    for _ in range(sum(controller.design.blocks)):
-        by_held_d, power = F @ by_held_d + E, F @ power
-        by_z.append(H @ power)
-        by_d.append(H @ by_held_d)
-    same = np.tile(np.eye(len(H)), (len(by_z), 1))
-    return PlanGains(
-        on_z=move.on_free @ np.vstack(by_z),
-        on_r=-move.on_free @ same,
-        on_d=move.on_free @ np.vstack(by_d),
-        on_last=move.on_last,
     )
 
 

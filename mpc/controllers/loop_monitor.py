@@ -13,9 +13,7 @@ and with the slowest of them, 1 / t, it is there in L + 4 t (2 % are left); a pr
 the PI by Skogestad's rule.
 
 **Reach.**  At a new target, and while an output stays off its own, the drives are sought that hold all
-targets in steady state, with the biases that the filter has found.  Where none do, within the ranges of the
-drives and the limits of outputs, it is said, with what can be held: a dead heater is a drive with a bias of
-its whole range.
+targets within the limits, with the biases that the filter has found: a dead heater is a bias of its range.
 
 **Another plant.**  A drive whose estimated bias is beyond 30 % of its range, or an output's beyond a third of
 a jump, for as long as the loop takes to arrive: a draw is over by then.  Besides,
@@ -24,13 +22,13 @@ a jump, for as long as the loop takes to arrive: a draw is over by then.  Beside
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from thermogrip.datasets.arrays import Array
-from thermogrip.mpc.design.design import Design, PILoop
+from thermogrip.mpc.design.design import Design
 from thermogrip.mpc.estimator.call_times import RESTART_S, SAME
 from thermogrip.mpc.estimator.fault_monitors import GainMonitor, StuckMonitor
 from thermogrip.mpc.estimator.oscillation import NOISE_SD, Oscillation
@@ -48,8 +46,7 @@ _REMEMBER = 0.3  # share of the newest distance in their mean
 
 
 def settling_time(gain: float, delay: float, lag: float, Kc: float, Ti: float) -> float:
-    """Return how long a loop of a first-order plant takes until 2 % are left [s], gain and Kc for one and the
-    same unit of drive; inf where it is not stable.
+    """Return how long a loop of a first-order plant takes until 2 % are left [s]; inf where it is not stable.
 
     >>> round(settling_time(gain=2.0, delay=5.0, lag=100.0, Kc=5.0, Ti=40.0), 1)
     129.7
@@ -65,9 +62,7 @@ class LoopMonitor:
     ----------
     plant : Plant
     design : Design
-        Of the loop: what is regulated in which ranges, how often, and how far it may overshoot.
-    loops : sequence of PILoop, optional
-        The PI loops that are watched; by default those of the design.
+        Of the loop; its PI loops pair outputs and drives.
 
     Examples
     --------
@@ -83,15 +78,15 @@ class LoopMonitor:
     ''
     """
 
-    def __init__(self, plant: Plant, design: Design, loops: Sequence[PILoop] | None = None) -> None:
-        self.model, self.loops = prediction_model(plant, design.dt), tuple(loops or design.loops)
+    def __init__(self, plant: Plant, design: Design) -> None:
+        self.model, self.loops = prediction_model(plant, design.dt), design.loops
         model = self.model
         self.controlled = design.controlled
         self._rows = [model.outputs.index(p.output) for p in self.loops]
         self._drives = [model.drives.index(p.drive) for p in self.loops]
         answers = [step_response(plant, p.drive, p.output) for p in self.loops]
         delays = [max(a.delay, model.dt) for a in answers]
-        spans = model.span[[model.drives.index(p.drive) for p in self.loops]].tolist()
+        spans = model.span[self._drives].tolist()
         self._promised = np.array(
             [
                 settling_time(a.gain / span, delay, a.lag, p.Kc, p.Ti)
@@ -134,8 +129,7 @@ class LoopMonitor:
         self._unreachable = ""
 
     def note(self, reading: Readings, move: Move, target: Trajectory) -> str:
-        """Note a reading, the move that answered it, and the target; return what is to be said of the loop,
-        nothing while all is well. Calls that come before a sample is over say what the last one said."""
+        """Note a reading, the move that answered it, and the target; return what is to be said."""
         now = number(reading, "time_s")
         seconds = now - self._time_s if np.isfinite(now - self._time_s) else self.model.dt
         if self._u is not None and seconds < self.model.dt * (1 - SAME):
@@ -162,8 +156,7 @@ class LoopMonitor:
         return self.said
 
     def _follow(self, y: Array, d: Array, applied: Array, seconds: float, *, new: bool) -> str:
-        """Let the filters follow, also towards a new target; return in what the plant is another than its
-        model."""
+        """Let the filters follow; return in what the plant is another than its model."""
         observer = self.observer
         if self._u is None or seconds > RESTART_S + self.model.dt:
             observer.reset(y, d)
@@ -187,7 +180,12 @@ class LoopMonitor:
         begun = np.where(np.isfinite(self._error), self._error, error)
         self._error = np.where(np.isfinite(error), begun + _REMEMBER * (error - begun), begun)
         self._strange_s = self._strange_s + seconds if strange else 0.0
-        self._look(target, d, seconds)
+        self._looked_s += seconds
+        # the drives that hold the targets are sought where these are new or have been missed for long
+        if not np.any(np.abs(self._error) > self._near + self._zone):
+            self._unreachable = ""
+        elif self._looked_s >= self._look_s:
+            self._unreachable, self._looked_s = self._missed(target, d), 0.0
         lasts = self._strange_s > np.max(self._promised, initial=0.0)
         if said := self.stuck.said or self._unreachable:
             return said
@@ -210,15 +208,6 @@ class LoopMonitor:
             f"{signal.period:.2g} s: the plant is not the model, its valve or relay sticks, or a load comes "
             "and goes"
         )
-
-    def _look(self, target: Array, d: Array, seconds: float) -> None:
-        """Seek the drives that hold the targets of the loops (n,), where they are new or have been missed for
-        long."""
-        self._looked_s += seconds
-        if not np.any(np.abs(self._error) > self._near + self._zone):
-            self._unreachable = ""
-        elif self._looked_s >= self._look_s:
-            self._unreachable, self._looked_s = self._missed(target, d), 0.0
 
     def _missed(self, target: Array, d: Array) -> str:
         """Return which target (n,) no drive holds, and what can be held; empty where drives hold all."""

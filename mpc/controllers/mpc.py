@@ -21,11 +21,8 @@ from thermogrip.mpc.controllers.linear_equivalent import to_control
 from thermogrip.mpc.controllers.pi import PIController
 from thermogrip.mpc.controllers.reference import ReferenceController
 from thermogrip.mpc.design.design import Design, check_design, default_design
-from thermogrip.mpc.estimator.observer import Observer
 from thermogrip.mpc.interface import Move, Readings, Trajectory
-from thermogrip.mpc.native.runtime import CompiledController, wanted
-from thermogrip.mpc.optimiser.rti import Optimiser
-from thermogrip.mpc.plant.prediction import PredictionModel
+from thermogrip.mpc.native.runtime import wanted
 
 if TYPE_CHECKING:
     from thermogrip.sysid.models.model import Model
@@ -73,28 +70,12 @@ class Controller(Shown):
         self.plant, self.notes = plant, dict(notes or {})
         self.design = default_design(plant) if design is None else check_design(design, plant)
         self.reference = ReferenceController(plant, self.design, clock=clock)
-        self._compiled = _compiled_step(self.reference)
-        self._law: ReferenceController | CompiledStep = self._compiled or self.reference
-
-    @property
-    def c(self) -> CompiledController | None:
-        """The C that does the steps; None where Python does."""
-        return None if self._compiled is None else self._compiled.c
-
-    @property
-    def model(self) -> PredictionModel:
-        """The plant as it is predicted."""
-        return self.reference.model
-
-    @property
-    def observer(self) -> Observer:
-        """The filter of the design."""
-        return self.reference.observer
-
-    @property
-    def optimiser(self) -> Optimiser:
-        """The program of the design."""
-        return self.reference.optimiser
+        self.model = self.reference.model
+        self.observer, self.optimiser = self.reference.observer, self.reference.optimiser
+        compiled = _compiled_step(self.reference)
+        self._law: ReferenceController | CompiledStep = compiled or self.reference
+        #: The C that does the steps; None where Python does.
+        self.c = None if compiled is None else compiled.c
 
     @property
     def controlled(self) -> tuple[str, ...]:
@@ -110,11 +91,6 @@ class Controller(Shown):
     def safe_drives(self) -> Array:
         """Drives (n_u,) of a loop that has failed or ends."""
         return self.reference.safe_drives
-
-    @property
-    def last_iterations(self) -> int:
-        """Changes of the program's active set in the last step."""
-        return self._law.last_iterations
 
     @property
     def plan(self) -> Array | None:
@@ -133,14 +109,7 @@ class Controller(Shown):
 
     def save(self, path: str | Path) -> Path:
         """Write the controller with its plant as JSON and return the path."""
-        return self._parts().save(path)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return what the file has, as plain JSON."""
-        return self._parts().to_dict()
-
-    def _parts(self) -> Parts:
-        return Parts("MPC", self.plant, self.design, self.notes)
+        return Parts("MPC", self.plant, self.design, self.notes).save(path)
 
     @classmethod
     def load(cls, path: str | Path, *, model: Model | None = None) -> Controller:

@@ -18,7 +18,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -29,7 +28,7 @@ from thermogrip.datasets.arrays import Array
 from thermogrip.mpc.controllers.advice import STALE
 from thermogrip.mpc.controllers.base import SampledController
 from thermogrip.mpc.controllers.controller_file import Parts
-from thermogrip.mpc.design.design import Design, PILoop, check_design, default_design
+from thermogrip.mpc.design.design import Design, check_design, default_design
 from thermogrip.mpc.interface import Move, Readings, Trajectory
 from thermogrip.mpc.native.shared_constants import UNCUT
 from thermogrip.mpc.optimiser.drive_limits import DriveLimits
@@ -50,8 +49,6 @@ class PIController(SampledController):
     design : Design, optional
         Its loops, limits and patience; by default that of
         :func:`thermogrip.mpc.design.design.default_design`.
-    loops : tuple of PILoop, optional
-        In place of the design's.
     notes : dict, optional
         What the tuner found, kept in the file.
     clock : callable, optional
@@ -77,13 +74,12 @@ class PIController(SampledController):
         plant: Plant,
         design: Design | None = None,
         *,
-        loops: tuple[PILoop, ...] | None = None,
         notes: Mapping[str, Any] | None = None,
         clock: Callable[[], float] = time.perf_counter,
         **changes: Any,
     ) -> None:
         design = default_design(plant, **changes) if design is None else design
-        self.design = check_design(design if loops is None else replace(design, loops=loops), plant)
+        self.design = check_design(design, plant)
         model = prediction_model(plant, design.dt)
         limits = DriveLimits.of(model, design.drive_range, design.slew_per_s, design.safe_drive)
         super().__init__(model, design.controlled, limits, design.patience_s, clock)

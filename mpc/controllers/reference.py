@@ -17,8 +17,7 @@ an answer, so every failure has a next best one, and the status says which:
 Whatever the status, a drive is finite, inside its range, and within the slew limit of the one before.
 
 It may be called at any rate (:mod:`thermogrip.mpc.estimator.call_times`): before a move is due the last one
-is held, with its status; called more seldom than its sample time, it answers with the mean of the plan over
-the time until it is likely to be called again.
+is held; called more seldom, it answers with the mean of the plan until the next call is likely.
 """
 
 from __future__ import annotations
@@ -53,7 +52,6 @@ class _Follows:
     plan: Array | None = None  # (N, n_u), as it was made ``age_s`` ago
     age_s: float = 0.0
     on_pi: bool = False  # whether the PI has taken over
-    iterations: int = 0  # of the program, in the last step
 
 
 @dataclass
@@ -90,23 +88,13 @@ class ReferenceController(SampledController):
         self, plant: Plant, design: Design, *, clock: Callable[[], float] = time.perf_counter
     ) -> None:
         model = prediction_model(plant, design.dt)
-        self.optimiser = Optimiser(model, design)
+        self.design, self.optimiser = design, Optimiser(model, design)
         super().__init__(model, design.controlled, self.optimiser.drives, design.patience_s, clock)
         self.observer = design.observer(model)
         self.pi = PIController(plant, design)
         self.monitor = ReadingMonitor(model.n_y, spike=model.spike)
         lost = np.full(model.n_y, np.nan)
         self._start(lost, model.undisturbed(design.ambient), self.observer.reset)
-
-    @property
-    def design(self) -> Design:
-        """What it is made of."""
-        return self.optimiser.design
-
-    @property
-    def last_iterations(self) -> int:
-        """Changes of the program's active set in the last step."""
-        return self._follows.iterations
 
     @property
     def plan(self) -> Array | None:
@@ -127,7 +115,6 @@ class ReferenceController(SampledController):
     def step(self, reading: Readings, target: Trajectory) -> Move:
         """Return the move for this sample; see :meth:`thermogrip.mpc.controllers.mpc.Controller.step`."""
         started = self.clock()
-        self._follows.iterations = 0
         self.times.call(reading)
         y, d = self._read(reading)
         if self.times.stale:
@@ -262,7 +249,6 @@ class ReferenceController(SampledController):
             outcome = self._optimise(wanted, ahead)
         except (np.linalg.LinAlgError, ArithmeticError):
             return self._fall_back("fallback_plan", advice.solver("not finite"))
-        self._follows.iterations = outcome.iterations
         self.observer.hold_drives(outcome.authority < WEAK)
         if outcome.status == "time limit":
             return self._fall_back("late", advice.TOO_LATE)
@@ -304,20 +290,17 @@ class ReferenceController(SampledController):
         guess, biases = self._guess(wanted, last), (observer.output_bias, observer.drive_bias)
         slew_s = self.times.slew_s
         sample = Sample(
-            observer.now, last, guess, d, wanted, self._approach.side, *biases, slew_s, self._lost
+            observer.now, last, guess, d, wanted, self._approach.side, *biases, slew_s, self._lost, ahead
         )
-        return self._converged(sample._replace(ahead=ahead))
-
-    def _converged(self, sample: Sample) -> Outcome:
-        """Return what one program gives, or as many as the design asks for until the plan stays."""
-        outcome, changes = self.optimiser.solve(sample), 0
+        outcome = self.optimiser.solve(sample)
+        # one program, or as many as the design asks for until the plan stays
         for _ in range(1, self.design.iterations if self.model.affine is None else 1):
             moved = np.abs(outcome.plan - sample.guess) > STAYS * self.model.span
             if outcome.status != "solved" or not moved.any():
                 break
-            sample, changes = sample._replace(guess=outcome.plan), changes + outcome.iterations
+            sample = sample._replace(guess=outcome.plan)
             outcome = self.optimiser.solve(sample)
-        return replace(outcome, iterations=outcome.iterations + changes)
+        return outcome
 
     def _ramp(self, wanted: Array, ahead: Array | None) -> tuple[Array, Array | None]:
         """Return the targets now (n_controlled,), of those that may only ramp a sample further on the way,

@@ -47,17 +47,7 @@ class _Heard(NamedTuple):
 
 
 class TopicLoop:
-    """A controller whose readings and targets come as messages.
-
-    ``hear`` takes a message of a topic, ``tick`` is called every sample time and returns what is published,
-    a number by topic.  Until every controlled output and every target was heard it returns nothing.
-    ``advice`` is a clause for the operator, empty while all is well.
-
-    Raises
-    ------
-    UserError
-        If the map lacks a controlled output, its target or a drive, or a unit or a type cannot be.
-    """
+    """A controller whose readings and targets come as messages; ``advice`` is a clause for the operator."""
 
     def __init__(
         self, controller: Controller | PIController, topics: TopicMap, *, file: str | Path = "topics"
@@ -152,10 +142,7 @@ class TopicLoop:
 
 
 def write_node(controller: Controller | PIController, folder: str | Path) -> tuple[str, ...]:
-    """Write a controller as a ROS 2 node into a folder, made where absent, and return the names of its files.
-
-    ``topics.toml`` is left as it is where it is there already.
-    """
+    """Write a controller as a ROS 2 node into a folder, but for a ``topics.toml`` that is there already."""
     place = Path(folder)
     place.mkdir(parents=True, exist_ok=True)
     controller.save(place / "controller.json")
@@ -174,10 +161,7 @@ def load_loop(folder: str | Path) -> TopicLoop:
 
 
 def replay_bag(loop: TopicLoop, bag: str | Path, out: str | Path) -> int:
-    """Write what a loop answers to a recorded bag as a ROS 2 bag (MCAP), and return the number of answers.
-
-    It ticks every sample time from the bag's first message on that it hears, and sees what came until then.
-    """
+    """Write what a loop answers to a recorded bag as a ROS 2 bag (MCAP), and return the number of answers."""
     types = dict(loop.publications)
     answered = [(seconds, answer) for seconds, answer in _ticks(loop, bag) if answer]
     messages = (

@@ -282,11 +282,6 @@ class Design:
     # of several controlled outputs, how long the model replaces one that is lost
     patience_s: NotNegative = 10.0
 
-    @property
-    def horizon_s(self) -> float:
-        """Length of the prediction [s]."""
-        return self.dt * sum(self.blocks)
-
     def observer(self, model: PredictionModel) -> Observer:
         """Return the filter of this design for a plant at its sample time."""
         chosen = choose_disturbances(model, self.controlled, ambient=self.ambient)
@@ -434,8 +429,8 @@ def default_design(
     >>> p, heaters = dict(zip(kit.parameters, kit.prior)), dict.fromkeys(kit.inputs, (0.0, 100.0))
     >>> plant = Plant(kit, p, dt=kit.dt, units=kit.units, valid=heaters)
     >>> design = default_design(plant, controlled=("t1",))
-    >>> design.dt, design.horizon_s, design.blocks
-    (2.0, 86.0, (1, 1, 2, 2, 3, 4, 5, 6, 8, 11))
+    >>> design.dt, design.blocks
+    (2.0, (1, 1, 2, 2, 3, 4, 5, 6, 8, 11))
     """
     controlled = default_controlled(plant) if controlled is None else tuple(controlled)
     for name in controlled:

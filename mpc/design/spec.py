@@ -118,15 +118,9 @@ class Spec(BaseModel):
             raise ValueError(f"settle_within_s: {self.settle_within_s:g} s is {too_long}")
         return self
 
-    def way(self, step: tuple[float, float]) -> float:
-        """Return how far a step leads until it is in the band [degC]."""
-        return abs(step[1] - step[0]) - self.band_degC
-
     @classmethod
     def of(cls, plant: Plant) -> Spec:
-        """Return what is wanted where nobody said: of a skin the defaults; of another plant the output that
-        each drive moves most, a step up and one down inside what the logs showed, and the time that the plant
-        takes by itself."""
+        """Return what is wanted where nobody said: of a skin the defaults, else what the logs showed."""
         usual = default_controlled(plant)
         if usual == ("t_surface",):
             return cls()
@@ -164,8 +158,7 @@ class Spec(BaseModel):
         return re.sub(r"(?m) +$", "", text)
 
     def widened(self, plant: Plant) -> Plant:
-        """Return the plant with the drives of the spec: those that it switches, and as wide as it has them
-        where only the logs showed how wide; and with its measured disturbances."""
+        """Return the plant with the spec's ranges of drives and its measured disturbances."""
         problem = "disturbances: the plant has no measured disturbance {}"
         _check_known(self.disturbances, plant.disturbances, problem)
         plant = replace(plant, nominal=plant.nominal | (self.disturbances or {}))
@@ -173,13 +166,12 @@ class Spec(BaseModel):
         for name, (low, high) in _by_drive("drive_limits", self.drive_limits, drive_names(plant)).items():
             (least, most), unit = drive_range(plant, name), plant.units.get(name, "1")
             of_unit = unit in ("percent", "0_255") or (unit == "1" and -1.0 <= least < most <= 1.0)
-            if not of_unit:
+            if not of_unit:  # only the logs showed how wide it is
                 ranges[name] = (min(low, least), max(high, most))
         return replace(plant, valid=ranges)
 
     def surroundings_in_words(self, plant: Plant) -> str:
-        """Return what measured disturbances are taken for in the trials, and where nobody reads them; empty
-        where the room's temperature is the only one."""
+        """Return what measured disturbances but the room's are taken for in the trials."""
         plant, sentences = self.widened(plant), []
         usual = plant.undisturbed(self.ambient_degC).tolist()
         for name, value in zip(plant.disturbances, usual, strict=True):
@@ -316,8 +308,7 @@ def read_spec(path: str | Path) -> Spec:
 
 
 def spec_from_dict(content: Mapping[str, Any], *, file: str | Path | None = None) -> Spec:
-    """Return a spec from plain values by key; a wrong or unknown key is a :class:`UserError` that names it,
-    with the file that it came from."""
+    """Return a spec from plain values by key; a wrong one is a :class:`UserError` that names key and file."""
     try:
         return Spec.model_validate(dict(content))
     except ValidationError as error:

@@ -94,14 +94,9 @@ class CallTimes:
 def shifted(plan: Array, samples: float) -> Array:
     """Return what is ahead of a plan (N, n_u) after so many samples, its last row staying; between two
     samples a row is the mean of the drives that were planned for those seconds."""
-    last = len(plan) - 1
-    samples = min(samples, float(last))
-    whole = math.floor(samples + SAME)
-    rows = np.arange(len(plan)) + whole
-    ahead = plan[np.minimum(rows, last)]
-    if samples - whole <= SAME:
-        return np.asarray(ahead)
-    return np.asarray(ahead + (samples - whole) * (plan[np.minimum(rows + 1, last)] - ahead))
+    whole, rows = math.floor(samples + SAME), np.arange(len(plan))
+    samples = samples if samples - whole > SAME else whole
+    return np.column_stack([np.interp(rows + samples, rows, drive) for drive in plan.T])
 
 
 def opening(plan: Array, samples: float) -> Array:

@@ -52,13 +52,10 @@ _CHANGED = 0.775
 
 
 class GainMonitor:
-    """Which drive does another share than before, by what readings do after new targets.
-
-    ``filters`` are one of each drive, ``settling_s`` is how long after a target a drive moves for it, and
-    ``share`` (n_u,) what each drive does of what it did before, NaN until enough targets were new.
-    """
+    """Which drive does another share than before, by what readings do after new targets."""
 
     def __init__(self, filters: Mapping[str, Observer], settling_s: float) -> None:
+        # one of each drive, and how long after a target a drive moves for it
         self.filters, self._settling_s = filters, settling_s
         self.forget()
 
@@ -68,6 +65,7 @@ class GainMonitor:
         self._before, self._window = np.zeros((3, n)), np.zeros((3, n))  # sums of psi^2, psi e, (psi e)^2
         self._last: deque[Array] = deque()
         self._since_s, self._was_new = np.inf, False
+        # what each drive (n_u,) does of what it did before, NaN until enough targets were new
         self.share, self._told = np.full(n, np.nan), np.zeros(n, dtype=bool)
 
     def restart(self, y: Array, d: Array) -> None:
@@ -80,8 +78,7 @@ class GainMonitor:
     def note(
         self, innovation: Array, R: Array, y: Array, u: Array, d: Array, seconds: float, *, new: bool
     ) -> None:
-        """Note the loop's innovation (n_y,) of variance R (n_y,) with readings y (n_y,) after drives u (n_u,)
-        and measured disturbances d (n_d,), and whether the target is new."""
+        """Note the loop's innovation of variance R at readings y, and whether the target is new."""
         slopes = []
         for j, observer in enumerate(self.filters.values()):
             less = u.copy()

@@ -87,7 +87,7 @@ For a nonlinear plant the update is repeated at its own answer (Gauss-Newton).
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
@@ -134,9 +134,8 @@ class RestingState:
 def resting_state(
     model: PredictionModel, x: Array, v: Array, y: Array, d: Array, *, unit: Array
 ) -> RestingState:
-    """Return where a plant at rest may be, linearised at state x (n_x,) and drive v (n_u,), for outputs y
-    (n_y,), temperatures all at the mean of their readings; ``unit`` (n_x,) is what counts as a
-    unit of each state. Shared: read it."""
+    """Return where a plant at rest may be, linearised at state x and drive v, in each state's ``unit``."""
+    # shared: read it
     return _resting_state(model, *(tuple(values.tolist()) for values in (x, v, y, d, unit)))
 
 
@@ -164,18 +163,6 @@ def _resting_state(model: PredictionModel, *at: tuple[float, ...]) -> RestingSta
     to_drive = model.span[:, None] * np.linalg.solve(S, scaled).T
     drive = model.neutral + to_drive @ (away @ mean - push)
     return RestingState(mean, 0.5 * (P + P.T), by_level, by_d, to_drive @ away, drive)
-
-
-@lru_cache(maxsize=16)
-def resting_state_in_room(model: PredictionModel, ambient: float, unit: tuple[float, ...]) -> RestingState:
-    """Return :func:`resting_state` linearised where all rests in a room of ``ambient`` [degC], or amid what
-    the logs showed."""
-    x, v, d = model.at_rest(ambient)
-    usual = model.usual(ambient)
-    level = float(np.mean(usual[model.warm]))
-    y = np.where(model.warm, level, usual)
-    resting = resting_state(model, x, v, y, d, unit=np.array(unit))
-    return replace(resting, x=resting.x + (ambient - level) * resting.by_level)
 
 
 _REPEATS, _STEADY = 5, 1e-3  # of the start on a nonlinear plant, and when it is still [units]
@@ -229,13 +216,7 @@ def reading_noise(plant: Plant, output: str) -> float | None:
 def detectability_margin(
     A: Array, C: Array, into_state: Array, into_output: Array, *, scale: Array | None = None
 ) -> float:
-    """Return how detectable the disturbances are: 0 is not at all.
-
-    Their steady effect on the outputs is G = W_y + C (I - A)^-1 W_x, with W_x (n_x, n_w) and W_y (n_y, n_w).
-    Its least singular value, disturbances in units of ``scale`` (n_w,) and outputs in degC, is the change
-    that the worst combination of them makes; 0 exactly where the rank test fails. Without (I - A)^-1 (an
-    integrator) the rank test itself decides.
-    """
+    """Return how detectable disturbances in units of ``scale`` (n_w,) are: 0 where the rank test fails."""
     n_x, n_w = A.shape[0], into_state.shape[1]
     if n_w > C.shape[0]:
         return 0.0
@@ -245,10 +226,11 @@ def detectability_margin(
     seen_of_slow = np.linalg.norm(C @ vectors[:, slow], axis=0) if slow.any() else np.ones(1)
     if np.any(seen_of_slow < 1e-9):
         return 0.0  # a mode that does not die out and cannot be seen
-    if slow.any():
+    if slow.any():  # an integrator has no steady effects: the rank test itself decides
         whole = np.block([[A - np.eye(n_x), into_state * scale], [C, into_output * scale]])
         values = np.linalg.svd(whole, compute_uv=False)
         return float(values[-1] / values[0]) if values[-1] > 1e-9 * values[0] else 0.0
+    # the least singular value is the change [degC] that the worst combination makes in steady state
     effect = into_output + C @ np.linalg.solve(np.eye(n_x) - A, into_state)
     values = np.linalg.svd(effect * scale, compute_uv=False)
     return float(values[-1]) if values[-1] > 1e-9 * max(1.0, float(values[0])) else 0.0
@@ -261,19 +243,20 @@ def choose_disturbances(
     ambient: float = 25.0,
     least: float = 1e-3,
 ) -> DisturbanceModel:
-    """Return the first set of disturbance states, one an output, that passes the rank test of the module's
-    theory.
-
-    The test is made at rest at ``ambient``; ``least`` is the steady change [degC] that 1 % of a drive's
-    range, or 1 degC of bias, must make. A UserError says that no set is detectable.
-    """
+    """Return the first set of disturbance states, one an output, that is detectable at rest."""
     _, A, B, E = model.linearise(*model.at_rest(ambient))
     chosen: list[tuple[str, int]] = []
     margin = float("inf")
-    for entry in _disturbance_order(model, controlled):
+    first = [i for i, name in enumerate(model.outputs) if name in controlled]
+    uncontrolled = [i for i in range(model.n_y) if i not in first]
+    order = [("input", j) for j in range(model.n_u)]
+    order += [("output", i) for i in first + uncontrolled]
+    order += [("disturbance", k) for k in range(model.n_d)]
+    for entry in order:
         if len(chosen) == model.n_y:
             break
         trial = _disturbance_matrices(model, [*chosen, entry])
+        # 1 % of a drive's range, or 1 degC of bias, must make a steady change of ``least`` [degC]
         scale = np.array([0.01 if kind == "input" else 1.0 for kind, _ in [*chosen, entry]])
         into_state = B @ (trial["input"] * model.span[:, None]) + E @ trial["disturbance"]
         trial_margin = detectability_margin(A, model.C, into_state, trial["output"], scale=scale)
@@ -293,14 +276,6 @@ def choose_disturbances(
     return DisturbanceModel(labels, on["input"], on["disturbance"], on["output"], margin)
 
 
-def _disturbance_order(model: PredictionModel, controlled: tuple[str, ...]) -> list[tuple[str, int]]:
-    first = [i for i, name in enumerate(model.outputs) if name in controlled]
-    uncontrolled = [i for i in range(model.n_y) if i not in first]
-    order = [("input", j) for j in range(model.n_u)]
-    order += [("output", i) for i in first + uncontrolled]
-    return order + [("disturbance", k) for k in range(model.n_d)]
-
-
 def _disturbance_matrices(model: PredictionModel, entries: list[tuple[str, int]]) -> dict[str, Array]:
     """Return on what each disturbance state (n_w) acts, by the kind of row."""
     n_w = len(entries)
@@ -315,12 +290,8 @@ def _disturbance_matrices(model: PredictionModel, entries: list[tuple[str, int]]
 
 
 class Observer:
-    """The filter: ``reset`` at rest, then ``update`` with a reading and ``predict`` with the move, in turn.
-
-    Where readings come at other times: ``advance`` by the seconds that passed, ``look``, then ``update``. x
-    (n_x,) is the state at the last sample, w (n_w,) the disturbances, ``found_offset`` (n_y,) what each
-    sensor was found to read too much at the start or after a jump that stayed.
-    """
+    """The filter: ``reset`` at rest, then ``update`` with a reading and ``predict`` with the move, in turn;
+    at other times ``advance`` by the seconds that passed, ``look``, then ``update``."""
 
     def __init__(
         self,
@@ -344,6 +315,7 @@ class Observer:
         spread = np.sqrt(np.maximum(np.diag(np.atleast_2d(plant.model.spread)), 1e-12))
         output_spread = np.sqrt(np.einsum("ij,j,ij->i", model.C, spread**2, model.C)).max()
         self.unit = spread / max(float(output_spread), 1e-12)
+        self._step_unit = self.unit * model.unit.max()  # what counts as a unit of each state at rest
         self.is_drive = disturbance.on_drive.any(axis=0)
         drives = np.array([self.noise.drive.get(name, DRIFT) for name in model.drives])
         # the unit of an output's bias is the output's, that of a measured disturbance's its own
@@ -352,8 +324,9 @@ class Observer:
         self.Q = np.concatenate([(self.noise.state * self.unit) ** 2, drift**2]) * model.dt
         by_drive = model.linearise(*model.at_rest(ambient)).B
         self.load = by_drive * model.span * [self.noise.load.get(name, 0.0) for name in model.drives]
-        self.x = np.zeros(model.n_x)
+        self.x = np.zeros(model.n_x)  # at the last sample
         self.w = np.zeros(disturbance.n_w)
+        # what each sensor was found to read too much at the start or after a jump that stayed
         self.found_offset = np.zeros(model.n_y)
         self.P0 = np.where(self.is_drive, 0.03, OFFSET * bias_unit) ** 2
         # a sensor without an offset among the disturbance states is read as loosely, once
@@ -386,23 +359,24 @@ class Observer:
 
     def reset_in_room(self, y: Array, d: Array) -> None:
         """Start as :meth:`reset`, with the plant linearised where all rests in the room: what the C does."""
-        resting = self.rest_in_room()
+        resting = self.rest_in_room
         x = resting.x + resting.by_level * (self._level(y, d) - self.ambient)
         x = x + resting.by_d @ (d - self.model.undisturbed(self.ambient))
         self._begin(x, resting.P, y)
-
-    @property
-    def _step_unit(self) -> Array:
-        """What counts as a unit of each state (n_x,)."""
-        return np.asarray(self.unit * self.model.unit.max())
 
     def _level(self, y: Array, d: Array) -> float:
         read_warm = np.isfinite(y) & self.model.warm
         return float(np.mean((y - self.offset)[read_warm])) if read_warm.any() else self.model.room(d)
 
+    @cached_property
     def rest_in_room(self) -> RestingState:
-        """Return where the plant may rest, linearised where all is as warm as the room."""
-        return resting_state_in_room(self.model, self.ambient, tuple(self._step_unit.tolist()))
+        """Where the plant may rest, linearised where all is as warm as the room, or amid the logs."""
+        model = self.model
+        x, v, d = model.at_rest(self.ambient)
+        usual = model.usual(self.ambient)
+        level = float(np.mean(usual[model.warm]))
+        resting = resting_state(model, x, v, np.where(model.warm, level, usual), d, unit=self._step_unit)
+        return replace(resting, x=resting.x + (self.ambient - level) * resting.by_level)
 
     def _begin(self, x: Array, P: Array, y: Array) -> None:
         """Start from a Gaussian state and a reading (n_y,)."""
@@ -484,7 +458,13 @@ class Observer:
             gain[np.asarray(self._held, dtype=bool)] = 0.0  # C holds whole numbers
             uncorrected = np.eye(self._P.shape[0]) - gain @ H  # Joseph's form: right for any gain
             self._P = uncorrected @ self._P @ uncorrected.T + (gain * R[read]) @ gain.T
-            self._change(gain @ innovation[read])
+            change, n_x = gain @ innovation[read], self.model.n_x
+            w = self.w + change[n_x:]
+            w = np.where(self.is_drive, np.clip(w, -LARGEST_BIAS, LARGEST_BIAS), w)
+            if self._share:
+                change[n_x:] = w - self.w
+                self._ahead = self._ahead + (self._way @ change)[:n_x]
+            self.x, self.w = self.x + change[:n_x], w
         return np.asarray(innovation)
 
     def _noise(self, share: float) -> Array:
@@ -492,15 +472,6 @@ class Observer:
         n_x, added = self.model.n_x, np.diag(np.where(self._held, 0.0, self.Q))
         added[:n_x, :n_x] += self.load @ self.load.T
         return share * added
-
-    def _change(self, change: Array) -> None:
-        """Change the states."""
-        n_x, w = self.model.n_x, self.w + change[self.model.n_x :]
-        w = np.where(self.is_drive, np.clip(w, -LARGEST_BIAS, LARGEST_BIAS), w)
-        if self._share:
-            change[n_x:] = w - self.w
-            self._ahead = self._ahead + (self._way @ change)[:n_x]
-        self.x, self.w = self.x + change[:n_x], w
 
     def predict(self, u: Array, d: Array) -> None:
         """Carry the estimate one sample on under drives u (n_u,) and disturbances d (n_d,)."""

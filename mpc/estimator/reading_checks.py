@@ -18,7 +18,6 @@ meanwhile, so that only what each sample adds is summed, not where the model wou
 **A plant that does not follow.**  The bias that the observer had to assume for the drive is beyond 30 % of
 its range, or that of an output 2 degC, or a thirtieth of a wide range: a pump that is off, a plug that has
 fallen off, another plant.
-
 """
 
 from __future__ import annotations

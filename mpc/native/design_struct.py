@@ -195,18 +195,14 @@ def config_header(sizes: Sizes) -> str:
     return "\n".join([*lines, "} tg_design;", "", "#endif", ""])
 
 
-def structure_of(sizes: Sizes) -> type[ctypes.Structure]:
-    """Return ``tg_design`` as ctypes sees it."""
+def as_structure(sizes: Sizes, numbers: dict[str, Any]) -> ctypes.Structure:
+    """Return ``tg_design`` as ctypes sees it, filled."""
     fields = []
     for name, (whole, shape, _) in _FIELDS.items():
         kind: Any = ctypes.c_int if whole else ctypes.c_double
         fields.append((name, kind * max(1, int(np.prod(sizes.shape(name)))) if shape else kind))
-    return type("tg_design", (ctypes.Structure,), {"_fields_": fields})
-
-
-def as_structure(sizes: Sizes, numbers: dict[str, Any]) -> ctypes.Structure:
-    """Return ``tg_design`` as ctypes sees it, filled."""
-    design = structure_of(sizes)()
+    struct: type[ctypes.Structure] = type("tg_design", (ctypes.Structure,), {"_fields_": fields})
+    design = struct()
     for name, (whole, shape, _) in _FIELDS.items():
         if shape:
             flat = _padded(sizes, name, numbers[name]).ravel().tolist()
@@ -235,7 +231,7 @@ def numbers_of(controller: ControllerParts, k: Array) -> dict[str, Any]:
     optimiser = controller.optimiser
     observer = controller.observer
     loops = design.loops
-    resting = observer.rest_in_room()
+    resting = observer.rest_in_room
     rows = [model.outputs.index(name) for name in (*design.controlled, *design.limits)]
     limits = np.array(list(design.limits.values()), dtype=float).reshape(-1, 2)
     same_names = (

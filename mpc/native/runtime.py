@@ -78,8 +78,7 @@ def c_source(name: str) -> str:
 
 
 def build_library(files: dict[str, str]) -> Path:
-    """Return a shared library of these C files, from the cache where it was built before; a RuntimeError has
-    the first words of a compiler that refuses."""
+    """Return a shared library of these C files, from the cache where it was built before."""
     gcc = compiler()
     if gcc is None:
         raise RuntimeError("no gcc")
@@ -161,13 +160,7 @@ def _loaded_library(path: Path) -> ctypes.CDLL:
 
 
 class CompiledController:
-    """The C of one controller, loaded: its design and one state.
-
-    ``given`` holds what a step is given, in this order: outputs, disturbances, drives that were applied, time
-    and targets, NaN where there is none; ``answer`` what it answers, as ``tg_host_step`` of ``tg_host.c``
-    says.  ``late`` says whether a step has taken too long; without it the clock of the C does, by the
-    design's deadline.
-    """
+    """The C of one controller, loaded: its design and one state."""
 
     def __init__(self, controller: ControllerParts, late: Callable[[], bool] | None = None) -> None:
         model = controller.model
@@ -184,8 +177,9 @@ class CompiledController:
         self.state = ctypes.c_void_p(self._memory.ctypes.data)
         self.library.tg_host_begin(self.state, ctypes.byref(self.design))
         n_u = self.sizes.NU
+        # outputs, disturbances, drives that were applied, time and targets, NaN where there is none
         self.given = (ctypes.c_double * (model.n_y + model.n_d + n_u + 1 + self.sizes.NC))()
-        self.answer = (ctypes.c_double * (n_u + 7))()
+        self.answer = (ctypes.c_double * (n_u + 7))()  # see ``tg_host_step`` of ``tg_host.c``
         self._step, self._seconds = self.library.tg_host_step, ctypes.c_double(controller.design.deadline_s)
         self._places = ctypes.byref(self.given), ctypes.byref(self.answer)
         self._until = ctypes.c_double()
@@ -196,8 +190,7 @@ class CompiledController:
         self.library.tg_host_late(self.state, self._late, ctypes.byref(self._until))
 
     def reset(self, estimate: Mapping[str, Array] | None = None) -> None:
-        """Start at rest at what is ``given``, with this estimate in place of the one of the plant linearised
-        in its room."""
+        """Start at rest at what is ``given``, with this estimate where there is one."""
         self.library.tg_host_reset(self.state, self._places[0])
         for name, values in ({} if estimate is None else estimate).items():
             self.view(name, values.shape)[...] = values

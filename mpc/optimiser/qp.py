@@ -111,21 +111,15 @@ class CondensedQP:
         if A.shape != (self.soft.size, f.size):
             raise ValueError(f"A is {A.shape}, not {(self.soft.size, f.size)}")
         room = upper - lower
-        is_finite = _is_finite(f) and (self._is_same(H, A) or (_is_finite(H) and _is_finite(A)))
+        is_same = self._given is not None and H is self._given[0] and A is self._given[1]
+        is_finite = _is_finite(f) and (is_same or (_is_finite(H) and _is_finite(A)))
         if not is_finite or np.isnan(room).any():
             return self._failed("not finite", f.size)
         if ((room < 0) & self._hard).any():
             return self._failed("infeasible", f.size)
         if (H.diagonal() <= 0).any():
             return self._failed("not convex", f.size)
-        return self._solve(H, f, A, lower, upper)
-
-    def _is_same(self, H: Array, A: Array) -> bool:
-        return self._given is not None and H is self._given[0] and A is self._given[1]
-
-    def _solve(self, H: Array, f: Array, A: Array, lower: Array, upper: Array) -> QPAnswer:
-        """Return the minimiser of a program that may have one."""
-        if not self._is_same(H, A):
+        if not is_same:
             factor, failed = dpotrf(H.T, lower=1, clean=1)
             if failed:
                 return self._failed("not convex", f.size)

@@ -89,7 +89,6 @@ class Outcome:
     status: str  # the solver's, ``"solved"`` where all is well
     # by how much a limit of an output will be broken [degC], where it is by more than BREAKS of its unit
     broken: dict[str, float]
-    iterations: int
     # (n_u,) response of the controlled outputs to each drive's next block, over that at rest: below 0 the
     # gain has turned over
     authority: Array
@@ -200,6 +199,7 @@ class Optimiser:
         # a later block may differ by what the slew allows between the middles of the two
         middles = np.cumsum(design.blocks) - 0.5 * np.array(design.blocks) + 0.5
         self._gaps = np.concatenate([[1.0], np.diff(middles)])
+        self.reach = np.cumsum(self._gaps)  # samples of slew (n_b,) from now to the middle of each block
         self._differences = np.kron(np.eye(self.n_b) - np.eye(self.n_b, k=-1), np.eye(model.n_u))
         self.qp = self._program()
         self._solves = 0
@@ -207,11 +207,6 @@ class Optimiser:
         self._G: Array | None = None
         self._A: Array | None = None
         self._kept: tuple[Any, Array, list[Array]] | None = None
-
-    @property
-    def reach(self) -> Array:
-        """Samples of slew (n_b,) from now to the middle of each block."""
-        return np.cumsum(self._gaps)
 
     def _program(self) -> CondensedQP:
         """Return the program: ranges and slews, then of each controlled and limited output its samples."""
@@ -247,14 +242,18 @@ class Optimiser:
         answer = self.qp.solve(H, f, *self._constraints(G, free, ends, problem))
         plan = self._park((answer.x * self._spans).reshape(guess.shape), problem)
         if not answer.solved:
-            return Outcome(plan, y_guess, answer.status, {}, answer.iterations, authority[0])
+            return Outcome(plan, y_guess, answer.status, {}, authority[0])
         if model.affine is not None:
             y = free + G @ (plan / model.span).ravel()
         else:
-            plan, y = self._best(
-                plan, guess, y_guess, lambda plans: self._simulate(x, plans + drive_bias, d) + bias, problem
-            )
-        return Outcome(plan, y, "solved", self._broken(y), answer.iterations, authority[0])
+
+            def predicted(plans: Array) -> Array:
+                states = np.repeat(x[None, :], len(plans), axis=0)
+                y, _ = model.run(states, np.repeat(plans + drive_bias, self.design.blocks, axis=1), d)
+                return np.asarray(y[:, 1:] + bias)
+
+            plan, y = self._best(plan, guess, y_guess, predicted, problem)
+        return Outcome(plan, y, "solved", self._broken(y), authority[0])
 
     def _problem(self, sample: Sample) -> Problem:
         """Return what a sample asks for; nothing is beyond a target that moves, or that is lost."""
@@ -334,29 +333,18 @@ class Optimiser:
         away, last_away = guess - drives.neutral, problem.last - drives.neutral
         reach = (self.reach[:, None] + problem.more) * drives.slew
         least = np.where(away * last_away > 0, np.abs(last_away) - reach, 0.0)  # what the slew allows
-        low, high = self._faded_range(away, drive_bias, authority, least)
+        fades = authority < 1 - FADING
+        best = np.abs(away + drive_bias) / np.maximum(1 - authority, FADING)  # where the gain is nothing
+        end = np.abs(np.where(away < 0, drives.lowest, drives.highest) - drives.neutral)
+        room = np.maximum(best * allowed_share(end, best, self.model.span), least)
+        low = np.where(fades & (away < 0), drives.neutral - room, drives.lowest)
+        high = np.where(fades & (away > 0), drives.neutral + room, drives.highest)
+        low, high = drives.cut(low), drives.cut(high)
         if not problem.parked:
             return low, high
         little = np.zeros(self.model.n_u)
         little[problem.parked] = LITTLE * self.model.span[problem.parked]
         return self._park(low, problem) - little, self._park(high, problem) + little
-
-    def _faded_range(self, away: Array, bias: Array, share: Array, least: Array) -> tuple[Array, Array]:
-        """Return the ends (n_b, n_u) of drives ``away`` from neutral, of whose gain at rest a ``share``
-        remains, where it will have faded; never nearer than the ``least`` distance."""
-        drives, fades = self.drives, share < 1 - FADING
-        best = np.abs(away + bias) / np.maximum(1 - share, FADING)  # where the gain is nothing
-        end = np.abs(np.where(away < 0, drives.lowest, drives.highest) - drives.neutral)
-        room = np.maximum(best * allowed_share(end, best, self.model.span), least)
-        low = np.where(fades & (away < 0), drives.neutral - room, drives.lowest)
-        high = np.where(fades & (away > 0), drives.neutral + room, drives.highest)
-        return np.maximum(low, drives.lowest), np.minimum(high, drives.highest)
-
-    def _simulate(self, x: Array, plans: Array, d: Array) -> Array:
-        """Return the outputs (B, N, n_y) of plans (B, n_b, n_u)."""
-        states = np.repeat(x[None, :], len(plans), axis=0)
-        y, _ = self.model.run(states, np.repeat(plans, self.design.blocks, axis=1), d)
-        return y[:, 1:]
 
     def _merit(self, plans: Array, y: Array, problem: Problem) -> Array:
         """Return the cost (B,) of plans (B, n_b, n_u) whose outputs y (B, N, n_y) were simulated."""
@@ -392,11 +380,7 @@ class Optimiser:
         self._solves = 0
 
     def linear_gains(self, G: Array) -> LinearGains:
-        """Return H, and the unconstrained plan's gains on the free response and on the last drive.
-
-        G (N, n_y, n) is the response to the plan in fractions of the drives' ranges; the first n_u rows of a
-        gain are the first move.
-        """
+        """Return the unconstrained plan of responses G (N, n_y, n) to plans in fractions of their ranges."""
         n_u, span = self.model.n_u, self._spans
         H, weighted = self._hessian(G, range(len(self._rows)))
         linear = np.stack(weighted, axis=2)

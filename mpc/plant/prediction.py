@@ -104,16 +104,7 @@ class Rest(NamedTuple):
 
 
 class PredictionModel:
-    """A plant seen at the controller's sample time, on/off inputs that are no drives at 1.
-
-    ``drives``, ``outputs`` and ``disturbances`` name u, y and d; ``dt`` is the sample time [s], ``sub`` the
-    model's steps in it.  A drive is between ``lowest`` and ``highest``, ``span`` wide, the unit in which
-    drives are scaled, and ``neutral`` is no drive or what is nearest to none, all (n_u,).  A reading is
-    between ``coldest`` and ``hottest``, and within ``spike`` (n_y,) of its prediction; ``unit`` (n_y,) is in
-    what figures of an output count.  Outputs ``warm`` (n_y,) share a level at rest: the temperatures, or
-    all.  Of the measured disturbances ``rooms`` (n_d,) are temperatures of the room; ``seen_d`` (n_d, 2) is
-    what the logs showed, ``least_d`` to ``most_d`` what may be read, a difference of ``close_d`` is none.
-    """
+    """A plant seen at the controller's sample time, on/off inputs that are no drives at 1."""
 
     def __init__(self, plant: Plant, *, dt: float | None = None) -> None:
         self.plant, self.model = plant, plant.model
@@ -128,17 +119,19 @@ class PredictionModel:
         self.n_u = len(self.drives)
         self.n_y = len(self.outputs)
         self.n_d = len(self.disturbances)
+        # which measured disturbances are temperatures of the room
         self.rooms: Mask = np.array([plant.is_room(name) for name in self.disturbances], dtype=bool)
         self.drive_index = [self.model.inputs.index(name) for name in self.drives]
         ranges = np.array([drive_range(plant, name) for name in self.drives])
         self.lowest, self.highest = ranges[:, 0], ranges[:, 1]
-        self.span = self.highest - self.lowest
+        self.span = self.highest - self.lowest  # the unit in which drives are scaled
         self.neutral = np.clip(np.zeros(self.n_u), self.lowest, self.highest)
         seen = np.array([plant.valid.get(name, (-np.inf, np.inf)) for name in self.outputs], dtype=float)
         warm = np.array([plant.units.get(name, "degC") == "degC" for name in self.outputs])
+        # outputs that share a level at rest: the temperatures, or all
         self.warm: Mask = warm if warm.any() else ~warm
         self._seen, spread = seen, np.nan_to_num(seen[:, 1] - seen[:, 0], posinf=0.0)
-        self.unit = unit_of(spread)
+        self.unit = unit_of(spread)  # in which figures of an output count
         away = np.nan_to_num(seen + spread[:, None] * [-1.0, 1.0], posinf=0.0, neginf=0.0)
         self.spike = np.maximum(SPIKE, 0.1 * spread)
         self.coldest = min(PLAUSIBLE[0], float(away[:, 0].min()))
@@ -150,6 +143,7 @@ class PredictionModel:
         self.least_d = np.where(self.rooms, self.coldest, low - width_allowed)
         self.most_d = np.where(self.rooms, self.hottest, high + width_allowed)
         some = np.where(high > low, high - low, np.maximum(1.0, np.abs(high)))
+        # a difference that is none
         self.close_d = np.where(self.rooms, 0.5, _CLOSE * some)
         wanted = sample_time(plant) if dt is None else float(dt)
         self.sub = max(1, round(wanted / plant.dt))
@@ -158,14 +152,13 @@ class PredictionModel:
         self.sub = self._fewest_steps()
 
     def _fewest_steps(self) -> int:
-        """Return into how few steps a sample may be cut with a full swing of the drives within a hundredth of
-        the outputs' units: an implicit network is as good for control at four times its own step, and a
-        controller's time goes into these."""
+        """Return into how few steps a sample may be cut: a controller's time goes into these."""
         native_steps = self.sub
         d = self.undisturbed(ROOM)
         x = self.rest(self.usual(ROOM), d)[None, :]
         plan = np.repeat(np.stack([self.highest, self.lowest]), 30, axis=0)[None]
         exact, _ = self.run(x, plan, d)
+        # an implicit network is as good for control at four times its own step
         for steps in range(1, native_steps):
             if native_steps % steps == 0:
                 self.sub = steps
@@ -241,10 +234,11 @@ class PredictionModel:
             return self.affine._replace(after=self.next_state(x, u, d))
         if self._kernel is None:
             return self._by_casadi(x, u, d)
-        by_x, by_u, by_d = np.split(np.eye(self.n_x + self.n_u + self.n_d), self._ends, axis=1)
+        places = [self.n_x, self.n_x + self.n_u]  # behind the derivatives by the states, and by the drives
+        by_x, by_u, by_d = np.split(np.eye(self.n_x + self.n_u + self.n_d), places, axis=1)
         by_u, by_d = (np.repeat(by[:, None], self.sub, axis=1) for by in (by_u, by_d))
         _, ends = self._along(self._kernel, x, np.tile(u, (self.sub, 1)), d, by_x, by_u, by_d)
-        return LinearStep(ends[0, : self.n_x], *np.split(ends[:, self.n_x :].T, self._ends, axis=1))
+        return LinearStep(ends[0, : self.n_x], *np.split(ends[:, self.n_x :].T, places, axis=1))
 
     @cached_property
     def affine(self) -> LinearStep | None:
@@ -259,8 +253,8 @@ class PredictionModel:
         return self._by_casadi(*(np.zeros(n) for n in (self.n_x, self.n_u, self.n_d)))
 
     def _by_casadi(self, x: Array, u: Array, d: Array) -> LinearStep:
-        after, A, B, E = self._casadi_sample(x, u, d)
-        return LinearStep(after.ravel(), A, B, E)
+        after, *derivatives = (np.asarray(value.full()) for value in self._casadi(x, u, d))
+        return LinearStep(after.ravel(), *derivatives)
 
     @cached_property
     def _kernel(self) -> Kernel | None:
@@ -270,17 +264,11 @@ class PredictionModel:
         steps = _TangentSteps(self)
         return Kernel(steps) if steps.are_arithmetic else None
 
-    @property
-    def _ends(self) -> list[int]:
-        """Where the derivatives by the states end, and those by the drives."""
-        return [self.n_x, self.n_x + self.n_u]
-
     def _along(
         self, kernel: Kernel, x: Array, u: Array, d: Array, by_x: Array, by_u: Array, by_d: Array
     ) -> tuple[Array, Array]:
-        """Return the outputs (B, n + 1, 2 n_y) and last states (B, 2 n_x) of a run from x (n_x,) under drives
-        u (n, n_u) of the model's steps and disturbances d (n_d,), each followed by its derivatives in
-        directions by_x (B, n_x), by_u (B, n, n_u), by_d (B, n, n_d)."""
+        """Return outputs (B, n + 1, 2 n_y) and last states (B, 2 n_x) of a run, each followed by its
+        derivatives in directions by_x (B, n_x), by_u (B, n, n_u), by_d (B, n, n_d)."""
         start = np.hstack([np.broadcast_to(x, by_x.shape), by_x])
         drives, disturbances = (
             np.concatenate([np.broadcast_to(value, by.shape), by], axis=2)
@@ -296,9 +284,8 @@ class PredictionModel:
         return np.stack(columns, axis=1)
 
     def trajectory(self, x: Array, plan: Array, d: Array, blocks: Sequence[int]) -> tuple[Array, Array]:
-        """Return the outputs (N, n_y) after 1...N samples of a plan (n_b, n_u) of blocks, from state x under
-        disturbances d (n_d,), and their derivatives (N, n_y, n_b, n_u), of a linear plant the same array
-        each time."""
+        """Return the outputs (N, n_y) of a plan (n_b, n_u) of blocks after 1...N samples, and their
+        derivatives (N, n_y, n_b, n_u), of a linear plant the same array each time."""
         if self.affine is not None:
             from_zero = self.affine
             by_x, by_rest, G = self.response(tuple(blocks))
@@ -350,16 +337,12 @@ class PredictionModel:
         outputs, gains = list[Array](), list[Array]()
         for block, length in enumerate(blocks):
             for _ in range(length):
-                x_next, A, B, _ = self._casadi_sample(x, plan[block], d)
+                x, A, B, _ = self._by_casadi(x, plan[block], d)
                 sensitivity = np.asarray(np.tensordot(A, sensitivity, axes=1), dtype=np.float64)
                 sensitivity[:, block, :] += B
-                x = x_next.ravel()
                 outputs.append(self.output(x))
                 gains.append(np.asarray(np.tensordot(self.C, sensitivity, axes=1), dtype=np.float64))
         return np.stack(outputs), np.stack(gains)
-
-    def _casadi_sample(self, x: Array, u: Array, d: Array) -> list[Array]:
-        return [np.asarray(value.full()) for value in self._casadi(x, u, d)]
 
     @cached_property
     def _casadi(self) -> Any:
@@ -421,8 +404,7 @@ def _symbolic_step(model: PredictionModel, symbols: list[Any]) -> list[Any]:
 
 
 class _TangentSteps:
-    """A step and its derivative in one direction, as CasADi takes it, for a compiled kernel: state, inputs
-    and disturbances, each followed by its directions (of inputs, the drives' alone)."""
+    """A step and its derivative in one direction for a compiled kernel: x, u, d, each and its direction."""
 
     def __init__(self, model: PredictionModel) -> None:
         import casadi as ca
@@ -534,8 +516,7 @@ class StepResponse:
 def step_response(
     plant: Plant, drive: str, output: str, *, ambient: float = ROOM, longest: float = 14400.0
 ) -> StepResponse:
-    """Simulate a step of a twentieth of a drive's range from rest at ``ambient`` [degC], for ``longest`` s at
-    most, and read gain, delay and lag off it. Shared: read it."""
+    """Read gain, delay and lag off a simulated step of a twentieth of a drive's range. Shared: read it."""
     model = PredictionModel(plant, dt=plant.dt)
     j, i = model.drives.index(drive), model.outputs.index(output)
     x_rest, start, d = model.at_rest(ambient)
@@ -566,19 +547,15 @@ def step_response(
 
 
 def sample_time(plant: Plant) -> float:
-    """Return a sample time [s] for control, on a 1-2-5 grid: a quarter of the longest apparent delay of an
-    output behind the drive that moves it most.
-
-    Where there is next to no delay, a 400th of the lag, 10 s at most; of an output that adds up what it gets,
-    a 40th of the time in which a full drive leads through all that the logs showed.  Never below the plant's
-    own step.
-    """
+    """Return a sample time [s] for control, a multiple of the plant's step near a 1-2-5 grid."""
     sample_times = []
     for output in plant.model.outputs:
         answers = [step_response(plant, drive, output) for drive in drive_names(plant)]
         best = max(answers, key=lambda answer: abs(answer.gain))
         if best.gain:
             low, high = plant.valid.get(output, (-np.inf, np.inf))
+            # a quarter of the delay; where there is next to none, a 400th of the lag, 10 s at most; of what
+            # adds up what it gets, a 40th of the time in which a full drive leads through all of the logs
             through = best.lag * (high - low) / abs(best.gain)
             short = through / 40 if through < best.lag / 20 else min(best.lag, 4000.0) / 400
             sample_times.append(max(best.delay / 4, short))
@@ -596,7 +573,8 @@ class Holding:
     """The drive that holds a target."""
 
     u: Array  # (n_u,) drives
-    y: Array  # (n_y,) all outputs at these drives [degC]
+    x: Array  # (n_x,) the state at these drives
+    y: Array  # (n_y,) all outputs [degC]
     # largest distance of a controlled output from its target [degC]; 0 where the target can be held
     miss: float
 
@@ -610,9 +588,7 @@ def holding_drive(
     within: tuple[Array, Array] | None = None,
 ) -> Holding:
     """Return the drives inside their range, or ``within`` these ends, that hold the controlled outputs
-    nearest to target (n_controlled,) [degC] in the least-squares sense, the smaller of two beyond an optimum;
-    of an integrator, which rests at any temperature or at none, those that balance it there, which may lie
-    outside their range."""
+    nearest to target (n_controlled,) [degC] in the least-squares sense."""
     wanted = np.asarray(target, dtype=float).reshape(len(controlled))
     d = np.asarray(d, dtype=float)
     rows = [model.outputs.index(name) for name in controlled]
@@ -629,12 +605,13 @@ def holding_drive(
         miss, starts[int(np.argmin(costs))], bounds=(low, high), diff_step=[1e-3] * model.n_u, xtol=1e-10
     )
     u = solution.x * model.span
-    y = model.steady_output(u, d)
-    if not np.isfinite(y).all():
+    x = model.steady_state(u, d)
+    if not np.isfinite(x).all():
+        # an integrator, which rests at any temperature or at none: what balances it may be out of range
         x, u = _balance(model, rows, wanted, d)
-        y = model.output(x)
-        return Holding(u, y, float(np.max(np.abs(np.where(np.isfinite(y[rows]), y[rows] - wanted, 1e3)))))
-    return Holding(u, y, float(np.max(np.abs(miss(solution.x)))))
+    y = model.output(x)
+    off = np.where(np.isfinite(y[rows]), y[rows] - wanted, 1e3)
+    return Holding(u, x, y, float(np.max(np.abs(off))))
 
 
 _HELD = 0.25  # of an output's unit: a start that drives miss by less is held
@@ -644,26 +621,19 @@ _HELD = 0.25  # of an output's unit: a start that drives miss by less is held
 def held_start(
     model: PredictionModel, controlled: tuple[str, ...], start: float, d: tuple[float, ...]
 ) -> tuple[Array, Array | None]:
-    """Return the state (n_x,) in which drives inside their range hold the controlled outputs at ``start``
-    [degC] for good, and these drives (n_u,); where none do, that of a plant which is as warm all over, and
-    None. Shared: read it."""
-    wanted = np.full(len(controlled), start)
-    holding = holding_drive(model, controlled, wanted, d)
-    x = model.steady_state(holding.u, d)
-    u = holding.u
-    miss = holding.miss
-    if not np.isfinite(x).all():  # an integrator
-        x, u = _balance(model, [model.outputs.index(name) for name in controlled], wanted, np.array(d))
-        miss = miss if np.all((model.lowest <= u) & (u <= model.highest)) else np.inf
+    """Return the state (n_x,) in which drives (n_u,) hold the controlled outputs at ``start`` [degC] for
+    good, and these; where none do, that of a plant which is as warm all over, and None. Shared: read it."""
+    holding = holding_drive(model, controlled, np.full(len(controlled), start), d)
+    x, u = holding.x, holding.u
     unit = model.unit[[model.outputs.index(name) for name in controlled]].min()
-    if miss < _HELD * unit and np.isfinite(x).all():
+    in_range = np.all((model.lowest <= u) & (u <= model.highest))
+    if in_range and holding.miss < _HELD * unit and np.isfinite(x).all():
         return x, u
     return model.rest(np.full(model.n_y, start), d), None
 
 
 def _balance(model: PredictionModel, rows: list[int], wanted: Array, d: Array) -> tuple[Array, Array]:
-    """Return a state that stays and has these outputs, and its drives, by Newton's method; the state is NaN
-    where there is none."""
+    """Return a state that stays and has these outputs (NaN: there is none), and its drives, by Newton."""
     x, u = model.rest(np.full(model.n_y, wanted.mean()), d), model.neutral
     for _ in range(_NEWTON_STEPS):
         step = model.linearise(x, u, d)

@@ -121,8 +121,7 @@ def review(
 
 
 def spec_of(controller: Reviewed, wanted: tuple[float, float] | None) -> tuple[Spec, bool]:
-    """Return the spec that the controller was tuned for, and whether there is one: else a step over the
-    wanted range [degC], or over what the logs showed."""
+    """Return the spec that the controller was tuned for, else a step; and whether there was one."""
     notes = controller.notes.get("spec")
     if isinstance(notes, Mapping):
         # a file that tells every default may have one that is longer than its steps, or a key that is gone
@@ -134,8 +133,8 @@ def spec_of(controller: Reviewed, wanted: tuple[float, float] | None) -> tuple[S
 
 
 def as_asked(controller: Reviewed, spec: Spec, draws: int, *, noted: bool) -> Check:
-    """Where the model is right, on the plant itself and on draws of it, every step of the spec must settle as
-    asked; of targets that nobody asked for nothing fails."""
+    """Every step of the spec must settle as asked on the plant and on draws; nothing fails that nobody asked
+    for."""
     numbers = sorted({0, *draws_of(controller.plant, draws)})
     results_of_all = run_trials(_again(controller), controller.plant, spec, steps_on(spec, numbers))
     words, verdicts = [], []
@@ -153,8 +152,7 @@ def as_asked(controller: Reviewed, spec: Spec, draws: int, *, noted: bool) -> Ch
 
 
 def after_loads(controller: Reviewed, spec: Spec, draws: int) -> Check:
-    """After a load on each drive and each output, on the plant itself and on draws of it, the loop must come
-    back into the band: one that swings or keeps an offset does not."""
+    """After a load the loop must come back into the band: one that swings or keeps an offset does not."""
     plant, target = controller.plant, spec.steps[0][1]
     numbers = sorted({0, *draws_of(plant, draws)})
     loads = loads_of(plant, spec, controller.design)
@@ -180,8 +178,8 @@ def _again(controller: Reviewed) -> Reviewed:
 
 
 def lacks_structure(controller: Reviewed, spec: Spec) -> Check:
-    """A plant may have what its model lacks: the spec's first step, with each of that in turn, must settle
-    without more overshoot and offset than the spec allows.  Of what the spec does not state nothing fails."""
+    """The spec's first step must settle on plants that have what their model lacks; nothing fails of what
+    the spec does not state."""
     plant, controlled = controller.plant, controller.design.controlled
     doubts = {key: share for key, share in _DOUBTS.items() if not getattr(spec, key)}
     doubted, stated = spec.model_copy(update=doubts), lacking(plant, spec, controlled)
@@ -199,8 +197,7 @@ def lacks_structure(controller: Reviewed, spec: Spec) -> Check:
 
 
 def _stepped(result: StepResult, spec: Spec, *, timed: bool = False) -> tuple[str, str]:
-    """Return what a step did, in words, and graded: it fails where it never settles, and goes three bands too
-    far or ends as far off; its time counts where ``timed``."""
+    """Return what a step did, in words, and graded; its time counts where ``timed``."""
     settled = bool(np.isfinite(result.settle_s))
     late = timed and not result.settle_s <= spec.settle_within_s
     over, off = result.overshoot / spec.overshoot_degC, abs(result.bias) / spec.bias_degC
@@ -276,8 +273,7 @@ def called_good(controller: Reviewed) -> Check:
 def beyond_logs(
     controller: Reviewed, target: float | Mapping[str, float], *, grasps: bool = False
 ) -> list[str]:
-    """Return a sentence for each thing that a session will do and the plant's logs have not done: targets
-    [degC] outside them, a pump that stops for ``grasps``."""
+    """Return a sentence for each thing that a session will do and the plant's logs have not done."""
     wanted = target if isinstance(target, Mapping) else dict.fromkeys(controller.controlled, float(target))
     sentences = []
     for output, value in wanted.items():

@@ -69,7 +69,10 @@ class _Race:
 
     def shortest_time(self) -> float:
         """Return the least time of arrival [s], inf where there is none."""
-        levels = np.clip(_DRIVE_LEVELS[:, None] * self._direction(), self.low, self.high)
+        # the end of each drive (n_u,) that helps: by its gain over the whole time, at rest
+        _, G = self.coarse.trajectory(self.x, self.neutral[None], self.d, [self.n])
+        direction = np.where(self.side * G[-1, self.row, 0] >= 0, self.high, self.low)
+        levels = np.clip(_DRIVE_LEVELS[:, None] * direction, self.low, self.high)
         plans = self._headed_for(np.repeat(levels[:, None], self.n, axis=1))
         heights = self._heights(plans)
         best = int(np.lexsort((-heights.max(axis=1), self._arrivals(heights)))[0])
@@ -83,13 +86,6 @@ class _Race:
             if heights[best, last] <= height[last] + 1e-9:
                 break
         return arrival * self.model.dt
-
-    def _direction(self) -> Array:
-        """Return the end of each drive (n_u,) that helps: by its gain over the whole time, at rest."""
-        blocks = [self.n]
-        _, G = self.coarse.trajectory(self.x, self.neutral[None], self.d, blocks)
-        gain = self.side * G[-1, self.row, 0]
-        return np.where(gain >= 0, self.high, self.low)
 
     def _better_ends(self, plan: Array, last: int) -> Array:
         """Return the end of each drive (1, n, n_u) that raises the height at native sample ``last``."""

@@ -34,11 +34,8 @@ the score is the sum of both.
 All draws have the model's structure.  What a spec states that this may lack (sensors that are slower, a
 longer delay, a weaker drive) is tried on the first draw, and counts as any other.
 
-**Bound.**  Before :func:`thermogrip.mpc.tuning.minimum_time.full_drive_bound` no drive inside its limits
-brings the output into the band.  Staying there takes longer still, since the drive must be taken back in
-time, so a settling time near the bound cannot be improved by weights: the actuator is the limit.  A target
-that may only ramp is in the band no sooner than its ramp brings it there, which is the bound where it is
-later.
+**Bound.**  Before :func:`thermogrip.mpc.tuning.minimum_time.full_drive_bound`, or before its ramp is there,
+no target is reached: a settling time near it cannot be improved by weights, the actuator is the limit.
 """
 
 from __future__ import annotations
@@ -214,11 +211,8 @@ def drawn(plant: Plant, draw: int) -> Plant:
 
 
 def readings_a_move(plant: Plant, output: str, dt: float) -> float:
-    """Return the number of readings of an output, as often as in the logs, come in a sample time [s].
-
-    Where rows of a log were averaged, one reading has the variance s^2, a mean of n of them s^2 / n, and what
-    the fit recorded as the excess of one over a mean is their difference.
-    """
+    """Return how many readings of an output, as often as in the logs, come in a sample time [s]."""
+    # where rows were averaged, the excess of one reading over a mean of n is recorded: s^2 - s^2 / n
     sd, excess = (of.get(output, 0.0) for of in (plant.scores.reading_sd, plant.scores.reading_excess))
     averaged = 1 / (1 - (excess / sd) ** 2) if 0 <= excess < sd < np.inf else 1.0
     return max(1.0, averaged * dt / plant.dt)
@@ -238,9 +232,9 @@ def as_tried(design: Design, plant: Plant) -> Design:
 def surroundings_of(
     spec: Spec, controlled: Sequence[str], plant: Plant, *, filtered_s: float = 0.0
 ) -> Surroundings:
-    """Return the room and the sensors of the trials: the controlled ones are off, the room's are, and those
-    of other disturbances by a share of what the logs showed; noise is that of the logs by output, of which
-    their quantum is a part, and of the mean of the readings in ``filtered_s``, where that is given."""
+    """Return the room and the sensors of the trials, with the noise of the mean of the readings in
+    ``filtered_s``, where that is given."""
+    # of which the logs' quantum is a part
     reading_sd = {name: sd for name, sd in plant.scores.reading_sd.items() if np.isfinite(sd)}
     stated = "noise_degC" in spec.model_fields_set
     offset = dict.fromkeys(controlled, spec.sensor_offset_degC)
@@ -425,11 +419,11 @@ def _cost_of_load(result: StepResult, spec: Spec, scales: Scales) -> float:
 
 
 def bounds_of(plant: Plant, design: Design, spec: Spec, draws: Sequence[int]) -> Bounds:
-    """Return :func:`full_drive_bound` of every step of the spec on these draws, or when the slowest ramp
-    brings its target into the band of its end."""
+    """Return the shortest time of every step on these draws: of full drive, or of the slowest ramp."""
     bounds: Bounds = {}
     for step in spec.steps:
-        ramp_s = max((spec.way(step) / rate for rate in design.ramp_per_s.values()), default=0.0)
+        way = abs(step[1] - step[0]) - spec.band_degC
+        ramp_s = max((way / rate for rate in design.ramp_per_s.values()), default=0.0)
         for draw in draws:
             bound = full_drive_bound(drawn(plant, draw), design, step, spec)
             bounds[(*step, draw)] = float(np.maximum(bound, ramp_s))  # NaN stays NaN

@@ -112,12 +112,10 @@ class Row:
     target: float
     settle_mean_s: float  # NaN where it did not settle on some draw
     settle_worst_s: float
-    overshoot_mean: float  # [degC]; the mean bias is of its size
+    overshoot_mean: float  # [degC], and the bias
     overshoot_worst: float
-    bias_mean: float
     bias_worst: float
     energy_mean_s: float  # over the draws
-    energy_worst_s: float
     travel_mean: float
     full_share: float
     bound_s: float  # before this no drive is in the band [s], mean over the draws; NaN of a load
@@ -148,7 +146,7 @@ def _score_row(name: str, part: Sequence[StepResult], bounds: Bounds) -> Row:
     def most(figure: str) -> float:
         return float(np.max([getattr(result, figure) for result in part]))
 
-    first, biases = part[0], [result.bias for result in part]
+    first = part[0]
     return Row(
         controller=name,
         start=first.start,
@@ -157,10 +155,8 @@ def _score_row(name: str, part: Sequence[StepResult], bounds: Bounds) -> Row:
         settle_worst_s=most("settle_s"),
         overshoot_mean=mean("overshoot"),
         overshoot_worst=most("overshoot"),
-        bias_mean=float(np.mean(np.abs(biases))),
-        bias_worst=max(biases, key=abs),
+        bias_worst=max((result.bias for result in part), key=abs),
         energy_mean_s=mean("energy_s"),
-        energy_worst_s=most("energy_s"),
         travel_mean=mean("travel"),
         full_share=mean("full_share"),
         bound_s=np.nan if first.load else float(np.mean([bounds[(*first.step, of.draw)] for of in part])),
@@ -375,7 +371,7 @@ class Bench:
     def run(
         self, kind: str, design: Design, draws: Sequence[int], seed: int, *, loads: bool = True
     ) -> list[StepResult]:
-        """Return the results on these draws: of steps, of what the plant lacks on the first, and of loads."""
+        """Return the results on these draws, what the plant lacks on the first alone."""
         cases = [
             replace(case, seconds=self.lengths[case.start, case.target])
             for case in steps_on(self.spec, draws)
@@ -553,8 +549,7 @@ def _final(
 
 
 def kept_of(scores: Mapping[str, float]) -> str:
-    """Return which controller is saved: a tuned MPC only where it wins what counts against the default one, a
-    PI where it scores less than the MPC that would be."""
+    """Return which controller is saved: a tuned MPC only where it wins what counts, a PI where it is best."""
     mpc = "tuned" if scores["tuned"] < (1 - SEARCH.won) * scores["baseline"] else "baseline"
     return "PI" if scores.get("PI", np.inf) < scores[mpc] else mpc
 
@@ -588,8 +583,7 @@ def best_of(parts: Mapping[str, Score], where: str, unknown: Sequence[str] = ())
 
 
 def verdict_of(spec: Spec, least: float, default: float, rows: Sequence[Row]) -> tuple[str, str]:
-    """Return the verdict and its reason in a sentence, from the least score, that of the default design and
-    the kept controller's rows of steps."""
+    """Return the verdict, and its reason in a sentence from the kept controller's rows of steps."""
     slowest = max(rows, key=lambda row: row.bound_s)
     if slowest.bound_s > spec.settle_within_s:
         step, needs = f"{slowest.start:g} to {slowest.target:g}", f"takes at least {slowest.bound_s:.0f} s"
@@ -609,8 +603,7 @@ def verdict_of(spec: Spec, least: float, default: float, rows: Sequence[Row]) ->
 def _runs_as_used(
     bench: Bench, candidates: Mapping[str, Trial], controller: Controller | PIController
 ) -> dict[str, ClosedLoop]:
-    """Return every step and load on the first unseen draw by the controller that is saved, and by the best of
-    the other kind."""
+    """Return every step and load on one unseen draw, of what is saved and of the best of the other kind."""
     saved = "PI" if isinstance(controller, PIController) else "MPC"
     designs = {saved: controller.design}
     if other := candidates.get("tuned" if saved == "PI" else "PI"):

@@ -18,7 +18,7 @@ from thermogrip.mpc.controllers.mpc import Controller
 from thermogrip.mpc.tuning.design_review import Check
 from thermogrip.mpc.tuning.tune import Row
 
-ROW = Row("tuned", 28.0, 38.0, 90.0, 95.0, 0.1, 0.2, 0.01, 0.01, 7.0, 7.0, 2.0, 0.5, 80.0)
+ROW = Row("tuned", 28.0, 38.0, 90.0, 95.0, 0.1, 0.2, 0.01, 7.0, 2.0, 0.5, 80.0)
 ROWS = (("tuned", "28 to 38", 90.0, 95.0, 0.1, 0.2, 0.01, 7.0, 80.0),)
 
 

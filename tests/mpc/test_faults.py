@@ -193,7 +193,7 @@ class Driver:
         elif what == "solver" and self.c is not None:
             self.c.design.iteration_limit = -1
         elif what == "solver":
-            bad = Outcome(np.full((1, 1), NAN), np.zeros((1, 2)), "iteration limit", {}, 0, np.ones(1))
+            bad = Outcome(np.full((1, 1), NAN), np.zeros((1, 2)), "iteration limit", {}, np.ones(1))
             self.controller.optimiser.solve = lambda *args, **kwargs: bad
 
     def mends(self) -> None:

@@ -30,8 +30,8 @@ def run(
     surroundings: Surroundings | None = None,
 ) -> ClosedLoop:
     design = default_design(KIT, dt=4.0)
-    loops = tuple(replace(loop, Kc=gain * loop.Kc) for loop in design.loops)
-    loop = RecordedController(PIController(KIT, design, loops=loops), LoopMonitor(KIT, design, loops))
+    design = replace(design, loops=tuple(replace(loop, Kc=gain * loop.Kc) for loop in design.loops))
+    loop = RecordedController(PIController(KIT, design), LoopMonitor(KIT, design))
     return simulate_closed_loop(loop, plant, [(target, seconds)], surroundings=surroundings)
 
 

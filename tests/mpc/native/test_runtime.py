@@ -178,7 +178,7 @@ def test_a_pi_in_c_that_reads_what_cannot_be_answers_as_python_does(tclab):
 
 def _with_pi(c, loops, truth, schedule, **about) -> tuple[ClosedLoop, ClosedLoop]:
     """Return the loop of a PI under the limits of a compiled controller's design, in Python and in C."""
-    python, compiled = (PIController(c.plant, c.design, loops=loops) for _ in range(2))
+    python, compiled = (PIController(c.plant, replace(c.design, loops=loops)) for _ in range(2))
     compiled.c = c.c
     loop = simulate_closed_loop(python, truth, schedule, **about)
     return loop, compiled_loop(compiled, truth, schedule, **about)

@@ -236,6 +236,6 @@ def test_a_solve_predicts_what_its_plan_does_and_parks_what_is_lost(optimiser):
         solve=lambda *given: QPAnswer(np.full(6, np.nan), "cycling", 4, None, None)
     )
     failed = optimiser.solve(Sample(START, LAST, guess, room, **ask))
-    assert (failed.status, failed.broken, failed.iterations) == ("cycling", {}, 4)
+    assert (failed.status, failed.broken) == ("cycling", {})
     assert np.isnan(failed.plan).all()
     np.testing.assert_allclose(failed.y, outputs(guess + bias), atol=1e-9)
