@@ -9,9 +9,6 @@ part in that choice either.  The one that is kept, and the network, are scored b
 of each log, fitted without them and run freely from the log's start, where its state is known.  When a plant
 is called good is in :mod:`thermogrip.sysid.validation.verdict`.
 
-The plant that is returned is fitted to everything; its scores on its own logs are listed beside, marked as
-in-sample.
-
 **Which candidate is kept.**  Among black boxes the one of the least error on parts held out, a linear one
 where another kind errs less by no more than a standard error and 5 percent.  On another run the gain differs
 besides (:mod:`thermogrip.sysid.validation.prediction_bands`): of one or two logs that is added to the errors,
@@ -448,10 +445,7 @@ def cases_of(logs: Sequence[Log], leave_one_out: bool) -> list[Case]:
 
 
 def run_held_out(plant: Plant, held: Held, *, unseen: bool = False) -> FreeRun:
-    """Return the free run over what is held out; ``unseen`` by the fit, a neural model may be refused for it.
-
-    Members of a neural model that disagree over what they have not seen have a mean that means nothing.
-    """
+    """Return the free run over what is held out; ``unseen`` by the fit, a neural model may be refused."""
     # a log may begin warm, and then its state needs more readings than one that begins at rest
     warmup = max(5.0 if held.score_from == 0 else warm_up_of(held.log["time"].values), plant.dt)
     if unseen and plant.model.kind == "neural":
@@ -583,16 +577,14 @@ def _fitted(
 
 
 def choose_black_box(fits: Sequence[BlackBoxFit], logs: Sequence[Log]) -> BlackBoxFit:
-    """Return the fit of the least error on the parts, a linear one where another kind errs barely less.
-
-    Among linear kinds the smaller one of two that tie was no better on 14 public logs (in the geometric mean
-    both err 1.34 times the best structure of all), nor was the one of the less error on the whole log of its
-    fit, run from its start (1.69 times, 1.37 where it decides within 5 percent)."""
+    """Return the fit of the least error on the parts, a linear one where another kind errs barely less."""
     run = _run_error(fits, logs)
     most = HARDLY_MORE if len(fits[0].grid.logs) < SEVERAL else MORE_BY_LOGS
     errors = [np.log(np.hypot(fit.choice.errors[fit.choice.structure], run)) for fit in fits]
     by_error = sorted(range(len(fits)), key=lambda k: float(errors[k].mean()))
     best = by_error[0]
+    # the smaller of two linear kinds that tie was no better on 14 public logs, nor the one of the less error
+    # over the whole log of its fit (1.69 times the best structure of all in the geometric mean, for 1.34)
     linear = next((k for k in by_error if fits[k].kind in LINEAR), best)
     return fits[linear if excess_within_noise(errors[linear] - errors[best], most) else best]
 

@@ -25,9 +25,8 @@ from thermogrip.sysid.blackbox import output_error
 
 
 def solve_armax(c: Array, records: output_error.Records, nb: int, delay: int) -> output_error.Solution | None:
-    """Solve for a, b, the constant and what begins a segment at this C; None where 1/C is unstable;
-    ``shared`` of the solution are a, b and the constant, its ``outputs`` -e, whose slopes by C are those of
-    an output-error model by A."""
+    """Solve for a, b, the constant and what begins a segment at this C, ``outputs`` being -e; None where 1/C
+    is unstable."""
     if not output_error.is_stable(c):
         return None
     na, n_shared = len(c), len(c) + records.n_drive * nb + 1

@@ -7,9 +7,8 @@ w are inputs, disturbances and products of inputs (``|drive|``: a Peltier elemen
 hold those of all smaller ones, and several logs only add rows.  Rows that would reach across a gap or use a
 lost reading are left out.
 
-Its weakness is known: noise on the *regressors* pulls the poles towards fast ones, the more the finer the
-sampling.  Hence block averages first, and a choice by free run and never by the one-step error that is
-minimised here.
+Noise on the *regressors* pulls the poles towards fast ones, the more the finer the sampling: hence block
+averages first, and a choice by free run.
 """
 
 from __future__ import annotations
@@ -53,18 +52,17 @@ class _Regression:
 def arx_family(
     grid: Grid,
     *,
+    # an arm that bends errs 25 times as much with three poles as with eight; fewer rows of the drives than
+    # poles and delays of four rows changed no choice on 14 public logs
     poles: Sequence[int] = (1, 2, 3, 4, 6, 8),
     delays: Sequence[int] = (1, 2),
     terms: Sequence[tuple[str, ...]] | None = None,
     only: Collection[Structure] | None = None,
 ) -> Mapping[Structure, StateSpaceModel]:
-    """Return an ARX model for each structure that gives a stable one, delays n_k in rows.
-
-    An arm that bends errs 25 times as much with three poles as with eight; on slow plants the folds keep one
-    or two.  Fewer rows of the drives than poles and delays of four rows changed no choice on 14 public logs.
-    """
+    """Return an ARX model for each structure that gives a stable one, delays n_k in rows."""
     out = {}
-    couplings = (False, True) if len(grid.outputs) > 1 else (True,)
+    n_y, n_drive = len(grid.outputs), len(grid.inputs) + len(grid.disturbances)
+    couplings = (False, True) if n_y > 1 else (True,)
     for products in default_terms(grid) if terms is None else terms:
         for kept_poles, kept_delays in _orders_to_try(poles, delays):
             regression = _regress(grid, products, max(kept_poles) + max(kept_delays) - 1)
@@ -73,20 +71,16 @@ def arx_family(
         else:
             continue
         for n, delay, coupled in product(kept_poles, kept_delays, couplings):
-            tried = _Orders(n, delay, coupled)
-            structure = _arx_structure(grid, products, tried)
-            model = _solve(grid, products, regression, tried) if only is None or structure in only else None
+            own_and_driven = (n_y if coupled else 1) + n_drive + len(products)
+            label = f"na {n}, nb {n}, delay {delay}" + (", coupled" if coupled and n_y > 1 else "")
+            label += f", with {', '.join(products)}" if products else ""
+            structure = Structure(label, n_y * (n * own_and_driven + 1))
+            if only is not None and structure not in only:
+                continue
+            model = _solve(grid, products, regression, _Orders(n, delay, coupled))
             if model is not None:
                 out[structure] = model
     return out
-
-
-def _arx_structure(grid: Grid, terms: tuple[str, ...], orders: _Orders) -> Structure:
-    n_y, n_drive = len(grid.outputs), len(grid.inputs) + len(grid.disturbances) + len(terms)
-    size = n_y * (orders.poles * (n_y if orders.coupled else 1) + n_drive * orders.poles + 1)
-    label = f"na {orders.poles}, nb {orders.poles}, delay {orders.delay}"
-    label += ", coupled" if orders.coupled and n_y > 1 else ""
-    return Structure(label + (f", with {', '.join(terms)}" if terms else ""), size)
 
 
 def _orders_to_try(

@@ -1,19 +1,16 @@
 """Black-box fits: choose a structure, fit it to all logs, resample it to see how certain it is.
 
 The kinds (:data:`BLACK_BOXES`) differ in the family of models
-(:class:`thermogrip.sysid.blackbox.order_selection.Family`); averaging, the choice by held-out free run and
-what the plant keeps are the same for all.  Where the averaging is not prescribed, both the averaged rate and
-the logs' own are tried: a coarse converter calls for the former, a delay for the latter.  The step that
-subspace models choose serves the other kinds as well as their own search (14 public logs: no choice differs).
+(:class:`thermogrip.sysid.blackbox.order_selection.Family`).  Where the averaging is not prescribed, both the
+averaged rate and the logs' own are tried: a coarse converter calls for the former, a delay for the latter.
+The step that subspace models choose serves the other kinds as well (14 public logs: no choice differs).
 
 **Uncertainty: dependent wild bootstrap** [1]_.  A black box has no parameters whose prior and likelihood
-could be written down, and its errors are not white: they depend on the input where the structure is wrong.
-So the chosen structure is fitted anew to readings that might have been: the free run of the fit plus its
-error times a random course w of mean 0, variance 1 and the correlation exp(-(t - s)^2 / l^2), l longer than
-the errors are correlated.  That keeps inputs, lengths and starts, and the errors' size and correlation where
-they were.  The spread of the refits estimates how the fit would differ had the same rig been logged again;
-what the logs do not contain (a room that was never colder) is in no refit.  The structure is not chosen
-again: held-out free runs show how good it is.  Refits whose free run over all logs errs more than 1.5 times
+could be written down, and its errors are not white.  So the chosen structure is fitted anew to readings that
+might have been: the free run of the fit plus its error times a random course w of mean 0, variance 1 and the
+correlation exp(-(t - s)^2 / l^2), l longer than the errors are correlated.  The spread of the refits
+estimates how the fit would differ had the same rig been logged again.  The structure is not chosen again:
+held-out free runs show how good it is.  Refits whose free run over all logs errs more than 1.5 times
 as much as that of the fit do not agree with the logs and are rejected.
 
 References
@@ -247,10 +244,7 @@ def _with_convention(
 def with_refits(
     fit: BlackBoxFit, n: int = 24, *, seed: int = 0, progress: Callable[[float, str], None] | None = None
 ) -> Plant:
-    """Return the plant with ``n`` refits to resampled errors, for :meth:`Plant.draw`.
-
-    Raises a UserError where the logs are too short, or too few of the refits agree with them.
-    """
+    """Return the plant with ``n`` refits to resampled errors, for :meth:`Plant.draw`."""
     if fit.kind not in RESAMPLED:
         raise ValueError(f"{fit.kind} is not refitted; choose from {', '.join(RESAMPLED)}")
     rows = sum(len(segment.time) for segment in fit.grid.segments)

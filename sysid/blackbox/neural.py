@@ -10,16 +10,14 @@ segments, are then fitted by Levenberg-Marquardt with exact sensitivities
 s the error of the linear fit in units of the spread and rho = :data:`RIDGE`.  Each segment has an initial
 state of its own.  Several members start from different random W, U, b.
 
-**The mean of members of all sizes.**  A descent may end in a poor minimum: the quarter that fits its own data
-worst is left out.  A member may fit the data and still diverge from the others elsewhere: the rest run over
-the training inputs in reverse order, and the three quarters nearest to their median are kept.  Single sizes
-differ from fold to fold by luck, their mean by less; in the one-standard-error rule it counts as no larger
-than the smallest.
+**The mean of members of all sizes.**  The quarter that fits its own data worst is left out (a poor minimum);
+the rest run over the training inputs in reverse order, and the three quarters nearest to their median are
+kept.  Single sizes differ from fold to fold by luck, their mean by less; in the one-standard-error rule it
+counts as no larger than the smallest.
 
 **Members.**  On held-out parts of a two-tank record the error of the mean of n trained members was about
-0.270 + 0.42/n V for n = 6 to 36.  So the last fit trains :data:`TOGETHER` times as many members as each fold.
-Twelve a fold are enough to choose by: with 36 the acidity of a stirred tank errs by 0.79 on its other half as
-well, with six by 1.09.
+0.270 + 0.42/n V for n = 6 to 36, so the last fit trains :data:`TOGETHER` times as many as each fold: twelve
+are enough to choose by (the acidity of a stirred tank errs by 0.79 with 12 and 36, by 1.09 with six).
 """
 
 from __future__ import annotations
@@ -105,9 +103,7 @@ def neural_family(
     members: int | None = None,
     only: Collection[Structure] | None = None,
 ) -> Mapping[Structure, NeuralModel]:
-    """Return the mean of members of each number of states and units, each started from ``members`` random
-    weights: 2 where absent, 1 with more than :data:`MANY` readings, and with ``only``, in the last fit,
-    :data:`TOGETHER` times as many."""
+    """Return the mean of members of each number of states and units, each from ``members`` random starts."""
     n_y, n_w = len(grid.outputs), len(grid.inputs) + len(grid.disturbances)
     orders = range(n_y + 1, max(5, n_y + 2)) if states is None else states
     sizes = list(product(orders, units))

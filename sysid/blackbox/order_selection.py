@@ -1,8 +1,8 @@
 """Order selection by free run on held-out parts.
 
-One-step error cannot choose a model: on a slow plant the last reading alone predicts the next one well,
-input or not. Every structure is therefore fitted on part of the data and *simulated* over the rest. With
-three or more logs each log is held out in turn: a run from its start.  Of one or two logs
+Every structure is fitted on part of the data and *simulated* over the rest (on a slow plant the last reading
+alone predicts the next one well). With three or more logs each log is held out in turn: a run from its start.
+Of one or two logs
 
 * each of four consecutive blocks is: the readings of a short warm-up set the state, the others are scored,
   and the second half is run once more from a warm-up of its own;
@@ -119,18 +119,16 @@ def folds(grid: Grid, *, blocks: int = _CUTS) -> list[Fold]:
     """Return the parts that are held out in turn: those whose rest moves each input that they move, or all
     where these are fewer than two."""
     if len(grid.logs) >= SEVERAL:
-        parts = [_whole_log(grid, name) for name in grid.logs]
+        by_log = {name: [s for s in grid.segments if s.log == name] for name in grid.logs}
+        parts = [
+            Fold(name, grid.having([s for s in grid.segments if s.log != name]), tuple(map(Run, held_out)))
+            for name, held_out in by_log.items()
+        ]
     else:
         parts = [*_cut_blocks(grid, blocks), _last_parts(grid)]
     range_of = np.ptp(np.concatenate([segment.u for segment in grid.segments]), axis=0)
     excited = [part for part in parts if _moves_all(part, least=MOVED * range_of)]
     return excited if len(excited) >= 2 else parts
-
-
-def _whole_log(grid: Grid, name: str) -> Fold:
-    training = [segment for segment in grid.segments if segment.log != name]
-    runs = tuple(Run(segment) for segment in grid.segments if segment.log == name)
-    return Fold(name, grid.having(training), runs)
 
 
 def _cut_blocks(grid: Grid, blocks: int) -> list[Fold]:
@@ -224,9 +222,8 @@ def choose(
     progress: Callable[[float, str], None] | None = None,
     beat: Mapping[str, float] | None = None,
 ) -> Choice:
-    """Fit every structure of the family on every fold and choose by the one-standard-error rule; refuse
-    where after two folds or more every structure errs :data:`_HOPELESS_RATIO` times what it has to ``beat``
-    (errors by fold)."""
+    """Fit every structure on every fold and choose by the one-standard-error rule; refuse where after two
+    folds or more all err :data:`_HOPELESS_RATIO` times what they have to ``beat`` (errors by fold)."""
     cases = folds(grid)
     scored = _score(grid, family, cases, warmup, progress, beat or {})
     structure, fitted = _first_sound(grid, family, scored, warmup)
@@ -376,8 +373,7 @@ def column_sizes(norms: Array) -> Array:
 
 def default_terms(grid: Grid) -> tuple[tuple[str, ...], ...]:
     """Return sets of products worth trying: none, and where there are any the magnitudes of signed inputs (a
-    Peltier element heats and cools unequally) or the squares of others that show their curvature (Joule
-    heat)."""
+    Peltier heats and cools unequally) or the squares of others that show their curvature (Joule heat)."""
     u = np.concatenate([segment.u for segment in grid.segments])
     signed = [n for i, n in enumerate(grid.inputs) if u[:, i].min() < 0 < u[:, i].max()]
     curved = [n for n, values in zip(grid.inputs, u.T) if n not in signed and _shows_curvature(values)]

@@ -18,8 +18,7 @@ output v
 
     dv/da_i = - q^-i v / A(q)
 
-is a shift of one filtered row as well.  Shifts are nearly alike where poles are slow: normal equations would
-leave costs that depend on rounding, hence a QR.
+is a shift of one filtered row as well.  Shifts are nearly alike where poles are slow: hence a QR.
 
 **Many structures, few searches.** The first structure of each denominator order starts from the ARX fit,
 from real poles at several time constants and from the order below with one fast pole more; all go a few
@@ -159,11 +158,8 @@ def refine(
 
 
 def _triangles(parts: Sequence[Array], na: int) -> tuple[Array, list[Array]]:
-    """Return R of the QR of all rows [own | rest], the own columns of each part projected out, and R by part.
-
-    The parts are transposed, (na + n_rest, n).  Normal equations would square the condition, and columns
-    that are shifts of one another are nearly dependent.
-    """
+    """Return R of the QR of all rows [own | rest], the own columns of each part (na + n_rest, n) projected
+    out, and R by part."""
     triangles = [_square_r(rows.T) for rows in parts]
     shared_triangles = [R[na:, na:] for R in triangles]
     return (
@@ -301,7 +297,10 @@ def oe_family(
     grid: Grid,
     *,
     poles: Sequence[int] = (1, 2, 3),
-    zeros: Sequence[int] = (1, 2),
+    zeros: Sequence[int] = (
+        1,
+        2,
+    ),  # two alone err by up to 41 % more on the rig's four logs, left out in turn
     delays: Sequence[int] = (1, 2, 3),
     terms: Sequence[tuple[str, ...]] | None = None,
     only: Collection[order_selection.Structure] | None = None,
@@ -309,8 +308,7 @@ def oe_family(
     search: type[Search] | None = None,
 ) -> Mapping[order_selection.Structure, StateSpaceModel]:
     """Return a model for each structure that has a stable one, by ``search`` of output error where absent;
-    ``searches``, empty at first, remember the denominators of fits before.  Numerators of two rows alone err
-    alike on 14 public logs, and on the rig's four, left out in turn, by up to 41 % more."""
+    ``searches``, empty at first, remember the denominators of fits before."""
     out, kind = {}, search or Search
     searches = [] if searches is None else searches
     searches += [kind() for _ in grid.outputs[len(searches) :]]
@@ -335,11 +333,8 @@ def oe_family(
 def assemble(
     grid: Grid, filters: Sequence[Filter], terms: tuple[str, ...], *, origin: str
 ) -> StateSpaceModel:
-    """Return the state-space model of one filter per output, block by block, in observer form.
-
-    Observer form: v_1+ = -a_1 v_1 + v_2 + (numerator row) w, ..., y = v_1; a delay of n_k adds n_k - 1 rows
-    of pure shift in front of the numerator, so that delays are states.
-    """
+    """Return the model of one filter per output, block by block, in observer form: v_1+ = -a_1 v_1 + v_2 +
+    (numerator row) w, ..., y = v_1, behind n_k - 1 rows of pure shift for a delay of n_k."""
     A = []
     W = []
     c = []

@@ -39,10 +39,8 @@ def sindy_family(
     memories: Sequence[int] = (1, 2),
     only: Collection[Structure] | None = None,
 ) -> Mapping[Structure, SindyModel]:
-    """Return a model for each degree, threshold and memory whose simulation stays bounded.
-
-    Thresholds of STLSQ are relative to the largest coefficient, ``memories`` are past values of each output.
-    """
+    """Return a model for each degree, threshold (a share of the largest coefficient) and memory (values of
+    each output) whose simulation stays bounded."""
     out: dict[Structure, SindyModel] = {}
     n_y, outside = len(grid.outputs), len(grid.inputs) + len(grid.disturbances)
     for degree, memory in product(degrees, memories):

@@ -70,8 +70,7 @@ def subspace_family(
     triangles: Triangles | None = None,
 ) -> Mapping[Structure, StateSpaceModel]:
     """Return a model for each order, number of block rows f and weighting that the data allow; where absent,
-    ``rows`` are 3, 5, 8, 15 and 30 as far as the data allow (2 where they allow none), and ``terms`` none and
-    the magnitudes of signed inputs, or else the squares of others; ``triangles``, empty at first,
+    ``rows`` are 3, 5, 8, 15 and 30 (2 where the data allow none of these); ``triangles``, empty at first,
     keep what segments add for later fits."""
     triangles = WeakKeyDictionary() if triangles is None else triangles
     models: dict[Structure, StateSpaceModel] = {}
@@ -84,19 +83,17 @@ def subspace_family(
     if rows is None and only is None:
         sizes = [f for f in sizes if 6 * f < longest and (few or f > 2)]
     for some in sets:
+        products = f", with {', '.join(some)}" if some else ""
         names = {
-            (f, w, n): _structure(n, f, w, some, n_drive, n_y)
+            (f, w, n): Structure(
+                f"order {n}, {f} block rows, {w}{products}", n * (n_drive + len(some) + n_y + 1)
+            )
             for f, w, n in product(sizes, weightings, orders)
             if n < f or (f == 2 and n <= n_y)
         }
         wanted = {of: name for of, name in names.items() if only is None or name in only}
         models |= {wanted[of]: model for of, model in _realised(grid, wanted, some, triangles).items()}
     return models
-
-
-def _structure(n: int, f: int, weighting: str, some: Sequence[str], n_drive: int, n_y: int) -> Structure:
-    label = f"order {n}, {f} block rows, {weighting}" + (f", with {', '.join(some)}" if some else "")
-    return Structure(label, n * (n_drive + len(some) + n_y + 1))
 
 
 def _realised(
@@ -154,11 +151,9 @@ def fit_inputs(grid: Grid, A: Array, C: Array, terms: tuple[str, ...] = ()) -> S
 
 
 def _unit_responses(drive: Array, A: Array, C: Array) -> Array:
-    """Simulate each output for each unit entry of [B E F c], drive by drive, then of x0: (n_y, N, n_w n + n).
-
-    An entry e_k moves output i by C_i A^j e_k after j + 1 rows, which is entry k of A'^j C_i': one run of the
-    transposed system, pushed by the drive along C_i, has the responses to all n entries.
-    """
+    """Simulate outputs for each unit entry of [B E F c], drive by drive, then of x0: (n_y, N, n_w n + n)."""
+    # An entry e_k moves output i by C_i A^j e_k after j + 1 rows, which is entry k of A'^j C_i': one run of
+    # the transposed system, pushed by the drive along C_i, has the responses to all n entries.
     from thermogrip.sysid.models.recurrences import run_linear  # pulls in numba
 
     n_y, n = C.shape
@@ -206,10 +201,7 @@ Triangles = WeakKeyDictionary[Segment, dict[tuple[int, tuple[str, ...], bool], _
 
 
 def _triangle(grid: Grid, f: int, terms: tuple[str, ...], triangles: Triangles) -> Array | None:
-    """Return R of the QR of all windows, signals at unit spread; None with too few windows.
-
-    What a segment adds does not depend on the others, so that its own triangle serves each fold that has it.
-    """
+    """Return R of the QR of all windows, signals at unit spread; None with too few windows."""
     readings = whole_readings(grid.segments, 2 * f)
     whole = np.hstack([np.concatenate(drives(grid, terms)), np.concatenate(readings)])
     mean, size = np.nanmean(whole, axis=0), np.nanstd(whole, axis=0)
@@ -221,7 +213,11 @@ def _triangle(grid: Grid, f: int, terms: tuple[str, ...], triangles: Triangles) 
             continue
         known, key = triangles.setdefault(segment, {}), (f, terms, y is not segment.y)
         if key not in known:
-            known[key] = _windows_of(np.hstack([drives_of(grid, segment, terms), y]), n_w, f)
+            z = np.hstack([drives_of(grid, segment, terms), y])
+            own_mean = np.nan_to_num(np.nanmean(z, axis=0))
+            rows = _windows(z - own_mean, n_w, f)
+            # its own triangle, which does not depend on the other segments, serves each fold that has it
+            known[key] = _Windows(np.asarray(np.linalg.qr(rows, mode="r")), len(rows), own_mean)
         windows = known[key]
         shift = _by_column(windows.mean - mean, n_w, f, constant=0.0)
         scale = _by_column(per_unit, n_w, f, constant=1.0)
@@ -231,12 +227,6 @@ def _triangle(grid: Grid, f: int, terms: tuple[str, ...], triangles: Triangles) 
     if not parts or count < 1.5 * parts[0].shape[1]:
         return None
     return np.asarray(np.linalg.qr(np.concatenate(parts), mode="r"))
-
-
-def _windows_of(z: Array, n_w: int, f: int) -> _Windows:
-    mean = np.nan_to_num(np.nanmean(z, axis=0))
-    rows = _windows(z - mean, n_w, f)
-    return _Windows(np.asarray(np.linalg.qr(rows, mode="r")), len(rows), mean)
 
 
 def _by_column(of_signal: Array, n_w: int, f: int, *, constant: float) -> Array:

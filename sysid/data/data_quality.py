@@ -9,14 +9,12 @@ Every finding has a verdict (``ok``, ``warn``, ``fail``) and a consequence in wo
 * **excitation**: the order n up to which the input is persistently exciting, that is, the rank of the
   covariance of n successive values, and the condition of the correlation between the inputs;
 * **feedback** from output to input: with u[k] regressed on its own past, does the past of y help?  An F test
-  in which only rows count at which the input moves: a level that is held adds nothing, and an output
-  that settles under it shows how long it has been held.  A relay is asked whether it is switched at the same
+  in which only rows count at which the input moves.  A relay is asked whether it is switched at the same
   readings; of one that is on for a share of even windows the shares are tested.  In closed loop the noise is
   in the input too, and equation-error fits are biased.
 
 :func:`evidence` says what a plant rests on: between which temperatures, and the minutes of each kind of
-drive. A model fitted on an hour of heating and two minutes of cooling is a model of heating.  Nothing in its
-errors shows that, for what is rare weighs little in them; the minutes do.
+drive, for what is rare weighs little in its errors.
 """
 
 from __future__ import annotations
@@ -205,16 +203,13 @@ def _quantum(channel: _Channel, averaged: float | None) -> Finding:
 
 
 def _sensorless_output(channel: _Channel) -> Finding:
-    """Question an output that no sensor reads: one that is constant but for jumps, or has no noise at all.
-
-    The noise is that of third differences, of which a smooth course has little; its variance is 20 times that
-    of white noise.
-    """
+    """Question an output that no sensor reads: one that is constant but for jumps, or has no noise at all."""
     values = channel.values[np.isfinite(channel.values)]
     unit, name = channel.unit, channel.name
     spread, moves = float(np.ptp(values)), np.diff(values)
     if values.size < _CHECKS.fewest_readings or not spread:
         return channel.found("noise", 0.0, unit, "ok", f"{name}: too few readings to see noise")
+    # third differences, of which a smooth course has little, have 20 times the variance of white noise
     noise = float(np.median(np.abs(np.diff(values, 3)))) / 0.6745 / np.sqrt(20.0)
     jumps = int(np.count_nonzero(moves))
     # a coarse sensor moves by one step of its converter, to and fro
@@ -326,11 +321,8 @@ def _helped(X: Array, Z: Array, v: Array, moves: int) -> tuple[float, float]:
 
 
 def _relay_feedback(grid: Grid, at: int, name: str) -> Finding:
-    """Tell whether a relay is switched where an output reaches the same reading again.
-
-    Of two switchings in the same direction the difference of the readings is compared with their range
-    between the two.  A clock switches so as well, once the plant has settled: its holds are all alike.
-    """
+    """Tell whether a relay is switched where an output reaches the same reading again, beside the range of
+    readings between; a clock does so too once the plant has settled, but its holds are all alike."""
     least, switchings = np.inf, 0
     lengths: set[int] = set()
     for output in range(len(grid.outputs)):

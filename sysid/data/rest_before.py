@@ -72,7 +72,6 @@ def _first_readings(log: Log, outputs: Sequence[str], n: int) -> dict[str, float
 
 
 def _begun_earlier(log: Log, readings: dict[str, float]) -> Log:
-    """Return the log with its first row held before it, and these readings."""
     time = np.asarray(log["time"].values, dtype=float)
     step = float(np.median(np.diff(time)))
     longer = log.isel(time=np.r_[np.zeros(_ADDED, dtype=int), : len(time)])

@@ -53,11 +53,7 @@ def in_columns(model: NetworkModel, log: Log) -> NetworkModel:
 
 
 def in_log_units(model: NetworkModel, logs: Sequence[Log]) -> NetworkModel:
-    """Return a network that takes its inputs in the logs' units, so that plant and controller speak them.
-
-    A share of full scale is one in every unit: ``full_scale``, ``range`` and ``step`` are written in that of
-    the logs.
-    """
+    """Return a network with ``full_scale``, ``range`` and ``step`` of its inputs in the logs' units."""
     inputs = dict(model.network.inputs)
     for name, item in inputs.items():
         columns = [log for log in logs if name in log]
@@ -77,11 +73,8 @@ def in_log_units(model: NetworkModel, logs: Sequence[Log]) -> NetworkModel:
 
 
 def in_logged_room(model: NetworkModel, logs: Sequence[Log]) -> tuple[NetworkModel, list[str]]:
-    """Return a network whose room nobody measures with the prior that the logs have of it, and a line on it.
-
-    A room is a boundary with a name of surroundings.  All logs have one column of such a name, in degC, that
-    is no signal of the network, whether it moves or not.
-    """
+    """Return a network whose room nobody measures with the prior that a column of a room's name in all logs
+    has of it, and a line on it."""
     network = model.network
     rooms = [item.temperature for item in network.boundaries.values() if _is_room(item.temperature, "degC")]
     signals = {*network.inputs, *network.disturbances, *network.outputs}

@@ -76,11 +76,8 @@ def signal_roles(
     network: GreyModel | None,
     still: Sequence[str] = (),
 ) -> tuple[tuple[SignalRole, ...], list[str]]:
-    """Return what each column of the logs was taken for: inputs, disturbances, outputs, the rest.
-
-    And, where no list names them, a line for each log with signals that the first one, which says what is
-    used, does not have.
-    """
+    """Return what each column of the logs was taken for, and, where no list names them, a line for each log
+    with signals that the first one does not have."""
     units, guesses = dict[str, str](), _guesses(logs)
     for log in reversed(logs):  # the first log has precedence
         units |= {str(name): str(item.attrs.get("units", "1")) for name, item in log.items()}

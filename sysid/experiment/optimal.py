@@ -101,13 +101,9 @@ def optimal_schedule(
 ) -> Log:
     """Return the schedule expected to gain most information, a row every ``plant.dt``.
 
-    ``ranges`` (low, high) are hard, of each input that is not a switch, and so are ``shortest`` seconds
-    between two changes of an input,
-    ``slew`` shares of its range in a second at most, 30 s in each position of a switch, and every output in
-    degC between ``lowest`` and ``highest``, of the plant and of eight draws of it. Inputs on ``hold`` stay
-    as at the start, in a room of 25 degC: a switch on, any other at 0 or what is nearest to it.
-    ``evaluations`` schedules are tried, 1500 where absent. A UserError where the plant has no covariance, or
-    nothing that moves an input keeps the limits.
+    ``ranges``, ``shortest`` seconds between changes of an input, ``slew`` shares of its range in a second and
+    the outputs' ``lowest`` and ``highest``, of the plant and of eight draws, are hard. Inputs on ``hold``
+    stay as at the start, in a room of 25 degC: a switch on, any other at 0 or what is nearest to it.
     """
     if not set(plant.inputs) - set(plant.model.switches) <= set(ranges):
         raise ValueError("ranges must name every input that is not a switch")

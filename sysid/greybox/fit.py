@@ -15,8 +15,8 @@ determine make the cost |r(z)|^2 a narrow curved valley, which straight steps le
     a = -(J'J + lambda)^-1 J' r_vv,       r_vv = (2 / h^2) (r(z + h v) - r(z) - h J v),
 
 which bends with the valley [1]_. Several lambda are tried at once, straight and bent, in one batch. A
-coordinate on its bound whose step would leave the box is held there.  SciPy's trust region, one straight
-trial at a time, stops in such valleys: at 303 for 51 on a printer's heater block.
+coordinate on its bound whose step would leave the box is held there.  (SciPy's trust region stops in such
+valleys: at 303 for 51 on a printer's heater block.)
 
 References
 ----------
@@ -43,7 +43,7 @@ from thermogrip.datasets.schema import Log, log_name
 from thermogrip.sysid.data.data_quality import reading_excess
 from thermogrip.sysid.greybox.identifiability import describe
 from thermogrip.sysid.greybox.problem import Problem, make_problem, start_seconds
-from thermogrip.sysid.greybox.sandwich import ScoreCovariance, score_covariance
+from thermogrip.sysid.greybox.sandwich import score_covariance
 from thermogrip.sysid.models.model import GreyModel
 from thermogrip.sysid.models.network import load_network
 from thermogrip.sysid.plant import fit_record
@@ -85,12 +85,8 @@ def levenberg_marquardt(
     tolerance: float = 1e-5,
     callback: Callable[[int, float], None] | None = None,
 ) -> Solution:
-    """Minimise |r|^2 inside a box, from ``z0`` (n,).
-
-    ``linearise`` returns r (m,) and J (m, n) at a point, ``residuals`` r (k, m) at k points.  It has
-    converged where a step lowers |r|^2 by less than ``tolerance`` of it, or no damping lowers it any more;
-    else it ends after ``iterations`` linearisations.  ``callback`` gets the number and the cost of each step.
-    """
+    """Minimise |r|^2 inside a box, by r (m,) and J (m, n) at a point and r (k, m) at k points, until none of
+    the dampings lowers it or a step lowers it by less than ``tolerance`` of it."""
     z, damping = np.clip(z0, low, high), 1.0
     residual, jacobian = linearise(z)
     cost = float(residual @ residual)
@@ -250,9 +246,7 @@ def fit_network(
 
 
 def residual_tau(errors: Sequence[Sequence[Sequence[Array]]], least: Array) -> Array:
-    """Return bins per independent bin of each output, tau = 1 + 2 sum rho_k of the errors' autocorrelation
-    while rho_k > 0.05, over all stretches, at most a twentieth of the bins: a log never counts as fewer than
-    twenty readings."""
+    """Return bins per independent bin of each output, tau = 1 + 2 sum rho_k of the errors' correlation."""
     out = np.array(least, dtype=float)
     for k in range(len(out)):
         series = [stretch[k] for log in errors for stretch in log if stretch[k].size > 20]
@@ -260,7 +254,7 @@ def residual_tau(errors: Sequence[Sequence[Sequence[Array]]], least: Array) -> A
         if not n:
             continue
         power = sum(float(s @ s) for s in series)
-        tau, longest = 1.0, n / 20
+        tau, longest = 1.0, n / 20  # a log never counts as fewer than twenty readings
         for lag in range(1, max(s.size for s in series) // 2):
             rho = sum(float(s[lag:] @ s[:-lag]) for s in series if s.size > lag) / max(power, 1e-300)
             if rho < 0.05 or tau > longest:
@@ -285,30 +279,28 @@ def _rms(parts: Sequence[Array]) -> float:
     return float(np.sqrt(np.mean(joined**2))) if joined.size else 0.0
 
 
-def _on_bound(problem: Problem, z: Array) -> dict[str, str]:
-    low, high = problem.box
-    names = [problem.model.parameters[i] for i in problem.free]
-    width = 1e-6 * (1 + np.abs(z))
-    return {
-        name: "low" if at_low else "high"
-        for name, at_low, at_high in zip(names, z <= low + width, z >= high - width)
-        if at_low or at_high
-    }
-
-
 def _as_plant(problem: Problem, solution: Solution, tau: Array) -> Plant:
     model, z = problem.model, solution.z
     names = tuple(model.parameters[i] for i in problem.free)
     by_log = problem.by_log(z, central=True)
     spread = score_covariance(problem, z, by_log)
     data = np.vstack([jacobian for _, jacobian in by_log])
-    identifiability = describe(names, data, spread.covariance, spread.widening, _on_bound(problem, z))
+    width = 1e-6 * (1 + np.abs(z))
+    at_ends = zip(names, z <= problem.box[0] + width, z >= problem.box[1] - width)
+    on_bound = {name: "low" if low else "high" for name, low, high in at_ends if low or high}
+    identifiability = describe(names, data, spread.covariance, spread.widening, on_bound)
     p = problem.parameters(z[None])[0]
     errors, starts = problem.errors(z), problem.start(z)
     noise = {name: _rms([s[k] for log in errors for s in log]) for k, name in enumerate(model.outputs)}
     first = [begin[0] for begin in starts]
     offsets = dict(zip(model.outputs, np.mean([s.y_offset for s in first], axis=0).tolist()))
     offsets |= dict(zip(model.disturbances, np.mean([s.d_offset for s in first], axis=0).tolist()))
+    numbers = fit_record.ErrorNumbers(
+        **vars(spread.numbers),
+        unit=tuple((problem.sd * np.sqrt(problem.tau)).tolist()),
+        bin_s=spread.bin_s,
+        merge=round(spread.bin_s / problem.average),
+    )
     scores = fit_record.PlantScores(
         in_sample_rmse={
             log: {name: round(_rms([s[k] for s in errors_of_log]), 4) for k, name in enumerate(model.outputs)}
@@ -321,7 +313,9 @@ def _as_plant(problem: Problem, solution: Solution, tau: Array) -> Plant:
         average_s=problem.average,
         independent_s={k: round(t * problem.average, 1) for k, t in zip(model.outputs, tau)},
         weight_s={k: float(t * problem.average) for k, t in zip(model.outputs, problem.tau)},
-        intervals=_of_intervals(problem, spread),
+        intervals=fit_record.Intervals(
+            numbers=numbers, between_logs=round(spread.phi, 3), coarsening=round(spread.coarsening, 3)
+        ),
         per_log=spread.effects,
     )
     return replace(
@@ -334,18 +328,6 @@ def _as_plant(problem: Problem, solution: Solution, tau: Array) -> Plant:
         logs=problem.names,
         scores=scores,
         verdict=_fit_verdict(problem, solution, identifiability),
-    )
-
-
-def _of_intervals(problem: Problem, spread: ScoreCovariance) -> fit_record.Intervals:
-    """Return what the intervals rest on."""
-    unit, merge = problem.sd * np.sqrt(problem.tau), round(spread.bin_s / problem.average)
-    return fit_record.Intervals(
-        numbers=fit_record.ErrorNumbers(
-            **vars(spread.numbers), unit=tuple(unit.tolist()), bin_s=spread.bin_s, merge=merge
-        ),
-        between_logs=round(spread.phi, 3),
-        coarsening=round(spread.coarsening, 3),
     )
 
 

@@ -132,7 +132,6 @@ def _trade_in_words(plant: Plant, pair: TradeOff) -> str:
 
 
 def _width(sd: float, log: bool) -> str:
-    """Return a 90 per cent half-width in words."""
     half = NormalDist().inv_cdf(0.95) * sd
     if not log:
         return f"±{half:.2g}"

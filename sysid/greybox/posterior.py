@@ -1,7 +1,6 @@
 """Posterior of a grey-box fit: whole parameter vectors from emcee, or a few draws for bands.
 
-What the samples are for, and why they lie closer than the intervals of the fit, is in
-``docs/explanation/uncertainty.md``.
+What the samples are for is in ``docs/explanation/uncertainty.md``.
 
 **Density.** What a fit leaves open is how far its simulations may move, d(z) = r(z) - r(z_fit), all logs
 together:
@@ -13,14 +12,13 @@ to the first term. With A = J'J, V the learnt covariance of the score
 (:mod:`~thermogrip.sysid.greybox.sandwich`; without model discrepancy, which the parameters have absorbed
 and a plant that is to predict readings keeps) and K = S R' V^-1 R S, the second term is A V^-1 A near the
 fit. The third, 0 where the plant is linear, excludes runs that the slopes do not predict; T = tr(P^-1 V) /
-tr(P^-1 A) is how much larger the errors are than the fit's weights expect [1]_.
+tr(P^-1 A) [1]_.
 
 **Draws.** Each is a fit of its own, to perturbed readings from a perturbed prior [2]_:
 
     minimise  |z - z_fit - xi|^2 + |K^(1/2) Q'd(z) - e|^2 + |d(z) - Q Q'd(z)|^2 / T,      xi, e ~ N(0, 1),
 
-a draw from p where the model is linear; elsewhere it bends as the plant does. All go through
-Levenberg-Marquardt side by side; along a valley that no run sees a draw may stop short of its end.
+a draw from p where the model is linear; along a valley that no run sees it may stop short of its end.
 
 **Sampling.** emcee moves the few parameters z_s that the data determine best relative to the prior; the
 others are integrated out to second order about one Gauss-Newton step from their conditional mean, with the
@@ -455,9 +453,7 @@ def with_draws(
     seed: int = 0,
     progress: Callable[[float, str], None] | None = None,
 ) -> Plant:
-    """Return the plant with a few plants that agree with the logs of :func:`fit_problem` as its samples, for
-    bands and closed loops: in seconds where :func:`sample_posterior` takes minutes, of the same density, but
-    too few for its quantiles, and they may stop short along a valley that no run sees."""
+    """Return the plant with a few draws of its posterior as its samples, for bands and closed loops."""
     z = problem.standard(plant.values)
     intervals = plant.scores.intervals
     numbers = None

@@ -15,11 +15,10 @@ bins (:mod:`thermogrip.sysid.greybox.noise_model`) and the variances D of s,
 
     cov(s_fit - s) = (1 - K B) D (1 - K B)' + K C_w K',
 
-and not D: a heater that may be 2 K from rest is known to a few tenths after a minute. That errors of the
-warm-up are in the residuals of the fit too is left out; the two partly cancel.
+and not D. That errors of the warm-up are in the residuals of the fit too is left out; the two partly cancel.
 
-**Model discrepancy** responds to the inputs in every log alike, so its effect on the parameters does not
-average out over logs. A bank of responses represents all that may be missing: every input u, its size |u|,
+**Model discrepancy** responds to the inputs in every log alike and does not average out over logs. A bank of
+responses represents all that may be missing: every input u, its size |u|,
 u v, v |v| and every disturbance, with v the first output above the ambient (else about its mean), each
 through first-order lags of 2, 8 and 32 bins, on all outputs alike. The error model learns one s per signal
 from the residuals; at s = 1 all of them together have an rms of half a sensor's sd. Without it intervals are
@@ -222,7 +221,14 @@ def _log_effects(
     for j, name in enumerate(plant.disturbances):
         spread = min(plant.nuisance.get(name, 0.0), most)
         if spread > 0:
-            moves, estimate = _of_ambient(problem, at, p, starts, j, spread), float(starts[0].d_offset[j])
+            of_one = spread * (np.arange(len(plant.disturbances)) == j)
+            lower = [replace(s, d_offset=s.d_offset + of_one) for s in starts]  # the truth, below the reading
+            measured, biased = (_simulations(problem, at, p, begin) for begin in (starts, lower))
+            moves = [
+                [np.asarray(operator @ (b[:, k] - a[:, k])) for k, operator in enumerate(cells.operators)]
+                for a, b, cells in zip(measured, biased, bins)
+            ]
+            estimate = float(starts[0].d_offset[j])
             out.append(_Column(f"bias of {name}", spread, estimate, _in_residual_units(problem, moves)))
     specs = list(problem.model.specs.values())
     for i, place in enumerate(problem.free):
@@ -233,18 +239,6 @@ def _log_effects(
     for k in range(len(stretches)):
         out += _of_start(problem, at, k, p, starts[k])
     return out
-
-
-def _of_ambient(
-    problem: Problem, at: int, p: Array, starts: list[Start], j: int, spread: float
-) -> list[list[Array]]:
-    """Return what a bias of disturbance j does to each bin: the true one is lower than the reading."""
-    moved = [replace(s, d_offset=s.d_offset + spread * (np.arange(s.d_offset.size) == j)) for s in starts]
-    measured, biased = (_simulations(problem, at, p, begin) for begin in (starts, moved))
-    return [
-        [operator @ (b[:, k] - a[:, k]) for k, operator in enumerate(cells.operators)]
-        for a, b, cells in zip(measured, biased, problem.logs[at][1])
-    ]
 
 
 def _of_start(problem: Problem, at: int, k: int, p: Array, start: Start) -> list[_Column]:

@@ -15,23 +15,21 @@ and with P = 1 + sum_l A_l, A_l = J_l' J_l, the estimate is off by P^-1 s(z_0):
 
     covariance = P^-1 Omega P^-1.
 
-This is the sandwich [1]_, with a model of the error in its middle instead of few noisy squares.
+the sandwich [1]_ with a model of the error in its middle.
 
 **Disagreement between logs.** Leaving log l out moves the estimate by
 
     d_l = (P - A_l)^-1 sum_{m != l} J_m' r_m - P^-1 sum_m J_m' r_m      (about z = 0),
 
 whose covariance follows from the V's. The mean over logs of d_li^2 over its expectation is q_i, 1 where the
-learnt model is right. Logs that differ by more, because the plant itself varies or because discrepancy meets
-other inputs, have q_i > 1. Three degrees of freedom determine one q_i poorly, so the parameters share one
-factor phi for V, their mean in ln q_i (that of a chi-squared with L - 1 degrees of freedom over L - 1 is
+learnt model is right. Three degrees of freedom determine one q_i poorly, so the parameters share one factor
+phi for V, their mean in ln q_i (that of a chi-squared with L - 1 degrees of freedom over L - 1 is
 digamma((L - 1) / 2) - ln((L - 1) / 2)). Where logs agree better than expected, the error model counts as one
 more log: phi is at least (1 + (L - 1) phi) / L. One or two logs say nothing of it.
 
-**Never wider than the prior.** Logs remove no prior knowledge, so no parameter is stated with a larger
-standard deviation than its prior's (1 in units of z). Eigenvalues are not cut: a direction of several
-parameters is known no better for that, and 90 per cent intervals would cover 80 per cent (of 48 simulated
-rigs of ``benchmarks/coverage``; by parameter 86, and 90 of the 800 rigs there).
+**Never wider than the prior.** Logs remove no prior knowledge, so no parameter has a larger standard
+deviation than its prior's (1 in z): 90 per cent intervals cover 86 per cent (48 simulated rigs of
+``benchmarks/coverage``), 80 per cent if eigenvalues were cut as well.
 
 References
 ----------
@@ -113,7 +111,11 @@ def score_covariance(
         width = [PRIORS.discrepancy_sd] * data.n_responses
         width += [PRIORS.effect_sd] * (len(data.kinds) - data.n_responses)
         numbers = learn_error_model(data.logs, z, width=width)
-    whole = _log_scores(problem, data, numbers, z.size)
+    merge = float(round(data.bin_s / problem.average))  # residuals in one mean
+    scores = [
+        _one_log(log, warm, merge, numbers, z.size, data.n_shared) for log, warm in zip(data.logs, data.warm)
+    ]
+    whole = LogScores(*(np.array(column) for column in zip(*scores)))
     pull = whole.discrepancy.sum(axis=0)
     hessian = np.eye(z.size) + whole.hessian.sum(axis=0)
     inverse = np.linalg.inv(hessian)
@@ -163,15 +165,6 @@ def common_factor(q: Array, n_log: int) -> float:
     expected_log = digamma(freedom / 2) - np.log(freedom / 2)  # of ln chi^2 / freedom
     phi = float(np.exp(np.log(np.maximum(q, 1e-9)).mean() - expected_log))
     return max(phi, (1 + freedom * phi) / n_log)
-
-
-def _log_scores(problem: Problem, data: Linearised, numbers: ErrorModel, n: int) -> LogScores:
-    """Return what each log adds to the score."""
-    merge = float(round(data.bin_s / problem.average))  # residuals in one mean
-    scores = [
-        _one_log(log, warm, merge, numbers, n, data.n_shared) for log, warm in zip(data.logs, data.warm)
-    ]
-    return LogScores(*(np.array(column) for column in zip(*scores)))
 
 
 class _LogScore(NamedTuple):

@@ -9,18 +9,13 @@ The equations come as functions on lists of numbers (:class:`Equations`). Each i
         m times:                x = advance(x, u_t, d_t, c, kept, h)
         y_(t+1) = read(x, c)
 
-which moves eight members of a batch through a log.  It is made anew in each process, in a fraction of
-a second; no file is written.  It holds no interpreter lock, so that blocks of eight run on all cores as plain
-threads.  A member's numbers do not depend on who its neighbours are.
+which moves eight members of a batch through a log, without the interpreter's lock, so that blocks of eight
+run on all cores as threads.  A member's numbers do not depend on who its neighbours are.
 
-**Vectors of eight.**  A :class:`Vector` represents eight numbers in a register, one for each of eight
-parameter sets.  It has no value; each ``+ - * /`` on it appends one instruction of LLVM, so that indices are
-looked up, loops unrolled and products with a constant 0 or 1 gone when LLVM turns the line into what the
-machine has (a register of AVX-512, two of AVX2, four of SSE2 or NEON).
-
-No branch may depend on a value, for none is known: ``if vector > 0`` raises.  A choice is
-``np.where(vector > 0, a, b)``; this, ``np.interp`` and NumPy's elementary functions work on vectors, so that
-equations meant for arrays do as well.  What processors lack (exp, sin, ...) is the C library's.
+A :class:`Vector` represents eight numbers in a register, one for each parameter set.  It has no value; each
+``+ - * /`` on it appends one instruction of LLVM, so that indices are looked up, loops unrolled and products
+with a constant 0 or 1 gone.  No branch may depend on a value: ``if vector > 0`` raises.  A choice is
+``np.where(vector > 0, a, b)``; this, ``np.interp`` and NumPy's elementary functions work on vectors.
 """
 
 from __future__ import annotations
@@ -31,6 +26,7 @@ import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache, lru_cache
+from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -339,9 +335,8 @@ class Kernel:
             raise ValueError(f"shapes {x0.shape}, {u.shape}, {d.shape}, {p.shape} do not belong together")
         if pieces != 1 and not (self._in_pieces and pieces > 1):
             raise ValueError(f"not made for {pieces} steps in a row")
-        moved = _ones(n + 1)  # the row behind the last ends the loop
+        moved = np.ones(n + 1, dtype=np.uint8)  # the row behind the last ends the loop
         if renew is not None:
-            moved = moved.copy()
             moved[:n] = renew
         arrays = [np.ascontiguousarray(a, dtype=float) for a in (x0, u, d, p)]
         y, x_end, calls, _ = self._laid_out(arrays, moved, h, pieces)
@@ -374,9 +369,8 @@ class Kernel:
 
 
 class Batch:
-    """A batch of fixed size that is run again and again: what changes is written into ``x0`` (B, n_x), ``u``
-    (B, n, n_u) and ``d`` (B, n, n_d), or (1, n, n_d) where it is the same for all, then :meth:`run`; outputs
-    ``y`` (B, n + 1, n_y) and last states ``x_end`` (B, n_x) stand until the next one.  No switch moves."""
+    """A batch of fixed size, no switch moved: write ``x0`` (B, n_x), ``u`` (B, n, n_u) and ``d`` (B or 1, n,
+    n_d), then :meth:`run`; ``y`` (B, n + 1, n_y) and ``x_end`` (B, n_x) stand until the next run."""
 
     def __init__(
         self, kernel: Kernel, *, batch: int, n: int, h: float, p: Array | None = None, same_d: bool = True
@@ -394,12 +388,6 @@ class Batch:
         """Simulate."""
         for call in self._calls:
             self._kernel._rollout(*call)
-
-
-@lru_cache(maxsize=64)
-def _ones(n: int) -> NDArray[np.uint8]:
-    """Return n ones, to be read only."""
-    return np.ones(n, dtype=np.uint8)
 
 
 @lru_cache(maxsize=256)
@@ -441,7 +429,10 @@ class _Writer:
             pointer.add_attribute("noalias")
         self.at = ir.IRBuilder(self.function.append_basic_block("entry"))
         self.h = spread(self.at, h)
-        self.places = [self._places(array, begin, k) for k, array in enumerate((x0, u, d, p))]
+        members = (self.at.load(self.at.gep(begin, [INTEGER(k)])) for k in range(4 * WIDTH))
+        self.places = [
+            [self.at.gep(array, [offset]) for offset in islice(members, WIDTH)] for array in (x0, u, d, p)
+        ]
         self.n_y = 0
         self._write()
 
@@ -491,11 +482,6 @@ class _Writer:
         builder.position_at_end(done)
         self._put(state, self.x_end, INTEGER(0), INTEGER(1))
         builder.ret_void()
-
-    def _places(self, array: Any, begin: Any, k: int) -> list[Any]:
-        """Return where each member begins in an array."""
-        offsets = [self.at.load(self.at.gep(begin, [INTEGER(k * WIDTH + m)])) for m in range(WIDTH)]
-        return [self.at.gep(array, [offset]) for offset in offsets]
 
     def _row(self, k: int, n: int, t: Any = _FIRST) -> list[Vector]:
         """Return row t, of n entries, of the k-th array."""

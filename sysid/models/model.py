@@ -7,11 +7,9 @@ With the state x, the inputs u, the measured disturbances d and the parameters p
 both in plain arithmetic, so that NumPy rows and CasADi symbols run the same lines.
 
 A :class:`GreyModel` also states what was known before any log was seen: a prior and bounds for each
-parameter, how well each sensor reads, and the times over which the fit averages.  A thermal network from a
-TOML file (:mod:`thermogrip.sysid.models.network`) and a class of the user's own
-(:mod:`thermogrip.sysid.models.user_model`) both are, and both answer most of it from tables
-(:class:`Described`); :func:`thermogrip.sysid.greybox.fit.fit_network`, the posterior and the report take
-either.
+parameter, how well each sensor reads, and the times over which the fit averages.  Thermal networks
+(:mod:`thermogrip.sysid.models.network`) and classes of the user's own
+(:mod:`thermogrip.sysid.models.user_model`) are of this kind.
 """
 
 from __future__ import annotations
@@ -187,10 +185,7 @@ class GreyModel(Model, Protocol):
     warmup: float  # seconds of a log from which a fit may estimate how it starts
 
     def prepared(self, free_runs: FreeRuns, spread: Mapping[str, float], p: Array | None = None) -> GreyModel:
-        """Return the model made ready for the logs of these runs, ``spread`` the sd of each of their outputs.
-
-        Its step is short enough at p (the prior where absent); the model itself where it is ready as it is.
-        """
+        """Return the model with a step short enough at p (its prior where absent) for these runs' logs."""
         ...
 
 

@@ -1,9 +1,7 @@
 """A lumped thermal network as a model: nodes, links, pipes, Peltiers, heaters, sensors.
 
-The network is declared in TOML (:mod:`thermogrip.sysid.models.network_spec`) and turned into lists of
-integers.  The arithmetic of a step is written once and runs on NumPy rows, on CasADi symbols, and on SIMD
-vectors (:mod:`thermogrip.sysid.models.jit_rollout`): no branch depends on a temperature, an input or a
-parameter.
+The network is declared in TOML (:mod:`thermogrip.sysid.models.network_spec`).  One arithmetic of a step runs
+on NumPy rows, CasADi symbols and SIMD vectors: no branch depends on a temperature, an input or a parameter.
 
 **Heat balance.**  Every state x_i is a temperature [degC] of a heat capacity C_i; z is x followed by the
 boundary temperatures (measured ambients, then fixed ones).  Heat flows through
@@ -22,22 +20,18 @@ r dT / 50) for the share v of the time, so that its Joule heat is proportional t
 Beyond a dead zone v_d, v - v_d replaces v.  a and R may follow the mean temperature of the element by a share
 per kelvin from 25 degC.
 
-**At rest** a plant whose sensors read y was held there by some input v, not necessarily by the one of the
-first row.  :meth:`NetworkModel.rest` finds the temperatures x and v, inside its range, together,
-
-    min  |heat(x, v)|^2 + w_y |y - output(x)|^2 + w_u |v - u|^2,
-
-with weights that make the sensors nearly exact and the input a mere tie-breaker.
+**At rest** (:meth:`NetworkModel.rest`) a plant whose sensors read y was held there by some input v, inside
+its range and not necessarily that of the first row:  min |heat(x, v)|^2 + w_y |y - output(x)|^2 + w_u |v -
+u|^2.
 
 **Time step.**  ROS2 of Verwer et al. [1]_, for dx/dt = f(x) over a step h with the input held:
 
     (1 - g h A) k_1 = f(x),    (1 - g h A) k_2 = f(x + h k_1) - 2 k_1,    x+ = x + h (3 k_1 + k_2) / 2
 
 is of second order for *any* matrix A, and L-stable with g = 1 - 1/sqrt(2) where A is the Jacobian.  A holds
-the conductances and flows, the only stiff terms (a pipe cell empties in a second).  So A changes with the
-switches alone and is factorised once per change. Column by column 1 - g h A is diagonally dominant, so that
-it needs no pivots: the (minimum-degree) elimination order is found once per network, and the elimination is
-played through on integers and written down as a list of multiplications.
+the conductances and flows, the only stiff terms, so it changes with the switches alone and is factorised once
+per change.  1 - g h A is diagonally dominant by columns and needs no pivots: the elimination is found once
+per network, in minimum-degree order, and written down as a list of multiplications.
 
 **Layout.**  States are numbered nodes first, then the cells of the pipes (water, then wall), then the sensors
 that lag.  A pipe of n cells with flow F and delay t holds F t of water, so each cell has the capacity F t /
@@ -90,11 +84,8 @@ class Monomial(NamedTuple):
 
 
 class Layout(NamedTuple):
-    """The structure of a network as integers: who is linked to whom, and how to eliminate.
-
-    Coefficients stand in one list c: capacities, fixed temperatures, links, their off-factors, bends,
-    radiation, heaters, Peltiers; ``at_*`` is where each part begins.
-    """
+    """The structure of a network as integers: ``at_*`` is where each part begins in its list c of
+    coefficients."""
 
     n_x: int
     n_d: int
@@ -308,6 +299,7 @@ def build_layout(network: Network) -> Layout:
     states = state_names(network)
     index = {name: i for i, name in enumerate([*states, *network.disturbances, *network.boundaries])}
     links = _links(network, index)
+    places, one = list(network.parameters), len(network.parameters)  # the place of a factor 1
     groups: dict[str, list[Coefficient]] = {
         "capacity": _capacities(network),
         "fixed": [(1.0, (item.temperature,)) for item in network.boundaries.values()],
@@ -326,7 +318,9 @@ def build_layout(network: Network) -> Layout:
         n_fixed=len(network.boundaries),
         **{f"at_{name}": position for name, position in begin.items() if name != "capacity"},
         coefficients=tuple(
-            _coefficient_monomial(item, network) for group in groups.values() for item in group
+            Monomial(scale, *[*map(places.index, names), one, one][:2])
+            for group in groups.values()
+            for scale, names in group
         ),
         links=tuple((link.to, link.source, link.both, link.switch) for link in links),
         bent=tuple(k for k, link in enumerate(links) if link.bend is not None),
@@ -406,13 +400,6 @@ def _peltier(network: Network, element: Any) -> list[Coefficient]:
         else:
             out.append((1.0, (parameter,)))
     return out
-
-
-def _coefficient_monomial(item: Coefficient, network: Network) -> Monomial:
-    scale, names = item
-    places, one = list(network.parameters), len(network.parameters)  # the place of a factor 1
-    left, right = [*map(places.index, names), one, one][:2]
-    return Monomial(scale, left, right)
 
 
 def _receiver(between: list[str], index: Mapping[str, int], n_x: int) -> tuple[int, int]:

@@ -61,14 +61,9 @@ class _Table(BaseModel):
 
 
 class Input(_Table):
-    """Something that is moved; ``switch`` marks a pump or valve.
+    """What is moved, seen by elements as a share of ``full_scale``; ``switch`` marks a pump or valve.
 
-    Elements see it as a share of ``full_scale``.  Where that is not said it is 100 of percent, 255 of 0_255,
-    1 of a dimensionless input with a range within -1 to 1, and of any other (V, A, W) the end of the range
-    that is farther from 0.
-
-    A driver with a coarse register drops what lies behind a multiple of ``step``, so a logged command of
-    18.6 counts may have been 18.
+    A driver with a coarse register drops what lies behind a multiple of ``step``.
     """
 
     unit: Literal["1", "percent", "0_255", "A", "V", "W"]

@@ -4,8 +4,7 @@ With the drives w = [u, d] and the outputs at zero mean and unit spread, each me
 
     x+ = A x + B w + c + V tanh(W x + U w + b),       its first n_y states are the outputs,
 
-and the model's output is the mean of its members.  Members differ in the random start of their weights: where
-the data speak they agree, where they do not their errors differ and the mean is better than any one of them.
+and the model's output is the mean of its members, which differ in the random start of their weights.
 
 **Bounded.**  A is that of a stable linear fit and is not trained, tanh never exceeds 1, and each drive is
 clipped to a little more than its reach r in the data (a drive that never moved there has r = 0 and moves
@@ -114,11 +113,8 @@ class NeuralModel(BlackBox):
         ]
 
     def rest(self, y: ArrayLike, u: ArrayLike, d: ArrayLike, p: ArrayLike) -> Array:
-        """Return the state at rest at which every member's outputs read y, held there by some input near u.
-
-        Each member solves min |f(x, v) - x|^2 + 1e-4 |v - w|^2 over its hidden states and the moved drives v,
-        by damped Gauss-Newton steps; an unknown reading is solved for as well.
-        """
+        """Return the state at rest at which every member's outputs read y, held there by some input near u:
+        min |f(x, v) - x|^2 + 1e-4 |v - w|^2 over hidden states, unknown readings and moved drives v."""
         y = (np.asarray(y, dtype=float) - self.y_middle) / self.y_size
         w = (np.concatenate([np.asarray(u, float), np.asarray(d, float)]) - self.w_middle) / self.w_size
         w = np.clip(w, -self.reach, self.reach)
@@ -133,7 +129,10 @@ class NeuralModel(BlackBox):
         weight = np.where(np.array(free) < n, 1e-4, 1e-2)
 
         def misfit(z: Array) -> Array:
-            return np.hstack([self._advance(z[:, :n], z[:, n:]) - z[:, :n], weight * (z[:, free] - z0)])
+            x, w = z[:, :n], z[:, n:]
+            t = np.tanh(_batched_product(self.W, x) + _batched_product(self.U, w) + self.b)
+            moves = _batched_product(self.B, w) + self.c + _batched_product(self.V, t)
+            return np.hstack([_batched_product(self.A, x) + moves - x, weight * (z[:, free] - z0)])
 
         z0 = z[:, free]
         for _ in range(12 if free else 0):
@@ -205,13 +204,6 @@ class NeuralModel(BlackBox):
         open_ends = zip(_RAILS, (-np.inf, np.inf))
         return {key: [free if v is None else v for v in data[key]] for key, free in open_ends}
 
-    def _advance(self, x: Array, w: Array) -> Array:
-        """Return the next states (K, n) of x (K, n) and w (K, m), not clipped."""
-        t = np.tanh(_batched_product(self.W, x) + _batched_product(self.U, w) + self.b)
-        return np.asarray(
-            _batched_product(self.A, x) + _batched_product(self.B, w) + self.c + _batched_product(self.V, t)
-        )
-
     def _member_step(self, k: int, x: Values, w: Values) -> list[Any]:
         units = zip(self.W[k], self.U[k], self.b[k])
         t = [_tanh(_dot(row, x) + _dot(column, w) + float(shift)) for row, column, shift in units]
@@ -237,5 +229,4 @@ def _dot(row: Array, values: Values) -> Any:
 
 
 def _tanh(value: Any) -> Any:
-    """Return tanh of a number, a row or a symbol (which brings its own)."""
-    return value.tanh() if hasattr(value, "tanh") else np.tanh(value)
+    return value.tanh() if hasattr(value, "tanh") else np.tanh(value)  # a symbol brings its own

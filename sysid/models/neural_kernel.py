@@ -10,10 +10,8 @@ S = dx/dtheta runs beside the state: with s = 1 - t^2,
     S+ = (A + V diag(s) W) S + E,
 
 where E is sparse: a step adds w_j to the row of B_ij, t_k to that of V_ik, V_:k s_k x_j to all rows for W_kj,
-and so on; a clipped state has no slope.  A pass over 2000 rows with 100 weights takes a few milliseconds.
-A is given; the weights are one vector
-
-    theta = [B, c, V, W, U, b],        each array row by row.
+and so on; a clipped state has no slope.  The weights are one vector theta = [B, c, V, W, U, b], each array
+row by row.
 
 This file alone imports numba, so nothing pays for the compiler before a model of this kind is made.
 """

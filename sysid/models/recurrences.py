@@ -44,9 +44,8 @@ def run_linear(A: Array, on: Array, push: Array, x0: Array, times: int) -> Array
 def run_polynomial(
     exponents: NDArray[np.int_], coefficients: Array, x0: Array, w: Array, times: int
 ) -> tuple[Array, Array]:
-    """Return the outputs (B, N + 1, n_y) of y+ = coefficients m(x, w), m the monomials of these exponents and
-    x the present and past outputs, newest first, each row of w (1 or B, N, m) ``times`` times; and the last
-    states (B, n_x)."""
+    """Return the outputs (B, N + 1, n_y) of y+ = coefficients m(x, w) with each row of w (1 or B, N, m)
+    ``times`` times, m the monomials of x, the outputs from the newest on, and the last states (B, n_x)."""
     n_batch, n_x = x0.shape
     n_y, n_term = coefficients.shape
     rows = w.shape[1]

@@ -13,8 +13,7 @@
 The arguments are named tuples.  The same lines run on numbers, on rows of a batch, compiled
 (:mod:`thermogrip.sysid.models.jit_rollout`), and on CasADi symbols, so a choice between two values is
 ``np.where`` or ``np.maximum``, never ``if``; what vectors cannot say (sorting, a function of SciPy) NumPy
-runs on whole batches, more slowly.  Whatever goes wrong inside the user's code becomes one line that names
-the file, the class and, for an exception, the line of their code where it was raised.
+runs on whole batches, more slowly.
 
 **In time.**  With dx/dt = f(x, u, d, p) and u, d held over a step, each step of the simulation is cut into n
 pieces, each a step of the classical Runge-Kutta rule of fourth order, after which a state with limits is put
@@ -162,7 +161,13 @@ class OwnCode:
     def __init__(self, made: Any) -> None:
         self.made, self.name = made, type(made).__name__
         self.file = _file_of(type(made))
-        self._check_names()
+        if not callable(getattr(made, "rhs", None)):
+            raise self.fault("has no function rhs", hint=f"write {_EXAMPLES['rhs']}")
+        attributes = (*_Attributes.model_fields, "rhs", "output", "rest")
+        for name in vars(type(made)):
+            meant = get_close_matches(name, attributes, n=1, cutoff=0.8)
+            if meant and name not in attributes and not hasattr(made, meant[0]):
+                raise self.fault(f"has {name!r}, which nothing reads", hint=f"call it {meant[0]!r}")
         stated = {name: getattr(made, name) for name in _Attributes.model_fields if hasattr(made, name)}
         try:
             tables = _Attributes.model_validate(stated)
@@ -263,16 +268,6 @@ class OwnCode:
             problem = f"returns {len(values)} numbers from {what}, not {len(names)}"
             raise self.fault(problem, hint=f"return one for each of {', '.join(names)}")
         return values
-
-    def _check_names(self) -> None:
-        """Refuse a class without equations, or one that seems to misspell an attribute."""
-        if not callable(getattr(self.made, "rhs", None)):
-            raise self.fault("has no function rhs", hint=f"write {_EXAMPLES['rhs']}")
-        attributes = (*_Attributes.model_fields, "rhs", "output", "rest")
-        for name in vars(type(self.made)):
-            meant = get_close_matches(name, attributes, n=1, cutoff=0.8)
-            if meant and name not in attributes and not hasattr(self.made, meant[0]):
-                raise self.fault(f"has {name!r}, which nothing reads", hint=f"call it {meant[0]!r}")
 
 
 def load_object(file: str | Path, name: str) -> Any:
@@ -461,8 +456,14 @@ class OwnModel(Described):
             model = finer
             runs = again
             n = 2 * n
-        if not all(np.isfinite(run).all() for _, run in runs):
-            raise model._not_finite(runs)
+        for log, run in runs:
+            lost_rows = np.flatnonzero(~np.isfinite(run[0]).all(axis=1))
+            if lost_rows.size:
+                where = f"{int(lost_rows[0]) * self.dt:g} s into {log}"
+                problem = f"gives no finite output {where}, with its parameters at their prior values"
+                raise self.code.fault(
+                    problem, hint="guard roots and divisions with np.maximum, or set limits"
+                )
         problem = f"changes too fast for {OWN.most_pieces} Runge-Kutta steps in dt = {self.dt:g} s"
         raise self.code.fault(problem, hint="give a smaller dt, or treat what is that fast as at rest")
 
@@ -516,29 +517,15 @@ class OwnModel(Described):
             rms, most = [np.sqrt((c**2).mean()) for c in change], [c.max() for c in change]
         return bool(np.max(rms) < OWN.step_error and np.max(most) < 1)  # NaN is not less
 
-    def _not_finite(self, runs: Sequence[tuple[str, Array]]) -> UserError:
-        """Return the error that names the log and the first state that is lost."""
-        for log, run in runs:
-            if not np.isfinite(run).all():
-                row = int(np.flatnonzero(~np.isfinite(run[0]).all(axis=1))[0])
-                where = f"{row * self.dt:g} s into {log}"
-                break
-        problem = f"gives no finite output {where}, with its parameters at their prior values"
-        return self.code.fault(problem, hint="guard roots and divisions with np.maximum, or set limits")
-
 
 _OF_TRUTHS = {np.bitwise_and: np.logical_and, np.bitwise_or: np.logical_or, np.invert: np.logical_not}
 
 
 class _Symbol(NDArrayOperatorsMixin):
-    """A scalar symbol of CasADi that NumPy's functions take as they take a number.
-
-    It passes them CasADi's view that follows NumPy.  What they return of a bare symbol is to change, CasADi
-    warns, and the view by itself cannot stand in an array.
-    """
+    """A scalar symbol of CasADi that NumPy's functions take as they take a number."""
 
     def __init__(self, view: Any) -> None:
-        self.view = view
+        self.view = view  # CasADi's own that follows NumPy; by itself it cannot stand in an array
 
     def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, **kwargs: Any) -> Any:
         ufunc = _OF_TRUTHS.get(ufunc, ufunc)

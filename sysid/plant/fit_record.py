@@ -177,9 +177,7 @@ class FitLog:
 
 
 def fit_logs(logs: Sequence[Log]) -> tuple[FitLog, ...]:
-    """Return what a plant keeps of the logs of its fit; the hash is that of a log's file, before repairs and
-    cuts, where it was read from one: names, order and units in the header do not count, so a copy under
-    another name is the same data."""
+    """Return what a plant keeps of the logs of its fit; the hash is that of a log's file where it has one."""
     from thermogrip.datasets.schema import hash_columns, log_name
 
     fitted = []

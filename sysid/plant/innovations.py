@@ -63,22 +63,17 @@ def innovation_noise(plant: PlantData, logs: Sequence[Log]) -> InnovationNoise |
     if estimate is None:
         return None
     names = [plant.inputs[j] for j in graded]
+    fastest = dict.fromkeys(names, 0.0)
+    for log, name in product(logs, names):
+        time, values = (np.asarray(log[key].values, dtype=float) for key in ("time", name))
+        rates = np.abs(np.diff(values)) / np.diff(time)
+        fastest[name] = max(fastest[name], float(rates.max(initial=0.0)))
     return InnovationNoise(
         state=estimate.state,
         reading=dict(zip(outputs, estimate.reading.tolist())),
         input=dict(zip(names, estimate.input.tolist())),
-        fastest={name: _fastest(logs, name) for name in names},
+        fastest=fastest,
     )
-
-
-def _fastest(logs: Sequence[Log], name: str) -> float:
-    """Return the largest change of an input from a row of a log to the next, in a second."""
-    most = 0.0
-    for log in logs:
-        time, values = (np.asarray(log[key].values, dtype=float) for key in ("time", name))
-        rates = np.abs(np.diff(values)) / np.diff(time)
-        most = max(most, float(rates.max(initial=0.0)))
-    return most
 
 
 @dataclass(frozen=True, eq=False)

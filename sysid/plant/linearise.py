@@ -5,9 +5,8 @@ About inputs u0, disturbances d0 and a state x0, by default the one in which the
     x = x0 + dx,  w = (u0, d0) + dw,  y = y0 + dy:      dx+ = A dx + B dw,   dy = C dx        (step dt)
                                                   or   dx/dt = A dx + B dw,  dy = C dx        (continuous).
 
-Matrices are central differences, which are exact for anything bilinear.  A switch is no small signal, so it
-stays where it is put.  Where a drive of a Peltier heats and cools with different gains its slope jumps at
-zero, and the model there is the mean of the two: choose a drive to one side.
+Matrices are central differences, exact for anything bilinear.  A switch stays where it is put.  Where a drive
+of a Peltier heats and cools with different gains the model at zero is the mean of the two.
 
 **Discrete** at a whole multiple of the plant's step, inputs held (zero-order hold): the plant's own
 arithmetic, n steps composed.  **Continuous**: the heat balance itself for a network, the class's ``rhs`` for

@@ -1,7 +1,6 @@
 """Logs as a model takes them: its signals in its units, on an even grid, cut where the input is unknown.
 
-**Cuts.**  After a gap of more than 10 s (and of five steps of a slow log) the input is unknown, so a new
-stretch begins there with an initial state of its own.
+After a gap of more than 10 s (and of five steps of a slow log) a stretch with a start of its own begins.
 
 **Inputs.**  With the grid t_k = t_0 + k dt of a stretch, an input is the exact mean of its held value over
 [t_k, t_k + dt).  A plant (:func:`cut_stretches`) has a grid of its own step: a command that its driver rounds
@@ -14,15 +13,14 @@ of the blocks of an averaged log).  Logs of a rig that says of an input what was
 samples over [t_k - dt/2, t_k + dt/2], so that it is not shifted in time; where the grid is the log's own,
 the samples stand as they are.  A reading lost while the input is known stays NaN.
 
-**Why average.**  A converter of quantum q moves in steps; once the output moves less than q in one step of
-the grid, most of what an equation-error fit sees is rounding.  The step chosen here is the longest of 1, 2,
-3, 4, 5, 6, 8 .. 50 samples in which the output moves less than one quantum (rms; the next one is beyond
-it), at least a hundredth of the dominant time constant (finer ones add nothing) and at most a tenth of it.
+**Why average.**  Once the output moves less than the quantum of its converter in one step of the grid, most
+of what an equation-error fit sees is rounding.  The step chosen here is the longest of 1, 2, 3, 4, 5, 6, 8 ..
+50 samples in which the output moves less than one quantum (rms; the next one is beyond it), at least a
+hundredth of the dominant time constant (finer ones add nothing) and at most a tenth of it.
 
-**Roles and units.**  Where a model is at hand, its roles are used (:func:`match_logs`): ``t_room`` is what a
-plant of a room predicts, and what a plant of a heater is disturbed by.  Shares of full scale come as ``1``
-(-1 to 1), ``percent`` or ``0_255``, so they are converted.  A column without a unit may be a share or a bare
-number of the model's own unit; values beyond 1 distinguish them.  Any other difference of units is refused.
+**Roles and units** of a model at hand are used (:func:`match_logs`).  Shares of full scale come as ``1`` (-1
+to 1), ``percent`` or ``0_255`` and are converted; values beyond 1 tell a column without a unit to be in the
+model's own.  Any other difference of units is refused.
 """
 
 from __future__ import annotations
@@ -359,11 +357,8 @@ def quantum(values: Array) -> float:
 
 
 def dominant_time(logs: Sequence[Rows]) -> float:
-    """Return the time constant [s] that dominates the outputs, from a first-order model at a coarse step.
-
-    The instrument is the lagged input, so that rounding and noise of the readings do not bias it.  Where the
-    data give no stable answer, a twentieth of the longest log is used instead.
-    """
+    """Return the time constant [s] that dominates the outputs, from a first-order model at a coarse step; a
+    twentieth of the longest log where the data give no stable answer."""
     longest = max(float(np.ptp(rows.time)) for rows in logs)
     native = max(rows.step for rows in logs)
     steps = [max(step, native) for step in (longest / 400, longest / 150)]

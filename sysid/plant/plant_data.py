@@ -1,21 +1,13 @@
 """The numbers of a plant: a model, its parameters with their uncertainty, and where both may be trusted.
 
-A :class:`~thermogrip.sysid.models.model.Model` is equations without numbers.  A :class:`Plant` adds the
-numbers: one value per parameter, the covariance of the free ones, samples of them where a posterior was
-drawn, the noise of each output, and the range of the data that the fit has seen.
-
 **Scales.**  A positive parameter is uncertain by a factor, so its ``theta`` is its logarithm; any other has
 ``theta`` equal to itself.  Covariance and Laplace draws live in theta; values, samples and intervals are in
 natural units.
 
-**One log is not another.**  Thermocouples are plugged anew and rooms change, so each log has sensor offsets
-of its own.  ``nuisance`` says by how much (a standard deviation per signal);
-:mod:`thermogrip.sysid.plant.simulation` estimates them from the warm-up of the log that it simulates.
+``nuisance`` is the sd of each sensor's offset from log to log.
 
-**Files.**  One dictionary serves the plant's own file, the controller's file that contains its plant, and who
-else wants a plant: the model's equations as data, values with units, covariance of theta with the scales
-it is in, bounds and ranges (an open end is null, for JSON has no infinity).  Samples stand beside the file
-as ``.nc``, or under ``draws`` where they are few or there is no file.  Reading never runs code.
+**Files.**  One dictionary serves the plant's own file and others that contain a plant.  Samples stand beside
+the file as ``.nc``, or under ``draws`` where they are few or there is no file.  Reading never runs code.
 This module loads no xarray, so that a file can be refused at once.
 """
 
@@ -107,8 +99,7 @@ class PlantData:
 
     def undisturbed(self, ambient: float) -> Array:
         """Return the measured disturbances (n_d,) where nobody reads them: ``nominal``, else ``ambient``
-        [degC] for the room's temperature and the middle of the logs for another; NaN where none of these is
-        known of what is no temperature."""
+        [degC] for the room's temperature and the middle of the logs for another; NaN where none is known."""
         levels = []
         for name in self.disturbances:
             temperature = self.units.get(name, "degC") == "degC"
@@ -128,12 +119,8 @@ class PlantData:
         return np.array([self.values[name] for name in self.model.parameters], dtype=float)
 
     def draw(self, k: int) -> Self:
-        """Return the plant with the parameters of the k-th draw.
-
-        Draw 0 is the plant itself.  Others come from the saved samples or refits where there are any (evenly
-        spread over them), else from the Laplace approximation N(theta, covariance) with seed k; a UserError
-        where there is nothing to draw from.
-        """
+        """Return the plant with the parameters of the k-th draw: 0 is the plant itself, others are spread
+        over the samples or refits, else from N(theta, covariance) with seed k."""
         if k < 0:
             raise UserError(f"draw {k} is negative", hint="count draws from 0")
         if k == 0:
@@ -145,18 +132,17 @@ class PlantData:
         if self.samples is not None:
             drawn = np.asarray(self.samples[int(along * len(self.samples))], dtype=float)
         elif self.covariance is not None:
-            drawn = self._laplace_draw(np.random.default_rng(k))
+            # eigh, not Cholesky: a weakly determined direction may have lost its last digits
+            size, axes = np.linalg.eigh(np.asarray(self.covariance))
+            normal = np.random.default_rng(k).standard_normal(len(size))
+            drawn = self._inside(self.theta + axes @ (np.sqrt(np.maximum(size, 0.0)) * normal))
         else:
             raise UserError("the plant has no uncertainty to draw from", hint="fit a network, or use draw 0")
         return replace(self, values=self.values | dict(zip(self.free, drawn.tolist())))
 
     def intervals(self, level: float = 0.9) -> dict[str, tuple[float, float]]:
-        """Return the central interval of probability ``level`` of each free parameter, in natural units.
-
-        theta +- z sd, clipped to the bounds; quantiles of the samples where there is no covariance.  Samples
-        are of plants that agree with the logs, and what their parameters mean may still be off
-        (:mod:`thermogrip.sysid.greybox.posterior`).
-        """
+        """Return the central interval of probability ``level`` of each free parameter, in natural units:
+        theta +- z sd, clipped to the bounds; quantiles of the samples where there is no covariance."""
         if not 0 < level < 1:
             raise ValueError(f"level must lie between 0 and 1, got {level:g}")
         if self.covariance is not None:
@@ -190,12 +176,6 @@ class PlantData:
         """Which free parameters (n_free,) are logarithms in ``theta``."""
         return np.array([self.scales.get(name) == "log" for name in self.free], dtype=bool)
 
-    def _laplace_draw(self, rng: np.random.Generator) -> Array:
-        # eigh, not Cholesky: a weakly determined direction may have lost its last digits
-        size, axes = np.linalg.eigh(np.asarray(self.covariance))
-        step = axes @ (np.sqrt(np.maximum(size, 0.0)) * rng.standard_normal(len(size)))
-        return self._inside(self.theta + step)
-
 
 SCHEMA, VERSION = "thermogrip.plant", 1
 _MOST_ERROR, _MOST_READING = 1e6, 1e9  # of a sensor, in any unit
@@ -205,12 +185,8 @@ _PLAIN = ("values", "units", "scales", "noise", "offsets", "nuisance", "referenc
 def check_plant_file(
     path: str | Path, *, inside: str | None = None, version: int = VERSION
 ) -> dict[str, Any]:
-    """Look through a plant, or that inside a file of another schema, up to a version, before what its model
-    needs is loaded.
-
-    Returns what the file holds; UserError if it is beyond the limits of a document or a field is not what it
-    should be.
-    """
+    """Return what a plant file holds, or one of another schema with a plant ``inside``, once its limits and
+    fields are checked; this loads nothing that its model needs."""
     content = read_json(path, inside or SCHEMA, version)
     with reading("is not whole", file=path, hint="write the file again"):
         if inside and not isinstance(content.get("plant"), dict):
@@ -226,7 +202,9 @@ def plain_content(plant: PlantData) -> dict[str, Any]:
     content |= {"free": list(plant.free), "logs": list(plant.logs)}
     content["scores"] = plant.scores.to_json()
     content["fitted_to"] = [asdict(log) for log in plant.fitted_to]
-    content |= {name: _ranges_to_json(getattr(plant, name)) for name in ("bounds", "valid")}
+    for kind in ("bounds", "valid"):  # an open end is null, for JSON has no infinity
+        ranges: dict[str, tuple[float, float]] = getattr(plant, kind)
+        content[kind] = {n: [end if np.isfinite(end) else None for end in ends] for n, ends in ranges.items()}
     content["covariance"] = None if plant.covariance is None else np.asarray(plant.covariance).tolist()
     content["samples"] = None
     if plant.inputs_end_at_row:  # absent otherwise: files of version 0.1.0 have no such key
@@ -346,11 +324,6 @@ def _valid(content: Mapping[str, Sequence[float | None]]) -> dict[str, tuple[flo
         if not (low <= high and all(abs(end) <= _MOST_READING or np.isinf(end) for end in (low, high))):
             raise ValueError(f"valid of {name} is {low:g} to {high:g}")
     return ranges
-
-
-def _ranges_to_json(ranges: Mapping[str, tuple[float, float]]) -> dict[str, list[float | None]]:
-    """Return ranges as JSON has them; an open end is null, for JSON has no infinity."""
-    return {name: [end if np.isfinite(end) else None for end in ends] for name, ends in ranges.items()}
 
 
 def _ranges_of_json(content: Mapping[str, Sequence[float | None]]) -> dict[str, tuple[float, float]]:

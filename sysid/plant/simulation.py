@@ -1,8 +1,5 @@
 """Free run of a plant over a log: the start, the gaps.
 
-**Grid.**  The log is cut at its gaps and put on the model's own step
-(:mod:`thermogrip.sysid.plant.log_grid`).
-
 **Start.**  What a log does not say is estimated from its warm-up, the first few seconds, and from nothing
 later:
 

@@ -12,8 +12,7 @@ Beside the free run stand
 * **no input**: y = m + (y_first - m) exp(-t/tau), with m the mean of the scored samples and tau chosen in
   hindsight. A model that does not beat it has learnt nothing from the input.
 
-The residual is tested (:mod:`thermogrip.sysid.validation.residual_tests`): does it correlate with an input?
-Whether that matters is another question: the verdict goes by how large the error is beside the stated one
+The residual is tested (:mod:`thermogrip.sysid.validation.residual_tests`), the verdict goes by its size
 (:mod:`thermogrip.sysid.validation.verdict`).
 
 After a gap of more than 10 s the input is unknown: the run starts afresh from its own warm-up, the next

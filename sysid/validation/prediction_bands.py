@@ -1,15 +1,13 @@
 """How far a free run may be off: the error of another run, bands, and the disagreement of an ensemble.
 
-**The error of another run.** One number is stated for each output: the rms error of a free run over another
-run like those of the fit (:func:`expected_error`).  `identify` prints it, the plant's file keeps it, bands
-and `validate` are made of it.  It has two parts.
+**The error of another run** is one number for each output, the rms error of a free run over another run like
+those of the fit (:func:`expected_error`); bands and `validate` are made of it.  It has two parts.
 
 *Parts held out.*  Each of n parts (blocks of a log and its last part, or whole logs) has an error e_f.  The
 error of one part more lies about them as they do about each other: ln e^2 is Student's t about their mean,
 with the scale s sqrt(1 + 1/n).  A few numbers barely show a spread, so s^2 is taken with a prior of
-:data:`PRIOR_PARTS` parts that differ by :data:`PRIOR_SPREAD`.  The median is the geometric mean of the e_f:
-one part that is unlike all others (a tank that overflows once) makes a band of rms errors three times too
-wide everywhere else.
+:data:`PRIOR_PARTS` parts that differ by :data:`PRIOR_SPREAD`.  The median is the geometric mean of
+the e_f: one part unlike all others (a tank that overflows once) would make an rms three times too wide.
 
 *What differs between runs* (supply voltage, air about the plant, a sensor that was glued anew) is in the
 errors of whole logs that were held out. A plant of one or two logs cannot show it. Then the gain of the
@@ -18,38 +16,26 @@ one adds
 
     (v(u) - v(u - g (u - u_0)))^2,        u_0 the value nearest to 0 in the logs of the fit:
 
-an input that was 0 at times has its whole effect scaled, and one that never was only the effect of its
-changes, for what it does from 0 on is part of the operating point.
-
-The stated error has the median of both parts, so that it is as likely exceeded as not; its ends are the 5
-and 95 % quantiles of their sum.
+for what an input that never was 0 does from 0 on is part of the operating point.  The stated error has the
+median of both parts, its ends the 5 and 95 % quantiles of their sum.
 
 **Bands.** With v the free run, a reading is expected within
 
     v +- z sqrt(var_k v_k + s^2 + (median g)^2 (effect^2 + mean effect^2)/2 + unlike^2),   z = 1.645 for 90 %,
 
-of which the constant half is for a level: on another day a sensor or the air about the plant is off where
-the inputs are 0 as well, and nothing says how much of the difference is gain.  (In proportion to the effect
-alone the bands of two heaters that were off by half a degree on another day held 69 and 52 percent.)  Here
-v_k are the free runs of draws of the parameters, each with a start of its own, and s^2 what these do not
-explain of the error of parts held out, so that on average a band is as wide as stated, and wider where its
-draws disagree.  A plant that was not compared (a fit alone) has the error of its fit, and the white noise of
-one reading where that was of means (:func:`thermogrip.sysid.data.data_quality.reading_excess`).
+of which the constant half is for a level that is off on another day where the inputs are 0 as well (without
+it the bands of two such heaters held 69 and 52 percent).  Here v_k are the free runs of draws of the
+parameters, each with a start of its own, and s^2 what these do not explain of the error of parts held out.
+A plant that was not compared has the error of its fit, and the white noise of one reading where that was of
+means (:func:`thermogrip.sysid.data.data_quality.reading_excess`).
 
-**A run unlike the fit.** A black box knows nothing of where it has not been. Two things are added to its
-variance, both 0 on a run like those of the fit: the part of v that lies beyond the range of the readings of
-the fit (losses curve, supplies saturate), and by how much the readings of the warm-up lie beyond it (another
-room, to which the model does not know the way).  A gain that depends on the size of the moves was no use:
-two runs of one protocol differ by a third in that size, by chance.
+**A run unlike the fit.** Added to the variance of a black box are the part of v that lies beyond the range of
+the readings of the fit, and by how much the readings of the warm-up lie beyond it.
 
-**Ensemble disagreement.** The members of a :class:`~thermogrip.sysid.models.neural.NeuralModel` were fitted
-to the same rows from different random weights, so they agree where the data constrain them. The standard
-deviation s of the members about their mean over a run, beside the spread S of the output in the data of the
-fit, depends on the drives alone, so a run is refused before its readings are used where
-
-    s > :data:`MOST_DISAGREEMENT` S.
-
-The mean errs by about as much as its members differ; a model that errs by half of S is not called good.
+**Ensemble disagreement.** The members of a :class:`~thermogrip.sysid.models.neural.NeuralModel` agree where
+the data constrain them, and their mean errs by about as much as they differ.  Their standard deviation s over
+a run, beside the spread S of the output in the data of the fit, depends on the drives alone, so a run is
+refused before its readings are used where s > :data:`MOST_DISAGREEMENT` S.
 """
 
 from __future__ import annotations
@@ -203,9 +189,7 @@ def unlike_fit(plant: Plant, log: Log, simulated: Log, warmup: float) -> dict[st
 
 def between_runs(plant: Plant, logs: Sequence[Log], gain: float = RUN_GAIN_SD) -> dict[str, Array]:
     """Return by output what a gain of the inputs that is off by so much changes at each row of the logs, one
-    after the other; empty for a plant of no log, or of so many that their held-out errors show what differs
-    between runs. The effect of an input begins at the value nearest to 0 in the fit: a run that holds it has
-    none of its own."""
+    after the other; empty for a plant of no log, or of so many that their held-out errors show it."""
     if not 0 < len(plant.logs) < SEVERAL:
         return {}
     return effect_of_inputs(plant, logs, gain)
@@ -244,10 +228,9 @@ class InputEffect:
 
 
 def effect_of_run(plant: Plant, error: Array, log: Log) -> InputEffect | None:
-    """Return what inputs did more in a run than in the fit, at once or later, whichever is nearest by least
-    squares to the errors (n, n_y) of the free run, NaN where it is not scored, in the spread of each output.
-    None where that is within two standard deviations of what differs from run to run, or leaves half of the
-    squared error.  A gain alone would be taken for what a mass that soaks for longer than the fit does."""
+    """Return what inputs did more in a run than in the fit, at once or later, by least squares on the errors
+    (n, n_y) of the free run, NaN where it is not scored, in the spread of each output; None where that is
+    within two standard deviations of what differs from run to run, or leaves half of the squared error."""
     effects = effect_of_inputs(plant, [log], _INPUT_CHANGE)
     at_once = np.array([effects[name] for name in plant.outputs]).T / _INPUT_CHANGE
     spread = np.array([np.nanstd(column(log, name)) for name in plant.outputs])
@@ -259,6 +242,7 @@ def effect_of_run(plant: Plant, error: Array, log: Log) -> InputEffect | None:
     scaled_error = np.where(is_finite, error / spread, 0.0)
     step, seconds = float(log["time"].diff("time").median()), float(log["time"][-1] - log["time"][0])
     best: tuple[float, float, float, Array] | None = None
+    # a gain alone would be taken for what a mass that soaks for longer than the fit does
     for lag_s in (0.0, *(seconds * share for share in _LATER)):
         keep = np.exp(-step / lag_s) if lag_s else 0.0
         effect = lfilter([1 - keep], [1, -keep], np.where(np.isfinite(at_once), at_once, 0.0), axis=0)

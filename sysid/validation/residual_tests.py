@@ -1,17 +1,14 @@
 """Score test of residuals: do they correlate with an input, or with the square of an output?
 
-(Lags of a cross-correlation with a slow input depend on each other: either none lies outside of its band or
-most do, and a count of them rejects right models by the dozen.)  The residual of an output, in means over
-blocks, is modelled as
+The residual of an output, in means over blocks, is modelled as
 
     e = N b + x beta + w,        b ~ N(0, 1).
 
-N b is what a right model may leave. Its columns are an offset of the sensor, of any size; the state in
-which each stretch begins, one prior sd in each direction (a few seconds of readings determine it poorly);
-and the change by draws of the plant's parameters. x are first-order lags of 1, 4, 16 and 64 blocks of the
-input: a delay, a time constant or a heat flow that the model lacks is nearly a mixture of them. The output's
-own simulated value about its mean, squared and lagged likewise, represents a loss that curves (radiation,
-free convection). With V the covariance of N b + w and beta = 0,
+N b is what a right model may leave: an offset of the sensor, of any size; the state in which each stretch
+begins, one prior sd in each direction; and the change by draws of the plant's parameters. x are first-order
+lags of 1, 4, 16 and 64 blocks of the input (a delay, time constant or heat flow that the model lacks is
+nearly a mixture of them), or of the squared output about its mean (a loss that curves). With V the covariance
+of N b + w and beta = 0,
 
     g = x' V^-1 e,      cov g = x' V^-1 x = H,      g' H^-1 g ~ chi-square, rank(H) degrees of freedom,
 
@@ -25,10 +22,8 @@ grid, averaged over blocks as readings are: with the block as the unit of time a
     c(0) = 2 (s - 1 + exp(-s)) / s^2,       c(k) = (2 sinh(s/2) / s)^2 exp(-k s)    for k > 0.
 
 (The sampled form exp(-k s) loses a third of the variance at low frequencies, where inputs act.)  Their
-variances maximise the likelihood of e with beta = 0, under wide log-normal priors.  An error slower than a
-third of the log resembles an input that is as slow, and w absorbs it as noise: effects over so long a time
-are found late. Where N b alone explains much of e by its starts, that is reported too, for then a longer
-warm-up is missing, not a term.
+variances maximise the likelihood of e with beta = 0, under wide log-normal priors.  What it rarely finds
+is in ``docs/explanation/validation.md``.
 """
 
 from __future__ import annotations
@@ -184,8 +179,7 @@ def _start_changes(
     plant: Plant, stretches: Sequence[Stretch], warmup: float, block: NDArray[np.int_], read: Mask
 ) -> list[Array]:
     """Return by output what a start of each stretch further by one prior sd in each direction changes in its
-    blocks, as columns (n, n_stretch n_x); what diverges is left at 0.  A few directions are run at a time and
-    none of their runs is kept, for there may be hundreds."""
+    blocks, as columns (n, n_stretch n_x); what diverges is left at 0."""
     n_x, n_y = plant.model.n_x, len(plant.outputs)
     variances, axes = np.linalg.eigh(plant.model.spread)
     directions = (axes * np.sqrt(np.maximum(variances, 0.0))).T
@@ -210,7 +204,6 @@ def _start_changes(
 
 
 def _modes(starts: Array) -> Array:
-    """Return the directions (n, k) in which columns (n, q) of starts move the blocks at all."""
     modes = starts @ np.linalg.eigh(starts.T @ starts)[1]
     return np.asarray(modes[:, np.abs(modes).max(axis=0, initial=0.0) > _SCORE_TEST.least_start])
 

@@ -6,17 +6,16 @@ errs by X (:func:`thermogrip.sysid.validation.prediction_bands.expected_error`),
 error without input over whole logs.  A single part that was much worse than the others, of moves that no
 other part has, widens the range of X and condemns no plant: the fit has seen that part in the end.
 
-An output that half of the parts barely excite may pass so far and be worse than no input on another run. So
-where the parts show how they differ (two or more have moves) it has to err less than no input on another
-part in 19 cases of 20: with e_f and b_f the errors on part f and those without input, ln (e_f / b_f) is
-Student's t about its mean, weighted by b_f^2, with the same prior for its spread as in the error of another
-run.  Of 11 outputs of public logs that were called good one was worse than no input on its log's other half,
-and this alone shows it: there .95 of parts lie below 1.17, of the others below .06 to .79.
+An output that half of the parts barely excite may be worse than no input on another run. So where two or more
+parts have moves it has to err less than no input on another part in 19 cases of 20: with e_f and b_f the
+errors on part f and those without input, ln (e_f / b_f) is Student's t about its mean, weighted by b_f^2,
+with the same prior for its spread as in the error of another run.  (Of 11 outputs of public logs one was so,
+with .95 of parts below 1.17, the others below .06 to .79.)
 
-**A free run** (`validate`).  With hours of readings a test finds what is real and does not matter, so the
-verdict goes by size. A plant states for this run the rms error X of each output, and the ends that 9 of 10
-runs lie within (:mod:`thermogrip.sysid.validation.prediction_bands`). With e the error and b that of the best
-decay without input, both of the same readings,
+**A free run** (`validate`) is judged by size (``docs/explanation/validation.md``). A plant states for this
+run the rms error X of each output, and the ends that 9 of 10 runs lie within
+(:mod:`thermogrip.sysid.validation.prediction_bands`). With e the error and b that of the best decay without
+input, both of the same readings,
 
     better          e below the low end, every output
     as stated       e within the ends
