@@ -93,11 +93,7 @@ class Switch:
 
 
 class RelayRig:
-    """A rig some of whose drives are relays, behind the interface of one whose drives are graded.
-
-    Inputs that no relay names are handed through.  A reading has the requested drive where the device applies
-    what was switched, else what it applies.
-    """
+    """A rig some of whose drives are relays, behind the interface of one whose drives are graded."""
 
     def __init__(self, rig: Rig, relays: Mapping[str, Relay], clock: Callable[[], float]) -> None:
         self.rig = rig
@@ -142,7 +138,7 @@ class RelayRig:
     def read(self) -> Reading:
         """Return the newest sample."""
         reading, orders = self.rig.read(), self._orders()
-        drive = dict(self._requested)
+        drive = dict(self._requested)  # where the device applies what was switched, else what it applies
         for name, relay in self.relays.items():
             applied = {channel: reading.drive[channel] for channel in {relay.heater, relay.cooler} - {""}}
             differs = [

@@ -54,8 +54,7 @@ BOARD = BoardSettings()
 class TCLabRig(SerialRig):
     """A TCLab behind the rig's interface; inputs ``q1``, ``q2`` in percent, outputs ``t1``, ``t2``.
 
-    A change of ``jump`` [K] between two scans is asked again; ``timeout`` of each line of an answer, of which
-    three are waited for, and ``greeting`` of a board that starts are real seconds.
+    A ``jump`` [K] between two scans is asked again; ``timeout`` of a line and ``greeting`` are real seconds.
     """
 
     def __init__(
@@ -68,16 +67,12 @@ class TCLabRig(SerialRig):
         clock: Callable[[], float] = time.monotonic,
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
-        self.port = port
+        super().__init__(port, timeout, clock, sleep)
         self.jump = jump
-        self.timeout = timeout
-        super().__init__(clock, sleep)
         self._set = [0.0, 0.0]
         self._pump = 0
         self._last: tuple[float, list[float]] | None = None
-        self._lost, self.closed = False, False
         self._known_at, self._heard = 0, 0  # the connection whose board is known; bytes so far
-        port.open()
         self.version = self._greet(greeting)
 
     @property
@@ -131,7 +126,13 @@ class TCLabRig(SerialRig):
             return
         with suppress(PortError):  # whatever the back-off of a lost port says: this is the last chance
             self.port.open()
-        self._end_heaters()
+        with suppress(PortError):  # one that is not confirmed must not keep the other on: the stop ends both
+            self._set_heaters([0.0, 0.0])
+        try:
+            self._ask(b"X", 1, _STOP_LINE, known=False)  # whatever board it is
+            self._set = [0.0, 0.0]
+        except PortError as error:
+            self._note("link", f"could not be switched off: {error}; PULL THE PLUG, the heaters stay on")
         self.closed = True
         self._last = None
         self._pump = 0
@@ -191,16 +192,6 @@ class TCLabRig(SerialRig):
     def _scan(self) -> list[float]:
         return [float(line) for line in self._ask(b"SCAN", 4, _DECIMAL_LINE)]
 
-    def _end_heaters(self) -> None:
-        """Switch both heaters off; never raises."""
-        with suppress(PortError):  # one that is not confirmed must not keep the other on: the stop ends both
-            self._set_heaters([0.0, 0.0])
-        try:
-            self._ask(b"X", 1, _STOP_LINE, known=False)  # whatever board it is
-            self._set = [0.0, 0.0]
-        except PortError as error:
-            self._note("link", f"could not be switched off: {error}; PULL THE PLUG, the heaters stay on")
-
     def _check_board(self) -> None:
         """Raise PortError where another board than before may answer now."""
         version = self._once(b"VER", 1, _VERSION_LINE)
@@ -216,11 +207,7 @@ class TCLabRig(SerialRig):
     def _ask(self, command: bytes, count: int, form: re.Pattern[bytes], *, known: bool = True) -> list[bytes]:
         """Return the lines that answer a command, each of the form; three attempts, of a board that is
         ``known`` or, for what switches off, of any."""
-        if self.closed:
-            raise PortError("lost", "is closed", file=self.port.url, hint="open the rig again")
-        try:
-            if not self.port.try_open():
-                raise PortError("lost", "is not there", file=self.port.url, hint="check cable and power")
+        with self._answering("; nothing on the board ends its heaters"):
             if known and self._known_at != self.port.opened:
                 self._check_board()
             before = self._heard
@@ -233,14 +220,6 @@ class TCLabRig(SerialRig):
             if not lines:
                 self._known_at = self._known_at if self._heard > before else 0  # the cable may be elsewhere
                 raise PortError("lost", "does not answer", file=self.port.url, hint="check cable and power")
-        except PortError as error:
-            if not self._lost:
-                self._note("link", f"{error}; nothing on the board ends its heaters")
-            self._lost = True
-            raise
-        if self._lost:
-            self._note("link", "answers again")
-        self._lost = False
         return lines
 
     def _wait_for_silence(self) -> None:

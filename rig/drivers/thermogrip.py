@@ -25,9 +25,8 @@ MOST_TRIES = 12  # of one question on a line that spoils half of it
 class DeviceRig(SerialRig):
     """A device with our firmware, behind the rig's interface.
 
-    ``timeout`` and ``greeting`` are real seconds: how long an answer may take, and an Arduino that starts
-    anew when its port is opened; after ``tries`` questions that are met with silence the device counts as
-    lost.
+    ``timeout`` of an answer and ``greeting`` of an Arduino that starts anew are real seconds; after ``tries``
+    questions that are met with silence the device counts as lost.
     """
 
     def __init__(
@@ -40,17 +39,12 @@ class DeviceRig(SerialRig):
         clock: Callable[[], float] = time.monotonic,
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
-        super().__init__(clock, sleep)
-        self.port = port
-        self.timeout = timeout
+        super().__init__(port, timeout, clock, sleep)
         self.tries = tries
         self._host = protocol.HostEnd()
         self._known: protocol.State | None = None
         self._heard, self._silent = 0, False  # bytes so far; whether the last question was met with none
         self._greeted_at = 0
-        self._lost = False
-        self.closed = False
-        port.open()
         self.identity = self._first_hello(greeting)
 
     @property
@@ -140,19 +134,10 @@ class DeviceRig(SerialRig):
 
     def _ask(self, request: protocol.Request) -> protocol.State:
         """Return what answers a question, greeting the device first where it is a new one."""
-        if self.closed:
-            raise PortError("lost", "is closed", file=self.port.url, hint="open the rig again")
-        try:
-            self._greet_if_new()
+        with self._answering():
+            if self._lost or self._greeted_at != self.port.opened:
+                self._greet()
             answer = self._exchange(request)
-        except PortError as error:
-            if not self._lost:
-                self._note("link", str(error))
-            self._lost, self._greeted_at = True, 0
-            raise
-        if self._lost:
-            self._lost = False
-            self._note("link", "answers again")
         if isinstance(answer, protocol.Refused):
             latched: tuple[str, ...] = ()
             if answer.code in ("latched", "active"):  # a refusal does not have the faults
@@ -163,12 +148,8 @@ class DeviceRig(SerialRig):
         self._compare(state)
         return state
 
-    def _greet_if_new(self) -> None:
-        """Open a lost port if that is due, and say hello on a new connection, after a silence or a reset."""
-        if not self.port.try_open():
-            raise PortError("lost", "is not there", file=self.port.url, hint="check cable and power")
-        if self._greeted_at == self.port.opened:
-            return
+    def _greet(self) -> None:
+        """Say hello, on a new connection and after a silence or a reset."""
         self._host.reset()
         answer = self._exchange(protocol.Hello())
         if not isinstance(answer, protocol.Answer) or answer.content != self.identity:

@@ -299,11 +299,7 @@ class Guard:
         return float("nan") if self.model is None else self.model.share
 
     def ready(self, time: float) -> bool:
-        """Say whether the skin has been compared with the model for long enough to be grasped with.
-
-        What a skin reads that has just been touched, or was found warm, is not known; a sensor that failed
-        meanwhile shows within the shortest window.
-        """
+        """Say whether the skin has been compared with the model for long enough to be grasped with."""
         if self.model is None:
             return True
         since_s = max(self.model.compared_from, self._released_s + self.settings.forget_s)
@@ -336,7 +332,11 @@ class Guard:
         if self._touched and not touching:
             self._released_s = reading.time_s
         self._touched = touching
-        masked, rooms = self._masked(reading.time_s), self.rooms(reading.values)
+        # an object determines the skin, or did lately
+        recent = touching or reading.time_s - self._released_s < self.settings.forget_s
+        recent |= self.model is not None and reading.time_s < self.model.compared_from
+        masked = frozenset((self.skin, f"{self.skin}_2")) if recent else frozenset()
+        rooms = self.rooms(reading.values)
         self._mean_drive = self._drive if reading.mean_drive is None else dict(reading.mean_drive)
         jumped = self._predict(reading)
         checked = self.sensors.check(
@@ -445,12 +445,6 @@ class Guard:
             problem = f"target {value:g} degC is unsafe"
             hint = f"choose one from {low:g} to {high:g} degC, or state the limits of {name} in a guard file"
             raise UserError(problem, file=self.settings.file, hint=hint)
-
-    def _masked(self, time: float) -> frozenset[str]:
-        """Return the outputs that an object determines, now or lately."""
-        recent = self._touched or time - self._released_s < self.settings.forget_s
-        recent |= self.model is not None and time < self.model.compared_from
-        return frozenset((self.skin, f"{self.skin}_2")) if recent else frozenset()
 
     def _predict(self, reading: Reading) -> frozenset[str]:
         """Predict with the model and return the sensors whose innovation is too large."""

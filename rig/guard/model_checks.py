@@ -104,7 +104,15 @@ class ModelMonitor:
         self, time: float, values: Mapping[str, float], masked: frozenset[str] = frozenset()
     ) -> list[Residual]:
         """Correct the estimate with readings and return the alarms; ``masked`` outputs touch an object."""
-        self._mask(time, masked)
+        # where an output is unmasked, its states are less certain, and its windows start afresh
+        if not (self._masked - masked).isdisjoint(self.plant.outputs):
+            self._filter.loosen()  # once, also where two sensors of one skin are unmasked together
+        for k, name in enumerate(self.plant.outputs):
+            if name in masked:
+                self._since[k] = np.inf
+            elif name in self._masked:
+                self._since[k] = max(time, self.compared_from)
+        self._masked = masked
         y = _values_of(self.plant.outputs, values)
         y[[name in masked for name in self.plant.outputs]] = np.nan
         self._filter.correct(time, y)
@@ -146,17 +154,6 @@ class ModelMonitor:
                     Residual("window", plant.outputs[k], length, *change, least + s.share * swing)
                 )
         return residuals
-
-    def _mask(self, time: float, masked: frozenset[str]) -> None:
-        """Where an output is unmasked, its states are less certain, and its windows start afresh."""
-        if not (self._masked - masked).isdisjoint(self.plant.outputs):
-            self._filter.loosen()  # once, also where two sensors of one skin are unmasked together
-        for k, name in enumerate(self.plant.outputs):
-            if name in masked:
-                self._since[k] = np.inf
-            elif name in self._masked:
-                self._since[k] = max(time, self.compared_from)
-        self._masked = masked
 
     def _biases(self, time: float) -> list[Residual]:
         if time < self.compared_from + self.settings.bias_after_s:

@@ -10,9 +10,8 @@
 Each session has a run folder of its own in the folder (``01-step``, ``02-loop``, ...), and what is known so
 far stands beside them.  Whatever ended it, the same call goes on from the sessions that are there.
 
-**How long a loop's log is.**  SIMC's integral time is 8 delays of what it controls (or the lag, where that is
-shorter), and the loop settles within a few of them.  The step is held for six of these; a bit of the
-PRBS lasts half of one, the time in which the loop answers a change of its target.
+SIMC's integral time is 8 delays of what it controls (or the lag, where that is shorter); a bit of the PRBS
+lasts half of one, the time in which the loop answers a change of its target.
 """
 
 from __future__ import annotations

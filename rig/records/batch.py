@@ -4,8 +4,7 @@ The columns of a plan and the folder of a batch are described in ``docs/referenc
 was not good (tripped, did not settle, marked bad, cut off) is kept as it is and done again in ``0002-2``.
 
 A batch that was stopped, by whatever, goes on where it was: every trial that has a good grasp on disk is
-skipped.  After a trip it stops, unless its kind is one of ``AGAIN`` or somebody who is asked has cleared its
-cause; then the trial is done once more, at most ``TRIES`` times.
+skipped.
 """
 
 from __future__ import annotations

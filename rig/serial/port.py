@@ -8,9 +8,8 @@ A port is opened ``exclusive``, which stops every program that asks for it too; 
 open it and steal bytes, and the protocol's checks then see damage and silence.  Windows lets nobody open a
 serial port twice, and a virtual device serves one socket at a time.
 
-**Coming back.**  A lost port is opened again after 0.1 s, then after twice as long each time, up to 5 s.  USB
-devices may return under another number: a name of ``/dev/serial/by-id`` stays the same.  Whether it is the
-same device the driver has to ask.
+USB devices may return under another number: a name of ``/dev/serial/by-id`` stays the same.  Whether it is
+the same device the driver has to ask.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ import select
 import sys
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from importlib.util import find_spec
 from typing import Any
 
@@ -49,11 +48,7 @@ class PortError(UserError):
 
 
 class Port:
-    """A serial port, pty or socket that is opened, lost and found again.
-
-    ``url`` is ``/dev/ttyACM0``, ``COM3`` or ``socket://127.0.0.1:5000``; a change of ``opened``, which
-    counts, shows that the connection is a new one.
-    """
+    """A serial port, pty or socket (``socket://127.0.0.1:5000``) that is opened, lost and found again."""
 
     def __init__(
         self,
@@ -64,7 +59,7 @@ class Port:
     ) -> None:
         self.url = url
         self.baudrate = baudrate
-        self.opened = 0
+        self.opened = 0  # counts: another one shows that the connection is new
         self._serial: Any = None
         self._back_off = BackOff(clock, first=FIRST_WAIT_S, longest=LONGEST_WAIT_S)
 
@@ -171,12 +166,37 @@ def port_error(url: str, error: Exception) -> PortError:
 
 
 class SerialRig:
-    """Time and notices of a rig behind a port; its clock starts at 0 when it is made."""
+    """What drivers share: port, clock (it starts at 0 when the rig is made), notices."""
 
-    def __init__(self, clock: Callable[[], float], sleep: Callable[[float], None]) -> None:
+    def __init__(
+        self, port: Port, timeout: float, clock: Callable[[], float], sleep: Callable[[float], None]
+    ) -> None:
+        self.port = port
+        self.timeout = timeout
+        self.closed = False
+        self._lost = False  # whether the last question was not answered
         self._clock, self._start = clock, clock()
         self._beat = Metronome(clock, sleep)
         self._notices: deque[Event] = deque(maxlen=1000)
+        port.open()
+
+    @contextlib.contextmanager
+    def _answering(self, consequence: str = "") -> Iterator[None]:
+        """Open a lost port if that is due, note that the device does not answer and that it does again."""
+        if self.closed:
+            raise PortError("lost", "is closed", file=self.port.url, hint="open the rig again")
+        try:
+            if not self.port.try_open():
+                raise PortError("lost", "is not there", file=self.port.url, hint="check cable and power")
+            yield
+        except PortError as error:
+            if not self._lost:
+                self._note("link", f"{error}{consequence}")
+            self._lost = True
+            raise
+        if self._lost:
+            self._note("link", "answers again")
+        self._lost = False
 
     def wait(self, seconds: float) -> None:
         """Let time pass; waits that follow each other end on a grid."""

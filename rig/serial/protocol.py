@@ -308,11 +308,6 @@ class HostEnd:
         self._bytes = b""
         self.identity: Identity | None = None
 
-    @property
-    def open(self) -> Request | None:
-        """The question that waits for its answer."""
-        return self._open
-
     def ask(self, request: Request) -> bytes:
         """Return the bytes of a new question; an older one that is still open is given up."""
         self._seq = self._seq % 0xFFFF + 1

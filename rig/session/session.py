@@ -226,12 +226,17 @@ def run_session(
     watch, requests = Guard(skin=output) if guard is None else guard, operator or Operator()
     run = Loop(rig, controller, recorder, progress, watch, clock, listener, requests, band)
     thing = Object(*grasp) if isinstance(grasp, tuple) else grasp
-    _check_object(thing, run)
+    if thing is not None and isinstance(thing.t_object, str) and thing.t_object not in run.reading.values:
+        hint = known_names(thing.t_object, run.reading.values, "use one of {}, or a number")
+        raise UserError(f"the rig has no sensor {thing.t_object!r}", hint=hint)
     verdict, touched = "not settled", None
     with run.powered():
         run.start(target if isinstance(target, Mapping) else {output: float(target)})
         if profile is not None:
-            _follow(run, profile)
+            for name, values in profile.targets.items():
+                run.check_targets(name, values)
+            for passed in run.regulate("hold", profile.seconds, profile):
+                run.report(passed / profile.seconds, "following the profile")
             verdict = "followed"
         elif _settle(run, settle_timeout, band):
             verdict = "settled"
@@ -245,13 +250,6 @@ def run_session(
     return _session_of(run, verdict, touched, band)
 
 
-def _check_object(thing: Object | None, run: Loop) -> None:
-    """Raise UserError where the object's temperature is to come from a sensor that the rig has not."""
-    if thing is not None and isinstance(thing.t_object, str) and thing.t_object not in run.reading.values:
-        hint = known_names(thing.t_object, run.reading.values, "use one of {}, or a number")
-        raise UserError(f"the rig has no sensor {thing.t_object!r}", hint=hint)
-
-
 def _settle(run: Loop, timeout: float, band: float) -> bool:
     """Regulate until every target's output has settled; False when the time is over."""
     for passed in run.regulate("settle", timeout):
@@ -263,14 +261,6 @@ def _settle(run: Loop, timeout: float, band: float) -> bool:
         if all(has_settled(time, error, band=band) for error in errors):
             return True
     return False
-
-
-def _follow(run: Loop, profile: Profile) -> None:
-    """Regulate along a profile to its end."""
-    for name, values in profile.targets.items():
-        run.check_targets(name, values)
-    for passed in run.regulate("hold", profile.seconds, profile):
-        run.report(passed / profile.seconds, "following the profile")
 
 
 def _grasp_object(
@@ -327,11 +317,7 @@ def grasp_of_rows(
     about: Mapping[str, Any],
     rooms: Collection[str],
 ) -> Grasps:
-    """Return the one grasp of these rows (columns with their unit suffix), closed at ``closed`` [s].
-
-    ``output`` is the skin, ``about`` the labels (``grasp_id``, ``material``, ``t_object``, ...; None or NaN
-    where not known); the first of the ``rooms`` is the grasp's ``t_ambient``.
-    """
+    """Return the one grasp of a session's rows: of the skin ``output``, with the labels of ``about``."""
     room = next((value for name, value in rows[0].items() if name.removesuffix("_degC") in rooms), np.nan)
     labels = {key: [about.get(key) or ""] for key in GRASP_LABELS if about.get(key)}
     stated_numbers = {key: about[key] for key in GRASP_NUMBERS if key in about}
@@ -453,9 +439,7 @@ def play(
 ) -> tuple[Log, str]:
     """Play a schedule, sampled every ``dt`` [s]; return the log, and the line of the trip that ended it.
 
-    What plays may also be a :class:`Player` of any kind, with a sample time of its own. The other arguments
-    are those of :func:`run_session`.  The rig is powered down but not closed at the end; UserError where a
-    trip comes before there are two rows.
+    A :class:`Player` has a sample time of its own; the other arguments are those of :func:`run_session`.
     """
     player = Playback(schedule, rig.units, dt) if isinstance(schedule, Log) else schedule
     watch = Guard() if guard is None else guard

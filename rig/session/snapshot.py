@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Mapping
-from contextlib import suppress
 from dataclasses import dataclass
 from typing import TypeAlias
 
@@ -66,8 +65,4 @@ class Operator:
 
     def take_bad(self) -> list[str]:
         """Return the marks since the last call."""
-        taken: list[str] = []
-        with suppress(IndexError):
-            while True:
-                taken.append(self._bad.popleft())
-        return taken
+        return [self._bad.popleft() for _ in range(len(self._bad))]

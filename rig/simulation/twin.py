@@ -213,7 +213,14 @@ class Twin:
         while (grid := round((self._k + 1) * dt, 9)) <= end:
             self._accumulate(grid - self.time)
             self.time = grid
-            self._step()
+            u = self._mean_input()
+            self._x, self._y = self._advance(u)
+            self._k += 1
+            self._applied[:] = 0.0
+            self._elapsed = 0.0
+            if self._contact is not None and np.isinf(self._contact.opened):
+                self._contact.follow(self.time, self._outputs_alone()[self.skin])
+            self._write_history(u)
         self._accumulate(end - self.time)
         self.time = end
         if self._pace is not None:
@@ -304,16 +311,6 @@ class Twin:
             self._x[None], u[None, None], self._d[None, None], self.plant.p[None], self.plant.dt
         )
         return x[0], y[0, -1]
-
-    def _step(self) -> None:
-        u = self._mean_input()
-        self._x, self._y = self._advance(u)
-        self._k += 1
-        self._applied[:] = 0.0
-        self._elapsed = 0.0
-        if self._contact is not None and np.isinf(self._contact.opened):
-            self._contact.follow(self.time, self._outputs_alone()[self.skin])
-        self._write_history(u)
 
     def _outputs_alone(self) -> dict[str, float]:
         """Return the plant's outputs now, without any object; worked out once for a time."""

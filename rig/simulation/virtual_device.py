@@ -220,7 +220,7 @@ class VirtualDevice:
     >>> device.exchange(b"Q1 100\\r\\n")
     b'100.000\\r\\n'
     >>> now[0] = 60.0
-    >>> device.true_temperatures["t1"] > 30.0
+    >>> device.truth().temperatures["t1"] > 30.0
     True
     >>> device.fault("sensor_open", sensor="t1")
     """
@@ -281,18 +281,8 @@ class VirtualDevice:
         """Seconds of the device's clock since it was made."""
         return self._clock() - self._start
 
-    @property
-    def applied_drive(self) -> dict[str, float]:
-        """What drives the plant now, by input: the pins', or a stuck driver's."""
-        return dict(self.truth().drive)
-
-    @property
-    def true_temperatures(self) -> dict[str, float]:
-        """How warm everything is now [degC], by output, whatever the sensors show."""
-        return dict(self.truth().temperatures)
-
     def truth(self) -> Moment:
-        """Return drive, pump and temperatures now."""
+        """Return what drives the plant now, and how warm everything is, whatever pins and sensors show."""
         with self._lock:
             self._advance()
             return self.bench.moment()

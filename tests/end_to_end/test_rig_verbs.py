@@ -85,7 +85,7 @@ def test_a_schedule_ends_where_the_guard_trips_and_the_answer_is_no(
     assert 25.0 < float(log["t1"][-1]) <= 27.5
     about = json.loads((out / "run.json").read_text())
     assert (about["verdict"], about["about"]["sample_s"], about["about"]["seed"]) == ("tripped", 0.5, 3)
-    assert device.applied_drive == {"q1": 0.0, "q2": 0.0}
+    assert device.truth().drive == {"q1": 0.0, "q2": 0.0}
 
 
 def test_record_writes_what_the_schedule_did(device: VirtualDevice, tmp_path: Path) -> None:
@@ -100,7 +100,7 @@ def test_record_writes_what_the_schedule_did(device: VirtualDevice, tmp_path: Pa
     assert set(log["q2"].values) == {0.0, 20.0}
     assert log["time"].values.tolist() == [float(k) for k in range(20)]
     assert log["q1"].values.tolist() == [40.0 * (k >= 5) for k in range(20)]
-    assert device.applied_drive == {"q1": 0.0, "q2": 0.0}
+    assert device.truth().drive == {"q1": 0.0, "q2": 0.0}
 
 
 def test_run_drives_the_rig_on_a_port_and_leaves_it_off(
@@ -114,7 +114,7 @@ def test_run_drives_the_rig_on_a_port_and_leaves_it_off(
     answer = json.loads(capsys.readouterr().out)
     assert answer["verdict"] == "not settled", answer
     assert max(moment.drive["q1"] for moment in device.trace) > 0.0
-    assert device.applied_drive == {"q1": 0.0, "q2": 0.0}
+    assert device.truth().drive == {"q1": 0.0, "q2": 0.0}
     made = json.loads((tmp_path / "run" / "run.json").read_text())
     assert made["about"]["port"] == device.port
     assert made["provenance"]["inputs"][str(controller)] == sha256(controller.read_bytes()).hexdigest()

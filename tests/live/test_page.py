@@ -217,7 +217,7 @@ def test_where_the_session_is_killed_the_page_says_so_and_the_drive_is_zero(
         page = viewer(address)
         until(page, "#word", "running")
         until(page, "#tiles", r"drive\s*(1\.|0\.[1-9])")
-        assert device.applied_drive["drive"] > 0.0
+        assert device.truth().drive["drive"] > 0.0
         run.kill()
         until(page, "#word", "session lost")
         until(
@@ -227,7 +227,7 @@ def test_where_the_session_is_killed_the_page_says_so_and_the_drive_is_zero(
         run.wait()
         run.stderr.close()
         end = time.monotonic() + 120.0  # of patience: it ends with the drive
-        while device.applied_drive["drive"] and time.monotonic() < end:
+        while device.truth().drive["drive"] and time.monotonic() < end:
             time.sleep(0.05)
-        assert device.applied_drive == {"drive": 0.0}
+        assert device.truth().drive == {"drive": 0.0}
     assert page.evaluate("fetch('/stop', {method: 'POST', body: '{}'}).then((a) => a.status)") == 409

@@ -98,7 +98,7 @@ def test_nothing_ends_the_heaters_of_a_board_whose_host_is_gone(bench: Lab) -> N
     bench.lab.apply(HALF, 1)
     bench.device.fault("cable_pulled")
     bench.clock.sleep(300.0)
-    assert bench.lab.read().drive == bench.device.applied_drive == HALF  # reported as they were set
+    assert bench.lab.read().drive == bench.device.truth().drive == HALF  # reported as they were set
     with pytest.raises(PortError):
         bench.lab.apply(OFF, 0)
     bench.lab.close()
@@ -119,13 +119,13 @@ def test_closing_does_not_wait_for_the_next_try_to_open(bench: Lab) -> None:
     bench.scan(1)
     bench.device.clear()
     bench.lab.close()
-    assert bench.device.applied_drive == OFF
+    assert bench.device.truth().drive == OFF
 
 
 @pytest.mark.parametrize("spoilt", [b"Q1", b"Q2"])
 def test_a_heater_that_answers_nonsense_does_not_keep_the_other_on(bench: Lab, spoilt: bytes) -> None:
     bench.lab.apply({"q1": 33.333, "q2": 66.667}, 1)
-    assert bench.device.applied_drive == bench.lab.read().drive == {"q1": 33.333, "q2": 66.667}
+    assert bench.device.truth().drive == bench.lab.read().drive == {"q1": 33.333, "q2": 66.667}
     whole = bench.device.exchange
     bench.device.exchange = (  # type: ignore[method-assign]
         lambda data: b"7.000\r\n" if data.startswith(spoilt) else whole(data)
@@ -133,7 +133,7 @@ def test_a_heater_that_answers_nonsense_does_not_keep_the_other_on(bench: Lab, s
     with pytest.raises(PortError, match=r"took 7 % where q. = (33\.333|66\.667) %"):
         bench.lab.apply({"q1": 33.333, "q2": 66.667}, 1)
     bench.lab.close()
-    assert bench.device.applied_drive == OFF
+    assert bench.device.truth().drive == OFF
     assert not any("PULL THE PLUG" in notice.text for notice in bench.lab.notices())
 
 
@@ -157,7 +157,7 @@ def test_what_is_reported_of_a_pulled_cable_is_true_of_the_board(protocol: str, 
     rig = open_rig(DirectPort(device), protocol, clock=clock, sleep=clock.sleep)
     session = run_session(rig, Half(device), {"t1": 40.0}, clock=clock)
     clock.sleep(60.0)
-    assert any(device.applied_drive.values()) is not ends
+    assert any(device.truth().drive.values()) is not ends
     power = next(event.text for event in session.events if event.kind == "power")
     assert session.trip.kind == "cable"
     for said in (power, session.trip.line()):
@@ -300,7 +300,7 @@ def test_the_makers_own_client_runs_against_the_virtual_board(
             lab.P1 = 150
             assert lab.P1 == 150.0
             lab.P1 = 200
-            assert device.applied_drive == {"q1": 40.0, "q2": 20.0}
+            assert device.truth().drive == {"q1": 40.0, "q2": 20.0}
             t1, t2, q1, q2 = lab.scan()
             assert (q1, q2) == (40.0, 20.0)
             assert min(t1, t2) > 20.0
@@ -309,5 +309,5 @@ def test_the_makers_own_client_runs_against_the_virtual_board(
                 history.update(k)
             assert history.columns == ["Time", "T1", "T2", "Q1", "Q2"]
             assert [row[3:] for row in history.log] == [(40.0, 20.0)] * 3
-        assert device.applied_drive == OFF
+        assert device.truth().drive == OFF
     assert "connected on port" in capsys.readouterr().out

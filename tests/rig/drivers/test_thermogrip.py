@@ -43,7 +43,7 @@ def test_readings_are_the_plants(bench: Bench) -> None:
     for _ in range(100):
         bench.rig.apply(DRIVE, 1)
         bench.rig.wait(1.0)
-    read, true = bench.rig.read().values, bench.device.true_temperatures
+    read, true = bench.rig.read().values, bench.device.truth().temperatures
     assert true["t_tank"] > 35.0
     assert all(read[name] == pytest.approx(value, abs=0.4) for name, value in true.items())
 
@@ -51,9 +51,9 @@ def test_readings_are_the_plants(bench: Bench) -> None:
 def test_a_drive_that_nobody_renews_ends_within_its_time(bench: Bench) -> None:
     bench.rig.apply(DRIVE, 1)
     bench.clock.sleep(TTL_S - 0.01)
-    assert bench.device.applied_drive == DRIVE
+    assert bench.device.truth().drive == DRIVE
     bench.clock.sleep(0.01)
-    assert bench.device.applied_drive == {"drive": 0.0}
+    assert bench.device.truth().drive == {"drive": 0.0}
     assert bench.rig.read().drive == {"drive": 0.0}
     assert bench.kinds() == {"expired"}
 
@@ -65,7 +65,7 @@ def test_an_open_sensor_reads_nan_and_latches_the_device(bench: Bench) -> None:
     reading = bench.rig.read()
     assert np.isnan(reading.values["t_tank"])
     assert np.isfinite(reading.values["t_surface"])
-    assert bench.device.applied_drive == {"drive": 0.0}
+    assert bench.device.truth().drive == {"drive": 0.0}
     with pytest.raises(DeviceRefusedError, match="open:t_tank") as refused:
         bench.rig.apply(DRIVE, 1)
     assert refused.value.code == "latched"
@@ -76,7 +76,7 @@ def test_an_open_sensor_reads_nan_and_latches_the_device(bench: Bench) -> None:
     bench.clock.sleep(0.2)
     bench.rig.clear()
     bench.rig.apply(DRIVE, 1)
-    assert bench.device.applied_drive == DRIVE
+    assert bench.device.truth().drive == DRIVE
     assert "latched" in bench.kinds()
 
 
@@ -89,12 +89,12 @@ def test_a_pulled_cable_is_no_reading_and_an_unconfirmed_drive(bench: Bench) -> 
     with pytest.raises(PortError):
         bench.rig.apply(DRIVE, 1)
     bench.rig.wait(TTL_S)
-    assert bench.device.applied_drive == {"drive": 0.0}
+    assert bench.device.truth().drive == {"drive": 0.0}
     bench.device.clear("cable_pulled")
     bench.clock.sleep(10.0)  # longer than any back-off
     assert all(np.isfinite(value) for value in bench.rig.read().values.values())
     bench.rig.apply(DRIVE, 1)
-    assert bench.device.applied_drive == DRIVE
+    assert bench.device.truth().drive == DRIVE
     reported = [notice.text for notice in bench.rig.notices() if notice.kind == "link"]
     assert "lost" in reported[0]
     assert reported[-1] == "answers again"
@@ -104,13 +104,13 @@ def test_a_reset_is_noted_and_nothing_is_driven_until_the_loop_asks_for_it(bench
     bench.rig.apply(DRIVE, 1)
     bench.device.fault("reset", cause="watchdog")
     bench.rig.wait(5.0)
-    assert bench.device.applied_drive == {"drive": 0.0}
+    assert bench.device.truth().drive == {"drive": 0.0}
     bench.rig.read()
     reported = [notice.text for notice in bench.rig.notices() if notice.kind == "reset"]
     assert len(reported) == 1
     assert "watchdog, boot 2" in reported[0]
     bench.rig.apply(DRIVE, 1)
-    assert bench.device.applied_drive == DRIVE
+    assert bench.device.truth().drive == DRIVE
 
 
 def test_a_reset_whose_line_was_lost_is_noted_all_the_same(direct: Bench) -> None:
@@ -140,7 +140,9 @@ def test_a_line_that_spoils_half_of_what_it_carries_gives_right_readings_or_none
             continue
         right += 1
         assert reading.drive == {"drive": value}
-        assert reading.values["t_tank"] == pytest.approx(direct.device.true_temperatures["t_tank"], abs=0.4)
+        assert reading.values["t_tank"] == pytest.approx(
+            direct.device.truth().temperatures["t_tank"], abs=0.4
+        )
     assert right > 150
     direct.device.clear()
 
@@ -149,9 +151,9 @@ def test_a_driver_that_is_stuck_is_cut_with_its_supply(bench: Bench) -> None:
     bench.rig.apply(DRIVE, 1)
     for share in (0.25, -1.0):
         bench.device.fault("driver_stuck", share=share)
-        assert bench.device.applied_drive == {"drive": share}
+        assert bench.device.truth().drive == {"drive": share}
     bench.rig.apply({"drive": 0.0}, 0)
-    assert bench.device.applied_drive == {"drive": 0.0}
+    assert bench.device.truth().drive == {"drive": 0.0}
 
 
 def test_close_never_raises_and_says_what_it_could_not_do(direct: Bench) -> None:
@@ -203,7 +205,7 @@ def test_a_board_that_comes_back_is_driven_on_where_its_number_says_so(direct: B
     direct.rig.read()
     direct.device.clear()
     direct.rig.apply(DRIVE, 1)
-    assert direct.device.applied_drive == DRIVE
+    assert direct.device.truth().drive == DRIVE
 
 
 @pytest.mark.parametrize(

@@ -139,14 +139,14 @@ def run_host_drill(drill: HostDrill, folder: Path) -> HostOutcome:
         words = [sys.executable, "-c", _HOST, device.port, str(folder), str(SPEED), drill.how]
         host = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
         try:
-            _wait(lambda: device.applied_drive["drive"] > 0.5, _READY_S, host)
+            _wait(lambda: device.truth().drive["drive"] > 0.5, _READY_S, host)
             said = ""
             if drill.act is not None:
                 _wait(lambda: (folder / "samples.csv").read_text().count("\n") > ROWS, _READY_S, host)
                 at = device.time
                 said = drill.act(host.pid, device.port)
             errors = host.communicate(timeout=_END_S)[1]
-            _wait(lambda: device.applied_drive["drive"] == 0.0, _END_S, None)
+            _wait(lambda: device.truth().drive["drive"] == 0.0, _END_S, None)
         finally:
             host.kill()
             host.wait()

@@ -86,7 +86,7 @@ def tuned(tmp_path_factory: pytest.TempPathFactory) -> Done:
     for when, fraction in (("playing the schedule", 0.02), ("following the profile", 0.27), ("", 0.5)):
         with pytest.raises(KeyboardInterrupt):
             desk.autotune(progress=stop_at(when, fraction)).run()
-        assert desk.device.applied_drive == {"q1": 0.0, "q2": 0.0}
+        assert desk.device.truth().drive == {"q1": 0.0, "q2": 0.0}
         stopped.append(sorted(path.name for path in desk.folder.glob("0*")))
         if when:
             tear(desk.folder / stopped[-1][-1])
@@ -103,7 +103,7 @@ def test_a_board_that_nobody_has_seen_is_brought_to_its_target(tuned: Done) -> N
     assert known["checked"]["verdict"] == "settled"
     assert known["checked"]["settle_s"] < 200.0
     assert known["checked"]["overshoot"] < 0.6
-    assert tuned.desk.device.applied_drive == {"q1": 0.0, "q2": 0.0}
+    assert tuned.desk.device.truth().drive == {"q1": 0.0, "q2": 0.0}
     assert max(max(moment.temperatures.values()) for moment in tuned.desk.device.trace) < LIMIT
     assert load_controller(tuned.desk.folder / "controller.json").notes["verdict"]
 
@@ -170,7 +170,7 @@ def test_a_trip_ends_it_and_the_rows_stay(tmp_path: Path) -> None:
 
     with pytest.raises(Tripped, match="lost: t2"):
         desk.autotune(progress=fails).run()
-    assert desk.device.applied_drive == {"q1": 0.0, "q2": 0.0}
+    assert desk.device.truth().drive == {"q1": 0.0, "q2": 0.0}
     assert read_run(desk.folder / "01-step").about["verdict"] == "tripped"
 
 

@@ -137,7 +137,7 @@ def test_a_device_is_off_when_its_hosts_disk_is_full(disk: Path) -> None:
         folder.finish(session)
     assert session.trip.kind == "disk"
     assert "free some space" in session.advice
-    assert device.applied_drive == {"drive": 0.0}
+    assert device.truth().drive == {"drive": 0.0}
     rows = session.log["time"].values
     on = [moment.time_s for moment in device.trace if any(moment.drive.values())]
     assert len(on) > 5

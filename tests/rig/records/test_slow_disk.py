@@ -84,7 +84,7 @@ def test_a_disk_that_takes_nothing_for_minutes_is_a_trip(
         stuck = Stuck(bench.clock, run_folder._write_bytes)
         monkeypatch.setattr(run_folder, "_write_bytes", stuck)
         log, ended = play(bench.rig, steps(100.0), clock=bench.clock, recorder=folder)
-        assert bench.device.applied_drive == {"q1": 0.0, "q2": 0.0}
+        assert bench.device.truth().drive == {"q1": 0.0, "q2": 0.0}
         stuck.let_go.set()
         folder.played(ended)
     assert ended.startswith("disk: the run folder: ")
@@ -105,7 +105,7 @@ def test_a_disk_that_cannot_be_forced_any_more_is_a_trip_at_the_next_sample(
     _, ended = play(bench.rig, steps(100.0), clock=bench.clock, recorder=folder)
     folder.close()
     assert ended.startswith("disk: the run folder: expected to be written, measured Input/output error")
-    assert bench.device.applied_drive == {"q1": 0.0, "q2": 0.0}
+    assert bench.device.truth().drive == {"q1": 0.0, "q2": 0.0}
 
 
 def test_a_fault_at_an_event_is_reported_by_the_next_row(

@@ -422,7 +422,7 @@ def test_a_trip_before_there_are_two_rows_is_one_line(plant: Plant, tmp_path: Pa
     bench = Bench(plant)
     with pytest.raises(UserError, match=r"first reading; disk: .*No space left"):
         play(bench.rig, schedule(tmp_path), clock=bench.clock, recorder=Full())
-    assert bench.device.applied_drive == {"drive": 0.0}
+    assert bench.device.truth().drive == {"drive": 0.0}
     bench.close()
 
 
@@ -446,7 +446,7 @@ def test_a_sensor_that_is_lost_while_a_schedule_is_played_ends_it_with_everythin
 
     log, ended = play(bench.rig, steps(2.0), clock=bench.clock, progress=progress)
     assert "t1" in ended
-    assert bench.device.applied_drive == {"q1": 0.0, "q2": 0.0}
+    assert bench.device.truth().drive == {"q1": 0.0, "q2": 0.0}
     assert 60 <= log.sizes["time"] < 90
     bench.close()
 

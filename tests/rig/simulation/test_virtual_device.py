@@ -35,7 +35,7 @@ def test_how_its_time_is_cut_does_not_matter(plant: Plant) -> None:
         for _ in range(pieces):
             bench.clock.sleep(3.0 / pieces)
             bench.device.truth()
-        return [*bench.device.true_temperatures.values(), *bench.rig.read().values.values()]
+        return [*bench.device.truth().temperatures.values(), *bench.rig.read().values.values()]
 
     assert run(1) == pytest.approx(run(60), abs=1e-9)
 
@@ -70,14 +70,14 @@ def test_a_sensors_fault_is_in_the_sensor_alone(
         if not device.core.faults:
             rig.apply({"drive": 0.1}, 1)
         clock.sleep(1.0)
-        past[k + 1] = device.true_temperatures["t_tank"]
+        past[k + 1] = device.truth().temperatures["t_tank"]
     true, got = past[60], shown(device, "t_tank")
     want = {"7 more": true + 7.0, "6 less": true - 6.0, "20 s ago": past[40]}.get(expected, expected)
     assert got == want if isinstance(want, str) else got == pytest.approx(want, abs=0.001)
-    assert shown(device, "t_surface") == pytest.approx(device.true_temperatures["t_surface"], abs=0.001)
+    assert shown(device, "t_surface") == pytest.approx(device.truth().temperatures["t_surface"], abs=0.001)
     device.clear(fault)
     clock.sleep(0.1)
-    assert shown(device, "t_tank") == pytest.approx(device.true_temperatures["t_tank"], abs=0.05)
+    assert shown(device, "t_tank") == pytest.approx(device.truth().temperatures["t_tank"], abs=0.05)
 
 
 def test_a_stalled_pump_moves_no_water(plant: Plant) -> None:
@@ -129,7 +129,7 @@ def test_every_fault_can_be_set_and_cleared(plant: Plant) -> None:
     bench.clock.sleep(0.5)
     bench.rig.clear()
     bench.rig.apply({"drive": 0.2}, 1)
-    assert bench.device.applied_drive == {"drive": 0.2}
+    assert bench.device.truth().drive == {"drive": 0.2}
 
 
 @pytest.mark.parametrize(("name", "sensor"), [("ghost", None), ("sensor_open", "t_nose")])
@@ -220,6 +220,6 @@ def test_a_device_that_the_computer_holds_up_counts_no_time_meanwhile(plant: Pla
         rig = DeviceRig(Port(device.port))
         rig.apply({"drive": 0.5}, 1)
         clock.late = 60.0
-        assert device.applied_drive == {"drive": 0.5}
+        assert device.truth().drive == {"drive": 0.5}
         assert rig.read().drive == {"drive": 0.5}
         rig.close()
