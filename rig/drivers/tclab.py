@@ -57,6 +57,9 @@ class TCLabRig(SerialRig):
     A ``jump`` [K] between two scans is asked again; ``timeout`` of a line and ``greeting`` are real seconds.
     """
 
+    expires_s = float("inf")  # nothing on the board ends its heaters
+    has_pump = False
+
     def __init__(
         self,
         port: Port,
@@ -79,16 +82,6 @@ class TCLabRig(SerialRig):
     def units(self) -> dict[str, str]:
         """Units of the driven inputs, by name."""
         return dict.fromkeys(HEATERS, "percent")
-
-    @property
-    def expires_s(self) -> float:
-        """Infinite: nothing on the board ends its heaters."""
-        return float("inf")
-
-    @property
-    def has_pump(self) -> bool:
-        """False: the board has two heaters and nothing else."""
-        return False
 
     def read(self) -> Reading:
         """Return the newest scan; NaN where a sensor is lost, everywhere while the board does not answer (its

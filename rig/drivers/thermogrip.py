@@ -29,6 +29,8 @@ class DeviceRig(SerialRig):
     questions that are met with silence the device counts as lost.
     """
 
+    expires_s = TTL_S
+
     def __init__(
         self,
         port: Port,
@@ -56,11 +58,6 @@ class DeviceRig(SerialRig):
     def state(self) -> protocol.State | None:
         """The device's last state, None while it cannot be reached."""
         return None if self._lost else self._known
-
-    @property
-    def expires_s(self) -> float:
-        """How long a drive lives on the device when nobody renews it [s]."""
-        return TTL_S
 
     @property
     def has_pump(self) -> bool:

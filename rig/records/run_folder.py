@@ -213,19 +213,15 @@ def refuse_links(folder: Path) -> None:
 def refuse_used(folder: Path) -> None:
     """Raise UserError where a folder holds a run, a file of a run's names, or a link."""
     refuse_links(folder)
-    if (folder / "run.json").exists():
-        raise UserError("holds a run already", file=folder, hint="choose another folder")
-    overwritten = next((name for name in NAMES if (folder / name).exists()), "")
-    if overwritten:
-        problem = f"holds a {overwritten} that would be overwritten"
+    used = next((name for name in NAMES if (folder / name).exists()), "")
+    if used:
+        problem = "holds a run already" if used == FILES[0] else f"holds a {used} that would be overwritten"
         raise UserError(problem, file=folder, hint="choose another folder")
 
 
 def event_line(event: Event) -> bytes:
     """Return an event as a line of ``events.jsonl``; what is no character (a lone surrogate) is ``?``."""
-    content: dict[str, Any] = {"time_s": event.time_s, "kind": event.kind, "text": event.text}
-    if event.data:
-        content["data"] = dict(event.data)
+    content = {key: value for key, value in vars(event).items() if key != "data" or value}
     return json.dumps(content, ensure_ascii=False).encode("utf-8", "replace") + b"\n"
 
 

@@ -31,7 +31,6 @@ from typing import Any, TypeAlias, get_args
 #: Most bytes before the star.
 MAX_BODY = 160
 _CHECK = 11  # bytes of *LLCCCCRRRR
-_CRC_START = 0xFFFF
 
 _BODY = re.compile(rb"(?:0|[1-9][0-9]{0,4})(?: [!-)+-~]+)+")  # words: printable, no space, no star
 _TRAILER = re.compile(rb"\*([0-9A-F]{2})([0-9A-F]{4})([0-9A-F]{4})")
@@ -56,7 +55,7 @@ class Damaged:
 
 def crc16(data: bytes) -> int:
     """Return the CRC-16 of the bytes."""
-    return crc_hqx(data, _CRC_START)
+    return crc_hqx(data, 0xFFFF)
 
 
 def encode_line(seq: int, *words: str) -> bytes:
@@ -138,15 +137,10 @@ def _check(sound: bool) -> None:
         raise ValueError("malformed")
 
 
-def join(values: Sequence[int | str]) -> str:
-    """Return the values with commas between them."""
-    return ",".join(str(value) for value in values)
-
-
 def _message_words(message: Request | State) -> tuple[str, ...]:
     """Return the fields of a message in their order, each as a word."""
     values = vars(message).values()
-    return tuple((join(v) or "-") if isinstance(v, tuple) else str(v) for v in values)
+    return tuple((",".join(map(str, v)) or "-") if isinstance(v, tuple) else str(v) for v in values)
 
 
 LOST = ("open", "short")

@@ -201,7 +201,11 @@ class Loop:
 
     def apply(self) -> dict[str, float]:
         """Apply the present move, or renew it; return its drive by input."""
-        drive = self.move.drive if isinstance(self.move.drive, dict) else self.single(self.move.drive)
+        drive = self.move.drive
+        if not isinstance(drive, dict):
+            if len(inputs := tuple(self.reading.drive)) != 1:
+                raise ValueError(f"the controller gave one number for the inputs {', '.join(inputs)}")
+            drive = {inputs[0]: float(drive)}
         refused = self.guard.refuse(drive, self.move.pump, self.reading.time_s)
         if refused is not None:
             raise TripError(refused)
@@ -332,13 +336,6 @@ class Loop:
                 trip = Trip("frozen", time_s, "this program", "a drive renewed within 2 s", text)
         if trip is not None:
             raise TripError(trip)
-
-    def single(self, drive: float) -> dict[str, float]:
-        """Return the drive by name where the controller gave a number."""
-        inputs = tuple(self.reading.drive)
-        if len(inputs) != 1:
-            raise ValueError(f"the controller gave one number for the inputs {', '.join(inputs)}")
-        return {inputs[0]: float(drive)}
 
     def no_drive(self) -> dict[str, float]:
         """Return zero for every input."""

@@ -32,10 +32,6 @@ class Profile:
         """How long it is."""
         return float(self.time[-1])
 
-    def highest(self) -> dict[str, float]:
-        """Return the highest target of each output."""
-        return {name: float(values.max()) for name, values in self.targets.items()}
-
     def at(self, seconds: float) -> dict[str, float]:
         """Return the targets at a time."""
         return {name: values[0] for name, values in self._at(np.array([seconds])).items()}

@@ -121,6 +121,8 @@ class Twin:
     (60.0, True)
     """
 
+    expires_s = 0.0  # its time stops with the program
+
     def __init__(
         self,
         plant: Plant,
@@ -174,11 +176,6 @@ class Twin:
     def units(self) -> dict[str, str]:
         """Units of the driven inputs, by name."""
         return {name: self.plant.units.get(name, "1") for name in self._drives()}
-
-    @property
-    def expires_s(self) -> float:
-        """0: its time stops with the program."""
-        return 0.0
 
     @property
     def has_pump(self) -> bool:

@@ -255,7 +255,7 @@ def run(
     clock = rig.clock(pace)
     opened = rig.open(clock, loaded, pace=pace, seed=seed)
     try:
-        furthest = wanted if path is None else path.highest()
+        furthest = wanted if path is None else {n: float(v.max()) for n, v in path.targets.items()}
         for line in beyond_logs(loaded, furthest, grasps=grasp is not None):
             console.warn(line)
         with _recorded(out, about, bridge, watch) as (folder, recorder):

@@ -177,7 +177,7 @@ def test_a_move_that_must_not_go_out_ends_it_before_it_does() -> None:
     assert run.rows == []
     run.reading = Reading(10.0, run.reading.values, {"a": 0.0, "b": 0.0}, 1)
     with pytest.raises(ValueError, match="one number for the inputs a, b"):
-        run.single(1.0)
+        run.apply()
 
 
 @pytest.mark.parametrize(

@@ -31,7 +31,6 @@ def test_a_target_is_on_the_line_between_two_rows_and_two_at_one_time_are_a_jump
 def test_what_is_ahead_are_the_targets_of_the_next_samples() -> None:
     assert RAMP.ahead(90.0, 5.0)["t"] == pytest.approx([29.0, 29.5, 40.0, 40.0, 40.0])
     assert RAMP.seconds == 200.0
-    assert RAMP.highest() == {"t": 40.0}
 
 
 @pytest.mark.parametrize(
