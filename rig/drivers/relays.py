@@ -97,6 +97,8 @@ class RelayRig:
 
     def __init__(self, rig: Rig, relays: Mapping[str, Relay], clock: Callable[[], float]) -> None:
         self.rig = rig
+        self.expires_s = rig.expires_s
+        self.has_pump = rig.has_pump
         self.relays = dict(relays)
         self._clock = clock
         for relay in self.relays.values():
@@ -106,6 +108,10 @@ class RelayRig:
                     raise UserError(f"relays: the rig has no input {name!r}", hint=hint)
         switched = {name for relay in self.relays.values() for name in (relay.heater, relay.cooler)}
         self._through = {name: unit for name, unit in rig.units.items() if name not in switched}
+        # of the drives as a controller has them; with a cooler -1...1
+        self.units = {
+            name: "1" if relay.cooler else rig.units[relay.heater] for name, relay in self.relays.items()
+        } | self._through
         self._switches = {
             (name, sign): Switch(relay.on_s, relay.off_s)
             for name, relay in self.relays.items()
@@ -116,24 +122,6 @@ class RelayRig:
         self._now = clock()
         self._read_at = clock()
         self._on_s = dict.fromkeys(self.relays, 0.0)  # since the last reading, the cooler's below zero
-
-    @property
-    def units(self) -> dict[str, str]:
-        """Units of the drives as a controller has them; with a cooler -1...1."""
-        units = self.rig.units
-        return {
-            name: "1" if relay.cooler else units[relay.heater] for name, relay in self.relays.items()
-        } | self._through
-
-    @property
-    def expires_s(self) -> float:
-        """The device's."""
-        return self.rig.expires_s
-
-    @property
-    def has_pump(self) -> bool:
-        """Whether there is one."""
-        return self.rig.has_pump
 
     def read(self) -> Reading:
         """Return the newest sample."""

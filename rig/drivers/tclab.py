@@ -72,16 +72,12 @@ class TCLabRig(SerialRig):
     ) -> None:
         super().__init__(port, timeout, clock, sleep)
         self.jump = jump
+        self.units = dict.fromkeys(HEATERS, "percent")
         self._set = [0.0, 0.0]
         self._pump = 0
         self._last: tuple[float, list[float]] | None = None
         self._known_at, self._heard = 0, 0  # the connection whose board is known; bytes so far
         self.version = self._greet(greeting)
-
-    @property
-    def units(self) -> dict[str, str]:
-        """Units of the driven inputs, by name."""
-        return dict.fromkeys(HEATERS, "percent")
 
     def read(self) -> Reading:
         """Return the newest scan; NaN where a sensor is lost, everywhere while the board does not answer (its

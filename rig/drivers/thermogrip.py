@@ -48,21 +48,13 @@ class DeviceRig(SerialRig):
         self._heard, self._silent = 0, False  # bytes so far; whether the last question was met with none
         self._greeted_at = 0
         self.identity = self._first_hello(greeting)
-
-    @property
-    def units(self) -> dict[str, str]:
-        """Units of the driven inputs, by name."""
-        return {channel.name: channel.unit for channel in self.identity.drives}
+        self.units = {channel.name: channel.unit for channel in self.identity.drives}
+        self.has_pump = self.identity.pump
 
     @property
     def state(self) -> protocol.State | None:
         """The device's last state, None while it cannot be reached."""
         return None if self._lost else self._known
-
-    @property
-    def has_pump(self) -> bool:
-        """Whether the device says that it has a pump."""
-        return self.identity.pump
 
     def read(self) -> Reading:
         """Return the newest sample; NaN everywhere while the device cannot be reached."""

@@ -141,6 +141,8 @@ class Twin:
         pace: Callable[[float], None] | None = None,
     ) -> None:
         self.plant = plant
+        self.units = {name: plant.units.get(name, "1") for name in plant.inputs if name != "pump"}
+        self.has_pump = "pump" in plant.inputs
         self.ambient = ambient
         self.skin = skin
         self.noise = noise
@@ -149,13 +151,13 @@ class Twin:
         self._pace = pace
         self.offsets = dict(plant.offsets if offsets is None else offsets)
         stated_limits = dict(limits or {})
-        self.limits = {name: stated_limits.get(name) or _input_range(plant, name) for name in self._drives()}
+        self.limits = {name: stated_limits.get(name) or _input_range(plant, name) for name in self.units}
         self._contact_model = contact  # the example rig's is read when something is grasped
         self._noise_rng, self._grasp_rng = (
             np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(2)
         )
         self._d = self._disturbance_vector(disturbances or {})
-        self._drive = dict.fromkeys(self._drives(), 0.0)
+        self._drive = dict.fromkeys(self.units, 0.0)
         self._pump = 1
         self.time, self.closed = 0.0, False
         self.history: list[dict[str, float]] = []
@@ -171,16 +173,6 @@ class Twin:
         self._x = np.asarray(plant.model.rest(level, self._input_vector(), self._d, plant.p), dtype=float)
         self._y = np.array(plant.model.output(self._x.tolist(), plant.p.tolist()), dtype=float)
         self._write_history(self._input_vector())
-
-    @property
-    def units(self) -> dict[str, str]:
-        """Units of the driven inputs, by name."""
-        return {name: self.plant.units.get(name, "1") for name in self._drives()}
-
-    @property
-    def has_pump(self) -> bool:
-        """Whether its plant has one."""
-        return "pump" in self.plant.inputs
 
     def read(self) -> Reading:
         """Return the sample at the present time; twice at one time gives the same sample."""
@@ -273,10 +265,6 @@ class Twin:
         if self._contact is not None:
             true[self.skin] += self._added(true[self.skin])
         return true
-
-    def _drives(self) -> tuple[str, ...]:
-        """Return the inputs that are driven: all but the pump."""
-        return tuple(name for name in self.plant.inputs if name != "pump")
 
     def _input_vector(self) -> Array:
         """Return what is applied now in the order of the plant's inputs."""
