@@ -24,7 +24,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -83,12 +83,8 @@ class StopRule:
     @classmethod
     def load(cls, path: str | Path) -> StopRule:
         """Return the rule of a file; a wrong entry is a :class:`UserError`."""
-        return cls.from_dict(read_json(path, _RULE_SCHEMA, _RULE_VERSION), file=path)
-
-    @classmethod
-    def from_dict(cls, content: Mapping[str, Any], *, file: str | Path = "stop rule") -> StopRule:
-        """Return the rule that a JSON object describes."""
-        with reading("is not a whole stop rule", file=file, hint="train again"):
+        content = read_json(path, _RULE_SCHEMA, _RULE_VERSION)
+        with reading("is not a whole stop rule", file=path, hint="train again"):
             numbers = {name: number_within(content, name, *ends) for name, ends in _RANGES.items()}
             times = array_within(content, "times", _RANGES["end"][1]).ravel().tolist()
             n_grasp = int(number_within(content, "n_grasp", 0, LARGEST))

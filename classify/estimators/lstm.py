@@ -32,7 +32,6 @@ trace, which is what another initial temperature is to a network that sees tempe
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
@@ -168,7 +167,16 @@ class LstmClassifier(JoinedClassifier):
         return np.ascontiguousarray(cube.transpose(0, 2, 1), dtype=np.float32)
 
     def _log_proba(self, grasps: Grasps) -> Floats:
-        return _logits(self.weights_, self._series(as_array(grasps, times=self.times_)))
+        weights, series = self.weights_, self._series(as_array(grasps, times=self.times_))
+        # in doubles a series' answer is the same in any batch, to 1e-12
+        inputs, recurrent = (weights[f"lstm.weight_{kind}_l0"].T.astype(float) for kind in ("ih", "hh"))
+        bias = weights["lstm.bias_ih_l0"].astype(float) + weights["lstm.bias_hh_l0"]
+        state = cell = np.zeros((series.shape[0], recurrent.shape[0]))
+        for t in range(series.shape[1]):
+            i, f, g, o = np.split(series[:, t] @ inputs + state @ recurrent + bias, 4, axis=1)
+            cell = expit(f) * cell + expit(i) * np.tanh(g)
+            state = expit(o) * np.tanh(cell)
+        return np.asarray(state @ weights["readout.weight"].T + weights["readout.bias"], dtype=float)
 
     def get_state(self) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
         arrays = {"times": self.times_, "mean": self.mean_, "sd": self.sd_, "loss_curve": self.loss_curve_}
@@ -300,16 +308,3 @@ def _weights_by_name(network: Any, readout: Any) -> Weights:
     return {
         f"{name}.{k}": v.cpu().numpy().copy() for name, state in modules.items() for k, v in state.items()
     }
-
-
-def _logits(weights: Mapping[str, NDArray[Any]], series: NDArray[np.float32]) -> Floats:
-    """Return the readout of the last state of each series, (n_series, K)."""
-    # in doubles a series' answer is the same in any batch, to 1e-12
-    inputs, recurrent = (weights[f"lstm.weight_{kind}_l0"].T.astype(float) for kind in ("ih", "hh"))
-    bias = weights["lstm.bias_ih_l0"].astype(float) + weights["lstm.bias_hh_l0"]
-    state = cell = np.zeros((series.shape[0], recurrent.shape[0]))
-    for t in range(series.shape[1]):
-        i, f, g, o = np.split(series[:, t] @ inputs + state @ recurrent + bias, 4, axis=1)
-        cell = expit(f) * cell + expit(i) * np.tanh(g)
-        state = expit(o) * np.tanh(cell)
-    return np.asarray(state @ weights["readout.weight"].T + weights["readout.bias"], dtype=float)

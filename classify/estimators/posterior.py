@@ -47,7 +47,7 @@ from thermogrip.classify.estimators.base import (
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.materials import load_materials
 from thermogrip.datasets.schema import has_touch_groups, label_values
-from thermogrip.sysid.effusivity.data import Touches, graded, touches
+from thermogrip.sysid.effusivity.data import Touches, graded, touches, whiten
 from thermogrip.sysid.effusivity.gripper_model import GripperModel, another_gripper
 from thermogrip.sysid.effusivity.laplace_approximation import (
     BUILD_UP,
@@ -58,7 +58,6 @@ from thermogrip.sysid.effusivity.laplace_approximation import (
     H,
     fit_candidates,
     unexplained,
-    whitened,
 )
 from thermogrip.sysid.effusivity.multi_touch import (
     Coupling,
@@ -170,7 +169,7 @@ class PosteriorClassifier(GraspClassifier):
         evidence, odds = np.empty((group.size, len(names))), np.full(group.size, np.nan)
         if single.size:
             data = touches(grasps, until=self.longest_, at=single)
-            noise = whitened(self.device_, graded(data, self.device_.grades))
+            noise = whiten(graded(data, self.device_.grades), self.device_.noise)
             fitted = fit_candidates(self.device_, data, names, noise=noise)
             evidence[single] = fitted.mode.log_evidence.reshape(-1, len(names))
             best = np.arange(single.size) * len(names) + evidence[single].argmax(axis=1)

@@ -81,10 +81,7 @@ def untouched(grasps: Grasps, *, seed: int = 0) -> Grasps:
 
 
 def has_before(grasps: Grasps) -> bool:
-    """Return whether a record has a level before contact, without which there is nothing to probe.
-
-    What is needed is three readings up to 0.25 s before the message, which contact may precede by 0.3 s.
-    """
+    """Return whether a record has a level before contact, without which there is nothing to probe."""
     return bool(np.sum(grasps["time"].values <= PROBE.level_until_s) >= PROBE.level_samples)
 
 
@@ -267,10 +264,8 @@ def _late(plan: Plan) -> tuple[str, ...]:
 
 
 def _jobs(named: Mapping[str, GraspClassifier], plan: Plan, probe: bool) -> list[_Job]:
-    """Return all fits.
-
-    The probe by the classifiers themselves runs in the first repeat; the generic one, which is cheap, in all.
-    """
+    """Return all fits; the probe by the classifiers themselves in the first repeat, the generic one, which is
+    cheap, in all."""
     numbered = list(enumerate(plan.folds))
     jobs = []
     for name, classifier in named.items():

@@ -76,15 +76,6 @@ class Stack:
             raise ValueError(f"need 0 <= first <= 1, creep >= -0.2, conductances >= 0, got {self}")
 
 
-class StackModes(NamedTuple):
-    """Modes of the gripper: decay rates [1/s], weights at face and sensor, resistance of the outer cell."""
-
-    lam: Array
-    face: Array
-    sensor: Array
-    resistance: float
-
-
 class TimeNodes(NamedTuple):
     """Steps that double in groups: ``dt`` (n_group,), ``repeat`` (n_group,), ``t`` (n_node,) [s]."""
 
@@ -104,8 +95,11 @@ def time_nodes(end: float, *, first: float = 0.01, per_group: int = 10) -> TimeN
 
 
 @lru_cache(maxsize=64)
-def stack_modes(stack: Stack) -> StackModes:
-    """Return the gripper's modes: rise at face and sensor per unit flux into the face."""
+def gripper_modes(stack: Stack) -> Any:
+    """Return the gripper as the time stepping takes it: the rise at face and sensor per unit flux into the
+    face, by modes."""
+    from thermogrip.sysid.contact.time_stepping import Gripper
+
     # cells grow inwards: fast changes live near the face
     growth = 1.22 ** np.arange(_N_INNER)
     outer = np.ones(_N_OUTER)
@@ -131,17 +125,10 @@ def stack_modes(stack: Stack) -> StackModes:
     # is never excited
     still = np.abs(shape[0]) <= 1e-9 * np.abs(shape[0]).max()
     face = np.where(still, np.inf, shape[0])
-    return StackModes(np.maximum(lam, 0.0), shape[0] ** 2, sensor / face, float(1 / half[0]))
-
-
-@lru_cache(maxsize=64)
-def gripper_modes(stack: Stack) -> Any:
-    """Return the gripper as the time stepping takes it."""
-    from thermogrip.sysid.contact.time_stepping import grippers
-
-    modes = stack_modes(stack)
-    numbers = [modes.resistance, stack.lag, stack.first, stack.creep, stack.settle, stack.g_far, stack.leak]
-    return grippers(modes.lam[None], modes.face[None], modes.sensor[None], np.array([numbers]))
+    by_mode = np.stack([np.maximum(lam, 0.0), shape[0] ** 2, sensor / face])
+    lag = np.array([[1 / stack.lag], [1 / stack.lag], [0.0]])
+    numbers = [1 / half[0], stack.lag, stack.first, stack.creep, stack.settle, stack.g_far, stack.leak]
+    return Gripper(np.concatenate([by_mode, lag], axis=1)[None], np.array([numbers]))
 
 
 class ContactResponse(NamedTuple):

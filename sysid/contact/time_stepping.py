@@ -168,17 +168,10 @@ def slab_modes(
 class Gripper(NamedTuple):
     """One gripper for all contacts, or one for each (k of them)."""
 
-    modes: Array  # (k, 3, n + 1): decay rates, weights at face and sensor, the sensor's lag last
+    # (k, 3, n + 1): decay rates, from slow to fast, weights at face and sensor, the sensor's lag last
+    modes: Array
     # (k, 7): resistance, lag, first, creep, settle, what the block's far face loses per degree, skin's leak
     numbers: Array
-
-
-def grippers(lam: Array, face: Array, sensor: Array, numbers: Array) -> Gripper:
-    """Return grippers of their modes (k, n), from slow to fast, and ``numbers`` (k, 7)."""
-    gripper_rows = np.stack([lam, face, sensor], axis=1)
-    lag = np.repeat(1.0 / numbers[:, 1, None, None], 3, axis=1)
-    lag[:, 2] = 0.0
-    return Gripper(np.concatenate([gripper_rows, lag], axis=2), numbers)
 
 
 def conductance(t: Array, h: Array, build_up: Array, numbers: Array) -> Array:

@@ -298,11 +298,6 @@ class Problem:
         """Return ln e of each label, a view into theta."""
         return theta[-len(self.labels) :]
 
-    @property
-    def room(self) -> Array:
-        """Return the room's temperature, the skin's where that is not known, (n,) [degC]."""
-        return np.where(np.isfinite(self.data.t_ambient), self.data.t_ambient, self.data.level)
-
     def room_difference(self) -> Array:
         """Return room minus object temperature where both are known, else 0, (n,)."""
         return np.nan_to_num(self.data.t_ambient - self.data.t_object)
@@ -313,7 +308,9 @@ class Problem:
         u = np.empty((self.which.size, N_NUISANCE))
         u[:, H] = self.ln_h(theta)[self.which]
         u[:, BUILD_UP], u[:, ONSET], u[:, LEVEL] = value["ln_build_up"], value["onset"], self.data.level
-        nominal = np.where(self.known, self.data.t_object + value["bias"], self.room)
+        # the room's temperature, the skin's where that is not known
+        room = np.where(np.isfinite(self.data.t_ambient), self.data.t_ambient, self.data.level)
+        nominal = np.where(self.known, self.data.t_object + value["bias"], room)
         u[:, T_OBJECT] = nominal + value["transit_loss"] * self.room_difference()
         if (discrepancy := self.discrepancy(theta)) is not None:
             u[:, ONSET] += discrepancy.onset[self.which]

@@ -371,11 +371,6 @@ def _inverse(chol: NDArray[np.floating[Any]]) -> Array:
 Whitened: TypeAlias = tuple[Array, Array]
 
 
-def taken(noise: Whitened, at: NDArray[np.int64]) -> Whitened:
-    """Return what whitens some of the touches."""
-    return noise[0][at], noise[1][at]
-
-
 def whiten(data: Touches, noise: Noise, extra: Array | float = 0.0) -> tuple[Array, Array]:
     """Return W with W' W = C^-1, (n, n_bin, n_bin), zero for empty bins, and ln det(2 pi C), (n,); ``extra``
     is what else C holds."""

@@ -135,12 +135,8 @@ class GripperSpread:
 
     def covariance(self, names: Sequence[str]) -> Array:
         """Return the covariance that another gripper adds to the estimates called ``names``, (n, n)."""
-        by_cause = np.array(
-            [
-                [source.get(name, source.get(name.split(" ")[0], 0.0)) for name in names]
-                for source in self._sources()
-            ]
-        )
+        stems = [name.split(" ")[0] for name in names]  # ln_h of all blocks alike
+        by_cause = np.array([[source.get(stem, 0.0) for stem in stems] for source in self._sources()])
         per_block = np.diag([self.block_contact**2 * name.startswith("ln_h ") for name in names])
         return np.asarray(by_cause.T @ by_cause + per_block)
 

@@ -189,7 +189,7 @@ def find_modes(
     the level as measured, or at ``start`` (n_pair, 7); a pair that has not settled within 20 steps is
     hopeless in practice, and where pairs of one touch are ``rivals`` one far behind the best is left early.
     """
-    from thermogrip.sysid.effusivity.mode_kernel import modes
+    from thermogrip.sysid.effusivity.mode_kernel import Law, curvature, search
 
     vary = prior.sd > 0
     u = prior.mean.copy() if start is None else np.where(vary, start, prior.mean)
@@ -198,18 +198,17 @@ def find_modes(
     dof = np.full(u.shape, np.inf) if prior.dof is None else prior.dof
     w_matrix, log_det = whitener
     pairs = pairs_asked(stack, nodes_for(data), data, row, beyond)
-    law = np.stack([prior.mean, prior.sd, dof], axis=1)
-    covariance, objective, misfit, settled = modes(pairs, w_matrix, law, u, rivals=rivals)
-    evidence = -0.5 * (objective + log_det[row]) + peak_ratio(dof, vary)
-    return Mode(u, covariance, evidence, settled, misfit)
-
-
-def peak_ratio(dof: Array, vary: Mask) -> Array:
-    """Return the log of Student's peak density over the normal one of the same scale, summed, (n_pair,)."""
+    law = Law.of(prior.mean, prior.sd, dof)
+    ended = search(pairs, w_matrix, law, prior.sd, u, rivals=rivals)
+    inverse, log_det_curvature = curvature(ended.matrix, law.penalty(ended.u).own)
+    covariance = inverse * (prior.sd[:, :, None] * prior.sd[:, None, :])
+    objective = ended.cost + log_det_curvature
+    # the peaks of Student's densities over the normal ones' of the same scale
     heavy = vary & np.isfinite(dof)
     nu = np.where(heavy, dof, 1.0)
     ratio = gammaln(0.5 * (nu + 1)) - gammaln(0.5 * nu) - 0.5 * np.log(0.5 * nu)
-    return np.asarray(np.where(heavy, ratio, 0.0).sum(axis=1))
+    evidence = -0.5 * (objective + log_det[row]) + np.where(heavy, ratio, 0.0).sum(axis=1)
+    return Mode(ended.u, covariance, evidence, ended.settled, ended.matrix[:, -1, -1])
 
 
 class Hypotheses(NamedTuple):
@@ -240,7 +239,7 @@ def material_hypotheses(gripper: GripperModel, candidates: Sequence[str | Materi
         else _untrained(gripper, candidate if isinstance(candidate, Material) else find_material(name))
         for name, candidate in zip(names, candidates)
     ]
-    return Hypotheses(*np.array(rows).T)
+    return Hypotheses(*(np.array([row[name] for row in rows]) for name in Hypotheses._fields))
 
 
 def free_hypotheses(gripper: GripperModel, ln_e: ArrayLike) -> Hypotheses:
@@ -299,7 +298,8 @@ def fit_pairs(
     prior: Prior | None = None, rivals: bool = False,
 ) -> Mode:  # fmt: skip
     """Return the modes of pairs, hypothesis i against touch ``row[i]``, a second sensor used; ``noise``
-    (:func:`whitened`) and ``prior`` (:func:`prior_of`) where a caller has them."""
+    (:func:`~thermogrip.sysid.effusivity.data.whiten`) and ``prior`` (:func:`prior_of`) where a caller has
+    them."""
     prior = prior_of(gripper, data.known(row), hypotheses) if prior is None else prior
     # what else counts may bring another one up
     rivals = rivals and gripper.discrepancy is None and (gripper.second is None or data.second is None)
@@ -337,17 +337,12 @@ def second_modes(
     return _own_modes(second, data.second, row, others, second_prior, begin, None), second_prior
 
 
-def whitened(gripper: GripperModel, data: Touches) -> Whitened:
-    """Return what whitens the first sensor's noise as :func:`fit_pairs` takes it."""
-    return whiten(data, gripper.noise)
-
-
 def _own_modes(
     gripper: GripperModel, data: Touches, row: NDArray[np.int64], hypotheses: Hypotheses, prior: Prior,
     start: Array | None, noise: Whitened | None, rivals: bool = False,
 ) -> Mode:  # fmt: skip
     """Return the modes of pairs by the first sensor alone."""
-    noise = whitened(gripper, data) if noise is None else noise
+    noise = whiten(data, gripper.noise) if noise is None else noise
     beyond = None if gripper.discrepancy is None else gripper.beyond(data.t[row], prior.mean[:, EFFUSIVITY])
     return find_modes(gripper.stack, data, row, noise, prior, start=start, beyond=beyond, rivals=rivals)
 
@@ -360,8 +355,9 @@ def hypotheses_of_second(gripper: GripperModel, second: GripperModel, one: Hypot
     for i, block in enumerate(one.block.astype(int)):
         name = gripper.materials[block] if block >= 0 else ""
         if name in second.blocks:
-            for column, value in zip(other, _trained(second, name)):
-                column[i] = value
+            trained = _trained(second, name)
+            for column, number in zip(other, Hypotheses._fields):
+                column[i] = trained[number]
     return Hypotheses(*other)
 
 
@@ -454,18 +450,24 @@ def fit_candidates(
     start: Array | None = None, noise: Whitened | None = None,
 ) -> Fitted:  # fmt: skip
     """Return the modes of every touch under every candidate, from nuisances ``start`` (n, m, 7), and evidence
-    that is the sum over the gripper's grades; ``noise`` is :func:`whitened` of the graded touches where a
-    caller has it."""
+    that is the sum over the gripper's grades; ``noise`` whitens the graded touches, where a caller has it."""
     n = data.level.size
     m = len(candidates)
     n_grade = len(gripper.grades)
-    begin = None if start is None else np.repeat(start.reshape(n, m, -1), n_grade, axis=0)
-    every = graded(data, gripper.grades)
-    mode, prior = candidate_modes(gripper, every, candidates, start=begin, noise=noise)
+    one, every = material_hypotheses(gripper, candidates), graded(data, gripper.grades)
+    row = np.repeat(np.arange(n * n_grade), m)
+    hypotheses = Hypotheses(*(np.tile(field, n * n_grade) for field in one))
+    begin = None
+    if start is not None:
+        begin = np.repeat(start.reshape(n, m, -1), n_grade, axis=0).reshape(row.size, -1)
+    stated = every.known(row)
+    prior = prior_of(gripper, stated, hypotheses)
+    mode = fit_rivals(gripper, every, row, hypotheses, start=begin, noise=noise, prior=prior)
+    mode = doubted(stated, prior, mode)
     place, candidate = np.arange(n)[:, None] * n_grade, np.arange(m)
     first = (place * m + candidate).ravel()
     if gripper.uncertainty is not None and gripper.discrepancy is None:
-        pairs, one = data.take(np.repeat(np.arange(n), m)), material_hypotheses(gripper, candidates)
+        pairs = data.take(np.repeat(np.arange(n), m))
         every_pair = Hypotheses(*(np.tile(field, n) for field in one))
         doubt = evidence_in_doubt(gripper, pairs, every_pair, prior.take(first), mode.take(first))
         sure = np.log1p(-DOUBT.gripper_prior) + mode.log_evidence[first]
@@ -495,19 +497,13 @@ def evidence_in_doubt(
     return doubted(data.known(row), prior, again).log_evidence
 
 
-def misfit_sd(data: Touches, row: NDArray[np.int64], mode: Mode) -> Array:
-    """Return how unusual the squared whitened residuals of modes of touches ``row`` are, in standard
-    deviations, (n,)."""
-    n = (data.count > 0).sum(axis=1)
-    if data.second is not None:
-        n = n + (data.second.count > 0).sum(axis=1)
-    return np.asarray((mode.misfit - n[row]) / np.sqrt(2 * n[row]))
-
-
 def unexplained(data: Touches, row: NDArray[np.int64], mode: Mode, prior: Prior) -> list[tuple[float, str]]:
     """Return of each of n modes of touches ``row`` its misfit [standard deviations], and in words why it
     does not explain the touch, if it does not."""
-    misfits, reasons = misfit_sd(data, row, mode), []
+    n = (data.count[row] > 0).sum(axis=1)
+    if data.second is not None:
+        n = n + (data.second.count[row] > 0).sum(axis=1)
+    misfits, reasons = (mode.misfit - n) / np.sqrt(2 * n), []
     # of an object that is anywhere in a range the prior has the sd of a uniform law
     off, sd = np.abs(mode.u - prior.mean)[:, T_OBJECT], prior.sd[:, T_OBJECT]
     for misfit, outside in zip(misfits.tolist(), (sd > DOUBT.stated_sd_K) & (off > np.sqrt(3.0) * sd)):
@@ -524,22 +520,6 @@ def over_grades(gripper: GripperModel, log_evidence: Array) -> Array:
     return np.asarray(log_evidence + log_prior.reshape(-1, *[1] * (log_evidence.ndim - 2)))
 
 
-def candidate_modes(
-    gripper: GripperModel, data: Touches, candidates: Sequence[str | Material], *,
-    start: Array | None = None, noise: Whitened | None = None,
-) -> tuple[Mode, Prior]:  # fmt: skip
-    """Return :func:`fit_candidates` under the grade that each of the touches has."""
-    one = material_hypotheses(gripper, candidates)
-    n, m = data.level.size, len(candidates)
-    row = np.repeat(np.arange(n), m)
-    hypotheses = Hypotheses(*(np.tile(h, n) for h in one))
-    begin = None if start is None else start.reshape(n * m, -1)
-    stated = data.known(row)
-    prior = prior_of(gripper, stated, hypotheses)
-    mode = fit_rivals(gripper, data, row, hypotheses, start=begin, noise=noise, prior=prior)
-    return doubted(stated, prior, mode), prior
-
-
 def fit_rivals(
     gripper: GripperModel, data: Touches, row: NDArray[np.int64], hypotheses: Hypotheses, *,
     start: Array | None, noise: Whitened | None, prior: Prior,
@@ -548,7 +528,7 @@ def fit_rivals(
 
     Where nuisances may be far from usual a density may have several modes (a sheet, or a block in poor
     contact): then each hypothesis is also looked for from where the likeliest of its touch ended."""
-    noise = whitened(gripper, data) if noise is None else noise
+    noise = whiten(data, gripper.noise) if noise is None else noise
     mode = fit_pairs(gripper, data, row, hypotheses, start=start, noise=noise, prior=prior, rivals=True)
     order = np.lexsort((mode.log_evidence, row))
     likeliest = np.empty(data.level.size, dtype=np.int64)
@@ -567,48 +547,35 @@ def fit_rivals(
     return mode
 
 
-class _Hypothesis(NamedTuple):
-    """One row of :class:`Hypotheses`."""
-
-    ln_h: float
-    ln_h_sd: float
-    ln_e: float
-    ln_e_sd: float
-    ln_rho_c: float
-    ln_rho_c_sd: float
-    ln_h_dof: float
-    ln_e_dof: float
-    block: float
-
-
-def _trained(gripper: GripperModel, name: str) -> _Hypothesis:
+def _trained(gripper: GripperModel, name: str) -> dict[str, float]:
+    """Return the numbers of :class:`Hypotheses` for a block that was calibrated."""
     block, spreads = gripper.blocks[name], gripper.spreads
     scatter = spreads.ln_effusivity if block.library_effusivity < INSULATOR else 0.0
-    return _Hypothesis(
-        ln_h=block.ln_h,
-        ln_h_sd=float(np.hypot(spreads.ln_h, block.ln_h_sd)),
-        ln_e=block.ln_effusivity,
-        ln_e_sd=scatter,
-        ln_rho_c=float(np.log(block.heat_capacity)),
-        ln_rho_c_sd=0.0,
-        ln_h_dof=spreads.dof,
-        ln_e_dof=spreads.insulator_dof if scatter else np.inf,
-        block=float(gripper.materials.index(name)),
-    )
+    return {
+        "ln_h": block.ln_h,
+        "ln_h_sd": float(np.hypot(spreads.ln_h, block.ln_h_sd)),
+        "ln_e": block.ln_effusivity,
+        "ln_e_sd": scatter,
+        "ln_rho_c": float(np.log(block.heat_capacity)),
+        "ln_rho_c_sd": 0.0,
+        "ln_h_dof": spreads.dof,
+        "ln_e_dof": spreads.insulator_dof if scatter else np.inf,
+        "block": float(gripper.materials.index(name)),
+    }
 
 
-def _untrained(gripper: GripperModel, row: Material) -> _Hypothesis:
+def _untrained(gripper: GripperModel, row: Material) -> dict[str, float]:
     ln_effusivity = float(gripper.found_effusivity(np.log([row.effusivity]))[0])
     scale_sd = gripper.effusivity_scale(np.array([ln_effusivity]))[1]
     scatter = gripper.spreads.ln_effusivity if row.effusivity < INSULATOR else 0.0
-    return _Hypothesis(
-        ln_h=float(gripper.expected_ln_h(np.array(ln_effusivity))),
-        ln_h_sd=float(np.hypot(gripper.spreads.ln_h_of_blocks, gripper.spreads.ln_h)),
-        ln_e=float(ln_effusivity),
-        ln_e_sd=float(np.sqrt(row.effusivity_sd_ln**2 + float(scale_sd[0]) ** 2 + scatter**2)),
-        ln_rho_c=float(np.log(row.rho * row.c_p)),
-        ln_rho_c_sd=0.05,
-        ln_h_dof=np.inf,
-        ln_e_dof=np.inf,
-        block=-1.0,
-    )
+    return {
+        "ln_h": float(gripper.expected_ln_h(np.array(ln_effusivity))),
+        "ln_h_sd": float(np.hypot(gripper.spreads.ln_h_of_blocks, gripper.spreads.ln_h)),
+        "ln_e": float(ln_effusivity),
+        "ln_e_sd": float(np.sqrt(row.effusivity_sd_ln**2 + float(scale_sd[0]) ** 2 + scatter**2)),
+        "ln_rho_c": float(np.log(row.rho * row.c_p)),
+        "ln_rho_c_sd": 0.05,
+        "ln_h_dof": np.inf,
+        "ln_e_dof": np.inf,
+        "block": -1.0,
+    }

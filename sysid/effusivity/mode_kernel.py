@@ -359,7 +359,8 @@ def search(asked: Asked, whitener: Any, law: Law, sd: Array, u: Array, *, rivals
 
     Where readings are not explained, they may bend along a step twice as much as their slopes say, so that
     whole steps go to and fro across the mode.  So what a step gains tells how much they bend along it, and
-    where that is more than 1.5 times the quadratic model's the next step is as much shorter.
+    where that is more than 1.5 times the quadratic model's the next step is as much shorter.  Where pairs of
+    one row are ``rivals``, one that is hopeless beside the best of them is left there, unsettled.
     """
     n, m = u.shape
     diagonal, none = np.arange(m), np.full(n, np.inf)
@@ -487,25 +488,6 @@ def _search_moved(here: _Search, there: Array, stale: Mask, step: int) -> _Searc
         matrix=np.where(row[:, :, None], there, here.matrix), slope=np.where(row, off.slope, here.slope),
         bound=np.where(row, off.bound, here.bound), stale=np.where(better, stale, here.stale),
     )  # fmt: skip
-
-
-def modes(
-    asked: Asked, whitener: Any, law: Array, u: Array, *, rivals: bool = False
-) -> tuple[Array, Array, Array, Mask]:  # fmt: skip
-    """Move ``u`` (n, 7) to the mode of each pair; return covariance (n, 7, 7), objective, misfit and where
-    the search settled.
-
-    The prior of each is its ``law`` (n, 3, 7): mean, sd, degrees of freedom.  The objective is -2 ln
-    (likelihood x prior density relative to its peak) + ln det of its curvature in units of sd.  Where pairs
-    of one row are ``rivals``, one that is hopeless beside the best of them is left there, unsettled.
-    """
-    mean, sd, dof = law.transpose(1, 0, 2)
-    prior_law = Law.of(mean, sd, dof)
-    ended = search(asked, whitener, prior_law, sd, u, rivals=rivals)
-    u[:] = ended.u
-    inverse, log_det = curvature(ended.matrix, prior_law.penalty(u).own)
-    covariance = inverse * (sd[:, :, None] * sd[:, None, :])
-    return covariance, ended.cost + log_det, ended.matrix[:, _LEFT, _LEFT], ended.settled
 
 
 def curvature(matrix: Array, own: Array) -> tuple[Array, Array]:

@@ -217,7 +217,8 @@ def joint_prior(
     coupling: Coupling, traces: Traces, rows: NDArray[np.int64], one: tuple[Array, Array],
     shared: tuple[Array, Array, Array], about: Array | None = None,
 ) -> tuple[Array, Array]:  # fmt: skip
-    """Return mean (m, 4 n) and covariance (m, 4 n, 4 n) of the x of n touches of one block."""
+    """Return mean (m, 4 n) and covariance (m, 4 n, 4 n) of the x of n touches of one block that is found at
+    ``about`` (m, n) [degC]; None: nothing of its way to the room is uncertain."""
     mean, variance = one
     n, m = rows.size, variance.size
     mu, p = np.repeat(mean[:, None, :], n, axis=1), np.zeros((m, n, 4, n, 4))
@@ -228,36 +229,22 @@ def joint_prior(
     p[:, touch, 1, touch, 1] += coupling.ln_h_sd**2
     p[:, 0, 0, 0, 0] = variance
     for k in range(1, n):
-        start = None if about is None else about[:, k - 1]
-        move = _move(coupling, traces, int(rows[k - 1]), int(rows[k]), start)
-        gain = move.gain
-        mu[:, k, 0] = gain * mu[:, k - 1, 0] + move.offset
+        before, rest_s = int(rows[k - 1]), float(traces.rest[rows[k]])
+        drop = coupling.found * traces.drop(rest_s)
+        skin, room = traces.skin[before], traces.room[before]
+        stay = np.exp(-coupling.loss * rest_s / traces.capacity) if np.isfinite(room) else 1.0
+        gain = stay * (1 - drop)
+        offset = stay * drop * skin + (1 - stay) * np.nan_to_num(room)
+        way_sd = np.zeros(m)
+        if about is not None:
+            t_object = about[:, k - 1]
+            to_room = gain * t_object + offset - (t_object - drop * (t_object - skin))
+            way_sd = traces.law(rest_s) * to_room
+        mu[:, k, 0] = gain * mu[:, k - 1, 0] + offset
         for j in range(k):
             p[:, j, 0, k, 0] = p[:, k, 0, j, 0] = gain * p[:, j, 0, k - 1, 0]
-        p[:, k, 0, k, 0] = gain**2 * p[:, k - 1, 0, k - 1, 0] + coupling.sd**2 + move.sd**2
+        p[:, k, 0, k, 0] = gain**2 * p[:, k - 1, 0, k - 1, 0] + coupling.sd**2 + way_sd**2
     return mu.reshape(m, 4 * n), p.reshape(m, 4 * n, 4 * n)
-
-
-class _Move(NamedTuple):
-    """How the block's temperature goes from one touch to the next, (m,) each."""
-
-    gain: Array
-    offset: Array
-    sd: Array  # of how far the room takes it [K]
-
-
-def _move(coupling: Coupling, traces: Traces, before: int, after: int, about: Array | None) -> _Move:
-    """Return the move of a block that is found at ``about`` (m,); None: nothing of it is uncertain."""
-    rest_s = float(traces.rest[after])
-    taken = coupling.found * traces.drop(rest_s)
-    room = traces.room[before]
-    stay = np.exp(-coupling.loss * rest_s / traces.capacity) if np.isfinite(room) else 1.0
-    gain = np.asarray(stay * (1 - taken))
-    offset = stay * taken * traces.skin[before] + (1 - stay) * np.nan_to_num(room)
-    if about is None:
-        return _Move(gain, np.asarray(offset), np.zeros(gain.shape))
-    way = gain * about + offset - (about - taken * (about - traces.skin[before]))
-    return _Move(gain, np.asarray(offset), np.asarray(traces.law(rest_s) * way))
 
 
 SHARED = (T_OBJECT, H, EFFUSIVITY, CAPACITY)
@@ -482,7 +469,12 @@ def next_touch_prior(
 ) -> Joint:  # fmt: skip
     """Return the log evidence (m,) from the touches of one block, and the prior mean (m, 4) and covariance
     (m, 4, 4) of another touch's x = (T_obj, ln h, ln e, ln C) after a ``rest`` [s]."""
-    at = _one_block(grasps)
+    at = np.array([0])
+    if grasps.sizes["grasp"] > 1:
+        at, *others = touch_groups(grasps).values()
+        if others or at.size != grasps.sizes["grasp"]:
+            hint = "give those of one block"
+            raise UserError("touches of several blocks", file=log_name(grasps), hint=hint)
     view = _view(gripper, grasps, material_hypotheses(gripper, candidates), coupling or Coupling())
     factor = _group_factors(view, [at])[0]
     if at.size > 1:
@@ -498,16 +490,6 @@ def next_touch_prior(
     joint = _over_losses(by_loss, BLOCK.log_loss_prior())
     last = slice(-N_SHARED, None)
     return Joint(joint.log_evidence, joint.mean[:, last], joint.covariance[:, last, last])
-
-
-def _one_block(grasps: Grasps) -> Rows:
-    """Return the rows of the one block of a record, in their order."""
-    if grasps.sizes["grasp"] == 1:
-        return np.array([0])
-    rows = list(touch_groups(grasps).values())
-    if len(rows) != 1 or rows[0].size != grasps.sizes["grasp"]:
-        raise UserError("touches of several blocks", file=log_name(grasps), hint="give those of one block")
-    return rows[0]
 
 
 class _View(NamedTuple):

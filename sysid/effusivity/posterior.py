@@ -87,12 +87,11 @@ def effusivity_posterior(
 ) -> list[EffusivityRow]:
     """Return one row a grasp: effusivity, object temperature and contact conductance, no material assumed.
 
-    The prior of the effusivity is log-uniform between 17 and 110 000 on the gripper's scale, from plastic
-    foam to diamond with room for the scale's own error; an interval that ends near there is bounded by the
-    prior, as copper's often is.  The result is divided by the scale
-    that the calibration's blocks show against the library, whose uncertainty widens the interval; so does
-    an insulator's own scatter from grasp to grasp.  Touches of one ``touch_group`` share the joint posterior
-    of the effusivity; each row has the object's temperature at its own touch.
+    The prior of the effusivity is log-uniform between 17 and 110 000; an interval that ends near there is
+    bounded by it, as copper's often is.  The result is divided by the scale that the calibration's blocks
+    show against the library, whose uncertainty widens the interval; so does an insulator's own scatter.
+    Touches of one ``touch_group`` share the joint posterior of the effusivity; each row has the object's
+    temperature at its own touch.
 
     Arguments are those of :func:`material_fit`; ``coupling`` is how blocks move between touches, by default
     those of the example rig.

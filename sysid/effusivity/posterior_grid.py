@@ -21,7 +21,7 @@ from scipy.special import logsumexp
 
 from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.materials import load_materials
-from thermogrip.sysid.effusivity.data import Touches, Whitened, graded, taken
+from thermogrip.sysid.effusivity.data import Touches, Whitened, graded, whiten
 from thermogrip.sysid.effusivity.gripper_model import GripperModel
 from thermogrip.sysid.effusivity.laplace_approximation import (
     EFFUSIVITY,
@@ -34,7 +34,6 @@ from thermogrip.sysid.effusivity.laplace_approximation import (
     free_hypotheses,
     over_grades,
     prior_of,
-    whitened,
 )
 
 # On the gripper's scale.  Of solids at room temperature plastic foams have least (expanded polystyrene, 32),
@@ -91,7 +90,7 @@ def grid_posteriors(gripper: GripperModel, data: Touches) -> list[GridPosterior]
 
 def _posteriors(gripper: GripperModel, data: Touches) -> list[GridPosterior]:
     """Return :func:`grid_posteriors` under the grade that each of the touches has."""
-    noise = whitened(gripper, data)
+    noise = whiten(data, gripper.noise)
     x = np.tile(np.linspace(*LN_E_RANGE, GRID.coarse_points), (data.level.size, 1))
     modes = _modes_at(gripper, data, noise, x, None)
     for widen, n_point in REFINEMENTS:
@@ -130,7 +129,7 @@ def _modes_at(gripper: GripperModel, data: Touches, noise: Whitened, x: Array, s
 
 def free_evidence(gripper: GripperModel, data: Touches, near: Array, noise: Whitened) -> Array:
     """Return the log evidence of a free effusivity for each touch, (n,), looked for from the modes ``near``
-    (n, 7) of a likely candidate on; ``noise`` is :func:`whitened` of the graded touches."""
+    (n, 7) of a likely candidate on; ``noise`` whitens the graded touches."""
     n_grade = len(gripper.grades)
     data, near = graded(data, gripper.grades), np.repeat(near, n_grade, axis=0)
     free = free_hypotheses(gripper, np.clip(near[:, EFFUSIVITY], *LN_E_RANGE))
@@ -140,7 +139,8 @@ def free_evidence(gripper: GripperModel, data: Touches, near: Array, noise: Whit
     about = over_grades(gripper, (mode.log_evidence + 0.5 * away**2).reshape(-1, n_grade))
     likely = np.flatnonzero(about > about.max(axis=1, keepdims=True) - GRID.grade_behind)
     out = np.full(data.level.size, -np.inf)
-    out[likely] = _evidence_about(gripper, data.take(likely), taken(noise, likely), mode.take(likely))
+    some_noise = noise[0][likely], noise[1][likely]
+    out[likely] = _evidence_about(gripper, data.take(likely), some_noise, mode.take(likely))
     return np.asarray(logsumexp(over_grades(gripper, out.reshape(-1, n_grade)), axis=1))
 
 

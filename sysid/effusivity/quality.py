@@ -108,8 +108,6 @@ class GraspQuality:
     masked: Flags  # (n, n_time), samples that are no readings (clipped or spikes)
     spiked: Flags  # (n, n_time), the spikes among them
     clipped_at: Floats  # (n,), the reading at which the sensor saturates [degC]; NaN if never
-    start: Floats  # (n,), time of the first usable sample [s]; NaN where none is
-    stop: Floats  # (n,), time of the last
     shortened: Flags  # (n,), contacts that are read in part and last much longer
     until: float  # later readings are not used [s]; inf where touches of one block are read whole
     _trace: _Trace = field(repr=False)
@@ -186,10 +184,7 @@ def check_grasps(grasps: Grasps, *, longest: float = np.inf, whole_traces: bool 
         if not note[i] and shortened[i]:
             note[i] = f"read until {longest:g} s, as long as contacts of the training lasted"
     until = float(longest) if single else np.inf
-    used = np.asarray(read & (time <= until + 1e-9))
-    start = np.where(used.any(axis=1), time[used.argmax(axis=1)], np.nan)
-    stop = np.where(used.any(axis=1), _last_sample_times(time, used), np.nan)
-    return GraspQuality(reason, note, masked, spiked, reading, start, stop, shortened, until, trace)
+    return GraspQuality(reason, note, masked, spiked, reading, shortened, until, trace)
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,11 +18,11 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.datasets.schema import Grasps
 from thermogrip.sysid.contact.simulation import simulate_grasps
-from thermogrip.sysid.effusivity.data import graded, touches
+from thermogrip.sysid.effusivity.data import graded, touches, whiten
 from thermogrip.sysid.effusivity.gripper_model import (
     load_default_gripper,
 )
-from thermogrip.sysid.effusivity.laplace_approximation import fit_candidates, whitened
+from thermogrip.sysid.effusivity.laplace_approximation import fit_candidates
 from thermogrip.sysid.effusivity.multi_touch import two_touch_fit
 from thermogrip.sysid.effusivity.posterior import effusivity_posterior, material_fit
 from thermogrip.sysid.effusivity.posterior_grid import free_evidence
@@ -147,7 +147,7 @@ def test_odds_of_an_unknown_are_prior_odds_times_the_bayes_factor() -> None:
     fits = fit_candidates(device, data, FIVE).mode
     best = fits.log_evidence.reshape(3, 5).argmax(axis=1)
     near = fits.u.reshape(3, 5, -1)[np.arange(3), best]
-    free = free_evidence(device, data, near, whitened(device, graded(data, device.grades)))
+    free = free_evidence(device, data, near, whiten(graded(data, device.grades), device.noise))
     factor = np.exp(known).mean(axis=1) / np.exp(free)
     for prior, odds in ((0.25, 3.0), (0.1, 9.0)):
         model = PosteriorClassifier(prior_unknown=prior).with_device(device)

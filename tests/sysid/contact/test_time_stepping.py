@@ -86,9 +86,9 @@ def test_the_slopes_of_a_contact_are_its_differences(block):
 def test_a_gripper_each_is_what_each_gripper_says():
     """The second one with another lag, and with a resistance before it."""
     one, nodes = gripper_modes(STACK), tuple(time_nodes(3.0))
-    own = one.modes[:, :, :-1]
     numbers = np.concatenate([one.numbers, one.numbers * [1.5, 2.0, 1, 1, 1, 1, 1]])
-    two = kernel.grippers(*np.repeat(own, 2, axis=0).transpose(1, 0, 2), numbers)
+    two = kernel.Gripper(np.repeat(one.modes, 2, axis=0), numbers)
+    two.modes[1, :2, -1] /= 2.0  # twice the lag
     contact, wanted = np.repeat([[*IRON, 800.0, 0.7]], 2, axis=0), np.ones((2, 5), dtype=bool)
     rise, _, _ = kernel.contacts(nodes, two, contact, wanted)
     for k in range(2):

@@ -8,11 +8,10 @@ from scipy.special import ndtr
 
 from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.sysid.effusivity import posterior_grid
-from thermogrip.sysid.effusivity.data import touches
+from thermogrip.sysid.effusivity.data import touches, whiten
 from thermogrip.sysid.effusivity.laplace_approximation import (
     EFFUSIVITY,
     fit_candidates,
-    whitened,
 )
 from thermogrip.sysid.effusivity.posterior_grid import (
     LN_E_RANGE,
@@ -102,6 +101,6 @@ def test_the_evidence_of_a_free_effusivity_is_the_integral_of_many_points(device
     data = touches(record.isel(grasp=np.flatnonzero(record["material"].values == material)[:3]))
     near = fit_candidates(device, data, [material]).mode.u
     near[:, EFFUSIVITY] = device.blocks[start].ln_effusivity if isinstance(start, str) else start
-    found = free_evidence(device, data, near, whitened(device, data))
+    found = free_evidence(device, data, near, whiten(data, device.noise))
     want = [posterior.log_evidence for posterior in grid_posteriors(device, data)]
     np.testing.assert_allclose(found, want, atol=0.5)  # of odds that have ten nats and more
