@@ -164,10 +164,10 @@ class FeatureReader:
         reader = cls(names, any(map(features.can_normalise, records)) and bool(usable.any()), end)
         if not reader.normalise:
             usable = np.ones(labels.size, dtype=bool)
-        parts = [
+        by_record = [
             reader._readings(record, table.reindex(feature=names)) for record, table in zip(records, tables)
         ]
-        readings = {key: np.concatenate([getattr(p, key) for p in parts]) for key in vars(parts[0])}
+        readings = {key: np.concatenate([getattr(p, key) for p in by_record]) for key in vars(by_record[0])}
         return LearntFeatures(reader, Readings(**readings), usable, notes)
 
     def to_dict(self) -> dict[str, Any]:

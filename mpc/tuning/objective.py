@@ -211,7 +211,7 @@ def drawn(plant: Plant, draw: int) -> Plant:
 
 
 def readings_a_move(plant: Plant, output: str, dt: float) -> float:
-    """Return how many readings of an output, as often as in the logs, come in a sample time [s]."""
+    """Return the number of readings of an output, as often as in the logs, that come in a sample time [s]."""
     # where rows were averaged, the excess of one reading over a mean of n is recorded: s^2 - s^2 / n
     sd, excess = (of.get(output, 0.0) for of in (plant.scores.reading_sd, plant.scores.reading_excess))
     averaged = 1 / (1 - (excess / sd) ** 2) if 0 <= excess < sd < np.inf else 1.0

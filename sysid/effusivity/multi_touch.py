@@ -469,16 +469,16 @@ def next_touch_prior(
 ) -> Joint:  # fmt: skip
     """Return the log evidence (m,) from the touches of one block, and the prior mean (m, 4) and covariance
     (m, 4, 4) of another touch's x = (T_obj, ln h, ln e, ln C) after a ``rest`` [s]."""
-    at = np.array([0])
+    block_rows = np.array([0])
     if grasps.sizes["grasp"] > 1:
-        at, *others = touch_groups(grasps).values()
-        if others or at.size != grasps.sizes["grasp"]:
+        block_rows, *others = touch_groups(grasps).values()
+        if others or block_rows.size != grasps.sizes["grasp"]:
             hint = "give those of one block"
             raise UserError("touches of several blocks", file=log_name(grasps), hint=hint)
     view = _view(gripper, grasps, material_hypotheses(gripper, candidates), coupling or Coupling())
-    factor = _group_factors(view, [at])[0]
-    if at.size > 1:
-        factor = _group_factors(view, [at], _cavities(view, [at], [factor]))[0]
+    factor = _group_factors(view, [block_rows])[0]
+    if block_rows.size > 1:
+        factor = _group_factors(view, [block_rows], _cavities(view, [block_rows], [factor]))[0]
     # the touch to come: a flat factor, in a row of its own
     m, new = view.hypotheses.ln_h.size, int(view.traces.rest.size)
     silent = Factor(*(np.concatenate([f, np.zeros((m, 1, *f.shape[2:]))], axis=1) for f in factor))
@@ -486,7 +486,7 @@ def next_touch_prior(
     before = view.traces
     skin, room = np.append(before.skin, np.nan), np.append(before.room, np.nan)
     traces = replace(before, skin=skin, room=room, rest=np.append(before.rest, rest))
-    by_loss = _by_loss(view._replace(traces=traces), np.append(at, new), silent)
+    by_loss = _by_loss(view._replace(traces=traces), np.append(block_rows, new), silent)
     joint = _over_losses(by_loss, BLOCK.log_loss_prior())
     last = slice(-N_SHARED, None)
     return Joint(joint.log_evidence, joint.mean[:, last], joint.covariance[:, last, last])
