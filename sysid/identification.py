@@ -210,7 +210,10 @@ def identify(
     kind = choose_model(_held_out_rows(folds), sum(len(case.held) for case in cases))
     kind = kind or (boxes.kept.kind if boxes.kept is not None else None)
     if kind is None:
-        raise _nothing_fitted([*boxes.refused, *(line for fold in folds for line in fold.refused)], task)
+        refused = [*boxes.refused, *(line for fold in folds for line in fold.refused), "none was asked for"]
+        noisy = [finding.says for finding in task.checked.of("noise") if finding.verdict != "ok"]
+        hint = "; ".join([*noisy, *task.doubts]) or None
+        raise UserError(f"no model could be fitted ({refused[0]})", hint=hint)
     plant, without_draws = _refit(kind, boxes.kept, task, steps)
     return _judged(kind, plant, boxes, folds, task, without_draws)
 
@@ -349,8 +352,7 @@ class _Boxes:
 def _fit_black_boxes(
     kinds: Sequence[str], task: _Task, steps: _Steps, early: Callable[[Identification], None] | None
 ) -> _Boxes:
-    """Fit each black box to all logs: subspace models first, whose step the others take; neural models, which
-    take longest, last. With ``leave_one_out`` they are fitted by case instead."""
+    """Fit each black box to all logs: subspace, whose step the others take, first, neural ones last."""
     boxes = [] if task.options.leave_one_out else [kind for kind in kinds if kind != "network"]
     fits: dict[str, BlackBoxFit] = {}
     refused: dict[str, str] = {}
@@ -373,8 +375,7 @@ def _fit_black_boxes(
 
 
 def _to_beat(others: Sequence[BlackBoxFit], logs: Sequence[Log]) -> dict[str, float] | None:
-    """Return the errors by part that neural models have to come near to; refuse where they are beyond
-    reach."""
+    """Return the errors by part that neural models have to come near to; refuse where that is impossible."""
     if not others:
         return None
     if beyond_reach(others, logs):
@@ -590,8 +591,7 @@ def choose_black_box(fits: Sequence[BlackBoxFit], logs: Sequence[Log]) -> BlackB
 
 
 def beyond_reach(fits: Sequence[BlackBoxFit], logs: Sequence[Log]) -> bool:
-    """Return whether a kind that errs by the noise of the readings alone would be barely better on another
-    run."""
+    """Return whether a kind that errs by white noise alone would be barely better on another run."""
     linear = [fit for fit in fits if fit.kind in LINEAR]
     if not linear:
         return False
@@ -625,12 +625,6 @@ def choose_model(rows: Sequence[Row], complete: int) -> str | None:
         return None
     best = min(mean, key=lambda model: mean[model])
     return "network" if mean.get("network", np.nan) <= WITHIN_NOISE * mean[best] else best
-
-
-def _nothing_fitted(refused: Sequence[str], task: _Task) -> UserError:
-    noisy = [finding.says for finding in task.checked.of("noise") if finding.verdict != "ok"]
-    problem = f"no model could be fitted ({refused[0] if refused else 'none was asked for'})"
-    return UserError(problem, hint="; ".join([*noisy, *task.doubts]) or None)
 
 
 # refit: the chosen one on all logs, with what its uncertainty is drawn from

@@ -13,7 +13,7 @@ averages first, and a choice by free run.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 
@@ -63,8 +63,11 @@ def arx_family(
     out = {}
     n_y, n_drive = len(grid.outputs), len(grid.inputs) + len(grid.disturbances)
     couplings = (False, True) if n_y > 1 else (True,)
+    # short logs with many signals do without the longest delays, then without the highest orders
+    fewer_delays = [(poles, delays[:n]) for n in range(len(delays), 0, -1)]
+    fewer_poles = [(poles[:n], delays[:1]) for n in range(len(poles) - 1, 0, -1)]
     for products in default_terms(grid) if terms is None else terms:
-        for kept_poles, kept_delays in _orders_to_try(poles, delays):
+        for kept_poles, kept_delays in (*fewer_delays, *fewer_poles):
             regression = _regress(grid, products, max(kept_poles) + max(kept_delays) - 1)
             if regression is not None:
                 break
@@ -81,17 +84,6 @@ def arx_family(
             if model is not None:
                 out[structure] = model
     return out
-
-
-def _orders_to_try(
-    poles: Sequence[int], delays: Sequence[int]
-) -> Iterator[tuple[Sequence[int], Sequence[int]]]:
-    """Yield all orders, then fewer for short logs with many signals: first without the longest delays, then
-    without the highest orders."""
-    for n_delay in range(len(delays), 0, -1):
-        yield poles, delays[:n_delay]
-    for n_pole in range(len(poles) - 1, 0, -1):
-        yield poles[:n_pole], delays[:1]
 
 
 def _regress(grid: Grid, terms: tuple[str, ...], deep: int) -> _Regression | None:

@@ -2,12 +2,11 @@
 
     y = G(q) w + v,    D(q) v = e,    D(q) = 1 + d_1 q^-1 + ... + d_p q^-p,
 
-with the filter G of :mod:`thermogrip.sysid.blackbox.output_error` and white e.  Least squares of the free run
-count every row as a reading of its own; where a disturbance lasts for many rows they are not, and the slow
-part of the response is fitted to the disturbance.  The likeliest G minimises the sum of e^2 instead, which is
-the output-error fit of D y to D w.  D follows from the residuals of such a fit by the Yule-Walker equations,
-its order by the Bayesian information criterion, so both are fitted in turn (generalised least squares,
-[1]_ chapter 7).  One D an output serves all structures: it is that of the largest one.
+with the filter G of :mod:`thermogrip.sysid.blackbox.output_error` and white e.  The likeliest G minimises the
+sum of e^2, which is the output-error fit of D y to D w.  D follows from the residuals of such a fit
+by the Yule-Walker equations, its order by the Bayesian information criterion, so both are fitted in turn
+(generalised least squares, [1]_ chapter 7).  One D an output serves all structures: it is that of the largest
+one.
 
 The plant keeps G alone: noise is not simulated.  So c and the initial conditions, which D nearly removes
 where the noise is slow, are fitted to the readings themselves.

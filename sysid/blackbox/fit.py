@@ -185,8 +185,7 @@ def _grids(
 
 
 def _within_steps(grid: Grid, grids: Sequence[Grid]) -> float:
-    """Return how far the readings on the finest grid lie off the lines between those of this one, in the
-    outputs' spread: errors at different steps are compared as errors of the same readings."""
+    """Return how far the readings on the finest grid lie off the lines between those of this one."""
     finest = min(grids, key=lambda each: each.dt)
     if grid.dt == finest.dt:
         return 0.0
@@ -203,8 +202,7 @@ def _within_steps(grid: Grid, grids: Sequence[Grid]) -> float:
 def _remembering(
     kind: str, order: int | None = None, delay: int | None = None, *, searches: bool = True
 ) -> Family:
-    """Return the family with order and delay as asked for, whose fits leave something to the next ones; a
-    kind that has none to fix is refused."""
+    """Return the family with order and delay as asked for; a kind that has none to fix is refused."""
     settings: dict[str, Any] = {}
     for what, value in (("order", order), ("delay", delay)):
         if value is None:
@@ -224,8 +222,7 @@ def _remembering(
 def _with_convention(
     kind: str, grid: Grid, choice: Choice, logs: Sequence[Log], family: Family
 ) -> tuple[Grid, Choice]:
-    """Return grid and choice with inputs that were applied up to their rows where that errs clearly less;
-    within a step that was averaged over several rows one row makes no difference."""
+    """Return grid and choice with inputs that were applied up to their rows where that errs clearly less."""
     if grid.dt > 1.5 * grid.native or kind in _AVERAGED:
         return grid, choice
     moved = replace(grid.of(logs, ends=True), why=grid.why)
@@ -277,8 +274,7 @@ def with_refits(
 def _resampled(
     segments: Sequence[Segment], misses: Sequence[Array], memory: float, rng: np.random.Generator
 ) -> list[Segment]:
-    """Return the segments with readings of the module's theory, of one course w for all outputs, whose
-    correlation l is so many rows."""
+    """Return the segments with resampled readings, one course w for all outputs, l so many rows."""
     from scipy.signal import oaconvolve  # half a second
 
     # a Gaussian filter of sd sigma leaves white noise the correlation exp(-(t - s)^2 / (4 sigma^2))
@@ -319,8 +315,7 @@ def _run_settings(fit: BlackBoxFit) -> dict[str, Any]:
 
 
 def _warmup_rows(grid: Grid) -> int:
-    """Return the number of readings that set the state of what is held out: those of 5 s of whole logs, which
-    begin at rest, and 50 samples of parts of a log."""
+    """Return the number of readings that set the state: 5 s of whole logs, 50 samples of parts of a log."""
     seconds = 5.0 if len(grid.logs) >= SEVERAL else 50 * grid.native
     most = sum(len(segment.time) for segment in grid.segments) // 16  # of a short log, a quarter of a block
     return max(2, min(round(seconds / grid.dt), most))

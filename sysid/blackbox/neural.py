@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 from scipy.linalg.blas import dsyrk
 
-from thermogrip.datasets.arrays import Array, Mask
+from thermogrip.datasets.arrays import Array
 from thermogrip.sysid.blackbox.order_selection import Structure
 from thermogrip.sysid.blackbox.subspace import subspace_family
 from thermogrip.sysid.models.neural import NeuralModel
@@ -129,14 +129,12 @@ def saturation_levels(grid: Grid) -> tuple[Array, Array]:
         columns = [segment.y[:, i] for segment in grid.segments]
         for sign, rail in ((1.0, high), (-1.0, low)):
             top = max(float(np.nanmax(sign * column)) for column in columns)
-            if max(_longest_run(sign * column >= top - 1e-9 * abs(top)) for column in columns) >= STANDS:
-                rail[i] = sign * top
+            for column in columns:
+                stands = np.r_[0, sign * column >= top - 1e-9 * abs(top), 0]
+                edges = np.flatnonzero(np.diff(stands))
+                if (edges[1::2] - edges[::2]).max(initial=0) >= STANDS:
+                    rail[i] = sign * top
     return low, high
-
-
-def _longest_run(constant: Mask) -> int:
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], constant.astype(int), [0]])))
-    return int((edges[1::2] - edges[::2]).max(initial=0))
 
 
 def _scaled_data(grid: Grid) -> _Data:
@@ -241,10 +239,8 @@ def _train_member(data: _Data, linear: _Linear, h: int, *, seed: int) -> _Member
             start_columns = slice(n_p + segment * n, n_p + (segment + 1) * n)
             v, S = run_with_slopes(linear.A, z[:n_p], h, z[start_columns], w, data.low, data.high)
             J = np.zeros((int(is_read[segment].sum()), len(z)))
-            J[:, :n_p], J[:, start_columns] = (
-                S[is_read[segment]][:, :n_p] / size,
-                S[is_read[segment]][:, n_p:] / size,
-            )
+            J[:, :n_p] = S[is_read[segment]][:, :n_p] / size
+            J[:, start_columns] = S[is_read[segment]][:, n_p:] / size
             rows.append((v - y)[is_read[segment]] / size)
             slopes.append(J)
         return np.concatenate(rows), np.concatenate(slopes)
@@ -258,8 +254,7 @@ def _train_member(data: _Data, linear: _Linear, h: int, *, seed: int) -> _Member
 def _levenberg_marquardt(
     linearise: Callable[[Array], tuple[Array, Array]], residuals: Callable[[Array], Array], z: Array
 ) -> Array:
-    """Return where Levenberg-Marquardt steps, three dampings tried at a time, no longer lower the cost; the
-    residuals are cheap and the normal equations expensive here, the other way round than for a network."""
+    """Return where Levenberg-Marquardt steps, three dampings tried at a time, no longer lower the cost."""
     damping = 1.0
     for _ in range(ITERATIONS):
         residual, jacobian = linearise(z)

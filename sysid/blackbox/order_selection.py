@@ -300,8 +300,7 @@ def _score(
 
 
 def _non_dominated(errors: Mapping[Structure, list[Array]], scale: Array) -> list[Structure]:
-    """Return the structures for which no other one has at most as many numbers and errs less on each part so
-    far; of some that all err alike, as on a long log of a simple plant, these are the smallest ones."""
+    """Return the structures for which no other one as small or smaller errs less on each part so far."""
     points = {
         structure: np.array([structure.size, *(np.min(np.mean(e / scale, axis=1)) for e in column)])
         for structure, column in errors.items()
@@ -350,9 +349,8 @@ def _fit_to_all(
 
 
 def drives(grid: Grid, terms: Sequence[str]) -> list[Array]:
-    """Return the columns w = [u, d, phi(u, d)] of each segment, shape (n, n_drive); a column that never moves
-    cannot be distinguished from a constant; it is zero here, so that its effect is fitted as none and not as
-    an arbitrary share of the constant."""
+    """Return the columns w = [u, d, phi(u, d)] of each segment, shape (n, n_drive); one that never moves is
+    zero, so that its effect is fitted as none and not as an arbitrary share of the constant."""
     w = [drives_of(grid, segment, terms) for segment in grid.segments]
     whole = np.concatenate(w)
     moves = np.ptp(whole, axis=0) > 1e-9 * np.maximum(np.abs(whole).max(axis=0), 1e-300)
@@ -376,14 +374,11 @@ def default_terms(grid: Grid) -> tuple[tuple[str, ...], ...]:
     Peltier heats and cools unequally) or the squares of others that show their curvature (Joule heat)."""
     u = np.concatenate([segment.u for segment in grid.segments])
     signed = [n for i, n in enumerate(grid.inputs) if u[:, i].min() < 0 < u[:, i].max()]
-    curved = [n for n, values in zip(grid.inputs, u.T) if n not in signed and _shows_curvature(values)]
+    moved = [(n, v) for n, v in zip(grid.inputs, u.T) if n not in signed and np.ptp(v) > 0]
+    # of two levels, or of few moves, the square of an input is a line in it
+    curved = [n for n, v in moved if abs(np.corrcoef(v, v**2)[0, 1]) < _ALIKE]
     products = tuple(f"|{n}|" for n in signed) or tuple(f"{n}*{n}" for n in curved)
     return ((), products) if products else ((),)
-
-
-def _shows_curvature(u: Array) -> bool:
-    """Return whether the square of an input is no line in it; of two levels, or of few moves, it is."""
-    return bool(np.ptp(u) > 0 and abs(np.corrcoef(u, u**2)[0, 1]) < _ALIKE)
 
 
 def as_state_space(
@@ -413,8 +408,7 @@ def with_spread(model: StateSpaceModel, grid: Grid, starts: Sequence[Array]) -> 
 
 
 def excess_within_noise(excess: Array, most: float = HARDLY_MORE) -> bool:
-    """Return whether paired differences of log errors are zero to within one standard error and 5 percent, or
-    ``most``."""
+    """Return whether paired differences of log errors are zero to within one standard error and ``most``."""
     return bool(excess.mean() <= min(excess.std(ddof=1) / np.sqrt(excess.size), most))
 
 

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from thermogrip.datasets.arrays import Array
 from thermogrip.sysid.blackbox.order_selection import Structure
 from thermogrip.sysid.models.polynomial import SindyModel
-from thermogrip.sysid.plant.log_grid import Grid, Segment, whole_readings
+from thermogrip.sysid.plant.log_grid import Grid, whole_readings
 
 
 def sindy_family(
@@ -157,7 +157,8 @@ def _trajectories(grid: Grid, memory: int) -> list[_Trajectory]:
     trajectories = []
     readings = whole_readings(grid.segments, memory + 5)
     for segment in (replace(some, y=y) for some, y in zip(grid.segments, readings)):
-        for begin, end in _whole_rows(segment):
+        is_read = np.r_[0, np.isfinite(segment.y).all(axis=1), 0]
+        for begin, end in np.flatnonzero(np.diff(is_read)).reshape(-1, 2).tolist():
             y = segment.y[begin:end]
             if end - begin < memory + 5:
                 continue
@@ -167,12 +168,6 @@ def _trajectories(grid: Grid, memory: int) -> list[_Trajectory]:
             variables = np.hstack([*states, outside])
             trajectories.append(_Trajectory(variables, np.diff(y, axis=0)[memory - 1 :]))
     return trajectories
-
-
-def _whole_rows(segment: Segment) -> list[tuple[int, int]]:
-    is_read = np.isfinite(segment.y).all(axis=1)
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], is_read, [False]]).astype(int)))
-    return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
 
 
 def _natural(powers: NDArray[np.int_], coefficients: Array, middle: Array, size: Array) -> tuple[Any, Array]:

@@ -23,8 +23,7 @@ output linearly, so they are a least-squares fit of the free run, not of one ste
     Y_f = Gamma_K L Z_p + H_K W_f + G_K Y_f + E,        Gamma L = (I - G_K)^-1 Gamma_K L,
 
 H_K and G_K strictly lower triangular.  The e of a row depends on none of what it is regressed on, even where
-w was fed back from y; PO-MOESP and CVA take the future drives for independent of the noise, and are biased by
-feedback.  (The paper goes on with A_K and K, which asks the past to be longer than any memory.)
+w was fed back from y; PO-MOESP and CVA are biased by feedback.
 
 Several logs are side by side in the Hankel matrices; a window that touches a gap or a lost reading is left
 out. Where less than half of the windows are whole, short holes are lines
@@ -131,8 +130,7 @@ def extended_observability(L32: Array, L33: Array, *, n_y: int, weighting: str) 
 
 
 def fit_inputs(grid: Grid, A: Array, C: Array, terms: tuple[str, ...] = ()) -> StateSpaceModel:
-    """Return the model with the B, E, constant of the least free-run error, given A and C; the simulated
-    output is linear in all of them; the columns of the regression are simulations of unit entries."""
+    """Return the model with the B, E, constant of the least free-run error, given A and C."""
     n = A.shape[0]
     y0 = np.nanmean(np.concatenate([segment.y for segment in grid.segments]), axis=0)
     scale = np.maximum(grid.output_spread(), 1e-9)
@@ -270,10 +268,8 @@ def predictor_observability(triangle: Array, f: int, n_y: int) -> Array:
         regressors = np.hstack([window.past, before, window.future[:, : row * n_w], constant])
         row_outputs = slice(row * n_y, (row + 1) * n_y)
         weights = np.linalg.lstsq(regressors, window.ahead[:, row_outputs], rcond=DEPENDENT)[0].T
-        by_past[row_outputs], by_readings[row_outputs, : row * n_y] = (
-            weights[:, :n_z],
-            -weights[:, n_z : n_z + row * n_y],
-        )
+        by_past[row_outputs] = weights[:, :n_z]
+        by_readings[row_outputs, : row * n_y] = -weights[:, n_z : n_z + row * n_y]
     apart = window.past - constant @ (constant.T @ window.past) / (constant.T @ constant)
     left_vectors, values, _ = np.linalg.svd(
         np.linalg.solve(by_readings, by_past) @ apart.T, full_matrices=False

@@ -260,7 +260,9 @@ def _excitation(grid: Grid, most: int = 6) -> list[Finding]:
             verdict: Verdict = "warn" if name in grid.switches else "fail"
             out.append(Finding("excitation", "", name, 0.0, "orders", verdict, says))
             continue
-        order = _regression_order(grid, [place], most)
+        successive = [np.lib.stride_tricks.sliding_window_view(s.u[:, place], most) for s in grid.segments]
+        size = np.linalg.svd(np.cov(np.concatenate(successive).T), compute_uv=False)
+        order = int(np.sum(size > 1e-6 * size[0]))
         count = sum(int(np.count_nonzero(np.abs(np.diff(s.u[:, place])) > 1e-9)) for s in grid.segments)
         good = order >= 3 and (count >= 4 or name in grid.switches)
         says = f"{name} moves {count} times and excites {order} of {most} orders"
@@ -275,40 +277,27 @@ def _excitation(grid: Grid, most: int = 6) -> list[Finding]:
     return out
 
 
-def _regression_order(grid: Grid, which: list[int], most: int) -> int:
-    stacked = []
-    for segment in grid.segments:
-        view = np.lib.stride_tricks.sliding_window_view(segment.u[:, which], most, axis=0)
-        stacked.append(view.reshape(len(view), -1))
-    z = np.concatenate(stacked)
-    size = np.linalg.svd(np.cov(z.T), compute_uv=False)
-    return int(np.sum(size > 1e-6 * size[0]))
-
-
 def _feedback(grid: Grid, at: int, name: str, lags: int = 3) -> Finding:
     """F test: does the past of the outputs help to predict the input beyond its own past?"""
     # a smooth input is predicted by many of its own rows: with few of them, outputs that filter it would help
     own_lags = min(_CHECKS.own_lags, key=lambda n: _bic(*_effect_regression(grid, at, own=n, others=0)))
     (X, v), (Z, _) = (_effect_regression(grid, at, own=own_lags, others=n) for n in (0, lags))
-    moves = (
-        int(np.count_nonzero(np.abs(v - X[:, 0]) > 1e-9 * np.ptp(v))) if len(v) else 0
-    )  # X[:, 0] is u[k-1]
+    steps = np.abs(v - X[:, 0]) if len(v) else np.zeros(1)  # X[:, 0] is u[k-1]
+    moves = int(np.count_nonzero(steps > 1e-9 * np.ptp(v))) if len(v) else 0
     if moves < 3 * Z.shape[1]:
         says = f"{name} moves too seldom to be tested for feedback"
         return Finding("feedback", "", name, float("nan"), "1", "ok", says)
     explained, chance = _helped(X, Z, v, moves)
     closed = chance < 1e-4 and explained > 0.02
-    steps = np.abs(v - X[:, 0])  # those of a set point hide what a controller does between them
+    # the steps of a set point hide what a controller does between them
     usual = (steps > 1e-9 * np.ptp(v)) & (steps <= np.quantile(steps[steps > 0], _CHECKS.usual_moves))
     if not closed and usual.sum() >= 3 * Z.shape[1]:
         explained, chance = _helped(X[usual], Z[usual], v[usual], int(usual.sum()))
         closed = chance < 1e-4 and explained > _CHECKS.explained_between
-    says = (
-        f"{name} follows the outputs ({100 * explained:.0f} % of its moves): recorded in closed loop; noise "
-    )
-    says += "is in the input too, so trust simulation-error fits and not one-step fits"
-    if not closed:
-        says = f"no sign that {name} was driven by the outputs"
+    says = f"no sign that {name} was driven by the outputs"
+    if closed:
+        says = f"{name} follows the outputs ({100 * explained:.0f} % of its moves): recorded in closed loop; "
+        says += "noise is in the input too, so trust simulation-error fits and not one-step fits"
     return Finding("feedback", "", name, explained, "1", "warn" if closed else "ok", says)
 
 
@@ -321,8 +310,7 @@ def _helped(X: Array, Z: Array, v: Array, moves: int) -> tuple[float, float]:
 
 
 def _relay_feedback(grid: Grid, at: int, name: str) -> Finding:
-    """Tell whether a relay is switched where an output reaches the same reading again, beside the range of
-    readings between; a clock does so too once the plant has settled, but its holds are all alike."""
+    """Tell whether a relay is switched where an output reaches the same reading again."""
     least, switchings = np.inf, 0
     lengths: set[int] = set()
     for output in range(len(grid.outputs)):
@@ -336,7 +324,7 @@ def _relay_feedback(grid: Grid, at: int, name: str) -> Finding:
                     ratios.append(abs(between_edges[-1] - between_edges[0]) / np.ptp(between_edges))
         if len(ratios) >= _CHECKS.fewest_switchings:
             least, switchings = min(least, float(np.median(ratios))), len(ratios)
-    closed = least <= _CHECKS.same_reading and len(lengths) > 2
+    closed = least <= _CHECKS.same_reading and len(lengths) > 2  # the holds of a clock are all alike
     says = f"no sign that {name} was driven by the outputs"
     if closed:
         says = (
@@ -361,8 +349,7 @@ def _feedback_to(name: str, at: int, grid: Grid, logs: Sequence[Log]) -> list[Fi
 
 
 def _window(logs: Sequence[Log], name: str) -> float:
-    """Return the window [s] of a relay that is switched on at even times for a share of each, which is what a
-    controller moves; 0 of any other input."""
+    """Return the window [s] of a relay that is on for a share of even windows; 0 of any other input."""
     if any(np.unique(column(log, name)).size > 2 for log in logs):
         return 0.0
     on = [np.diff(log["time"].values[1:][np.diff(column(log, name)) > 0]) for log in logs]

@@ -31,8 +31,7 @@ _BESIDE_SENSOR = 1.0  # K, by which the air at the plant may differ from that at
 
 
 def shipped_network(logs: Sequence[Log]) -> NetworkModel | None:
-    """Return the network of the package whose signals all logs have, under the columns' names, if there is
-    one."""
+    """Return the network of the package whose signals all logs have, under the columns' names, if any."""
     for network in map(named_network, builtin_networks()):
         columns = _by_name(network, logs[0])
         if columns is None:
@@ -121,8 +120,7 @@ def renamed(network: Network, columns: Mapping[str, str]) -> Network:
 
 
 def _by_name(network: Network, log: Log, *, needs_inputs: bool = True) -> dict[str, str] | None:
-    """Return the column of each signal that is called like it, in whatever case; None where one is absent. An
-    input may be where it is not needed; it then has the case of the others."""
+    """Return the column of each signal that is called like it, in whatever case; None where one is absent."""
     written: dict[str, list[str]] = {}
     for name in log.data_vars:
         written.setdefault(str(name).lower(), []).append(str(name))

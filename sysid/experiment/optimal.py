@@ -56,8 +56,7 @@ class Expectation:
     widths: dict[str, dict[str, float]]  # of each parameter's 90 % interval in natural units, by schedule
 
     def narrower(self, kind: str, than: str) -> float:
-        """Return the factor by which intervals are expected to narrow, the geometric mean over independent
-        directions."""
+        """Return the factor by which intervals are expected to narrow, a geometric mean over directions."""
         n = len(self.widths[than])
         return float(2.0 ** ((self.bits[kind] - self.bits[than]) / n))
 
@@ -223,8 +222,7 @@ def _plain_shapes(frame: _Frame) -> list[Array]:
 def _shrunk(
     frame: _Frame, evaluate: Callable[[Array], float], cells: Array, halvings: int
 ) -> tuple[Array, float]:
-    """Return the cells, drawn towards rest as far as the limits ask, and their value (-inf: none keeps
-    them)."""
+    """Return the cells, drawn towards rest as far as the limits ask, and their value; -inf if none do."""
     value = evaluate(cells)
     low = 0.0
     high = 1.0

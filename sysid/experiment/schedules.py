@@ -1,7 +1,6 @@
 """Input schedules to identify a plant by: PRBS, multisine, staircase, inside the rig's limits.
 
-What a schedule must excite are the time constants of the plant, tau_fast to tau_slow, so periods should span
-about pi tau_fast to 2 pi tau_slow.
+To excite time constants from tau_fast to tau_slow periods should span about pi tau_fast to 2 pi tau_slow.
 
 * **prbs**: a maximum-length shift register of two levels about the mean, held for tau_fast per bit; 2^n - 1
   bits have a spectrum flat up to 0.44 / tau_fast and are balanced but for one bit.

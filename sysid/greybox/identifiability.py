@@ -4,11 +4,9 @@
 eigenvalue per combination of parameters that is not practically identifiable. Its eigenvector is reported
 in words.
 
-**Trade-offs.** Two parameters of which only a combination is identifiable are strongly correlated. On the
-scale of their priors (ln p of a positive one) a correlation near 1 means that their ratio is known better
-than either, near -1 their product; for parameters that may be negative it is the difference and the sum.
-For standard deviations s_1, s_2 and correlation r that combination has the variance s_1^2 + s_2^2 - 2 |r|
-s_1 s_2.
+**Trade-offs.** On the scale of the priors (ln p of a positive one) a correlation r near 1 of two parameters
+means that their ratio is known better than either, near -1 their product (of parameters that may be negative
+the difference and the sum), with the variance s_1^2 + s_2^2 - 2 |r| s_1 s_2.
 """
 
 from __future__ import annotations

@@ -61,8 +61,7 @@ EFFECTS = EffectSettings()
 
 
 def discrepancy_responses(problem: Problem, runs: Sequence[Sequence[Array]]) -> list[tuple[str, Parts]]:
-    """Return the responses with s = 1 by log, stretch and output, in the units of the readings, each with the
-    name of its signal."""
+    """Return the responses with s = 1, in the units of the readings, each with the name of its signal."""
     signals_of = [
         [signals(problem.model, stretch.u, stretch.d, run) for stretch, run in zip(stretches, of_log)]
         for (stretches, _), of_log in zip(problem.logs, runs)
@@ -99,8 +98,7 @@ def signals(model: Model, u: Array, d: Array, run: Array) -> dict[str, Array]:
 def _response(
     problem: Problem, signals_of: Sequence[Sequence[Mapping[str, Array]]], name: str, lag: float, rms: float
 ) -> Parts:
-    """Return the response to a signal behind a lag [s], of this rms [sd of a bin], by log, stretch and
-    output."""
+    """Return the response to a signal behind a lag [s], of this rms [sd of a bin]."""
     keep = np.exp(-problem.plant.dt / lag)
     means = []
     for of_log, (_, bins) in zip(signals_of, problem.logs):

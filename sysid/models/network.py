@@ -84,8 +84,7 @@ class Monomial(NamedTuple):
 
 
 class Layout(NamedTuple):
-    """The structure of a network as integers: ``at_*`` is where each part begins in its list c of
-    coefficients."""
+    """The structure of a network as integers: ``at_*`` is where each part of the coefficients begins."""
 
     n_x: int
     n_d: int

@@ -5,19 +5,15 @@ With x the state, u the inputs, d the measured disturbances and y the outputs, o
     x+ = A x + B u + E d + F phi(u, d) + sum_s u_s A_s x + c,        y = C x + y0.
 
 There is no direct term: an input that is applied at a row cannot have moved the reading of that row.
-Transport delays are states (a shift register), so the same matrices serve simulation and control.  ``phi``
-are products of inputs, their magnitudes and disturbances (``"drive*|drive|"``); ``A_s`` lets a switch such as
-the pump change how the states couple.  Both are empty for a linear model.
+Transport delays are states (a shift register).  ``phi`` are products of inputs, their magnitudes and
+disturbances (``"drive*|drive|"``); with ``A_s`` a switch such as the pump changes how the states couple.
 
-**State at rest.**  A plant at rest whose outputs read y was held there by *some* input, not necessarily by
-the one that the first row of a log applies.  ``rest`` therefore solves for the state and a constant past
-input v together,
+**State at rest.**  A plant at rest whose outputs read y was held there by *some* constant input v,
 
     min |x - A x - B v - E d - c|^2 + eps |v - u|^2     subject to     C x + y0 = y,
 
 and ``start`` improves on it with the readings of a warm-up: with x0 = x_rest + s, s ~ N(0, P), the readings
-are linear in s and the estimate is a ridge regression.  P (``spread``) is the covariance of the state in the
-data of the fit.
+are linear in s and the estimate is a ridge regression; P (``spread``) is the state's covariance in the fit.
 """
 
 from __future__ import annotations
@@ -196,10 +192,8 @@ class StateSpaceModel(BlackBox):
         """Return B u + E d + F phi(u, d) + c for rows of inputs, shape (..., n_x)."""
         out = u @ self.B.T + d @ self.E.T + self.c
         if self.terms:
-            out = (
-                out
-                + evaluate_terms(self.terms, self.inputs + self.disturbances, join_columns(u, d)) @ self.F.T
-            )
+            names = self.inputs + self.disturbances
+            out = out + evaluate_terms(self.terms, names, join_columns(u, d)) @ self.F.T
         return np.asarray(out)
 
     def poles(self) -> NDArray[np.complex128]:
@@ -231,10 +225,8 @@ class StateSpaceModel(BlackBox):
         if not self.terms:
             return np.zeros_like(self.B)
         step = 1e-3 * np.eye(len(self.inputs))
-        names, joined = (
-            self.inputs + self.disturbances,
-            [join_columns(u + sign * step, np.tile(d, (len(u), 1))) for sign in (1, -1)],
-        )
+        names = self.inputs + self.disturbances
+        joined = [join_columns(u + sign * step, np.tile(d, (len(u), 1))) for sign in (1, -1)]
         up, down = (evaluate_terms(self.terms, names, rows) for rows in joined)
         return np.asarray(self.F @ ((up - down) / 2e-3).T)
 

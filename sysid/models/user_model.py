@@ -442,8 +442,7 @@ class OwnModel(Described):
         return kernel.rollout(x0, u, d, p, dt / n, pieces=n)
 
     def prepared(self, free_runs: FreeRuns, spread: Mapping[str, float], p: Array | None = None) -> OwnModel:
-        """Return the model with steps short enough for these logs and its sensors' sd known, itself where all
-        that is so already."""
+        """Return the model with steps short enough for these logs and its sensors' sd known."""
         sd = {name: OWN.sensor_sd * (spread[name] or 1.0) for name in self.outputs}
         model = replace(self, sd=sd)
         p_tried = self.prior if p is None else np.asarray(p, dtype=float)

@@ -109,7 +109,10 @@ class _Filter:
         model, n_x, inverse = self.plant.model, self.plant.model.n_x, np.linalg.inv(spreads)
         squares, count = np.zeros(len(gains)), 0
         for stretch in stretches:
-            readings = _on_grid(stretch, self.plant.dt) - self.offset
+            steps, dt = self.plant.dt * np.arange(len(stretch.u)), self.plant.dt
+            rows = np.minimum(np.searchsorted(stretch.time, steps - 1e-9 * dt), len(stretch.time) - 1)
+            is_near = stretch.time[rows] - steps < 0.5 * dt
+            readings = np.where(is_near[:, None], stretch.y[rows], np.nan) - self.offset
             z = np.zeros((len(gains), self.F.shape[0]))
             first = np.where(np.isfinite(readings[0]), readings[0], self.middle - self.offset)
             z[:, :n_x] = model.rest(first, stretch.u[0], stretch.d[0], self.plant.p)
@@ -205,11 +208,3 @@ def _parabola_minimum(ratios: Sequence[float], cost: Array, best: int) -> float:
     bend = ends[0] - 2 * ends[1] + ends[2]
     share = 0.5 * (ends[0] - ends[2]) / bend if bend > 0 else 0.0
     return float(ratios[best] * (ratios[best] / ratios[best - 1]) ** share)
-
-
-def _on_grid(stretch: Stretch, dt: float) -> Array:
-    """Return the readings (N, n_y) at the grid's steps; NaN where no row is near."""
-    rows = np.searchsorted(stretch.time, dt * np.arange(len(stretch.u)) - 1e-9 * dt)
-    rows = np.minimum(rows, len(stretch.time) - 1)
-    late = stretch.time[rows] - dt * np.arange(len(stretch.u))
-    return np.asarray(np.where((late < 0.5 * dt)[:, None], stretch.y[rows], np.nan))

@@ -55,8 +55,7 @@ LINEAR = LinearSettings()
 
 @dataclass(frozen=True, eq=False)
 class LinearPlant:
-    """Matrices with names, in the units of the plant's states, inputs and outputs, and the point that they
-    are about."""
+    """Matrices with names, in the plant's units, and the operating point that they are about."""
 
     A: Array  # (n_x, n_x)
     B: Array  # (n_x, n_w)
@@ -225,8 +224,7 @@ def _steady_state(plant: PlantData, u: Array, d: Array) -> Array:
 def _jacobians(
     function: Callable[[Array, Array, Array], Array], x: Array, u: Array, d: Array, moved: Sequence[int]
 ) -> tuple[Array, Array]:
-    """Return derivatives of function(x, u, d) by x, and by the moved inputs and the disturbances, from one
-    batch of central differences."""
+    """Return central differences of function(x, u, d) by x, and by moved inputs and disturbances."""
     point, ends = np.concatenate([x, u, d]), [x.size, x.size + u.size]
     columns = [*range(x.size), *(x.size + k for k in moved), *range(ends[1], point.size)]
     size = LINEAR.difference_step * np.maximum(1.0, np.abs(point[columns]))

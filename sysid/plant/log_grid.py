@@ -252,10 +252,8 @@ def at_rows(stretch: Stretch, run: Array, dt: float) -> Array:
     place = np.clip(stretch.time / dt, 0.0, run.shape[1] - 1)
     cell_before = np.minimum(place.astype(int), run.shape[1] - 2)
     share = (place - cell_before)[None, :, None]
-    out, after = (
-        run[:, cell_before],
-        run[:, cell_before + 1],
-    )  # in place: a run may be long, and a batch large
+    # in place: a run may be long, and a batch large
+    out, after = run[:, cell_before], run[:, cell_before + 1]
     out *= 1 - share
     after *= share
     out += after
@@ -450,8 +448,7 @@ def _area_at(at: Array, s: Array, v: Array, area: Array) -> Array:
 
 
 def _rms_move(time: Array, values: Array, step: float) -> float:
-    """Root mean square change of a reading over ``step`` seconds, of means so that rounding is out; NaN of a
-    log that is too short to show one."""
+    """Root mean square change of a reading over ``step`` seconds, of means; NaN of a log too short."""
     coarse = max(step, 8 * float(np.median(np.diff(time))))  # the slope over a longer stretch, scaled down
     grid = np.arange(time[0], time[-1], coarse)
     mean = _line_mean(time, values[:, None], grid, coarse)[:, 0]

@@ -89,9 +89,8 @@ def find_starts(plant: PlantData, p: Array, stretches: Sequence[Stretch], warmup
 def predict(
     model: Model, dt: float, p: Array, stretches: Sequence[Stretch], starts: Sequence[Start]
 ) -> list[Array]:
-    """Simulate the stretches of one log for a batch of parameters; the starts' shifts, offsets and changes
-    are held; what they are relative to (the state at rest, the state propagated through a gap) follows the
-    parameters."""
+    """Simulate the stretches of one log for a batch of parameters; starts' shifts, offsets and changes are
+    held relative to the state at rest, or propagated through a gap, of these parameters."""
     out: list[Array] = []
     x_end = np.empty((len(p), model.n_x))
     for index, (stretch, start) in enumerate(zip(stretches, starts)):
@@ -212,10 +211,8 @@ def _corrected(
         moved = np.concatenate([along.T @ start.shift, beside])
         # min |A s - r|^2 + |s + moved|^2 within the directions that the few rows of A see
         axes, triangle = np.linalg.qr(A.T)
-        rows, right = (
-            np.vstack([triangle.T, np.eye(len(triangle))]),
-            np.append(r + A @ moved, np.zeros(len(triangle))),
-        )
+        rows = np.vstack([triangle.T, np.eye(len(triangle))])
+        right = np.append(r + A @ moved, np.zeros(len(triangle)))
         step = axes @ np.linalg.lstsq(rows, right, rcond=None)[0] - moved
         shift = root @ step[: plant.model.n_x]
         start = replace(

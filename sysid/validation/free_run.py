@@ -353,7 +353,10 @@ def _notes(run: FreeRun, by_inputs: InputEffect | None) -> list[str]:
     if by_inputs is not None:
         remaining = ", ".join(f"{name} {rms:.2g} {units[name]}" for name, rms in by_inputs.remaining.items())
         notes.append(f"most of the error is {by_inputs.words()}, which would leave {remaining}")
-    notes += _outside_notes(plant, outside)
+    for name, share in outside.items():
+        low, high = plant.valid[name]
+        where = f"{low:g} to {high:g}, the range of the fit, in {100 * share:.0f} % of the rows"
+        notes.append(f"{name} lies outside of {where}")
     return notes if verdict is None else [*notes, str(verdict)]
 
 
@@ -398,16 +401,6 @@ def _correlation_note(
     if unseen:
         why = f"the fit has not seen {', '.join(unseen)} as here, so this need not be a term that is missing"
     return f"{name}: the residual correlates with {what} (rms {size}, p = {found.p:.1g}): {why}"
-
-
-def _outside_notes(plant: Plant, outside: Mapping[str, float]) -> list[str]:
-    """Return which signals leave the range that the fit has seen."""
-    out = []
-    for name, share in outside.items():
-        low, high = plant.valid[name]
-        where = f"{low:g} to {high:g}, the range of the fit, in {100 * share:.0f} % of the rows"
-        out.append(f"{name} lies outside of {where}")
-    return out
 
 
 def _outside(plant: Plant, signals: Mapping[str, Array]) -> dict[str, float]:

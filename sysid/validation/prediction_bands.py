@@ -115,10 +115,8 @@ def free_run_band(
     wide = NormalDist().inv_cdf(0.5 + level / 2)
     taken = draws if plant.uncertain else 0
     stretches = cut_stretches(plant, match_logs(plant, [log])[0][0]) if taken else []
-    run, variances = (
-        columns(simulated, plant.outputs),
-        np.zeros((simulated.sizes["time"], len(plant.outputs))),
-    )
+    run = columns(simulated, plant.outputs)
+    variances = np.zeros((simulated.sizes["time"], len(plant.outputs)))
     for k in range(1, taken + 1):
         variances += (plant.draw(k).over(stretches, warmup)[0] - run) ** 2 / taken
     scored = np.asarray(simulated["scored"].values) > 0
@@ -133,9 +131,8 @@ def free_run_band(
         error_of_parts = expected_error(errors, 0.0).rmse
         effect = (MEDIAN * other_run.get(name, np.zeros(1))) ** 2
         explained = variance.mean() if compared else 0.0  # errors of a fit have no part of its draws
-        like_fit = (
-            variance + max(error_of_parts**2 - explained, 0.0) + (effect + effect.mean()) / 2
-        )  # gain, and level
+        gain_and_level = (effect + effect.mean()) / 2
+        like_fit = variance + max(error_of_parts**2 - explained, 0.0) + gain_and_level
         added = unlike.get(name, 0.0) ** 2
         half[name] = wide * np.sqrt(like_fit + added)
         is_unlike = is_unlike or bool(np.mean(added) > _UNLIKE * np.mean(like_fit))

@@ -263,7 +263,11 @@ class _Null:
     def test(self, x: Array, rms: float) -> CorrelationTest:
         """Test the residual against a signal x (n, n_lag)."""
         weighted = self.inverse @ x
-        p, beta = _score_test(x.T @ weighted, weighted.T @ self.residual)
+        H, g = x.T @ weighted, weighted.T @ self.residual
+        size = np.sqrt(np.maximum(np.diag(H), 1e-300))
+        inverse, rank = pinvh(H / np.outer(size, size), rtol=1e-6, return_rank=True)
+        beta = inverse @ (g / size) / size  # H^-1 g, in the directions that H has
+        p = float(chdtrc(rank, g @ beta)) if rank else 1.0
         beyond_right = x - self.columns @ (self.columns.T @ weighted)
         return CorrelationTest(p, rms * float(np.sqrt(np.mean((beyond_right @ beta) ** 2))))
 
@@ -298,14 +302,6 @@ def learn_noise(block: NDArray[np.int_], residual: Array, columns: Array) -> Arr
         cost, start, jac=True, method="L-BFGS-B", bounds=[(-4.0, 4.0)] * len(start), options={"ftol": 1e-7}
     )
     return np.asarray(np.einsum("k,kij->ij", variances(best.x), kernels))
-
-
-def _score_test(H: Array, g: Array) -> tuple[float, Array]:
-    """Return p of the score g with covariance H, and beta = H^-1 g, in the directions that H has."""
-    size = np.sqrt(np.maximum(np.diag(H), 1e-300))
-    inverse, rank = pinvh(H / np.outer(size, size), rtol=1e-6, return_rank=True)
-    beta = inverse @ (g / size) / size
-    return (float(chdtrc(rank, g @ beta)) if rank else 1.0), beta
 
 
 def marked_by_holm(

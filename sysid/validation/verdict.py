@@ -188,16 +188,14 @@ def verdict_of(
 
 
 def _pooled(rows: Sequence[Row]) -> tuple[float, float]:
-    """Return the rms errors of a candidate and of no input over all of some rows: a part in which nothing
-    moves weighs nothing."""
+    """Return the rms errors of a candidate and of no input over all of some rows."""
     both = [(row.rmse, row.no_input_rmse) for row in rows] or [(0.0, np.inf)]
     error, idle = np.sqrt(np.mean(np.square(both), axis=0)).tolist()
     return error, idle
 
 
 def _ratio_on_another_part(rows: Sequence[Row]) -> float:
-    """Return below what the error over that without input stays on another part, in 19 cases of 20, as in
-    the module's theory; 0 where one part alone has moves."""
+    """Return below what the error over that without input stays on another part, in 19 cases of 20."""
     from scipy.special import stdtrit
 
     from thermogrip.sysid.validation.prediction_bands import PRIOR_PARTS, PRIOR_SPREAD

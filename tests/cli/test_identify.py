@@ -35,7 +35,6 @@ from thermogrip.sysid.plant.linearise import linearise_plant
 from thermogrip.sysid.plant.log_grid import roles_of
 from thermogrip.sysid.plant.plant import Plant
 from thermogrip.sysid.validation.free_run import free_run
-from thermogrip.sysid.validation.prediction_bands import Band
 from thermogrip.sysid.validation.verdict import Row, Standing, Verdict
 
 BOARD = plant_from_prior(load_network("tclab"))
@@ -442,22 +441,6 @@ def test_a_warm_up_shorter_than_that_of_the_fit_is_told(
     assert "--warmup 50 --score-from 50" in words_of(done.err)
     done = bench.run("validate", "plant.json", "good.csv", "--warmup", "50", "--score-from", "50")
     assert "set the state" not in done.err
-
-
-def test_a_simulation_has_the_ends_of_its_bands(bench: Bench, stand_in: StandIn) -> None:
-    log = make_log(np.arange(3.0), {"t_tank": ([20.0, 21.0, 22.0], "degC", "output")})
-    stand_in("thermogrip.sysid.plant.plant.Plant.simulate", log)
-    band = Band(0.9, {"t_tank": np.array([0.5, 1.0, 1.5])}, {"t_tank": 1.0}, 0)
-    asked = stand_in("thermogrip.sysid.validation.prediction_bands.free_run_band", band)
-    words = ["simulate", "plant.json", "good.csv", "--out", "s.csv"]
-    assert bench.run(*words, "--bands").code == 0
-    assert (bench.path / "s.csv").read_text().splitlines() == [
-        "time_s,t_tank_degC,t_tank_low_degC,t_tank_high_degC",
-        "0.0,20.0,19.5,20.5", "1.0,21.0,20.0,22.0", "2.0,22.0,20.5,23.5",
-    ]  # fmt: skip
-    assert asked[0].args[2] is log
-    assert bench.run(*words).code == 0
-    assert len(asked) == 1
 
 
 def test_a_plant_is_linearised_where_it_is_asked_for(bench: Bench) -> None:

@@ -468,9 +468,6 @@ def simulate(
     path: Annotated[str, cli.arg("LOG", "Inputs and warm-up come from here.")],
     out: Annotated[Path, cli.opt("--out", "SIM.csv", "Where the log goes.")],
     warmup: Warmup = 5.0,
-    bands: Annotated[
-        bool, cli.flag("--bands", "Add the ends of each output's 90 % band, OUTPUT_low and OUTPUT_high.")
-    ] = False,
     network: cli.OwnNetwork = None,
     columns: cli.Columns = None,
     dt: cli.Step = None,
@@ -481,7 +478,6 @@ def simulate(
     from thermogrip.datasets.log_files import check_written, write_log
 
     check_written(cli.new_file(out))
-    from thermogrip.datasets.schema import column
     from thermogrip.sysid.plant.log_grid import match_logs, roles_of
 
     console = Console(as_json)
@@ -492,13 +488,6 @@ def simulate(
     for line in converted:
         console.warn(f"{log.attrs['name']}: {line}")
     simulated = loaded.simulate(log, warmup=warmup)
-    if bands:
-        from thermogrip.sysid.validation.prediction_bands import free_run_band
-
-        for name, half in free_run_band(loaded, log, simulated, warmup=warmup).half.items():
-            for end, sign in (("low", -1), ("high", 1)):
-                attrs = {"units": simulated[name].attrs["units"], "role": "other"}
-                simulated[f"{name}_{end}"] = ("time", column(simulated, name) + sign * half, attrs)
     write_log(simulated, out)
     console.say(f"wrote {out}: {', '.join(loaded.outputs)} at {simulated.sizes['time']} times")
     rows = simulated.sizes["time"]
