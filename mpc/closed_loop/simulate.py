@@ -356,14 +356,9 @@ class RecordedController:
     """A controller that keeps its ``moves``, beside a monitor whose words advise where one is ok."""
 
     def __init__(self, controller: Controller, monitor: LoopMonitor | None = None) -> None:
-        self.controller, self.monitor = controller, monitor
+        self.controller, self.monitor, self.dt = controller, monitor, controller.dt
         # each with the time of its reading [s], counted in sample times where the reading has none
         self.moves: list[tuple[float, Move]] = []
-
-    @property
-    def dt(self) -> float:
-        """Sample time [s]."""
-        return self.controller.dt
 
     def reset(self, reading: Readings) -> None:
         """Let the controller forget the past; the moves are kept."""

@@ -32,7 +32,7 @@ class SampledController:
         clock: Callable[[], float],
     ) -> None:
         self.model = model
-        self.controlled = controlled
+        self.controlled, self.dt = controlled, model.dt
         self.drives = drives
         self.clock = clock
         self.times = CallTimes(model.dt)
@@ -46,11 +46,6 @@ class SampledController:
         self._u = self.drives.neutral.copy()
         self._target = np.full(len(self.controlled), np.nan)
         self._unread_s = np.zeros(len(self.controlled))  # since each controlled output was read
-
-    @property
-    def dt(self) -> float:
-        """Sample time [s]."""
-        return self.model.dt
 
     def _applied(self, reading: Readings, otherwise: Array) -> Array:
         """Return the drives (n_u,) that a reading says were applied, else these."""

@@ -22,8 +22,6 @@ from thermogrip.mpc.estimator.reading_checks import is_off
 from thermogrip.mpc.interface import STATUSES, Move, Readings, Trajectory, number
 from thermogrip.mpc.native.runtime import QP_STATUS, CompiledController, address
 
-_NAN = float("nan")
-
 
 class _Code(IntEnum):
     """What the C advises of: ``enum tg_advice``."""
@@ -160,6 +158,6 @@ def _put(into: Any, values: Mapping[str, Any], names: Sequence[str], at: int = 0
     """Write values of these names into an array of C from place ``at`` on, NaN where one is none."""
     for place, name in enumerate(names, at):
         try:
-            into[place] = values.get(name, _NAN)
+            into[place] = values.get(name, np.nan)
         except TypeError:  # a number as a text, an array of one
             into[place] = number(values, name)

@@ -70,27 +70,13 @@ class Controller(Shown):
         self.plant, self.notes = plant, dict(notes or {})
         self.design = default_design(plant) if design is None else check_design(design, plant)
         self.reference = ReferenceController(plant, self.design, clock=clock)
-        self.model = self.reference.model
+        self.model, self.controlled, self.dt = self.reference.model, self.design.controlled, self.reference.dt
+        self.safe_drives = self.reference.safe_drives
         self.observer, self.optimiser = self.reference.observer, self.reference.optimiser
         compiled = _compiled_step(self.reference)
         self._law: ReferenceController | CompiledStep = compiled or self.reference
         #: The C that does the steps; None where Python does.
         self.c = None if compiled is None else compiled.c
-
-    @property
-    def controlled(self) -> tuple[str, ...]:
-        """Outputs with a target."""
-        return self.design.controlled
-
-    @property
-    def dt(self) -> float:
-        """Sample time [s]."""
-        return self.model.dt
-
-    @property
-    def safe_drives(self) -> Array:
-        """Drives (n_u,) of a loop that has failed or ends."""
-        return self.reference.safe_drives
 
     @property
     def plan(self) -> Array | None:

@@ -10,8 +10,6 @@ So the integrator stands while the drive is limited, which is most of the time a
 new target less than a reading, against overshoot.  Where readings have a time, dt is what really passed, for
 the integrator and for the slew alike, and a call before a move is due
 (:mod:`thermogrip.mpc.estimator.call_times`) holds the last one.
-
-Its loops are tuned by :mod:`thermogrip.mpc.design.design`.
 """
 
 from __future__ import annotations

@@ -49,17 +49,11 @@ if TYPE_CHECKING:
 class _Follows:
     """What the drives follow."""
 
+    side: Array  # (n_controlled,) whence outputs come to targets: +1 from below, -1 from above, 0 neither
+    ramped: Array  # (n_controlled,) where targets are that may only ramp, NaN before the first
     plan: Array | None = None  # (N, n_u), as it was made ``age_s`` ago
     age_s: float = 0.0
     on_pi: bool = False  # whether the PI has taken over
-
-
-@dataclass
-class _Approach:
-    """From where the controlled outputs come to their targets."""
-
-    side: Array  # (n_controlled,) +1 from below, -1 from above, 0 neither
-    ramped: Array  # (n_controlled,) where targets are that may only ramp, NaN before the first
 
 
 @dataclass
@@ -129,7 +123,7 @@ class ReferenceController(SampledController):
         event = self._absorb(y, d, applied) or (advice.STALE if self.times.stale else "")
         wanted, wrong = self._wanted(target)
         if not np.array_equal(wanted, self._target):
-            self._approach.side = self._sides(wanted)
+            self._follows.side = self._sides(wanted)
         self._target = wanted
         samples = np.arange(1, self.optimiser.N + 1)
         ahead = targets_ahead(
@@ -152,8 +146,8 @@ class ReferenceController(SampledController):
         d = np.where(np.isfinite(d), d, self.model.undisturbed(self.design.ambient))
         begin(y, d)
         self._forget()
-        self._follows = _Follows()
-        self._approach = _Approach(np.zeros(len(self._rows)), np.full(len(self._rows), np.nan))
+        n_c = len(self._rows)
+        self._follows = _Follows(side=np.zeros(n_c), ramped=np.full(n_c, np.nan))
         self._past = _Past(y, d, self.observer.now)
         self.monitor.forget(y)
         self.optimiser.forget()
@@ -174,11 +168,11 @@ class ReferenceController(SampledController):
         if silent and np.isfinite(y).any():
             u = self._u
             target = self._target
-            side = self._approach.side
+            side = self._follows.side
             self._start(y, np.where(np.isfinite(d), d, self._past.d), self.observer.reset_in_room)
             self._u, self._past.fresh = u, False
             self._target = target
-            self._approach.side = side
+            self._follows.side = side
             self._past.y = y
             return advice.silence(silent)
         if not self._past.fresh:
@@ -225,7 +219,7 @@ class ReferenceController(SampledController):
         wanted, _ = self._wanted(target)
         self._start(y, np.where(np.isfinite(d), d, self._past.d), self.observer.reset_in_room)
         self._u = u
-        self._target, self._approach.side = wanted, self._sides(wanted)
+        self._target, self._follows.side = wanted, self._sides(wanted)
         stands = advice.pump_off(self.model.model.switches)
         # without a pump that is asked for nobody would switch it on again
         self._move = replace(self._answer("off", stands, started), pump=1)
@@ -240,7 +234,11 @@ class ReferenceController(SampledController):
         if not np.isfinite(wanted).all():
             return _Choice(self.drives.safe, "off", advice.no_target(safe=bool(self.design.safe_drive)))
         if (self._unread_s > 0).all():
-            return self._without_readings()
+            if not self._lost.all():
+                plan = self._young_plan()
+                return _Choice(self._u if plan is None else self._first_of(plan), "fallback_plan", "")
+            self._follows.plan = None
+            return _Choice(self.drives.safe, "off", advice.blind(self._unread_s.min()))
         if self.clock() - started >= self.design.deadline_s:
             return self._fall_back("late", advice.TOO_LATE)
         low, high = self.drives.lowest - 1e-9, self.drives.highest + 1e-9
@@ -287,10 +285,15 @@ class ReferenceController(SampledController):
         last = self.drives.cut(self._u)
         observer = self.observer
         d = self._past.d + observer.disturbance_bias
-        guess, biases = self._guess(wanted, last), (observer.output_bias, observer.drive_bias)
+        # linearised along the last plan, shifted, by blocks; else along the drive of now
+        guess, plan = np.repeat(last[None, :], self.optimiser.n_b, axis=0), self.plan
+        if plan is not None:
+            lengths = np.asarray(self.design.blocks)
+            guess = np.add.reduceat(plan, np.cumsum(lengths) - lengths, axis=0) / lengths[:, None]
+        biases = observer.output_bias, observer.drive_bias
         slew_s = self.times.slew_s
         sample = Sample(
-            observer.now, last, guess, d, wanted, self._approach.side, *biases, slew_s, self._lost, ahead
+            observer.now, last, guess, d, wanted, self._follows.side, *biases, slew_s, self._lost, ahead
         )
         outcome = self.optimiser.solve(sample)
         # one program, or as many as the design asks for until the plan stays
@@ -307,31 +310,15 @@ class ReferenceController(SampledController):
         and what is ahead (N, n_controlled) from there."""
         rates = np.array([self.design.ramp_per_s.get(name, np.inf) for name in self.controlled])
         shown = self._past.y[self._rows]
-        begun = np.where(np.isfinite(self._approach.ramped), self._approach.ramped, shown)
+        begun = np.where(np.isfinite(self._follows.ramped), self._follows.ramped, shown)
         reach = rates * self.times.waited_s
         now = np.where(np.isfinite(begun), np.clip(wanted, begun - reach, begun + reach), wanted)
-        self._approach.ramped = now
+        self._follows.ramped = now
         later = np.arange(1, self.optimiser.N + 1)[:, None] * rates * self.dt
         if ahead is None and np.array_equal(now, wanted):
             return now, None
         ends = np.broadcast_to(wanted, later.shape) if ahead is None else ahead
         return now, np.clip(ends, now - later, now + later)
-
-    def _guess(self, wanted: Array, last: Array) -> Array:
-        """Return the plan to linearise along: the last one, shifted, by blocks; else the drive of now."""
-        plan = self.plan
-        if plan is None:
-            return np.repeat(last[None, :], self.optimiser.n_b, axis=0)
-        lengths = np.asarray(self.design.blocks)
-        begins = np.cumsum(lengths) - lengths
-        return np.asarray(np.add.reduceat(plan, begins, axis=0) / lengths[:, None])
-
-    def _without_readings(self) -> _Choice:
-        if not self._lost.all():
-            plan = self._young_plan()
-            return _Choice(self._u if plan is None else self._first_of(plan), "fallback_plan", "")
-        self._follows.plan = None
-        return _Choice(self.drives.safe, "off", advice.blind(self._unread_s.min()))
 
     def _young_plan(self) -> Array | None:
         return None if self._follows.on_pi or self._follows.age_s > self._patience_s else self.plan

@@ -52,7 +52,7 @@ class TopicLoop:
     def __init__(
         self, controller: Controller | PIController, topics: TopicMap, *, file: str | Path = "topics"
     ) -> None:
-        self.controller, self._columns = controller, dict(topics.columns)
+        self.controller, self.dt, self._columns = controller, controller.dt, dict(topics.columns)
         model = controller.model
         self._targets = {TARGET + name: name for name in controller.controlled}
         needed = (*controller.controlled, *self._targets, *model.drives)
@@ -72,11 +72,6 @@ class TopicLoop:
                 problem = f"is published as field 'data' in {unit!r}, the map says otherwise"
                 raise UserError(problem, file=file, column=name, hint="convert it where it is received")
         self.reset()
-
-    @property
-    def dt(self) -> float:
-        """Sample time [s]."""
-        return self.controller.dt
 
     @property
     def subscriptions(self) -> tuple[tuple[str, str], ...]:

@@ -9,9 +9,7 @@ Temperatures count in degC, so ``move = 1`` means: one whole range in one sample
 for one sample.  ``default_design`` takes everything from the plant: sample time and horizon from its delay
 and lag, blocks that double from one sample on, and one move weight that the tuner then improves.
 
-**Checks.**  A controller's file can be edited, cut short, or written for another plant.  Whatever is in it,
-either the loop does what the file says or one line says which field cannot be: nothing is rounded, clipped or
-left out.
+**Checks.**  Either a loop does what its file says or one line says which field cannot be.
 
 **PI loops** follow Skogestad's rule (SIMC), with gain k, delay L and lag T of the step response:
 
@@ -85,14 +83,13 @@ class PILoop:
 def simc(plant: Plant, drive: str, output: str, *, tau_c: float | None = None) -> PILoop:
     """Return SIMC settings of one loop for a closed-loop time constant tau_c [s], by default the apparent
     delay; a drive that does not move the output is a ValueError."""
-    model = PredictionModel(plant, dt=plant.dt)
     answer = step_response(plant, drive, output)
     if answer.gain == 0:
         raise ValueError(f"drive {drive} does not move {output}")
     delay = max(answer.delay, plant.dt)
     closed = max(delay, 2 * plant.dt) if tau_c is None else tau_c
-    span = float(model.span[model.drives.index(drive)])
-    Kc = span * answer.lag / (answer.gain * (closed + delay))
+    low, high = drive_range(plant, drive)
+    Kc = (high - low) * answer.lag / (answer.gain * (closed + delay))
     Ti = min(answer.lag, 4 * (closed + delay))
     return PILoop(drive, output, Kc, Ti)
 
@@ -136,7 +133,13 @@ def check_design(design: Design, plant: Plant) -> Design:
     """Return the design as it is, or raise :class:`UserError` naming the field that cannot be."""
     _validated(asdict(design))
     _check_names(design, plant)
-    _check_size(design, plant)
+    steps, unknowns = design.dt / plant.dt, len(design.blocks) * len(drive_names(plant))
+    no_multiple = abs(steps - round(steps)) > 1e-6 * steps
+    _refuse(no_multiple, f"dt is {design.dt:g} s, no multiple of the plant's step of {plant.dt:g} s")
+    N = sum(design.blocks)
+    _refuse(N > LONGEST_HORIZON, f"blocks sum to {N} samples, more than the {LONGEST_HORIZON} of a horizon")
+    size = f"{len(design.blocks)} blocks of {len(drive_names(plant))} drives"
+    _refuse(unknowns > MOST_UNKNOWNS, f"{size} are more than {MOST_UNKNOWNS} unknowns")
     for name, (low, high) in design.drive_range.items():
         least, most = drive_range(plant, name)
         beyond = f"is {low:g} to {high:g}, beyond the drive's {least:g} to {most:g}"
@@ -191,18 +194,6 @@ def _check_names(design: Design, plant: Plant) -> None:
         _refuse(no_pair, f"{pair} no pair of a regulated output and a drive")
         twice = any(loop.drive == other.drive or loop.output == other.output for other in design.loops[:k])
         _refuse(twice, f"{pair} there twice")
-
-
-def _check_size(design: Design, plant: Plant) -> None:
-    """Refuse a sample time that is none of the plant's, and a program that is too large."""
-    steps = design.dt / plant.dt
-    no_multiple = abs(steps - round(steps)) > 1e-6 * steps
-    _refuse(no_multiple, f"dt is {design.dt:g} s, no multiple of the plant's step of {plant.dt:g} s")
-    N = sum(design.blocks)
-    n_b = len(design.blocks)
-    n_u = len(drive_names(plant))
-    _refuse(N > LONGEST_HORIZON, f"blocks sum to {N} samples, more than the {LONGEST_HORIZON} of a horizon")
-    _refuse(n_b * n_u > MOST_UNKNOWNS, f"{n_b} blocks of {n_u} drives are more than {MOST_UNKNOWNS} unknowns")
 
 
 def _validated(content: Mapping[str, Any]) -> Design:

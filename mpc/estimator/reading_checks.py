@@ -46,14 +46,12 @@ class ReadingMonitor:
 
     def __init__(self, n_y: int, *, spike: Array | float = SPIKE) -> None:
         self._spike = spike
-        self._last = np.full(n_y, np.nan)
-        self._moved = np.zeros(n_y)
-        self._spikes = np.zeros(n_y, dtype=int)  # samples in a row that each reading was left out for
+        self.forget(np.full(n_y, np.nan))
 
     def forget(self, y: Array) -> None:
         """Start afresh from reading y (n_y,)."""
-        self._last, self._moved = np.array(y, dtype=float), np.zeros(len(self._last))
-        self._spikes = np.zeros(len(self._last), dtype=int)
+        self._last, self._moved = np.array(y, dtype=float), np.zeros(len(y))
+        self._spikes = np.zeros(len(y), dtype=int)  # samples in a row that each reading was left out for
 
     def expect(self, change: Array) -> None:
         """Note by how much the model moves the outputs (n_y,) in a sample [degC]."""

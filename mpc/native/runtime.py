@@ -4,9 +4,6 @@ The sources of an export (:mod:`thermogrip.mpc.controllers.export`), with a mode
 :mod:`thermogrip.mpc.native.codegen`, become a library in the user's cache directory.  It is named by the hash
 of all that went into it: sources, flags, and what the compiler says of the machine.  A second controller of
 the same structure (any parameters, any weights) finds it built; anything else is built beside it.
-
-Without gcc, or with ``THERMOGRIP_COMPILED=0`` in the environment, steps are done in Python
-(:mod:`thermogrip.mpc.controllers.reference`).
 """
 
 from __future__ import annotations

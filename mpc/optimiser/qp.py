@@ -15,8 +15,6 @@ H = L L': the factor and A L^-T are LAPACK's and BLAS', which take less time for
 its length r_i in units in which H has a diagonal of 1, so that tolerances are of the row; a slack becomes
 s/r, and its penalties w r and q r^2.
 
-Where the very same H and A are given again, as of a linear plant, their scales and factors are kept.
-
 A failed solve is an answer with a status, never an exception.
 
 References
@@ -94,15 +92,9 @@ class CondensedQP:
         self.soft = np.asarray(soft, dtype=bool)
         self.linear = np.asarray(linear, dtype=float)
         self.quadratic = np.asarray(quadratic, dtype=float)
-        if not self.soft.shape == self.linear.shape == self.quadratic.shape:
-            raise ValueError(
-                f"one penalty a row: {self.soft.shape=}, {self.linear.shape=}, {self.quadratic.shape=}"
-            )
-        if np.any(self.linear[self.soft] < 0) or np.any(self.quadratic[self.soft] < 0):
-            raise ValueError("penalties must be >= 0")
         self.iteration_limit, self.time_limit_s = iteration_limit, time_limit_s
         self._hard, self._priced = ~self.soft, np.where(self.soft, self.linear, 0.0)
-        self._given: tuple[Array, Array] | None = None  # the newest H and A, and what was made of them
+        self._given: tuple[Array, Array] | None = None  # the newest H and A, of a linear plant the same ones
         self._scaled: tuple[Array, ...] = ()
 
     def solve(self, H: Array, f: Array, A: Array, lower: Array, upper: Array) -> QPAnswer:

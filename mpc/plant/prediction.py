@@ -322,8 +322,8 @@ class PredictionModel:
         steps = np.concatenate([np.zeros((1, *impulse[0].shape)), np.cumsum(impulse, axis=0)])
         G, first = np.zeros((len(impulse), self.n_y, len(blocks), self.n_u)), 0
         for block, length in enumerate(blocks):
-            for k in range(first, len(impulse)):
-                G[k, :, block] = steps[k - first + 1] - steps[max(0, k - first + 1 - length)]
+            since = np.arange(len(impulse)) - first + 1
+            G[:, :, block] = steps[np.maximum(since, 0)] - steps[np.maximum(since - length, 0)]
             first += length
         self._responses[blocks] = Response(np.stack(by_x), np.stack(by_rest), G)
         return self._responses[blocks]

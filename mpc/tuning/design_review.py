@@ -139,7 +139,7 @@ def as_asked(controller: Reviewed, spec: Spec, draws: int, *, noted: bool) -> Ch
     results_of_all = run_trials(_again(controller), controller.plant, spec, steps_on(spec, numbers))
     words, verdicts = [], []
     for step in spec.steps:
-        results = [result for result in results_of_all if result.step == step]
+        results = [result for result in results_of_all if result.case.step == step]
         of_step = [_stepped(result, spec, timed=noted) for result in results]
         late = [float(np.nan_to_num(result.settle_s, nan=np.inf)) for result in results]
         worst_of = max(range(len(results)), key=lambda k: (_RANK[of_step[k][1]], late[k]))
@@ -161,7 +161,7 @@ def after_loads(controller: Reviewed, spec: Spec, draws: int) -> Check:
     results = run_trials(_again(controller), plant, spec, cases)
     words = []
     for load in loads:
-        of_load = [result for result in results if result.load == load.words]
+        of_load = [result for result in results if result.case.load == load]
         back = np.max([result.settle_s for result in of_load])  # NaN where one does not settle
         ends = f"back in {back:.0f} s" if np.isfinite(back) else f"not back after {seconds:.0f} s"
         words.append(f"{load.words}: {ends}, {max(result.overshoot for result in of_load):.2f} off at most")
@@ -187,9 +187,9 @@ def lacks_structure(controller: Reviewed, spec: Spec) -> Check:
     cases = [Case(start, target, draw, structure) for structure in lacking(plant, doubted, controlled)]
     words, verdicts = [], []
     for result in run_trials(_again(controller), plant, doubted, cases):
-        ends, verdict = _stepped(result, spec)
-        words.append(f"{result.lacks}: {ends}")
-        verdicts.append(verdict if result.lacks in stated else min(verdict, "warn", key=_RANK.__getitem__))
+        (ends, verdict), structure = _stepped(result, spec), result.case.lacks
+        words.append(f"{structure}: {ends}")
+        verdicts.append(verdict if structure in stated else min(verdict, "warn", key=_RANK.__getitem__))
     fix = "identify on a log of the closed loop and tune again; a design that moves less tolerates more"
     finding = f"{start:g} to {target:g} degC, each alone: {'; '.join(words)}"
     name = "settles where the model lacks structure"

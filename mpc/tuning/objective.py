@@ -43,7 +43,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -105,23 +105,22 @@ class Case:
     load: Load | None = None
     seconds: float | None = None  # how long it runs; ``hold_s`` of the spec where absent
 
+    @property
+    def step(self) -> tuple[float, float]:
+        """Start and target [degC]."""
+        return self.start, self.target
 
-class CaseKey(NamedTuple):
-    """What of a case controllers are compared by."""
-
-    start: float  # [degC]
-    target: float
-    draw: int
-    load: str
+    @property
+    def key(self) -> Case:
+        """What controllers are compared by, whatever the plant lacks."""
+        return replace(self, lacks="", seconds=None)
 
 
 @dataclass(frozen=True)
 class StepResult:
     """What one case came to; of the worst output where several are controlled."""
 
-    start: float  # [degC]
-    target: float
-    draw: int  # which draw of the plant was the truth
+    case: Case
     settle_s: float  # NaN where it did not settle
     overshoot: float  # [degC]; of a load the largest error
     bias: float  # signed, of the output where it is largest
@@ -130,19 +129,7 @@ class StepResult:
     travel: float
     full_share: float
     length_s: float
-    lacks: str = ""
-    load: str = ""  # in words
     iae: float = 0.0  # integral of the absolute error [degC s]
-
-    @property
-    def step(self) -> tuple[float, float]:
-        """Start and target [degC]."""
-        return self.start, self.target
-
-    @property
-    def key(self) -> CaseKey:
-        """What it is compared by, whatever the plant lacks."""
-        return CaseKey(self.start, self.target, self.draw, self.load)
 
 
 def draws_of(plant: Plant, count: int) -> list[int]:
@@ -336,9 +323,7 @@ def result_of(run: ClosedLoop, case: Case) -> StepResult:
     length = parts[0].end_s - parts[0].begin_s
     beyond = [part.overshoot for part in parts] if case.load is None else [np.max(np.abs(e)) for e in errors]
     return StepResult(
-        start=case.start,
-        target=case.target,
-        draw=case.draw,
+        case=case,
         settle_s=float(np.max([part.settle_s for part in parts])),  # NaN wins, as it should
         overshoot=float(max(beyond)),
         bias=worst.bias,
@@ -347,8 +332,6 @@ def result_of(run: ClosedLoop, case: Case) -> StepResult:
         travel=parts[0].travel,
         full_share=parts[0].full_share,
         length_s=length,
-        lacks=case.lacks,
-        load=case.load.words if case.load else "",
         iae=length * float(max(np.mean(np.abs(error)) for error in errors)),
     )
 
@@ -363,8 +346,8 @@ class Scales:
 
     bounds: Bounds  # shortest times [s]
     # by start, target, draw and load: full drives that the default MPC moves, the reference's IAE [degC s]
-    moves: dict[CaseKey, float]
-    iae: dict[CaseKey, float]
+    moves: dict[Case, float]
+    iae: dict[Case, float]
 
 
 @dataclass(frozen=True)
@@ -382,16 +365,17 @@ class Score:
 
 def score(results: Sequence[StepResult], spec: Spec, scales: Scales) -> Score:
     """Return the score of a set of trials, see the module's text."""
-    costs: dict[tuple[CaseKey, str], list[float]] = {}
+    costs: dict[Case, list[float]] = {}
     for result in results:
-        cost = _cost_of_load(result, spec, scales) if result.load else _cost_of_step(result, spec, scales)
+        case, cost_of = result.case, _cost_of_load if result.case.load else _cost_of_step
+        cost = cost_of(result, spec, scales)
         # a plant that lacks structure is run for longer than the reference was
-        default_moves = np.inf if result.lacks else scales.moves.get(result.key, np.inf)
+        default_moves = np.inf if case.lacks else scales.moves.get(case.key, np.inf)
         most = (spec.moves_limit or np.inf) * default_moves
         cost += spec.moves_weight * result.travel + COSTS.moves * max(0.0, result.travel / most - COSTS.free)
-        costs.setdefault((result.key, result.lacks), []).append(cost)
-    steps = [float(np.mean(noises)) for (case, _), noises in costs.items() if not case.load]
-    loads = [float(np.mean(noises)) for (case, _), noises in costs.items() if case.load]
+        costs.setdefault(case, []).append(cost)
+    steps = [float(np.mean(noises)) for case, noises in costs.items() if not case.load]
+    loads = [float(np.mean(noises)) for case, noises in costs.items() if case.load]
     return Score(_mean_and_worst(steps), _mean_and_worst(loads))
 
 
@@ -401,7 +385,7 @@ def _mean_and_worst(costs: Sequence[float]) -> float:
 
 
 def _cost_of_step(result: StepResult, spec: Spec, scales: Scales) -> float:
-    bound = scales.bounds[(*result.step, result.draw)]
+    bound = scales.bounds[(*result.case.step, result.case.draw)]
     unit = max(bound if np.isfinite(bound) else result.length_s, 1.0)
     if np.isfinite(result.settle_s):
         cost = result.settle_s / unit + COSTS.bias * max(0.0, abs(result.bias) / spec.bias_degC - COSTS.free)
@@ -412,7 +396,7 @@ def _cost_of_step(result: StepResult, spec: Spec, scales: Scales) -> float:
 
 
 def _cost_of_load(result: StepResult, spec: Spec, scales: Scales) -> float:
-    cost = result.iae / max(scales.iae[result.key], 1e-12)
+    cost = result.iae / max(scales.iae[result.case.key], 1e-12)
     if not np.isfinite(result.settle_s):
         cost += COSTS.error * abs(result.last_error) / spec.band_degC
     return float(cost)
@@ -427,14 +411,9 @@ def bounds_of(plant: Plant, design: Design, spec: Spec, draws: Sequence[int]) ->
         for draw in draws:
             bound = full_drive_bound(drawn(plant, draw), design, step, spec)
             bounds[(*step, draw)] = float(np.maximum(bound, ramp_s))  # NaN stays NaN
-    return bounds
-
-
-def check_steps(bounds: Bounds) -> None:
-    """Raise UserError where no step can be reached at all."""
-    if bounds and not any(np.isfinite(bound) for bound in bounds.values()):
-        first = next(iter(bounds))
+    if not np.isfinite(list(bounds.values())).any():
         raise UserError(
-            f"steps: full drive does not reach {first[1]:g} degC, nor any other target",
+            f"steps: full drive does not reach {spec.steps[0][1]:g} degC, nor any other target",
             hint="choose nearer targets, a wider drive range, or a longer hold_s",
         )
+    return bounds

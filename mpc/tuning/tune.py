@@ -11,17 +11,6 @@ of the least score is what is saved, whatever its kind; a tuned MPC where it win
 not know zones, prices of energy, limits of outputs, ramps or what is switched: where the spec asks for
 one of these the MPC is taken.
 
-**Interrupted** by Ctrl-C, once the default design and the PI by SIMC are scored, it returns the best so far.
-
-**Verdict.**
-
-* **actuator-limited**: the spec asks for less time than the drive allows, or the settling time is within a
-  quarter of what the drive allows and the search won nothing: change the hardware or the spec, not the
-  weights;
-* **improved**: the score is more than 3 % below that of the default design on draws that the search has not
-  seen;
-* **flat**: it is not.
-
 References
 ----------
 .. [1] J. A. Nelder, R. Mead, "A simplex method for function minimization", Computer Journal 7(4), 1965.
@@ -47,14 +36,12 @@ from thermogrip.mpc.design.spec import Spec
 from thermogrip.mpc.tuning.objective import (
     Bounds,
     Case,
-    CaseKey,
     Scales,
     Score,
     StepResult,
     apparent_delays,
     as_tried,
     bounds_of,
-    check_steps,
     draws_of,
     lacking,
     load_seconds,
@@ -134,8 +121,8 @@ def rows_of(name: str, results: Sequence[StepResult], bounds: Bounds) -> list[Ro
     """Return a controller's rows, one a step or load."""
     of_case: dict[Any, list[StepResult]] = {}
     for result in results:
-        if not result.lacks:
-            of_case.setdefault((result.step, result.load), []).append(result)
+        if not result.case.lacks:
+            of_case.setdefault((result.case.step, result.case.load), []).append(result)
     return [_score_row(name, part, bounds) for part in of_case.values()]
 
 
@@ -146,7 +133,7 @@ def _score_row(name: str, part: Sequence[StepResult], bounds: Bounds) -> Row:
     def most(figure: str) -> float:
         return float(np.max([getattr(result, figure) for result in part]))
 
-    first = part[0]
+    first, draws = part[0].case, [result.case.draw for result in part]
     return Row(
         controller=name,
         start=first.start,
@@ -159,8 +146,8 @@ def _score_row(name: str, part: Sequence[StepResult], bounds: Bounds) -> Row:
         energy_mean_s=mean("energy_s"),
         travel_mean=mean("travel"),
         full_share=mean("full_share"),
-        bound_s=np.nan if first.load else float(np.mean([bounds[(*first.step, of.draw)] for of in part])),
-        load=first.load,
+        bound_s=np.nan if first.load else float(np.mean([bounds[(*first.step, k)] for k in draws])),
+        load=first.load.words if first.load else "",
         iae_mean=mean("iae"),
     )
 
@@ -184,7 +171,7 @@ class Tuning:
     controller : Controller or PIController
         The best one of all kinds.
     verdict : str
-        ``"improved"``, ``"flat"`` or ``"actuator-limited"``.
+        ``"improved"``, ``"flat"``, or ``"actuator-limited"``: change the hardware or the spec, not weights.
     finding : str
         Which controller is best and by how much, and the verdict in numbers, a few sentences.
     rows : tuple of Row
@@ -289,7 +276,6 @@ class Bench:
         self.baseline = spec.design(plant)
         draws = sorted({*self.draws, *self.unseen})
         self.bounds = bounds_of(plant, self.baseline, spec, draws)
-        check_steps(self.bounds)
         controlled = self.baseline.controlled
         self.lacking = list(lacking(plant, spec, controlled))
         self.loads = loads_of(plant, spec, self.baseline)
@@ -312,22 +298,23 @@ class Bench:
         least, most = min(self.load_s, self.spec.hold_s), self.spec.hold_s
         lengths = {}
         for step in self.spec.steps:
-            slowest = np.max([result.settle_s for result in results if result.step == step])  # or NaN
+            slowest = np.max([result.settle_s for result in results if result.case.step == step])  # or NaN
             lengths[step] = float(np.clip(2 * np.nan_to_num(slowest, nan=most), least, most))
         return lengths
 
     def _scales(self) -> Scales:
         """Return what trials count in, of all draws."""
-        moves: dict[CaseKey, float] = {}
-        iae: dict[CaseKey, float] = {}
+        moves: dict[Case, float] = {}
+        iae: dict[Case, float] = {}
         for draws, seed in ((self.draws, self.seed), (self.unseen, self.check_seed)):
             for kind, design in (("PI", self.design("PI", {})), ("MPC", self.baseline)):
                 for result in self.run(kind, design, draws, seed):
-                    if result.lacks:
+                    if result.case.lacks:
                         continue
-                    iae[result.key] = min(result.iae, iae.get(result.key, np.inf))
+                    key = result.case.key
+                    iae[key] = min(result.iae, iae.get(key, np.inf))
                     if kind == "MPC" and np.isfinite(result.settle_s) and result.travel > 0:
-                        moves[result.key] = result.travel
+                        moves[key] = result.travel
         return Scales(self.bounds, moves, iae)
 
     def design(self, kind: str, parameters: Mapping[str, float]) -> Design:
@@ -390,16 +377,12 @@ class Bench:
             for draw in draws
         ]
 
-    def score(self, results: Sequence[StepResult]) -> Score:
-        """Return the score of results."""
-        return score(results, self.spec, self.scales)
-
     def evaluate(self, kind: str, parameters: Mapping[str, float]) -> Trial:
         """Return the trial of a design on the search's draws."""
         design, results = self.design(kind, parameters), []
         for noise in range(SEARCH.noises):
             results += self.run(kind, design, self.draws, self.seed + noise, loads=not noise)
-        parts_of_score = self.score(results)
+        parts_of_score = score(results, self.spec, self.scales)
         cost = parts_of_score.total
         if kind == "MPC":
             self.default = self.default or parts_of_score  # which comes first
@@ -496,7 +479,7 @@ def _tuning(
     interrupted: bool,
 ) -> Tuning:
     """Return what was found, with the best of the candidates for its controller."""
-    spec, scored = bench.spec, {name: bench.score(part) for name, part in results.items()}
+    spec, scored = bench.spec, {n: score(part, bench.spec, bench.scales) for n, part in results.items()}
     scores = {name: part.total for name, part in scored.items()}
     saved = kept_of(scores)
     rows = tuple(row for name, part in results.items() for row in rows_of(name, part, bench.bounds))
@@ -509,7 +492,7 @@ def _tuning(
     finding = f"{best_of(scored, where, unknown_to_pi(spec))} {words}"
     if interrupted:
         finding = f"Interrupted after {len(tried)} designs; this is the best of them. {finding}"
-    meets = all(meets_spec(result, spec) for result in results[saved] if not result.load)
+    meets = all(meets_spec(result, spec) for result in results[saved] if not result.case.load)
     notes = {
         "verdict": verdict,
         "finding": finding,

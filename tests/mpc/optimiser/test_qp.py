@@ -191,21 +191,10 @@ def test_a_flag_of_the_solver_is_a_status_and_no_number_is_no_solution(monkeypat
     )
 
 
-@pytest.mark.parametrize(
-    ("changes", "says"),
-    [({"linear": [0.0]}, "one penalty a row"), ({"quadratic": [0.0]}, "one penalty a row"),
-     ({"linear": [-1.0, 0.0]}, "penalties must be >= 0"),
-     ({"quadratic": [-1.0, 0.0]}, "penalties must be >= 0"),
-     ({"linear": [0.0, -1.0]}, ""), ({"quadratic": [0.0, -1.0]}, "")],
-)  # fmt: skip
-def test_penalties_are_one_a_row_and_none_is_below_0_where_it_counts(changes, says):
-    given = {"soft": [True, False], "linear": [0.0, 0.0], "quadratic": [0.0, 0.0]} | changes
-    if says:
-        with pytest.raises(ValueError, match=says):
-            CondensedQP(**given)
-        return
+def test_rows_of_another_shape_are_refused():
+    solver = CondensedQP(soft=[True, False], linear=[0.0, 0.0], quadratic=[0.0, 0.0])
     with pytest.raises(ValueError, match=r"A is \(1, 1\), not \(2, 1\)"):
-        CondensedQP(**given).solve(np.eye(1), np.zeros(1), np.eye(1), np.zeros(1), np.zeros(1))
+        solver.solve(np.eye(1), np.zeros(1), np.eye(1), np.zeros(1), np.zeros(1))
 
 
 @pytest.mark.parametrize("side", [1.0, -1.0])

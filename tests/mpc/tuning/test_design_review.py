@@ -15,7 +15,7 @@ from thermogrip.mpc.design.design import default_design
 from thermogrip.mpc.design.spec import Spec
 from thermogrip.mpc.tuning import design_review as checks
 from thermogrip.mpc.tuning.design_review import review
-from thermogrip.mpc.tuning.objective import StepResult, apparent_delays
+from thermogrip.mpc.tuning.objective import Case, StepResult, apparent_delays
 from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.plant import Plant
 
@@ -158,7 +158,7 @@ def test_a_plant_that_has_what_its_model_lacks_settles_or_is_warned_of(tank: Any
     assert ("never" in found.finding or "(asked" in found.finding) == (verdict == "warn")
 
 
-STEP = StepResult(18.0, 43.0, 0, 60.0, 0.1, 0.02, 0.0, 1.0, 1.0, 0.5, 600.0)
+STEP = StepResult(Case(18.0, 43.0, 0), 60.0, 0.1, 0.02, 0.0, 1.0, 1.0, 0.5, 600.0)
 NEVER = "never settles, overshoot 0.10, offset"
 
 
@@ -200,7 +200,7 @@ def test_every_step_of_the_spec_must_settle_where_the_model_is_right(
         spec, noted = checks.spec_of(controller, None)
         return checks.as_asked(controller, spec, 2, noted=noted)
 
-    last = replace(STEP, start=43.0, target=30.0)
+    last = replace(STEP, case=Case(43.0, 30.0, 0))
     # the worst draw of the last step counts
     monkeypatch.setattr(checks, "run_trials", lambda *given: [STEP, last, replace(last, **changes)])
     for steps in ({"settle_within_s": 450.0}, {}):  # of the defaults

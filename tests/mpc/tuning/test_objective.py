@@ -37,7 +37,8 @@ from thermogrip.sysid.plant.fit_record import PlantScores
 
 STEPS = [(28.0, 36.0), (28.0, 20.0)]
 SPEC = Spec(steps=STEPS, hold_s=300.0, search_draws=2, check_draws=3, sensor_offset_degC=0.4, band_degC=0.3)
-ONE = StepResult(28.0, 36.0, 1, 150.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 300.0)
+CASE = Case(28.0, 36.0, 1)
+ONE = StepResult(CASE, 150.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 300.0)
 BOUNDS: Any = {(28.0, 36.0, draw): bound for draw, bound in ((1, 50.0), (2, 40.0), (3, np.inf), (4, 0.2))}
 DOUBTED = SPEC.model_copy(update={"extra_lag": 0.5, "extra_delay": 0.6, "lost_gain": 0.15})
 FREE_OF_MOVES = SPEC.model_copy(update={"moves_weight": 0.0})
@@ -80,7 +81,7 @@ def test_a_load_without_noise_is_seen_and_met_without_any_before(tank):
     assert 0.3 < result.overshoot < 1.0  # the largest error: less than the load, which comes gradually
     assert np.isfinite(result.settle_s)
     assert abs(result.bias) < 0.05
-    assert result.load == "t_surface by -1"
+    assert result.case.load.words == "t_surface by -1"
     assert result.iae == pytest.approx(np.mean(np.abs(run.outputs["t_surface"] - 36.0)) * 300.0)
     rest = trial(made, tank, spec, Case(36.0, 36.0, 0, load=replace(load, size=0.0)))
     assert np.ptp(rest.outputs["t_surface"]) < 1e-3  # nothing else moves it
@@ -162,8 +163,8 @@ def test_each_case_has_its_draw_its_length_its_seed_and_what_it_lacks(monkeypatc
 def test_a_step_costs_its_settling_in_bounds_and_what_the_spec_forbids():
     assert total([ONE]) == pytest.approx(3.0)
     # in units of its whole length where nothing reaches it, and of a second at least
-    assert total([replace(ONE, draw=3)]) == pytest.approx(0.5)
-    assert total([replace(ONE, draw=4)]) == pytest.approx(150.0)
+    assert total([replace(ONE, case=replace(CASE, draw=3))]) == pytest.approx(0.5)
+    assert total([replace(ONE, case=replace(CASE, draw=4))]) == pytest.approx(150.0)
     never = replace(ONE, settle_s=np.nan, last_error=-1.5, bias=5.0)  # its bias is not charged besides
     assert total([never]) == pytest.approx(300 / 50 + 0.5 * 1.5 / 0.3)
     assert total([replace(ONE, overshoot=0.5)]) == pytest.approx(3 + 3 * (0.5 / 0.3 - 0.9))
@@ -173,13 +174,14 @@ def test_a_step_costs_its_settling_in_bounds_and_what_the_spec_forbids():
 
 
 def test_a_score_is_the_mean_and_half_of_what_the_worst_is_above_it_noises_by_their_mean():
-    others = [replace(ONE, draw=2, settle_s=settle) for settle in (30.0, 50.0)]
+    others = [replace(ONE, case=replace(CASE, draw=2), settle_s=settle) for settle in (30.0, 50.0)]
     assert total([ONE, *others]) == pytest.approx(2.0 + 0.5 * (3.0 - 2.0))
 
 
 def test_a_load_costs_its_iae_in_that_of_the_reference_and_is_added():
-    loads = [replace(ONE, start=36.0, load="q by 1", iae=30.0, settle_s=20.0, draw=d) for d in (1, 2)]
-    iae = {load.key: 20.0 for load in loads}
+    cases = [Case(36.0, 36.0, draw, load=Load("q", 1.0)) for draw in (1, 2)]
+    loads = [replace(ONE, case=case, iae=30.0, settle_s=20.0) for case in cases]
+    iae = dict.fromkeys(cases, 20.0)
     assert total(loads, iae=iae) == pytest.approx(1.5)
     assert total([ONE, *loads], iae=iae) == pytest.approx(3.0 + 1.5)
     lost = [replace(loads[0], settle_s=np.nan, last_error=0.6), loads[1]]
@@ -190,26 +192,33 @@ def test_a_load_costs_its_iae_in_that_of_the_reference_and_is_added():
 
 def test_moves_beyond_the_limit_are_charged_as_overshoot_is():
     """The limit is in moves of the default design in the same trial, where that settles; without, none."""
-    moves, one = {ONE.key: 1.25}, replace(ONE, travel=3.0)
+    moves, one = {CASE: 1.25}, replace(ONE, travel=3.0)
     assert total([one], FREE_OF_MOVES, moves=moves) == pytest.approx(3 + 3 * (3.0 / (1.5 * 1.25) - 0.9))
     assert total([replace(one, travel=1.6)], FREE_OF_MOVES, moves=moves) == pytest.approx(3.0)
-    assert total([replace(one, draw=4, settle_s=0.2)], FREE_OF_MOVES, moves=moves) == pytest.approx(0.2)
+    other = replace(one, case=replace(CASE, draw=4), settle_s=0.2)
+    assert total([other], FREE_OF_MOVES, moves=moves) == pytest.approx(0.2)
     free = FREE_OF_MOVES.model_copy(update={"moves_limit": 0.0})
     assert total([one], free, moves=moves) == pytest.approx(3.0)
 
 
 def test_a_run_without_structure_counts_as_any_other_draw():
-    found = score([ONE, replace(ONE, lacks="lag", settle_s=200.0)], SPEC, Scales(BOUNDS, {}, {}))
+    found = score(
+        [ONE, replace(ONE, case=replace(CASE, lacks="lag"), settle_s=200.0)], SPEC, Scales(BOUNDS, {}, {})
+    )
     assert (found.steps, found.loads) == pytest.approx((3.75, 0.0))
 
 
 def test_a_score_does_not_depend_on_the_unit_of_the_outputs():
     results = [
-        StepResult(28.0, 36.0, 1, 150.0, 0.5, 0.02, 0.1, 3.0, 2.0, 0.5, 300.0),
-        StepResult(28.0, 36.0, 2, np.nan, 0.2, 0.5, 0.7, 3.0, 2.0, 0.5, 300.0),
+        StepResult(CASE, 150.0, 0.5, 0.02, 0.1, 3.0, 2.0, 0.5, 300.0),
+        StepResult(replace(CASE, draw=2), np.nan, 0.2, 0.5, 0.7, 3.0, 2.0, 0.5, 300.0),
     ]
-    sizes = ("start", "target", "overshoot", "bias", "last_error")
-    milli = [replace(r, **{name: 1000 * getattr(r, name) for name in sizes}) for r in results]
+    sizes = ("overshoot", "bias", "last_error")
+    cases = [Case(28e3, 36e3, draw) for draw in (1, 2)]
+    milli = [
+        replace(r, case=case, **{name: 1000 * getattr(r, name) for name in sizes})
+        for case, r in zip(cases, results)
+    ]
     small = SPEC.model_copy(update={"band_degC": 300.0, "overshoot_degC": 300.0, "bias_degC": 50.0})
     big = {(1000 * start, 1000 * end, draw): bound for (start, end, draw), bound in BOUNDS.items()}
     for pair in zip(results, milli, strict=True):

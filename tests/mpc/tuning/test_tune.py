@@ -14,7 +14,7 @@ from thermogrip.mpc.controllers.mpc import Controller, load_controller
 from thermogrip.mpc.controllers.pi import PIController
 from thermogrip.mpc.design.spec import Spec
 from thermogrip.mpc.tuning.figures import closed_loop_figure
-from thermogrip.mpc.tuning.objective import Score, StepResult, meets_spec
+from thermogrip.mpc.tuning.objective import Case, Load, Score, StepResult, meets_spec
 from thermogrip.mpc.tuning.tune import (
     Row,
     Trial,
@@ -194,11 +194,12 @@ STEP = Spec(steps=((28.0, 36.0),), settle_within_s=100.0, overshoot_degC=0.5, bi
 
 
 def result(settle: float = 80.0, overshoot: float = 0.1, bias: float = 0.0, draw: int = 1) -> StepResult:
-    return StepResult(28.0, 36.0, draw, settle, overshoot, bias, 0.0, 10.0 * draw, 1.0, 0.5, 200.0, iae=9.0)
+    case = Case(28.0, 36.0, draw)
+    return StepResult(case, settle, overshoot, bias, 0.0, 10.0 * draw, 1.0, 0.5, 200.0, iae=9.0)
 
 
 def rows(bound: float, *results: StepResult) -> list[Row]:
-    return rows_of("tuned", results, {(28.0, 36.0, one.draw): bound for one in results})
+    return rows_of("tuned", results, {(28.0, 36.0, one.case.draw): bound for one in results})
 
 
 @pytest.mark.parametrize(
@@ -282,8 +283,9 @@ def test_a_run_meets_the_spec_up_to_its_numbers(change: dict[str, float], met: b
 
 def test_a_row_is_the_mean_and_the_worst_of_its_draws_and_a_load_has_its_own() -> None:
     results = [result(80.0, 0.1, 0.1), result(90.0, 0.3, -0.3, draw=2)]
-    load = replace(result(10.0), start=36.0, load="q by 1")
-    row, loaded = rows(50.0, *results, load, replace(result(), lacks="a lag"))
+    load = replace(result(10.0), case=Case(36.0, 36.0, 1, load=Load("q", 1.0)))
+    lacking = replace(result(), case=Case(28.0, 36.0, 1, "a lag"))
+    row, loaded = rows(50.0, *results, load, lacking)
     assert (row.controller, row.start, row.target) == ("tuned", 28.0, 36.0)
     assert (row.settle_mean_s, row.settle_worst_s) == (85.0, 90.0)
     assert (row.overshoot_mean, row.overshoot_worst) == (0.2, 0.3)
