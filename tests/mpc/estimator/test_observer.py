@@ -159,6 +159,10 @@ def test_the_margin_is_the_steady_change_of_the_worst_combination_in_its_own_siz
     steady = into_y + C @ np.linalg.inv(np.eye(2) - A) @ into_x
     want = np.linalg.svd(steady * scale)[1][-1]
     assert detectability_margin(A, C, into_x, into_y, scale=np.array(scale)) == pytest.approx(want)
+    beyond = np.array([[1.005, 0.0], [0.0, 0.3]])  # of a pole that grows slowly, whose states are large
+    steady = C @ np.linalg.inv(np.eye(2) - beyond) @ into_x
+    found = detectability_margin(beyond, C, into_x, 0 * into_y, scale=np.array(scale))
+    assert found == pytest.approx(np.linalg.svd(steady * scale)[1][-1])
     integrator = np.diag([1.0, 0.8])
     for size in (1.0, 10.0):  # there the rank test decides, of the disturbances in their sizes
         whole = np.block([[integrator - np.eye(2), into_x * size], [C, into_y * size]])
