@@ -226,8 +226,8 @@ def detectability_margin(
     seen_of_slow = np.linalg.norm(C @ vectors[:, slow], axis=0) if slow.any() else np.ones(1)
     if np.any(seen_of_slow < 1e-9):
         return 0.0  # a mode that does not die out and cannot be seen
-    # An integrator has no steady effects: the rank test itself decides.  A pole beyond 1, as a nonlinear model
-    # may have at one point, is none: its equilibrium moves by as much as any other's.
+    # An integrator has no steady effects: the rank test itself decides.  A pole beyond 1, as a nonlinear
+    # model may have at one point, is none: its equilibrium moves by as much as any other's.
     if np.any(np.abs(poles - 1) < 1e-9):
         whole = np.block([[A - np.eye(n_x), into_state * scale], [C, into_output * scale]])
         values = np.linalg.svd(whole, compute_uv=False)
