@@ -552,7 +552,7 @@ def test_columns_are_what_was_named_what_the_network_has_or_what_was_guessed():
     second.attrs["guesses"] = "fan: other\nt: its name is: x"
     second["q"].attrs["units"] = "V"
     logs = [first, second]
-    assert signal_roles._moves([first.assign(lamp=first["lamp"] * np.nan)], "lamp")
+    assert signal_roles.moves([first.assign(lamp=first["lamp"] * np.nan)], "lamp")
     network: Any = SimpleNamespace(name="block", inputs=("q",), disturbances=("room",), outputs=("t",))
     lists = {"inputs": ["q"], "disturbances": None, "outputs": None}
     found, unused = signal_roles.signal_roles(logs, (("q",), ("room",), ("t",)), lists, network)
