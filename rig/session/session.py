@@ -22,7 +22,8 @@ The temperature has settled if level and drift are inside the band even at two s
 
     |a| + 2 se(a) <= band    and    window (|b| + 2 se(b)) <= band.
 
-The rule errs towards waiting: with noise that could hide a drift of the size of the band it is never met.
+The window is 30 s, or five samples of the controller where these are longer.  The rule errs towards waiting:
+with noise that could hide a drift of the size of the band it is never met.
 """
 
 from __future__ import annotations
@@ -46,6 +47,8 @@ from thermogrip.rig.session.profile import Profile
 from thermogrip.rig.session.snapshot import Listener, Operator
 from thermogrip.sysid.effusivity.quality import find_contact
 
+FEWEST_ROWS = 5  # through which a line and the scatter about it are fitted
+
 
 @dataclass(frozen=True)
 class StepFigures:
@@ -68,7 +71,7 @@ def has_settled(
         return False
     recent = (t >= t[-1] - window) & np.isfinite(e)
     t, e = t[recent], e[recent]
-    if t.size < 5:
+    if t.size < FEWEST_ROWS:
         return False
     slope, level = np.polyfit(t - t.mean(), e, 1)
     se_level = _standard_error(e - level - slope * (t - t.mean()), quantum)
@@ -256,9 +259,12 @@ def _settle(run: Loop, timeout: float, band: float) -> bool:
         run.report(0.9 * passed / timeout, "settling")
         if not run.guard.ready(run.reading.time_s):
             continue
-        time = run.column("time_s", last=40.0)
-        errors = [run.column(f"{name}_degC", last=40.0) - value for name, value in run.target.items()]
-        if all(has_settled(time, error, band=band) for error in errors):
+        # 30 s, or as long as the readings that the line takes: a slow plant is read every few minutes
+        window = max(30.0, FEWEST_ROWS * run.controller.dt)
+        recent_s = 1.4 * window
+        time = run.column("time_s", last=recent_s)
+        errors = [run.column(f"{name}_degC", last=recent_s) - value for name, value in run.target.items()]
+        if all(has_settled(time, error, band=band, window=window) for error in errors):
             return True
     return False
 

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tests.rig.conftest import Proportional
 from tests.rig.makers import Bench, make_lab
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.log_files import read_log
@@ -74,6 +75,12 @@ def test_a_settled_verdict_is_true_of_the_real_skin(plant: Plant, controller: An
         twin, target = Twin(plant, seed=seed), 28.0 + 4 * seed
         assert run_session(twin, controller, target).verdict == "settled"
         assert abs(twin.truth()["t_surface"] - target) < 0.25
+
+
+def test_a_loop_of_long_samples_settles_over_as_many_readings_as_a_line_takes(plant: Plant) -> None:
+    session = run_session(Twin(plant, seed=1), Proportional(gain=0.05, dt=20.0), 30.0)
+    assert session.verdict == "settled"
+    assert 100 <= session.log["time"].values[-1] < 900
 
 
 def test_a_loop_that_comes_round_late_settles_as_one_that_does_not(plant: Plant) -> None:
