@@ -18,7 +18,7 @@ References
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -481,15 +481,16 @@ def _tuning(
     """Return what was found, with the best of the candidates for its controller."""
     spec, scored = bench.spec, {n: score(part, bench.spec, bench.scales) for n, part in results.items()}
     scores = {name: part.total for name, part in scored.items()}
-    saved = kept_of(scores)
+    settled = {name for name, part in results.items() if settles_in_every_trial(part)}
+    saved = kept_of(scores, settled)
     rows = tuple(row for name, part in results.items() for row in rows_of(name, part, bench.bounds))
     kept_rows = [row for row in rows if row.controller == saved and not row.load]
-    least = min(scores[saved], scores["tuned"])
+    least = min(scores[saved], scores["tuned"] if "tuned" in settled else np.inf)
     verdict, words = verdict_of(spec, least, scores["baseline"], kept_rows)
     where = "on the search's own draws" if interrupted else "on unseen draws"
     if bench.draws == [0] and not interrupted:
         where = "under fresh noise (the plant has no uncertainty)"
-    finding = f"{best_of(scored, where, unknown_to_pi(spec))} {words}"
+    finding = f"{best_of(scored, settled, where, unknown_to_pi(spec))} {words}"
     if interrupted:
         finding = f"Interrupted after {len(tried)} designs; this is the best of them. {finding}"
     meets = all(meets_spec(result, spec) for result in results[saved] if not result.case.load)
@@ -531,10 +532,19 @@ def _final(
     return Controller(bench.plant, design, notes=notes)
 
 
-def kept_of(scores: Mapping[str, float]) -> str:
-    """Return which controller is saved: a tuned MPC only where it wins what counts, a PI where it is best."""
-    mpc = "tuned" if scores["tuned"] < (1 - SEARCH.won) * scores["baseline"] else "baseline"
-    return "PI" if scores.get("PI", np.inf) < scores[mpc] else mpc
+def settles_in_every_trial(results: Sequence[StepResult]) -> bool:
+    """Return whether each step to a target settled."""
+    return all(np.isfinite(result.settle_s) for result in results if not result.case.load)
+
+
+def kept_of(scores: Mapping[str, float], settled: Collection[str]) -> str:
+    """Return which controller is saved: a tuned MPC only where it wins what counts, a PI where it is best.
+
+    What does not settle in every trial never takes the place of the default design: where draws of a plant
+    differ so much that nothing settles on some of them, scores compare failures."""
+    won = scores["tuned"] < (1 - SEARCH.won) * scores["baseline"]
+    mpc = "tuned" if won and "tuned" in settled else "baseline"
+    return "PI" if "PI" in settled and scores.get("PI", np.inf) < scores[mpc] else mpc
 
 
 def unknown_to_pi(spec: Spec) -> list[str]:
@@ -548,14 +558,18 @@ def unknown_to_pi(spec: Spec) -> list[str]:
     return [wish for wish, value in wishes.items() if value]
 
 
-def best_of(parts: Mapping[str, Score], where: str, unknown: Sequence[str] = ()) -> str:
+def best_of(
+    parts: Mapping[str, Score], settled: Collection[str], where: str, unknown: Sequence[str] = ()
+) -> str:
     """Return the sentence that names the best controller, by how much, and where the other kind loses."""
     scores = {name: part.total for name, part in parts.items()}
-    kept, mpc = kept_of(scores), kept_of({name: scores[name] for name in ("baseline", "tuned")})
+    kept, mpc = kept_of(scores, settled), kept_of(scores, {*settled} - {"PI"})
     words = {"baseline": "default MPC", "tuned": "tuned MPC", "PI": "PI"}[kept]
     if "PI" not in parts:
         because = f"a PI does not know {', '.join(unknown)}" if unknown else "no PI can be made"
         return f"The {words} is what is saved: {because}."
+    if scores["PI"] < scores[kept]:
+        return f"The {words} is what is saved: the PI, which scores less, does not settle in every trial."
     other, loser = (mpc, "MPC") if kept == "PI" else ("PI", "PI")
     share = 100 * (1 - scores[kept] / scores[other])
     costs = {name: (getattr(parts[other], name), getattr(parts[kept], name)) for name in _SCORED_PARTS}

@@ -235,10 +235,16 @@ def test_the_verdict_and_its_sentence(
     ],
 )
 def test_the_best_is_kept_and_a_tuned_mpc_where_it_wins_what_counts(tuned, pi, kept) -> None:
-    assert kept_of({"baseline": 1.0, "tuned": tuned, "PI": pi}) == kept
-    assert kept_of({"baseline": 1.0, "tuned": tuned}) == ("tuned" if tuned < 0.97 else "baseline")
+    scores = {"baseline": 1.0, "tuned": tuned, "PI": pi}
+    assert kept_of(scores, ALL) == kept
+    mpc = "tuned" if tuned < 0.97 else "baseline"
+    assert kept_of({"baseline": 1.0, "tuned": tuned}, ALL) == mpc
+    # what does not settle in every trial takes no place of the default design
+    assert kept_of(scores, {"baseline"}) == kept_of(scores, set()) == "baseline"
+    assert kept_of(scores, {"baseline", "tuned"}) == mpc
 
 
+ALL = {"baseline", "tuned", "PI"}
 PARTS = {"baseline": Score(1.2, 1.4), "tuned": Score(1.0, 1.2), "PI": Score(1.1, 1.0)}
 
 
@@ -260,7 +266,12 @@ PARTS = {"baseline": Score(1.2, 1.4), "tuned": Score(1.0, 1.2), "PI": Score(1.1,
 def test_the_first_sentence_names_the_best_of_all_kinds_and_where_the_other_loses(
     changes: dict[str, Score], said: str
 ) -> None:
-    assert best_of(PARTS | changes, "on unseen draws") == said
+    assert best_of(PARTS | changes, ALL, "on unseen draws") == said
+
+
+def test_a_pi_that_does_not_settle_is_not_saved_and_the_first_sentence_says_so() -> None:
+    said = best_of(PARTS, ALL - {"PI"}, "on unseen draws")
+    assert said.startswith("The tuned MPC is what is saved: the PI, which scores less, does not settle")
 
 
 @pytest.mark.parametrize(
@@ -268,7 +279,7 @@ def test_the_first_sentence_names_the_best_of_all_kinds_and_where_the_other_lose
 )
 def test_without_a_pi_the_first_sentence_says_why(unknown: list[str], why: str) -> None:
     parts = {name: PARTS[name] for name in ("baseline", "tuned")}
-    assert best_of(parts, "on unseen draws", unknown) == f"The tuned MPC is what is saved: {why}."
+    assert best_of(parts, ALL, "on unseen draws", unknown) == f"The tuned MPC is what is saved: {why}."
 
 
 @pytest.mark.parametrize(
