@@ -410,6 +410,13 @@ def test_a_single_grasp_is_named(named: SimpleNamespace, stand_in: StandIn) -> N
     stand_in("thermogrip.classify.decisions.predict.answer_record", ([one], "quality"))
     done = named.bench.run("classify", "m", "grasps.csv", "--early", "--out", "p.csv")
     assert (done.code, "a iron 0.75 0.125 9 wrote p.csv" in words_of(done.out)) == (0, True), done
+    verb._answerer.cache_clear()
+    stand_in(
+        "thermogrip.classify.decisions.predict.answer_record",
+        ([replace(one, material="unknown", p_unknown=0.625)], "quality"),
+    )
+    done = named.bench.run("classify", "m", "grasps.csv", "--early", "--out", "p.csv")
+    assert "a unknown, nearest iron 0.75 0.625 9 wrote p.csv" in words_of(done.out)
 
 
 @pytest.mark.parametrize(

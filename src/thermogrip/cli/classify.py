@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import lru_cache, partial
 from importlib.util import find_spec
@@ -354,7 +354,7 @@ def classify(
     shown = [
         (
             row["grasp_id"],
-            row["material"],
+            _material_words(row),
             max((row[key] for key in row if _is_candidate(key) and row[key] is not None), default=None),
             row["p_unknown"],
             row["decided_at_s"],
@@ -652,6 +652,14 @@ def say_names(console: Console, said: Iterable[tuple[str, str]]) -> None:
     for words, of in names.items():
         more = f" and {len(of) - SHOWN} more" if len(of) > SHOWN else ""
         console.say(f"{words}: {', '.join(of[:SHOWN])}{more}")
+
+
+def _material_words(row: Mapping[str, Any]) -> str:
+    """Return the name, of an unknown material the candidate that the probability beside it is of, too."""
+    if row["material"] != "unknown":
+        return str(row["material"])
+    p = {key.removeprefix("p_"): row[key] for key in row if _is_candidate(key) and row[key] is not None}
+    return f"unknown, nearest {max(p, key=p.__getitem__)}" if p else "unknown"
 
 
 def _is_candidate(key: str) -> bool:
