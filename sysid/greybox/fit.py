@@ -288,7 +288,7 @@ def _as_plant(problem: Problem, solution: Solution, tau: Array) -> Plant:
     width = 1e-6 * (1 + np.abs(z))
     at_ends = zip(names, z <= problem.box[0] + width, z >= problem.box[1] - width)
     on_bound = {name: "low" if low else "high" for name, low, high in at_ends if low or high}
-    identifiability = describe(names, data, spread.covariance, spread.widening, on_bound)
+    identifiability = describe(names, data, spread.covariance, spread.widening, on_bound, shift=z)
     p = problem.parameters(z[None])[0]
     errors, starts = problem.errors(z), problem.start(z)
     noise = {name: _rms([s[k] for log in errors for s in log]) for k, name in enumerate(model.outputs)}

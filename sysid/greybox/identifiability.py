@@ -137,9 +137,15 @@ def _width(sd: float, log: bool) -> str:
 
 
 def describe(
-    names: Sequence[str], jacobian: Array, covariance: Array, widening: Array, on_bound: Mapping[str, str]
+    names: Sequence[str],
+    jacobian: Array,
+    covariance: Array,
+    widening: Array,
+    on_bound: Mapping[str, str],
+    *,
+    shift: Array,
 ) -> Identifiability:
-    """Return the identifiability report of a fit."""
+    """Return the identifiability report of a fit that lies ``shift`` prior sd off the prior's means."""
     size = np.linalg.norm(jacobian, axis=0)
     scaled = jacobian / np.where(size > 0, size, 1.0)
     values, axes = np.linalg.eigh(scaled.T @ scaled)  # rising
@@ -153,7 +159,13 @@ def describe(
             _in_words(axis, names) for value, axis in zip(values, axes.T) if value < REPORT.flat_eigenvalue
         ],
         identifiable=bool(least > REPORT.unmoved_eigenvalue),
-        prior_only=[name for name, s in zip(names, sd) if s > REPORT.prior_only_sd],
+        # Data that narrow a prior to a share s of its sd move it by sqrt(1 - s^2) of that: what is twice as
+        # far off was moved, by data or by what the model lacks.
+        prior_only=[
+            name
+            for name, s, off in zip(names, sd, np.abs(shift))
+            if s > REPORT.prior_only_sd and off < 2 * np.sqrt(1 - REPORT.prior_only_sd**2)
+        ],
         on_bound=dict(on_bound),
         widening={name: round(float(w), 3) for name, w in zip(names, widening)},
     )

@@ -21,7 +21,9 @@ def a_plant(correlation: float, jacobian: np.ndarray | None = None) -> Plant:
     covariance = 0.04 * np.eye(n)
     i, j = plant.free.index("power_1"), plant.free.index("G_amb")
     covariance[i, j] = covariance[j, i] = 0.04 * correlation
-    report = describe(plant.free, np.eye(n) if jacobian is None else jacobian, covariance, np.ones(n), {})
+    report = describe(
+        plant.free, np.eye(n) if jacobian is None else jacobian, covariance, np.ones(n), {}, shift=np.zeros(n)
+    )
     return replace(plant, covariance=covariance, scores=PlantScores(identifiability=report))
 
 
@@ -94,7 +96,8 @@ def test_the_spectrum_of_the_scaled_hessian_knows_no_units():
     rng = np.random.default_rng(0)
     jacobian = rng.normal(size=(30, 4))
     reports = [
-        describe("abcd", jacobian * scale, np.eye(4), np.ones(4), {}) for scale in (1.0, [1, 10, 1e3, 0.1])
+        describe("abcd", jacobian * scale, np.eye(4), np.ones(4), {}, shift=np.zeros(4))
+        for scale in (1.0, [1, 10, 1e3, 0.1])
     ]
     assert reports[0].spectrum == pytest.approx(reports[1].spectrum)
     assert sum(reports[0].spectrum) == pytest.approx(4.0, rel=1e-2)  # a unit diagonal
@@ -135,7 +138,8 @@ def test_what_a_fit_says_of_its_parameters():
         (0.022, ["c up"]),
     ):
         jacobian[1, 1] = tilt
-        found = describe("abc", jacobian, np.diag(sd**2), np.array([1.2345, 1.0, 2.0]), {"a": "low"})
+        widening, shift = np.array([1.2345, 1.0, 2.0]), np.array([0.0, 0.5, -0.8])
+        found = describe("abc", jacobian, np.diag(sd**2), widening, {"a": "low"}, shift=shift)
         least = 1 - 1 / np.sqrt(1 + tilt**2)
         assert found.spectrum == pytest.approx([0.0, least, 2 - least], rel=5e-3)
         assert [way.replace("a down, b up", "a up, b down") for way in found.flat] == (
@@ -145,7 +149,10 @@ def test_what_a_fit_says_of_its_parameters():
     assert (found.identifiable, found.weakest, found.on_bound) == (False, "c up", {"a": "low"})
     assert found.widening == {"a": 1.234, "b": 1.0, "c": 2.0}
     assert found.condition == pytest.approx((2 - least) / 1e-18, rel=1e-3)
-    alone = describe("ab", jacobian[:, :2], np.eye(2), np.ones(2), {})
+    # what was moved by more than data that narrow it by a tenth may do is not the prior's
+    pulled = describe("abc", jacobian, np.diag(sd**2), widening, {}, shift=np.array([0.0, 0.5, -2.4]))
+    assert pulled.prior_only == ["b"]
+    alone = describe("ab", jacobian[:, :2], np.eye(2), np.ones(2), {}, shift=np.zeros(2))
     assert alone.identifiable
     assert alone.condition == pytest.approx((2 - least) / least, rel=1e-6)
 
