@@ -433,6 +433,14 @@ class Guard:
         stated = () if self.model is None else room_disturbances(self.model.plant)
         return sorted(self.rooms(names).difference(stated)) if self.settings.room_sensors is None else []
 
+    def unread(self, names: Collection[str]) -> dict[str, float]:
+        """Return the plant's disturbances that no sensor reads, rooms aside, and what they are taken for."""
+        if self.model is None:
+            return {}
+        plant = self.model.plant
+        taken = zip(plant.disturbances, plant.undisturbed(0.0).tolist(), strict=True)
+        return {name: value for name, value in taken if name not in names and not plant.is_room(name)}
+
     def limits_of(self, name: str) -> tuple[float, float]:
         """Return between which temperatures a sensor may read [degC]."""
         s, skin = self.settings, name in (self.skin, f"{self.skin}_2")

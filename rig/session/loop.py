@@ -133,6 +133,9 @@ class Loop:
         if guessed := self.guard.guessed_rooms(self.reading.values):
             text = f"{', '.join(guessed)} by name taken for the room's; state room_sensors in the guard file"
             self.note("room", text)
+        if unread := self.guard.unread(self.reading.values):
+            taken = ", ".join(f"{name} as {value:.4g}" for name, value in unread.items())
+            self.note("room", f"the rig does not read {', '.join(unread)}: the controller takes {taken}")
         self.accepted = {**self.reading.values, **self.guard.sensors.last_good()}
         self.controller.reset(self.controller_reading())
         self.check()

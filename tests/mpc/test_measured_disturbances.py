@@ -261,7 +261,7 @@ def test_review_says_amid_what_targets_are_held():
     assert said == "26 to 28 degC in rooms of 8, 12 degC, sun of 420"
 
 
-def test_a_run_without_the_reading_goes_on():
+def test_a_run_without_the_reading_says_what_is_taken_and_goes_on():
     plant, spec = SUN.plant(), SUN.spec()
     controller = Controller(plant, spec.design(plant))
     twin = Twin(plant, ambient=SUN.room, t_start=24.0, skin="t")
@@ -269,6 +269,8 @@ def test_a_run_without_the_reading_goes_on():
     session = run_session(
         twin, controller, 28.0, output="t", guard=Guard(plant, skin="t"), settle_timeout=1500.0
     )
+    said = [event.text for event in session.events if event.kind == "room"]
+    assert said == ["the rig does not read sun: the controller takes sun as 420"]
     assert session.trip is None
     with pytest.raises(UserError, match="does not say what its disturbance 'sun' was in the logs"):
         Twin(SUN.plant(nominal={}, valid={"heat": (0.0, 100.0)}))
