@@ -45,15 +45,7 @@ class _Half(NamedTuple):
 
 
 class Oscillation:
-    """One signal of sample time ``dt`` whose loop has an apparent ``delay`` [s]; ``least`` is the amplitude
-    from which on a swing counts.
-
-    >>> from math import sin
-    >>> signal = Oscillation(dt=1.0, delay=10.0, least=0.3)
-    >>> swings = [signal.note(sin(0.2 * k), 1.0) for k in range(130)]
-    >>> sum(swings) > 0, round(signal.amplitude), round(signal.period)
-    (True, 1, 31)
-    """
+    """One signal of a loop with an apparent ``delay`` [s], in which swings count from an amplitude on."""
 
     def __init__(self, dt: float, delay: float, least: float) -> None:
         self._shortest = _SHORTEST_PERIOD * dt
@@ -84,7 +76,14 @@ class Oscillation:
         if isfinite(error):
             side = float(error > 0) - float(error < 0) or self._open.side
             if side != self._open.side:
-                self._close()
+                half = self._open
+                if self._counts(half):
+                    # two half swings on one side, which noise cut, are one
+                    if self._halves and self._halves[-1].side == half.side:
+                        before = self._halves.pop()
+                        half = half._replace(iae=before.iae + half.iae, begin=before.begin)
+                    self._halves.append(half)
+                self._arrived = self._arrived or half.side != 0.0
                 self._open = _Half(side, 0.0, before_s, before_s)
             iae = self._open.iae + abs(error) * seconds
             self._open = self._open._replace(iae=iae, end=self._now_s)
@@ -95,16 +94,6 @@ class Oscillation:
             return False
         first, second, *_, fifth, sixth = (half.iae for half in self._halves)
         return fifth + sixth >= _LAST_TWO * (first + second)
-
-    def _close(self) -> None:
-        """Keep the half swing that ends where it counts; two on one side, which noise cuts, are one."""
-        half = self._open
-        if self._counts(half):
-            if self._halves and self._halves[-1].side == half.side:
-                before = self._halves.pop()
-                half = half._replace(iae=before.iae + half.iae, begin=before.begin)
-            self._halves.append(half)
-        self._arrived = self._arrived or half.side != 0.0
 
     def _counts(self, half: _Half) -> bool:
         seconds = half.end - half.begin

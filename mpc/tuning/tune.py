@@ -538,10 +538,8 @@ def settles_in_every_trial(results: Sequence[StepResult]) -> bool:
 
 
 def kept_of(scores: Mapping[str, float], settled: Collection[str]) -> str:
-    """Return which controller is saved: a tuned MPC only where it wins what counts, a PI where it is best.
-
-    What does not settle in every trial never takes the place of the default design: where draws of a plant
-    differ so much that nothing settles on some of them, scores compare failures."""
+    """Return which controller is saved: a tuned MPC only where it wins what counts, a PI where it is best."""
+    # where draws differ so much that nothing settles on some of them, scores compare failures
     won = scores["tuned"] < (1 - SEARCH.won) * scores["baseline"]
     mpc = "tuned" if won and "tuned" in settled else "baseline"
     return "PI" if "PI" in settled and scores.get("PI", np.inf) < scores[mpc] else mpc
