@@ -41,7 +41,11 @@ from thermogrip.sysid.blackbox.fit import (
     white_error,
     with_refits,
 )
-from thermogrip.sysid.blackbox.order_selection import HARDLY_MORE, MORE_BY_LOGS, excess_within_noise
+from thermogrip.sysid.blackbox.order_selection import (
+    SIMPLER_MARGIN,
+    SIMPLER_MARGIN_OF_LOGS,
+    excess_within_noise,
+)
 from thermogrip.sysid.data.data_quality import DataCheck, Evidence, check_data, evidence
 from thermogrip.sysid.data.rest_before import with_rest
 from thermogrip.sysid.data.signal_roles import (
@@ -580,7 +584,7 @@ def _fitted(
 def choose_black_box(fits: Sequence[BlackBoxFit], logs: Sequence[Log]) -> BlackBoxFit:
     """Return the fit of the least error on the parts, a linear one where another kind errs barely less."""
     run = _run_error(fits, logs)
-    most = HARDLY_MORE if len(fits[0].grid.logs) < SEVERAL else MORE_BY_LOGS
+    most = SIMPLER_MARGIN if len(fits[0].grid.logs) < SEVERAL else SIMPLER_MARGIN_OF_LOGS
     errors = [np.log(np.hypot(fit.choice.errors[fit.choice.structure], run)) for fit in fits]
     by_error = sorted(range(len(fits)), key=lambda k: float(errors[k].mean()))
     best = by_error[0]

@@ -42,20 +42,22 @@ from thermogrip.sysid.plant.log_grid import MOVED, Grid, Segment
 Array = NDArray[np.float64]
 Item = TypeVar("Item")
 
-HARDLY_MORE = float(np.log(1.05))  # of log errors
-MORE_BY_LOGS = float(np.log(1.2))  # the same over whole logs, of which there are few
+SIMPLER_MARGIN = float(np.log(1.05))  # of log errors
+SIMPLER_MARGIN_OF_LOGS = float(np.log(1.2))  # the same over whole logs, of which there are few
 # Times the error on the worst part: a fit to all data, which it has seen, errs on them no more than that;
 # where none does (one structure was asked for, say) no more than twice that.
-_MOST_ON_ALL = (1.0, 2.0)
+_ERROR_ON_ALL_RATIOS = (1.0, 2.0)
 _CUTS = 4  # of one or two logs
 # From twice the error on two parts of five, the other three would have to bring less than 0.6 times it each.
 _HOPELESS_RATIO = 2.0
 MANY_ROWS = 8000  # beyond it a fit to all structures and steps takes minutes, and two parts tell them apart
-FEWEST = 20  # rows of a block that is held out
+FEWEST_HELD_OUT_ROWS = 20  # rows of a block that is held out
 
-_ALIKE = 0.98  # correlation of an input with its square: a line leaves a fifth of the square's spread
+_LINEAR_CORRELATION = (
+    0.98  # correlation of an input with its square: a line leaves a fifth of the square's spread
+)
 
-_SHORT = 0.25  # of a held-out part: the memory of an offset that fades
+_FADING_SHARE = 0.25  # of a held-out part: the memory of an offset that fades
 
 
 class Model(PlantModel, Protocol):
@@ -133,10 +135,10 @@ def folds(grid: Grid, *, blocks: int = _CUTS) -> list[Fold]:
 
 def _cut_blocks(grid: Grid, blocks: int) -> list[Fold]:
     total = sum(len(segment.time) for segment in grid.segments)
-    if total < FEWEST * blocks:
+    if total < FEWEST_HELD_OUT_ROWS * blocks:
         raise UserError(
             f"{total} rows of {grid.dt:g} s are too few: parts are held out in turn, which takes "
-            f"{FEWEST * blocks}",
+            f"{FEWEST_HELD_OUT_ROWS * blocks}",
             hint="give a longer log or average less",
         )
     edges = [round(total * block / blocks) for block in range(blocks + 1)]
@@ -158,7 +160,7 @@ def _last_parts(grid: Grid) -> Fold:
         begin, end = segments[0].time[0], segments[-1].time[-1]
         for segment in segments:
             cut = int(np.searchsorted(segment.time, begin + (1 - HELD_OUT_SHARE) * (end - begin)))
-            training += [segment.part(0, cut)] if cut >= FEWEST else []
+            training += [segment.part(0, cut)] if cut >= FEWEST_HELD_OUT_ROWS else []
             runs += [Run(segment, cut)] if cut < len(segment.time) else []
     return Fold(f"{TAIL}{' and '.join(grid.logs)}", grid.having(training), tuple(runs))
 
@@ -167,7 +169,7 @@ def priors_of(grid: Grid) -> tuple[StartPrior, ...]:
     """Return how a first error may be shared between state and sensor, and how long an offset lasts; offsets
     that fade do in a quarter of a held-out part: a longer memory cannot be told from one that lasts."""
     seconds = grid.dt * sum(len(segment.time) for segment in grid.segments)
-    fading = _SHORT * seconds / (len(grid.logs) if len(grid.logs) >= 3 else _CUTS)
+    fading = _FADING_SHARE * seconds / (len(grid.logs) if len(grid.logs) >= 3 else _CUTS)
     none = [StartPrior(noise=r) for r in (0.03, 0.1, 0.3)]
     kinds = [(0.0, np.inf), *product((0.1, 0.3, 1.0), (np.inf, fading))]
     return tuple(replace(some, nuisance=q, memory=memory) for q, memory in kinds for some in none)
@@ -236,9 +238,9 @@ def _first_sound(
     grid: Grid, family: Family, scored: Mapping[Structure, _Errors], warmup: int
 ) -> tuple[Structure, Model]:
     """Return the best structure whose fit to all data errs on them no more than it may, and that fit."""
-    most = HARDLY_MORE if len(grid.logs) < SEVERAL else MORE_BY_LOGS
+    most = SIMPLER_MARGIN if len(grid.logs) < SEVERAL else SIMPLER_MARGIN_OF_LOGS
     on_all: dict[Structure, tuple[Model, float] | None] = {}
-    for times in _MOST_ON_ALL:
+    for times in _ERROR_ON_ALL_RATIOS:
         remaining = {structure: errors.mean for structure, errors in scored.items()}
         while any(np.isfinite(errors).all() for errors in remaining.values()):
             structure = smallest_near_the_best(remaining, most, size=lambda s: s.size)
@@ -376,7 +378,7 @@ def default_terms(grid: Grid) -> tuple[tuple[str, ...], ...]:
     signed = [n for i, n in enumerate(grid.inputs) if u[:, i].min() < 0 < u[:, i].max()]
     moved = [(n, v) for n, v in zip(grid.inputs, u.T) if n not in signed and np.ptp(v) > 0]
     # of two levels, or of few moves, the square of an input is a line in it
-    curved = [n for n, v in moved if abs(np.corrcoef(v, v**2)[0, 1]) < _ALIKE]
+    curved = [n for n, v in moved if abs(np.corrcoef(v, v**2)[0, 1]) < _LINEAR_CORRELATION]
     products = tuple(f"|{n}|" for n in signed) or tuple(f"{n}*{n}" for n in curved)
     return ((), products) if products else ((),)
 
@@ -407,7 +409,7 @@ def with_spread(model: StateSpaceModel, grid: Grid, starts: Sequence[Array]) -> 
     return replace(model, spread=spread + 1e-8 * max(np.trace(spread), 1e-12) * np.eye(model.n_x))
 
 
-def excess_within_noise(excess: Array, most: float = HARDLY_MORE) -> bool:
+def excess_within_noise(excess: Array, most: float = SIMPLER_MARGIN) -> bool:
     """Return whether paired differences of log errors are zero to within one standard error and ``most``."""
     return bool(excess.mean() <= min(excess.std(ddof=1) / np.sqrt(excess.size), most))
 

@@ -236,7 +236,7 @@ def test_an_excess_is_noise_within_a_standard_error_and_five_percent(excess, wit
 )
 def test_the_smallest_of_the_good_ones_is_taken(table, chosen):
     errors = {structure: np.array(each) for structure, each in table.items()}
-    found = selection.smallest_near_the_best(errors, selection.HARDLY_MORE, size=lambda s: s.size)
+    found = selection.smallest_near_the_best(errors, selection.SIMPLER_MARGIN, size=lambda s: s.size)
     assert found.label == chosen
 
 
