@@ -342,6 +342,14 @@ class Stream:
         read = len(self._time) > 1 and np.isfinite(self._reading).any()
         return check_grasps(self.grasps()).reason[0] if read else ""
 
+    @property
+    def p_unknown(self) -> float:
+        """Probability, by the samples so far, that it is none of the candidates; NaN where the contact is not
+        usable.  It takes some tens of milliseconds: ask for it before the answer is acted on."""
+        if self.nothing_because or self._u is None:
+            return float("nan")
+        return float(self._model.p_unknown(self.grasps(), self.candidates)[0])
+
     def grasps(self) -> Grasps:
         """Return the contact so far as a record of one grasp."""
         about = {name: [value] for name, value in self._about.items()}

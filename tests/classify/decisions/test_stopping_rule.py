@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from thermogrip.classify import StopRule, Stream, classify_grasps, learn_stop_rule, load_stop_rule
+from thermogrip.classify import StopRule, Stream, answer, classify_grasps, learn_stop_rule, load_stop_rule
 from thermogrip.classify.decisions import stopping_rule
 from thermogrip.classify.decisions.stopping_rule import (
     TIMES,
@@ -392,3 +392,18 @@ def test_a_stream_begins_at_the_prior_odds():
     known = PosteriorClassifier(priors={"copper": 3.0}).with_device(load_default_gripper())
     touch = Stream(known, candidates=["copper", "wood"], t_object=28.0, t_ambient=27.0)
     assert touch.update(-1.0, 23.0) == pytest.approx({"copper": 0.75, "wood": 0.25})
+
+
+@pytest.mark.parametrize(("material", "candidates"), [("copper", THREE), ("wood", ["copper", "iron"])])
+def test_a_stream_knows_what_is_none_of_its_candidates_as_the_answer_does(material, candidates):
+    known = PosteriorClassifier().with_device(load_default_gripper())
+    grasps = load_example_grasps()["exp2_dT20"]
+    grasp = grasps.isel(grasp=[grasps["material"].values.tolist().index(material)])
+    about = {name: float(grasp[name].values[0]) for name in ("t_object", "t_ambient")}
+    touch = Stream(known, candidates=candidates, **about)
+    assert np.isnan(touch.p_unknown)  # before the contact
+    for time, reading in zip(grasp["time"].values, grasp["t_surface"].values[0]):
+        touch.update(float(time), float(reading))
+    (found,) = answer(known, grasp, candidates)
+    assert touch.p_unknown == pytest.approx(found.p_unknown, rel=1e-6)
+    assert (touch.p_unknown > 0.5) == (material not in candidates)
