@@ -7,7 +7,7 @@ steps and on loads (:mod:`thermogrip.mpc.tuning.objective`). An MPC that
 is worse than the default design by more than 3 % on steps or on loads is not taken, whatever it wins on
 the other: trials are the model's word, and on two of eight plants the truth denied it. The default
 design, the best MPC and the best PI are then compared on draws that the search has not seen, and the one
-of the least score is what is saved, whatever its kind; a tuned MPC where it wins more than 3 %. A PI does
+of the least score is what is saved, whatever its kind; a tuned MPC where it wins more than 10 %. A PI does
 not know zones, prices of energy, limits of outputs, ramps or what is switched: where the spec asks for
 one of these the MPC is taken.
 
@@ -61,7 +61,10 @@ if TYPE_CHECKING:
 class SearchSettings:
     """How designs are searched and compared."""
 
-    won: float = 0.03  # relative fall of the score that counts
+    # relative fall of the score that counts: one noise alone moves a score by a tenth, and of four plants on
+    # whose draws a design won 4 to 8 % the truth gave it .91, .77, 1.23 and 1.76 of the best's error in loads
+    won: float = 0.10
+    worse: float = 0.03  # relative rise of steps or of loads from which an MPC is not taken
     near: float = 1.25  # settling over bound that counts as the actuator's limit
     check_from: int = 100  # draws of the comparison, apart from those of the search
     noises: int = 2  # in which each trial of a search is run: one noise alone moves a score by a tenth
@@ -387,7 +390,7 @@ class Bench:
         if kind == "MPC":
             self.default = self.default or parts_of_score  # which comes first
             worse = (
-                getattr(parts_of_score, name) > (1 + SEARCH.won) * getattr(self.default, name)
+                getattr(parts_of_score, name) > (1 + SEARCH.worse) * getattr(self.default, name)
                 for name in _SCORED_PARTS
             )
             cost = np.inf if any(worse) else cost
