@@ -235,7 +235,7 @@ class _Disk:
         self._waiting: deque[Future[None]] = deque()  # lines that are not written yet
         self._force_asked = False
         self._fault: OSError | None = None
-        self.refused = False  # whether a caller was told of a fault
+        self.refused = False  # whether a fault was reported to a caller
 
     def write(self, file: _Lines, line: bytes, *, force: bool) -> None:
         """Hand over a line."""

@@ -167,7 +167,7 @@ def _last_parts(grid: Grid) -> Fold:
 
 def priors_of(grid: Grid) -> tuple[StartPrior, ...]:
     """Return how a first error may be shared between state and sensor, and how long an offset lasts; offsets
-    that fade do in a quarter of a held-out part: a longer memory cannot be told from one that lasts."""
+    that fade do in a quarter of a held-out part: a longer memory looks like one that lasts."""
     seconds = grid.dt * sum(len(segment.time) for segment in grid.segments)
     fading = _FADING_SHARE * seconds / (len(grid.logs) if len(grid.logs) >= 3 else _CUTS)
     none = [StartPrior(noise=r) for r in (0.03, 0.1, 0.3)]

@@ -57,7 +57,7 @@ class ScoreTestSettings:
     """Settings of the score test; lags and correlation times in blocks, sizes in rms of the residual."""
 
     most_blocks: int = 300  # of a log: a covariance of that size is inverted in milliseconds
-    fewest_blocks: int = 20  # with fewer the noise cannot be told from the input
+    fewest_blocks: int = 20  # with fewer, noise and input cannot be distinguished
     input_lags: tuple[float, ...] = (1.0, 4.0, 16.0, 64.0)  # two octaves apart, to a fifth of the log
     noise_taus: tuple[float, ...] = (2.0, 8.0, 32.0, 128.0)  # likewise, to a third of the log and more
     noise_sd: float = 0.3  # prior median of each part of w

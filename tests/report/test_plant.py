@@ -162,16 +162,29 @@ def test_parameters_stand_where_there_are_any(monkeypatch: pytest.MonkeyPatch) -
     found = identified()
     found.runs = (SimpleNamespace(warmup=9.0),)
     board = plant_from_prior(load_network("tclab"))
-    found.held_out_runs = {"last 30 % of one": "held out"}
-    first, held_out, second, last = plant.identification_sections(found, ["a log"], board, None)
+    sections = plant.identification_sections(found, ["a log"], board, None)
     assert asked == [(board, "a log", 9.0)]
-    assert last == (("a run",), {"seen": True})
-    title = "Does it predict what it was fitted without? last 30 % of one"
-    assert held_out == (("held out",), {"title": title})
-    titles = "Which plant is behind the logs?", "How well are its parameters known?"
-    assert (first.title, second.title) == titles
+    assert sections[-1] == (("a run",), {"seen": True})
+    assert [section.title for section in sections[:2]] == [
+        "Which plant is behind the logs?", "How well are its parameters known?",
+    ]  # fmt: skip
     black = SimpleNamespace(free=())
-    assert len(plant.identification_sections(found, ["a log"], black, None)) == 3
+    assert len(plant.identification_sections(found, ["a log"], black, None)) == 2
+
+
+def test_what_was_held_out_is_drawn_and_its_error_is_the_answer(run: tuple[Plant, Log, FreeRun]) -> None:
+    _, log, found = run
+    kept = identified()
+    kept.held_out_runs = {"last 30 % of one": found}
+    section = plant.held_out_section(kept)
+    assert section.verdict == f"RMSE of last 30 % of one: t {found.scores['t'].rmse:.2g} degC."
+    (drawn,) = section.parts
+    assert isinstance(drawn, Plot)
+    measured, simulated = drawn.chart.columns[0][0].curves
+    np.testing.assert_array_equal(measured.y, log["t"].values)
+    np.testing.assert_array_equal(simulated.y, found.log["t"].values)
+    assert (measured.dash, simulated.dash) == ("-", "--")
+    assert measured.colour != simulated.colour
 
 
 @pytest.mark.usefixtures("no_figures")

@@ -126,10 +126,10 @@ def identify(
     logs, wanted_network = _read(read, wanted_network, shipped=a_network)
     repairs = _repaired(console, logs)
     have = dict.fromkeys(map(str, logs[0].data_vars), "")  # what a word means may be written otherwise
-    columns_by_role = [
+    inputs_read, outputs_read, disturbances_read = (
         None if words is None else tuple(find_column(w, have) for w in words) for words in roles
-    ]
-    roles = columns_by_role[0], columns_by_role[1], columns_by_role[2]
+    )
+    roles = inputs_read, outputs_read, disturbances_read
     from thermogrip.datasets.parallel import sub_progress
     from thermogrip.report.html import write_report
     from thermogrip.report.plant import identification_sections

@@ -37,7 +37,7 @@ _HEAD = 1 << 16  # bytes that show what a file is
 
 
 def kind_of(path: str | Path) -> str:
-    """Return what a file or folder is, "" where that cannot be told."""
+    """Return what a file or folder is, "" where it is no known kind."""
     if os.path.isdir(path):
         return next((kind for name, kind in _KIND_BY_CONTENT.items() if os.path.isfile(Path(path, name))), "")
     name = str(path).lower()

@@ -115,8 +115,8 @@ def identification_sections(
     from thermogrip.sysid.validation.free_run import free_run
 
     sections = [identification_section(found)]
-    for name, run in found.held_out_runs.items():
-        sections.append(free_run_section(run, title=f"Does it predict what it was fitted without? {name}"))
+    if found.held_out_runs:
+        sections.append(held_out_section(found))
     if plant.free:
         sections.append(parameters_section(plant, record))
     if dynamics is not None:
@@ -125,6 +125,25 @@ def identification_sections(
         run = free_run(plant, log, known.warmup)
         sections.append(free_run_section(run, seen=True))
     return sections
+
+
+def held_out_section(found: Identification) -> Section:
+    """Return the section of the kept model over what it was fitted without: measured beside free run."""
+    runs = found.held_out_runs
+    words = (
+        ", ".join(f"{o} {s.rmse:.2g}{_spaced(s.unit)}" for o, s in r.scores.items()) for r in runs.values()
+    )
+    errors = "; ".join(f"{name}: {error}" for name, error in zip(runs, words))
+    evidence = tuple(
+        Plot(
+            plots.free_run_chart(run, tuple(run.scores)[k : k + 2]),
+            f"{name}: {found.model} fitted without it, simulated from the inputs alone (dashed), over what "
+            f"was measured. Readings of the first {run.warmup:.3g} s set the state. On grey: not scored.",
+        )
+        for name, run in runs.items()
+        for k in range(0, len(run.scores), 2)
+    )
+    return Section("Does it predict what it has not seen?", evidence, f"RMSE of {errors}.", "plain")
 
 
 def gain_table(found: Dynamics) -> Cells:
