@@ -109,7 +109,7 @@ class LoopMonitor:
 
     def forget(self) -> None:
         """Begin anew, as with other readings."""
-        self.said = ""  # of the newest sample
+        self.message = ""  # of the newest sample
         self._time_s = np.nan
         self._u: Array | None = None
         self._goals: list[float] = []
@@ -133,7 +133,7 @@ class LoopMonitor:
         now = number(reading, "time_s")
         seconds = now - self._time_s if np.isfinite(now - self._time_s) else self.model.dt
         if self._u is not None and seconds < self.model.dt * (1 - SAME):
-            return self.said
+            return self.message
         self._time_s = now
         y = np.array([number(reading, name) for name in self.model.outputs])
         d = np.array([number(reading, name) for name in self.model.disturbances])
@@ -150,10 +150,10 @@ class LoopMonitor:
         self._u, self._goals = u, goals
         if move.status not in ("ok", "late", "infeasible"):
             self._restart()  # no law is followed
-            self.said = ""
+            self.message = ""
         else:
-            self.said = self._judge(y[self._rows], np.array(goals), d, seconds, strange)
-        return self.said
+            self.message = self._judge(y[self._rows], np.array(goals), d, seconds, strange)
+        return self.message
 
     def _follow(self, y: Array, d: Array, applied: Array, seconds: float, *, new: bool) -> str:
         """Let the filters follow; return in what the plant is another than its model."""
@@ -187,11 +187,11 @@ class LoopMonitor:
         elif self._looked_s >= self._look_s:
             self._unreachable, self._looked_s = self._missed(target, d), 0.0
         lasts = self._strange_s > np.max(self._promised, initial=0.0)
-        if said := self.stuck.said or self._unreachable:
-            return said
+        if message := self.stuck.message or self._unreachable:
+            return message
         if swings:
             return "; ".join(filter(None, (swings, strange)))
-        return self.gain.said or (f"{strange} or is it a load?" if strange and lasts else "")
+        return self.gain.message or (f"{strange} or is it a load?" if strange and lasts else "")
 
     def _swings(self, error: Array, seconds: float) -> str:
         """Note the errors (n,), so many seconds after the last; return which output swings most."""

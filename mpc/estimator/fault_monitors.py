@@ -66,7 +66,7 @@ class GainMonitor:
         self._last: deque[Array] = deque()
         self._since_s, self._was_new = np.inf, False
         # what each drive (n_u,) does of what it did before, NaN until enough targets were new
-        self.share, self._told = np.full(n, np.nan), np.zeros(n, dtype=bool)
+        self.share, self._reported = np.full(n, np.nan), np.zeros(n, dtype=bool)
 
     def restart(self, y: Array, d: Array) -> None:
         """Begin the filters anew at readings y (n_y,) and d (n_d,); what was found stays."""
@@ -106,18 +106,18 @@ class GainMonitor:
             variance = self._before[2] / self._before[0] ** 2
             known = self._before[1] / self._before[0] * _PRIOR_SD**2 / (_PRIOR_SD**2 + variance)
             self.share = (1.0 + effect / power) / (1.0 + known)
-        self._told = changed & self._changed()
+        self._reported = changed & self._changed()
 
     def _changed(self) -> Mask:
         """Return of each drive (n_u,) whether it does another share."""
         return np.asarray((self.share < _CHANGED) | (self.share > 1.0 / _CHANGED))
 
     @property
-    def said(self) -> str:
+    def message(self) -> str:
         """Which drive does another share, empty where none does."""
-        if not self._told.any():
+        if not self._reported.any():
             return ""
-        drive = int(self._told.argmax())
+        drive = int(self._reported.argmax())
         does = f"{list(self.filters)[drive]} does {self.share[drive]:.0%} of what it did before"
         return f"{does}: has it changed, or is it a load?"
 
@@ -135,12 +135,12 @@ class StuckMonitor:
         self._y = np.full(n, np.nan)
         # of each output since its reading changed: where it was, x, x of the held drive, that drive, w
         self._runs: list[tuple[float, Array, Array, Array, Array] | None] = [None] * n
-        self.said = ""
+        self.message = ""
 
     def note(self, observer: Observer, y: Array, u: Array, d: Array) -> None:
         """Note readings y (n_y,) after drives u (n_u,) and measured disturbances d (n_d,)."""
         model, disturbance = observer.model, observer.disturbance
-        self.said = ""
+        self.message = ""
         for i, name in enumerate(self.outputs):
             run = self._runs[i]
             if y[i] != self._y[i] or run is None:
@@ -155,5 +155,5 @@ class StuckMonitor:
             moved = float(model.output(x)[i]) - begin
             by_drive = float((model.output(x) - model.output(still))[i])
             if min(abs(moved), abs(by_drive)) > SHARE * float(model.spike[i]):
-                self.said = f"{name} is stuck at {y[i]:.4g}: by its drives the model moves by {moved:+.2g}"
+                self.message = f"{name} is stuck at {y[i]:.4g}: by its drives the model moves by {moved:+.2g}"
         self._y = np.where(np.isfinite(y), y, self._y)

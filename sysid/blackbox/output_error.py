@@ -102,10 +102,8 @@ class Solution:
                 J[i - 1, i:] = -filtered[:-i]
             rows.append(np.vstack([X[len(self.shared) :], X[: len(self.shared)], J * is_read, miss]))
         whole, _ = _triangles(rows, na)
-        first_own = len(self.shared)
-        return whole[first_own : first_own + na, first_own : first_own + na], whole[
-            first_own : first_own + na, -1
-        ]
+        of_a = slice(len(self.shared), len(self.shared) + na)
+        return whole[of_a, of_a], whole[of_a, -1]
 
     def filter(self, records: Records, nb: int, delay: int) -> Filter:
         """Return the filter of these numbers."""
@@ -162,9 +160,9 @@ def _triangles(parts: Sequence[Array], na: int) -> tuple[Array, list[Array]]:
     out, and R by part."""
     triangles = [_square_r(rows.T) for rows in parts]
     shared_triangles = [R[na:, na:] for R in triangles]
-    return (
-        shared_triangles[0] if len(shared_triangles) == 1 else _square_r(np.concatenate(shared_triangles))
-    ), triangles
+    one_part = len(shared_triangles) == 1
+    whole = shared_triangles[0] if one_part else _square_r(np.concatenate(shared_triangles))
+    return whole, triangles
 
 
 def _square_r(rows: Array) -> Array:
@@ -297,10 +295,8 @@ def oe_family(
     grid: Grid,
     *,
     poles: Sequence[int] = (1, 2, 3),
-    zeros: Sequence[int] = (
-        1,
-        2,
-    ),  # two alone err by up to 41 % more on the rig's four logs, left out in turn
+    # two alone err by up to 41 % more on the rig's four logs, left out in turn
+    zeros: Sequence[int] = (1, 2),
     delays: Sequence[int] = (1, 2, 3),
     terms: Sequence[tuple[str, ...]] | None = None,
     only: Collection[order_selection.Structure] | None = None,
@@ -321,10 +317,8 @@ def oe_family(
             structure = order_selection.Structure(label, size)
             if only is not None and structure not in only:
                 continue
-            fitted = [
-                search_of_output(record, na, nb, nk) for search_of_output, record in zip(searches, records)
-            ]
-            filters = [search_of_output for search_of_output in fitted if search_of_output is not None]
+            fitted = [search_one(record, na, nb, nk) for search_one, record in zip(searches, records)]
+            filters = [filter_of_output for filter_of_output in fitted if filter_of_output is not None]
             if len(filters) == len(fitted):
                 out[structure] = assemble(grid, filters, products, origin=kind.origin)
     return out
