@@ -18,6 +18,8 @@ from thermogrip.datasets.schema import Log, column
 from thermogrip.sysid.data.signal_roles import moves
 from thermogrip.sysid.models.network import NetworkModel
 from thermogrip.sysid.models.network_spec import (
+    Disturbance,
+    Input,
     Network,
     builtin_networks,
     named_network,
@@ -52,23 +54,30 @@ def in_columns(model: NetworkModel, log: Log) -> NetworkModel:
 
 
 def in_log_units(model: NetworkModel, logs: Sequence[Log]) -> NetworkModel:
-    """Return a network with ``full_scale``, ``range`` and ``step`` of its inputs in the logs' units."""
-    inputs = dict(model.network.inputs)
-    for name, item in inputs.items():
-        columns = [log for log in logs if name in log]
-        unit = str(columns[0][name].attrs.get("units", "1")) if columns else item.unit
-        if unit == item.unit or not {unit, item.unit} <= {*SHARES}:
-            continue
-        largest = max(float(np.nanmax(np.abs(column(log, name)), initial=0.0)) for log in columns)
-        bare = unit == "1" and largest > 1 + 1e-9  # a number of the network's own unit, which is not written
-        network_share, theirs = (1.0, 1.0) if bare else (SHARES[item.unit], SHARES[unit])
-        scaled = {"full_scale": item.full_scale * theirs / network_share, "unit": unit}
-        scaled["range"] = tuple(end * theirs / network_share for end in item.range)
-        scaled["step"] = None if item.step is None else item.step * theirs / network_share
-        inputs[name] = item.model_copy(update=scaled)
-    if all(item is model.network.inputs[name] for name, item in inputs.items()):
-        return model
-    return NetworkModel(model.network.model_copy(update={"inputs": inputs}))
+    """Return a network with ``full_scale``, ``range`` and ``step`` of inputs and disturbances in the logs'
+    units."""
+    tables: dict[str, dict[str, Input | Disturbance]] = {
+        "inputs": dict(model.network.inputs),
+        "disturbances": dict(model.network.disturbances),
+    }
+    changed = False
+    for table in tables.values():
+        for name, item in table.items():
+            columns = [log for log in logs if name in log]
+            unit = str(columns[0][name].attrs.get("units", "1")) if columns else item.unit
+            if unit == item.unit or not {unit, item.unit} <= {*SHARES}:
+                continue
+            largest = max(float(np.nanmax(np.abs(column(log, name)), initial=0.0)) for log in columns)
+            # a number of the network's own unit, which is not written
+            bare = unit == "1" and largest > 1 + 1e-9
+            own, theirs = (1.0, 1.0) if bare else (SHARES[item.unit], SHARES[unit])
+            scaled: dict[str, Any] = {"unit": unit, "full_scale": item.full_scale * theirs / own}
+            if isinstance(item, Input):
+                scaled["range"] = tuple(end * theirs / own for end in item.range)
+                scaled["step"] = None if item.step is None else item.step * theirs / own
+            table[name] = item.model_copy(update=scaled)
+            changed = True
+    return NetworkModel(model.network.model_copy(update=tables)) if changed else model
 
 
 def in_logged_room(model: NetworkModel, logs: Sequence[Log]) -> tuple[NetworkModel, list[str]]:

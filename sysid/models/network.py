@@ -4,12 +4,12 @@ The network is declared in TOML (:mod:`thermogrip.sysid.models.network_spec`).  
 on NumPy rows, CasADi symbols and SIMD vectors: no branch depends on a temperature, an input or a parameter.
 
 **Heat balance.**  Every state x_i is a temperature [degC] of a heat capacity C_i; z is x followed by the
-boundary temperatures (measured ambients, then fixed ones).  Heat flows through
+boundary temperatures (disturbances, then fixed ones).  Heat flows through
 
     conductances   q_ij = G_ij (z_j - z_i) (1 + b |z_j - z_i| / 10 K),    taken from j, given to i
     flows          q_ij = F (z_j - z_i),       given to i only: the water of i moved on with its heat
     radiation      q_ij = k (T_j^4 - T_i^4),   T in kelvin
-    heaters        q_i  = P u
+    heaters        q_i  = P u,                 or P d of what is measured and not moved
     Peltiers       face: a I T_face + R I^2 / 2,    sink: -a I T_sink + R I^2 / 2,    T in kelvin
 
 and C_i dx_i/dt = sum of q.  A sensor is a state too: its time constant is C, a unit flow from its
@@ -102,7 +102,7 @@ class Layout(NamedTuple):
     ]  # (to, from: an index into z, taken from there, switch or -1)
     bent: tuple[int, ...]  # links whose conductance depends on their temperature difference
     radiation: tuple[tuple[int, int], ...]  # (to, from)
-    heaters: tuple[tuple[int, int], ...]  # (state, input)
+    heaters: tuple[tuple[int, int, bool], ...]  # (state, input or index into z, whether it is measured)
     peltiers: tuple[tuple[int, int, int, bool], ...]  # (face, sink, input, whether by a pulse-width driver)
     # of each link the entries (to, to), (to, from), (from, from), (from, to) of the matrix, or -1
     place: tuple[tuple[int, int, int, int], ...]
@@ -203,8 +203,8 @@ def _heat(z: Any, u: Any, c: Any, g: Any, layout: Layout) -> list[Any]:
     for k, (i, j) in enumerate(layout.radiation):
         a, b = z[i] + KELVIN, z[j] + KELVIN
         move(i, j, c[layout.at_radiation + k] * (b * b * b * b - a * a * a * a))
-    for k, (i, by) in enumerate(layout.heaters):
-        q[i] = q[i] + c[layout.at_heater + k] * u[by]
+    for k, (i, by, measured) in enumerate(layout.heaters):
+        q[i] = q[i] + c[layout.at_heater + k] * (z[by] if measured else u[by])
     for k, (face, sink, by, duty) in enumerate(layout.peltiers):
         first = layout.at_peltier + len(PELTIER) * k
         v = u[by] / c[first + 7] + c[first + 3]
@@ -299,6 +299,8 @@ def build_layout(network: Network) -> Layout:
     index = {name: i for i, name in enumerate([*states, *network.disturbances, *network.boundaries])}
     links = _links(network, index)
     places, one = list(network.parameters), len(network.parameters)  # the place of a factor 1
+    full_scale = {name: item.full_scale for name, item in network.inputs.items()}
+    full_scale |= {name: item.full_scale for name, item in network.disturbances.items()}
     groups: dict[str, list[Coefficient]] = {
         "capacity": _capacities(network),
         "fixed": [(1.0, (item.temperature,)) for item in network.boundaries.values()],
@@ -306,7 +308,7 @@ def build_layout(network: Network) -> Layout:
         "off": [(0.0, ()) if link.off is None else (1.0, (link.off,)) for link in links],
         "bend": [(1.0, (link.bend,)) for link in links if link.bend is not None],
         "radiation": [(STEFAN_BOLTZMANN, (r.area, r.emissivity)) for r in network.radiation.values()],
-        "heater": [(1.0 / network.inputs[h.input].full_scale, (h.power,)) for h in network.heaters.values()],
+        "heater": [(1.0 / full_scale[h.input], (h.power,)) for h in network.heaters.values()],
         "peltier": [item for element in network.peltiers.values() for item in _peltier(network, element)],
     }
     begin = dict(zip(groups, np.cumsum([0, *map(len, groups.values())]).tolist()))
@@ -324,7 +326,12 @@ def build_layout(network: Network) -> Layout:
         links=tuple((link.to, link.source, link.both, link.switch) for link in links),
         bent=tuple(k for k, link in enumerate(links) if link.bend is not None),
         radiation=tuple(_receiver(r.between, index, len(states)) for r in network.radiation.values()),
-        heaters=tuple((index[h.node], inputs.index(h.input)) for h in network.heaters.values()),
+        heaters=tuple(
+            (index[h.node], index[h.input], True)
+            if h.input in network.disturbances
+            else (index[h.node], inputs.index(h.input), False)
+            for h in network.heaters.values()
+        ),
         peltiers=tuple(
             (index[e.face], index[e.sink], inputs.index(e.input), e.driver == "duty")
             for e in network.peltiers.values()

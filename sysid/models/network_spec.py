@@ -32,9 +32,9 @@ class Quantity(NamedTuple):
 
 
 class Refers(NamedTuple):
-    """What a name in an element refers to; a place is a node, a disturbance or a boundary."""
+    """What a name in an element refers to; a place is a node, a measured temperature or a boundary."""
 
-    to: Literal["place", "node", "switch", "input"]
+    to: Literal["place", "node", "switch", "input", "heat"]
 
 
 Name = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]*$", max_length=100)]
@@ -60,13 +60,16 @@ class _Table(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, populate_by_name=True)
 
 
+_DriveUnit = Literal["1", "percent", "0_255", "A", "V", "W"]
+
+
 class Input(_Table):
     """What is moved, seen by elements as a share of ``full_scale``; ``switch`` marks a pump or valve.
 
     A driver with a coarse register drops what lies behind a multiple of ``step``.
     """
 
-    unit: Literal["1", "percent", "0_255", "A", "V", "W"]
+    unit: _DriveUnit
     range: tuple[Number, Number]
     switch: bool = False
     step: Positive | None = None
@@ -87,10 +90,22 @@ class Input(_Table):
 
 
 class Disturbance(_Table):
-    """A measured ambient; ``log_sd`` is how far its sensor is off, from log to log."""
+    """What is measured and not moved: a temperature, or of another unit what brings heat, such as a lamp.
 
-    unit: Literal["degC"] = "degC"
+    ``log_sd`` is how far its sensor is off, from log to log; heaters see a share of ``full_scale``, which is
+    1 of its unit where the unit is no share and the file does not say.
+    """
+
+    unit: Literal["degC"] | _DriveUnit = "degC"
     log_sd: NotNegative = 0.0
+    full_scale: Positive = 0.0  # 0 until the validator has set it
+
+    @model_validator(mode="before")
+    @classmethod
+    def _full_scale(cls, content: Any) -> Any:
+        if not isinstance(content, Mapping) or "full_scale" in content:
+            return content
+        return {**content, "full_scale": _SHARES.get(str(content.get("unit")), 1.0)}
 
 
 class Output(_Table):
@@ -161,10 +176,10 @@ class Radiation(_Table):
 
 
 class Heater(_Table):
-    """A resistor; ``power`` at the input's ``full_scale``."""
+    """A resistor, or what else brings heat; ``power`` at the ``full_scale`` of its input or disturbance."""
 
     node: OfNode
-    input: Annotated[Name, Refers("input")]
+    input: Annotated[Name, Refers("heat")]
     power: Annotated[Name, Quantity("W")]
 
 
@@ -353,13 +368,15 @@ def _network_faults(network: Network) -> Iterator[tuple[str, str]]:
 def _reference_faults(
     network: Network, where: str, kind: Refers, names: list[str]
 ) -> Iterator[tuple[str, str]]:
-    outside = [*network.disturbances, *network.boundaries]
+    measured = {name: item.unit for name, item in network.disturbances.items()}
+    outside = [*(name for name, unit in measured.items() if unit == "degC"), *network.boundaries]
     switches = [name for name, item in network.inputs.items() if item.switch]
     candidates = {"place": [*network.nodes, *outside], "node": [*network.nodes], "switch": switches}
     candidates["input"] = [*network.inputs]
+    candidates["heat"] = [*network.inputs, *(name for name, unit in measured.items() if unit != "degC")]
     for name in names:
         if name not in candidates[kind.to]:
-            lacking = "node" if kind.to == "place" else kind.to
+            lacking = {"place": "node", "heat": "input"}.get(kind.to, kind.to)
             yield f"{where}: no {lacking} {name!r}", known_names(name, candidates[kind.to], "there are {}")
     if len(names) == 2 and (names[0] == names[1] or set(names) <= set(outside)):
         yield f"{where}: joins {names[0]} and {names[1]}", "join two places, one of them a node"

@@ -224,14 +224,17 @@ def cut_stretches(plant: PlantData, log: Log, *, gaps: str = "restart") -> list[
         else:
             command[:] = np.trunc(command / step + 1e-9 * np.sign(command)) * step
     rows = replace(rows, after=()) if gaps == "hold" else rows
-    stretches = _stretches(rows, step=plant.dt, steps=steps, smooth=plant.model.smooth)
+    # an ambient's sensor is slow and coarse; what is no temperature, such as a lamp, acts when it changes
+    smooth = [plant.model.smooth if plant.units.get(n, "degC") == "degC" else 0.0 for n in plant.disturbances]
+    stretches = _stretches(rows, step=plant.dt, steps=steps, smooth=smooth)
     return [replace(stretch, time=stretch.time + middle) for stretch in stretches]
 
 
 def _stretches(
-    rows: Rows, *, step: float, steps: Callable[[float], int], smooth: float | None = None
+    rows: Rows, *, step: float, steps: Callable[[float], int], smooth: Sequence[float] = ()
 ) -> Iterator[Stretch]:
-    """Yield stretches of two rows or more on a grid of ``step`` [s], ``steps(length [s])`` each."""
+    """Yield stretches of two rows or more on a grid of ``step`` [s], ``steps(length [s])`` each, the first
+    disturbances smoothed over so many seconds."""
     for begin, end in pairwise([0, *rows.after, rows.time.size]):
         in_stretch, t = slice(begin, end), rows.time[begin:end]
         n = steps(t[-1] - t[0])
@@ -239,10 +242,10 @@ def _stretches(
             continue
         edges = t[0] + step * np.arange(n + 1)
         input_means = held_means(t, rows.u[in_stretch], edges)
-        if smooth is None:
-            disturbance_means = held_means(t, rows.d[in_stretch], edges)
-        else:
-            disturbance_means = _smooth(t, rows.d[in_stretch], edges, smooth)
+        disturbance_means = held_means(t, rows.d[in_stretch], edges)
+        for k, seconds in enumerate(smooth):
+            if seconds > step:
+                disturbance_means[:, k] = _smooth(t, rows.d[in_stretch, k : k + 1], edges, seconds)[:, 0]
         gap = min(float(t[0] - rows.time[begin - 1]), _LONGEST_GAP * step) if begin else 0.0
         yield Stretch(in_stretch, t - t[0], rows.y[in_stretch], input_means, disturbance_means, gap, rows.log)
 

@@ -15,7 +15,7 @@ from thermogrip.datasets.media import printable
 from thermogrip.report.console import Console
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
     from thermogrip.datasets.parallel import Progress
     from thermogrip.datasets.schema import Log
@@ -191,15 +191,24 @@ def identify(
 def _stating(
     found: Identification, paths: Sequence[str], out: Path, dt: float | None, logs: Sequence[Log]
 ) -> str:
-    """Return the command that states what was guessed, to be corrected where the guess is wrong."""
-    words = ["identify", *map(str, paths)]
-    for role in ("input", "output", "disturbance"):
-        names = [signal.name for signal in found.signals if signal.role == role]
-        words += [f"--{role}s", ",".join(names)] if names else []
+    """Return the command that states what was guessed, to be corrected where the guess is wrong; an input
+    that nothing but its course shows may be one that nobody sets, such as a lamp."""
+    named = {r: [s.name for s in found.signals if s.role == r] for r in ("input", "output", "disturbance")}
+    words = ["identify", *map(str, paths), *_stated_roles(named)]
     if dt is None and any(log.attrs.get("clock_doubts") for log in logs):
         step = float(logs[0]["time"].diff("time").median())
         words += ["--dt", f"{step:g}"]
-    return printable(shlex.join([*words, "--out", str(out)]))
+    command = shlex.join([*words, "--out", str(out)])
+    by_course = [s.name for s in found.signals if s.role == "input" and s.guessed and "name" not in s.why]
+    driven = [name for name in named["input"] if name not in by_course]
+    if driven and by_course:
+        measured = {"input": driven, "disturbance": [*named["disturbance"], *by_course]}
+        command += f"  # can you set {', '.join(by_course)}? if not: {shlex.join(_stated_roles(measured))}"
+    return printable(command)
+
+
+def _stated_roles(named: Mapping[str, Sequence[str]]) -> list[str]:
+    return [word for r, names in named.items() if names for word in (f"--{r}s", ",".join(names))]
 
 
 def _read(

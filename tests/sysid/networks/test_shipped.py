@@ -18,7 +18,7 @@ from thermogrip.sysid.validation.free_run import free_run
 
 # rows, seconds between them, rows that an input is held, levels of each input, course of each disturbance
 LOGS = {
-    "room": (1500, 600.0, 24, {"heater": (0, 2000), "solar": (0, 700)}, {"t_outdoor": (8.0, 6.0)}),
+    "room": (1500, 600.0, 24, {"heater": (0, 2000)}, {"solar": (350, 350), "t_outdoor": (8.0, 6.0)}),
     "hotend": (1600, 1.0, 100, {"heater": (10, 70)}, {}),
     "furnace": (2000, 20.0, 60, {"power": (10, 70)}, {}),
     "tank": (1500, 2.0, 75, {"heater": (0, 90), "valve": (0, 1)}, {"t_inlet": (14, 1), "t_ambient": (22, 1)}),
@@ -39,7 +39,8 @@ def plant_and_log(name):
         level[0] = 0.0  # from rest
         signals[input_] = (np.repeat(level, held)[:n].astype(float), plant.units[input_], "input")
     for number, (room, (mean, swing)) in enumerate(courses.items()):
-        signals[room] = (mean + swing * np.sin(time / time[-1] * (9 + 4 * number)), "degC", "disturbance")
+        course = mean + swing * np.sin(time / time[-1] * (9 + 4 * number))
+        signals[room] = (course, plant.units[room], "disturbance")
     cold = dict.fromkeys(levels, 0.0), {room: mean for room, (mean, _) in courses.items()}
     for output, rest in zip(plant.outputs, linearise_plant(plant, inputs=cold[0], disturbances=cold[1]).y):
         signals[output] = (np.full(n, rest), "degC", "output")

@@ -483,31 +483,35 @@ def test_inputs_that_end_at_their_rows_are_moved_by_one_and_nothing_else_is():
 
 def heater(**more: Any) -> Any:
     """A plant of one input and one output, of steps of 2 s."""
-    model = SimpleNamespace(smooth=None, command_steps=more.pop("command_steps", {}))
+    model = SimpleNamespace(smooth=more.pop("smooth", 0.0), command_steps=more.pop("command_steps", {}))
     roles: dict[str, Any] = {
         "inputs": ("q",),
         "outputs": ("t",),
         "disturbances": (),
         "inputs_end_at_row": False,
+        "units": {},
     }
     plant = SimpleNamespace(dt=2.0, model=model, **roles)
-    vars(model)["smooth"] = more.pop("smooth", None)
     vars(plant).update(more)
     return plant
 
 
 @pytest.mark.parametrize(
-    ("smooth", "want"),
+    ("smooth", "unit", "want"),
     [
-        (6.0, [14 / 4, 55 / 6, 139 / 6, 271 / 6, 230 / 4]),  # means of k^2 over 3 s to either side of 1, 3 ..
-        (0.5, [0.5, 6.5, 20.5, 42.5, 72.5]),  # no less than the step
-        (None, [0.5, 6.5, 20.5, 42.5, 72.5]),
+        (
+            6.0,
+            "degC",
+            [14 / 4, 55 / 6, 139 / 6, 271 / 6, 230 / 4],
+        ),  # means of k^2 over 3 s to either side of 1, 3 ..
+        (0.5, "degC", [0.5, 6.5, 20.5, 42.5, 72.5]),  # no less than the step
+        (6.0, "1", [0.5, 6.5, 20.5, 42.5, 72.5]),  # a lamp acts when it changes
     ],
 )
-def test_a_disturbance_is_smoothed_about_the_middle_of_each_step(smooth: Any, want: list[float]):
+def test_a_disturbance_is_smoothed_about_the_middle_of_each_step(smooth: float, unit: str, want: list[float]):
     t = T[:10]
-    log = log_of(t, t + 3.0, room=(t**2, "degC", "disturbance"))
-    (found,) = cut_stretches(heater(disturbances=("room",), smooth=smooth), log)
+    log = log_of(t, t + 3.0, room=(t**2, unit, "disturbance"))
+    (found,) = cut_stretches(heater(disturbances=("room",), smooth=smooth, units={"room": unit}), log)
     np.testing.assert_allclose(found.d[:, 0], want)
 
 
