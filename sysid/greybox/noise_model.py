@@ -112,15 +112,6 @@ class ErrorModel:
         sizes = zip(self.tau, self._together())
         return [(weights @ np.exp(-lag / tau))[:, None, None] * together for tau, together in sizes]
 
-    def in_time(self, n: int) -> Array:
-        """Return the covariance (n, n_y, n, n_y) of n bins in a row."""
-        lags = np.abs(np.subtract.outer(np.arange(n), np.arange(n)))
-        terms = [(np.eye(n), np.diag(np.square(self.white)))]
-        terms += [(np.exp(-lags / tau), together) for tau, together in zip(self.tau, self._together())]
-        return np.asarray(
-            sum(np.einsum("st,jk->sjtk", in_time, between_outputs) for in_time, between_outputs in terms)
-        )
-
     def _together(self) -> list[Array]:
         """Return the covariance (n_y, n_y) of the outputs by slow error."""
         one = np.eye(len(self.white), dtype=bool)

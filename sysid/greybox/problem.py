@@ -167,10 +167,6 @@ class Problem:
             self._starts.linearised = self.start(z)
         return self._starts.linearised
 
-    def warm_up(self, at: int) -> float:
-        """Return the seconds at the beginning of a log from which its start is estimated."""
-        return start_seconds(self.model, self.logs[at][0], self.plant.dt)
-
     @property
     def _free_specs(self) -> list[Parameter]:
         specs = list(self.model.specs.values())

@@ -339,25 +339,11 @@ class Kernel:
         if renew is not None:
             moved[:n] = renew
         arrays = [np.ascontiguousarray(a, dtype=float) for a in (x0, u, d, p)]
-        y, x_end, calls, _ = self._laid_out(arrays, moved, h, pieces)
-        if len(calls) == 1 or n < _WORTH_THREADS or _cores() == 1:
-            for call in calls:
-                self._rollout(*call)
-        else:
-            list(_threads().map(lambda call: self._rollout(*call), calls))
-        return y, x_end
-
-    def _laid_out(
-        self, arrays: Sequence[Array], moved: NDArray[np.uint8], h: float, pieces: int = 1
-    ) -> tuple[Array, Array, list[tuple[float, ...]], NDArray[np.int64]]:
-        """Return where outputs and last states of a batch of x0, u, d and p will be, the arguments of the
-        rollout of each block, and what these point to besides."""
-        batch, n = len(arrays[0]), arrays[1].shape[1]
         n_block = -(-batch // WIDTH)
-        entries = (arrays[0][0].size, *(a[0].size if len(a) > 1 else 0 for a in arrays[1:]))
+        entries = (x0[0].size, *(a[0].size if len(a) > 1 else 0 for a in arrays[1:]))
         begin = _entries(batch, entries if batch > 1 else (0,) * 4)
         y = np.empty((self._n_y, n + 1, n_block * WIDTH))
-        x_end = np.empty((arrays[0].shape[1], n_block * WIDTH))
+        x_end = np.empty((n_x, n_block * WIDTH))
         *addresses, to_y, to_end, to_moved, to_begin = (
             a.ctypes.data for a in (*arrays, y, x_end, moved, begin)
         )
@@ -365,29 +351,12 @@ class Kernel:
             (to_begin + k * begin[0].nbytes, to_y + k * BYTES, to_end + k * BYTES) for k in range(n_block)
         ]
         calls = [(*addresses, *places, n, n_block * WIDTH, pieces, h, to_moved) for places in into]
-        return y.transpose(2, 1, 0)[:batch], x_end.T[:batch], calls, begin
-
-
-class Batch:
-    """A batch of fixed size, no switch moved: write ``x0`` (B, n_x), ``u`` (B, n, n_u) and ``d`` (B or 1, n,
-    n_d), then :meth:`run`; ``y`` (B, n + 1, n_y) and ``x_end`` (B, n_x) stand until the next run."""
-
-    def __init__(
-        self, kernel: Kernel, *, batch: int, n: int, h: float, p: Array | None = None, same_d: bool = True
-    ) -> None:
-        n_x, n_u, n_d, n_p = kernel.equations.sizes
-        self.x0, self.u = np.zeros((batch, n_x)), np.zeros((batch, n, n_u))
-        self.d = np.zeros((1 if same_d else batch, n, n_d))
-        moved = np.zeros(n + 1, dtype=np.uint8)
-        moved[n] = 1  # ends the loop
-        arrays = [self.x0, self.u, self.d, np.zeros((1, n_p)) if p is None else np.ascontiguousarray(p)]
-        self.y, self.x_end, self._calls, begin = kernel._laid_out(arrays, moved, h)
-        self._kernel, self._kept = kernel, (arrays, moved, begin)  # what the calls point to
-
-    def run(self) -> None:
-        """Simulate."""
-        for call in self._calls:
-            self._kernel._rollout(*call)
+        if len(calls) == 1 or n < _WORTH_THREADS or _cores() == 1:
+            for call in calls:
+                self._rollout(*call)
+        else:
+            list(_threads().map(lambda call: self._rollout(*call), calls))
+        return y.transpose(2, 1, 0)[:batch], x_end.T[:batch]
 
 
 @lru_cache(maxsize=256)

@@ -45,7 +45,7 @@ References
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -57,7 +57,14 @@ from numpy.typing import ArrayLike
 from thermogrip.datasets.arrays import Array, Run, Values
 from thermogrip.datasets.errors import UserError
 from thermogrip.sysid.models.model import SMOOTH, Described, FreeRuns, Sizes
-from thermogrip.sysid.models.network_spec import Network, Pipe, named_network, network_from_dict
+from thermogrip.sysid.models.network_spec import (
+    Heater,
+    Network,
+    Peltier,
+    Pipe,
+    named_network,
+    network_from_dict,
+)
 
 if TYPE_CHECKING:
     from thermogrip.sysid.models.jit_rollout import Kernel
@@ -66,7 +73,7 @@ GAMMA = 0.2928932188134524  # 1 - 1/sqrt(2)
 KELVIN = 273.15
 DROOP_SPAN = 50.0  # K between face and sink to which the droop refers
 
-#: Coefficients of one Peltier element, in this order.
+# coefficients of one Peltier element, in this order
 PELTIER = (
     *("seebeck", "resistance", "current", "offset", "heating_gain", "cooling_gain", "droop", "full"),
     *("dead_zone", "seebeck_slope", "resistance_slope"),
@@ -75,198 +82,21 @@ REFERENCE = 25.0  # degC at which a Peltier element has its nominal numbers
 BEND_SPAN = 10.0  # K to which the bend of a conductance refers
 
 
-class Monomial(NamedTuple):
-    """``scale * p[left] * p[right]``, where index n_p means 1."""
+class Coefficient(NamedTuple):
+    """A number times at most two parameters, by their places in p."""
 
     scale: float
-    left: int
-    right: int
+    places: tuple[int, ...] = ()
+
+    def of(self, p: Values) -> Any:
+        """Return its value at the parameters p."""
+        value: Any = self.scale
+        for place in self.places:
+            value = value * p[place]
+        return value
 
 
-class Layout(NamedTuple):
-    """The structure of a network as integers: ``at_*`` is where each part of the coefficients begins."""
-
-    n_x: int
-    n_d: int
-    n_fixed: int
-    at_fixed: int
-    at_link: int
-    at_off: int
-    at_bend: int
-    at_radiation: int
-    at_heater: int
-    at_peltier: int
-    coefficients: tuple[Monomial, ...]
-    links: tuple[
-        tuple[int, int, bool, int], ...
-    ]  # (to, from: an index into z, taken from there, switch or -1)
-    bent: tuple[int, ...]  # links whose conductance depends on their temperature difference
-    radiation: tuple[tuple[int, int], ...]  # (to, from)
-    heaters: tuple[tuple[int, int, bool], ...]  # (state, input or index into z, whether it is measured)
-    peltiers: tuple[tuple[int, int, int, bool], ...]  # (face, sink, input, whether by a pulse-width driver)
-    # of each link the entries (to, to), (to, from), (from, from), (from, to) of the matrix, or -1
-    place: tuple[tuple[int, int, int, int], ...]
-    diagonal: tuple[int, ...]  # (n_x,) entry of each pivot
-    order: tuple[int, ...]  # (n_x,) elimination order
-    # pivot by pivot the entries below the diagonal: (entry, row, updates), each w[to] -= entry w[by]
-    lower: tuple[tuple[tuple[int, int, tuple[tuple[int, int], ...]], ...], ...]
-    upper: tuple[tuple[tuple[int, int], ...], ...]  # pivot by pivot: (entry, column) right of the diagonal
-    n_entry: int
-    output: tuple[int, ...]  # (n_y,) state that each output reads
-
-
-@dataclass(frozen=True)
-class ThermalSteps:
-    """The three parts of a step; see :class:`thermogrip.sysid.models.model.Equations`."""
-
-    layout: Layout
-    n_u: int  # number of inputs
-    n_p: int  # of parameters
-
-    @property
-    def sizes(self) -> Sizes:
-        """Numbers of states, inputs, disturbances and parameters."""
-        return Sizes(self.layout.n_x, self.n_u, self.layout.n_d, self.n_p)
-
-    def prepare(self, p: Values) -> list[Any]:
-        """Return the coefficients: products of at most two parameters and a number."""
-        c: list[Any] = []
-        for monomial in self.layout.coefficients:
-            value = monomial.scale + 0.0 * p[0]
-            if monomial.left < self.n_p:
-                value = value * p[monomial.left]
-            if monomial.right < self.n_p:
-                value = value * p[monomial.right]
-            c.append(value)
-        return c
-
-    def renew(self, u: Values, c: Values, h: Any) -> list[Any]:
-        """Return the conductances, then the factors of 1 - g h A."""
-        g = _conductances(u, c, self.layout)
-        return [*g, *_lu_factors(c, g, GAMMA * h, self.layout)]
-
-    def advance(self, x: Values, u: Values, d: Values, c: Values, kept: Values, h: Any) -> list[Any]:
-        """Return the state one step of ``h`` [s] on."""
-        layout, n_link = self.layout, len(self.layout.links)
-        g = kept[:n_link]
-        w = kept[n_link:]
-        outside = self._outside(d, c)
-        q = _heat([*x, *outside], u, c, g, layout)
-        k = _solved(w, layout, [a / b for a, b in zip(q, c)])
-        q = _heat([*(a + h * b for a, b in zip(x, k)), *outside], u, c, g, layout)
-        k2 = _solved(w, layout, [a / b - 2.0 * e for a, b, e in zip(q, c, k)])
-        return [a + h * (1.5 * e + 0.5 * b) for a, e, b in zip(x, k, k2)]
-
-    def read(self, x: Values, c: Values) -> list[Any]:
-        """Return what the sensors read [degC]."""
-        return [x[i] for i in self.layout.output]
-
-    def heat(self, x: Values, u: Values, d: Values, p: Values) -> list[Any]:
-        """Return the heat that each state receives [W] (sensors: [K])."""
-        c = self.prepare(p)
-        return _heat([*x, *self._outside(d, c)], u, c, _conductances(u, c, self.layout), self.layout)
-
-    def _outside(self, d: Values, c: Values) -> list[Any]:
-        """Return the boundary temperatures: measured, then fixed."""
-        first_fixed, n_d = self.layout.at_fixed, self.layout.n_d
-        return [*(d[i] for i in range(n_d)), *c[first_fixed : first_fixed + self.layout.n_fixed]]
-
-
-def _conductances(u: Any, c: Any, layout: Layout) -> list[Any]:
-    """Return the conductance [W/K] of every link at these switch positions."""
-    g = []
-    for k, (_, _, _, switch) in enumerate(layout.links):
-        value = c[layout.at_link + k]
-        if switch >= 0:
-            off = c[layout.at_off + k]
-            value = value * (off + (1.0 - off) * u[switch])
-        g.append(value)
-    return g
-
-
-def _heat(z: Any, u: Any, c: Any, g: Any, layout: Layout) -> list[Any]:
-    """Return the heat that each state receives [W], at temperatures z [degC]."""
-    n = layout.n_x
-    q = [0.0 * z[i] for i in range(n)]
-
-    def move(i: int, j: int, flow: Any, both: bool = True) -> None:
-        q[i] = q[i] + flow
-        if both and j < n:
-            q[j] = q[j] - flow
-
-    for (i, j, both, _), conductance in zip(layout.links, g):
-        move(i, j, conductance * (z[j] - z[i]), both)
-    for m, k in enumerate(layout.bent):
-        i, j, both, _ = layout.links[k]
-        rise = z[j] - z[i]
-        move(i, j, g[k] * c[layout.at_bend + m] / BEND_SPAN * rise * abs(rise), both)
-    for k, (i, j) in enumerate(layout.radiation):
-        a, b = z[i] + KELVIN, z[j] + KELVIN
-        move(i, j, c[layout.at_radiation + k] * (b * b * b * b - a * a * a * a))
-    for k, (i, by, measured) in enumerate(layout.heaters):
-        q[i] = q[i] + c[layout.at_heater + k] * (z[by] if measured else u[by])
-    for k, (face, sink, by, duty) in enumerate(layout.peltiers):
-        first = layout.at_peltier + len(PELTIER) * k
-        v = u[by] / c[first + 7] + c[first + 3]
-        v = v - 0.5 * (abs(v + c[first + 8]) - abs(v - c[first + 8]))
-        size = abs(v)
-        up, down = c[first + 4] * 0.5 * (v + size), c[first + 5] * 0.5 * (v - size)
-        droop = c[first + 6] / DROOP_SPAN * (z[face] - z[sink])
-        if duty:
-            on = c[first + 2] * (1.0 - droop)
-            current, square = up * on, up * on * on
-        else:
-            current = c[first + 2] * ((up + down) - droop * (up - down))
-            square = current * current
-        warm = 0.5 * (z[face] + z[sink]) - REFERENCE
-        pumped = c[first] * (1.0 + c[first + 9] * warm) * current
-        joule = 0.5 * c[first + 1] * (1.0 + c[first + 10] * warm) * square
-        q[face] = q[face] + pumped * (z[face] + KELVIN) + joule
-        q[sink] = q[sink] - pumped * (z[sink] + KELVIN) + joule
-    return q
-
-
-def _lu_factors(c: Any, g: Any, gh: Any, layout: Layout) -> list[Any]:
-    """Return the LU factors of 1 - gh A; pivots are inverted."""
-    w = [0.0 * c[0] for _ in range(layout.n_entry)]
-    for i in layout.diagonal:
-        w[i] = 1.0 + 0.0 * c[0]
-    for (i, j, _, _), conductance, (to_to, to_from, from_from, from_to) in zip(layout.links, g, layout.place):
-        share = gh * conductance / c[i]
-        w[to_to] = w[to_to] + share
-        if to_from >= 0:
-            w[to_from] = w[to_from] - share
-        if from_from >= 0:
-            share = gh * conductance / c[j]
-            w[from_from] = w[from_from] + share
-            w[from_to] = w[from_to] - share
-    for pivot, below in zip(layout.order, layout.lower):
-        diagonal = layout.diagonal[pivot]
-        w[diagonal] = 1.0 / w[diagonal]
-        for entry, _, updates in below:
-            w[entry] = w[entry] * w[diagonal]
-            for to, by in updates:
-                w[to] = w[to] - w[entry] * w[by]
-    return w
-
-
-def _solved(w: Any, layout: Layout, q: list[Any]) -> list[Any]:
-    """Return the solution of (1 - gh A) k = q, in the place of ``q``."""
-    for pivot, below in zip(layout.order, layout.lower):
-        for entry, row, _ in below:
-            q[row] = q[row] - w[entry] * q[pivot]
-    for pivot, right in zip(reversed(layout.order), reversed(layout.upper)):
-        value = q[pivot]
-        for entry, column in right:
-            value = value - w[entry] * q[column]
-        q[pivot] = value * w[layout.diagonal[pivot]]
-    return q
-
-
-STEFAN_BOLTZMANN = 5.670374419e-8  # W m^-2 K^-4
-
-Coefficient = tuple[float, tuple[str, ...]]  # a number times at most two parameters
-_ONE: Coefficient = (1.0, ())
+_NONE, _ONE = Coefficient(0.0), Coefficient(1.0)
 
 
 class _Link(NamedTuple):
@@ -276,9 +106,209 @@ class _Link(NamedTuple):
     source: int
     value: Coefficient
     both: bool
-    switch: int = -1
-    off: str | None = None
-    bend: str | None = None
+    switch: int = -1  # an input, or -1
+    off: Coefficient = _NONE  # the share that is left with the switch off
+    bend: Coefficient | None = None
+
+
+class _Exchange(NamedTuple):
+    """Radiation to a state from a place."""
+
+    to: int
+    source: int
+    value: Coefficient
+
+
+class _Heater(NamedTuple):
+    state: int
+    source: int  # an input, or an index into z of what is measured
+    measured: bool
+    power: Coefficient  # of one unit of the source
+
+
+class _Peltier(NamedTuple):
+    face: int
+    sink: int
+    input: int
+    duty: bool  # whether by a pulse-width driver
+    values: tuple[Coefficient, ...]  # in the order of PELTIER
+
+
+class _Values(NamedTuple):
+    """What depends on the parameters alone: by element, in the order of :class:`ThermalSteps`."""
+
+    capacity: list[Any]
+    fixed: list[Any]
+    link: list[Any]
+    off: list[Any]
+    bend: list[Any]
+    radiation: list[Any]
+    heater: list[Any]
+    peltier: list[dict[str, Any]]
+
+
+class _Pivot(NamedTuple):
+    """One step of an elimination."""
+
+    state: int
+    inverse: Any  # of the pivot
+    below: dict[int, Any]  # by row: what was taken of the pivot's
+    right: dict[int, Any]  # by column: the pivot's row
+
+
+@dataclass(frozen=True)
+class ThermalSteps:
+    """The three parts of a step; see :class:`thermogrip.sysid.models.model.Equations`.  Places are numbers
+    and no parameter has a value, so that networks of one structure share what is compiled."""
+
+    sizes: Sizes
+    capacities: tuple[Coefficient, ...]  # by state
+    fixed: tuple[Coefficient, ...]  # temperatures of the boundaries
+    links: tuple[_Link, ...]
+    radiation: tuple[_Exchange, ...]
+    heaters: tuple[_Heater, ...]
+    peltiers: tuple[_Peltier, ...]
+    output: tuple[int, ...]  # (n_y,) state that each output reads
+
+    def prepare(self, p: Values) -> _Values:
+        """Return the coefficients."""
+        return _Values(
+            capacity=[item.of(p) for item in self.capacities],
+            fixed=[item.of(p) for item in self.fixed],
+            link=[link.value.of(p) for link in self.links],
+            off=[link.off.of(p) for link in self.links],
+            bend=[None if link.bend is None else link.bend.of(p) for link in self.links],
+            radiation=[item.value.of(p) for item in self.radiation],
+            heater=[item.power.of(p) for item in self.heaters],
+            peltier=[dict(zip(PELTIER, (v.of(p) for v in item.values))) for item in self.peltiers],
+        )
+
+    def renew(self, u: Values, c: _Values, h: Any) -> tuple[list[Any], list[_Pivot]]:
+        """Return the conductances, and the factors of 1 - g h A."""
+        g = self._conductances(u, c)
+        return g, self._factors(c, g, GAMMA * h)
+
+    def advance(
+        self, x: Values, u: Values, d: Values, c: _Values, kept: tuple[list[Any], list[_Pivot]], h: Any
+    ) -> list[Any]:
+        """Return the state one step of ``h`` [s] on."""
+        g, factors = kept
+        outside = [*d, *c.fixed]
+        q = self._flows([*x, *outside], u, c, g)
+        k = _solved(factors, [a / b for a, b in zip(q, c.capacity)])
+        q = self._flows([*(a + h * b for a, b in zip(x, k)), *outside], u, c, g)
+        k2 = _solved(factors, [a / b - 2.0 * e for a, b, e in zip(q, c.capacity, k)])
+        return [a + h * (1.5 * e + 0.5 * b) for a, e, b in zip(x, k, k2)]
+
+    def read(self, x: Values, c: Any) -> list[Any]:
+        """Return what the sensors read [degC]."""
+        return [x[i] for i in self.output]
+
+    def heat(self, x: Values, u: Values, d: Values, p: Values) -> list[Any]:
+        """Return the heat that each state receives [W] (sensors: [K])."""
+        c = self.prepare(p)
+        return self._flows([*x, *d, *c.fixed], u, c, self._conductances(u, c))
+
+    def _conductances(self, u: Values, c: _Values) -> list[Any]:
+        """Return the conductance [W/K] of every link at these switch positions."""
+        return [
+            value if link.switch < 0 else value * (off + (1.0 - off) * u[link.switch])
+            for link, value, off in zip(self.links, c.link, c.off)
+        ]
+
+    def _flows(self, z: Values, u: Values, c: _Values, g: Values) -> list[Any]:
+        """Return the heat that each state receives [W], at temperatures z [degC]."""
+        n = self.sizes.n_x
+        q = [0.0 * z[i] for i in range(n)]
+
+        def move(i: int, j: int, flow: Any, both: bool = True) -> None:
+            q[i] = q[i] + flow
+            if both and j < n:
+                q[j] = q[j] - flow
+
+        for link, conductance in zip(self.links, g):
+            move(link.to, link.source, conductance * (z[link.source] - z[link.to]), link.both)
+        for link, conductance, bend in zip(self.links, g, c.bend):
+            if bend is not None:
+                rise = z[link.source] - z[link.to]
+                move(link.to, link.source, conductance * bend / BEND_SPAN * rise * abs(rise), link.both)
+        for (i, j, _), factor in zip(self.radiation, c.radiation):
+            a, b = z[i] + KELVIN, z[j] + KELVIN
+            move(i, j, factor * (b * b * b * b - a * a * a * a))
+        for (i, source, measured, _), power in zip(self.heaters, c.heater):
+            q[i] = q[i] + power * (z[source] if measured else u[source])
+        for (face, sink, by, duty, _), element in zip(self.peltiers, c.peltier):
+            at_face, at_sink = _peltier_heat(element, u[by], z[face], z[sink], duty)
+            q[face] = q[face] + at_face
+            q[sink] = q[sink] + at_sink
+        return q
+
+    def _factors(self, c: _Values, g: Values, gh: Any) -> list[_Pivot]:
+        """Return the LU factors of 1 - gh A, by rows of what is not 0."""
+        rows: list[dict[int, Any]] = [{i: 1.0} for i in range(self.sizes.n_x)]
+
+        def add(row: int, column: int, value: Any) -> None:
+            rows[row][column] = rows[row][column] + value if column in rows[row] else value
+
+        for link, conductance in zip(self.links, g):
+            i, j = link.to, link.source
+            share = gh * conductance / c.capacity[i]
+            add(i, i, share)
+            if j < len(rows):
+                add(i, j, -share)
+                if link.both:
+                    share = gh * conductance / c.capacity[j]
+                    add(j, j, share)
+                    add(j, i, -share)
+        factors, remaining = [], set(range(len(rows)))
+        while remaining:
+            # the state with the fewest neighbours first, so that little is filled in
+            neighbours = {i: sum(j in rows[i] or i in rows[j] for j in remaining) for i in remaining}
+            pivot = min(remaining, key=lambda i: (neighbours[i], i))
+            remaining.remove(pivot)
+            inverse = 1.0 / rows[pivot][pivot]
+            right = {column: value for column, value in rows[pivot].items() if column in remaining}
+            below = {row: rows[row][pivot] * inverse for row in sorted(remaining) if pivot in rows[row]}
+            for row, share in below.items():
+                for column, value in right.items():
+                    add(row, column, -(share * value))
+            factors.append(_Pivot(pivot, inverse, below, right))
+        return factors
+
+
+def _peltier_heat(element: dict[str, Any], u: Any, t_face: Any, t_sink: Any, duty: bool) -> tuple[Any, Any]:
+    """Return the heat that face and sink of an element receive [W]."""
+    v, dead = u / element["full"] + element["offset"], element["dead_zone"]
+    v = v - 0.5 * (abs(v + dead) - abs(v - dead))
+    size = abs(v)
+    up, down = element["heating_gain"] * 0.5 * (v + size), element["cooling_gain"] * 0.5 * (v - size)
+    droop = element["droop"] / DROOP_SPAN * (t_face - t_sink)
+    if duty:
+        on = element["current"] * (1.0 - droop)
+        current, square = up * on, up * on * on
+    else:
+        current = element["current"] * ((up + down) - droop * (up - down))
+        square = current * current
+    warm = 0.5 * (t_face + t_sink) - REFERENCE
+    pumped = element["seebeck"] * (1.0 + element["seebeck_slope"] * warm) * current
+    joule = 0.5 * element["resistance"] * (1.0 + element["resistance_slope"] * warm) * square
+    return pumped * (t_face + KELVIN) + joule, joule - pumped * (t_sink + KELVIN)
+
+
+def _solved(factors: list[_Pivot], q: list[Any]) -> list[Any]:
+    """Return the solution of (1 - gh A) k = q, in the place of ``q``."""
+    for pivot in factors:
+        for row, share in pivot.below.items():
+            q[row] = q[row] - share * q[pivot.state]
+    for pivot in reversed(factors):
+        value = q[pivot.state]
+        for column, entry in pivot.right.items():
+            value = value - entry * q[column]
+        q[pivot.state] = value * pivot.inverse
+    return q
+
+
+STEFAN_BOLTZMANN = 5.670374419e-8  # W m^-2 K^-4
 
 
 def state_names(network: Network) -> tuple[str, ...]:
@@ -293,195 +323,117 @@ def state_names(network: Network) -> tuple[str, ...]:
     return (*network.nodes, *cells, *sensors)
 
 
-def build_layout(network: Network) -> Layout:
-    """Return the layout of a checked network."""
-    states = state_names(network)
-    index = {name: i for i, name in enumerate([*states, *network.disturbances, *network.boundaries])}
-    links = _links(network, index)
-    places, one = list(network.parameters), len(network.parameters)  # the place of a factor 1
-    full_scale = {name: item.full_scale for name, item in network.inputs.items()}
-    full_scale |= {name: item.full_scale for name, item in network.disturbances.items()}
-    groups: dict[str, list[Coefficient]] = {
-        "capacity": _capacities(network),
-        "fixed": [(1.0, (item.temperature,)) for item in network.boundaries.values()],
-        "link": [link.value for link in links],
-        "off": [(0.0, ()) if link.off is None else (1.0, (link.off,)) for link in links],
-        "bend": [(1.0, (link.bend,)) for link in links if link.bend is not None],
-        "radiation": [(STEFAN_BOLTZMANN, (r.area, r.emissivity)) for r in network.radiation.values()],
-        "heater": [(1.0 / full_scale[h.input], (h.power,)) for h in network.heaters.values()],
-        "peltier": [item for element in network.peltiers.values() for item in _peltier(network, element)],
-    }
-    begin = dict(zip(groups, np.cumsum([0, *map(len, groups.values())]).tolist()))
-    inputs = list(network.inputs)
-    return Layout(
-        n_x=len(states),
-        n_d=len(network.disturbances),
-        n_fixed=len(network.boundaries),
-        **{f"at_{name}": position for name, position in begin.items() if name != "capacity"},
-        coefficients=tuple(
-            Monomial(scale, *[*map(places.index, names), one, one][:2])
-            for group in groups.values()
-            for scale, names in group
+class _Places:
+    """Where the names of a network stand in z, u and p."""
+
+    def __init__(self, network: Network) -> None:
+        states = state_names(network)
+        self.n_x = len(states)
+        self.z = {name: i for i, name in enumerate([*states, *network.disturbances, *network.boundaries])}
+        self.u = {name: i for i, name in enumerate(network.inputs)}
+        self._p = list(network.parameters)
+
+    def coefficient(self, *names: str, scale: float = 1.0) -> Coefficient:
+        return Coefficient(scale, tuple(self._p.index(name) for name in names))
+
+    def share(self, off: str | None) -> Coefficient:
+        return _NONE if off is None else self.coefficient(off)
+
+    def switch(self, name: str | None) -> int:
+        return -1 if name is None else self.u[name]
+
+    def receiver(self, between: list[str]) -> tuple[int, int]:
+        """Return (to, from) such that the receiver is a state."""
+        a, b = (self.z[name] for name in between)
+        return (a, b) if a < self.n_x else (b, a)
+
+
+def thermal_steps(network: Network) -> ThermalSteps:
+    """Return the equations of a checked network."""
+    at = _Places(network)
+    return ThermalSteps(
+        sizes=Sizes(at.n_x, len(network.inputs), len(network.disturbances), len(network.parameters)),
+        capacities=tuple(_capacities(network, at)),
+        fixed=tuple(at.coefficient(item.temperature) for item in network.boundaries.values()),
+        links=tuple(_links(network, at)),
+        radiation=tuple(
+            _Exchange(*at.receiver(r.between), at.coefficient(r.area, r.emissivity, scale=STEFAN_BOLTZMANN))
+            for r in network.radiation.values()
         ),
-        links=tuple((link.to, link.source, link.both, link.switch) for link in links),
-        bent=tuple(k for k, link in enumerate(links) if link.bend is not None),
-        radiation=tuple(_receiver(r.between, index, len(states)) for r in network.radiation.values()),
-        heaters=tuple(
-            (index[h.node], index[h.input], True)
-            if h.input in network.disturbances
-            else (index[h.node], inputs.index(h.input), False)
-            for h in network.heaters.values()
-        ),
-        peltiers=tuple(
-            (index[e.face], index[e.sink], inputs.index(e.input), e.driver == "duty")
-            for e in network.peltiers.values()
-        ),
-        **elimination(len(states), [(link.to, link.source, link.both) for link in links]),
+        heaters=tuple(_heater(network, heater, at) for heater in network.heaters.values()),
+        peltiers=tuple(_peltier(network, element, at) for element in network.peltiers.values()),
         output=tuple(
-            index[o.node if o.lag is None else f"{name}.sensor"] for name, o in network.outputs.items()
+            at.z[o.node if o.lag is None else f"{name}.sensor"] for name, o in network.outputs.items()
         ),
     )
 
 
-def _capacities(network: Network) -> list[Coefficient]:
-    out: list[Coefficient] = [(1.0, (node.capacity,)) for node in network.nodes.values()]
+def _capacities(network: Network, at: _Places) -> Iterator[Coefficient]:
+    """Yield the capacity of each state in order."""
+    for node in network.nodes.values():
+        yield at.coefficient(node.capacity)
     for pipe in network.pipes.values():
         for _ in range(pipe.cells):
-            out.append((1.0 / pipe.cells, (pipe.flow, pipe.delay)))
+            yield at.coefficient(pipe.flow, pipe.delay, scale=1.0 / pipe.cells)
             if pipe.wall_capacity is not None:
-                out.append((1.0 / pipe.cells, (pipe.wall_capacity,)))
-    out += [(1.0, (output.lag,)) for output in network.outputs.values() if output.lag is not None]
-    return out
+                yield at.coefficient(pipe.wall_capacity, scale=1.0 / pipe.cells)
+    for output in network.outputs.values():
+        if output.lag is not None:
+            yield at.coefficient(output.lag)
 
 
-def _links(network: Network, index: Mapping[str, int]) -> list[_Link]:
-    links = list[_Link]()
-    n_x = len(state_names(network))
-    inputs = list(network.inputs)
+def _links(network: Network, at: _Places) -> Iterator[_Link]:
     for link in network.links.values():
-        to, source = _receiver(link.between, index, n_x)
-        switch = -1 if link.switch is None else inputs.index(link.switch)
-        value = (1.0, (link.conductance,))
-        links.append(_Link(to, source, value, both=True, switch=switch, off=link.off, bend=link.bend))
+        bend = None if link.bend is None else at.coefficient(link.bend)
+        value, switch = at.coefficient(link.conductance), at.switch(link.switch)
+        yield _Link(*at.receiver(link.between), value, True, switch, at.share(link.off), bend)
     for element in network.peltiers.values():
         if element.conductance is not None:
-            face, sink = index[element.face], index[element.sink]
-            links.append(_Link(face, sink, (1.0, (element.conductance,)), both=True))
+            yield _Link(at.z[element.face], at.z[element.sink], at.coefficient(element.conductance), True)
     for name, pipe in network.pipes.items():
-        _pipe(links, name, pipe, index, -1 if pipe.switch is None else inputs.index(pipe.switch))
+        yield from _pipe(name, pipe, at)
     for name, output in network.outputs.items():
         if output.lag is not None:
-            links.append(_Link(index[f"{name}.sensor"], index[output.node], _ONE, both=False))
-    return links
+            yield _Link(at.z[f"{name}.sensor"], at.z[output.node], _ONE, both=False)
 
 
-def _pipe(links: list[_Link], name: str, pipe: Pipe, index: Mapping[str, int], switch: int) -> None:
-    """Add the flow through the cells and out of them, and what each cell exchanges with wall and
+def _pipe(name: str, pipe: Pipe, at: _Places) -> Iterator[_Link]:
+    """Yield the flow through the cells and out of them, and what each cell exchanges with wall and
     surroundings."""
-    upstream, share = index[pipe.source], 1.0 / pipe.cells
+    upstream, share, switch = at.z[pipe.source], 1.0 / pipe.cells, at.switch(pipe.switch)
+    flow, off = at.coefficient(pipe.flow), at.share(pipe.off)
     for k in range(1, pipe.cells + 1):
-        water = outside = index[f"{name}.{k}"]
-        links.append(_Link(water, upstream, (1.0, (pipe.flow,)), both=False, switch=switch, off=pipe.off))
+        water = outside = at.z[f"{name}.{k}"]
+        yield _Link(water, upstream, flow, False, switch, off)
         if pipe.film is not None:
-            outside = index[f"{name}.{k}.wall"]
+            outside = at.z[f"{name}.{k}.wall"]
             film_switch = -1 if pipe.film_off is None else switch
-            links.append(
-                _Link(water, outside, (share, (pipe.film,)), both=True, switch=film_switch, off=pipe.film_off)
-            )
+            film = at.coefficient(pipe.film, scale=share)
+            yield _Link(water, outside, film, True, film_switch, at.share(pipe.film_off))
         if pipe.loss is not None and pipe.surroundings is not None:
-            links.append(_Link(outside, index[pipe.surroundings], (share, (pipe.loss,)), both=True))
+            yield _Link(outside, at.z[pipe.surroundings], at.coefficient(pipe.loss, scale=share), True)
         upstream = water
-    target = index[pipe.target]
-    links.append(_Link(target, upstream, (1.0, (pipe.flow,)), both=False, switch=switch, off=pipe.off))
+    yield _Link(at.z[pipe.target], upstream, flow, False, switch, off)
 
 
-def _peltier(network: Network, element: Any) -> list[Coefficient]:
-    """Return the coefficients of one element in the order of ``PELTIER``."""
-    out: list[Coefficient] = []
+def _heater(network: Network, heater: Heater, at: _Places) -> _Heater:
+    measured = heater.input in network.disturbances
+    source = (network.disturbances if measured else network.inputs)[heater.input]
+    power = at.coefficient(heater.power, scale=1.0 / source.full_scale)
+    return _Heater(at.z[heater.node], (at.z if measured else at.u)[heater.input], measured, power)
+
+
+def _peltier(network: Network, element: Peltier, at: _Places) -> _Peltier:
+    values = []
     for name in PELTIER:
         if name == "full":
-            out.append((network.inputs[element.input].full_scale, ()))
+            values.append(Coefficient(network.inputs[element.input].full_scale))
         elif (parameter := getattr(element, name)) is None:
-            out.append((1.0 if name.endswith("gain") else 0.0, ()))
+            values.append(_ONE if name.endswith("gain") else _NONE)
         else:
-            out.append((1.0, (parameter,)))
-    return out
-
-
-def _receiver(between: list[str], index: Mapping[str, int], n_x: int) -> tuple[int, int]:
-    """Return (to, from) such that the receiver is a state."""
-    a, b = (index[name] for name in between)
-    return (a, b) if a < n_x else (b, a)
-
-
-def elimination(n: int, links: list[tuple[int, int, bool]]) -> dict[str, Any]:
-    """Return the elimination lists of the matrix whose rows are coupled by (to, from, both) links."""
-    pattern: list[set[int]] = [{i} for i in range(n)]
-    for to, source, both in links:
-        if source < n:
-            pattern[to].add(source)
-            if both:
-                pattern[source].add(to)
-    order = _minimum_degree(pattern)
-    places = [(row, column) for row in range(n) for column in sorted(pattern[row])]
-    entry = {place: k for k, place in enumerate(places)}
-    lower, upper = _play(order, pattern, entry)
-    return {
-        "place": tuple(
-            (
-                entry[to, to],
-                entry[to, source] if source < n else -1,
-                entry[source, source] if both and source < n else -1,
-                entry[source, to] if both and source < n else -1,
-            )
-            for to, source, both in links
-        ),
-        "diagonal": tuple(entry[i, i] for i in range(n)),
-        "order": tuple(order),
-        "lower": tuple(lower),
-        "upper": tuple(upper),
-        "n_entry": len(entry),
-    }
-
-
-def _minimum_degree(pattern: list[set[int]]) -> list[int]:
-    """Return the order that eliminates the state with the fewest neighbours first."""
-    neighbours = [set() for _ in pattern]  # type: list[set[int]]
-    for i, row in enumerate(pattern):
-        for j in row - {i}:
-            neighbours[i].add(j)
-            neighbours[j].add(i)
-    order, remaining = [], set(range(len(pattern)))
-    while remaining:
-        pivot = min(remaining, key=lambda i: (len(neighbours[i]), i))
-        remaining.remove(pivot)
-        order.append(pivot)
-        for i in neighbours[pivot]:
-            neighbours[i] = (neighbours[i] | neighbours[pivot]) - {i, pivot}
-    return order
-
-
-def _play(order: list[int], pattern: list[set[int]], entry: dict[tuple[int, int], int]) -> tuple[Any, Any]:
-    """Eliminate on the pattern alone; return ``lower`` and ``upper``, fill-in is added to ``entry``."""
-    lower = []
-    upper = []
-    rows = [set(row) for row in pattern]
-    for position, pivot in enumerate(order):
-        later = order[position + 1 :]
-        right = [j for j in later if j in rows[pivot]]
-        upper.append(tuple((entry[pivot, j], j) for j in right))
-        below = [row for row in later if pivot in rows[row]]
-        for row in below:
-            rows[row].update(right)
-            for j in right:
-                entry.setdefault((row, j), len(entry))
-        lower.append(
-            tuple(
-                (entry[row, pivot], row, tuple((entry[row, j], entry[pivot, j]) for j in right))
-                for row in below
-            )
-        )
-    return lower, upper
+            values.append(at.coefficient(parameter))
+    duty = element.driver == "duty"
+    return _Peltier(at.z[element.face], at.z[element.sink], at.u[element.input], duty, tuple(values))
 
 
 @dataclass(frozen=True)
@@ -506,7 +458,7 @@ class NetworkModel(Described):
     def __init__(self, network: Network) -> None:
         super().__init__(network)
         self.network = network
-        self.steps = ThermalSteps(build_layout(network), len(network.inputs), len(network.parameters))
+        self.steps = thermal_steps(network)
         self.states = state_names(network)
         self.n_x = len(self.states)
         self.reference = next((name for name, item in network.outputs.items() if item.reference), None)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -15,7 +14,6 @@ from scipy.stats import chi2
 from tests.sysid.greybox.makers import TRUTH, TwoGains, a_log, heater, made
 from thermogrip.datasets.errors import UserError
 from thermogrip.sysid.greybox import noise_model
-from thermogrip.sysid.greybox import sandwich as module
 from thermogrip.sysid.greybox.fit import fit_network, levenberg_marquardt
 from thermogrip.sysid.greybox.noise_model import Block, ErrorModel, LogData, information
 from thermogrip.sysid.greybox.problem import Problem, make_problem
@@ -269,52 +267,6 @@ def test_nine_bins_are_too_few_and_ten_are_not():
     problem, z, by_log = fitted(1, seconds=41)
     assert sum(r.size for r, _ in by_log) == 10
     assert isinstance(score_covariance(problem, z, by_log), ScoreCovariance)
-
-
-class Started(TwoGains):
-    """Its two lags begin anywhere; a warm-up of a minute identifies where."""
-
-    warmup = 60.0
-
-    @property
-    def spread(self) -> Array:
-        return np.diag([0.2, 0.4]) ** 2
-
-
-def test_a_start_estimated_from_its_warm_up_counts_for_what_that_left_unknown(
-    monkeypatch: pytest.MonkeyPatch,
-):
-    logs = [a_log(seed) for seed in (1, 2, 3)]
-    problem = make_problem(Started(), logs, average=4.0, independent=60.0)
-    z = levenberg_marquardt(
-        problem.linearise, problem.trials, np.zeros(2), low=problem.box[0], high=problem.box[1]
-    ).z
-    by_log = problem.by_log(z, central=True)
-    numbers = white(problem, z, 0.2)
-    whole = module.linearise_logs
-
-    def spread(reported: bool, started: bool) -> Array:
-        def linearise(*given: Any, **options: Any) -> Any:
-            data = whole(*given, **options)
-            none = data if reported else replace(data, warm=[None] * len(data.logs))
-            if started:
-                return none
-            for log in none.logs:  # no effect is larger than nothing
-                for block in log.blocks:
-                    first = none.n_shared
-                    block.products[..., first:-1, :] = block.products[..., first:-1] = 0.0
-            return none
-
-        with monkeypatch.context() as patch:
-            patch.setattr(module, "linearise_logs", linearise)
-            found = score_covariance(problem, z, by_log, numbers)
-        return np.diag(found.spread / found.phi)
-
-    nothing, with_warm, stated = spread(False, False), spread(True, True), spread(False, True)
-    assert np.all(stated > 1.1 * nothing)
-    # four readings in the bins of a minute, white as the ridge assumes: most of the start is known
-    assert np.all(with_warm - nothing < 0.7 * (stated - nothing))
-    assert np.all(with_warm > nothing)
 
 
 def test_effects_of_a_log_are_reported_in_the_signals_unit_with_their_sd():

@@ -333,7 +333,7 @@ def test_what_a_network_says_of_its_signals_is_what_its_file_says():
     assert (model.switches, model.average, model.dt) == (("pump",), 7.0, 0.5)
     assert (model.independent, model.warmup, model.smooth) == (60.0, 60.0, 20.0)
     np.testing.assert_allclose(np.sqrt(np.diag(model.spread)), [1.0, 3.0, 1.0] + [0.5] * 6)
-    assert [float(c) for c in model.steps.prepare(model.prior.tolist())[: model.n_x]] == pytest.approx(
+    assert [float(c) for c in model.steps.prepare(model.prior.tolist()).capacity] == pytest.approx(
         [500.0, 200.0, 80.0, 48.0, 15.0, 48.0, 15.0, 96.0, 3.0]
     )
     plain = model_of(everything())
