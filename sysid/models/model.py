@@ -44,19 +44,19 @@ class Equations(Protocol):
         """Numbers of states, inputs, disturbances and parameters."""
         ...
 
-    def prepare(self, p: Values) -> list[Any]:
+    def prepare(self, p: Values) -> Any:
         """Return what depends on the parameters alone, c."""
         ...
 
-    def renew(self, u: Values, c: Values, h: Any) -> list[Any]:
+    def renew(self, u: Values, c: Any, h: Any) -> Any:
         """Return what depends on the switches among the inputs besides, and on the step h [s]."""
         ...
 
-    def advance(self, x: Values, u: Values, d: Values, c: Values, kept: Values, h: Any) -> list[Any]:
+    def advance(self, x: Values, u: Values, d: Values, c: Any, kept: Any, h: Any) -> list[Any]:
         """Return the state after h seconds."""
         ...
 
-    def read(self, x: Values, c: Values) -> list[Any]:
+    def read(self, x: Values, c: Any) -> list[Any]:
         """Return the outputs."""
         ...
 
@@ -224,7 +224,7 @@ def roll_rows(
     n_batch, n = len(x0), u.shape[1]
     c = steps.prepare(list(p.T))
     x = list(x0.T.copy())
-    switched = list[Any]()
+    switched: Any = None
     u_rows, d_rows = list(u.transpose(1, 2, 0)), list(d.transpose(1, 2, 0))
     with np.errstate(all="ignore"):  # what is not finite is found afterwards
         outputs = [*steps.read(x, c)]
