@@ -25,7 +25,7 @@ STATUSES = ("ok", "late", "infeasible", "fallback_plan", "fallback_pi", "off", "
 
 @dataclass(frozen=True)
 class Move:
-    """A controller's answer to one reading.
+    """A controller's answer to one reading; ``drive`` is a number where the plant has one input, else a dict.
 
     Attributes
     ----------

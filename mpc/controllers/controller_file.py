@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from thermogrip.sysid.models.model import Model
     from thermogrip.sysid.plant.plant import Plant
 
-_KEPT_DRAWS = 50  # of the posterior, for the controller's review
+KEPT_DRAWS = 50  # of the posterior, for the controller's review
 
 
 class Parts(NamedTuple):
@@ -35,7 +35,7 @@ class Parts(NamedTuple):
         content: dict[str, Any] = {"schema": SCHEMA, "version": FILE_VERSIONS[self.kind]}
         if self.kind != "MPC":
             content["kind"] = self.kind
-        plant = self.plant.to_dict(draws=_KEPT_DRAWS)
+        plant = self.plant.to_dict(draws=KEPT_DRAWS)
         content |= {"design": self.design.to_dict(), "notes": self.notes, "plant": plant}
         return write_json(path, content, schema=SCHEMA, version=FILE_VERSIONS[self.kind])
 

@@ -38,7 +38,9 @@ if TYPE_CHECKING:
 
 SPEC_TEMPLATE = (files(__package__) / "spec.toml").read_text(encoding="utf-8")
 
-_WATER = (2.0, 65.0)  # degC: neither ice nor scald in a tank of water
+#: Of a tank of water [degC]: 2 K inside of where the firmware switches off (rig/firmware/config.h), since
+#: readings scatter about a soft limit.
+_WATER = (4.0, 58.0)
 _SAMPLES = 5  # of a step, at least
 _LEAST_SEEN = 1.0  # range of the logs [degC] within which steps would be lost in the noise
 
@@ -143,10 +145,8 @@ class Spec(BaseModel):
             wanted[key] = float(f"{max(least, share * (above - below)):.2g}")
         wanted["settle_within_s"] = float(f"{np.clip(3 * max(times.values()), 7.5, 27000):.2g}")
         wanted["hold_s"] = float(f"{wanted['settle_within_s'] / 0.75:.2g}")
-        rooms = [name for name in plant.disturbances if plant.is_room(name) and name in plant.valid]
-        if rooms:
-            room = float(np.mean(plant.valid[rooms[0]]))
-            wanted["ambient_degC"] = round(min(max(room, -20.0), 150.0), 1)
+        if plant.room is not None:
+            wanted["ambient_degC"] = round(min(max(plant.room, -20.0), 150.0), 1)
         return cls(**wanted)
 
     def in_toml(self) -> str:

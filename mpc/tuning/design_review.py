@@ -9,7 +9,7 @@ sign, are seen there.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TypeAlias
 
@@ -22,11 +22,13 @@ from thermogrip.mpc.plant.prediction import holding_drive
 from thermogrip.mpc.tuning.objective import (
     Case,
     StepResult,
-    as_tried,
-    draws_of,
+    judged_draws,
+    judged_seed,
     lacking,
     load_seconds,
     loads_of,
+    made_for_trials,
+    meets_spec,
     run_trials,
     steps_on,
 )
@@ -76,9 +78,9 @@ def review(
     *,
     wanted: tuple[float, float] | None = None,
     rooms: Sequence[float] | None = None,
-    draws: int = 2,
+    draws: int | None = None,
 ) -> list[Check]:
-    """Return the findings about a controller's design.
+    """Return the findings about a controller's design; one that was tuned meets its spec where none fails.
 
     Parameters
     ----------
@@ -86,10 +88,11 @@ def review(
     wanted : (float, float), optional
         The range of targets [degC]; by default that of its spec's steps, else what the logs showed.
     rooms : sequence of float, optional
-        Room temperatures in which the range must be reachable [degC]; by default 7 degC below and 5 above
-        the design's.
+        Room temperatures in which the range must be reachable [degC]; by default the design's, and those of
+        the logs are tried.
     draws : int, optional
-        Posterior draws, besides the plant itself, on which the closed loop is run.
+        Posterior draws, besides the plant itself, on which the closed loop is run; by default those on which
+        it was tuned, else 2.
 
     Examples
     --------
@@ -109,12 +112,15 @@ def review(
     steps = np.array(spec.steps)
     targets = steps[:, 1] if noted else steps
     span = (float(targets.min()), float(targets.max())) if wanted is None else wanted
-    usual = controller.design.ambient
+    plant, seed = controller.plant, controller.notes.get("seed")
+    count = draws if draws is not None else spec.check_draws if noted else 2
+    judged = sorted({0, *judged_draws(plant, count)})
+    noise = judged_seed(plant, seed if isinstance(seed, int) else 0)
     return [
-        reachable(controller, span, (usual - 7.0, usual + 5.0) if rooms is None else rooms),
-        as_asked(controller, spec, draws, noted=noted),
-        after_loads(controller, spec, draws),
-        lacks_structure(controller, spec),
+        reachable(controller, spec, span, rooms),
+        as_asked(controller, spec, judged, noise, noted=noted),
+        after_loads(controller, spec, judged[:3]),
+        lacks_structure(controller, spec, judged[-1], noise, noted=noted),
         valid_range(controller, span),
         called_good(controller),
     ]
@@ -132,32 +138,43 @@ def spec_of(controller: Reviewed, wanted: tuple[float, float] | None) -> tuple[S
     return Spec(steps=[(low, max(low + 1.0, high))]), False
 
 
-def as_asked(controller: Reviewed, spec: Spec, draws: int, *, noted: bool) -> Check:
-    """Every step of the spec must settle as asked on the plant and on draws; nothing fails that nobody asked
+def passes(checks: Iterable[Check]) -> bool:
+    """Return whether no check fails."""
+    return all(check.verdict != "fail" for check in checks)
+
+
+def settle_limit_s(controller: Reviewed) -> float:
+    """Return after how long a target is given up [s]: twice what the spec allows a step, which may be
+    shorter; where there is none, the spec that would be taken of the plant."""
+    spec, noted = spec_of(controller, None)
+    return 2 * (spec if noted else Spec.of(controller.plant)).settle_within_s
+
+
+def as_asked(controller: Reviewed, spec: Spec, draws: Sequence[int], seed: int, *, noted: bool) -> Check:
+    """Every step of the spec must be as asked on the plant and on draws; nothing fails that nobody asked
     for."""
-    numbers = sorted({0, *draws_of(controller.plant, draws)})
-    results_of_all = run_trials(_again(controller), controller.plant, spec, steps_on(spec, numbers))
+    cases = steps_on(spec, draws)
+    results_of_all = run_trials(_again(controller), controller.plant, spec, cases, seed=seed)
     words, verdicts = [], []
     for step in spec.steps:
         results = [result for result in results_of_all if result.case.step == step]
-        of_step = [_stepped(result, spec, timed=noted) for result in results]
+        of_step = [_stepped(result, spec, noted=noted) for result in results]
         late = [float(np.nan_to_num(result.settle_s, nan=np.inf)) for result in results]
         worst_of = max(range(len(results)), key=lambda k: (_RANK[of_step[k][1]], late[k]))
         words.append(f"{step[0]:g} to {step[1]:g} degC: {of_step[worst_of][0]}")
-        verdicts.append("fail" if noted and np.isinf(max(late)) else of_step[worst_of][1])
-    finding = f"the worst of {len(numbers)}: {'; '.join(words)}" if len(numbers) > 1 else "; ".join(words)
+        verdicts.append(of_step[worst_of][1])
+    finding = f"the worst of {len(draws)}: {'; '.join(words)}" if len(draws) > 1 else "; ".join(words)
     fix = "ask for less, or identify on logs in which the drive is held for longer, and tune again"
     name = "settles as asked where the model is right"
     return _graded(name, finding, fail=("fail" in verdicts, fix), warn=(set(verdicts) != {"pass"}, fix))
 
 
-def after_loads(controller: Reviewed, spec: Spec, draws: int) -> Check:
+def after_loads(controller: Reviewed, spec: Spec, draws: Sequence[int]) -> Check:
     """After a load the loop must come back into the band: one that swings or keeps an offset does not."""
     plant, target = controller.plant, spec.steps[0][1]
-    numbers = sorted({0, *draws_of(plant, draws)})
     loads = loads_of(plant, spec, controller.design)
     seconds = 2 * load_seconds(controller.design)
-    cases = [Case(target, target, draw, load=load, seconds=seconds) for load in loads for draw in numbers]
+    cases = [Case(target, target, draw, load=load, seconds=seconds) for load in loads for draw in draws]
     results = run_trials(_again(controller), plant, spec, cases)
     words = []
     for load in loads:
@@ -172,22 +189,22 @@ def after_loads(controller: Reviewed, spec: Spec, draws: int) -> Check:
 
 def _again(controller: Reviewed) -> Reviewed:
     """Return the same controller for trials, which has not run."""
-    if isinstance(controller, PIController):
-        return PIController(controller.plant, controller.design)
-    return Controller(controller.plant, as_tried(controller.design, controller.plant))
+    kind = "PI" if isinstance(controller, PIController) else "MPC"
+    return made_for_trials(kind, controller.plant, controller.design)
 
 
-def lacks_structure(controller: Reviewed, spec: Spec) -> Check:
+def lacks_structure(controller: Reviewed, spec: Spec, draw: int, seed: int, *, noted: bool) -> Check:
     """The spec's first step must settle on plants that have what their model lacks; nothing fails of what
     the spec does not state."""
     plant, controlled = controller.plant, controller.design.controlled
     doubts = {key: share for key, share in _DOUBTS.items() if not getattr(spec, key)}
     doubted, stated = spec.model_copy(update=doubts), lacking(plant, spec, controlled)
-    (start, target), (draw,) = spec.steps[0], draws_of(plant, 1)
+    start, target = spec.steps[0]
     cases = [Case(start, target, draw, structure) for structure in lacking(plant, doubted, controlled)]
     words, verdicts = [], []
-    for result in run_trials(_again(controller), plant, doubted, cases):
-        (ends, verdict), structure = _stepped(result, spec), result.case.lacks
+    for result in run_trials(_again(controller), plant, doubted, cases, seed=seed):
+        structure = result.case.lacks
+        ends, verdict = _stepped(result, spec, noted=noted and structure in stated)
         words.append(f"{structure}: {ends}")
         verdicts.append(verdict if structure in stated else min(verdict, "warn", key=_RANK.__getitem__))
     fix = "identify on a log of the closed loop and tune again; a design that moves less tolerates more"
@@ -196,10 +213,10 @@ def lacks_structure(controller: Reviewed, spec: Spec) -> Check:
     return _graded(name, finding, fail=("fail" in verdicts, fix), warn=(set(verdicts) != {"pass"}, fix))
 
 
-def _stepped(result: StepResult, spec: Spec, *, timed: bool = False) -> tuple[str, str]:
-    """Return what a step did, in words, and graded; its time counts where ``timed``."""
+def _stepped(result: StepResult, spec: Spec, *, noted: bool = False) -> tuple[str, str]:
+    """Return what a step did, in words, and graded: by the spec itself where that was ``noted``."""
     settled = bool(np.isfinite(result.settle_s))
-    late = timed and not result.settle_s <= spec.settle_within_s
+    late = noted and not result.settle_s <= spec.settle_within_s
     over, off = result.overshoot / spec.overshoot_degC, abs(result.bias) / spec.bias_degC
     lost = not settled and max(abs(result.bias), result.overshoot) > _FAR_BEYOND * spec.band_degC
     figures = [
@@ -210,32 +227,45 @@ def _stepped(result: StepResult, spec: Spec, *, timed: bool = False) -> tuple[st
     gone = (late, over > 1, off > 1)
     limits = (f"{spec.settle_within_s:g} s", f"{spec.overshoot_degC:g}", f"{spec.bias_degC:g}")
     sentences = [figure + f" (asked {most})" * broken for figure, broken, most in zip(figures, gone, limits)]
+    if noted:
+        return ", ".join(sentences), "pass" if meets_spec(result, spec) else "fail"
     return ", ".join(sentences), "fail" if lost else "pass" if settled and not any(gone) else "warn"
 
 
-def reachable(controller: Reviewed, span: tuple[float, float], rooms: Sequence[float]) -> Check:
-    """Each end of the wanted range [degC] must be held by a drive inside its limits, in every room [degC]."""
+def reachable(
+    controller: Reviewed, spec: Spec, span: tuple[float, float], asked: Sequence[float] | None = None
+) -> Check:
+    """Each end of the wanted range [degC] must be held by a drive inside its limits, in every room [degC]
+    that was asked for: else in the design's, and those of the logs are warned of."""
     design, model = controller.design, controller.model
     low, high = np.array([design.drive_range[name] for name in model.drives]).T
-    missed, barely_held = [], []
-    for room in rooms if model.rooms.any() else rooms[:1]:
+    required = [design.ambient] if asked is None else asked
+    rooms = list(required if model.rooms.any() else required[:1])
+    for name in model.disturbances if asked is None else ():
+        if controller.plant.is_room(name):
+            rooms += np.round(controller.plant.valid.get(name, ()), 1).tolist()
+    rooms = list(dict.fromkeys(rooms))
+    missed, missed_elsewhere, barely_held = list[str](), list[str](), list[str]()
+    for room in rooms:
+        out_of_reach = missed if room in required else missed_elsewhere
         for target in span:
             d = model.undisturbed(room)
             holding = holding_drive(model, design.controlled, np.full(len(design.controlled), target), d)
             outside = np.any(holding.u < low - 1e-6) or np.any(holding.u > high + 1e-6)
             text = f"{target:g} degC in a room of {room:g} degC"
             if not np.isfinite(holding.y).all():
-                missed.append(f"{text} (nothing comes to rest)")
-            elif holding.miss > 0.05:
-                missed.append(f"{text} (misses by {holding.miss:.1f} degC)")
+                out_of_reach.append(f"{text} (nothing comes to rest)")
+            elif holding.miss > spec.bias_degC:
+                out_of_reach.append(f"{text} (misses by {holding.miss:.1f} degC)")
             elif outside:
-                missed.append(f"{text} (needs a drive of {', '.join(f'{u:.2f}' for u in holding.u)})")
+                out_of_reach.append(f"{text} (needs a drive of {', '.join(f'{u:.2f}' for u in holding.u)})")
             elif np.any(np.minimum(holding.u - low, high - holding.u) < 0.03 * model.span):
                 barely_held.append(text)
     name = "targets can be held in steady state"
-    if missed:
-        fix = "narrow the targets, widen drive_limits, or cool the heatsinks better"
-        return Check(name, "fail", f"out of reach: {', '.join(missed)}", fix)
+    if missed or missed_elsewhere:
+        fix = "narrow the targets, widen drive_limits, or let the rig heat or cool more"
+        finding = f"out of reach: {', '.join(missed + missed_elsewhere)}"
+        return Check(name, "fail" if missed else "warn", finding, fix)
     if barely_held:
         fix = "expect slow settling there, leave some drive in reserve"
         return Check(name, "warn", f"within 3 % of the drive's limit: {', '.join(barely_held)}", fix)

@@ -60,6 +60,7 @@ from thermogrip.mpc.plant.prediction import drive_names, held_start, prediction_
 from thermogrip.mpc.tuning.minimum_time import full_drive_bound
 
 if TYPE_CHECKING:
+    from thermogrip.mpc.native.runtime import CompiledController
     from thermogrip.sysid.plant.plant import Plant
 
 
@@ -75,6 +76,8 @@ class CostSettings:
     load: float = 0.1  # of a drive's range, and of the first step
     load_times: float = 6.0  # integral times that a load's trial lasts
     sensor_off: float = 0.02  # of what the logs showed, a sensor of a disturbance that is not the room's
+    judged_from: int = 100  # draws on which a controller is judged, apart from those of a search
+    noises: int = 2  # in which each trial of a search is run: one noise alone moves a score by a tenth
 
 
 COSTS = CostSettings()
@@ -135,6 +138,16 @@ class StepResult:
 def draws_of(plant: Plant, count: int) -> list[int]:
     """Return which draws to try: 1 to count, or the plant itself alone where it has no uncertainty."""
     return list(range(1, count + 1)) if plant.uncertain else [0]
+
+
+def judged_draws(plant: Plant, count: int) -> list[int]:
+    """Return on which draws a controller is judged, of which a search has seen none."""
+    return [draw + COSTS.judged_from if draw else 0 for draw in draws_of(plant, count)]
+
+
+def judged_seed(plant: Plant, seed: int) -> int:
+    """Return the seed of the noise there: a plant without draws has one that the search had not."""
+    return seed if plant.uncertain else seed + COSTS.noises
 
 
 @lru_cache(maxsize=16)
@@ -214,6 +227,17 @@ def as_tried(design: Design, plant: Plant) -> Design:
         if sd is not None
     }
     return replace(design, noise=replace(design.noise, reading=means))
+
+
+def made_for_trials(
+    kind: str, plant: Plant, design: Design, *, c: CompiledController | None = None
+) -> Controller | PIController:
+    """Return a controller whose trials run in C where there is one; a PI's in the library ``c`` of an MPC."""
+    if kind == "PI":
+        loops = PIController(plant, design)
+        loops.c = c or Controller(plant, design).c
+        return loops
+    return Controller(plant, as_tried(design, plant))
 
 
 def surroundings_of(

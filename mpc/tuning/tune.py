@@ -29,29 +29,34 @@ import numpy as np
 from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.parallel import Progress
 from thermogrip.mpc.closed_loop.simulate import ClosedLoop
+from thermogrip.mpc.controllers.controller_file import KEPT_DRAWS
 from thermogrip.mpc.controllers.mpc import Controller
 from thermogrip.mpc.controllers.pi import PIController
 from thermogrip.mpc.design.design import Design
 from thermogrip.mpc.design.spec import Spec
+from thermogrip.mpc.tuning.design_review import Check, passes, review
 from thermogrip.mpc.tuning.objective import (
+    COSTS,
     Bounds,
     Case,
     Scales,
     Score,
     StepResult,
     apparent_delays,
-    as_tried,
     bounds_of,
     draws_of,
+    judged_draws,
+    judged_seed,
     lacking,
     load_seconds,
     loads_of,
-    meets_spec,
+    made_for_trials,
     run_trials,
     score,
     steps_on,
     trial,
 )
+from thermogrip.sysid.plant.plant_data import thin
 
 if TYPE_CHECKING:
     from thermogrip.sysid.plant.plant import Plant
@@ -66,8 +71,6 @@ class SearchSettings:
     won: float = 0.10
     worse: float = 0.03  # relative rise of steps or of loads from which an MPC is not taken
     near: float = 1.25  # settling over bound that counts as the actuator's limit
-    check_from: int = 100  # draws of the comparison, apart from those of the search
-    noises: int = 2  # in which each trial of a search is run: one noise alone moves a score by a tenth
     # by which a search first varies each parameter.  Score over the default's on unseen draws of four plants
     # (geometric mean): .971; subplex .982 from 2 and from 4 on; a compass search .970
     first_factor: float = 2.0
@@ -75,7 +78,7 @@ class SearchSettings:
     # where each part of the work ends, in shares of its time
     scaled: float = 0.15
     searched: float = 0.75
-    compared: float = 0.9
+    compared: float = 0.9  # then come the runs that are shown, and the review
 
 
 SEARCH = SearchSettings()
@@ -183,8 +186,8 @@ class Tuning:
         By controller, on those draws; lower is better.
     history : tuple of Trial
         Every design that was tried.
-    meets_spec : bool
-        Whether the controller meets the spec on every draw.
+    checks : tuple of Check
+        What :func:`~thermogrip.mpc.tuning.design_review.review` finds in the controller.
     runs : dict of str to ClosedLoop
         One closed loop a step or load and controller, on one draw, for figures: ``"28 to 38, MPC"``.
     spec : Spec
@@ -199,11 +202,16 @@ class Tuning:
     rows: tuple[Row, ...]
     scores: dict[str, float]
     history: tuple[Trial, ...]
-    meets_spec: bool
+    checks: tuple[Check, ...]
     runs: dict[str, ClosedLoop]
     spec: Spec
     seed: int
     interrupted: bool = False
+
+    @property
+    def meets_spec(self) -> bool:
+        """Whether no check of the controller's review fails."""
+        return passes(self.checks)
 
     def save(self, path: str | Path) -> Path:
         """Write the controller with what was found about it, and return the path."""
@@ -248,6 +256,8 @@ def tune(
     show = progress or (lambda share, what: None)
     show(0.0, "what the plant can do")
     spec = Spec.of(plant) if spec is None else spec
+    if plant.samples is not None:  # those that the controller's file will have, which its review tries
+        plant = replace(plant, samples=thin(plant.samples, KEPT_DRAWS))
     bench = Bench(spec.widened(plant), spec, seed, show)
     tried: list[Trial] = []
     try:
@@ -261,7 +271,7 @@ def tune(
         candidates = _best_of_each_kind(bench, tried)
         results = {name: list(trial_so_far.results) for name, trial_so_far in candidates.items()}
         interrupted = True
-    return _tuning(bench, tried, candidates, results, interrupted)
+    return _tuning(bench, tried, candidates, results, interrupted, show)
 
 
 class Bench:
@@ -272,10 +282,7 @@ class Bench:
         self.spec = spec
         self.seed = seed
         self.draws = draws_of(plant, spec.search_draws)
-        certain = self.draws == [0]  # no draws: the comparison takes the same plant, and fresh noise
-        self.unseen = [draw + SEARCH.check_from if draw else 0 for draw in draws_of(plant, spec.check_draws)]
-        # a noise of the comparison is none of the search's
-        self.check_seed = seed + SEARCH.noises if certain else seed
+        self.unseen, self.check_seed = judged_draws(plant, spec.check_draws), judged_seed(plant, seed)
         self.baseline = spec.design(plant)
         draws = sorted({*self.draws, *self.unseen})
         self.bounds = bounds_of(plant, self.baseline, spec, draws)
@@ -352,11 +359,7 @@ class Bench:
 
     def made(self, kind: str, design: Design) -> Controller | PIController:
         """Return a controller whose trials run in C where there is one."""
-        if kind == "PI":
-            loops = PIController(self.plant, design)
-            loops.c = self._c
-            return loops
-        return Controller(self.plant, as_tried(design, self.plant))
+        return made_for_trials(kind, self.plant, design, c=self._c)
 
     def run(
         self, kind: str, design: Design, draws: Sequence[int], seed: int, *, loads: bool = True
@@ -383,7 +386,7 @@ class Bench:
     def evaluate(self, kind: str, parameters: Mapping[str, float]) -> Trial:
         """Return the trial of a design on the search's draws."""
         design, results = self.design(kind, parameters), []
-        for noise in range(SEARCH.noises):
+        for noise in range(COSTS.noises):
             results += self.run(kind, design, self.draws, self.seed + noise, loads=not noise)
         parts_of_score = score(results, self.spec, self.scales)
         cost = parts_of_score.total
@@ -413,7 +416,7 @@ def _search_designs(bench: Bench, tried: list[Trial], show: Progress) -> None:
         counts[kind] += 1
         best = min(tried, key=lambda each: each.score)
         share = sum(counts.values()) / (most * len(ranges))
-        words = f"{kind} {counts[kind]}; best so far: {best.controller}, score {best.score:.3f}"
+        words = f"{kind}: design {counts[kind]}; best so far: {best.controller}, score {best.score:.3f}"
         show(SEARCH.scaled + (SEARCH.searched - SEARCH.scaled) * share, words)
         return tried[-1]
 
@@ -480,6 +483,7 @@ def _tuning(
     candidates: Mapping[str, Trial],
     results: Mapping[str, list[StepResult]],
     interrupted: bool,
+    show: Progress,
 ) -> Tuning:
     """Return what was found, with the best of the candidates for its controller."""
     spec, scored = bench.spec, {n: score(part, bench.spec, bench.scales) for n, part in results.items()}
@@ -496,17 +500,18 @@ def _tuning(
     finding = f"{best_of(scored, settled, where, unknown_to_pi(spec))} {words}"
     if interrupted:
         finding = f"Interrupted after {len(tried)} designs; this is the best of them. {finding}"
-    meets = all(meets_spec(result, spec) for result in results[saved] if not result.case.load)
     notes = {
         "verdict": verdict,
         "finding": finding,
-        "meets_spec": meets,
         "scores": scores,
         "spec": spec.model_dump(mode="json"),
         "seed": bench.seed,
         "rows": [row.to_dict() for row in rows],
     }
     controller = _final(bench, candidates, saved, notes)
+    show(SEARCH.compared, "review")
+    checks = tuple(review(controller))
+    controller.notes["meets_spec"] = passes(checks)
     return Tuning(
         controller=controller,
         verdict=verdict,
@@ -514,7 +519,7 @@ def _tuning(
         rows=rows,
         scores=scores,
         history=tuple(tried),
-        meets_spec=meets,
+        checks=checks,
         runs={} if interrupted else _runs_as_used(bench, candidates, controller),
         spec=spec,
         seed=bench.seed,

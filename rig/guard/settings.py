@@ -21,6 +21,9 @@ from thermogrip.sysid.plant.plant import Plant
 
 GUARD_TEMPLATE = (files(__package__) / "guard.toml").read_text(encoding="utf-8")
 
+#: Beyond these the device switches off by itself (rig/firmware/config.h, virtual devices) [degC].
+DEVICE_LIMITS = {"t_tank": (2.0, 60.0), "t_surface": (3.0, 55.0)}
+
 #: The hottest limit that may be stated [degC]: above the thermocouples of a kiln (type S ends at 1768 degC).
 HOTTEST = 1800.0
 
@@ -179,12 +182,13 @@ class GuardSettings(_Table):
 
     @classmethod
     def of(cls, plant: Plant | None, skin: str = "t_surface") -> GuardSettings:
-        """Return what is allowed where no file says it: an output of a plant whose logs went beyond the usual
-        limits may go there again."""
+        """Return what is allowed where no file says it: what the device allows; an output of a plant whose
+        logs went beyond the usual limits may go there again."""
         usual = cls()
         coldest, hottest = usual.others_degC
         logged = {} if plant is None else {name: plant.valid.get(name) for name in plant.outputs}
-        limits = {
+        limits = {name: ends for name, ends in DEVICE_LIMITS.items() if name in logged and name != skin}
+        limits |= {
             name: (coldest, ends[1] + usual.beyond_logs * (ends[1] - ends[0]))
             for name, ends in logged.items()
             if ends is not None and ends[1] > hottest and name not in (skin, f"{skin}_2")

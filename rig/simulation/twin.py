@@ -108,6 +108,8 @@ class Twin:
 
     Attributes
     ----------
+    disturbances : dict of str to float
+        The plant's measured disturbances, which stay.
     history : list of dict
         One row a native step: time, inputs as integrated, true outputs, ``contact`` (0 or 1).
 
@@ -157,6 +159,7 @@ class Twin:
             np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(2)
         )
         self._d = self._disturbance_vector(disturbances or {})
+        self.disturbances = dict(zip(plant.disturbances, self._d.tolist()))
         self._drive = dict.fromkeys(self.units, 0.0)
         self._pump = 1
         self.time, self.closed = 0.0, False
@@ -179,8 +182,7 @@ class Twin:
         if self._newest is None or self._newest.time_s != self.time:
             true = self.truth()
             values = {name: self._sensor(name, value) for name, value in true.items()}
-            disturbances = dict(zip(self.plant.disturbances, self._d.tolist(), strict=True))
-            values |= {name: round(disturbances[name], 1) for name in room_disturbances(self.plant)}
+            values |= {name: round(self.disturbances[name], 1) for name in room_disturbances(self.plant)}
             self._newest = Reading(self.time, values, dict(self._drive), self._pump)
         return Reading(self.time, self._newest.values, dict(self._drive), self._pump)
 

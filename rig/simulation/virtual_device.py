@@ -22,6 +22,7 @@ from typing import Any
 from thermogrip.rig.clock import ScaledClock
 from thermogrip.rig.firmware.reference import SERIALS, Board, DeviceCore, Outputs, Sensor, Value
 from thermogrip.rig.guard.sensor_checks import room_disturbances
+from thermogrip.rig.guard.settings import DEVICE_LIMITS
 from thermogrip.rig.serial.protocol import Channel
 from thermogrip.rig.simulation.cable import PtyLink, SocketLink, spoil
 from thermogrip.rig.simulation.faults import FAULTS, SENSOR_FAULTS
@@ -29,7 +30,6 @@ from thermogrip.rig.simulation.tclab_firmware import TCLabCore
 from thermogrip.rig.simulation.twin import Twin
 from thermogrip.sysid.plant.plant import Plant
 
-_LIMITS = {"t_tank": (2_000, 60_000), "t_surface": (3_000, 55_000)}
 _ABSOLUTE_ZERO = -273_150
 
 
@@ -164,7 +164,8 @@ def board_of(twin: Twin) -> Board:
         Channel(name, units[name], round(1e4 * twin.limits[name][0]), round(1e4 * twin.limits[name][1]))
         for name in units
     )
-    guarded = tuple(Sensor(name, *_LIMITS.get(name, (2_000, 80_000))) for name in twin.plant.outputs)
+    limits = [(name, DEVICE_LIMITS.get(name, (2.0, 80.0))) for name in twin.plant.outputs]
+    guarded = tuple(Sensor(name, round(1e3 * low), round(1e3 * high)) for name, (low, high) in limits)
     sensors = guarded + tuple(Sensor(name, guarded=False) for name in room_disturbances(twin.plant))
     pump = "pump" in twin.plant.inputs
     return Board(drives, sensors, pump, tachometer=pump)

@@ -97,6 +97,12 @@ class PlantData:
         """Tell whether a measured disturbance is the temperature of the room."""
         return is_room_temperature(name, self.units.get(name, "degC"))
 
+    @property
+    def room(self) -> float | None:
+        """The middle of what the logs showed of the room's temperature [degC]; None where they did not."""
+        rooms = (self.valid[name] for name in self.disturbances if self.is_room(name) and name in self.valid)
+        return next((float(np.mean(ends)) for ends in rooms), None)
+
     def undisturbed(self, ambient: float) -> Array:
         """Return the measured disturbances (n_d,) where nobody reads them: ``nominal``, else ``ambient``
         [degC] for the room's temperature and the middle of the logs for another; NaN where none is known."""

@@ -24,7 +24,7 @@ ROWS = (("tuned", "28 to 38", 90.0, 95.0, 0.1, 0.2, 0.01, 7.0, 80.0),)
 
 def test_an_interrupted_tuning_is_written_and_ends_with_130(bench: Bench, stand_in: StandIn) -> None:
     found = SimpleNamespace(
-        save=lambda out: out.write_text("{}"), verdict="tuned", finding="faster", meets_spec=True,
+        save=lambda out: out.write_text("{}"), verdict="tuned", finding="faster", meets_spec=True, checks=(),
         scores={"tuned": 1.5}, rows=(ROW,), interrupted=True, controller=None,
     )  # fmt: skip
     stand_in("thermogrip.mpc.tuning.tune.tune", found)

@@ -257,7 +257,7 @@ def test_the_c_alone_starts_amid_it(case, tmp_path):
 
 def test_review_says_amid_what_targets_are_held():
     plant, spec = SUN.plant(), SUN.spec()
-    said = reachable(Controller(plant, spec.design(plant)), (26.0, 28.0), (8.0, 12.0)).finding
+    said = reachable(Controller(plant, spec.design(plant)), spec, (26.0, 28.0), (8.0, 12.0)).finding
     assert said == "26 to 28 degC in rooms of 8, 12 degC, sun of 420"
 
 

@@ -14,6 +14,7 @@ from thermogrip.mpc.closed_loop.simulate import ClosedLoop, Segment
 from thermogrip.mpc.controllers.mpc import Controller
 from thermogrip.mpc.controllers.pi import PIController
 from thermogrip.mpc.design.spec import Spec
+from thermogrip.mpc.tuning.design_review import Check
 from thermogrip.report import control
 from thermogrip.report.html import Plot, Table, Text
 
@@ -60,13 +61,13 @@ def tuning_of(**changes: Any) -> Any:
         controlled=("t1", "t2"), dt=2.0, deadline_s=0.5, limits={}, slew_per_s={"q": 5.0},
         drive_range={"q": (0.0, 100.0)}, to_dict=dict,
     )  # fmt: skip
-    plant = SimpleNamespace(samples=None, covariance=np.eye(1), valid={}, units={})
+    plant = SimpleNamespace(uncertain=True, valid={}, units={})
     run = SimpleNamespace(
         segments=(), status=("ok",), advice=("", "wait"), band=0.25, seconds=(0.01, 0.02), settle=0.0
     )
     made = {
         "spec": spec, "scores": {"tuned": 1.23456, "PI": 2.0}, "verdict": "tuned", "finding": "Faster.",
-        "meets_spec": True, "rows": [], "seed": 7,
+        "meets_spec": True, "checks": (), "rows": [], "seed": 7,
         "runs": {"28 to 38, MPC": run, "28 to 38, PI": run, "28 to 18, MPC": run, "q by 10, MPC": run},
         "controller": Stub(design, plant),
     }  # fmt: skip
@@ -93,14 +94,14 @@ def test_a_step_is_good_where_each_output_is_as_the_spec_asks(figures: dict, ton
     ("meets", "known", "tone", "says", "of"),
     [
         (True, True, "good", "The MPC meets the spec on every draw.", "5 draws of the plant that the search"),
-        (False, False, "warn", "The MPC does not meet the spec on every draw.", "the plant, which has no"),
+        (False, False, "warn", "The MPC does not meet the spec: c: late.", "the plant, which has no"),
     ],
 )
 def test_a_tuned_controller_stands_with_its_scores_and_what_it_did_not_know(
     meets: bool, known: bool, tone: str, says: str, of: str
 ) -> None:
-    tuning = tuning_of(meets_spec=meets)
-    tuning.controller.plant.covariance = np.eye(1) if known else None
+    tuning = tuning_of(meets_spec=meets, checks=() if meets else (Check("c", "fail", "late"),))
+    tuning.controller.plant.uncertain = known
     section = control.tuning_section(tuning)
     assert (section.verdict, section.tone) == (says, tone)
     picture, table, finding, about, scores = section.parts

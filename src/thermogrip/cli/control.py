@@ -69,19 +69,25 @@ def tune(
 
 def _written(console: Console, found: Tuning, plant: str, out: Path, report: Path | None) -> dict[str, Any]:
     """Write and show what a search found; return the answer."""
-    from thermogrip.report.control import kind_of, tuning_caption, tuning_sections, tuning_table
+    from thermogrip.report.control import (
+        kind_of,
+        spec_answer,
+        tuning_caption,
+        tuning_sections,
+        tuning_table,
+    )
     from thermogrip.report.html import write_report
 
     found.save(out)
-    kind, meets = kind_of(found.controller), "meets" if found.meets_spec else "does not meet"
+    kind = kind_of(found.controller)
     if report is not None:
         best = "a PI" if kind == "PI" else "an MPC"
         lead = f"The best controller for {plant} is {best}, by simulations on its draws."
         write_report(report, "Tuning", lead, tuning_sections(found))
     console.table(tuning_caption(found), *tuning_table(found))
     console.say(f"{found.verdict}: {found.finding}")
-    console.say(f"The {kind} {meets} the spec on every draw; wrote {out}")
-    keys = ("verdict", "finding", "meets_spec", "interrupted", "scores", "rows")
+    console.say(f"{spec_answer(found)}; wrote {out}")
+    keys = ("verdict", "finding", "meets_spec", "checks", "interrupted", "scores", "rows")
     return {"kind": kind} | {key: getattr(found, key) for key in keys} | {"out": out, "report": report}
 
 

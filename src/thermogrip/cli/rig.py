@@ -128,8 +128,10 @@ class RigOptions:
         *,
         pace: float | None,
         seed: int,
+        say: Callable[[str], None] | None = None,
     ) -> Rig:
-        """Return the rig on a port, or the simulated one at a pace, with the relays of a file."""
+        """Return the rig on a port, or the simulated one at a pace, with the relays of a file; ``say`` what
+        is round the simulated one."""
         from thermogrip.rig.clock import Metronome
         from thermogrip.rig.drivers.connect import open_rig
         from thermogrip.rig.drivers.relays import RelayRig, read_relays
@@ -138,6 +140,9 @@ class RigOptions:
         if self.twin is not None:
             wait = None if pace is None else Metronome(clock, clock.sleep).wait
             simulated = self._twin(self.twin, controller, seed=seed, wait=wait)
+            if say is not None and simulated.disturbances:
+                values = (f"{name} {value:.4g}" for name, value in simulated.disturbances.items())
+                say(f"The twin's world, from the middle of its plant's logs: {', '.join(values)}")
             return RelayRig(simulated, switched, lambda: simulated.time) if switched else simulated
         rig: Rig = open_rig(str(self.port), self.protocol, clock=clock, sleep=clock.sleep)
         try:
@@ -162,6 +167,7 @@ class RigOptions:
         """Return the simulated rig; a drive whose unit does not say its range has the controller's."""
         from thermogrip.rig.interface import UNIT_RANGES
         from thermogrip.rig.simulation.twin import Twin
+        from thermogrip.sysid.plant.linearise import ROOM
         from thermogrip.sysid.plant.plant import Plant
 
         try:
@@ -174,7 +180,9 @@ class RigOptions:
         limits = {
             name: ends for name, ends in ranges.items() if plant.units.get(name, "1") not in UNIT_RANGES
         }
-        return Twin(plant.draw(self.draw), seed=seed, t_start=self.start, limits=limits, pace=wait)
+        room = ROOM if plant.room is None else plant.room
+        drawn = plant.draw(self.draw)
+        return Twin(drawn, seed=seed, ambient=room, t_start=self.start, limits=limits, pace=wait)
 
 
 @dataclass(frozen=True)
@@ -183,14 +191,22 @@ class GraspOptions:
 
     grasp_time: Annotated[float, cli.shared("--grasp-time")] = 10.0
     stop_early: Annotated[Path | None, cli.shared("--stop-early")] = None
-    settle_timeout: Annotated[float, cli.shared("--settle-timeout")] = 900.0
+    settle_timeout: Annotated[float | None, cli.shared("--settle-timeout")] = None
 
-    def of_session(self, watch: Watch) -> dict[str, Any]:
-        """Return them as a session takes them."""
+    def of_session(
+        self, watch: Watch, controller: Controller | PIController, say: Callable[[str], None] | None
+    ) -> dict[str, Any]:
+        """Return them as a session takes them; ``say`` when it gives up."""
         from thermogrip.classify.decisions.stopping_rule import session_stop
+        from thermogrip.mpc.tuning.design_review import settle_limit_s
 
         stop = None if self.stop_early is None else session_stop(self.stop_early, tell=watch.posterior)
-        return {"grasp_time": self.grasp_time, "settle_timeout": self.settle_timeout, "stop": stop}
+        limit_s = self.settle_timeout
+        if limit_s is None:
+            limit_s = settle_limit_s(controller)
+            if say is not None:
+                say(f"Gives up settling after {limit_s:g} s, twice what the spec allows a step")
+        return {"grasp_time": self.grasp_time, "settle_timeout": limit_s, "stop": stop}
 
 
 @stop_signals()
@@ -228,7 +244,7 @@ def run(
     cli.choices("--target", wanted if isinstance(wanted, dict) else (), controller, "outputs")
     from thermogrip.mpc.closed_loop.simulate import RecordedController
     from thermogrip.mpc.controllers.loop_monitor import LoopMonitor
-    from thermogrip.mpc.tuning.design_review import beyond_logs
+    from thermogrip.mpc.tuning.design_review import beyond_logs, spec_of
     from thermogrip.report.control import session_sections
     from thermogrip.report.html import write_report
     from thermogrip.rig.session.profile import read_profile, tracking_error
@@ -238,8 +254,8 @@ def run(
         raise UserError("--stop-early without a grasp", hint="give --object and --material too")
     console, pace = Console(as_json), rig.pace(show)
     watch = show.watch("run", console, out, pace)
-    of_grasp = grasps.of_session(watch)
     loaded = load_controller(controller, rig.network)
+    of_grasp = grasps.of_session(watch, loaded, console.say if profile is None else None)
     regulator, path = RecordedController(loaded, LoopMonitor(loaded.plant, loaded.design)), None
     if profile is not None:
         path = read_profile(profile, loaded.controlled, preview_s=loaded.dt * sum(loaded.design.blocks))
@@ -253,7 +269,9 @@ def run(
     about |= {} if profile is None else {"profile": profile.name}
     about |= {"from_degC": rig.start, "hold_s": hold, "object_degC": obj, "material": material, "seed": seed}
     clock = rig.clock(pace)
-    opened = rig.open(clock, loaded, pace=pace, seed=seed)
+    if rig.port and (taken := spec_of(loaded, None)[0].surroundings_in_words(loaded.plant)):
+        console.say(f"Where the rig does not read it, {taken}")
+    opened = rig.open(clock, loaded, pace=pace, seed=seed, say=console.say)
     try:
         furthest = wanted if path is None else {n: float(v.max()) for n, v in path.targets.items()}
         for line in beyond_logs(loaded, furthest, grasps=grasp is not None):
@@ -352,7 +370,7 @@ def batch(
             output=loaded.controlled[0],
             clock=None if rig.port is None else clock,
             **watch.hooks,
-            **grasps.of_session(watch),
+            **grasps.of_session(watch, loaded, console.say),
         )
         watch.ended(done.verdict)
     console.say(f"{len(done.done)} of {len(trials)} grasps are good: {done.verdict}")

@@ -61,8 +61,8 @@ def tuning_table(tuning: Tuning) -> Cells:
 
 def tuning_caption(tuning: Tuning) -> str:
     """Return what the comparison ran on."""
-    plant, count = tuning.controller.plant, tuning.spec.check_draws
-    if plant.samples is None and plant.covariance is None:
+    count = tuning.spec.check_draws
+    if not tuning.controller.plant.uncertain:
         return "Closed loops on the plant, which has no uncertainty, under noise that the search did not have"
     return f"Closed loops on {count} draw{'' if count == 1 else 's'} of the plant that the search did not see"
 
@@ -91,8 +91,6 @@ def _tone(spec: Spec, run: ClosedLoop) -> str:
 
 def tuning_section(tuning: Tuning) -> Section:
     """Return the section of a tuned controller: verdict, table, closed loops."""
-    meets = "meets" if tuning.meets_spec else "does not meet"
-    answer = f"The {kind_of(tuning.controller)} {meets} the spec on every draw."
     scores = ", ".join(f"{name} {value:.3f}" for name, value in tuning.scores.items())
     evidence: list[Any] = [
         *([Plot(steps_chart(tuning.runs), _STEPS_CAPTION)] if tuning.runs else []),
@@ -111,7 +109,15 @@ def tuning_section(tuning: Tuning) -> Section:
         ),
     ]
     tone = "good" if tuning.meets_spec else "warn"
-    return Section("Does the controller meet the spec?", tuple(evidence), answer, tone, shown=2)
+    question = "Does the controller meet the spec?"
+    return Section(question, tuple(evidence), f"{spec_answer(tuning)}.", tone, shown=2)
+
+
+def spec_answer(tuning: Tuning) -> str:
+    """Return the sentence that says whether the spec is met, and what its review fails."""
+    failed = "; ".join(f"{check.name}: {check.finding}" for check in tuning.checks if check.verdict == "fail")
+    kind = kind_of(tuning.controller)
+    return f"The {kind} {'does not meet the spec: ' + failed if failed else 'meets the spec on every draw'}"
 
 
 def loop_section(run: ClosedLoop, design: Design, title: str, *, tone: str = "") -> Section:

@@ -26,7 +26,7 @@ def test_every_line_of_the_template_that_is_commented_out_is_valid_too():
         body = line.removeprefix("# ")
         lines.append(body if line.startswith("# ") and ("= " in body or body.startswith("[")) else line)
     text = "\n".join(lines)
-    assert Spec.model_validate(tomllib.loads(text)).limits == {"t_tank": (2.0, 65.0)}
+    assert Spec.model_validate(tomllib.loads(text)).limits == {"t_tank": (4.0, 58.0)}
 
 
 @pytest.mark.parametrize(
@@ -165,7 +165,7 @@ def test_the_spec_reaches_the_design(tank):
     assert design.drive_range == {"drive": (-0.5, 0.8)}
     assert design.slew_per_s == {"drive": 0.1}
     assert (design.dt, design.overshoot, design.ambient) == (3.0, 0.1, 20.0)
-    assert design.limits == {"t_tank": (2.0, 65.0)}
+    assert design.limits == {"t_tank": (4.0, 58.0)}
     assert Spec(output="t_tank").design(tank).limits == {}  # what is regulated has its targets
     ends = {"t_surface": (18.0, 43.0), "t_tank": (30.0, 31.0)}  # targets 18 to 43; of the tank there is none
     assert Spec(limits=ends).design(tank, track=3.0).limits == ends

@@ -13,6 +13,7 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.mpc.controllers.mpc import Controller, load_controller
 from thermogrip.mpc.controllers.pi import PIController
 from thermogrip.mpc.design.spec import Spec
+from thermogrip.mpc.tuning.design_review import review
 from thermogrip.mpc.tuning.figures import closed_loop_figure
 from thermogrip.mpc.tuning.objective import Case, Load, Score, StepResult, meets_spec
 from thermogrip.mpc.tuning.tune import (
@@ -114,12 +115,32 @@ def test_the_same_seed_finds_the_same_controller(tank, tuning):
     assert again.scores == tuning.scores
 
 
+def test_a_controller_meets_its_spec_where_its_review_finds_no_fault(tuning, by_pi, tmp_path):
+    for found in (tuning, by_pi):
+        checks = review(load_controller(found.save(tmp_path / "c.json")))
+        assert found.meets_spec == ("fail" not in {check.verdict for check in checks})
+
+
+def test_a_room_that_neither_spec_nor_logs_have_is_no_fault() -> None:
+    plant = follower()
+    held = review(PIController(plant, DULL.design(plant)), wanted=(24.0, 40.0), draws=0)[0]
+    assert held.verdict == "pass"
+    logged = review(
+        PIController(replace(plant, valid=plant.valid | {"room": (18.0, 25.0)}), DULL.design(plant)),
+        wanted=(24.0, 40.0),
+        draws=0,
+    )[0]
+    assert (logged.verdict, "24 degC in a room of 25 degC" in logged.finding) == ("warn", True)
+
+
 def test_a_target_out_of_reach_is_refused(tank):
     with pytest.raises(UserError, match="does not reach"):
         tune(tank, QUICK.model_copy(update={"steps": [(28.0, 140.0)], "evaluations": 1}))
 
 
-@pytest.mark.parametrize(("when", "designs"), [("MPC 2", 3), ("PI 2", None), ("comparison: tuned", None)])
+@pytest.mark.parametrize(
+    ("when", "designs"), [("MPC: design 2", 3), ("PI: design 2", None), ("comparison: tuned", None)]
+)
 def test_an_interrupt_keeps_the_best_so_far(tank, tuning, tmp_path, when: str, designs: int | None):
     """Ctrl-C at a call boundary: in the search of either kind, and in the comparison."""
 
@@ -154,9 +175,8 @@ def test_progress_starts_at_once_rises_and_names_the_best_so_far(tank):
     assert seen[0] == (0.0, "what the plant can do")
     shares = [share for share, _ in seen]
     assert shares == sorted(shares)
-    assert next(what for _, what in seen if what.startswith("PI 1")).startswith(
-        "PI 1; best so far: MPC, score"
-    )
+    first = next(what for _, what in seen if what.startswith("PI"))
+    assert first.startswith("PI: design 1; best so far: MPC, score")
 
 
 VALLEY = {"a": 6.0, "b": 0.3, "c": 1.0}

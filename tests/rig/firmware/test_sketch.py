@@ -11,8 +11,12 @@ from pathlib import Path
 import pytest
 
 from tests.rig.cores import BOARDS
+from thermogrip.mpc.design.spec import Spec
 from thermogrip.rig.firmware.reference import SERIALS, DeviceCore
+from thermogrip.rig.guard.guard import LIMIT_MARGIN, Guard
+from thermogrip.rig.guard.settings import GuardSettings
 from thermogrip.rig.serial.protocol import State, encode_line
+from thermogrip.rig.simulation.virtual_device import example_plant
 
 SKETCH = Path(str(files("thermogrip.rig"))) / "firmware"
 STUB = Path(__file__).parents[1] / "arduino_stub"
@@ -58,6 +62,18 @@ def test_the_longest_lines_are_as_long_as_the_sketch_says(board: str, tmp_path: 
     (tmp_path / "host.cpp").write_text(host.replace("static const", "static constexpr") + asserts)
     done = compiled("-I", SKETCH, tmp_path / "host.cpp")
     assert done.returncode == 0, done.stderr
+
+
+def test_tune_stays_inside_of_what_the_guard_and_the_device_allow() -> None:
+    plant, sketch = example_plant(), (SKETCH / "config.h").read_text()
+    guard = Guard(plant, GuardSettings.of(plant))
+    limits = re.findall(r'{"(\w+)", (\d+), (\d+), true}', sketch)
+    assert limits
+    for name, low, high in limits:
+        assert guard.limits_of(name) == (int(low) / 1e3, int(high) / 1e3)
+    [(tank, (least, most))] = Spec().design(plant).limits.items()
+    low, high = guard.limits_of(tank)
+    assert low + LIMIT_MARGIN <= least < most <= high - LIMIT_MARGIN
 
 
 def test_the_sketch_uses_every_pin_that_it_configures() -> None:

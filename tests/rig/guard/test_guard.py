@@ -490,7 +490,7 @@ def test_a_drive_that_is_applied_late_is_no_fault_of_the_plant(late: float) -> N
     ("logged", "settings", "highest"),
     [
         (None, GuardSettings(), 70.0),
-        ((20.0, 60.0), None, 70.0),
+        ((20.0, 70.0), None, 60.0),  # where the device switches off
         ((20.0, 96.0), None, 103.6),  # a tenth of the range beyond the logs
         ((20.0, 96.0), GuardSettings.from_dict({}, file="guard.toml"), 70.0),  # a file says what may be
         ((20.0, 96.0), GuardSettings().below(90.0), 90.0),
@@ -505,9 +505,10 @@ def test_a_target_may_be_where_the_logs_went_or_as_somebody_states(
         plant = replace(plant, valid={**plant.valid, "t_tank": logged, "t_surface": logged})
     guard = Guard(plant, settings)
     guard.check_target("t_tank", highest)
-    with pytest.raises(UserError, match=f"unsafe; choose one from -1 to {highest:g} degC, or state"):
+    lowest = 2 if highest == 60 else -1
+    with pytest.raises(UserError, match=f"unsafe; choose one from {lowest} to {highest:g} degC, or state"):
         guard.check_target("t_tank", highest + 0.1)
     with pytest.raises(UserError, match="choose one from 3 to 55 degC"):
         guard.check_target("t_surface", 56.0)  # what touches has its limits whatever was logged
-    assert guard.sensors.plausible(highest + 4.9)
-    assert not guard.sensors.plausible(max(75.0, highest + 5.1))
+    assert guard.sensors.plausible(max(70.0, highest) + 4.9)
+    assert not guard.sensors.plausible(max(75.1, highest + 5.1))
