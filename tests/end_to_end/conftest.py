@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.end_to_end.drawn import faults_of
 from thermogrip.cli.main import main
 from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.plant import Plant
@@ -38,10 +39,14 @@ class Bench:
     capsys: pytest.CaptureFixture[str]
 
     def run(self, *words: object) -> Outcome:
-        """Run one command line in this process."""
+        """Run one command line in this process; what it draws on a page is looked at."""
         self.capsys.readouterr()
         code = main([str(word) for word in words])
         out, err = self.capsys.readouterr()
+        for word in map(str, words):
+            for page in (Path(word), Path(word, "report.html")):
+                if page.suffix == ".html" and page.is_file():
+                    assert list(faults_of(page.read_text(encoding="utf-8"))) == [], f"{page} of {words}"
         return Outcome(code, out, err)
 
     def write(self, name: str, text: str | bytes) -> Path:

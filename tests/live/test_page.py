@@ -66,6 +66,8 @@ def test_two_viewers_see_a_session_from_its_start_over_the_grasp_to_its_end(
         assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
         # a session is shown at each look, of which a sample has several, and with its verdict at last
         assert page.evaluate("rows.length") > len(session.log["time"])
+        # of the size of what was measured: about 28 degC over two minutes
+        assert page.evaluate("rows.flat().every((x) => x === null || Math.abs(x) < 1000)")
         assert page.evaluate("$('c-skin').getContext('2d').getImageData(0, 0, 300, 150).data.some((x) => x)")
         page.hover("#c-skin")
         until(page, "#r-skin", r"^\d+\.\d s: target 28\.00, t_surface \d\d\.\d\d °C$")

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from tests.end_to_end.conftest import small_plant
+from tests.end_to_end.drawn import faults_of
 from thermogrip.classify import make_classifier
 from thermogrip.classify.estimators.base import GraspClassifier
 from thermogrip.datasets.examples import load_example_grasps
@@ -132,6 +133,7 @@ def test_the_whole_demo_leaves_a_page_whose_every_question_is_answered(tmp_path:
     assert all(section.verdict for section in questions)
     page = done.report.read_text(encoding="utf-8")
     assert all(section.title in page for section in done.sections)
+    assert list(faults_of(page)) == []
     made = {path.name for path in tmp_path.iterdir()}
     assert made >= {
         "plant.json",

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from scipy.stats import binomtest
 
+from tests.end_to_end.drawn import faults_of
 from thermogrip.classify import make_classifier
 from thermogrip.classify.estimators.base import GraspClassifier
 from thermogrip.cli.main import main
@@ -131,6 +132,7 @@ def test_every_case_and_every_rate_is_printed(small: Repeated) -> None:
     assert {path.name for path in small.out.iterdir()} == {"bundled", "simulated", "report.html"}
     page = (small.out / "report.html").read_text(encoding="utf-8")
     assert all(cell in page for row in rows for cell in row[6:])
+    assert list(faults_of(page)) == []
     assert all(row["copies_right"] < 0.9 * row["copies_n"] for row in small.found.copies)  # after two epochs
     # of a case that has not learnt its copies nothing is said
     assert "has learnt the copies of no case, so nothing is said of their worth" in page

@@ -82,7 +82,7 @@ def autotune(
         raise
     page = out / "report.html"
     if work.session is not None:
-        _write_page(work, page, str(rig.port or rig.twin))
+        write_page(work, page, str(rig.port or rig.twin))
     head, rows = _stage_table(work)
     console.table(f"{rig.port or rig.twin}, to {target} degC", head, rows)
     console.say(f"wrote {page if page.exists() else out}")
@@ -103,7 +103,7 @@ def _stage_table(work: Autotune) -> tuple[list[str], list[list[Any]]]:
     return ["loop", "after [min]", "settles in [s]", "overshoot [K]"], rows
 
 
-def _write_page(work: Autotune, page: Path, rig: str) -> None:
+def write_page(work: Autotune, page: Path, rig: str) -> None:
     """Write the one page: the stages, the session under the tuned loop, the tuning, the plant."""
     from thermogrip.report.control import session_sections, tuning_sections
     from thermogrip.report.html import Section, Table, write_report

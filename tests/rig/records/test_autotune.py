@@ -10,7 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tests.end_to_end.drawn import faults_of
 from tests.rig.makers import DirectPort, SteppedClock, make_lab
+from thermogrip.cli.autotune import write_page
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import column
 from thermogrip.mpc import PIController, Spec, load_controller
@@ -75,7 +77,7 @@ class Done:
     """What an autotune left that was stopped in its step test, its loop and its tuning."""
 
     desk: Desk
-    known: dict[str, Any]
+    work: Autotune
     stopped: list[list[str]]  # the runs that were there at each stop
     first_controller: PIController
 
@@ -93,11 +95,11 @@ def tuned(tmp_path_factory: pytest.TempPathFactory) -> Done:
     first = load_controller(desk.folder / "controller.json")
     work = desk.autotune()
     work.run()
-    return Done(desk, work.known, stopped, first)
+    return Done(desk, work, stopped, first)
 
 
 def test_a_board_that_nobody_has_seen_is_brought_to_its_target(tuned: Done) -> None:
-    known = tuned.known
+    known = tuned.work.known
     assert known["first"]["minutes"] < 10.0  # what was stopped counts
     assert known["tuned"]["minutes"] <= 20.0
     assert known["checked"]["verdict"] == "settled"
@@ -117,7 +119,7 @@ def test_what_was_stopped_goes_on_with_what_is_there(tuned: Done) -> None:
     rows = read_run(tuned.desk.folder / "03-loop")
     assert rows.about["verdict"] == "interrupted"
     assert rows.log is not None
-    assert tuned.known["tuned"]["minutes"] > np.ptp(rows.log["time"].values) / 60
+    assert tuned.work.known["tuned"]["minutes"] > np.ptp(rows.log["time"].values) / 60
 
 
 def test_there_is_a_controller_before_it_is_tuned(tuned: Done) -> None:
@@ -146,10 +148,15 @@ def test_targets_of_the_loop_are_moved_and_stay_below_the_limit(tuned: Done) -> 
     assert abs(np.corrcoef(moved)[0, 1]) < 0.7
 
 
+def test_its_page_is_drawn_at_the_size_of_the_outputs(tuned: Done, tmp_path: Path) -> None:
+    write_page(tuned.work, tmp_path / "page.html", "a board")
+    assert list(faults_of((tmp_path / "page.html").read_text(encoding="utf-8"))) == []
+
+
 def test_done_is_done(tuned: Done) -> None:
     again, before = tuned.desk.autotune(), tuned.desk.clock()
     again.run()
-    assert again.known == tuned.known
+    assert again.known == tuned.work.known
     assert tuned.desk.clock() == before
 
 
