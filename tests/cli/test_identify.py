@@ -17,7 +17,6 @@ from scipy.io import loadmat
 from tests.cli.conftest import Bench, StandIn, shares, words_of
 from tests.end_to_end.conftest import small_plant
 from thermogrip.cli.identify import _starts
-from thermogrip.cli.verbs import Verb
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.log_files import read_log
 from thermogrip.datasets.schema import make_log
@@ -383,31 +382,6 @@ def test_what_comes_after_validate_follows_from_what_it_found(
     seconds = done.err.split("--warmup ")[-1].split()[0]
     assert done.err.endswith(f"next: thermogrip {then.format(s=seconds)}\n")
     assert verdicts != ("start",) or 5 < float(seconds) <= 60  # a tenth of a log of ten minutes at most
-
-
-@pytest.mark.parametrize(
-    ("command", "then"),
-    [
-        (
-            "thermogrip identify a.csv 'b c.csv@10:' --network tclab --out p.json --workers 2 --json",
-            "a.csv 'b c.csv@10:' --network tclab",
-        ),
-        ("thermogrip identify a.csv gone.csv --out p.json", "LOG_OF_FIT"),  # as seen from another folder
-        ("thermogrip identify 'a.csv", "LOG_OF_FIT"),
-        ("rm a.csv", "LOG_OF_FIT"),
-        (3, "LOG_OF_FIT"),
-    ],
-)
-def test_after_a_plant_that_has_changed_the_fit_is_typed_once_more_with_the_new_log(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: Any, then: str
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    for name in ("a.csv", "b c.csv"):
-        Path(name).touch()
-    inputs = {str(tmp_path / name): "" for name in ("a.csv", "b c.csv", "gone.csv")}
-    Path("p.json").write_text(json.dumps({"provenance": {"command": command, "inputs": inputs}}))
-    given = {"plant": Path("p.json"), "paths": ["new.csv"]}
-    assert Verb("validate").next(given, found="worse") == f"identify {then} new.csv --out both.json"
 
 
 @pytest.mark.parametrize(

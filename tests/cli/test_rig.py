@@ -389,12 +389,12 @@ def test_after_a_trip_the_operator_is_asked_whether_it_is_cleared(
 @pytest.mark.parametrize(("words", "shown"), [([], "0"), (["8642"], "8642"), (["--seed", "3"], "0")])
 def test_live_may_stand_alone(words: list[str], shown: str, ran: SimpleNamespace, stand_in: StandIn) -> None:
     made = stand_in("thermogrip.cli.rig.ShowOptions.watch", UserError("seen"))
-    given = ["run", "c.json", "--target", "40", "--twin", "plant.json", "--out", "r", "--on-trip", "mail me"]
+    given = ["run", "c.json", "--target", "40", "--twin", "plant.json", "--out", "r"]
     assert ran.bench.run(*given, "--live", *words).code == 2
-    assert made[0].args[0] == ShowOptions(live=int(shown), on_trip="mail me")
+    assert made[0].args[0] == ShowOptions(live=int(shown))
     assert (made[0].args[1], made[0].args[3:]) == ("run", (Path("r"), 10.0))
     ran.bench.run(*given, "--foxglove")
-    assert made[1].args[0] == ShowOptions(foxglove=8765, on_trip="mail me")
+    assert made[1].args[0] == ShowOptions(foxglove=8765)
 
 
 def test_a_first_touch_reports_median_and_sd_of_its_90_percent_interval(

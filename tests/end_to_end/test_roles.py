@@ -68,9 +68,11 @@ def test_an_output_that_is_called_like_a_room_is_an_output_where_the_plant_decla
 
 def test_the_names_of_a_network_file_are_inputs_and_outputs_and_the_plant_has_the_log_s_units(house: Bench):
     """A lamp burns in the part that is held out alone: what it gives is as unknown as its prior says."""
-    lamp = 'heaters.lamp = { node = "room", input = "lamp", power = "L" }\ninputs.lamp = { unit = "1", range = [0, 1] }\n'
+    head, parameters = ROOM.split("[parameters]")
+    lamp = 'inputs.lamp = { unit = "1", range = [0, 1] }\n'
+    lamp += 'heaters.lamp = { node = "room", input = "lamp", power = "L" }\n'
     unknown = 'L = { unit = "W", value = 50.0, sd_log = 4.0 }\n'
-    house.write("room.toml", ROOM.replace("\n[parameters]", f"{lamp}\n[parameters]") + unknown)
+    house.write("room.toml", f"{head}{lamp}[parameters]{parameters}{unknown}")
     rows = (house.path / "room.csv").read_text().splitlines()
     lit = [f"{row},{int(k > 320)}" for k, row in enumerate(rows[1:])]
     house.write("room.csv", "\n".join([f"{rows[0]},lamp", *lit]) + "\n")

@@ -10,12 +10,10 @@ import time
 from contextlib import suppress
 from dataclasses import replace
 from importlib import util
-from typing import Any
 from urllib.request import Request, urlopen
 
 import pytest
 
-from tests.live.conftest import Running, paced_twin
 from tests.live.test_terminal import NOW, TRIP
 from thermogrip.datasets.errors import UserError
 from thermogrip.live import watch as module
@@ -54,20 +52,6 @@ def test_work_that_shows_no_session_shows_its_progress(capsys: pytest.CaptureFix
     with Watch("batch", Console()) as watch:
         watch.progress(0.5, "trial 2 of 4: copper")
     assert capsys.readouterr().err == "batch  50 % trial 2 of 4: copper\n"
-
-
-def test_a_trip_runs_the_command_while_the_session_ends(monkeypatch: pytest.MonkeyPatch) -> None:
-    ran: list[Any] = []
-    monkeypatch.setattr("thermogrip.live.trip_command.TripCommand.start", lambda self, trip: ran.append(trip))
-    with Watch("run", Console(), Show(on_trip="true")) as watch:
-        rig = paced_twin()
-        running = Running(watch, rig, hold=10_000.0)
-        while watch.now is None or watch.now.time_s < 5.0:
-            time.sleep(0.01)
-        watch.operator.stop("a test")
-        session = running.result()
-    assert session.trip is not None
-    assert ran == [session.trip]
 
 
 @pytest.mark.parametrize("extra", ["live", "foxglove"])

@@ -70,7 +70,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     words = [*words[1:], "--help"] if words[0] == "help" else words
     try:
         width = 10_000 if sys.stdout.isatty() else 100  # of help, at most
-        with work(["thermogrip", *_without_passwords(words)]):
+        with work(["thermogrip", *map(without_password, words)]):
             code = app(args=words, prog_name="thermogrip", standalone_mode=False, max_content_width=width)
         sys.stdout.flush()
     except (KeyboardInterrupt, typer.Abort):
@@ -97,15 +97,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     if code == ExitCode.INTERRUPTED:  # typer makes a code of a Ctrl-C inside a verb
         return _fail("stopped by Ctrl-C", ExitCode.INTERRUPTED)
     return int(code or ExitCode.DONE)
-
-
-def _without_passwords(words: Sequence[str]) -> list[str]:
-    """Return the words of a command line as records keep them: of ``--on-trip`` no more than the program."""
-    recorded: list[str] = []
-    for before, word in zip(["", *words], words):
-        command = before == "--on-trip" or word.startswith("--on-trip=")
-        recorded.append(without_password(re.sub(r"(?s)\s.*", " ...", word) if command else word))
-    return recorded
 
 
 def _ignore_settings_of_folder() -> None:

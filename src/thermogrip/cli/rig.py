@@ -64,14 +64,13 @@ class ShowOptions:
 
     live: Annotated[int | None, cli.shared("--live")] = None
     foxglove: Annotated[int | None, cli.shared("--foxglove")] = None
-    on_trip: Annotated[str | None, cli.shared("--on-trip")] = None
 
     def watch(self, title: str, console: Console, out: Path, pace: float | None = None) -> Watch:
         """Return what shows a session, ``pace`` times as fast as real time where a twin is watched."""
         from thermogrip.live.watch import Show, Watch
 
         layout = out / "foxglove_layout.json"
-        show = Show(live=self.live, foxglove=self.foxglove, on_trip=self.on_trip, layout=layout, pace=pace)
+        show = Show(live=self.live, foxglove=self.foxglove, layout=layout, pace=pace)
         return Watch(title, console, show)
 
 

@@ -109,7 +109,6 @@ class Verb(TyperCommand):
         for name, value in given.items():
             words[name] = printable(shlex.join(map(str, value if isinstance(value, list) else [value])))
         words.setdefault("target", _target(given.get("controller")))
-        words["fit"] = _fit_of(given.get("plant"))
         rig = "port" if "port" in given else "twin"
         words["rig"] = f"--{rig} {words.get(rig, 'PLANT')}"
         line = str(then).format(**words)
@@ -148,29 +147,6 @@ def _target(controller: Any) -> str:
         steps = json.loads(Path(controller).read_text(encoding="utf-8"))["notes"]["spec"]["steps"]
         return f"{float(steps[0][1]):g}"
     return "38"
-
-
-#: Options of a fit, with a value, that its plant does not depend on.
-_BESIDE = ("--out", "--report", "--workers", "--cluster", "--backend")
-
-
-def _fit_of(plant: Any) -> str:
-    """Return the words by which a plant in a file was identified, but for where its results went;
-    ``LOG_OF_FIT`` where its logs are not here."""
-    with suppress(Exception):
-        content = json.loads(Path(plant).read_text(encoding="utf-8"))["provenance"]
-        program, verb, *typed = shlex.split(content["command"])
-        names = {Path(name).name for name in content["inputs"]}
-        logs = [word for word in typed if Path(word.rpartition("@")[0] or word).name in names]
-        if (program, verb) != ("thermogrip", "identify") or not logs:
-            return "LOG_OF_FIT"
-        if all(Path(word.rpartition("@")[0] or word).exists() for word in logs):
-            words = iter(typed)
-            repeated = [
-                word for word in words if not (word in _BESIDE and next(words, "")) and word != "--json"
-            ]
-            return printable(shlex.join(repeated))
-    return "LOG_OF_FIT"
 
 
 def function_of(verb: str) -> Any:

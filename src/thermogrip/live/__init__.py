@@ -1,4 +1,4 @@
-"""A session while it runs: on the terminal, on a page, in Foxglove, and for a command on a trip.
+"""A session while it runs: on the terminal, on a page, and in Foxglove.
 
 Others use ``watch.Watch``.
 """

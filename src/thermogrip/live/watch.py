@@ -32,7 +32,6 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.media import printable
 from thermogrip.live.server import PAGE
 from thermogrip.live.terminal import line, panel
-from thermogrip.live.trip_command import TripCommand
 from thermogrip.report.console import Console, plain
 from thermogrip.rig.session.loop import PHASES
 from thermogrip.rig.session.signals import check_stopped
@@ -62,7 +61,6 @@ class Show:
 
     live: int | None = None  # port of the page, 0 for any; None for no page
     foxglove: int | None = None  # port
-    on_trip: str | None = None  # command line
     layout: Path | None = None  # where Foxglove's layout goes
     pace: float | None = None  # of a twin [times real time]: its page stays until it has been looked at
 
@@ -99,7 +97,6 @@ class Watch:
         self._show = show or Show()
         self.operator = Operator()
         self._show.check()
-        self._command = None if self._show.on_trip is None else TripCommand(self._show.on_trip, console.warn)
         self._queue: deque[Snapshot] = deque(maxlen=WATCH.keep)
         self._posterior: deque[list[Any]] = deque(maxlen=WATCH.keep)
         self.now: Snapshot | None = None
@@ -125,8 +122,6 @@ class Watch:
     def listen(self, snapshot: Snapshot) -> None:
         """Take a snapshot; returns at once."""
         self._queue.append(snapshot)
-        if snapshot.trip is not None and self._command is not None:
-            self._command.start(snapshot.trip)
 
     def progress(self, fraction: float, what: str) -> None:
         """Take how far the work is."""
@@ -220,8 +215,6 @@ class Watch:
             self._thread.join()
         self._view.pause()
         self._close_page()
-        if self._command is not None:
-            self._command.join()
         sys.setswitchinterval(self._switch)
 
     def _stay(self) -> None:
