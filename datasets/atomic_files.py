@@ -11,17 +11,17 @@ from __future__ import annotations
 import json
 import os
 import re
-import stat
-import tempfile
+import shutil
 import tomllib
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
-from thermogrip.datasets.errors import UserError, as_user_error, os_fault, os_faults
+from thermogrip.datasets.errors import UserError, as_user_error, os_faults
 from thermogrip.datasets.limits import check_content, check_size, check_source, most_bytes, read_within
-from thermogrip.datasets.provenance import KEY, hash_file, note_written, provenance
+from thermogrip.datasets.provenance import KEY, note_written, provenance
 
 #: A document's part of what a file of records may have (:mod:`thermogrip.datasets.limits`): 8 MiB, 1 MiB.
 JSON_SHARE, _TOML_SHARE = 256, 2048
@@ -42,11 +42,6 @@ def make_folder(path: str | Path) -> None:
             _sync_folder(place.parent)
 
 
-# Windows writes a line end of two bytes unless it is asked not to; a child process gets no copy on either
-_AS_WRITTEN = sum(getattr(os, name, 0) for name in ("O_BINARY", "O_NOINHERIT", "O_CLOEXEC"))
-_NO_LINK = getattr(os, "O_NOFOLLOW", 0)  # Windows has none
-
-
 @contextmanager
 def atomic_path(path: str | Path) -> Iterator[Path]:
     """Yield a temporary path beside ``path``, synced and renamed to it on success and removed on any
@@ -54,42 +49,24 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     target = Path(path)
     if os.path.isdir(target):  # Path.is_dir raises on a name that is too long
         raise UserError("is a folder", file=target, hint="name a file")
-    temporary: Path | None = None
-    try:
-        # the suffix stays, since writers choose their format or compression by it
-        prefix = f".{target.stem[:40]}-"
-        handle, name = tempfile.mkstemp(prefix=prefix, suffix=target.suffix, dir=target.parent)
-        os.close(handle)
-        temporary = Path(name)
+    # nobody else may write to this folder, so that no link can be put in the file's place
+    with os_faults(target), TemporaryDirectory(prefix=".", dir=target.parent) as folder:
+        temporary = Path(folder) / target.name  # writers choose their format or compression by the suffix
         yield temporary
-        _sync_file(temporary, _mode_of(target))
+        _sync(temporary, os.O_RDWR)  # Windows syncs only what is writable
+        if target.is_file() and not target.is_symlink():  # a link is replaced, whatever it leads to
+            shutil.copymode(target, temporary)
         os.replace(temporary, target)
         note_written(target)
         _sync_folder(target.parent)
-        temporary = None
-    except OSError as error:
-        raise os_fault(error, target) from error
-    finally:
-        if temporary is not None:
-            with suppress(OSError):
-                temporary.unlink()
 
 
 def write_atomic(path: str | Path, content: bytes | str) -> Path:
     """Write ``content`` to ``path`` in one step and return the path; text as UTF-8, with ``?`` for what is no
     character, as in the name of a file that is no text."""
-    data = content.encode("utf-8", "replace") if isinstance(content, str) else content
-    flags = os.O_WRONLY | os.O_TRUNC | _NO_LINK | _AS_WRITTEN
-    with atomic_path(path) as temporary, open(os.open(temporary, flags), "wb") as file:
-        file.write(data)
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(content.encode("utf-8", "replace") if isinstance(content, str) else content)
     return Path(path)
-
-
-def open_new(path: str | Path) -> int:
-    """Return the descriptor of a new file for writing; OSError if its name is there, if only as a link."""
-    handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | _NO_LINK | _AS_WRITTEN, 0o666)
-    note_written(path)
-    return handle
 
 
 def read_bytes(path: str | Path, *, share: int = 1) -> bytes:
@@ -103,13 +80,6 @@ def read_bytes(path: str | Path, *, share: int = 1) -> bytes:
     return data
 
 
-def file_hash(path: str | Path) -> str:
-    """Return the SHA-256 of a file as 64 hexadecimal digits."""
-    check_source(path)
-    with os_faults(path):
-        return hash_file(path)
-
-
 def write_json(path: str | Path, content: Mapping[str, Any], *, schema: str, version: int) -> Path:
     """Write a JSON object of finite numbers with ``schema``, ``version`` and provenance, return the path."""
     whole = {"schema": schema, "version": version} | dict(content) | {KEY: provenance()}
@@ -120,7 +90,7 @@ def read_toml(path: str | Path, *, hint: str) -> dict[str, Any]:
     """Return the content of a TOML file; ``hint`` says where a good one comes from."""
     raw = read_bytes(path, share=_TOML_SHARE)
     too_deep = as_user_error(RecursionError, "is nested too deeply", file=path, hint=hint)
-    # no TOML, no text, or an integer of thousands of digits
+    # no text, no TOML, or an integer of thousands of digits
     with too_deep, as_user_error(ValueError, "is not TOML ({error})", file=path, hint=hint):
         text = raw.decode("utf-8")
         if _LONG_KEY.search(text):  # tomllib takes the square of the parts of a key
@@ -134,15 +104,15 @@ def read_json(path: str | Path, schema: str, version: int) -> dict[str, Any]:
     """Return the JSON object in ``path``, which must have this schema and no newer version."""
     raw = read_bytes(path, share=JSON_SHARE)
     place: dict[str, Any] = {"file": path, "hint": f"it must be a JSON file of schema {schema!r}"}
-    with as_user_error(UnicodeDecodeError, "is not text, so it is not JSON", **place):
-        text = raw.decode("utf-8")
-    too_deep = as_user_error(RecursionError, "is nested too deeply", **place)
-    with too_deep, as_user_error(ValueError, "is not JSON ({error})", **place):
-        try:
-            content: dict[str, Any] = parse_json(text)
-        except json.JSONDecodeError as error:
-            problem = f"is not JSON ({error.msg}, column {error.colno})"
-            raise UserError(problem, **place, row=error.lineno) from error
+    try:
+        content: dict[str, Any] = parse_json(raw.decode("utf-8"))
+    except json.JSONDecodeError as error:
+        problem = f"is not JSON ({error.msg}, column {error.colno})"
+        raise UserError(problem, **place, row=error.lineno) from error
+    except RecursionError as error:
+        raise UserError("is nested too deeply", **place) from error
+    except ValueError as error:  # no text, or half a character
+        raise UserError(f"is not JSON ({error})", **place) from error
     check_json(content, schema, version, file=path)
     check_content(content, file=path)
     return content
@@ -170,34 +140,16 @@ def check_json(content: Any, schema: str, version: int, *, file: str | Path | No
         raise UserError(problem, file=file, hint="update thermogrip or write the file anew")
 
 
-def _sync_file(path: Path, mode: int) -> None:
-    """Set a file's permissions and force it to disk."""
-    handle = os.open(path, os.O_RDWR | _NO_LINK)  # Windows syncs only what is writable
-    try:
-        if hasattr(os, "fchmod"):
-            os.fchmod(handle, mode)
-        os.fsync(handle)
-    finally:
-        os.close(handle)
-
-
 def _sync_folder(path: Path) -> None:
     """Force a folder's names to disk; Windows cannot open one, and need not."""
-    if os.name == "nt":
-        return
-    handle = os.open(path, os.O_RDONLY)
+    if os.name != "nt":
+        _sync(path, os.O_RDONLY)
+
+
+def _sync(path: Path, flags: int) -> None:
+    """Force a file or a folder's names to disk."""
+    handle = os.open(path, flags)
     try:
         os.fsync(handle)
     finally:
         os.close(handle)
-
-
-def _mode_of(target: Path) -> int:
-    """Return the permissions of the file that is replaced, else what the umask leaves (not 0600)."""
-    with suppress(OSError):
-        mode = os.lstat(target).st_mode
-        if stat.S_ISREG(mode):  # a link is replaced, and where it leads to is not asked
-            return mode & 0o777
-    mask = os.umask(0)
-    os.umask(mask)
-    return 0o666 & ~mask

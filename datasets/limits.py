@@ -87,20 +87,6 @@ def read_within(stream: BinaryIO, most: int) -> bytes:
     return content.getvalue()
 
 
-def unpack_within(stream: BinaryIO, source: BinaryIO, *, file: str | Path) -> bytes:
-    """Return what ``stream`` unpacks from the open file ``source``; what came out is compared with what has
-    been read so far, so what grows too much is refused after 8 MiB."""
-    content = io.BytesIO()
-    while True:
-        bytes_left = most_unpacked(source.tell()) + 1 - content.tell()
-        piece = stream.read(min(bytes_left, 4 * _MB))
-        if not piece:
-            break
-        content.write(piece)
-        check_unpacked(source.tell(), content.tell(), file=file)
-    return content.getvalue()
-
-
 class Unpacker:
     """Unpack the chunks of one bag, which count together, to what the file may hold and not a byte further;
     readers would unpack chunks whole, which grow 255 times (lz4) or many thousand times (zstd, bz2)."""

@@ -3,7 +3,7 @@
 Local processes are those of loky: each is a new interpreter, not a fork that would copy locks which numerical
 libraries hold; they stay for the next call, for each takes seconds to import.  Only the user's own processes
 unpickle functions and items: those that this one started, or those of the cluster that was named
-(``tcp://HOST:PORT`` of its scheduler, extra ``cluster``).  What a killed process had in hand is done again.
+(``tcp://HOST:PORT`` of its scheduler, extra ``cluster``), which does again what a killed worker had in hand.
 """
 
 from __future__ import annotations
@@ -11,18 +11,15 @@ from __future__ import annotations
 import atexit
 import os
 import signal
-import sys
 import threading
 from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import Future, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import closing, contextmanager
-from importlib.metadata import version
+from contextlib import closing
 from importlib.util import find_spec
 from typing import Any, TypeAlias, TypeVar
 from warnings import catch_warnings, simplefilter
 
-from thermogrip import __version__
 from thermogrip.datasets.errors import UserError, as_user_error
 
 Progress: TypeAlias = Callable[[float, str], None]
@@ -31,7 +28,7 @@ Workers: TypeAlias = int | str
 
 _CONNECT_S = 10  # a scheduler of the same network answers within one
 _IDLE_S = 60  # after which a local process ends: longer than between two calls of one command
-_DEATHS = 3  # of processes without a result between them: one or two may be chance, three are the work's
+_SAME_VERSIONS = ("thermogrip", "numba", "numpy", "scipy")  # on which the last bits of answers depend
 
 #: Who sets one of these wants as many threads of linear algebra.
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
@@ -115,151 +112,96 @@ def _done(
     check_workers(workers)
     if isinstance(workers, str):
         if todo:
-            yield from _on_cluster(function, todo, workers)
+            from distributed import KilledWorker
+
+            problem = f"workers of {workers} are killed again and again"
+            with as_user_error(KilledWorker, problem, hint="give them more memory"):
+                yield from _in_pool(_client_of(workers).get_executor(), function, todo)
         return
     n = min(workers, os.cpu_count() or 1)
     if n == 1 or len(todo) < 2:
         yield from enumerate(map(function, todo))
-    else:
-        yield from _on_processes(function, todo, n)
+        return
+    pool, hint = _processes(n), "lower --workers; memory may be short"
+    try:
+        with as_user_error(BrokenProcessPool, "a worker process was killed", hint=hint):
+            yield from _in_pool(pool, function, todo)
+    except KeyboardInterrupt:
+        pool.shutdown(wait=True, kill_workers=True)
+        raise
 
 
-def _on_processes(
-    function: Callable[[_Item], _Result], todo: list[_Item], n: int
+def _in_pool(
+    pool: Any, function: Callable[[_Item], _Result], todo: list[_Item]
 ) -> Generator[tuple[int, _Result], None, None]:
-    remaining, pool = dict(enumerate(todo)), _processes(n)
-    deaths = 0
-    while remaining:
-        futures: dict[Future[_Result], int] = {}
-        try:
-            futures |= {pool.submit(function, item): i for i, item in remaining.items()}
-            for future in as_completed([*futures]):
-                result = future.result()
-                place = futures.pop(future)  # it holds the result, of which only the caller may need many
-                del remaining[place], future
-                deaths = 0
-                yield place, result
-        except BrokenProcessPool as error:  # all of the pool is lost
-            deaths += 1
-            if deaths > _DEATHS:
-                raise UserError(
-                    "worker processes are killed again and again", hint="lower --workers; memory may be short"
-                ) from error
-            pool = _processes(n)
-        except KeyboardInterrupt:
-            pool.shutdown(wait=True, kill_workers=True)
-            raise
-        finally:
-            for future in futures:
-                future.cancel()  # what has not begun
+    places: dict[Future[_Result], int] = {}
+    try:
+        places |= {pool.submit(function, item): place for place, item in enumerate(todo)}
+        for future in as_completed([*places]):
+            result = future.result()
+            place = places.pop(future)  # it holds the result, of which only the caller may need many
+            del future
+            yield place, result
+    finally:
+        for future in places:
+            future.cancel()  # what has not begun
 
 
 def _processes(n: int) -> Any:
     """Return the executor of n local processes, the one that there is unless it broke."""
     from loky import get_reusable_executor
 
-    with _lock, _sound_environment() as environment:
-        settings: dict[str, Any] = {"timeout": _IDLE_S, "initializer": _ignore_interrupts, "env": environment}
-        pool = get_reusable_executor(n, **settings)
-        pool.submit(int)  # which starts them
+    # several threads of linear algebra in each process would get in each other's way
+    kept = {"PYTHONSAFEPATH": "1"} | {name: os.environ.get(name, "1") for name in THREADS}
+    # a Ctrl-C is left to the process that started this one, and that ends it
+    ignored = {"initializer": signal.signal, "initargs": (signal.SIGINT, signal.SIG_IGN)}
+    with _lock:
+        before = os.environ.get("PYTHONSAFEPATH")
+        # modules are ours, not those of the folder that this process happens to run in: loky's own helper
+        # process gets no other environment than this one
+        os.environ["PYTHONSAFEPATH"] = "1"
+        try:
+            pool = get_reusable_executor(n, timeout=_IDLE_S, env=kept, **ignored)
+            pool.submit(int)  # which starts them
+        finally:
+            del os.environ["PYTHONSAFEPATH"]
+            if before is not None:
+                os.environ["PYTHONSAFEPATH"] = before
     return pool
-
-
-@contextmanager
-def _sound_environment() -> Iterator[dict[str, str]]:
-    """Start processes whose modules are ours, not those of the folder that this one happens to run in, and
-    yield the variables that they keep: several threads each would get in each other's way."""
-    before = os.environ.get("PYTHONSAFEPATH")
-    os.environ["PYTHONSAFEPATH"] = "1"
-    try:
-        yield {"PYTHONSAFEPATH": "1"} | {name: os.environ.get(name, "1") for name in THREADS}
-    finally:
-        del os.environ["PYTHONSAFEPATH"]
-        if before is not None:
-            os.environ["PYTHONSAFEPATH"] = before
-
-
-def _ignore_interrupts() -> None:
-    """Leave a Ctrl-C to the process that started this one, and that ends it."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-
-
-def _on_cluster(
-    function: Callable[[_Item], _Result], todo: list[_Item], address: str
-) -> Generator[tuple[int, _Result], None, None]:
-    import distributed
-
-    dask: Any = distributed  # its functions have no types
-    client = _client_of(address)
-    # as bytes: the scheduler would import what they need, and unpack and pack them, before a worker may begin
-    packed = [dask.protocol.pickle.dumps((function, item)) for item in todo]
-    futures = {future: i for i, future in enumerate(client.map(_on_worker, packed, pure=False))}
-    try:
-        for future in dask.as_completed([*futures], loop=client.loop):
-            result = dask.protocol.pickle.loads(future.result())  # the first fault ends it
-            yield futures.pop(future), result
-    except dask.KilledWorker as error:
-        problem = f"workers of {address} are killed again and again"
-        raise UserError(problem, hint="give them more memory") from error
-    finally:
-        client.cancel([*futures])
 
 
 def _client_of(address: str) -> Any:
     """Return the client of a scheduler, the same one until the program ends."""
-    with _lock:
-        if address not in _clients or _clients[address].status != "running":
-            _clients[address] = _connected(address)
-            atexit.register(_clients[address].close)
-        return _clients[address]
-
-
-def _connected(address: str) -> Any:
-    """Return a client of a scheduler whose workers run this code."""
     import distributed
 
     dask: Any = distributed  # its functions have no types
-    hint = "start one with 'dask scheduler', or check the address"
-    # its own words about versions are a table; _check_cluster says it in one line
-    lost = as_user_error((OSError, ValueError), f"no scheduler answers at {address}", hint=hint)
-    with catch_warnings(), lost:
-        simplefilter("ignore", dask.versions.VersionMismatchWarning)
-        client = dask.Client(address, timeout=_CONNECT_S, set_as_default=False)
-    try:
-        _check_cluster(client, address)
-    except BaseException:
-        client.close()
-        raise
-    return client
-
-
-def _on_worker(packed: bytes) -> bytes:
-    """Return what a function returns for an item, packed as they came."""
-    from distributed import protocol
-
-    pickle: Any = protocol.pickle  # its functions have no types
-    function, item = pickle.loads(packed)
-    return bytes(pickle.dumps(function(item)))
+    with _lock:
+        if address in _clients and _clients[address].status == "running":
+            return _clients[address]
+        hint = "start one with 'dask scheduler', or check the address"
+        lost = as_user_error((OSError, ValueError), f"no scheduler answers at {address}", hint=hint)
+        with catch_warnings(), lost:
+            # its own words about versions are a table; _check_cluster says it in one line
+            simplefilter("ignore", dask.versions.VersionMismatchWarning)
+            client = dask.Client(address, timeout=_CONNECT_S, set_as_default=False)
+        atexit.register(client.close)
+        try:
+            _check_cluster(client, address)
+        except UserError:
+            client.close()
+            raise
+        _clients[address] = client
+        return client
 
 
 def _check_cluster(client: Any, address: str) -> None:
     """Refuse a cluster without workers, or one that would run other code."""
-    if not client.scheduler_info()["workers"]:
+    versions = client.get_versions(packages=_SAME_VERSIONS)
+    if not versions["workers"]:
         raise UserError(f"the cluster at {address} has no workers", hint=f"run 'dask worker {address}'")
-    ours = _versions()
-    hint = f"install thermogrip {__version__} on all of them"
-    with as_user_error(ModuleNotFoundError, f"a worker of {address} has no thermogrip", hint=hint):
-        theirs = client.run(_versions).values()
-    others = {
-        name: sorted({versions[name] for versions in theirs} - {our_version})
-        for name, our_version in ours.items()
-    }
-    if differ := [f"{name} {', '.join(those)} for {ours[name]}" for name, those in others.items() if those]:
-        problem = f"a worker of {address} has {'; '.join(differ)}"
-        raise UserError(problem, hint="install the same versions on all of them")
-
-
-def _versions() -> dict[str, str]:
-    """Return the versions on which the last bits of answers depend."""
-    packages = {name: version(name) for name in ("numba", "numpy", "scipy")}
-    return {"thermogrip": __version__, "Python": f"{sys.version_info[0]}.{sys.version_info[1]}"} | packages
+    ours = versions["client"]["packages"]
+    for machine in (versions["scheduler"], *versions["workers"].values()):
+        for name in _SAME_VERSIONS:
+            if (theirs := machine["packages"][name]) != ours[name]:
+                problem = f"a machine of {address} has {name} {theirs or 'missing'} for {ours[name]}"
+                raise UserError(problem, hint="install the same versions on all of them")

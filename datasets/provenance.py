@@ -27,7 +27,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.errors import UserError, os_faults
 
 KEY = "provenance"
 _ROOMS = tuple(
@@ -89,17 +89,19 @@ def provenance() -> dict[str, Any]:
     from thermogrip import __version__
 
     now = _WORK.get() or _Work([Path(sys.argv[0]).name, *sys.argv[1:]])
+    epoch = os.environ.get("SOURCE_DATE_EPOCH", "")
+    seconds = int(epoch) if _EPOCH.fullmatch(epoch) else None
     try:
         folder = os.getcwd()
     except OSError:  # it was removed, which must not cost what is being written
         folder = ""
     below = folder.rstrip(os.sep) + os.sep
     for name in now.read:
-        with suppress(OSError):  # it is gone
+        with suppress(UserError):  # it is gone
             now.read[name] = now.read[name] or (hash_file(name) if os.path.isfile(name) else "")
     return {
         "thermogrip": __version__,
-        "written": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(_epoch())),
+        "written": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(seconds)),
         "command": shlex.join(now.words),
         "git": _commit_of(folder) if folder else None,
         "seed": now.seed,
@@ -107,15 +109,9 @@ def provenance() -> dict[str, Any]:
     }
 
 
-def _epoch() -> int | None:
-    """Return the seconds since 1970 that the environment sets, None where it sets none."""
-    epoch = os.environ.get("SOURCE_DATE_EPOCH", "")
-    return int(epoch) if _EPOCH.fullmatch(epoch) else None
-
-
 def hash_file(path: str | Path) -> str:
     """Return the SHA-256 of a file as 64 hexadecimal digits."""
-    with open(path, "rb") as stream:
+    with os_faults(path), open(path, "rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 

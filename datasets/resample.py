@@ -24,9 +24,6 @@ from thermogrip.datasets.schema import Log, log_name
 Floats: TypeAlias = NDArray[np.float64]
 _Blocks: TypeAlias = tuple[Floats, Floats]
 
-# where the blocks of a log that version 0.2 averaged start anew [s]: long blocks hide a gap
-_AFTER_GAP = "after_gap"
-
 
 def cut(log: Log, start: float = -np.inf, stop: float = np.inf) -> Log:
     """Return the rows with start <= time < stop; times stay as they are.
@@ -60,11 +57,9 @@ def cut(log: Log, start: float = -np.inf, stop: float = np.inf) -> Log:
 
 def gaps(log: Log, longer_than: float = 10.0) -> list[tuple[int, float, float]]:
     """Return (row before, time before [s], time after [s]) of each gap, longer than this [s] and than five
-    median steps; in an averaged log the blocks end where the gaps of the log itself were."""
+    median steps."""
     time = log["time"].values
-    begins = [float(t) for t in str(log.attrs.get(_AFTER_GAP, "")).split()]
-    gap_starts = np.union1d(gap_rows(time, longer_than), np.flatnonzero(np.isin(time[1:], begins)))
-    return [(int(row), float(time[row]), float(time[row + 1])) for row in gap_starts]
+    return [(int(row), float(time[row]), float(time[row + 1])) for row in gap_rows(time, longer_than)]
 
 
 def block_means(

@@ -24,9 +24,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from importlib.util import find_spec
-from operator import itemgetter
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -43,8 +41,6 @@ from thermogrip.datasets.units import UNITS, split_header, to_record_unit
 
 Floats = NDArray[np.float64]
 
-_UNPACK = "unpack it, or write it anew with `ros2 bag convert`, not compressed as a file"
-_STORED = (".mcap", ".db3")  # what a ROS 2 bag is made of
 _NO_NUMBER = (KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError)
 _SINGLE_FIELDS = {"temperature": "degC", "data": ""}  # the one field of a message without a map, and its unit
 
@@ -167,41 +163,28 @@ def write_bag(folder: str | Path, messages: Iterable[tuple[str, str, float, floa
 
 
 def bag_parts(folder: str | Path) -> list[Path]:
-    """Return the files of the ROS 2 bag that a folder is; UserError where it is none, or its
-    ``metadata.yaml`` names no file, or one that is missing or not read."""
+    """Return the files of the ROS 2 bag that a folder is; UserError where it is none, or a file that its
+    ``metadata.yaml`` names is missing."""
     place = Path(folder)
     listed = place / "metadata.yaml"
     if not listed.is_file():
-        if stored := sorted(path for path in place.iterdir() if path.suffix.lower() in _STORED):
+        if stored := sorted(path for path in place.iterdir() if path.suffix.lower() in (".mcap", ".db3")):
             return stored
         raise UserError("is a folder, and no ROS 2 bag", file=place, hint="name a file in it")
-    names = _files_in_metadata(listed)
-    hint = "copy the whole bag again"
-    if not names:
-        raise UserError("names no file of a bag", file=listed, hint=hint)
-    for name in names:
-        if Path(name).suffix.lower() not in _STORED:
-            raise UserError(f"names {name}, which is not read", file=listed, hint=_UNPACK)
-        if not (place / name).is_file():
-            raise UserError(f"names {name}, which is not there", file=listed, hint=hint)
-    return [place / name for name in names]
-
-
-def _files_in_metadata(path: Path) -> list[str]:
-    """Return the files that the metadata of a bag name, without their folders."""
-    _need("rosbags", path)
+    _need("rosbags", place)
     from ruamel.yaml import YAML
 
-    data = read_bytes(path)
-    check_size(len(data), file=path, share=64)
-    with reading("is no metadata of a ROS 2 bag", file=path, hint="copy the bag again"):
+    data, hint = read_bytes(listed, share=64), "copy the whole bag again"
+    with reading("is no metadata of a ROS 2 bag", file=listed, hint=hint):
         about_bag = YAML(typ="safe").load(data)["rosbag2_bagfile_information"]
-        names = [Path(str(name)).name for name in about_bag["relative_file_paths"]]
-        packed_whole = str(about_bag.get("compression_mode", "")).lower() == "file"
-    if packed_whole:
-        problem = f"names {names[0] if names else 'files'}, which is compressed whole"
-        raise UserError(problem, file=path, hint=_UNPACK)
-    return names
+        parts = [place / Path(str(name)).name for name in about_bag["relative_file_paths"]]
+        if str(about_bag.get("compression_mode", "")).lower() == "file":  # unpacked by rosbags without limits
+            unpack = "unpack it, or write it anew with `ros2 bag convert`, not compressed as a file"
+            raise UserError("names files that are compressed whole", file=listed, hint=unpack)
+    for part in parts:
+        if not part.is_file():
+            raise UserError(f"names {part.name}, which is not there", file=listed, hint=hint)
+    return parts
 
 
 def _map_beside(file: Path) -> TopicMap | None:
@@ -290,60 +273,48 @@ def _bag_table(
     clock: str,
     notes: list[str],
 ) -> Table:
-    in_time = itemgetter(0)
-    sorted_series = {name: np.asarray(sorted(zip(*pair), key=in_time)).T for name, pair in series.items()}
-    units = {name: to_record_unit(v, columns[name].unit)[1] for name, (_, v) in sorted_series.items()}
+    import pandas as pd
+
+    frames = {
+        name: pd.DataFrame({"time": times, "value": values}).sort_values("time", kind="stable")
+        for name, (times, values) in series.items()
+    }
+    units = {name: to_record_unit(np.zeros(1), column.unit)[1] for name, column in columns.items()}
     roles = {name: column.role or guess_role(name, units[name]) for name, column in columns.items()}
     if not clock:
         outputs = [name for name in columns if roles[name] == "output"] or list(columns)
-        clock = max(outputs, key=lambda name: len(sorted_series[name][0]))
-    axis = sorted_series[clock][0]
-    numbers: dict[str, Floats] = {"time_s": axis - axis[0]}
+        clock = max(outputs, key=lambda name: len(frames[name]))
+    axis = frames[clock][["time"]]
+    rows = axis["time"].to_numpy()
+    numbers: dict[str, Floats] = {"time_s": rows - rows[0]}
     attrs: dict[str, dict[str, str]] = {"time_s": {}}
     for name, column in columns.items():
-        times, values = sorted_series[name]
-        is_input = roles[name] == "input"
-        numbers[name] = (_held if is_input else _nearest)(axis, times, values)
+        messages = frames[name]
+        rule: dict[str, Any] = {"direction": "backward"}
+        if roles[name] != "input":
+            step = messages["time"].diff().median() if len(messages) > 1 else np.inf
+            rule = {"direction": "nearest", "tolerance": 0.5 * step + 1e-6}
+        numbers[name] = pd.merge_asof(axis, messages, on="time", **rule)["value"].to_numpy(dtype=float)
         attrs[name] = {"units": column.unit, "role": roles[name]}
         if name != clock:
-            how = "the last message holds" if is_input else "the nearest message is taken"
-            notes.append(f"{name}: {len(times)} messages of {column.topic} on the times of {clock}; {how}")
-    return Table(str(file), numbers, {}, np.arange(1, axis.size + 1), attrs, {}, tuple(notes))
-
-
-def _held(axis: Floats, times: Floats, values: Floats) -> Floats:
-    row = np.searchsorted(times, axis, "right") - 1
-    return np.where(row >= 0, values[np.maximum(row, 0)], np.nan)
-
-
-def _nearest(axis: Floats, times: Floats, values: Floats) -> Floats:
-    after = np.clip(np.searchsorted(times, axis), 0, times.size - 1)
-    before = np.maximum(after - 1, 0)
-    nearest = np.where(np.abs(times[after] - axis) <= np.abs(axis - times[before]), after, before)
-    step = float(np.median(np.diff(times))) if times.size > 1 else np.inf
-    return np.where(np.abs(times[nearest] - axis) <= 0.5 * step + 1e-6, values[nearest], np.nan)
+            how = "the last message holds" if roles[name] == "input" else "the nearest message is taken"
+            notes.append(f"{name}: {len(messages)} messages of {column.topic} on the times of {clock}; {how}")
+    return Table(str(file), numbers, {}, np.arange(1, rows.size + 1), attrs, {}, tuple(notes))
 
 
 def _messages(file: Path, notes: list[str]) -> Iterator[Message]:
     if not file.exists():
         raise os_fault(FileNotFoundError(2, "missing"), file)
-    if not os.path.isdir(file):
-        yield from _messages_of_file(file, notes)
-        return
-    bag_files = bag_parts(file)
-    if not (file / "metadata.yaml").is_file():
+    parts = bag_parts(file) if os.path.isdir(file) else [file]
+    if os.path.isdir(file) and not (file / "metadata.yaml").is_file():
         notes.append("has no metadata.yaml: its writer died; all of its files are read")
-    elif all(bag_file.suffix.lower() == ".db3" for bag_file in bag_files):
-        check_size(sum(check_source(bag_file) for bag_file in bag_files), file=file)
-        bag_files = bag_files[:1]  # the reader of one reads all that the metadata name
-    for bag_file in bag_files:
+    elif all(part.suffix.lower() == ".db3" for part in parts):
+        check_size(sum(check_source(part) for part in parts), file=file)
+        parts = parts[:1]  # the reader of one reads all that the metadata name
+    for part in parts:
         part_notes: list[str] = []
-        yield from _messages_of_file(bag_file, part_notes)
-        notes += [f"{bag_file.name}: {line}" for line in part_notes]
-
-
-def _messages_of_file(file: Path, notes: list[str]) -> Iterator[Message]:
-    return _mcap_messages(file, notes) if file.suffix.lower() == ".mcap" else _bag_messages(file)
+        yield from _mcap_messages(part, part_notes) if part.suffix.lower() == ".mcap" else _bag_messages(part)
+        notes += [f"{part.name}: {line}" if part != file else line for line in part_notes]
 
 
 def _bag_messages(file: Path) -> Iterator[Message]:
@@ -357,10 +328,9 @@ def _bag_messages(file: Path) -> Iterator[Message]:
     hint = "run `rosbag reindex` on it" if bag1 else "copy it again, or export it as MCAP"
     with reading("is damaged or no bag", file=file, hint=hint):
         check_size(check_source(file), file=file)
-        whole = not bag1 and (file.parent / "metadata.yaml").is_file()  # a .db3 belongs to its folder
-        with AnyReader(
-            [file.parent if whole and bag_parts(file.parent) else file], default_typestore=store
-        ) as reader:
+        # the metadata say how the messages of a .db3 are compressed, and which files continue it
+        whole = not bag1 and (file.parent / "metadata.yaml").is_file() and bag_parts(file.parent)
+        with AnyReader([file.parent if whole else file], default_typestore=store) as reader:
             unpack = _bound_chunks(reader, file) if bag1 else _bound_messages(reader, file)
             for connection, stamp, raw in reader.messages():
                 content = reader.deserialize(unpack(raw), connection.msgtype)
@@ -411,29 +381,28 @@ def _mcap_records(data: bytes, file: Path) -> Iterator[Any]:
         yield from breakup_chunk(record, validate_crc=True)
 
 
-def _mcap_contents(data: bytes, file: Path) -> Iterator[tuple[Any, Any, Any]]:
-    """Yield (schema or None, channel, message) in the order of the file."""
-    from mcap.reader import NonSeekingReader
-
-    reader: Any = NonSeekingReader(io.BytesIO())
-    reader._stream_reader = SimpleNamespace(
-        records=_mcap_records(data, file)
-    )  # its own unpacks without limits
-    yield from reader.iter_messages(log_time_order=False)
-
-
 def _mcap_messages(file: Path, notes: list[str]) -> Iterator[Message]:
     """Yield the messages of an MCAP up to its end, or to its first damage, which is noted."""
     _need("mcap", file)
+    from mcap import records
+
     data, count = read_bytes(file), 0
-    last = 0.0
+    schemas: dict[int, Any] = {}
+    channels: dict[int, Any] = {}
     decoders = _Decoders(file)
     try:
-        for schema, channel, message in _mcap_contents(data, file):
-            content = decoders.decode(schema, channel, message.data)
-            count, last = count + 1, 1e-9 * message.log_time
-            kind = schema.name if schema is not None else channel.message_encoding
-            yield Message(channel.topic, kind, last, content, channel.metadata)
+        for record in _mcap_records(data, file):
+            if isinstance(record, records.Schema):
+                schemas[record.id] = record
+            elif isinstance(record, records.Channel):
+                channels[record.id] = record
+            elif isinstance(record, records.Message):
+                channel = channels[record.channel_id]
+                schema = schemas.get(channel.schema_id)
+                content = decoders.decode(schema, channel, record.data)
+                kind = channel.message_encoding if schema is None else schema.name
+                count += 1
+                yield Message(channel.topic, kind, 1e-9 * record.log_time, content, channel.metadata)
     except UserError:
         raise
     except Exception as error:  # whatever damage makes a reader, unpacker or decoder stumble over
@@ -453,35 +422,32 @@ class _Decoders:
     def __init__(self, file: Path) -> None:
         self._file = file
         self._store: Any = None
-        self._known: dict[str, str] = {}
+        self._types: dict[str, str] = {}  # by the name of a schema
 
     def decode(self, schema: Any, channel: Any, data: bytes) -> Any:
-        if channel.message_encoding == "json":
+        encoding = channel.message_encoding
+        if encoding == "json":
             return json.loads(data)
-        if channel.message_encoding in ("cdr", "ros1") and schema is not None:
-            kind = self._type(schema)
-            if channel.message_encoding == "cdr":
-                return self._store.deserialize_cdr(data, kind)
-            return self._store.deserialize_ros1(data, kind)
-        hint = "export it as CDR, ROS 1 or JSON"
-        problem = f"{channel.topic} is encoded as {channel.message_encoding!r}, which is not read"
-        raise UserError(problem, file=self._file, hint=hint)
+        if encoding not in ("cdr", "ros1") or schema is None:
+            problem = f"{channel.topic} is encoded as {encoding!r}, which is not read"
+            raise UserError(problem, file=self._file, hint="export it as CDR, ROS 1 or JSON")
+        kind = self._types.get(schema.name) or self._registered(schema)
+        deserialize = self._store.deserialize_cdr if encoding == "cdr" else self._store.deserialize_ros1
+        return deserialize(data, kind)
 
-    def _type(self, schema: Any) -> str:
-        """Return the message's type, registered from the definition in the file."""
+    def _registered(self, schema: Any) -> str:
+        """Return the type of messages that the definition in the file is of."""
         _need("rosbags", self._file)
         from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-        if self._store is None:
-            self._store = get_typestore(Stores.EMPTY)
-        if schema.name not in self._known:
-            name = schema.name if "/msg/" in schema.name else schema.name.replace("/", "/msg/", 1)
-            problem = f"the definition of {schema.name} cannot be read"
-            with reading(problem, file=self._file, hint="write the file again"):
-                definitions = get_types_from_msg(schema.data.decode(), name)
-                self._store.register({k: v for k, v in definitions.items() if k not in self._store.fielddefs})
-            self._known[schema.name] = name
-        return self._known[schema.name]
+        self._store = self._store or get_typestore(Stores.EMPTY)
+        kind = schema.name if "/msg/" in schema.name else schema.name.replace("/", "/msg/", 1)
+        problem = f"the definition of {schema.name} cannot be read"
+        with reading(problem, file=self._file, hint="write the file again"):
+            definitions = get_types_from_msg(schema.data.decode(), kind)
+            self._store.register({k: v for k, v in definitions.items() if k not in self._store.fielddefs})
+        self._types[schema.name] = kind
+        return str(kind)
 
 
 def _need(package: str, file: Path) -> None:

@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 
 from thermogrip.datasets import limits
 from thermogrip.datasets.atomic_files import read_bytes
-from thermogrip.datasets.errors import UserError, as_user_error, os_faults, reading
+from thermogrip.datasets.errors import UserError, as_user_error, reading
 from thermogrip.datasets.media import from_csv
 from thermogrip.datasets.repair import name_rows
 from thermogrip.datasets.units import read_header
@@ -728,18 +728,16 @@ def _decode(metadata: dict[bytes, bytes] | None) -> dict[str, str]:
 
 def _bytes_of(path: str | Path) -> bytes:
     """Return a file of text, unpacked, within the limits of :mod:`thermogrip.datasets.limits`."""
-    limits.check_size(limits.check_source(path), file=path)
+    data = read_bytes(path)
     openers: dict[str, Any] = {".gz": gzip.open, ".xz": lzma.open}
     opener = openers.get(Path(path).suffix.lower())
+    if opener is None:
+        return data
     spoilt = reading("is damaged or not compressed as its name says", file=path, hint="copy it again")
-    with os_faults(path), open(path, "rb") as file, spoilt:
-        if opener is None:
-            data = limits.read_within(file, limits.most_bytes())
-        else:
-            with opener(file, "rb") as stream:
-                data = limits.unpack_within(stream, file, file=path)
-    limits.check_size(len(data), file=path)  # a pipe says no size, and a file may grow
-    return data
+    with spoilt, opener(io.BytesIO(data), "rb") as stream:
+        unpacked = limits.read_within(stream, limits.most_unpacked(len(data)))
+    limits.check_unpacked(len(data), len(unpacked), file=path)
+    return unpacked
 
 
 def _decoded(data: bytes, file: str, *, strict: bool = False) -> tuple[str, tuple[str, ...]]:

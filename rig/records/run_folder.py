@@ -35,9 +35,7 @@ from types import TracebackType
 from typing import Any, NamedTuple
 
 from thermogrip.datasets.atomic_files import (
-    file_hash,
     make_folder,
-    open_new,
     parse_json,
     read_bytes,
     read_json,
@@ -48,6 +46,7 @@ from thermogrip.datasets.errors import UserError, os_faults
 from thermogrip.datasets.grasp_files import read_grasps, write_grasps
 from thermogrip.datasets.log_files import write_log
 from thermogrip.datasets.media import csv_text, from_csv
+from thermogrip.datasets.provenance import hash_file, note_written
 from thermogrip.datasets.schema import Grasps, Log
 from thermogrip.rig.guard.sensor_checks import room_sensors
 from thermogrip.rig.interface import Event
@@ -199,7 +198,7 @@ def _versions() -> dict[str, str]:
 
 def write_sums(folder: Path) -> Path:
     """Write ``SHA256SUMS`` of a run folder (``sha256sum -c`` reads it) and return its path."""
-    lines = [f"{file_hash(folder / name)}  {name}\n" for name in FILES if (folder / name).exists()]
+    lines = [f"{hash_file(folder / name)}  {name}\n" for name in FILES if (folder / name).exists()]
     return write_atomic(folder / _SUMS, "".join(lines))
 
 
@@ -294,7 +293,9 @@ class _Lines:
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self._file = open_new(path)
+        in_bytes = getattr(os, "O_BINARY", 0)  # Windows writes a line end of two bytes unless it is asked not to
+        self._file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | in_bytes, 0o666)
+        note_written(path)
         self._size = 0
 
     def write(self, line: bytes) -> None:
@@ -466,7 +467,7 @@ def sums_agree(folder: Path) -> list[str] | None:
         digest, _, name = line.partition("  ")
         if name not in FILES:  # no path of somebody else's making is opened
             wrong.append(name[:80] or "SHA256SUMS")
-        elif not (folder / name).is_file() or file_hash(folder / name) != digest:
+        elif not (folder / name).is_file() or hash_file(folder / name) != digest:
             wrong.append(name)
     return wrong
 

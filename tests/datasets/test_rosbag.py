@@ -126,7 +126,7 @@ def test_a_bag_that_is_compressed_as_a_file_is_refused(tmp_path: Path) -> None:
     listed = file.parent / "metadata.yaml"
     listed.write_text(listed.read_text().replace("run.db3.zstd", "run.db3"))
     (file.parent / "run.db3.zstd").rename(file)
-    with pytest.raises(UserError, match=r"names run\.db3, which is compressed whole"):
+    with pytest.raises(UserError, match="names files that are compressed whole"):
         read_log(file)
 
 
@@ -180,14 +180,10 @@ def test_a_folder_whose_writer_died_before_its_metadata_is_read_and_reported(
     [
         ("[1, 2", "is no metadata of a ROS 2 bag"),
         ("rosbag2_bagfile_information: 3", "is no metadata of a ROS 2 bag"),
-        ("rosbag2_bagfile_information: {relative_file_paths: []}", "names no file"),
+        ("rosbag2_bagfile_information: {relative_file_paths: []}", "has no topic with a single number"),
         (
             "rosbag2_bagfile_information: {relative_file_paths: [../gone.mcap]}",
             "gone.mcap, which is not there",
-        ),
-        (
-            "rosbag2_bagfile_information: {relative_file_paths: [run.mcap.zstd]}",
-            "run.mcap.zstd, which is not read",
         ),
         ("!!python/object/apply:os.system ['true']", "is no metadata of a ROS 2 bag"),
         (None, "is a folder, and no ROS 2 bag"),
@@ -312,7 +308,7 @@ def test_topics_of_a_number_stand_on_the_times_of_the_output_with_most_messages(
 ) -> None:
     table, nan = table_of(monkeypatch, SAID), np.nan
     wanted = {
-        "time_s": [0.0, 1.0, 2.0, 3.0], "skin": [300.0, 301.0, 301.0, nan],
+        "time_s": [0.0, 1.0, 2.0, 3.0], "skin": [300.0, 300.0, 301.0, nan],
         "a_tank": [25.0, 25.25, 25.5, 25.75], "pump": [3.0, 3.0, 2.0, 2.0],
         "u": [nan, 8.0, 8.0, 9.0], "u_2": [4.5] * 4,
     }  # fmt: skip
