@@ -21,14 +21,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thermogrip.datasets.atomic_files import write_atomic
-from thermogrip.datasets.errors import UserError, os_faults
+from thermogrip.datasets.errors import UserError, os_faults, reading
 from thermogrip.datasets.file_names import file_format, file_stem, matching_files
-from thermogrip.datasets.media import csv_cell, csv_text
+from thermogrip.datasets.media import csv_cell
 from thermogrip.datasets.netcdf import open_netcdf, record_unit, write_netcdf
 from thermogrip.datasets.schema import (
     GRASP_LABELS,
     GRASP_NUMBERS,
-    as_record,
     check_grasps,
     log_name,
     make_grasps,
@@ -97,7 +96,7 @@ def read_grasps(path: str | Path, *, name: str | None = None) -> Grasps:
     """
     kind = file_format(path)
     if kind == "netcdf":
-        return _with_level_before(_of_dataset(open_netcdf(path), path, name), path)
+        return _of_dataset(open_netcdf(path), path, name)
     if kind == "parquet":
         samples = read_parquet_table(path, text=_is_text, tolerated=0.0)
         return _of_tables(samples, None, name or file_stem(path))
@@ -169,7 +168,11 @@ def write_grasps(grasps: Grasps, path: str | Path) -> Path:
         return write_netcdf(grasps, path)
     if file_format(path) != "csv" or Path(path).suffix.lower() != ".csv":
         raise UserError("grasps are written as .csv or .nc", file=path, hint="use one of the two")
-    write_atomic(Path(path).with_name(f"{file_stem(path)}_meta.csv"), _meta_text(grasps))
+    facts = grasps.drop_dims("time").to_dataframe().reset_index().map(csv_cell)
+    units = {name: "" if unit == "1" else f"_{unit}" for name, unit in GRASP_NUMBERS.items()}
+    header = ["grasp_id", *(META_NAMES.get(name, name) + units.get(name, "") for name in facts.columns[1:])]
+    meta_path = Path(path).with_name(f"{file_stem(path)}_meta.csv")
+    write_atomic(meta_path, facts.to_csv(index=False, header=header, lineterminator="\n"))
     channels = [name for name in ("t_surface", "t_surface_2") if name in grasps]
     samples = grasps[channels].to_dataframe(["grasp", "time"])[channels].dropna(how="all").reset_index()
     samples["grasp"] = samples["grasp"].map(csv_cell)
@@ -242,21 +245,16 @@ def _is_text(header: str) -> bool:
     return not header.startswith(_SAMPLE_COLUMNS) and _name_of_fact(header)[0] not in GRASP_NUMBERS
 
 
-def _samples_of(table: Table, facts: Table | None) -> _Samples:
-    """Return the samples of a table, in which the facts of a grasp may stand too, where they have no table of
-    their own."""
+def _samples_of(table: Table) -> _Samples:
+    """Return the samples of a table, in which the facts of a grasp may stand too."""
     file = table.file
     if "grasp_id" not in table.text:
         hint = "a grasp file has grasp_id,time_s,t_surface_degC"
         raise UserError("no column grasp_id", file=file, hint=hint)
     channels, repairs = {}, list(table.notes)
-    others = [h for h in table.text if h != "grasp_id"]
-    for header, values in table.numbers.items():
-        if not header.startswith(_SAMPLE_COLUMNS):
-            others.append(header)
-            continue
+    for header in [header for header in table.numbers if header.startswith(_SAMPLE_COLUMNS)]:
         name, unit = split_header(header, file=file)
-        channels[name], unit_after = to_record_unit(values, unit)
+        channels[name], unit_after = to_record_unit(table.numbers[header], unit)
         if name.startswith("t_surface") and unit_after != "degC":
             raise UserError("is not a temperature", file=file, column=header, hint=f"write {name}_degC")
         if name == "time" and unit_after != "s":
@@ -274,9 +272,6 @@ def _samples_of(table: Table, facts: Table | None) -> _Samples:
     if "" in ids:
         row = int(table.lines[ids.index("")])
         raise UserError("is empty", file=file, row=row, column="grasp_id", hint="name the grasp")
-    unused = [header for header in others if not header.startswith("pump")]
-    if unused and facts is not None:
-        repairs.append(f"not used: {', '.join(unused)}")
     skin = {name: values for name, values in channels.items() if name in ("t_surface", "t_surface_2")}
     return _Samples(ids, np.round(time, 6), skin, repairs)
 
@@ -284,8 +279,12 @@ def _samples_of(table: Table, facts: Table | None) -> _Samples:
 def _onto_one_axis(samples: _Samples, order: Sequence[str], file: str) -> tuple[Floats, dict[str, Floats]]:
     """Return the common time axis (n_time,) and the channels (n_grasp, n_time); what is repaired is added to
     the samples' repairs."""
+    import pandas as pd
+
     time, rows_of = samples.time, []
-    for grasp, rows in zip(order, _rows_of(samples.grasp_ids, order)):
+    rows_by_grasp = pd.Series(samples.grasp_ids).groupby(samples.grasp_ids).indices
+    for grasp in order:
+        rows = rows_by_grasp[grasp]
         steps = np.diff(time[rows])
         if (back := np.flatnonzero(steps < 0)).size:
             begin, end = time[rows[back[0] : back[0] + 2]]
@@ -304,14 +303,6 @@ def _onto_one_axis(samples: _Samples, order: Sequence[str], file: str) -> tuple[
         name: np.stack([_on_axis(axis, time[rows], values[rows], step) for rows in rows_of])
         for name, values in samples.channels.items()
     }
-
-
-def _rows_of(ids: Sequence[str], order: Sequence[str]) -> list[Rows]:
-    """Return the rows of each grasp, in the order of the file."""
-    import pandas as pd
-
-    rows = pd.Series(ids).groupby([*ids]).indices
-    return [np.asarray(rows[grasp]) for grasp in order]
 
 
 def _is_even(axis: Floats, step: float) -> bool:
@@ -375,10 +366,9 @@ def _name_of_fact(header: str, file: str | None = None) -> tuple[str, str]:
     return name.lower() if name.lower() in GRASP_LABELS else _FROM_META.get(name, name), unit  # "Material"
 
 
-def _facts_of(table: Table, rows: Sequence[int]) -> tuple[dict[str, Any], list[str]]:
-    """Return what is known of each grasp, from a row of each, and the columns that mean nothing."""
+def _facts_of(table: Table, rows: Sequence[int]) -> dict[str, Any]:
+    """Return what is known of each grasp, from a row of each."""
     facts: dict[str, Any] = {}
-    unknown = []
     for header in (*table.text, *table.numbers):
         name, unit = _name_of_fact(header, table.file)
         if name in facts:
@@ -391,9 +381,17 @@ def _facts_of(table: Table, rows: Sequence[int]) -> tuple[dict[str, Any], list[s
             facts[name] = numbers[[*rows]]
         elif name in GRASP_LABELS:
             facts[name] = [table.text[header][row] for row in rows]
-        elif name != "grasp_id" and not header.startswith((*_SAMPLE_COLUMNS, "pump")):
-            unknown.append(header)
-    return facts, unknown
+    return facts
+
+
+def _unused(table: Table, known: Sequence[str]) -> list[str]:
+    """Return a line about the columns of a table that are none of the known ones, if there are any."""
+    used = ("grasp_id", "pump", *_SAMPLE_COLUMNS)
+    columns = [header for header in (*table.text, *table.numbers) if not header.startswith(used)]
+    unused = [header for header in columns if _name_of_fact(header)[0] not in known]
+    numbers = (f"{META_NAMES.get(name, name)}_{unit}" for name, unit in GRASP_NUMBERS.items())
+    hint = f"known are {', '.join([*numbers, *GRASP_LABELS])}"
+    return [f"{Path(table.file).name}: not used: {', '.join(unused)}; {hint}"] if unused else []
 
 
 def _rows_of_meta(table: Table, order: Sequence[str], file: str) -> list[int]:
@@ -418,50 +416,39 @@ def _rows_of_meta(table: Table, order: Sequence[str], file: str) -> list[int]:
     return [rows[grasp] for grasp in order]
 
 
-def _first_rows(table: Table, order: Sequence[str]) -> list[int]:
+def _first_rows(table: Table) -> list[int]:
     """Return the first row of each grasp in a table that repeats its facts; UserError where they differ."""
-    rows_of = _rows_of(table.text["grasp_id"], order)
+    import pandas as pd
+
+    grasps, order = pd.factorize(np.asarray(table.text["grasp_id"], dtype=object))
+    first_rows = np.unique(grasps, return_index=True)[1]
     for header, column in {**table.text, **table.numbers}.items():
         if _name_of_fact(header)[0] not in (*GRASP_LABELS, *GRASP_NUMBERS):
             continue
         cells = np.asarray(column)
-        for grasp, rows in zip(order, rows_of):
-            first = cells[rows[0]]
-            other = rows[(cells[rows] != first) & ~((cells[rows] != cells[rows]) & (first != first))]
-            if other.size:
-                earlier = f"was {first!s} in row {table.lines[rows[0]]}"
-                problem = f"{cells[other[0]]!s} of grasp {grasp!r} {earlier}"
-                hint, row = "repeat in each row what is known of its grasp", int(table.lines[other[0]])
-                raise UserError(problem, file=table.file, row=row, column=header, hint=hint)
-    return [int(rows[0]) for rows in rows_of]
-
-
-def _with_defaults(facts: dict[str, Any], n: int, stem: str) -> dict[str, Any]:
-    """Fill in the material, session and block where they are missing."""
-    material = facts.get("material", [""] * n)
-    session = [label or stem for label in facts.get("session", [""] * n)]
-    block = [label or its_material for label, its_material in zip(facts.get("block", [""] * n), material)]
-    return facts | {"material": material, "session": session, "block": block}
+        first = cells[first_rows][grasps]
+        differs = (cells != first) & ~((cells != cells) & (first != first))  # NaN is as good as NaN
+        if differs.any():
+            row = int(differs.argmax())
+            earlier = f"was {first[row]!s} in row {table.lines[first_rows[grasps[row]]]}"
+            problem = f"{cells[row]!s} of grasp {order[grasps[row]]!r} {earlier}"
+            hint, line = "repeat in each row what is known of its grasp", int(table.lines[row])
+            raise UserError(problem, file=table.file, row=line, column=header, hint=hint)
+    return [int(row) for row in first_rows]
 
 
 def _of_tables(table: Table, meta: Table | None, name: str) -> Grasps:
     """Return the grasps of a table with a row a sample, and of one with a row a grasp, if there is one."""
-    samples = _samples_of(table, meta)
+    samples = _samples_of(table)
     order = list(dict.fromkeys(samples.grasp_ids))
-    rows = _first_rows(table, order) if meta is None else _rows_of_meta(meta, order, table.file)
+    rows = _first_rows(table) if meta is None else _rows_of_meta(meta, order, table.file)
     axis, channels = _onto_one_axis(samples, order, table.file)
-    facts, unknown = _facts_of(table if meta is None else meta, rows)
-    if unknown:
-        numbers = (f"{META_NAMES.get(name, name)}_{unit}" for name, unit in GRASP_NUMBERS.items())
-        line = f"{Path((meta or table).file).name}: not used: {', '.join(unknown)}"
-        samples.repairs.append(f"{line}; known are {', '.join([*numbers, *GRASP_LABELS])}")
-    facts = _with_defaults(facts, len(order), name)
-    try:
-        grasps = make_grasps(axis, grasp_id=order, name=name, **channels, **facts)
-    except UserError as error:  # which knows the record's name alone
-        raise UserError(error.problem, file=table.file, column=error.column, hint=error.hint) from error
-    grasps.attrs["repairs"] = "\n".join(samples.repairs)
-    return _with_level_before(grasps, table.file)
+    facts = _facts_of(meta or table, rows)
+    known = (*GRASP_NUMBERS, *GRASP_LABELS)
+    unused = _unused(table, known) if meta is None else [*_unused(table, ()), *_unused(meta, known)]
+    repairs = [*samples.repairs, *unused]
+    attrs = {"name": name, "repairs": "\n".join(repairs)}
+    return _record(table.file, name, order, axis, channels | facts, attrs)
 
 
 def _of_dataset(data: xr.Dataset, path: str | Path, called: str | None = None) -> Grasps:
@@ -469,37 +456,38 @@ def _of_dataset(data: xr.Dataset, path: str | Path, called: str | None = None) -
     schema = data.attrs.get("schema", "thermogrip.grasps")
     if schema != "thermogrip.grasps":
         raise UserError(f"holds a {schema}, not grasps", file=path, hint="give a file of grasps")
-    stem = called or file_stem(path)
-    data.attrs["name"] = called or data.attrs.get("name", stem)
-    variables = {"t_surface", "t_surface_2", *GRASP_NUMBERS, *GRASP_LABELS}
-    data = data[[name for name in data.data_vars if name in variables]]
-    if "grasp" in data.coords:
-        data = data.assign_coords(grasp=("grasp", data["grasp"].values.astype(str)))
+    for need in ("grasp", "time", "t_surface"):
+        if need not in data.variables:
+            raise UserError(f"no {need}", file=path, hint="give a file of grasps")
     expected = {"time": "s", "t_surface": "degC", "t_surface_2": "degC", **GRASP_NUMBERS}
-    for name in [n for n in expected if n in data.variables]:
-        values, unit = record_unit(data[name], name, str(path))
+    numbers: dict[str, Any] = {}
+    for name in [name for name in expected if name in data.variables]:
+        numbers[name], unit = record_unit(data[name], name, str(path))
         if unit != expected[name]:
             hint = f"it must be in {expected[name]}"
             raise UserError(f"unit {unit!r} does not fit", file=path, column=name, hint=hint)
-        data[name] = (data[name].dims, values, {"units": unit})
-    try:
-        check_grasps(data)
-    except UserError as error:
-        raise UserError(error.problem, file=path, column=error.column, hint=error.hint) from error
-    labels = {name: data[name].values.tolist() for name in ("material", "session", "block") if name in data}
-    for name, values in _with_defaults(labels, data.sizes["grasp"], stem).items():
-        data[name] = ("grasp", np.asarray(values, dtype=str))
-    return as_record(data)
+    labels = {name: data[name].values.tolist() for name in GRASP_LABELS if name in data}
+    axis, ids = numbers.pop("time"), data["grasp"].values.astype(str).tolist()
+    stem = called or file_stem(path)
+    attrs = data.attrs | {"name": called or data.attrs.get("name", stem)}
+    with reading("is no record of grasps", file=path, hint="give dims (grasp, time)"):
+        return _record(path, stem, ids, axis, numbers | labels, attrs)
 
 
-def _meta_text(grasps: Grasps) -> str:
-    columns: dict[str, list[str]] = {"grasp_id": [str(grasp) for grasp in grasps["grasp"].values]}
-    for name, variable in grasps.data_vars.items():
-        key = str(name)
-        if key in GRASP_LABELS:
-            columns[key] = [str(label) for label in variable.values]
-        elif key in GRASP_NUMBERS:
-            unit = "" if GRASP_NUMBERS[key] == "1" else f"_{GRASP_NUMBERS[key]}"
-            cells = ["" if np.isnan(number) else repr(float(number)) for number in variable.values]
-            columns[META_NAMES.get(key, key) + unit] = cells
-    return csv_text([[*columns], *zip(*columns.values(), strict=True)])
+def _record(
+    file: str | Path,
+    stem: str,
+    ids: Sequence[str],
+    axis: Floats,
+    variables: dict[str, Any],
+    attrs: dict[Any, Any],
+) -> Grasps:
+    """Return the grasps of a file, each with the session and the block that it has where none is stated."""
+    unstated = np.full(len(ids), "")
+    material = variables.get("material", unstated)
+    for label, default in (("material", ""), ("session", stem), ("block", material)):
+        stated = np.asarray(variables.get(label, unstated), dtype=str)
+        variables[label] = np.where(stated == "", default, stated)
+    grasps = make_grasps(axis, grasp_id=ids, name=str(file), **variables)  # whose faults name the file
+    grasps.attrs |= attrs
+    return _with_level_before(grasps, file)

@@ -43,21 +43,24 @@ class Material:
 
 
 @cache
-def _bundled() -> tuple[Material, ...]:
+def _bundled() -> dict[str, Material]:
+    materials = {}
     text = (files("thermogrip.datasets") / "data" / "materials.csv").read_text(encoding="utf-8")
-    return tuple(_material(row) for row in csv.DictReader(io.StringIO(text)))
-
-
-def _material(row: dict[str, str]) -> Material:
-    k, rho, c_p, percent = (float(row[key]) for key in ("k", "rho", "c_p", "effusivity_sd_percent"))
-    aliases = tuple(alias for alias in row["aliases"].split(";") if alias)
-    e = math.sqrt(k * rho * c_p)
-    return Material(row["name"], k, rho, c_p, e, percent / 100, row["source"], row["kind"], aliases)
+    for row in csv.DictReader(io.StringIO(text)):
+        k, rho, c_p = (float(row[key]) for key in ("k", "rho", "c_p"))
+        materials[row["name"]] = Material(
+            row["name"], k, rho, c_p,
+            effusivity=math.sqrt(k * rho * c_p),
+            effusivity_sd_ln=float(row["effusivity_sd_percent"]) / 100,
+            source=row["source"], kind=row["kind"],
+            aliases=tuple(filter(None, row["aliases"].split(";"))),
+        )  # fmt: skip
+    return materials
 
 
 def load_materials() -> dict[str, Material]:
     """Return the table by name, in file order: the paper's five first."""
-    return {material.name: material for material in _bundled()}
+    return dict(_bundled())
 
 
 def find_material(name: str) -> Material:
@@ -82,7 +85,7 @@ def find_material(name: str) -> Material:
     ...
     thermogrip.datasets.errors.UserError: no material 'aluminim'; did you mean aluminium, alumina?
     """
-    by_name = {n: m for m in _bundled() for n in (m.name, *m.aliases)}
+    by_name = {n: m for m in _bundled().values() for n in (m.name, *m.aliases)}
     wanted = " ".join(name.lower().replace("_", " ").split())
     if wanted in by_name:
         return by_name[wanted]

@@ -23,7 +23,6 @@ from thermogrip.datasets.units import UNITS, any_unit, to_record_unit
 if TYPE_CHECKING:
     import xarray as xr
 
-_OLD_ATTRIBUTES = ("Conventions", "title", "source")  # to files of versions up to 0.2
 _MOST_MEMBERS = 4096  # of a file
 _PART = 16 << 20  # bytes of text that are looked at in one piece
 
@@ -140,12 +139,8 @@ def convention_unit(unit: str, name: str, file: str) -> str:
 
 def _text_as_str(data: xr.Dataset) -> xr.Dataset:
     """Turn the object arrays that variable-length text is read as into arrays of str."""
-    for key, variable in data.variables.items():
-        if variable.dtype.kind in "OS":
-            cells = variable.values.ravel()
-            text = np.asarray([cell.decode() if isinstance(cell, bytes) else str(cell) for cell in cells])
-            data[key] = (variable.dims, text.reshape(variable.shape), variable.attrs)
-    return data
+    texts = [key for key, variable in data.variables.items() if variable.dtype.kind in "OS"]
+    return data.assign({key: data[key].astype(str) for key in texts})
 
 
 def _of_versions(data: xr.Dataset) -> xr.Dataset:
@@ -153,6 +148,4 @@ def _of_versions(data: xr.Dataset) -> xr.Dataset:
     if "grasp_id" in data.variables and data["grasp_id"].dims == ("grasp",) and "grasp" not in data.variables:
         names = data["grasp_id"].values.astype(str)
         data = data.drop_vars("grasp_id").assign_coords(grasp=("grasp", names))
-    if str(data.attrs.get("schema", "")).startswith("thermogrip."):
-        data.attrs = {key: value for key, value in data.attrs.items() if key not in _OLD_ATTRIBUTES}
     return data

@@ -293,7 +293,7 @@ class _Lines:
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        in_bytes = getattr(os, "O_BINARY", 0)  # Windows writes a line end of two bytes unless it is asked not to
+        in_bytes = getattr(os, "O_BINARY", 0)  # else Windows writes line ends of two bytes
         self._file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | in_bytes, 0o666)
         note_written(path)
         self._size = 0
