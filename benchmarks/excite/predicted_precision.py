@@ -100,7 +100,7 @@ def noisy(plant: Plant, u: NDArray[np.float64], y: NDArray[np.float64], seed: in
 def kept(loss: float, count: int) -> None:
     """Print what was predicted, what was stated and how far off fits were."""
     plant = plant_from_prior(load_network("tclab"))
-    seen = PlantScores(independent_s={"t1": MEMORY, "t2": MEMORY}, average_s=5.0)
+    seen = PlantScores(average_s=5.0)
     plant = replace(plant, values=plant.values | TRUTH, scores=seen)
     limits = {"lowest": 5.0, "highest": 90.0}
     best = optimal_for(plant, 20.0, **limits, slew=np.inf).log

@@ -3,7 +3,7 @@
 The start is the stable subspace model of the same order, in coordinates whose first states are the outputs,
 and V = 0, so that the first iterate *is* the linear fit.  The simulated outputs of every row, all
 segments, are then fitted by Levenberg-Marquardt with exact sensitivities
-(:mod:`thermogrip.sysid.models.neural_kernel`),
+(:mod:`thermogrip.sysid.models.recurrences`),
 
     min  sum_k |v_k - y_k|^2 / s^2  +  rho |V, W, U, b|^2  +  |B - B_lin, c - c_lin|^2  +  x_0 terms,
 
@@ -208,7 +208,7 @@ def _averaged(grid: Grid, data: _Data, members: Sequence[_Member]) -> NeuralMode
 
 def _train_member(data: _Data, linear: _Linear, h: int, *, seed: int) -> _Member:
     """Return the member of one random start."""
-    from thermogrip.sysid.models.neural_kernel import run_states, run_with_slopes  # pulls in numba
+    from thermogrip.sysid.models.recurrences import run_states, run_with_slopes  # pulls in numba
 
     n, m = linear.B.shape
     rng = np.random.default_rng(seed)
@@ -278,7 +278,7 @@ def _levenberg_marquardt(
 
 def _nearest_to_median(data: _Data, members: Sequence[_Member], h: int) -> NDArray[np.int_]:
     """Return which members are nearest to the median of all on the inputs in reverse order."""
-    from thermogrip.sysid.models.neural_kernel import run_states
+    from thermogrip.sysid.models.recurrences import run_states
 
     count, n = len(members), len(members[0].A)
     if count < 3:

@@ -26,7 +26,6 @@ References
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -172,8 +171,8 @@ def fit_network(
     Returns
     -------
     Plant
-        With covariance, noise, pooled offsets, valid ranges, ``scores`` (in-sample errors, identifiability,
-        iterations, seconds) and a verdict.
+        With covariance, noise, pooled offsets, valid ranges, ``scores`` (identifiability, weights) and a
+        verdict.
 
     Raises
     ------
@@ -197,7 +196,6 @@ def fit_network(
     >>> round(plant.values["G_amb"], 4), round(plant.values["power_1"], 2)
     (0.0139, 1.3)
     """
-    began = time.perf_counter()
     report = progress or (lambda fraction, what: None)
     model = load_network(network) if isinstance(network, (str, Path)) else network
     logs, _ = match_logs(model, logs)
@@ -233,12 +231,8 @@ def fit_network(
         )
         solution = _descend(problem, solution.z, report, (0.9, 0.95))
     report(0.95, "covariance")
-    plant = _as_plant(problem, solution, tau)
-    scores = replace(
-        plant.scores,
-        reading_excess=reading_excess(rows, model.outputs, problem.average),
-        seconds=round(time.perf_counter() - began, 2),
-    )
+    plant = _as_plant(problem, solution)
+    scores = replace(plant.scores, reading_excess=reading_excess(rows, model.outputs, problem.average))
     valid = {name: (float(np.nanmin(values)), float(np.nanmax(values))) for name, values in logged.items()}
     plant = plant.with_medians({name: logged[name] for name in model.disturbances})
     report(1.0, "fitted")
@@ -279,7 +273,7 @@ def _rms(parts: Sequence[Array]) -> float:
     return float(np.sqrt(np.mean(joined**2))) if joined.size else 0.0
 
 
-def _as_plant(problem: Problem, solution: Solution, tau: Array) -> Plant:
+def _as_plant(problem: Problem, solution: Solution) -> Plant:
     model, z = problem.model, solution.z
     names = tuple(model.parameters[i] for i in problem.free)
     by_log = problem.by_log(z, central=True)
@@ -288,35 +282,20 @@ def _as_plant(problem: Problem, solution: Solution, tau: Array) -> Plant:
     width = 1e-6 * (1 + np.abs(z))
     at_ends = zip(names, z <= problem.box[0] + width, z >= problem.box[1] - width)
     on_bound = {name: "low" if low else "high" for name, low, high in at_ends if low or high}
-    identifiability = describe(names, data, spread.covariance, spread.widening, on_bound, shift=z)
+    identifiability = describe(names, data, spread.covariance, on_bound, shift=z)
     p = problem.parameters(z[None])[0]
     errors, starts = problem.errors(z), problem.start(z)
     noise = {name: _rms([s[k] for log in errors for s in log]) for k, name in enumerate(model.outputs)}
     first = [begin[0] for begin in starts]
     offsets = dict(zip(model.outputs, np.mean([s.y_offset for s in first], axis=0).tolist()))
     offsets |= dict(zip(model.disturbances, np.mean([s.d_offset for s in first], axis=0).tolist()))
-    numbers = fit_record.ErrorNumbers(
-        **vars(spread.numbers),
-        unit=tuple((problem.sd * np.sqrt(problem.tau)).tolist()),
-        bin_s=spread.bin_s,
-        merge=round(spread.bin_s / problem.average),
-    )
     scores = fit_record.PlantScores(
-        in_sample_rmse={
-            log: {name: round(_rms([s[k] for s in errors_of_log]), 4) for k, name in enumerate(model.outputs)}
-            for log, errors_of_log in zip(problem.names, errors)
-        },
         identifiability=identifiability,
-        cost=round(solution.cost, 3),
-        iterations=solution.iterations,
-        converged=solution.converged,
         average_s=problem.average,
-        independent_s={k: round(t * problem.average, 1) for k, t in zip(model.outputs, tau)},
         weight_s={k: float(t * problem.average) for k, t in zip(model.outputs, problem.tau)},
         intervals=fit_record.Intervals(
-            numbers=numbers, between_logs=round(spread.phi, 3), coarsening=round(spread.coarsening, 3)
+            numbers=spread.numbers, between_logs=round(spread.phi, 3), coarsening=round(spread.coarsening, 3)
         ),
-        per_log=spread.effects,
     )
     return replace(
         problem.plant,

@@ -140,7 +140,6 @@ def describe(
     names: Sequence[str],
     jacobian: Array,
     covariance: Array,
-    widening: Array,
     on_bound: Mapping[str, str],
     *,
     shift: Array,
@@ -153,7 +152,6 @@ def describe(
     sd = np.sqrt(np.diag(covariance))
     return Identifiability(
         condition=float(values[-1] / max(least, 1e-18)),
-        spectrum=[float(f"{max(value, 0.0):.3g}") for value in values],
         weakest=_in_words(axes[:, 0], names),
         flat=[
             _in_words(axis, names) for value, axis in zip(values, axes.T) if value < REPORT.flat_eigenvalue
@@ -167,5 +165,4 @@ def describe(
             if s > REPORT.prior_only_sd and off < 2 * np.sqrt(1 - REPORT.prior_only_sd**2)
         ],
         on_bound=dict(on_bound),
-        widening={name: round(float(w), 3) for name, w in zip(names, widening)},
     )

@@ -87,20 +87,8 @@ class LogData:
     n_effects: int
 
 
-@dataclass(frozen=True)
-class ErrorModel:
-    """Numbers of the covariance."""
-
-    white: tuple[float, ...]  # w by output, of one bin
-    tau: tuple[float, ...]  # correlation times [bins]
-    sd: tuple[tuple[float, ...], ...]  # a by slow error and output
-    correlation: tuple[float, ...]  # between outputs, by slow error
-    spread: tuple[float, ...] = ()  # s by kind of column, in units of what was stated beforehand
-
-    @classmethod
-    def of(cls, numbers: ErrorNumbers) -> ErrorModel:
-        """Return the error model that a fit has written into the scores of its plant."""
-        return cls(numbers.white, numbers.tau, numbers.sd, numbers.correlation, numbers.spread)
+class ErrorModel(ErrorNumbers):
+    """What the numbers that a fit keeps stand for."""
 
     def covariance(self, n: int) -> Array:
         """Return the covariance (n_band, n_y, n_y) of a stretch of n bins."""

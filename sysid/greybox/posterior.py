@@ -458,7 +458,7 @@ def with_draws(
     intervals = plant.scores.intervals
     numbers = None
     if intervals is not None and intervals.numbers is not None and problem.names == tuple(plant.logs):
-        numbers = ErrorModel.of(intervals.numbers)  # the fit has learnt it already
+        numbers = ErrorModel(**vars(intervals.numbers))  # the fit has learnt it already
     target = RandomizedMap(problem, z, score_covariance(problem, z, numbers=numbers))
     free_columns = [problem.model.parameters.index(name) for name in plant.free]
     drawn = problem.parameters(target.draws(n, seed=seed, progress=progress))[:, free_columns]

@@ -112,8 +112,6 @@ class Linearised:
     kinds: list[str]  # responses and random effects that are estimated, each of one sd over all logs
     n_responses: int  # the first of ``kinds`` are of the model discrepancy
     n_shared: int  # columns that logs share: parameters, then responses
-    # of each effect of a log: name (empty for its start), stated sd, value that the start already contains
-    effects: list[list[tuple[str, float, float]]]
     bin_s: float  # width of a bin [s]
 
 
@@ -121,10 +119,8 @@ class Linearised:
 class _Column:
     """Something that moves the residuals of one log: values by stretch and output."""
 
-    name: str
-    stated: float
-    base: float  # value that the start already contains
-    moves: list[list[Array]]
+    name: str  # empty of a start
+    moves: list[list[Array]]  # at the stated sd
 
 
 def linearise_logs(problem: Problem, z: Array, by_log: Sequence[tuple[Array, Array]]) -> Linearised:
@@ -153,8 +149,7 @@ def linearise_logs(problem: Problem, z: Array, by_log: Sequence[tuple[Array, Arr
     kinds = [*signals_of, *dict.fromkeys(c.name for log in effects_of_logs for c in log if c.name)]
     for log, effects in zip(logs, effects_of_logs):
         log.kind[len(shared) :] = [kinds.index(c.name) if c.name else -1 for c in effects]
-    stated = [[(c.name, c.stated, c.base) for c in log] for log in effects_of_logs]
-    return Linearised(logs, kinds, len(signals_of), len(shared), stated, merge * problem.average)
+    return Linearised(logs, kinds, len(signals_of), len(shared), merge * problem.average)
 
 
 def _simulations(problem: Problem, at: int, p: Array, starts: list[Start]) -> list[Array]:
@@ -176,8 +171,7 @@ def _log_effects(
                 [np.full(mean.size, spread if k == j else 0.0) for k, mean in enumerate(cells.means)]
                 for cells in bins
             ]
-            estimate = float(starts[0].y_offset[j])
-            out.append(_Column(f"offset of {name}", spread, estimate, _in_residual_units(problem, moves)))
+            out.append(_Column(f"offset of {name}", _in_residual_units(problem, moves)))
     for j, name in enumerate(plant.disturbances):
         spread = min(plant.nuisance.get(name, 0.0), most)
         if spread > 0:
@@ -188,14 +182,13 @@ def _log_effects(
                 [np.asarray(operator @ (b[:, k] - a[:, k])) for k, operator in enumerate(cells.operators)]
                 for a, b, cells in zip(measured, biased, bins)
             ]
-            estimate = float(starts[0].d_offset[j])
-            out.append(_Column(f"bias of {name}", spread, estimate, _in_residual_units(problem, moves)))
+            out.append(_Column(f"bias of {name}", _in_residual_units(problem, moves)))
     specs = list(problem.model.specs.values())
     for i, place in enumerate(problem.free):
         spread = specs[place].per_log or 0.0
         if spread > 0:
             moves = [[s[:, i] * spread / problem.width[i] for s in stretch] for stretch in slopes]
-            out.append(_Column(problem.model.parameters[place], spread, 0.0, moves))
+            out.append(_Column(problem.model.parameters[place], moves))
     for k in range(len(stretches)):
         out += _of_start(problem, at, k, p, starts[k])
     return out
@@ -221,7 +214,7 @@ def _of_start(problem: Problem, at: int, k: int, p: Array, start: Start) -> list
     for mode in modes.T:
         moves = [bins_of_output * sd for bins_of_output, sd in zip(np.split(mode, ends), problem.sd)]
         everywhere = _in_residual_units(problem, [*nothing[:k], moves, *nothing[k + 1 :]])
-        out.append(_Column("", 1.0, 0.0, everywhere))
+        out.append(_Column("", everywhere))
     return out
 
 

@@ -47,9 +47,9 @@ from scipy.special import digamma
 
 from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.errors import UserError
-from thermogrip.sysid.greybox.noise_model import ErrorModel, LogData, information, learn_error_model
+from thermogrip.sysid.greybox.noise_model import ErrorModel, LogData, learn_error_model
 from thermogrip.sysid.greybox.problem import Problem
-from thermogrip.sysid.greybox.random_effects import Linearised, linearise_logs
+from thermogrip.sysid.greybox.random_effects import linearise_logs
 
 
 @dataclass(frozen=True)
@@ -86,13 +86,6 @@ class ScoreCovariance:
     phi: float  # how much logs differ over how much they should, as a variance
     numbers: ErrorModel  # in the units of the fit's residuals
     bin_s: float  # width of its bins [s]
-    # by log and effect: estimate and standard deviation, in the signal's unit or of ln p
-    effects: dict[str, dict[str, tuple[float, float]]]
-
-    @property
-    def widening(self) -> Array:
-        """Standard deviation over that of the inverse Hessian, (n_free,)."""
-        return np.asarray(np.sqrt(np.diag(self.covariance) / np.diag(np.linalg.inv(self.hessian))))
 
 
 def score_covariance(
@@ -124,16 +117,7 @@ def score_covariance(
     covariance = covariance * np.outer(narrower, narrower)
     by_weights = np.trace(inverse @ whole.hessian.sum(axis=0))
     coarsening = max(1.0, float(np.trace(inverse @ spread)) / max(float(by_weights), 1e-12))
-    return ScoreCovariance(
-        covariance,
-        spread,
-        coarsening,
-        hessian,
-        phi,
-        numbers,
-        data.bin_s,
-        _effects(data, numbers, z),
-    )
+    return ScoreCovariance(covariance, spread, coarsening, hessian, phi, numbers, data.bin_s)
 
 
 def disagreement(scores: LogScores, z: Array) -> Array:
@@ -188,13 +172,3 @@ def _one_log(log: LogData, merge: float, numbers: ErrorModel, n: int, n_shared: 
         score=products[:n, -1],
         discrepancy=products[:n, n:n_shared],
     )
-
-
-def _effects(data: Linearised, numbers: ErrorModel, z: Array) -> dict[str, dict[str, tuple[float, float]]]:
-    """Return the effects of each log with their sd."""
-    posterior, out = information(numbers, data.logs, z), {}
-    for log, names, (mean, covariance) in zip(data.logs, data.effects, posterior.effects):
-        scale = numbers.scale(log.kind[data.n_shared :])
-        rows = zip(names, scale * mean, scale * np.sqrt(np.diag(covariance)))
-        out[log.name] = {name: (float(base + m * s), float(d * s)) for (name, s, base), m, d in rows if name}
-    return out

@@ -148,7 +148,7 @@ class NeuralModel(BlackBox):
 
     def rollout(self, x0: ArrayLike, u: ArrayLike, d: ArrayLike, p: ArrayLike, dt: float) -> Run:
         """Simulate a batch."""
-        from thermogrip.sysid.models.neural_kernel import run_outputs  # pulls in numba
+        from thermogrip.sysid.models.recurrences import run_outputs  # pulls in numba
 
         times = self._steps_per_row(dt)
         drives = self._scaled_drives(u, d, times)
@@ -168,7 +168,7 @@ class NeuralModel(BlackBox):
 
     def states(self, x0: ArrayLike, u: ArrayLike, d: ArrayLike, dt: float) -> Array:
         """Return the states (N + 1, n_x) from one x0 (n_x,) under u (N, n_u) and d (N, n_d)."""
-        from thermogrip.sysid.models.neural_kernel import run_states
+        from thermogrip.sysid.models.recurrences import run_states
 
         times = self._steps_per_row(dt)
         (w,) = self._scaled_drives(np.asarray(u)[None], np.asarray(d)[None], times)

@@ -54,27 +54,22 @@ class Identifiability:
     """What the logs say of the free parameters (:mod:`thermogrip.sysid.greybox.identifiability`)."""
 
     condition: float  # of the scaled Hessian
-    spectrum: list[float]  # its eigenvalues
     weakest: str  # the direction of the smallest, in words
     flat: list[str]  # all directions that the logs barely determine, in words
     identifiable: bool  # False: a direction changes no output at all
     prior_only: list[str]  # names
     on_bound: dict[str, str]  # name -> "low" or "high"
-    widening: dict[str, float]  # of each interval by correlated errors
 
 
 @dataclass(frozen=True)
 class ErrorNumbers:
-    """The numbers of :class:`thermogrip.sysid.greybox.noise_model.ErrorModel` and of its bins."""
+    """Numbers of the errors of a fit (:class:`thermogrip.sysid.greybox.noise_model.ErrorModel`)."""
 
-    white: tuple[float, ...]
-    tau: tuple[float, ...]
-    sd: tuple[tuple[float, ...], ...]
-    correlation: tuple[float, ...]
-    unit: tuple[float, ...]  # by output: what 1 is worth, in the output's unit
-    bin_s: float
-    merge: int  # bins of the fit in one of these
-    spread: tuple[float, ...] = ()
+    white: tuple[float, ...]  # w by output, of one bin
+    tau: tuple[float, ...]  # correlation times [bins]
+    sd: tuple[tuple[float, ...], ...]  # a by slow error and output
+    correlation: tuple[float, ...]  # between outputs, by slow error
+    spread: tuple[float, ...] = ()  # s by kind of column, in units of what was stated beforehand
 
 
 @dataclass(frozen=True)
@@ -115,11 +110,7 @@ class PlantScores:
     {'structure': 'na 1', 'average_s': 2.0}
     """
 
-    in_sample_rmse: dict[str, dict[str, float]] = field(default_factory=dict)  # by log and output, over bins
     identifiability: Identifiability | None = None
-    cost: float | None = None
-    iterations: int | None = None
-    converged: bool | None = None
     structure: str = ""  # of a black box: its orders
     average_s: float | None = None  # averaging step or bin of the fit [s]
     average_why: str = ""  # which rule set it
@@ -128,12 +119,10 @@ class PlantScores:
     folds: list[str] = field(default_factory=list)  # of a black box: names of the parts held out in turn
     held_out_rmse: dict[str, float] = field(default_factory=dict)  # by output, over all of them
     held_out_by_part: dict[str, list[float]] = field(default_factory=dict)
-    independent_s: dict[str, float] = field(default_factory=dict)  # between independent residuals
-    weight_s: dict[str, float] = field(default_factory=dict)  # the same, as the fit weighted them
+    # between independent residuals, as the fit weighted them
+    weight_s: dict[str, float] = field(default_factory=dict)
     intervals: Intervals | None = None
-    per_log: dict[str, dict[str, tuple[float, float]]] = field(default_factory=dict)  # by effect: value, sd
     innovations: InnovationNoise | None = None
-    seconds: float | None = None  # that the fit took
     posterior: Sampling | None = None
     held_out: list[HeldOut] = field(default_factory=list)  # free runs over what the fit had not seen
     expected: dict[str, ExpectedError] = field(default_factory=dict)  # by output, of another run

@@ -31,6 +31,7 @@ from scipy.linalg import solve_discrete_are
 from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.schema import Log
 from thermogrip.sysid.plant.fit_record import InnovationNoise
+from thermogrip.sysid.plant.linearise import discrete_matrices, output_matrix, states_after
 from thermogrip.sysid.plant.log_grid import Stretch, cut_stretches
 from thermogrip.sysid.plant.plant_data import PlantData
 
@@ -125,24 +126,16 @@ class _Filter:
                     z = z + np.einsum("bij,bj->bi", gains, e)
                 u = np.repeat(stretch.u[k][None], len(z), axis=0)
                 u[:, self.graded] += z[:, n_x:]
-                z = np.hstack([_states_after_step(self.plant, z[:, :n_x], u, stretch.d[k]), z[:, n_x:]])
+                d = np.repeat(stretch.d[k][None], len(z), axis=0)
+                z = np.hstack([states_after(self.plant, z[:, :n_x], u, d), z[:, n_x:]])
         return squares, count
-
-
-def _states_after_step(plant: PlantData, x: Array, u: Array, d: Array) -> Array:
-    """Return states (B, n_x) a step later under inputs (B, n_u)."""
-    disturbance = np.ascontiguousarray(np.broadcast_to(d, (len(x), 1, d.size)))
-    numbers = np.repeat(plant.p[None], len(x), axis=0)
-    x, u = np.ascontiguousarray(x), np.ascontiguousarray(u[:, None])
-    return np.asarray(plant.model.rollout(x, u, disturbance, numbers, plant.dt)[1])
 
 
 def _filter_of(plant: PlantData, stretches: Sequence[Stretch], graded: list[int]) -> _Filter | None:
     """Return the plant linearised once, amid the logs; None where it diverges there."""
     model, p, n_x, n_w = plant.model, plant.p, plant.model.n_x, len(graded)
     offset = np.array([plant.offsets.get(name, 0.0) for name in plant.outputs])
-    level = np.array(model.output([0.0] * n_x, p.tolist()))
-    C = np.array([model.output(row, p.tolist()) for row in np.eye(n_x).tolist()]).T - level[:, None]
+    C, level = output_matrix(plant)
     spread = np.sqrt(np.maximum(np.diag(np.atleast_2d(model.spread)), 1e-12))
     unit = spread / np.sqrt(np.einsum("ij,j,ij->i", C, spread**2, C)).max()
     u, d, y = (np.concatenate([getattr(stretch, key) for stretch in stretches]) for key in "udy")
@@ -151,15 +144,10 @@ def _filter_of(plant: PlantData, stretches: Sequence[Stretch], graded: list[int]
     u0 = u.mean(axis=0)
     d0 = d.mean(axis=0)
     x0 = np.asarray(model.rest(middle - offset, u0, d0, p), dtype=float)
-    tried = 1e-3 * np.concatenate([unit, size])
-    moves = np.concatenate([np.zeros((1, n_x + n_w)), np.diag(tried)])
-    pushed = np.repeat(u0[None], len(moves), axis=0)
-    pushed[:, graded] += moves[:, n_x:]
-    after = _states_after_step(plant, x0 + moves[:, :n_x], pushed, d0)
-    into = (after[1:] - after[0]).T / tried  # (n_x, n_x + n_w)
-    if not np.isfinite(into).all():
+    A, B = discrete_matrices(plant, x0, u0, d0, graded)
+    if not (np.isfinite(A).all() and np.isfinite(B).all()):
         return None
-    F = np.vstack([into, np.hstack([np.zeros((n_w, n_x)), np.eye(n_w)])])
+    F = np.block([[A, B[:, :n_w]], [np.zeros((n_w, n_x)), np.eye(n_w)]])
     H = np.hstack([C, np.zeros((len(C), n_w))])
     return _Filter(plant, graded, F, H, level, offset, middle, unit, size)
 

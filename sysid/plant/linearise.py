@@ -69,15 +69,10 @@ class LinearPlant:
     dt: float | None  # step [s]; None is continuous time
     name: str = "plant"
 
-    def simulate(self, w: ArrayLike) -> Array:
-        """Return outputs (N + 1, n_y) under inputs w (N, n_w), from the operating point (discrete only)."""
-        if self.dt is None:
-            raise ValueError("a continuous model has no step; linearise at a dt")
-        dx, out = np.zeros(self.x.size), [self.y]
-        for row in np.asarray(w, dtype=float) - self.w:
-            dx = self.A @ dx + self.B @ row
-            out.append(self.y + self.C @ dx)
-        return np.array(out)
+    @property
+    def D(self) -> Array:
+        """The (n_y, n_w) direct term: none, for what is applied at a row acts from it on."""
+        return np.zeros((len(self.outputs), len(self.inputs)))
 
     def gain(self) -> Array:
         """Return the (n_y, n_w) gain at rest."""
@@ -128,7 +123,7 @@ def linearise_plant(
     if x.shape != (plant.model.n_x,):
         raise UserError(f"the state has {x.size} numbers", hint=f"give {plant.model.n_x}")
     moved = [k for k, name in enumerate(plant.inputs) if name not in plant.model.switches]
-    A, B = _discrete(plant, x, u, d, moved)
+    A, B = discrete_matrices(plant, x, u, d, moved)
     size = np.abs(np.linalg.eigvals(A))
     if size.max() > 1 + LINEAR.growth:
         seconds = plant.dt / np.log(size.max())
@@ -140,18 +135,17 @@ def linearise_plant(
         A, B = _continuous(plant, x, u, d, moved, A, B)
     else:
         A, B = composed(A, B, steps_in(plant, dt))
-    zero = _output(plant, np.zeros(x.size))
-    C: Array = np.stack([_output(plant, row) - zero for row in np.eye(x.size)], axis=1)
+    C, level = output_matrix(plant)
     names = (*(plant.inputs[k] for k in moved), *plant.disturbances)
     w = np.concatenate([u[moved], d])
     labels = state_labels(plant)
-    return LinearPlant(A, B, C, labels, names, plant.outputs, x, w, _output(plant, x), dt)
+    return LinearPlant(A, B, C, labels, names, plant.outputs, x, w, level + C @ x, dt)
 
 
 def save_linear(near: LinearPlant, path: str | Path) -> Path:
     """Write the matrices, names and operating point as JSON or MATLAB file."""
     file = Path(path)
-    matrices = {"A": near.A, "B": near.B, "C": near.C, "D": np.zeros((len(near.outputs), len(near.inputs)))}
+    matrices = {"A": near.A, "B": near.B, "C": near.C, "D": near.D}
     labels = {"states": near.states, "inputs": near.inputs, "outputs": near.outputs}
     point = {"x0": near.x, "u0": near.w, "y0": near.y}
     if file.suffix == ".mat":
@@ -188,15 +182,19 @@ def state_labels(plant: PlantData) -> tuple[str, ...]:
     return tuple(name.replace(".", "_") for name in plant.model.states)
 
 
-def _output(plant: PlantData, x: Array) -> Array:
-    return np.array(plant.model.output(x.tolist(), plant.p.tolist()), dtype=float)
+def output_matrix(plant: PlantData) -> tuple[Array, Array]:
+    """Return C (n_y, n_x) and the level (n_y,) of the outputs, which are affine in the state."""
+    zero, *moved = (
+        np.array(plant.model.output(row.tolist(), plant.p.tolist()), dtype=float)
+        for row in np.eye(plant.model.n_x + 1, plant.model.n_x, -1)
+    )
+    return np.stack(moved, axis=1) - zero[:, None], zero
 
 
-def _next(plant: PlantData, x: Array, u: Array, d: Array) -> Array:
+def states_after(plant: PlantData, x: Array, u: Array, d: Array) -> Array:
     """Return the states (B, n_x) one step after x (B, n_x) under u (B, n_u), d (B, n_d)."""
     p = np.repeat(plant.p[None], len(x), axis=0)
-    _, end = plant.model.rollout(x, u[:, None], d[:, None], p, plant.dt)
-    return np.asarray(end)
+    return np.asarray(plant.model.rollout(x, u[:, None], d[:, None], p, plant.dt)[1])
 
 
 def _steady_state(plant: PlantData, u: Array, d: Array) -> Array:
@@ -205,14 +203,14 @@ def _steady_state(plant: PlantData, u: Array, d: Array) -> Array:
     x = np.asarray(plant.model.rest(start, u, d, plant.p), dtype=float)
     with np.errstate(all="ignore"):
         for _ in range(60):
-            A, _ = _discrete(plant, x, u, d, [])
+            A, _ = discrete_matrices(plant, x, u, d, [])
             I_minus_A = np.eye(x.size) - A
             if (
                 not np.isfinite(I_minus_A).all()
                 or np.linalg.svd(I_minus_A, compute_uv=False)[-1] < LINEAR.integrator
             ):
                 break
-            move = np.linalg.solve(I_minus_A, _next(plant, x[None], u[None], d[None])[0] - x)
+            move = np.linalg.solve(I_minus_A, states_after(plant, x[None], u[None], d[None])[0] - x)
             x = np.asarray(x + np.clip(move, -100.0, 100.0))
             if np.max(np.abs(move)) < 1e-7 * max(1.0, float(np.abs(x).max())):
                 return x
@@ -235,8 +233,11 @@ def _jacobians(
     return both[:, : x.size], both[:, x.size :]
 
 
-def _discrete(plant: PlantData, x: Array, u: Array, d: Array, moved: Sequence[int]) -> tuple[Array, Array]:
-    return _jacobians(lambda *w: _next(plant, *(np.ascontiguousarray(v) for v in w)), x, u, d, moved)
+def discrete_matrices(
+    plant: PlantData, x: Array, u: Array, d: Array, moved: Sequence[int]
+) -> tuple[Array, Array]:
+    """Return A, and B of ``moved`` inputs and then disturbances, of the plant's own step at a point."""
+    return _jacobians(lambda *w: states_after(plant, *map(np.ascontiguousarray, w)), x, u, d, moved)
 
 
 def steps_in(plant: PlantData, dt: float) -> int:
@@ -297,13 +298,6 @@ def _rate(plant: PlantData) -> Callable[[Array, Array, Array], Array] | None:
     return None
 
 
-def to_control(plant: PlantData, **point: Any) -> Any:
-    """Return a plant for python-control; see :meth:`thermogrip.sysid.plant.plant.Plant.to_control`."""
-    linear = linearise_plant(plant, **point)
-    D = np.zeros((len(linear.outputs), len(linear.inputs)))
-    return control_system(linear, (linear.A, linear.B, linear.C, D, linear.dt or 0), linear.name)
-
-
 def control_system(labels: Any, numbers: Sequence[Any], name: str) -> Any:
     """Return A, B, C, D, dt as a ``StateSpace`` with the inputs, outputs and states that ``labels`` has."""
     try:
@@ -317,16 +311,6 @@ def control_system(labels: Any, numbers: Sequence[Any], name: str) -> Any:
         name=name,
         remove_useless_states=False,
     )
-
-
-def to_scipy(plant: PlantData, **point: Any) -> Any:
-    """Return a plant for scipy; see :meth:`thermogrip.sysid.plant.plant.Plant.to_scipy`."""
-    from scipy import signal
-
-    linear = linearise_plant(plant, **point)
-    step = {} if linear.dt is None else {"dt": linear.dt}
-    D = np.zeros((len(linear.outputs), len(linear.inputs)))
-    return signal.StateSpace(linear.A, linear.B, linear.C, D, **step)
 
 
 def to_casadi(plant: PlantData, *, dt: float | None = None) -> Any:

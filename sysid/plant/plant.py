@@ -282,9 +282,10 @@ class Plant(Shown, plant_data.PlantData):
         >>> system.input_labels, system.output_labels, bool(max(system.poles().real) < 0)
         (['q1', 'q2'], ['t1', 't2'], True)
         """
-        from thermogrip.sysid.plant.linearise import to_control  # pulls in scipy.linalg
+        from thermogrip.sysid.plant.linearise import control_system, linearise_plant  # pulls in scipy.linalg
 
-        return to_control(self, **point)
+        linear = linearise_plant(self, **point)
+        return control_system(linear, (linear.A, linear.B, linear.C, linear.D, linear.dt or 0), linear.name)
 
     def to_scipy(self, **point: Any) -> Any:
         """Return the plant about an operating point as a ``scipy.signal.StateSpace``, discrete where dt is
@@ -292,9 +293,13 @@ class Plant(Shown, plant_data.PlantData):
 
         scipy names no signals: inputs are the plant's without its switches, then its disturbances, in order.
         """
-        from thermogrip.sysid.plant.linearise import to_scipy
+        from scipy import signal
 
-        return to_scipy(self, **point)
+        from thermogrip.sysid.plant.linearise import linearise_plant
+
+        linear = linearise_plant(self, **point)
+        step = {} if linear.dt is None else {"dt": linear.dt}
+        return signal.StateSpace(linear.A, linear.B, linear.C, linear.D, **step)
 
     def to_casadi(self, *, dt: float | None = None) -> Any:
         """Return one step of the plant as a CasADi ``Function`` (x, u, d, p) -> (x_next, y).

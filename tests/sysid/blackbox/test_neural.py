@@ -10,7 +10,7 @@ import pytest
 from thermogrip.sysid.blackbox import neural
 from thermogrip.sysid.blackbox.neural import _Data, _Linear, _Member, saturation_levels
 from thermogrip.sysid.blackbox.order_selection import Structure
-from thermogrip.sysid.models.neural_kernel import run_states
+from thermogrip.sysid.models.recurrences import run_states
 from thermogrip.sysid.plant.log_grid import Grid, Segment, make_grid
 
 

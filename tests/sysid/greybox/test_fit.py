@@ -30,7 +30,7 @@ def test_the_fit_finds_what_made_the_data():
     plant = fit_network(heater(), [made(0), made(1)])
     for name, value in TRUTH.items():
         assert plant.values[name] == pytest.approx(value, rel=0.03), name
-    assert plant.scores.converged
+    assert "ran out of iterations" not in plant.verdict
     assert plant.scores.identifiability.identifiable
     assert plant.noise["t"] < 0.05
     assert plant.logs == ("made0", "made1")
@@ -129,9 +129,7 @@ def test_a_fit_whose_errors_are_whiter_than_a_reading_a_minute_is_done_again_wit
         for m, n in ((0.5, 600), (300.0, 1800))
     )
     assert slow.scores.weight_s["t"] == 60.0
-    assert slow.scores.independent_s["t"] > 60.0
     weight = white.scores.weight_s["t"]
-    assert weight == pytest.approx(white.scores.independent_s["t"], abs=0.06)
     assert weight < 0.2 * 60.0
     # and it ends where least squares with that weight does
     problem, z = problem_of(TwoGains(), [a_log(k, memory=0.5) for k in (1, 2)], white)
@@ -186,15 +184,9 @@ def reported() -> tuple[Plant, list[Log], Problem, Array]:
     return plant, logs, *problem_of(model, logs, plant)
 
 
-def test_errors_offsets_and_ranges_are_those_of_the_fit_log_by_log(reported: Any):
+def test_errors_offsets_and_ranges_are_those_of_the_fit(reported: Any):
     plant, logs, problem, z = reported
     errors = problem.errors(z)
-    by_log = [rms([stretch[0] for stretch in log]) for log in errors]
-    assert by_log[1] > 1.2 * by_log[0]
-    stated = plant.scores.in_sample_rmse
-    assert {name: part["t"] for name, part in stated.items()} == pytest.approx(
-        dict(zip(["log 1", "log 2", "log 3"], by_log)), abs=1e-3
-    )
     whole = rms([stretch[0] for log in errors for stretch in log])
     assert plant.noise["t"] == pytest.approx(whole, abs=1e-3)
     starts = [begin[0].y_offset[0] for begin in problem.start(z)]
@@ -213,9 +205,6 @@ def test_the_covariance_is_that_of_the_score_in_the_parameters_own_units(reporte
     np.testing.assert_allclose(plant.covariance, 16.0 * spread.covariance, rtol=1e-2)  # the prior's sd is 4 K
     stated = plant.scores.intervals
     assert stated.coarsening == pytest.approx(spread.coarsening, rel=1e-2)
-    # what the learnt error counts in: a sensor's sd times the root of the bins for one reading
-    tau = plant.scores.weight_s["t"] / 4.0
-    assert stated.numbers.unit == pytest.approx([0.1 * np.sqrt(tau)])
 
 
 def test_the_rooms_offset_is_the_mean_of_those_of_its_logs():
@@ -242,7 +231,6 @@ def test_a_fit_that_runs_out_of_iterations_says_so(monkeypatch: pytest.MonkeyPat
     )
     plant = fit_network(TwoGains(), logs)
     assert "the fit ran out of iterations" in plant.verdict
-    assert plant.scores.converged is False
 
 
 def test_free_runs_are_named_by_their_logs():

@@ -147,14 +147,6 @@ def test_a_point_is_of_what_is_named_and_where_the_plant_is_put():
     assert (near.states, near.inputs, near.outputs) == (("x1",), ("q", "wind"), ("t", "t2"))
     assert (near.dt, near.name) == (4.0, "plant")
     np.testing.assert_allclose([*near.A[0], *near.B[0]], [0.81, 0.95, 0.38], rtol=1e-6)  # two steps
-    # from the operating point, under changes of 1 and 2
-    got = near.simulate([[3.0, 9.0], [2.0, 7.0]])
-    x = 0.95 + 2 * 0.38
-    np.testing.assert_allclose(
-        got, [[23.0, 41.0], [23 + x, 41 - 3 * x], [23 + 0.81 * x, 41 - 2.43 * x]], rtol=1e-6
-    )
-    with pytest.raises(ValueError, match="a continuous model has no step"):
-        linearise_plant(plant, inputs={"q": 2.0}).simulate([[1.0, 1.0]])
     with pytest.raises(UserError, match="has no q there; its inputs and disturbances are q, wind"):
         linearise_plant(plant, disturbances={"q": 2.0})
     none = replace(plant, units=plant.units | {"wind": "1"}, valid={})

@@ -13,7 +13,7 @@ from thermogrip.datasets.schema import make_log
 from thermogrip.sysid.blackbox.fit import fit_black_box
 from thermogrip.sysid.blackbox.neural import neural_family, saturation_levels
 from thermogrip.sysid.models.neural import NeuralModel
-from thermogrip.sysid.models.neural_kernel import run_states, run_with_slopes
+from thermogrip.sysid.models.recurrences import run_states, run_with_slopes
 from thermogrip.sysid.plant.log_grid import make_grid
 from thermogrip.sysid.plant.plant import Plant
 from thermogrip.sysid.validation.free_run import free_run
