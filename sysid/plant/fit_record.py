@@ -42,6 +42,7 @@ class ExpectedError:
     rmse: float  # as likely more as less
     low: float  # less in one run of twenty
     high: float  # more in one run of twenty
+    same_gain: float | None = None  # ``rmse`` without the gain that is assumed to vary; None where none is
 
     def words(self, unit: str) -> str:
         """Return it as it is printed everywhere."""

@@ -96,7 +96,9 @@ def expected_error(errors: Sequence[float], gain_effect: float) -> ExpectedError
     part_squares = np.exp(middle + scale * stdtrit(freedom, ranks))
     gains = (gain_effect * ndtri(0.5 + ranks / 2)) ** 2
     low, high = np.sqrt(np.quantile(part_squares[:, None] + gains, (0.05, 0.95))).tolist()
-    return ExpectedError(float(np.hypot(np.exp(middle / 2), MEDIAN * gain_effect)), low, high)
+    of_parts = float(np.exp(middle / 2))
+    rmse = float(np.hypot(of_parts, MEDIAN * gain_effect))
+    return ExpectedError(rmse, low, high, of_parts if gain_effect else None)
 
 
 def free_run_band(
@@ -124,6 +126,7 @@ def free_run_band(
     inside = {}
     expected = {}
     likely = {}
+    by_gain = 0.0  # share of the squared error, of the output where it is most
     other_run, unlike = between_runs(plant, [log]), unlike_fit(plant, log, simulated, warmup)
     is_unlike, compared = False, bool(plant.scores.held_out or plant.scores.held_out_rmse)
     for column_index, name in enumerate(plant.outputs):
@@ -138,6 +141,9 @@ def free_run_band(
         is_unlike = is_unlike or bool(np.mean(added) > _UNLIKE * np.mean(like_fit))
         size = np.mean((like_fit + added)[scored]) if scored.any() else np.nan
         expected[name] = float(np.sqrt(size))
+        if scored.any() and size > 0:
+            rest = np.mean((like_fit + added - gain_and_level)[scored])
+            by_gain = max(by_gain, 1 - float(rest / size))
         other = np.hypot(other_run.get(name, np.zeros(1)), unlike.get(name, np.zeros(1)) / MEDIAN)
         ends = expected_error(errors, float(np.sqrt(np.mean(other**2))))
         beyond = np.sqrt(max(size - ends.rmse**2, 0.0))  # what draws say beyond it
@@ -147,7 +153,8 @@ def free_run_band(
         inside[name] = float(np.mean(miss[is_read] <= half[name][is_read])) if is_read.any() else float("nan")
     words = "the errors of free runs over parts held out of it" if compared else "the error of the fit"
     if other_run:
-        words += f" and a gain that varies by {100 * RUN_GAIN_SD:.0f} % from run to run (assumed: "
+        words += f" and a gain that varies by {100 * RUN_GAIN_SD:.0f} % from run to run (assumed, "
+        words += f"{100 * by_gain:.0f} % of the squared error: "
         words += f"{'one log' if len(plant.logs) == 1 else 'two logs'} cannot show it)"
     if is_unlike:
         words += ", wider because this run is unlike the fit (range of the readings)"

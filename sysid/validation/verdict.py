@@ -158,9 +158,13 @@ def verdict_of(
     label = f"network {named}" if named else model
     errors = ", ".join(f"{name} {each.words(plant.units.get(name, '1'))}" for name, each in expected.items())
     another = f"Expected error of another run like these: {errors}."
-    if 0 < len(plant.logs) < SEVERAL:
-        another += f" That gains vary by {100 * RUN_GAIN_SD:.0f} % from run to run is assumed; {SEVERAL} "
-        another += "logs would show it."
+    without = {name: each.same_gain for name, each in expected.items() if each.same_gain is not None}
+    if without:
+        sizes = ", ".join(
+            f"{n} {e:.2g} {plant.units.get(n, '1')}".removesuffix(" 1") for n, e in without.items()
+        )
+        another += f" It would be {sizes}, were gains the same from run to run: that they vary by "
+        another += f"{100 * RUN_GAIN_SD:.0f} % is assumed; {SEVERAL} logs would show it."
     own_rows = [row for row in rows if row.model == model]
     for name, error in expected.items():
         part_error, parts_idle = _pooled([row for row in own_rows if row.output == name and row.held_out])

@@ -194,7 +194,7 @@ def test_the_answer_of_identify_is_what_was_found(room: SimpleNamespace) -> None
     found = room.found
     assert json.loads(done.out) == {
         "model": "network", "network": "tclab", "good": True, "verdict": "it is good",
-        "expected_error": {"t1": {"rmse": 0.4, "low": 0.2, "high": 0.9}},
+        "expected_error": {"t1": {"rmse": 0.4, "low": 0.2, "high": 0.9, "same_gain": None}},
         "signals": [asdict(each) for each in found.signals], "rows": [asdict(each) for each in found.rows],
         "data_check": [asdict(finding) for finding in found.data_check.findings],
         "evidence": {"minutes": 3.0},

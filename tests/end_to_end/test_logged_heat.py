@@ -96,6 +96,15 @@ def test_a_controller_drives_the_heater_alone_and_gives_it_less_under_the_lamp(p
         assert moves[0] - moves[1] == pytest.approx(100 * LAMP_W / HEATER_W, abs=8), moves
 
 
+def test_the_verdict_says_how_much_of_the_stated_error_is_a_gain_that_is_assumed_to_vary(
+    plant: Plant,
+) -> None:
+    stated = plant.scores.expected["t_tank"]
+    assert stated.same_gain == pytest.approx(0.03, rel=0.2)  # the noise; 5 % of up to 20 K are assumed
+    assert stated.rmse > 5 * stated.same_gain
+    assert f"It would be t_tank {stated.same_gain:.2g} degC, were gains the same" in plant.verdict
+
+
 def test_a_lamp_joins_no_nodes_and_a_temperature_heats_nothing(log: Log, bench: Bench) -> None:
     write_log(log, bench.path / "tank.csv")
     for old, new, said in (

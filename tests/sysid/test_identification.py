@@ -212,8 +212,8 @@ def test_one_error_is_stated_of_another_run_everywhere():
     differs = np.sqrt(np.mean(between_runs(found.plant, [log])["t"] ** 2))
     (stated,) = found.expected.values()
     assert stated == expected_error(parts, float(differs))
-    said = f"(oe). Expected error of another run like these: t {stated.words('degC')}. That gains vary by 5 %"
-    assert said in found.verdict
+    said = f"(oe). Expected error of another run like these: t {stated.words('degC')}. It would be t "
+    assert f"{said}{stated.same_gain:.2g} degC, were gains the same from run to run" in found.verdict
     assert "Good for simulation and control on runs like these" in found.verdict
     assert Plant.from_dict(found.plant.to_dict()).scores.expected == found.expected
     again = free_run(found.plant, plant_log(seed=7))  # of the same kind, so its band is as stated

@@ -356,7 +356,8 @@ def test_the_words_of_a_band_say_what_its_own_error_is_and_what_is_assumed():
     assert band.own_error == "the errors of free runs over parts held out of it"
     assert band.expected["t"] == pytest.approx(1.0)  # their geometric mean
     assert band.likely["t"][0] < 0.5 < 2.0 < band.likely["t"][1]
-    again = " and a gain that varies by 5 % from run to run (assumed: {} cannot show it)"
+    again = " and a gain that varies by 5 % from run to run (assumed, 0 % of the squared error: "
+    again += "{} cannot show it)"
     for logs, how in ((("a",), "one log"), (("a", "b"), "two logs"), (("a", "b", "c"), None), ((), None)):
         band = free_run_band(replace(still()[0], logs=logs), log, run)
         assert band.own_error == "the error of the fit" + (again.format(how) if how else "")
