@@ -42,7 +42,9 @@ from thermogrip.sysid.plant.log_grid import Grid
 RIDGE = 3.0  # rho; the data count as many readings as there are rows
 STANDS = 8  # rows in a row at the end of the range make a saturation level
 MANY = 2500  # readings: beyond it fewer starts
-BEYOND = 1.25  # of the drives' reach in the data: further out they are clipped
+# of the drives' reach in the data, further out they are clipped: with 1.25 a controller that may drive beyond
+# its log took the rest of its range for lost (a PCR block's IAE 1.38 of a PI's, 1.05 with 10)
+BEYOND = 10.0
 SLOWEST = 0.9995  # largest pole of the linear part
 ALIKE = 1e6  # condition of C: beyond it outputs are combinations of others, and cannot be states
 ITERATIONS = 30

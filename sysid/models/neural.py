@@ -7,7 +7,7 @@ With the drives w = [u, d] and the outputs at zero mean and unit spread, each me
 and the model's output is the mean of its members, which differ in the random start of their weights.
 
 **Bounded.**  A is that of a stable linear fit and is not trained, tanh never exceeds 1, and each drive is
-clipped to a little more than its reach r in the data (a drive that never moved there has r = 0 and moves
+clipped to r, ten times its reach in the data (a drive that never moved there has r = 0 and moves
 nothing).  So the state is bounded whatever the weights and the inputs,
 
     |x| <= sum_k |A^k| (|B| r + |c| + |V| 1).

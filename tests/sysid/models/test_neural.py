@@ -84,6 +84,14 @@ def test_what_bends_the_plant_is_learnt_and_a_linear_model_misses_it(tank, fit_o
     assert errors[0] < 0.25 * errors[1]
 
 
+def test_a_drive_beyond_what_the_log_moved_goes_on_moving_the_output(tank):
+    rest = tank.rest([4.0], [0.56], [], ())
+    y, _ = tank.rollout(rest[None], np.full((1, 4, 1), 2.0), np.zeros((1, 4, 0)), (), 1.0)
+    assert y[0, -1, 0] == pytest.approx(
+        4.0 + 4 * (0.25 * 2.0 - 0.07 * 2.0), abs=0.15
+    )  # the log ends at 1.3 V
+
+
 def test_an_output_that_stands_at_its_end_is_clipped_there_and_nowhere_else(tank):
     assert tank.high.tolist() == [10.0]
     assert tank.low.tolist() == [-np.inf]
