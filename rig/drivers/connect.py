@@ -31,7 +31,7 @@ def recognise(port: Port, *, seconds: float = 6.0) -> str:
                 return "tclab"
     answer = "nothing" if not heard_all else f"only {heard_all[-60:]!r}"
     hint = "check power and firmware, or name the language with --protocol"
-    raise PortError("absent", f"says {answer}", file=port.url, hint=hint)
+    raise PortError(f"says {answer}", file=port.url, hint=hint)
 
 
 def open_rig(

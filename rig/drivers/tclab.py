@@ -138,7 +138,7 @@ class TCLabRig(SerialRig):
                 return lines[0].decode("ascii").strip()
         self.port.close()
         hint = "check that it is a TCLab with firmware 2, or give --protocol"
-        raise PortError("absent", "no TCLab answers here", file=self.port.url, hint=hint)
+        raise PortError("no TCLab answers here", file=self.port.url, hint=hint)
 
     def _set_heaters(self, power: list[float]) -> None:
         """Set both heaters; each answer is the value that the board took."""
@@ -150,7 +150,7 @@ class TCLabRig(SerialRig):
                 took = float(self._ask(text, 1, _DECIMAL_LINE)[0])  # an answer that slipped, or was spoilt
             if abs(took - value) > BOARD.same:
                 problem = f"took {took:g} % where q{channel + 1} = {value:g} %"
-                raise PortError("lost", problem, file=self.port.url, hint="check cable and power")
+                raise PortError(problem, file=self.port.url, hint="check cable and power")
             self._set[channel] = round(value, 3)
 
     def _checked_scan(self) -> tuple[list[float], list[float]]:
@@ -185,12 +185,12 @@ class TCLabRig(SerialRig):
         """Raise PortError where another board than before may answer now."""
         version = self._once(b"VER", 1, _VERSION_LINE)
         if not version or not (scan := self._once(b"SCAN", 4, _DECIMAL_LINE)):
-            raise PortError("lost", "does not answer", file=self.port.url, hint="check cable and power")
+            raise PortError("does not answer", file=self.port.url, hint="check cable and power")
         heaters_as_set = all(abs(float(now) - then) <= BOARD.same for now, then in zip(scan[2:], self._set))
         same = any(self._set) and heaters_as_set
         if not same or version[0].decode("ascii").strip() != self.version:
             problem = "may be another board now, or was reset: no serial number and no heater tells"
-            raise PortError("lost", problem, file=self.port.url, hint="start anew")
+            raise PortError(problem, file=self.port.url, hint="start anew")
         self._known_at = self.port.opened
 
     def _ask(self, command: bytes, count: int, form: re.Pattern[bytes], *, known: bool = True) -> list[bytes]:
@@ -208,7 +208,7 @@ class TCLabRig(SerialRig):
                 self._wait_for_silence()
             if not lines:
                 self._known_at = self._known_at if self._heard > before else 0  # the cable may be elsewhere
-                raise PortError("lost", "does not answer", file=self.port.url, hint="check cable and power")
+                raise PortError("does not answer", file=self.port.url, hint="check cable and power")
         return lines
 
     def _wait_for_silence(self) -> None:

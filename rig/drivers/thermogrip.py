@@ -119,7 +119,7 @@ class DeviceRig(SerialRig):
                 return answer.content
         self.port.close()
         hint = "check that it runs thermogrip's firmware, or give --protocol"
-        raise PortError("absent", "nothing here speaks our protocol", file=self.port.url, hint=hint)
+        raise PortError("nothing here speaks our protocol", file=self.port.url, hint=hint)
 
     def _ask(self, request: protocol.Request) -> protocol.State:
         """Return what answers a question, greeting the device first where it is a new one."""
@@ -142,7 +142,7 @@ class DeviceRig(SerialRig):
         self._host.reset()
         answer = self._exchange(protocol.Hello())
         if not isinstance(answer, protocol.Answer) or answer.content != self.identity:
-            raise PortError("lost", "is another device now", file=self.port.url, hint="start anew")
+            raise PortError("is another device now", file=self.port.url, hint="start anew")
         self._greeted_at = self.port.opened
 
     def _exchange(self, request: protocol.Request) -> protocol.Answer | protocol.Refused:
@@ -158,11 +158,11 @@ class DeviceRig(SerialRig):
             silent += self._silent
             if silent >= most:
                 text = f"did not answer within {most * self.timeout:g} s"
-                raise PortError("lost", text, file=self.port.url, hint="check cable and power")
+                raise PortError(text, file=self.port.url, hint="check cable and power")
             data = self._host.again()
             self._note("repeated", "no answer; asked again")
         text = f"was asked {MOST_TRIES} times and only damaged answers came"
-        raise PortError("lost", text, file=self.port.url, hint="check cable and ground")
+        raise PortError(text, file=self.port.url, hint="check cable and ground")
 
     def _once(self, data: bytes) -> protocol.Answer | protocol.Refused | None:
         """Send a question and return its answer, None if none came in time or it was damaged."""

@@ -283,28 +283,24 @@ def collect(folder: str | Path, *, name: str = "") -> Grasps:
     content = read_json(path / "batch.json", SCHEMA, VERSION)
     with reading("is no plan of a batch", file=path / "batch.json", hint="give the folder of a batch"):
         n_trial = len(content["plan"])
+    import pandas as pd
+
     runs = [run for k in range(n_trial) if (run := good_run(path, k)) is not None]
     if not runs:
         raise UserError("has no good grasp yet", file=path, hint="run the batch first")
     grasps = [read_grasps(run / "grasps.csv") for run in runs]
     step = float(np.median(np.diff(grasps[0]["time"].values)))
-    ticks = [np.round(one_grasp["time"].values / step).astype(int) for one_grasp in grasps]
-    first, last = min(int(t[0]) for t in ticks), max(int(t[-1]) for t in ticks)
-    readings = np.full((len(grasps), last - first + 1), np.nan)
-    for row, (one_grasp, places) in enumerate(zip(grasps, ticks)):
-        readings[row, places - first] = one_grasp["t_surface"].values[0]
-    per_grasp: dict[str, list[Any]] = {}
-    for key in (*GRASP_NUMBERS, *GRASP_LABELS):
-        if any(key in one_grasp for one_grasp in grasps):
-            lost: Any = np.nan if key in GRASP_NUMBERS else ""
-            per_grasp[key] = [one_grasp[key].values[0] if key in one_grasp else lost for one_grasp in grasps]
-    return make_grasps(
-        np.round(np.arange(first, last + 1) * step, 9),
-        readings,
-        [run.name for run in runs],
-        name=name or path.name,
-        **per_grasp,
-    )
+    traces = pd.DataFrame(
+        {
+            run.name: pd.Series(one["t_surface"].values[0], np.round(one["time"].values / step))
+            for run, one in zip(runs, grasps)
+        }
+    ).sort_index()
+    facts = pd.concat([one.drop_dims("time").to_dataframe() for one in grasps])
+    facts = facts.fillna({label: "" for label in GRASP_LABELS if label in facts})
+    time = np.round(traces.index.to_numpy() * step, 9)
+    about = {str(key): values.tolist() for key, values in facts.items()}
+    return make_grasps(time, traces.T.to_numpy(), [*traces], name=name or path.name, **about)
 
 
 def good_run(folder: Path, k: int) -> Path | None:

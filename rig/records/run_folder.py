@@ -19,7 +19,6 @@ import csv
 import errno
 import json
 import os
-import platform
 import re
 import time
 from collections import deque
@@ -27,7 +26,6 @@ from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import ExitStack, suppress
 from dataclasses import asdict, dataclass
-from importlib.metadata import PackageNotFoundError, version
 from itertools import count
 from math import isfinite
 from pathlib import Path
@@ -64,7 +62,6 @@ FILES = ("run.json", "samples.csv", "events.jsonl", "grasps.csv", "grasps_meta.c
 _GRASPS = ("grasps.csv", "grasps_meta.csv")
 _SUMS = "SHA256SUMS"
 NAMES = (*FILES, _SUMS)  # of everything that a run may leave
-_PACKAGES = ("thermogrip", "numpy", "scipy", "xarray", "casadi", "daqp", "pyserial")
 
 
 class RunFolder:
@@ -85,7 +82,7 @@ class RunFolder:
         if self.path.is_symlink():
             raise UserError("is a link", file=self.path, hint="name the folder that it leads to")
         began = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
-        self._made = {"began": began, "versions": _versions()}
+        self._made = {"began": began}
         # a run that cannot begin leaves no file behind
         with ExitStack() as undo, os_faults(self.path):
             make_folder(self.path)
@@ -185,15 +182,6 @@ class RunFolder:
     def _write_about(self, result: Mapping[str, Any]) -> None:
         content = {"about": self.about, **self._made, **result}
         write_json(self.path / "run.json", content, schema=SCHEMA, version=VERSION)
-
-
-def _versions() -> dict[str, str]:
-    """Return the versions of what a run runs on."""
-    versions = {"python": platform.python_version()}
-    for name in _PACKAGES:
-        with suppress(PackageNotFoundError):
-            versions[name] = version(name)
-    return versions
 
 
 def write_sums(folder: Path) -> Path:

@@ -40,11 +40,7 @@ _DROP_S = 0.5
 
 
 class PortError(UserError):
-    """The port is ``absent``, ``taken`` or was ``lost`` (its ``kind``)."""
-
-    def __init__(self, kind: str, problem: str, *, file: str, hint: str) -> None:
-        self.kind = kind
-        super().__init__(problem, file=file, hint=hint)
+    """The port is absent or taken, or was lost."""
 
 
 class Port:
@@ -132,23 +128,16 @@ class Port:
         while self.read(0.0) and time.monotonic() < end:
             pass
 
-    def __enter__(self) -> Port:
-        self.open()
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self.close()
-
     def _opened(self) -> Any:
         if self._serial is None:
-            raise PortError("lost", "is not open", file=self.url, hint="plug the cable in")
+            raise PortError("is not open", file=self.url, hint="plug the cable in")
         return self._serial
 
     def _lost(self, error: Exception) -> PortError:
         if isinstance(error, PortError):
             return error
         self.close()
-        return PortError("lost", f"was lost ({error})", file=self.url, hint="check cable and power")
+        return PortError(f"was lost ({error})", file=self.url, hint="check cable and power")
 
 
 def port_error(url: str, error: Exception) -> PortError:
@@ -156,13 +145,13 @@ def port_error(url: str, error: Exception) -> PortError:
     text = str(error)
     code = getattr(error, "errno", None)
     if code == 16 or "exclusively lock" in text or "busy" in text.lower():
-        return PortError("taken", "is used by another program", file=url, hint="close that program")
+        return PortError("is used by another program", file=url, hint="close that program")
     if code == 13:
-        return PortError("taken", "may not be opened by you", file=url, hint="join the group dialout")
+        return PortError("may not be opened by you", file=url, hint="join the group dialout")
     if isinstance(error, ValueError):
         hint = "write /dev/ttyACM0 or socket://HOST:PORT"
-        return PortError("absent", f"is no port ({text})", file=url, hint=hint)
-    return PortError("absent", f"cannot be opened ({text})", file=url, hint="check name, cable and power")
+        return PortError(f"is no port ({text})", file=url, hint=hint)
+    return PortError(f"cannot be opened ({text})", file=url, hint="check name, cable and power")
 
 
 class SerialRig:
@@ -184,10 +173,10 @@ class SerialRig:
     def _answering(self, consequence: str = "") -> Iterator[None]:
         """Open a lost port if that is due, note that the device does not answer and that it does again."""
         if self.closed:
-            raise PortError("lost", "is closed", file=self.port.url, hint="open the rig again")
+            raise PortError("is closed", file=self.port.url, hint="open the rig again")
         try:
             if not self.port.try_open():
-                raise PortError("lost", "is not there", file=self.port.url, hint="check cable and power")
+                raise PortError("is not there", file=self.port.url, hint="check cable and power")
             yield
         except PortError as error:
             if not self._lost:

@@ -48,7 +48,7 @@ class DirectPort(Port):
     def open(self) -> None:
         """Open it."""
         if self.device.is_pulled:
-            raise PortError("absent", "is not there", file=self.url, hint="plug the cable in")
+            raise PortError("is not there", file=self.url, hint="plug the cable in")
         self.opened += not self.is_open
         self._serial = self.device
 
@@ -76,7 +76,7 @@ class DirectPort(Port):
     def require_open(self) -> None:
         if not self.is_open or self.device.is_pulled:
             self.close()
-            raise PortError("lost", "was lost", file=self.url, hint="check cable and power")
+            raise PortError("was lost", file=self.url, hint="check cable and power")
 
 
 def make_lab() -> Plant:

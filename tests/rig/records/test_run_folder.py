@@ -522,10 +522,9 @@ def test_the_run_reads_back_as_the_session_that_it_was(plant: Plant, controller:
     assert sums_agree(tmp_path / "run") == []
 
 
-def test_run_json_says_what_the_run_was_made_with(tmp_path: Path) -> None:
+def test_run_json_says_what_was_run_and_when(tmp_path: Path) -> None:
     RunFolder(tmp_path / "run", {"seed": 7}).close()
     about = read_json(tmp_path / "run" / "run.json", "thermogrip.run", 1)
-    assert {"python", "thermogrip", "numpy"} <= set(about["versions"])
     assert about["about"] == {"seed": 7}
     assert about["began"].startswith(time.strftime("%Y", time.gmtime()))
 

@@ -21,7 +21,7 @@ from thermogrip.rig.session.loop import Loop, log_of_rows, trip_of_device
 from thermogrip.rig.session.snapshot import MOST_MARKS, Snapshot
 
 NONE = call({"q": 0.0}, 0)
-LOST = PortError("lost", "did not answer", file="COM3", hint="check cable")
+LOST = PortError("did not answer", file="COM3", hint="check cable")
 
 
 def rig_of(**values: float) -> Mock:

@@ -115,7 +115,7 @@ def test_a_gripper_that_does_not_answer_is_a_trip_and_is_opened(plant: Plant, co
         released = 0
 
         def grasp(self, material: str, t_object: float) -> None:
-            raise PortError("lost", "did not answer within 0.75 s", file="COM3", hint="check cable")
+            raise PortError("did not answer within 0.75 s", file="COM3", hint="check cable")
 
         def release(self) -> None:
             self.released += 1
