@@ -10,6 +10,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Protocol, runtime_checkable
 
+from thermogrip.datasets.errors import UserError
+
 #: What a drive may be, by its unit.
 UNIT_RANGES = {"1": (-1.0, 1.0), "percent": (0.0, 100.0), "0_255": (0.0, 255.0)}
 
@@ -21,6 +23,14 @@ def range_of(unit: str, seen: tuple[float, float] | None) -> tuple[float, float]
     if usual is not None and (unit != "1" or seen is None or -1.05 <= seen[0] <= seen[1] <= 1.05):
         return usual
     return seen
+
+
+def known_range(name: str, unit: str, seen: tuple[float, float] | None, *, hint: str) -> tuple[float, float]:
+    """Return what a drive may be, as of :func:`range_of`; UserError where nothing says it."""
+    ends = range_of(unit, seen)
+    if ends is None:
+        raise UserError(f"the range of {name} [{unit}] is unknown", hint=hint)
+    return ends
 
 
 class DeviceRefusedError(Exception):
@@ -123,11 +133,3 @@ class Rig(Protocol):
 
     def close(self) -> None:
         """Switch all power off and let the rig go."""
-
-
-@runtime_checkable
-class LatchingRig(Rig, Protocol):
-    """A rig whose device latches its faults."""
-
-    def clear(self) -> None:
-        """Clear the latch; DeviceRefusedError where the cause is still there."""

@@ -1,15 +1,7 @@
 """Relays as drives: a requested share of full power, by switching on and off with least times.
 
-A relay keeps what it owes,
-
-    debt(t) = int (requested - state) dt      [s of full power],
-
-and switches on once it owes half of its shortest pulse, off once it owes nothing, neither before its least
-time is over.  So whatever is requested,
-
-    -on_s / 2  <=  debt  <=  max(on_s / 2, off_s),
-
-and over a window of W seconds the mean of the relay is off by at most the width of that over W.  There is no
+A relay keeps what it owes, debt(t) = int (requested - state) dt [s of full power], and switches on once it
+owes half of its shortest pulse, off once it owes nothing, neither before its least time is over.  There is no
 period to choose: at a share d it is the shortest that the least times allow.
 
 A heater and a cooler are two such relays of one drive from -1 to 1, each asked for its own sign.  One comes
@@ -75,6 +67,8 @@ class Switch:
         if self.on:
             self.debt += (max(share, 0.0) - 1.0) * seconds
             return
+        # -on_s / 2 <= debt <= max(on_s / 2, off_s), whatever is requested: over a window of W seconds the
+        # mean is off by at most the width of that over W
         least = min(self.debt, 0.0) if share < 0 else -inf
         most = max(0.5 * self._on_s, self._off_s) + _SWITCHING.shortest_s
         self.debt = min(max(self.debt + share * seconds, least), most)

@@ -14,29 +14,8 @@ interlock)
 
 A suspect reading never reaches the controller; the last good one takes its place, for two looks.
 
-**The time of a reading** by the computer's clock lies between ``asked`` and ``now``, when it was asked for
-and when it was there; the rig's clock is wrong where no moments between these allow what it says.  The
-program itself was late (*frozen*) where a drive stood for longer than ``expiry_s`` without being renewed.
-A device that ends its drives itself knows better whether that one has held: the loop asks it then.
-
-**How far beyond a limit.**  A limit trips on the second accepted reading beyond it.  A rig that changes by at
-most r K/s is then at most 2 r :data:`~thermogrip.rig.session.loop.LOOK_S` beyond it, and three times its
-noise: 0.35 K + 0.1 K for a TCLab at full power.  What is in a heater by then still comes: the same TCLab goes
-on by 1.3 K from 40 degC.  :data:`LIMIT_MARGIN` holds for both together wherever the heat in transit is less
-than 1.5 K (docs/reference/faults.md has measured figures).
-
-**The rule that needs no model** is that of 3-D printers (Klipper's ``verify_heater``, Marlin's
-``WATCH_TEMP``), with a sign, because a Peltier drive does both, and by energy, because what heats slowly
-burns as well.
-
-Each time the integral of the drive (a share of its range, positive heats) has come to ``full_drive_s``
-without a change of sign, an output must have moved by ``least_K`` with the drive, or one must stand where
-such a drive holds it:
-
-    |T - T_room| >= far_K min(1, 2 |mean drive|) - least_K,    T on the drive's side of the room.
-
-By ``least_K`` sensors may disagree as well: a drive that holds no more than that apart is not judged.  Where
-no sensor reads the room, the output must stand ``least_K`` beyond what it read before in the session.
+Without a model stands the rule of 3-D printers (Klipper's ``verify_heater``, Marlin's ``WATCH_TEMP``), with a
+sign, because a Peltier drive does both, and by energy, because what heats slowly burns as well.
 """
 
 from __future__ import annotations
@@ -54,6 +33,9 @@ from thermogrip.rig.interface import Reading, range_of
 from thermogrip.sysid.plant.plant import Plant
 
 #: A limit is not exceeded by more than this before power is off [K].
+# It trips on the second accepted reading beyond it: a rig that changes by at most r K/s is then at most
+# 2 r LOOK_S beyond, and three times its noise, 0.35 K + 0.1 K for a TCLab at full power.  What is in a heater
+# by then still comes: the same TCLab goes on by 1.3 K from 40 degC (docs/reference/faults.md has more).
 LIMIT_MARGIN = 2.0
 
 
@@ -105,6 +87,10 @@ class RuleMonitor:
         self._moved = {}
 
     def _no_answer(self, time: float, outputs: Mapping[str, float], room: float) -> Trip | None:
+        # the drive has come to ``full_drive_s`` without a change of sign: an output must have moved by
+        # ``least_K`` with it, or one must stand where such a drive holds it, on its side of the room,
+        #     |T - T_room| >= far_K min(1, 2 |mean drive|) - least_K
+        # by ``least_K`` sensors may disagree as well: a drive that holds no more than that is not judged
         s, seconds = self.settings, time - self._begun
         mean = self._energy / seconds
         heats, holds = mean > 0, s.far_K * min(1.0, 2 * abs(mean))
@@ -120,20 +106,14 @@ class RuleMonitor:
         kind = "reversed" if against[most] >= s.least_K else "driver"
         change = -against[most] if kind == "reversed" else with_drive[most]
         change = change if heats else -change
-        return Trip(
-            kind=kind,
-            time_s=time,
-            subject=most,
-            expected=f"at least {s.least_K:g} K {'warmer' if heats else 'colder'} "
-            f"in {seconds:.0f} s of drive {mean:+.2f}",
-            measured=f"{change:+.1f} K",
-            check=_to_check(["drift", kind]),
-        )
+        way = f"{s.least_K:g} K {'warmer' if heats else 'colder'}"
+        expected = f"at least {way} in {seconds:.0f} s of drive {mean:+.2f}"
+        return Trip(kind, time, most, expected, f"{change:+.1f} K", check=_to_check(["drift", kind]))
 
     def _beyond_room(self, name: str, value: float, room: float, heats: bool) -> float:
         """Return how far an output is from the room on the drive's side [K]."""
         low = high = room
-        if not isfinite(room):
+        if not isfinite(room):  # beyond what the output read before in the session, then
             coldest, warmest = self._ranges[name]
             lowest_room, highest_room = self.settings.usual_room
             low, high = min(coldest, highest_room), max(warmest, lowest_room)
@@ -260,37 +240,22 @@ class Guard:
 
     def late(self, now: float) -> Trip | None:
         """Return the trip of a drive that has stood without being renewed until the host's time [s]."""
+        # a device that ends its drives itself knows better whether that one has held: the loop asks it then
         silence_s = now - self._renewed_s
         if not any(self._drive.values()) or silence_s <= self.settings.expiry_s:
             return None
-        return Trip(
-            kind="frozen",
-            time_s=self._time_s,
-            subject="this program",
-            expected=f"a drive renewed within {self.settings.expiry_s:g} s",
-            measured=f"after {silence_s:.1f} s",
-        )
+        expected = f"a drive renewed within {self.settings.expiry_s:g} s"
+        return Trip("frozen", self._time_s, "this program", expected, f"after {silence_s:.1f} s")
 
     def refuse(self, drive: Mapping[str, float], pump: int, time: float) -> Trip | None:
         """Return the trip of a move that must not go out, None where it may."""
         has_pump = self.model is None or "pump" in self.model.plant.inputs
         for name, value in drive.items():
             if not isfinite(value):
-                return Trip(
-                    kind="drive",
-                    time_s=time,
-                    subject=name,
-                    expected="a number",
-                    measured=f"{value}",
-                )
+                return Trip("drive", time, name, "a number", f"{value}")
             if pump == 0 and value != 0.0 and has_pump:
-                return Trip(
-                    kind="interlock",
-                    time_s=time,
-                    subject=name,
-                    expected="no drive while the pump is off",
-                    measured=f"{value:g} with the pump off",
-                )
+                expected = "no drive while the pump is off"
+                return Trip("interlock", time, name, expected, f"{value:g} with the pump off")
         return None
 
     @property
@@ -361,26 +326,18 @@ class Guard:
 
     def _clocks(self, reading: Reading, heard: Heard) -> Trip | None:
         """Return the trip of a reading that is not new, or whose time cannot be."""
+        # by the computer's clock a reading is of a moment between when it was asked for and when it was
+        # there: the rig's clock is wrong where no two such moments allow what it says
         rig_s = reading.time_s - self._time_s  # since the last reading, by the rig's clock
         least_s = heard.asked_s - self._heard.at_s  # by this computer's
         most_s = heard.at_s - self._heard.asked_s
         if rig_s == 0 and least_s > self.settings.stale_s:
-            return Trip(
-                kind="stale",
-                time_s=reading.time_s,
-                subject="readings",
-                expected=f"a new one within {self.settings.stale_s:g} s",
-                measured=f"none for {least_s:.1f} s",
-            )
+            expected = f"a new one within {self.settings.stale_s:g} s"
+            return Trip("stale", reading.time_s, "readings", expected, f"none for {least_s:.1f} s")
         host_s = min(max(rig_s, least_s), most_s)
         if rig_s < 0 or (rig_s > 0 and abs(rig_s - host_s) > self.settings.clock_slack_s):
-            return Trip(
-                kind="clock",
-                time_s=reading.time_s,
-                subject="the rig's clock",
-                expected=f"{host_s:+.2f} s since the last reading",
-                measured=f"{rig_s:+.2f} s",
-            )
+            expected = f"{host_s:+.2f} s since the last reading"
+            return Trip("clock", reading.time_s, "the rig's clock", expected, f"{rig_s:+.2f} s")
         return None
 
     def _driver(self, reading: Reading) -> Trip | None:
@@ -394,14 +351,10 @@ class Guard:
         self._n_differs = self._n_differs + 1 if wrong else 0
         if self._n_differs < 2:
             return None
-        is_off = not any(reading.drive.values())
-        return Trip(
-            kind="device" if is_off else "driver",
-            time_s=reading.time_s,
-            subject=wrong,
-            expected=f"{self._drive[wrong]:+.3g}, as asked",
-            measured="0: the device has switched off" if is_off else f"{reading.drive[wrong]:+.3g}",
-        )
+        expected = f"{self._drive[wrong]:+.3g}, as asked"
+        if not any(reading.drive.values()):
+            return Trip("device", reading.time_s, wrong, expected, "0: the device has switched off")
+        return Trip("driver", reading.time_s, wrong, expected, f"{reading.drive[wrong]:+.3g}")
 
     def _limits(self, time: float, outputs: Mapping[str, float]) -> Trip | None:
         driven = any(self._drive.values())
@@ -413,13 +366,7 @@ class Guard:
             beyond = not low <= value <= high
             self._n_beyond[name] = self._n_beyond.get(name, 0) + 1 if beyond else 0
             if self._n_beyond[name] >= 2 and (driven or not self._touched):
-                return Trip(
-                    kind="limit",
-                    time_s=time,
-                    subject=name,
-                    expected=f"{low:g} to {high:g} degC",
-                    measured=f"{value:.2f} degC",
-                )
+                return Trip("limit", time, name, f"{low:g} to {high:g} degC", f"{value:.2f} degC")
         return None
 
     def rooms(self, names: Collection[str]) -> frozenset[str]:
@@ -498,15 +445,9 @@ class Guard:
             expected = f"{name} {alarm.expected:+.2f} +- {alarm.allowed:.2f} K in {alarm.window:.0f} s"
             if repeats >= 4 and abs(alarm.measured) < abs(alarm.expected):
                 kind, measured = "stuck", f"{measured} (bit for bit the same for {seconds:.0f} s)"
-        return Trip(
-            kind=kind,
-            time_s=time,
-            subject=name,
-            expected=expected,
-            measured=measured,
-            # a sensor may drift, whichever bias shows it
-            check=_to_check([kind, "drift"]) if alarm.kind == "bias" else "",
-        )
+        # a sensor may drift, whichever bias shows it
+        check = _to_check([kind, "drift"]) if alarm.kind == "bias" else ""
+        return Trip(kind, time, name, expected, measured, check=check)
 
     def _plausible(self, values: Mapping[str, float]) -> dict[str, float]:
         return {name: value for name, value in values.items() if self.sensors.plausible(value)}

@@ -5,21 +5,8 @@ State x, a bias w on each drive (a fraction of half its range) and a bias b on e
 
     x+ = f(x, u + w, d),    w+ = w + noise,    b+ = b + noise,    y = h(x) + y0 + b + noise,
 
-an extended Kalman filter with the model's own Jacobian by differences.  With z = (x, w, b) and its covariance
-P, a native step predicts and a reading corrects by
-
-    P = F P F' + Q,    S = H P H' + R,    K = P H' S^-1,    z += K (y - expected),
-
-and P by (I - K H) P (I - K H)' + K R K', which stays positive whatever rounding does to K.  It starts at rest
-at the first readings; where those agree neither with each other nor with the room nothing is known of what
-cannot be read (a hot heatsink), and P starts a hundred times larger.
-
-**Inputs between readings.**  A model steps with its own dt, readings come when they come.  What was applied
-is averaged over each native step of the model, as the twin and the fits do: with u(t) held between calls,
-
-    u_k = (1 / dt) * integral of u(t) from k dt to (k + 1) dt.
-
-An estimate that is kept with the number of its step can so be simulated again under what was applied since.
+an extended Kalman filter of z = (x, w, b), with the model's own Jacobian F by differences.  An estimate is
+kept with the number of its native step, so that it can be simulated again under what was applied since.
 """
 
 from __future__ import annotations
@@ -115,7 +102,7 @@ class RigFilter:
         self.x = np.asarray(plant.model.rest(resting_outputs, self.u, self.d, self._p), dtype=float)
         self.w, self.b = np.zeros(len(self.drives)), np.zeros(len(plant.outputs))
         self._P = np.diag(self._p0)
-        if not self.at_rest:
+        if not self.at_rest:  # nothing is known of what cannot be read, such as a hot heatsink
             n = self.x.size
             self._P[np.arange(n), np.arange(n)] *= START.not_at_rest
         self.done = 0
@@ -129,6 +116,7 @@ class RigFilter:
     def predict(self, time: float, u: Array, d: Array) -> None:
         """Predict the estimate at a time [s] under u (n_u,) and d (n_d,), the last one where it is NaN."""
         self.d = np.where(np.isfinite(d), d, self.d)
+        # a model has its own steps, readings come when they come: u_k = (1 / dt) int u(t) dt over step k
         steps, dt = [], self.plant.dt
         while (grid := self._start + (self.done + 1) * dt) <= time + 1e-9:
             steps.append(((self._dose + (grid - self._until) * u) / dt, self.d))
@@ -148,6 +136,7 @@ class RigFilter:
         if read_outputs.size:
             H = self._H[read_outputs]
             PH = self._P @ H.T
+            # K = P H' (H P H' + R)^-1
             gain = np.linalg.solve(H @ PH + np.diag(self._R[read_outputs]), PH.T).T
             change = gain @ (y - self.expected)[read_outputs]
             n, m = self.x.size, self.w.size
@@ -155,6 +144,7 @@ class RigFilter:
             self.w = np.clip(self.w + change[n : n + m], -LARGEST_DRIVE_BIAS, LARGEST_DRIVE_BIAS)
             self.b[self.biased] += change[n + m :]
             remaining = np.eye(self._P.shape[0]) - gain @ H
+            # (I - K H) P (I - K H)' + K R K' stays positive whatever rounding does to K
             self._P = remaining @ self._P @ remaining.T + (gain * self._R[read_outputs]) @ gain.T
         self._keep(time, y)
 

@@ -1,28 +1,8 @@
 r"""Does the rig follow its identified model?
 
-A filter follows the rig (:mod:`~thermogrip.rig.guard.kalman_filter`), and three tests are made.
-
-*One step.*  An innovation that is too large is no temperature of this rig: the reading is suspect.
-
-*A window.*  The state of H seconds ago is simulated under the drives that were applied since, without looking
-at a reading, and the mean of the last ``smooth_s`` seconds of readings is compared with where it ends.  The
-residual r may be
-
-    |r| <= floor(H) + share * swing,
-
-swing the largest change that either path makes in the window: a model is wrong by a share of what it
-predicts, and by a floor when it predicts nothing.  A pump that was switched meanwhile is another plant, and
-the floor is larger by ``switching_K``.
-
-*A bias.*  A sensor that drifts slowly, or a driver that weakens, is followed by the filter's biases b and w.
-b may not exceed ``bias_limit_K``, and w, of standard deviation sd in the filter, not
-
-    sqrt((drive_limit e / s)^2 + (5 sd)^2),
-
-e being what the largest drive of the longest window does in such a window, and s its slope: e / s is that
-drive, but more of it where more drive barely does more, near a Peltier element's optimum.  From run to run
-the effect of inputs differs by 5 % of itself (:data:`~thermogrip.sysid.plant.fit_record.RUN_GAIN_SD`), so
-``drive_limit`` is three of that.
+A filter follows the rig (:mod:`~thermogrip.rig.guard.kalman_filter`), and three things are tested: an
+innovation that is too large for this rig (the reading is suspect), the change over windows, and the filter's
+biases, which follow a sensor that drifts slowly or a driver that weakens.
 """
 
 from __future__ import annotations
@@ -133,6 +113,10 @@ class ModelMonitor:
         now = self._filter
         s = self.settings
         plant = self.plant
+        # the state of a window ago is simulated under the drives since, without looking at a reading, and
+        # where it ends compared with the mean of the newest readings.  A model is wrong by a share of what it
+        # predicts (of the largest change that either path makes), and by a floor when it predicts nothing:
+        #     |r| <= floor + share * swing
         switches = [index for index, name in enumerate(plant.inputs) if name in plant.model.switches]
         residuals = []
         for length, floor in zip(s.windows_s, s.floors_K):
@@ -143,6 +127,7 @@ class ModelMonitor:
             recent = [one for one in now.estimates if one.time > recent_s]
             u, d = now.applied_since(begin.step)
             path = now.path(begin, u, d)
+            # a pump that was switched meanwhile is another plant
             least = floor + (s.switching_K if np.ptp(u[:, switches], axis=0).any() else 0.0)
             readings = np.array([one.y for one in recent])
             ends = path[[one.step - begin.step for one in recent]]
@@ -166,6 +151,7 @@ class ModelMonitor:
         for j, (bias, sd) in enumerate(zip(self._filter.w.tolist(), self._filter.bias_spread().tolist())):
             if abs(bias) <= 5 * sd:  # five: of 5,700 estimates without a fault the largest was 3.1
                 continue
+            # from run to run the effect of inputs differs by 5 % of itself (fit_record.RUN_GAIN_SD)
             limit = float(np.hypot(s.drive_limit * self._largest_drive(j), 5 * sd))
             if abs(bias) > limit:
                 residuals.append(Residual("bias", self.drives[j], 0.0, 0.0, bias, limit))
@@ -174,6 +160,7 @@ class ModelMonitor:
     def _largest_drive(self, j: int) -> float:
         """Return the largest drive of the longest window by its effect over its slope, a fraction of half its
         range; infinite where the slope is 0."""
+        # it is that drive, but more of it where more drive barely does more, near a Peltier's optimum
         now = self._filter
         input_index = now.drive_at[j]
         applied = now.applied_since(now.done - len(now.applied))[0]

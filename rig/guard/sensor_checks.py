@@ -1,27 +1,6 @@
 r"""Faults of a single sensor that show without any model: lost, jumping, stuck, or apart from its pair.
 
-*Lost.*  A reading that is not finite, or outside what a water loop can be, is suspect; the third in a row
-trips, for one spike (a loose plug) must not end a night's work.  So does a quarter of the time without a good
-reading (three in a row come every 84 readings then anyway),
-
-    share += (1 - exp(-passed / 60 s)) (lost - share),    lost = 1 from a suspect reading to the next, else 0.
-
-*Jump.*  Water cannot change faster than ``rate_K_per_s``; a reading that does is suspect.  A skin that
-touches an object may.
-
-*Stuck.*  What number of bit-equal readings proves a fault depends on the noise: with white noise of standard
-deviation s about the middle of a quantum q, a healthy sensor repeats itself with
-
-    p = erf(q / (2 sqrt(2) s)),
-
-so n = ln(alpha) / ln(p) repeats are a false alarm with probability alpha.  For q = 1/16 K and s = 0.04 K it
-takes 37 samples at 1e-9; for a converter of 0.3 K with the same noise no number proves anything (the model
-has to).  q is the smallest step seen.
-
-*Pairs.*  Two sensors of one temperature, ``x`` and ``x_2``, may differ by ``pair_limit_K`` for ``pair_s``, no
-longer.
-
-**The room's sensors.**  Losing one is no reason to stop, and no limit holds for it.
+The room's sensors are excepted: losing one is no reason to stop, and no limit holds for it.
 """
 
 from __future__ import annotations
@@ -82,6 +61,8 @@ def room_sensors(
 
 def repeats_needed(quantum: float, noise: float, alpha: float) -> float:
     """Return the equal readings in a row (10 or more) that a healthy sensor gives with chance ``alpha``."""
+    # white noise about the middle of a quantum stays in it with probability p, n times in a row with p^n.
+    # For 1/16 K and 0.04 K that takes 37 samples at 1e-9; for a converter of 0.3 K no number proves anything
     p = erf(quantum / (2 * sqrt(2) * noise))
     needed = log(alpha) / log(p) if 0 < p < 1 else float("inf")
     return max(10, ceil(needed)) if needed < 2000 else float("inf")
@@ -147,7 +128,10 @@ class SensorMonitor:
         self._seen = time
         for name, value in values.items():
             memory = self._memory.setdefault(name, _Memory(value, time, since=time, last=value))
+            # one spike (a loose plug) must not end a night's work: three in a row trip, and a quarter of the
+            # time without a good reading (three in a row come every 84 readings then anyway)
             memory.lost_share += newer * ((memory.bad > 0) - memory.lost_share)
+            # water cannot change faster; a skin that touches an object may
             allowed = self.settings.rate_K_per_s * max(time - memory.time, 0.0) + self.settings.slack_K
             jump = (
                 isfinite(memory.good) and abs(value - memory.good) > allowed and name not in touching | rooms
@@ -208,11 +192,7 @@ class SensorMonitor:
                 continue
             seconds = time - self._apart_since.setdefault(name, time)
             if seconds >= self.settings.pair_s:
-                return Trip(
-                    kind="disagree",
-                    time_s=time,
-                    subject=f"{name} and {twin}",
-                    expected=f"within {limit:g} K of each other",
-                    measured=f"{accepted[name]:.2f} and {accepted[twin]:.2f} degC for {seconds:.0f} s",
-                )
+                measured = f"{accepted[name]:.2f} and {accepted[twin]:.2f} degC for {seconds:.0f} s"
+                expected = f"within {limit:g} K of each other"
+                return Trip("disagree", time, f"{name} and {twin}", expected, measured)
         return None

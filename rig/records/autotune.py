@@ -29,7 +29,7 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.parallel import sub_progress
 from thermogrip.datasets.schema import Log, column
 from thermogrip.rig.guard.guard import LIMIT_MARGIN, Guard
-from thermogrip.rig.interface import Rig, range_of
+from thermogrip.rig.interface import Rig, known_range
 from thermogrip.rig.records.run_folder import Run, RunFolder, read_run, recover
 from thermogrip.rig.session.profile import Profile
 from thermogrip.rig.session.session import Session, play, run_session, step_figures
@@ -174,7 +174,9 @@ class Autotune:
             if not goals:
                 names = ", ".join(begin)
                 raise UserError(f"the rig has no sensor of {self.target}", hint=f"it has {names}")
-            test = StepTest(_rig_drive_ranges(rig), goals, seconds=30 * self.minutes, has_pump=rig.has_pump)
+            hint = "record a log of it, and go on with identify and tune"
+            ranges = {name: known_range(name, unit, None, hint=hint) for name, unit in rig.units.items()}
+            test = StepTest(ranges, goals, seconds=30 * self.minutes, has_pump=rig.has_pump)
             self._note(start={name: round(value, 2) for name, value in begin.items()})
             with RunFolder(self._next("step"), self._asked) as folder:
                 options = {"progress": self._part(0.0, 0.1), **self.shown}
@@ -329,15 +331,3 @@ def first_step(run: Run, targets: Iterable[str]) -> dict[str, float | None] | No
 def _finite(figures: Mapping[str, float]) -> dict[str, float | None]:
     """Return figures as JSON has them, which knows no NaN."""
     return {key: round(value, 3) if value == value else None for key, value in figures.items()}
-
-
-def _rig_drive_ranges(rig: Rig) -> dict[str, tuple[float, float]]:
-    """Return what each drive may be; UserError where its unit does not say."""
-    ranges = {}
-    for name, unit in rig.units.items():
-        ends = range_of(unit, None)
-        if ends is None:
-            problem = f"the range of {name} [{unit}] is unknown"
-            raise UserError(problem, hint="record a log of it, and go on with identify and tune")
-        ranges[name] = ends
-    return ranges

@@ -27,7 +27,7 @@ from thermogrip.datasets.tables import read_csv_table
 from thermogrip.mpc.interface import Controller
 from thermogrip.rig.guard.guard import Guard
 from thermogrip.rig.guard.trip import Trip
-from thermogrip.rig.interface import DeviceRefusedError, LatchingRig, Rig
+from thermogrip.rig.interface import DeviceRefusedError, Rig
 from thermogrip.rig.records.run_folder import RunFolder, mark_bad, read_run
 from thermogrip.rig.session.loop import Recorder
 from thermogrip.rig.session.session import Object, Session, run_session
@@ -268,9 +268,10 @@ class _Source:
 
     def clear(self) -> None:
         """Clear the device's latch; one whose cause is still there trips again."""
-        if isinstance(self.rig, LatchingRig):
+        clear = getattr(self.rig, "clear", None)  # of a device that latches
+        if clear is not None:
             with suppress(DeviceRefusedError):
-                self.rig.clear()
+                clear()
 
     def close(self) -> None:
         if self._open is not None:

@@ -2,15 +2,9 @@
 
 Its files, and which folders are refused, are described in ``docs/reference/files.md``.
 
-**Writing.**  Lines of text are the one format that a killed process leaves whole; everything else is exported
-from it later.  A session waits for no disk: one thread writes the lines, each at once and in one ``write``,
-another forces them to disk, once a second and after each event.  A part of a line that still fitted on a full
-disk is cut off again; the caller gets the ``OSError`` at that row or the next one, and the loop switches off.
-A disk that has not taken the last ``MOST_WAITING`` lines counts as gone.
-
-**Reading.**  A line counts if it is whole: ended, of the header's width, every cell a number or empty.  After
-a power cut a file system may leave half a line, or zeros, at the end; lines after the last whole one are the
-tail.  A bad line with whole ones after it is damage of another kind; it is skipped and reported.
+Lines of text are the one format that a killed process leaves whole; everything else is exported from it
+later.  A session waits for no disk.  A line counts if it is whole: ended, of the header's width, every cell a
+number or empty; a bad one with whole ones after it is damage, skipped and reported.
 """
 
 from __future__ import annotations
@@ -215,6 +209,9 @@ def event_line(event: Event) -> bytes:
 class _Disk:
     """Two threads that wait for the disk: one that takes seconds to force lines takes others meanwhile."""
 
+    # one writes the lines, each at once and in one ``write``, the other forces them to disk, once a second
+    # and after each event; the caller gets an OSError at that row or the next, and the loop switches off
+
     def __init__(self, *files: _Lines) -> None:
         self._files = files
         self._writer = ThreadPoolExecutor(1, "run-folder-write")
@@ -292,7 +289,7 @@ class _Lines:
             while unwritten:
                 unwritten = unwritten[_write_bytes(self._file, unwritten) :]
         except OSError:
-            with suppress(OSError):  # the reader drops half a line, too
+            with suppress(OSError):  # a part of it may have fitted on a full disk; the reader drops it, too
                 os.ftruncate(self._file, self._size)
                 os.lseek(self._file, self._size, os.SEEK_SET)
             raise
@@ -474,6 +471,7 @@ def _whole_lines(path: Path, good: Any) -> _Whole:
         for number in range(last)
         if not flags[number]
     ]
+    # half a line, or the zeros that a file system may leave after a power cut
     tail = sum(len(line) + 1 for line in lines[last + 1 :]) + len(unended)
     if tail:
         lost.append(f"{path.name}: the last {tail} bytes are no whole line (cut off while it was written)")

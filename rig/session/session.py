@@ -1,7 +1,7 @@
 """One session: settle, stop the pump, grasp, record; or play a schedule.
 
-    settle    regulate until the target has settled (below) and the guard has compared the skin with the
-              model for long enough, or the time-out is over
+    settle    regulate until the target has settled (:func:`has_settled`) and the guard has compared the
+              skin with the model for long enough, or the time-out is over
     hold      keep regulating for ``hold`` seconds
     lead_in   one second of fast samples under the last move
     pump_off  pump and drive off, one second, so that no water moves when the object touches
@@ -10,20 +10,6 @@
 
 Whatever ends it (done, time-out, a trip, an exception, Ctrl-C, ``kill``), drive and pump are off afterwards.
 A session that does not settle is an answer (a verdict), not an error, and so is one that the guard ended.
-
-**When has a temperature settled?**  Over the last ``window`` seconds the error e = y - target is fitted by a
-line, e = a + b (t - t_mean).  With the residual standard deviation s, floored at the rounding error
-quantum / sqrt(12), and its lag-one correlation r, the n samples are worth n_eff = n (1 - r) / (1 + r)
-independent ones, so
-
-    se(a) = s / sqrt(n_eff),        se(b) = sqrt(12) s / (window sqrt(n_eff)).
-
-The temperature has settled if level and drift are inside the band even at two standard errors:
-
-    |a| + 2 se(a) <= band    and    window (|b| + 2 se(b)) <= band.
-
-The window is 30 s, or five samples of the controller where these are longer.  The rule errs towards waiting:
-with noise that could hide a drift of the size of the band it is never met.
 """
 
 from __future__ import annotations
@@ -76,6 +62,7 @@ def has_settled(
     slope, level = np.polyfit(t - t.mean(), e, 1)
     se_level = _standard_error(e - level - slope * (t - t.mean()), quantum)
     se_slope = np.sqrt(12.0) * se_level / window
+    # even at two standard errors; with noise that could hide a drift as large as the band it is never met
     level_ok = abs(level) + 2 * se_level <= band
     return bool(level_ok and window * (abs(slope) + 2 * se_slope) <= band)
 
@@ -105,6 +92,8 @@ def step_figures(
 
 def _standard_error(residual: Array, quantum: float) -> float:
     """Return the standard error of the mean of correlated residuals about a line."""
+    # n samples whose lag-one correlation is r are worth n (1 - r) / (1 + r) independent ones; the residual sd
+    # is at least the rounding error
     n = residual.size
     sd = max(float(np.sqrt(residual @ residual / (n - 2))), quantum / np.sqrt(12.0))
     power = float(residual @ residual)

@@ -3,18 +3,6 @@
 One line a command, ``WORD [ARG]`` ended by a carriage return or a line feed; one line back, ended by both
 (``SCAN`` gives four).  An empty command gives nothing, so the usual ``\\r\\n`` gives one answer.  Words that
 end in ``B`` (four bytes, a little-endian float), which no client here uses, are left out.
-
-| word | does | answer |
-|---|---|---|
-| ``A``, ``X`` | heaters off | ``Start``, ``Stop`` |
-| ``Q1 v``, ``Q2 v`` | heater to v % of its ceiling, clipped to 0...100 | the value, ``%.3f`` |
-| ``R1``, ``R2`` | | heater, ``%.3f`` |
-| ``P1 v``, ``P2 v`` | ceiling, 0...255, at the start 200 and 100 | ``%.2f`` |
-| ``T1``, ``T2`` | | mean of ten conversions of 0.3222656 degC each, ``%.3f`` |
-| ``SCAN`` | | T1, T2, Q1, Q2 |
-| ``LED v`` | | ``%.2f`` |
-| ``VER`` | | name and version |
-| anything else | heaters off | the word |
 """
 
 from __future__ import annotations
@@ -74,11 +62,11 @@ class TCLabCore:
             case "A" | "X":
                 self._power = [0.0, 0.0]
                 return ["Start" if word == "A" else "Stop"]
-            case "Q1" | "Q2" | "R1" | "R2":
+            case "Q1" | "Q2" | "R1" | "R2":  # set, or ask for, a heater in percent of its ceiling
                 heater = int(word[1]) - 1
                 self._power[heater] = _clip(value, 100.0) if word[0] == "Q" else self._power[heater]
                 return [f"{self._power[heater]:.3f}"]
-            case "P1" | "P2":
+            case "P1" | "P2":  # the ceiling, of 255
                 self._ceilings[int(word[1]) - 1] = _clip(value, 255.0)
                 return [f"{self._ceilings[int(word[1]) - 1]:.2f}"]
             case "T1" | "T2":
@@ -90,7 +78,7 @@ class TCLabCore:
                 return [f"{_clip(value, 100.0):.2f}"]
             case "VER":
                 return [TCLAB_VERSION]
-            case _:
+            case _:  # what is no word switches off, too
                 self._power = [0.0, 0.0]
                 return [word]
 

@@ -7,18 +7,8 @@ two steps the outputs are interpolated towards a provisional step, so the twin c
 A reading is  truth + offset + slow noise + white noise, rounded to the quantum;  slow noise is an
 Ornstein-Uhlenbeck process (standard deviation ``slow_noise``, memory ``SLOW_S``).
 
-**Contact.**  Heat conduction is linear, so what an object does to the skin adds to what the skin would have
-done alone: with y(t) the plant's skin, t_c the true time of contact and F the step response of
-:mod:`~thermogrip.sysid.contact.simulation`,
-
-    T_dev(t) = y(t) + (T_obj - y(t_c)) F(t - t_c) + (T_room - T_obj) G(t - t_c)
-               - int F(t - s) dy(s),   s from t_c to t,
-
-G being what the room does by the far face of the block.  The integral is Duhamel's: the object answers to the
-difference as it is, not as it was at contact.
-
-On release the addition dies out with the time constant ``RECOVERY_S``; it is the heat that soaks into the
-finger and the water, which the plant's states do not know.
+On release what an object adds to the skin dies out with the time constant ``RECOVERY_S``; it is the heat that
+soaks into the finger and the water, which the plant's states do not know.
 """
 
 from __future__ import annotations
@@ -31,7 +21,7 @@ import numpy as np
 from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.errors import UserError
 from thermogrip.rig.guard.sensor_checks import room_disturbances
-from thermogrip.rig.interface import Event, Reading, check_order, range_of
+from thermogrip.rig.interface import Event, Reading, check_order, known_range
 from thermogrip.sysid.contact.simulation import ContactModel, Touch
 from thermogrip.sysid.effusivity.gripper_model import load_default_gripper
 from thermogrip.sysid.plant.plant import Plant
@@ -57,9 +47,13 @@ class _Contact:
         """Return what the object adds to the skin's reading [K], which alone would be at ``alone``."""
         if time > self.opened:
             return self.left * float(np.exp((self.opened - time) / RECOVERY_S))
+        # heat conduction is linear: with the plant's skin y(t), the true time of contact t_c, the step
+        # response F of sysid.contact.simulation and G, what the room does by the far face of the block,
+        #     (T_obj - y(t_c)) F(t - t_c) + (T_room - T_obj) G(t - t_c) - int F(t - s) dy(s), s = t_c ... t;
+        # the integral is Duhamel's: the object answers to the difference as it is, not as it was at contact
         since_closed = np.array([time - self.closed])
         share, room = float(self.touch.response(since_closed)[0]), float(self.touch.by_room(since_closed)[0])
-        # the object undoes the skin's own way since it closed; what that did before the touch from then on
+        # what the skin did between closing and the touch counts from the touch on
         times, skin_alone = np.array([*self.times, time]), np.array([*self.alone, alone])
         onset = self.touch.onset
         since = np.maximum(0.5 * (times[1:] + times[:-1]), self.closed + onset)
@@ -337,8 +331,5 @@ class Twin:
 
 def _input_range(plant: Plant, name: str) -> tuple[float, float]:
     unit = plant.units.get(name, "1")
-    ends = range_of(unit, plant.valid.get(name) if unit == "1" else None)
-    if ends is None:
-        problem = f"the range of {name} [{unit}] is unknown"
-        raise UserError(problem, hint=f"give it: limits={{{name!r}: (lo, hi)}}")
-    return ends
+    seen = plant.valid.get(name) if unit == "1" else None
+    return known_range(name, unit, seen, hint=f"give it: limits={{{name!r}: (lo, hi)}}")

@@ -146,15 +146,11 @@ class Bench:
             case "sensor_offset":
                 return true + round(1000 * fault.kelvin)
             case "sensor_lag":
-                return self._earlier(name, self.time - fault.seconds, true)
+                then = self.time - fault.seconds + 1e-9
+                past = [values for time_s, values in self._past if time_s <= then]
+                return (past[-1] if past else self._past[0][1])[name]
             case _:
                 return _ABSOLUTE_ZERO
-
-    def _earlier(self, name: str, time_s: float, otherwise: int) -> int:
-        for moment, values in reversed(self._past):
-            if moment <= time_s + 1e-9:
-                return values[name]
-        return self._past[0][1][name] if self._past else otherwise
 
 
 def board_of(twin: Twin) -> Board:
