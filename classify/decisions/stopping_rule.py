@@ -368,8 +368,6 @@ class Stream:
         """Take what was read so far for what it is."""
         grasp = self.grasps()
         quality = check_grasps(grasp)
-        if quality.spiked[0, -1]:  # the next readings show whether it was a spike
-            return
         if quality.reason[0]:
             self.log_p = np.full(len(self.candidates), np.nan)
             return

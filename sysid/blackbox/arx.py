@@ -91,7 +91,7 @@ def _regress(grid: Grid, terms: tuple[str, ...], deep: int) -> _Regression | Non
     blocks, targets = [], []
     for segment, w in zip(grid.segments, drives(grid, terms)):
         y, n = segment.y, len(segment.y)
-        if n <= deep + 1:
+        if n <= deep:
             continue
         past_y = [y[deep - i : n - i] for i in range(1, deep + 1)]
         past_w = [w[deep - i : n - i] for i in range(1, deep + 1)]
