@@ -1,9 +1,4 @@
-"""The door of the program, ``thermogrip`` and ``python -m thermogrip``.
-
-The command line takes a moment to be imported.  A Ctrl-C in it is one quiet line too: it
-ends the process at once, since nothing was begun, and since Python loses an exception that a signal raises in
-a callback of an import.
-"""
+"""The door of the program, ``thermogrip`` and ``python -m thermogrip``."""
 
 import os
 import signal
@@ -16,6 +11,8 @@ def main() -> int:
     """Run the words of the process and return the exit code."""
     usual = signal.getsignal(signal.SIGINT) is signal.default_int_handler  # nohup and its like ignore it
     if usual:
+        # while the command line is imported a Ctrl-C ends the process at once: nothing was begun, and Python
+        # loses an exception that a signal raises in a callback of an import
         signal.signal(signal.SIGINT, _leave)
     if not sys.warnoptions and "--debug" not in sys.argv:  # they name lines of code, not what to do
         warnings.simplefilter("ignore")

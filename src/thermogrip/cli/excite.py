@@ -1,10 +1,4 @@
-"""excite: an input schedule to identify a plant by, and how well it is expected to identify it.
-
-The amplitude of a plain schedule is the largest share of each drive's range, about a mean that holds the
-plant in the middle of the allowed temperatures, for which the simulated outputs of the plant and of draws
-of its parameters stay inside; it is found by bisection, since hotter means more drive.  The optimal one
-starts from these.
-"""
+"""excite: an input schedule to identify a plant by, and how well it is expected to identify it."""
 
 from __future__ import annotations
 
@@ -129,12 +123,8 @@ def _optimal(
 def schedule_for(
     plant: Plant, kind: str, minutes: float, *, lowest: float, highest: float, seed: int
 ) -> tuple[Log, float]:
-    """Return a schedule for every drive of a plant, and the share of the drives' ranges that it uses.
-
-    Every output in degC stays from ``lowest`` to ``highest`` in simulation from a room of 25 degC, also with
-    eight draws of the parameters where the plant knows their uncertainty; UserError if not even a fiftieth
-    of the range stays inside.
-    """
+    """Return a schedule for every drive of a plant, and the share of the drives' ranges that it uses;
+    UserError if not even a fiftieth of them keeps every output in degC from ``lowest`` to ``highest``."""
     import numpy as np
 
     from thermogrip.datasets.schema import column, make_log
@@ -149,6 +139,7 @@ def schedule_for(
         middle, reach = (0.5 * (low + high), 0.5 * (high - low)) if low >= 0 else (0.0, min(-low, high))
         full[name] = middle + reach * column(log, "drive")
     time = np.asarray(log["time"].values, dtype=float)
+    # simulated from a room of 25 degC, with eight draws of the parameters too; found by bisection
     share = _largest_interval(ExperimentForecast(plant, lowest=lowest, highest=highest), full, time.size)
     variables = {name: (share * drive, plant.units.get(name, "1"), "input") for name, drive in full.items()}
     variables |= {name: (np.ones(time.size), "1", "input") for name in plant.model.switches}

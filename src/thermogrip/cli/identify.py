@@ -214,11 +214,7 @@ def _stated_roles(named: Mapping[str, Sequence[str]]) -> list[str]:
 def _read(
     read: Callable[..., list[Log]], network: GreyModel | None, *, shipped: bool
 ) -> tuple[list[Log], GreyModel | None]:
-    """Return the logs, and the network under the names of their columns: the given one, or a shipped one.
-
-    What a network calls its own has the role that it has there, so that logs are read again where it is found
-    by their columns.
-    """
+    """Return the logs, and the network under the names of their columns: the given one, or a shipped one."""
     from thermogrip.sysid.data.shipped_networks import in_columns, shipped_network
     from thermogrip.sysid.models.network import NetworkModel
     from thermogrip.sysid.plant.log_grid import roles_of
@@ -229,6 +225,7 @@ def _read(
         matching = shipped_network(logs)
     elif isinstance(network, NetworkModel):
         matching = in_columns(network, logs[0])
+    # what a network calls its own has the role that it has there
     return (logs if matching is network or matching is None else read(known=roles_of(matching))), matching
 
 

@@ -4,7 +4,7 @@
 
 Exit codes: 0 done; 1 our bug; 2 the user's input is at fault; 3 done, but the answer is no; 130 Ctrl-C.  A
 mistake of the user is one line on stderr that says what is wrong and what to do; a traceback is shown with
-``--debug`` only.  This module and everything that it imports at the top load no heavy package.
+``--debug`` only.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from typing import Annotated
 
 import typer
 
+# none of these loads a heavy package: --help is there within half a second
 from thermogrip import __version__
 from thermogrip.cli.options import ExitCode
 from thermogrip.cli.verbs import Verb, Verbs
@@ -100,10 +101,10 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _ignore_settings_of_folder() -> None:
-    """Keep libraries from settings in the working folder, which may be somebody's data: those of Numba name a
-    folder of pickles, which run code, and those of matplotlib can start LaTeX."""
-    os.environ.setdefault("NUMBA_CACHE_DIR", "")  # goes before .numba_config.yaml
-    if os.path.lexists("matplotlibrc"):  # goes before $MATPLOTLIBRC
+    """Keep libraries from settings in the working folder, which may be somebody's data."""
+    # .numba_config.yaml, before which this goes, names a folder of pickles, which run code
+    os.environ.setdefault("NUMBA_CACHE_DIR", "")
+    if os.path.lexists("matplotlibrc"):  # goes before $MATPLOTLIBRC, and can start LaTeX
         with chdir(Path(__file__).parent):  # no thread runs yet
             import_module("matplotlib")
 

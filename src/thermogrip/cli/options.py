@@ -310,20 +310,18 @@ def load_logs(
     columns: Sequence[str] | None = None,
     dt: float | None = None,
 ) -> list[Log]:
-    """Read several logs with the same roles; ``known`` are those that a model gives to its signals.
-
-    What is guessed of the first log is so in all; a column that never moves in any is not guessed to be an
-    input or an output.
-    """
+    """Read several logs with the same roles; ``known`` are those that a model gives to its signals."""
     import numpy as np
 
     from thermogrip.datasets.log_files import read_log
 
     logs: list[Log] = []
     for path in paths:
+        # what is guessed of the first log is so in all
         first = {str(n): str(v.attrs["role"]) for log in logs[:1] for n, v in log.data_vars.items()}
         roles = {**first, **known} if known else first or None
         logs.append(read_log(path, inputs, outputs, disturbances, known=roles, columns=columns, dt=dt))
+    # a column that never moves in any log is not guessed to be an input or an output
     for line in str(logs[0].attrs.get("guesses", "")).splitlines():
         name, why = line.split(": ", 1)[0], "it never moves"
         if name not in logs[0]:  # of a file whose column was lost
@@ -356,11 +354,7 @@ def warn_of_contacts(
 
 
 def find_network(text: str) -> GreyModel:
-    """Return the model of ``--network``: a network by name or TOML file, or ``FILE.py:NAME``, which runs it.
-
-    NAME is a class of the user's own (:mod:`thermogrip.sysid.models.user_model`), or a class or function
-    without arguments that makes a :class:`~thermogrip.sysid.models.network.NetworkModel`.
-    """
+    """Return the model of ``--network``: a network by name or TOML file, or ``FILE.py:NAME``, run."""
     from thermogrip.sysid.models.network import NetworkModel, load_network
     from thermogrip.sysid.models.user_model import load_object, own_model
 
@@ -368,6 +362,7 @@ def find_network(text: str) -> GreyModel:
     if not name:
         return load_network(text)
     own_object = load_object(file, name)
+    # a class of the user's own, or what makes a NetworkModel without arguments
     if isinstance(own_object, type) and not issubclass(own_object, NetworkModel):
         return own_model(own_object)
     made = _made(own_object, file, name)

@@ -49,10 +49,8 @@ class Mirror:
         self._shown = events
 
     def layout(self, columns: list[str], units: list[str]) -> str:
-        """Return the layout file of these columns: temperatures with the target, drives, what happened.
-
-        It is what the application imports; what ``foxglove.layouts`` builds is for notebooks alone.
-        """
+        """Return the layout file of these columns: temperatures with the target, drives, what happened."""
+        # as the application imports it; what foxglove.layouts builds is for notebooks alone
 
         def plot(title: str, names: list[str]) -> dict[str, Any]:
             shown = {"enabled": True, "timestampMethod": "receiveTime"}

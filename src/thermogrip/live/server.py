@@ -5,11 +5,6 @@
 
 Neither end needs the other.  Without this process the session goes on.  Without the session the line ends
 here, the page says so, and says what then holds for the drive.
-
-Only this computer is served (a loopback address), and who has the token: it is in the address that the
-terminal shows, and in a cookie from then on.  A name that is not the loopback's (a rebound DNS name) and a
-request from another site's page are refused, whatever they know; so is an action that is no POST.  The page
-loads nothing from elsewhere, and runs no script but its own, which the browser knows by its hash.
 """
 
 from __future__ import annotations
@@ -39,7 +34,7 @@ if TYPE_CHECKING:
     from starlette.types import ASGIApp, Receive, Scope, Send
     from uvicorn import Server
 
-HOST = "127.0.0.1"
+HOST = "127.0.0.1"  # only this computer is served
 
 
 @dataclass(frozen=True)
@@ -111,10 +106,7 @@ class State:
 
 
 class Requests:
-    """What viewers ask, handed on at a person's pace, since the session takes its time for each.
-
-    A stop and the answer to a question are handed on once, a mark once a second at most.
-    """
+    """What viewers ask, handed on at a person's pace, since the session takes its time for each."""
 
     def __init__(
         self, state: State, ask: Callable[[dict[str, Any]], None], clock: Callable[[], float] = time.monotonic
@@ -137,7 +129,7 @@ class Requests:
             once = str((state.now.get("question") or {}).get("number", ""))
             if not once or words.get("question") != once:
                 return 409, "this is not asked any more"
-        if once not in self._done:
+        if once not in self._done:  # a stop, and the answer to a question
             self._ask({"do": do, **words})
         if once:
             self._done.add(once)
@@ -167,10 +159,11 @@ class Gate:
     def refused(self, request: Request) -> str:
         """Return why a request is refused, "" where it is not."""
         host, origin = request.headers.get("host", ""), request.headers.get("origin")
-        if host not in self._hosts:
+        if host not in self._hosts:  # a rebound DNS name, whatever it knows
             return "refused: this address is not the page's own"
         if origin != f"http://{host}" and (origin is not None or request.method == "POST"):
             return "refused: this comes from another page"
+        # the token is in the address that the terminal shows, and in a cookie from then on
         shown_token = request.cookies.get(self.cookie, "")
         if request.url.path == "/":
             shown_token = request.query_params.get("token", shown_token)
@@ -181,6 +174,7 @@ class Gate:
 
 def page_text() -> tuple[str, str]:
     """Return the page and the policy under which a browser shows it."""
+    # it loads nothing from elsewhere, and runs no script but its own, which the browser knows by its hash
     sources = {
         name: (files(__package__) / f"page.{name}").read_text(encoding="utf-8")
         for name in ("html", "css", "js")
@@ -239,6 +233,7 @@ def application(state: State, ask: Callable[[dict[str, Any]], None], *, port: in
         status, refused = requests.take(request.url.path.lstrip("/"), words)
         return JSONResponse({"refused": refused} if refused else {"done": True}, status)
 
+    # POST alone: no link and no image of another page can ask for anything
     actions = [Route(f"/{name}", act, methods=["POST"]) for name in ("stop", "bad", "answer")]
     app = Starlette(routes=[Route("/", page), Route("/events", events), *actions])
     return Gate(app, port=port, token=token)
@@ -323,14 +318,15 @@ def _server(state: State, token: str, listener: socket.socket) -> Server:
 
 
 def _send_to_session(content: dict[str, Any]) -> None:
-    """Say something to the session; one that is gone hears nothing."""
-    with suppress(OSError):
+    """Say something to the session."""
+    with suppress(OSError):  # one that is gone hears nothing
         sys.stdout.write(json.dumps(content) + "\n")
         sys.stdout.flush()
 
 
 def _stdin_lines() -> Iterator[bytes]:
-    """Yield the lines of standard input; unbuffered, for a thread that waits in a buffer holds up the end."""
+    """Yield the lines of standard input."""
+    # unbuffered: a thread that waits in a buffer holds up the end
     unfinished = b""
     while data := os.read(0, 1 << 16):
         *whole, unfinished = (unfinished + data).split(b"\n")

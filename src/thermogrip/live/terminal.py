@@ -1,7 +1,4 @@
-"""A session on a terminal: its numbers, and what happened last.
-
-Where there is no terminal the same numbers are one line, at most once a second.
-"""
+"""A session on a terminal: its numbers, and what happened last; the same in one line where there is none."""
 
 from __future__ import annotations
 

@@ -2,8 +2,7 @@
 
 The loop appends a snapshot to a queue (:meth:`Watch.listen`).  A thread takes them out ten times a second for
 the terminal and for the page's process (:mod:`~thermogrip.live.server`), which it writes lines to; another
-one reads what comes back.  A queue that is full drops its oldest.  Where the page's process is gone, that is
-said once, and the session goes on.
+one reads what comes back.
 """
 
 from __future__ import annotations
@@ -84,31 +83,27 @@ class Question:
 
 
 class Watch:
-    """Show a session; a context manager, whose methods are called from the session's thread.
-
-    ``operator`` is handed to the session, as are :meth:`listen` and :meth:`progress`; ``address`` is that of
-    the page, with its token, ``page`` its process, ``viewers`` the number that look at it, ``now`` the newest
-    snapshot, ``typing`` the thread that reads the terminal.
-    """
+    """Show a session; a context manager, whose methods are called from the session's thread."""
 
     def __init__(self, title: str, console: Console, show: Show | None = None) -> None:
         self.title = title
         self._console = console
         self._show = show or Show()
-        self.operator = Operator()
+        self.operator = Operator()  # is handed to the session, as are listen and progress
         self._show.check()
+        # full, it drops its oldest: the loop never waits
         self._queue: deque[Snapshot] = deque(maxlen=WATCH.keep)
         self._posterior: deque[list[Any]] = deque(maxlen=WATCH.keep)
-        self.now: Snapshot | None = None
+        self.now: Snapshot | None = None  # the newest
         self._heard = time.monotonic()
         self._fraction, self._what = 0.0, ""
         self._verdict = ""
         self._question: Question | None = None
         self._asked = 0
         self._answers: queue.Queue[tuple[int, str]] = queue.Queue()
-        self.typing: threading.Thread | None = None
+        self.typing: threading.Thread | None = None  # reads the terminal
         self._over = threading.Event()
-        self.address = ""
+        self.address = ""  # of the page, with its token
         self.page: subprocess.Popen[bytes] | None = None
         self._reached = False  # whether the page's process takes what is written
         self.viewers: int | None = None  # who look at the page now; None where nobody has come yet
@@ -181,7 +176,8 @@ class Watch:
             sys.stderr.write("\n")
 
     def _read_typed(self) -> None:
-        """Read lines from the terminal; not through Python's buffer, which a waiting thread would hold."""
+        """Read lines from the terminal."""
+        # not through Python's buffer, whose lock a waiting thread would hold at the end
         unfinished = b""
         with suppress(OSError, ValueError):
             while data := os.read(sys.stdin.fileno(), 4096):

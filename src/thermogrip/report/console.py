@@ -3,7 +3,7 @@
 Names, notes and messages are other people's text: what would steer a terminal is written out.
 
 A verb builds one answer (a dict) and, for people, a few tables.  With ``--json`` the answer is the only thing
-on stdout; numbers that are not finite become ``null`` because JSON has no word for them.
+on stdout.
 """
 
 from __future__ import annotations
@@ -85,10 +85,7 @@ class Console:
     @contextmanager
     def progress(self, title: str) -> Iterator[Progress]:
         """Show on stderr how far the work is while the block runs: on a terminal a line that is written anew,
-        else a line whenever the work changes, at most one for each twentieth of it.
-
-        It never goes back: where work turns out to be longer than was thought, it waits.
-        """
+        else a line whenever the work changes, at most one for each twentieth of it."""
         try:
             yield _progress_lines(printable(title))
         finally:
@@ -122,7 +119,7 @@ def plain(value: Any) -> Any:
         return plain(value.tolist())
     if isinstance(value, int):
         return value
-    if isinstance(value, float):
+    if isinstance(value, float):  # JSON has no word for what is not finite
         return value if math.isfinite(value) else None
     return str(value)
 
@@ -187,6 +184,7 @@ def _progress_lines(title: str) -> Progress:
     begin, first = time.monotonic(), list[float]()  # work that was begun before goes on at its share
 
     def show(fraction: float, what: str) -> None:
+        # where work turns out to be longer than was thought, the bar waits: it never goes back
         fraction = min(max(fraction, last[2]), 1.0)
         stage = what.split(":")[0]
         step = int(20 * fraction)

@@ -1,16 +1,8 @@
 """Reports: one self-contained HTML page made of sections, tables and figures.
 
 A report is a list of :class:`Section`; each says its verdict in words first and shows the evidence under it.
-The page is one file which opens without a network: styles, figures and the script are in it, and its content
-security policy names the hashes of that script and style alone.  A :class:`Plot` can be zoomed and read point
-by point; on paper and without scripts it is the same figure at rest, as all others are: inline SVG.
-Every text is escaped by the template.
-
-The script draws with uPlot [1]_, whose licence stands in ``templates/uPlot.LICENSE`` and in every page.
-
-References
-----------
-.. [1] https://github.com/leeoniya/uPlot, version 1.6.32.
+A :class:`Plot` can be zoomed and read point by point; on paper and without scripts it is the same figure at
+rest, as all others are: inline SVG.
 """
 
 from __future__ import annotations
@@ -215,7 +207,7 @@ def html_page(title: str, lead: str, sections: Sequence[Section]) -> str:
     loader = PackageLoader("thermogrip", "templates")
     env = Environment(
         loader=loader,
-        autoescape=True,
+        autoescape=True,  # names in files are other people's text
         undefined=StrictUndefined,
         finalize=_finalize,
         trim_blocks=True,
@@ -224,6 +216,8 @@ def html_page(title: str, lead: str, sections: Sequence[Section]) -> str:
     env.filters["breakable"] = lambda name: escape(printable(name)).replace("_", Markup("_<wbr>"))
     template = env.get_template("report.html.j2")
     plots = [evidence for section in sections for evidence in section.parts if isinstance(evidence, Plot)]
+    # styles, figures and script are in the page, which opens without a network; its content security policy
+    # names the hashes of this script and this style alone
     script, style = _script(drawing=bool(plots)), _asset("uPlot.min.css") + _asset("report.css")
     return template.render(
         title=title, lead=lead, sections=sections, points=_points(plots), provenance=provenance(),
@@ -253,6 +247,7 @@ def _asset(name: str) -> str:
 
 def _script(*, drawing: bool) -> str:
     """Return the script of a page, with what draws charts where there are any."""
+    # https://github.com/leeoniya/uPlot, version 1.6.32
     drawn = f"/*! {_asset('uPlot.LICENSE')} */\n{_asset('uPlot.iife.min.js')}\n" if drawing else ""
     return drawn + _asset("report.js")
 
@@ -263,7 +258,8 @@ def _source(text: str) -> str:
 
 
 def _packed(values: Array) -> str:
-    """Return numbers as base64 of little-endian float32, gaps and what is no number as NaN."""
+    """Return numbers as base64 of little-endian float32."""
+    # infinity too: the page's axes cannot have it
     with_gaps = np.where(np.isfinite(values), values, np.nan)
     return base64.b64encode(np.asarray(with_gaps, dtype="<f4").tobytes()).decode()
 
@@ -278,10 +274,7 @@ def _finalize(value: Any) -> Any:
 
 
 def literal(figure: Figure) -> Figure:
-    r"""Return the figure with every text in it set literally: no formula, no control character.
-
-    Only the superscripts that thermogrip's own units have are formulas.
-    """
+    """Return the figure with every text in it set literally: no formula, no control character."""
     from matplotlib.text import Text as FigureText
     from matplotlib.ticker import FixedFormatter, Formatter, FuncFormatter
 
@@ -301,7 +294,8 @@ def literal(figure: Figure) -> Figure:
 
 
 def _literal(text: str) -> str:
-    pieces = _SUPERSCRIPT.split(printable(text))  # own superscripts are every second part
+    # only the superscripts of thermogrip's own units are formulas: every second piece
+    pieces = _SUPERSCRIPT.split(printable(text))
     return "".join(piece if place % 2 else _DOLLAR.sub(r"\\$", piece) for place, piece in enumerate(pieces))
 
 

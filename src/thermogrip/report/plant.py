@@ -107,11 +107,7 @@ def identification_sections(
     dynamics: Dynamics | None = None,
 ) -> list[Section]:
     """Return the report of an identification: the model comparison, what was held out, parameters, responses,
-    every log.
-
-    ``plant`` is the chosen one, with samples where ``record`` says how they were drawn.  Its free runs
-    are those of the comparison, with residual tests.
-    """
+    every log; ``plant`` is the chosen one, with samples where ``record`` says how they were drawn."""
     from thermogrip.sysid.validation.free_run import free_run
 
     sections = [identification_section(found)]
@@ -122,6 +118,7 @@ def identification_sections(
     if dynamics is not None:
         sections.append(dynamics_section(dynamics))
     for log, known in zip(logs, found.runs):
+        # those of the comparison again, now with residual tests and a band of this plant's draws
         run = free_run(plant, log, known.warmup)
         sections.append(free_run_section(run, seen=True))
     return sections
@@ -134,6 +131,7 @@ def held_out_section(found: Identification) -> Section:
         ", ".join(f"{o} {s.rmse:.2g}{_spaced(s.unit)}" for o, s in r.scores.items()) for r in runs.values()
     )
     errors = "; ".join(f"{name}: {error}" for name, error in zip(runs, words))
+    # without a band: of a fit that has not seen what it is to predict, draws may lie anywhere
     evidence = tuple(
         Plot(
             plots.free_run_chart(run, tuple(run.scores)[k : k + 2]),
@@ -282,11 +280,9 @@ def _prior_intervals(plant: Plant) -> dict[str, tuple[float, float]]:
 def free_run_section(
     run: FreeRun, band: Band | None = None, *, seen: bool = False, title: str = ""
 ) -> Section:
-    """Return the section of a log: free run beside the measurement, scores, residual tests, notes.
-
-    ``band`` is that of the run, where it is known already; ``seen`` says that the log was in the fit;
-    ``title`` takes the place of the usual one.
-    """
+    """Return the section of a log: free run beside the measurement, scores, residual tests, notes; ``seen``
+    says that the log was in the fit, ``title`` takes the place of the usual one."""
+    # a caller that has printed the band has it already
     band = run.band() if band is None else band
     name = log_name(run.log)
     units = {output: "" if score.unit == "1" else f" {score.unit}" for output, score in run.scores.items()}

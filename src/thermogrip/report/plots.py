@@ -1,15 +1,8 @@
 """Charts and figures of a plant and of a session: free runs, posterior, closed loops, grasps.
 
 They take records and numbers.  What a reader wants to zoom into is a chart
-(:class:`~thermogrip.datasets.charts.Chart`), the rest are matplotlib figures made without ``pyplot``, so that
-no window system is asked for and nothing global is left behind.  Figures of a classifier's results are in
-:mod:`thermogrip.classify.figures`.
-
-The corner figure of a posterior: each pair of parameters, marginals on the diagonal
-------------------------------------------------------------------------------------
-
-Where two parameters trade off, their panel is a ridge: neither is known well, a combination
-is.
+(:class:`~thermogrip.datasets.charts.Chart`), the rest are matplotlib figures.  Figures of a classifier's
+results are in :mod:`thermogrip.classify.figures`.
 """
 
 from __future__ import annotations
@@ -242,6 +235,7 @@ def corner_figure(posterior: Posterior, names: Sequence[str] | None = None) -> F
             raise UserError(f"{name!r} was not sampled", hint=known_names(name, posterior.free))
     columns = posterior.samples[:, [posterior.free.index(name) for name in names]]
     n = len(names)
+    # without pyplot: no window system is asked for, and nothing global is left behind
     figure = Figure(figsize=(1.7 * n + 0.6, 1.7 * n + 0.6), layout="constrained")
     axes = figure.subplots(n, n, squeeze=False)
     for i in range(n):
@@ -266,6 +260,7 @@ def _corner_panel(
             ax.axvline(edge, color="tab:blue", lw=0.8, ls="--")
         ax.set_yticks([])
     else:
+        # a ridge where two parameters trade off: neither is known well, a combination is
         ax.plot(columns[:, j], columns[:, i], ".", ms=1.5, alpha=0.4, rasterized=True)  # of thousands
         ax.axhline(posterior.fitted[names[i]], color="0.6", lw=0.8)
         ax.tick_params(labelleft=j == 0)  # a row shares its scale

@@ -62,10 +62,8 @@ def run_demo(
     out: Path, *, seed: int = 0, workers: Workers = 2, progress: Progress | None = None
 ) -> DemoResult:
     """Run every stage once and write files and a report into an existing folder, in place of what an earlier
-    demo left there.
-
-    With several workers they compare classifiers, which needs no plant, while this process identifies one.
-    """
+    demo left there."""
+    # to compare classifiers needs no plant: the workers do it while this process identifies one
     with ThreadPoolExecutor(1) as beside:
         compare = partial(_compare, out, seed, workers)
         compared = None if workers == 1 else beside.submit(copy_context().run, compare, None)

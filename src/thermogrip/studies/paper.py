@@ -9,10 +9,8 @@ with an LSTM that is trained on noisy copies.  Here the same cases are repeated
   cases.  The simulated gripper is of the family of models that the posterior classifier assumes, which
   favours it there.
 
-A third table shows what the published numbers can rest on.  Every accuracy in the paper is k of 3 or k of
-5, and its data sets have a hundred series a material: one real grasp a material, with copies.  So its LSTM
-is trained on the copies of one grasp a material and tested three times: on further copies of those grasps,
-on one other grasp a material as the paper seems to have done, and on all others.
+A third table shows what the published numbers can rest on: the paper's LSTM is trained on copies of one grasp
+a material, and tested on further copies and on other grasps.
 """
 
 from __future__ import annotations
@@ -271,6 +269,8 @@ def _train_on_copies(job: tuple[Case, Grasps, bool, int]) -> dict[str, Any]:
     from thermogrip.classify.estimators.registry import make_classifier
     from thermogrip.datasets.schema import make_grasps
 
+    # every accuracy in the paper is k of 3 or k of 5, and its data sets have a hundred series a material: one
+    # real grasp a material, with copies, and one other grasp a material to test, as it seems
     case, grasps, quick, seed = job
     labels = grasps["material"].values.astype(str)
     first = np.array([int(np.argmax(labels == name)) for name in case.materials])
