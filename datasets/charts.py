@@ -154,10 +154,8 @@ def _draw(axis: Axes, panel: Panel) -> None:
         }
         labels_shown.add(curve.label)
         if curve.low is not None and curve.high is not None:
-            axis.fill_between(
-                curve.x, curve.low, curve.high, color=curve.colour, alpha=0.18, lw=0,
-                step="post" if curve.step else None,
-            )  # fmt: skip
+            held: Any = {"step": "post"} if curve.step else {}
+            axis.fill_between(curve.x, curve.low, curve.high, color=curve.colour, alpha=0.18, lw=0, **held)
         if curve.dash:
             steps = "steps-post" if curve.step else "default"
             axis.plot(curve.x, curve.y, lw=curve.width, ls=curve.dash, drawstyle=steps, **look)

@@ -263,8 +263,11 @@ def _read_netcdf_table(path: str | Path) -> Table:
 
 
 _OF_TEXT = {
-    "csv": read_text_table, "text": read_text_table, "matlab": read_matlab_table, "excel": read_excel_table
-}  # fmt: skip
+    "csv": read_text_table,
+    "text": read_text_table,
+    "matlab": read_matlab_table,
+    "excel": read_excel_table,
+}
 
 
 def _read_table(file: Path, columns: Sequence[str] | None) -> Table:

@@ -85,14 +85,16 @@ def read_hold(folder: str | Path) -> Grasps:
     own = [name.groupdict() for _, name in found]
     return with_lead_in(
         make_grasps(
-            _AVERAGED * _STEP * (np.arange(n) + 0.5), rows,
+            _AVERAGED * _STEP * (np.arange(n) + 0.5),
+            rows,
             [f"{o['object']}_{o['trial']}" for o in own],
             material=[o["object"].replace("_", " ") for o in own],
             block=[f"{o['object']}_{o['number']}" for o in own],
             session=[f"pair{(int(o['trial']) + 1) // 2}" for o in own],
-            t_gripper=rows[:, 0], name="hold",
+            t_gripper=rows[:, 0],
+            name="hold",
         )
-    )  # fmt: skip
+    )
 
 
 def read_toh(folder: str | Path, *, every: int = 10) -> Grasps:
@@ -126,11 +128,14 @@ def read_toh(folder: str | Path, *, every: int = 10) -> Grasps:
     found = [f for n in range(1, 31) for f in _found(Path(folder) / f"R_{n}", "*.pkl", _TOH)]
     cube = np.stack([_pickled_array(file)[::every, :3] for file, _ in found])
     return make_grasps(
-        np.round(cube[0, :, 0], 6), cube[:, :, 2],
+        np.round(cube[0, :, 0], 6),
+        cube[:, :, 2],
         [f"{f.parent.name}_{f.stem.split('_sensor')[0]}" for f, _ in found],
-        t_surface_2=cube[:, :, 1], material=[_KINDS[name["kind"]] for _, name in found],
-        session=[f.parent.name.replace("R_", "set") for f, _ in found], name="toh",
-    )  # fmt: skip
+        t_surface_2=cube[:, :, 1],
+        material=[_KINDS[name["kind"]] for _, name in found],
+        session=[f.parent.name.replace("R_", "set") for f, _ in found],
+        name="toh",
+    )
 
 
 def _found(folder: Path, pattern: str, name: re.Pattern[str]) -> Sequence[tuple[Path, re.Match[str]]]:

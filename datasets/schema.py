@@ -33,10 +33,8 @@ ROLES = ("input", "disturbance", "output", "other")
 
 # Per-grasp variables with their units; labels are strings, "" where absent.
 # ``rest`` is the time since the block's touch before; ``touch`` counts the touches of a ``touch_group``.
-GRASP_NUMBERS = {
-    "t_object": "degC", "t_object_sd": "degC", "t_gripper": "degC", "t_ambient": "degC",
-    "repeat": "1", "touch": "1", "rest": "s",
-}  # fmt: skip
+GRASP_NUMBERS = dict.fromkeys(("t_object", "t_object_sd", "t_gripper", "t_ambient"), "degC")
+GRASP_NUMBERS |= {"repeat": "1", "touch": "1", "rest": "s"}
 _SLOWEST = 5.0  # s between the samples of a grasp: beyond it they are milliseconds
 HOTTEST = 200.0  # degC, either side of 0: beyond it a number is kelvin, or of no sensor
 GRASP_LABELS = ("material", "experiment", "split", "touch_group", "session", "block")

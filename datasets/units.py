@@ -34,9 +34,11 @@ _SPELT = {
 }  # fmt: skip
 _MULTIPLES = {
     "s": {"h": 3.6e3, "hr": 3.6e3, "hour": 3.6e3, "hours": 3.6e3, "us": 1e-6, "ns": 1e-9, "days": 86.4e3},
-    "V": {"mV": 1e-3, "kV": 1e3}, "A": {"mA": 1e-3, "uA": 1e-6}, "W": {"mW": 1e-3, "kW": 1e3},
+    "V": {"mV": 1e-3, "kV": 1e3},
+    "A": {"mA": 1e-3, "uA": 1e-6},
+    "W": {"mW": 1e-3, "kW": 1e3},
     "K": {"mK": 1e-3},
-}  # fmt: skip
+}
 _FOREIGN = {word: (unit, 1.0) for unit, words in _SPELT.items() for word in words.split()}
 _FOREIGN |= {word: (unit, factor) for unit, those in _MULTIPLES.items() for word, factor in those.items()}
 _ANY_CASE = {word.lower(): word for word in (*_FOREIGN, *UNITS) if len(word) > 2 or word == "ms"}

@@ -279,10 +279,8 @@ def _grasp_object(
     run.ends = closed + seconds
     t_object = float(run.accepted[t_object_source] if isinstance(t_object_source, str) else t_object_source)
     t_gripper = run.target.get(output, np.nan)
-    about = {
-        "grasp_id": thing.grasp_id, "material": thing.material, "t_object": t_object,
-        "t_object_sd": thing.t_object_sd, "t_gripper": t_gripper, **thing.labels,
-    }  # fmt: skip
+    about = {"grasp_id": thing.grasp_id, "material": thing.material, "t_object": t_object}
+    about |= {"t_object_sd": thing.t_object_sd, "t_gripper": t_gripper, **thing.labels}
     as_json = {key: None if value != value else value for key, value in about.items()}
 
     def grasp_so_far() -> Grasps:

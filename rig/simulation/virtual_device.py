@@ -168,9 +168,7 @@ def board_of(twin: Twin) -> Board:
 
 
 PROTOCOLS = ("thermogrip", "tclab")
-_BOARD = {
-    "G_amb": 0.013, "G_between": 0.006, "power_1": 0.86, "power_2": 0.61, "lag_1": 16.0, "lag_2": 19.0,
-}  # fmt: skip
+_BOARD = {"G_amb": 0.013, "G_between": 0.006, "power_1": 0.86, "power_2": 0.61, "lag_1": 16.0, "lag_2": 19.0}
 SAMPLE_MS = 100
 _POLL_S = 0.02  # of real time
 _HELD_UP_S = 0.05  # of real time, twice and a half a poll: a device that is further behind was held up

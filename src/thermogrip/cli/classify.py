@@ -172,10 +172,8 @@ def effusivity(
         lead = "How fast the touched objects take up heat, grasp by grasp."
         write_report(report, "Effusivity", lead, [effusivity_section(noted, len(rows))])
     if as_json:
-        console.answer({
-            "grasps": rows, "without_contact": [*missed], "unexplained": unexplained, "out": out,
-            "report": report,
-        })  # fmt: skip
+        found = {"grasps": rows, "without_contact": [*missed], "unexplained": unexplained}
+        console.answer(found | {"out": out, "report": report})
     return 0
 
 

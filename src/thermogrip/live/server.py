@@ -198,9 +198,12 @@ def application(state: State, ask: Callable[[dict[str, Any]], None], *, port: in
 
     (text, policy), requests = page_text(), Requests(state, ask)
     safe = {
-        "Cache-Control": "no-store", "Content-Security-Policy": policy, "Referrer-Policy": "no-referrer",
-        "X-Content-Type-Options": "nosniff", "Cross-Origin-Resource-Policy": "same-origin",
-    }  # fmt: skip
+        "Cache-Control": "no-store",
+        "Content-Security-Policy": policy,
+        "Referrer-Policy": "no-referrer",
+        "X-Content-Type-Options": "nosniff",
+        "Cross-Origin-Resource-Policy": "same-origin",
+    }
 
     async def page(request: Request) -> Response:
         response = HTMLResponse(text, headers=safe)

@@ -251,7 +251,9 @@ class Watch:
         names = [] if now is None else [*now.values, *now.drive]
         units = [] if now is None else [*["degC"] * len(now.values), *(now.units[k] for k in now.drive)]
         message = {
-            "title": self.title, "what": self._what, "fraction": self._fraction,
+            "title": self.title,
+            "what": self._what,
+            "fraction": self._fraction,
             "columns": ["time_s", "phase", "pump", "target", *names],
             "units": ["s", "1", "1", "degC", *units],
             "rows": [_page_row(snapshot) for snapshot in taken],
@@ -261,7 +263,7 @@ class Watch:
             "question": None if question is None else asdict(question),
             "stopping": bool(self.operator.stop_asked),
             "ended": (self._verdict or "ended") if over else "",
-        }  # fmt: skip
+        }
         if now is None:
             message |= {"columns": [], "units": []}
         try:

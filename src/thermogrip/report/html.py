@@ -219,11 +219,11 @@ def html_page(title: str, lead: str, sections: Sequence[Section]) -> str:
     # styles, figures and script are in the page, which opens without a network; its content security policy
     # names the hashes of this script and this style alone
     script, style = _script(drawing=bool(plots)), _asset("uPlot.min.css") + _asset("report.css")
-    return template.render(
-        title=title, lead=lead, sections=sections, points=_points(plots), provenance=provenance(),
-        icons=ICONS, marks={tone: icon.split()[0] for tone, icon in ICONS.items()}, verdicts=VERDICTS,
-        style=Markup(style), style_hash=_source(style), script=Markup(script), script_hash=_source(script),
-    )  # fmt: skip
+    signs = {"icons": ICONS, "marks": {tone: icon.split()[0] for tone, icon in ICONS.items()}}
+    sources = {name: Markup(text) for name, text in (("style", style), ("script", script))}
+    hashes = {f"{name}_hash": _source(text) for name, text in sources.items()}
+    result = {"title": title, "lead": lead, "sections": sections, "points": _points(plots)}
+    return template.render(**result, **signs, **sources, **hashes, verdicts=VERDICTS, provenance=provenance())
 
 
 def write_report(path: Path, title: str, lead: str, sections: Sequence[Section]) -> None:

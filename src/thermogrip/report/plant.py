@@ -250,13 +250,10 @@ def parameter_table(plant: Plant, record: Posterior | None = None) -> Cells:
     before = _prior_intervals(plant)
     nothing = (None, None)
     head = ["parameter", "value", "unit", "5 %", "95 %", "prior 5 %", "prior 95 %"]
-    rows: list[list[Any]] = [
-        [
-            name, plant.values[name], plant.units.get(name, "1"), *intervals.get(name, nothing),
-            *before.get(name, nothing),
-        ]
-        for name in plant.free
-    ]  # fmt: skip
+    rows: list[list[Any]] = []
+    for name in plant.free:
+        ends = (*intervals.get(name, nothing), *before.get(name, nothing))
+        rows.append([name, plant.values[name], plant.units.get(name, "1"), *ends])
     if record is not None:
         head[3:3], head[7:7] = ["mean", "sd"], ["ESS"]
         for k, row in enumerate(rows):
