@@ -82,7 +82,7 @@ def test_the_mpc_is_saved_where_it_is_best_with_the_tuned_pi_behind_it(tuning, t
     assert loaded.notes["spec"]["steps"] == [[28.0, 36.0]]
     assert loaded.design == tuning.controller.design
     assert min(tuning.scores, key=lambda name: tuning.scores[name]) != "PI"
-    assert tuning.scores["tuned"] < tuning.scores["baseline"] < tuning.scores["PI"]  # its search moves the MPC
+    assert tuning.scores["tuned"] < tuning.scores["baseline"] < tuning.scores["PI"]  # the search moves it
     assert "MPC is best and is what is saved: it scores" in tuning.finding
 
 
