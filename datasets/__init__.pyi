@@ -23,5 +23,3 @@ if typing.TYPE_CHECKING:  # doors of 0.1.0, which are found and not listed
     from thermogrip.datasets.materials import Material as Material
     from thermogrip.datasets.materials import load_materials as load_materials
     from thermogrip.datasets.resample import gaps as gaps
-    from thermogrip.datasets.splits import by_grasp as by_grasp
-    from thermogrip.datasets.splits import shipped as shipped

@@ -21,8 +21,7 @@ from thermogrip.classify.estimators.base import despiked, grasp_labels, pick, re
 from thermogrip.classify.evaluation.comparison import Caution
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.grasp_files import Records
-from thermogrip.datasets.schema import Grasps, has_touch_groups, log_name, unit_names
-from thermogrip.datasets.splits import by_grasp, shipped
+from thermogrip.datasets.schema import Grasps, has_touch_groups, label_values, log_name, unit_names
 
 _TELLING_VALUES = 10
 
@@ -100,10 +99,9 @@ def _shipped(records: Sequence[Grasps]) -> Plan:
         if test is None:
             notes.append(f"{name}: no grasp is marked 'test' in its split, so it only trains")
             continue
-        if _marked(grasps, "train") is not None:
-            rows_train, rows_test = shipped(grasps)
-            like, test = pick(grasps, rows_train), pick(grasps, rows_test)
-        else:
+        like = _marked(grasps, "train")
+        _refuse_torn(grasps, label_values(grasps, "split"), "split")
+        if like is None:
             alike = _alike(test, trains)
             if alike is None:
                 notes.append(f"{name}: no training grasps, nor a condition at its temperatures: left out")
@@ -126,6 +124,8 @@ def _shipped(records: Sequence[Grasps]) -> Plan:
 def _random(records: Sequence[Grasps], repeats: int, train_per_class: int, seed: int) -> Plan:
     if repeats < 1:
         raise UserError(f"{repeats} repeats", hint="give at least one")
+    if train_per_class < 1:
+        raise UserError(f"{train_per_class} training grasps a material", hint="give at least one")
     folds: list[Fold] = []
     notes, cautions = [], list[Caution]()
     for number, whole in enumerate(records):
@@ -146,16 +146,17 @@ def _random(records: Sequence[Grasps], repeats: int, train_per_class: int, seed:
         ]
         grasps = pick(whole, enough_grasps) if few else whole
         try:
-            splits = list(
-                by_grasp(grasps, train_per_class=train_per_class, repeats=repeats, seed=seed + 7919 * number)
-            )
+            _refuse_torn(grasps, grasp_labels(grasps), "material")
         except UserError as error:
             notes.append(f"{name}: {error.problem}: left out")
             continue
-        folds += [
-            Fold(name, repeat, pick(grasps, train), pick(grasps, test_rows), scored_apart(grasps))
-            for repeat, (train, test_rows) in enumerate(splits)
-        ]
+        rng = np.random.default_rng(seed + 7919 * number)
+        labels, units = grasp_labels(grasps), unit_names(grasps)
+        units_of = [np.unique(units[labels == material]) for material in dict.fromkeys(labels.tolist())]
+        for repeat in range(repeats):
+            chosen = np.concatenate([rng.permutation(names)[:train_per_class] for names in units_of])
+            train = np.isin(units, chosen)
+            folds.append(Fold(name, repeat, pick(grasps, train), pick(grasps, ~train), scored_apart(grasps)))
     if not folds:
         raise UserError("no condition can be split", hint="; ".join(notes))
     training = tuple(tuple(f.train for f in folds if f.repeat == repeat) for repeat in range(repeats))
@@ -217,10 +218,7 @@ def _rounds(
 ) -> list[set[str]]:
     """Return what each repeat holds out."""
     for grasps, key in zip(records, keys):
-        units = unit_names(grasps)
-        for unit in np.unique(units):
-            if np.unique(key[units == unit]).size > 1:
-                raise UserError(f"touches of {str(unit)!r} differ in {kind}", file=log_name(grasps))
+        _refuse_torn(grasps, key, kind)
     every = np.unique(np.concatenate(keys)).tolist()
     if kind == "session":
         return [{name} for name in every]
@@ -233,6 +231,15 @@ def _rounds(
         only = next(m for m, names in blocks.items() if len(names) < 2)
         raise UserError(f"there is one block of {only}", hint="give the column block, or split by grasp")
     return [{names[k] for names in blocks.values()} for k in range(fewest)]
+
+
+def _refuse_torn(grasps: Grasps, labels: NDArray[np.str_], kind: str) -> None:
+    """Refuse a block whose touches differ in the label that is split by."""
+    units = unit_names(grasps)
+    for unit in np.unique(units):
+        if np.unique(labels[units == unit]).size > 1:
+            hint = "its touches must agree"
+            raise UserError(f"touches of {str(unit)!r} differ in {kind}", file=log_name(grasps), hint=hint)
 
 
 def _from_files(records: Sequence[Grasps], tests: Sequence[Grasps]) -> Plan:

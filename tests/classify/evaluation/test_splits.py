@@ -53,6 +53,19 @@ def test_conditions_of_one_size_are_split_differently_and_trained_on_together(ma
     assert plan.notes == ("cold: grasps of one material: left out",)
     with pytest.raises(UserError, match="0 repeats; give at least one"):
         plan_folds(both, split="random", repeats=0)
+    with pytest.raises(UserError, match="0 training grasps a material; give at least one"):
+        plan_folds(both, split="random", train_per_class=0)
+
+
+@pytest.mark.parametrize(("split", "label"), [("shipped", "split"), ("random", "material")])
+def test_touches_of_a_block_that_differ_in_what_is_split_by_are_refused(
+    three: Grasps, split: str, label: str
+) -> None:
+    groups = np.full(three.sizes["grasp"], "", dtype="<U4")
+    labels = three[label].values
+    groups[[0, int(np.argmax(labels != labels[0]))]] = "torn"
+    with pytest.raises(UserError, match=f"touches of 'torn' differ in {label}"):
+        plan_folds([three.assign(touch_group=("grasp", groups))], split=split)
 
 
 def test_a_copy_under_another_name_is_noted_where_its_samples_speak() -> None:
