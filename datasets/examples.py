@@ -21,13 +21,13 @@ from thermogrip.datasets.log_files import read_log
 if TYPE_CHECKING:
     from thermogrip.datasets.schema import Grasps, Log
 
+_FOLDER = Path(str(files("thermogrip.datasets"))) / "data"
 EXAMPLE_LOGS = ("prbs_heating_cooling", "step_up_down", "multisine", "pump_on_off")
 
 
 def example_grasps() -> tuple[str, ...]:
     """Return the names of the bundled sets of grasps, in order."""
-    stems = [p.name.removesuffix("_meta.csv.xz") for p in _folder().glob("*_meta.csv.xz")]
-    return tuple(sorted(stems))
+    return tuple(sorted(p.name.removesuffix("_meta.csv.xz") for p in _FOLDER.glob("*_meta.csv.xz")))
 
 
 def example_path(name: str) -> Path:
@@ -48,22 +48,21 @@ def example_path(name: str) -> Path:
     >>> example_path("multisine").name
     'multisine.csv.xz'
     """
-    path = _folder() / f"{name}.csv.xz"
+    path = _FOLDER / f"{name}.csv.xz"
     if not path.is_file():
-        example_names = [*EXAMPLE_LOGS, *example_grasps()]
-        raise UserError(f"no example {name!r}", hint=known_names(name, example_names, "there are {}"))
+        hint = known_names(name, [*EXAMPLE_LOGS, *example_grasps()], "there are {}")
+        raise UserError(f"no example {name!r}", hint=hint)
     return path
 
 
 def copy_examples(folder: str | Path) -> list[Path]:
     """Write the bundled logs into a folder, the grasps into ``grasps`` in it and what each file is into
     ``EXAMPLES.md``, and return their paths; UserError before any is written where another file is there."""
-    folder, source = Path(folder), _folder()
-    files_of_grasps = [f"{name}{end}.csv.xz" for name in example_grasps() for end in ("", "_meta")]
-    places = {folder / f"{name}.csv.xz": source / f"{name}.csv.xz" for name in EXAMPLE_LOGS}
-    places |= {folder / "grasps" / name: source / name for name in files_of_grasps}
-    content = {path: original.read_bytes() for path, original in places.items()}
-    about = (source / "README.md").read_text(encoding="utf-8")
+    folder, content = Path(folder), {}
+    for original in sorted(_FOLDER.glob("*.csv.xz")):
+        is_log = original.name.removesuffix(".csv.xz") in EXAMPLE_LOGS
+        content[(folder if is_log else folder / "grasps") / original.name] = original.read_bytes()
+    about = (_FOLDER / "README.md").read_text(encoding="utf-8")
     content[folder / "EXAMPLES.md"] = about.split("## materials.csv")[0].rstrip().encode() + b"\n"
     for path, data in content.items():
         if path.exists() and path.read_bytes() != data:
@@ -95,7 +94,3 @@ def load_example_grasps() -> dict[str, Grasps]:
     24
     """
     return {name: read_grasps(example_path(name)) for name in example_grasps()}
-
-
-def _folder() -> Path:
-    return Path(str(files("thermogrip.datasets"))) / "data"

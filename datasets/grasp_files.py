@@ -122,22 +122,20 @@ def _with_level_before(grasps: Grasps, path: str | Path) -> Grasps:
 
 
 def as_grasps(grasps: Records) -> list[Grasps]:
-    """Return records as they are, those of files and DataFrames as they are read."""
+    """Return records as they are, those of files as they are read, and those of DataFrames, whose columns are
+    the ones of a Parquet file, with their rows counted from 1."""
     from pandas import DataFrame
 
     records = list(grasps) if isinstance(grasps, Sequence) and not isinstance(grasps, str) else [grasps]
-    read: list[Any] = [
-        read_grasps(record) if isinstance(record, str | Path) else record for record in records
-    ]
-    return [from_frame(record) if isinstance(record, DataFrame) else record for record in read]
-
-
-def from_frame(frame: DataFrame) -> Grasps:
-    """Return the grasps of a table with a row a sample, in which each row repeats what is known of its grasp;
-    columns as in the two files of :func:`read_grasps`.  What is refused is named by its row, the first one
-    1."""
-    table = frame_table(frame.reset_index(drop=True), "DataFrame", text=_is_text, tolerated=0.0)
-    return _of_tables(table, None, "DataFrame")
+    read: list[Any] = []
+    for record in records:
+        if isinstance(record, DataFrame):
+            rows = record.reset_index(drop=True)
+            table = frame_table(rows, "DataFrame", text=_is_text, tolerated=0.0)
+            read.append(_of_tables(table, None, "DataFrame"))
+        else:
+            read.append(read_grasps(record) if isinstance(record, str | Path) else record)
+    return read
 
 
 def write_grasps(grasps: Grasps, path: str | Path) -> Path:

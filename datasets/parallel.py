@@ -39,23 +39,6 @@ _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
 
 
-def run_parallel(
-    function: Callable[[_Item], _Result],
-    items: Iterable[_Item],
-    workers: Workers = 1,
-    progress: Progress | None = None,
-    *,
-    what: str = "working",
-) -> list[_Result]:
-    """Return ``[function(item) for item in items]``, computed on so many processes or on a cluster.
-
-    The first exception that ``function`` raises stops the rest and is raised here.  A single item runs in
-    this process; more processes are never started than there are processors.  ``progress`` is called with
-    the fraction done and ``what``.
-    """
-    return list(in_order(function, items, workers, progress, what=what))
-
-
 def in_order(
     function: Callable[[_Item], _Result],
     items: Iterable[_Item],
@@ -64,8 +47,13 @@ def in_order(
     *,
     what: str = "working",
 ) -> Iterator[_Result]:
-    """Yield the results of :func:`run_parallel` in the order of the items, each once it and those before it
-    are there."""
+    """Yield ``function(item)`` of each item in their order, computed on so many processes or on a cluster,
+    each once it and those before it are there.
+
+    The first exception that ``function`` raises stops the rest and is raised here.  A single item runs in
+    this process; more processes are never started than there are processors.  ``progress`` is called with
+    the fraction done and ``what``.
+    """
     todo = list(items)
     waiting: dict[int, _Result] = {}
     following = 0

@@ -30,7 +30,7 @@ from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.errors import UserError, known_names
 from thermogrip.datasets.log_files import Logs, as_logs
 from thermogrip.datasets.media import Shown
-from thermogrip.datasets.parallel import Workers, run_parallel, sub_progress
+from thermogrip.datasets.parallel import Workers, in_order, sub_progress
 from thermogrip.datasets.schema import Log, log_name
 from thermogrip.sysid.blackbox.fit import (
     BLACK_BOXES,
@@ -522,7 +522,7 @@ def _hold_out(
     if task.options.leave_one_out and workers != 1 and portable:
         items: list[_FoldItem] = [(kind, case, kept, task, None) for kind, case in pairs]
         report = steps.start("left out", of=len(items))
-        return run_parallel(_fold_of, items, workers, report, what="fitting")
+        return list(in_order(_fold_of, items, workers, report, what="fitting"))
     return [
         _fold_of((kind, case, kept, task, steps.start(f"{kind} without {_case_name(case)}")))
         for kind, case in pairs

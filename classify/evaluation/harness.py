@@ -42,7 +42,7 @@ from thermogrip.classify.evaluation.comparison import Caution, Comparison
 from thermogrip.classify.evaluation.splits import Fold, Plan, plan_folds
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.grasp_files import Records
-from thermogrip.datasets.parallel import Progress, Workers, run_parallel
+from thermogrip.datasets.parallel import Progress, Workers, in_order
 from thermogrip.datasets.schema import Grasps, log_name, unit_names
 from thermogrip.sysid.effusivity.quality import check_grasps, contact_faults
 
@@ -164,7 +164,7 @@ def evaluate(
     )
     late = _late(plan) if probe else ()
     jobs = _jobs(named, plan, probe and not late)
-    done = run_parallel(_run_job, jobs, workers, progress, what="train and test")
+    done = list(in_order(_run_job, jobs, workers, progress, what="train and test"))
     order = {name: i for i, name in enumerate(named)}
     results = sorted(
         (r for job_results in done for r in job_results), key=lambda r: (order.get(r.classifier, -1), r.order)

@@ -18,7 +18,12 @@ import pytest
 from thermogrip import __version__
 from thermogrip.datasets import parallel
 from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.parallel import in_order, run_parallel, sub_progress
+from thermogrip.datasets.parallel import in_order, sub_progress
+
+
+def run_parallel(*given, **options):
+    return list(in_order(*given, **options))
+
 
 OWN = ["__import__('os').getpid()"] * 4  # a process may not find this module, the builtin eval it does
 
@@ -223,9 +228,9 @@ def test_processes_begin_with_our_modules_and_not_with_files_of_the_folder(tmp_p
     program = """
 import os, sys
 sys.path.remove("")
-from thermogrip.datasets.parallel import run_parallel
-found = run_parallel(eval, ["hasattr(__import__('colorsys'), 'hsv_to_rgb')"] * 2, 2)
-threads = run_parallel(os.getenv, ["OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"], 2)
+from thermogrip.datasets.parallel import in_order
+found = [*in_order(eval, ["hasattr(__import__('colorsys'), 'hsv_to_rgb')"] * 2, 2)]
+threads = [*in_order(os.getenv, ["OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"], 2)]
 print(found, threads, "PYTHONSAFEPATH" in os.environ, "OPENBLAS_NUM_THREADS" in os.environ)
 """
     apart = ("PYTHONSAFEPATH", *parallel.THREADS)
@@ -240,10 +245,10 @@ print(found, threads, "PYTHONSAFEPATH" in os.environ, "OPENBLAS_NUM_THREADS" in 
 def test_a_ctrl_c_ends_the_processes_too(tmp_path):
     program = """
 import os, signal, threading
-from thermogrip.datasets.parallel import run_parallel
-run_parallel(abs, [-1, 2], 2)
+from thermogrip.datasets.parallel import in_order
+list(in_order(abs, [-1, 2], 2))
 threading.Timer(1.0, os.killpg, (os.getpgid(0), signal.SIGINT)).start()
-run_parallel(eval, ["__import__('time').sleep(300)"] * 2, 2)
+list(in_order(eval, ["__import__('time').sleep(300)"] * 2, 2))
 """
     done = subprocess.run(
         [sys.executable, "-c", program], capture_output=True, text=True, timeout=200, start_new_session=True

@@ -59,7 +59,7 @@ def test_logs_left_out_on_other_processes_give_the_same(monkeypatch):
         asked.append((workers, len(items)))
         return [function(item) for item in items]
 
-    monkeypatch.setattr(identification, "run_parallel", parallel)
+    monkeypatch.setattr(identification, "in_order", parallel)
     shared = identify(logs, **how, workers=2)
     assert asked == [(2, 4)]
     assert (shared.rows, shared.notes, shared.model) == (alone.rows, alone.notes, alone.model)

@@ -209,7 +209,7 @@ def repeat_paper(
     from thermogrip.classify.estimators.registry import make_classifier
     from thermogrip.classify.evaluation.harness import evaluate
     from thermogrip.datasets.examples import load_example_grasps
-    from thermogrip.datasets.parallel import run_parallel, sub_progress
+    from thermogrip.datasets.parallel import in_order, sub_progress
 
     models = {name: make_classifier(name, quick=quick, seed=seed) for name in CLASSIFIERS}
     for model in models.values():
@@ -233,7 +233,7 @@ def repeat_paper(
         probe=False,
         progress=sub_progress(progress, 0.5, 0.8, "simulated grasps"),
     )
-    copies = run_parallel(
+    copies = in_order(
         _train_on_copies,
         [(case, examples[case.record], quick, seed) for case in CASES],
         workers,
