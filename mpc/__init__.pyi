@@ -12,7 +12,6 @@ from thermogrip.mpc.design.spec import read_spec as read_spec
 from thermogrip.mpc.interface import Move as Move
 from thermogrip.mpc.tuning.design_review import Check as Check
 from thermogrip.mpc.tuning.design_review import review as review
-from thermogrip.mpc.tuning.figures import closed_loop_figure as closed_loop_figure
 from thermogrip.mpc.tuning.tune import Tuning as Tuning
 from thermogrip.mpc.tuning.tune import tune as tune
 

@@ -19,7 +19,8 @@ import pandas as pd
 from matplotlib_inline.backend_inline import set_matplotlib_formats
 
 from thermogrip.datasets import load_example_logs
-from thermogrip.mpc import Spec, closed_loop_figure, review, simulate_closed_loop, tune
+from thermogrip.mpc import Spec, review, simulate_closed_loop, tune
+from thermogrip.report import plot
 from thermogrip.sysid import identify
 
 set_matplotlib_formats("png")  # figures are shown under their cells
@@ -60,7 +61,7 @@ controller
 
 # %%
 loop = simulate_closed_loop(controller, plant.draw(2), [(38.0, 300.0), (30.0, 300.0)], start=28.0)
-figure = closed_loop_figure(loop, "28 to 38 to 30 degC, on a draw of the plant")
+figure = plot(loop)  # 28 to 38 to 30 degC, on a draw of the plant
 figure.set_size_inches(8, 5)
 figure
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from thermogrip.datasets.charts import Chart, Curve, Panel
+from thermogrip.report.charts import Chart, Curve, Panel
 from thermogrip.report.html import Commands, Picture, Plot, Section, Table, Text, write_report
 
 TIME = np.arange(0.0, 1000.0)

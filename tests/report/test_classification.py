@@ -13,10 +13,10 @@ import pytest
 from matplotlib.figure import Figure
 
 from thermogrip.classify import evaluate, make_classifier
-from thermogrip.datasets.charts import Chart
 from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.datasets.schema import make_log
 from thermogrip.report import classification
+from thermogrip.report.charts import Chart
 from thermogrip.report.classification import (
     comparison_sections,
     effusivity_section,

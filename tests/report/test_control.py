@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from tests.mpc.makers import make_tank
-from thermogrip.datasets.charts import Chart
 from thermogrip.mpc.closed_loop.simulate import ClosedLoop, Segment
 from thermogrip.mpc.controllers.mpc import Controller
 from thermogrip.mpc.controllers.pi import PIController
 from thermogrip.mpc.design.spec import Spec
 from thermogrip.mpc.tuning.design_review import Check
 from thermogrip.report import control
+from thermogrip.report.charts import Chart
 from thermogrip.report.html import Plot, Table, Text
 
 NAN, INF = float("nan"), float("inf")

@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from thermogrip.datasets.charts import Chart, Curve, Panel
 from thermogrip.datasets.provenance import work
+from thermogrip.report.charts import Chart, Curve, Panel
 from thermogrip.report.html import (
     SETTINGS,
     Commands,

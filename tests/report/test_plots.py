@@ -14,12 +14,12 @@ from matplotlib.text import Text as MplText
 
 from tests.end_to_end.conftest import HEADER, small_log_rows, small_plant
 from tests.report.conftest import described
-from thermogrip.datasets.charts import draw_chart
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.log_files import read_log
 from thermogrip.datasets.schema import make_grasps, make_log
 from thermogrip.mpc import PIController, simulate_closed_loop
 from thermogrip.report import plot
+from thermogrip.report.charts import draw_chart
 from thermogrip.report.plots import (
     bode_chart,
     corner_figure,

@@ -47,10 +47,9 @@ def plot(result: Identification | FreeRun | Plant | ClosedLoop | Comparison, *, 
     """
     from thermogrip.classify.evaluation.comparison import Comparison
     from thermogrip.classify.figures import accuracy_figure
-    from thermogrip.datasets.charts import draw_chart
     from thermogrip.mpc.closed_loop.simulate import ClosedLoop
-    from thermogrip.mpc.tuning.figures import closed_loop_figure
     from thermogrip.report import plots
+    from thermogrip.report.charts import draw_chart
     from thermogrip.sysid.export.dynamics import plant_dynamics
     from thermogrip.sysid.identification import Identification
     from thermogrip.sysid.plant.plant import Plant
@@ -64,7 +63,7 @@ def plot(result: Identification | FreeRun | Plant | ClosedLoop | Comparison, *, 
         dynamics = plant_dynamics(result)
         return draw_chart(plots.bode_chart(dynamics) if bode else plots.step_response_chart(dynamics))
     if isinstance(result, ClosedLoop):
-        return closed_loop_figure(result)
+        return draw_chart(plots.closed_loop_chart(result))
     if isinstance(result, Comparison):
         return accuracy_figure(result)
     raise TypeError(f"there is no picture of a {type(result).__name__}")

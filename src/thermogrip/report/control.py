@@ -13,11 +13,10 @@ import numpy as np
 from thermogrip.mpc.closed_loop.simulate import session_loop
 from thermogrip.mpc.controllers.mpc import Controller
 from thermogrip.mpc.controllers.pi import PIController
-from thermogrip.mpc.tuning.figures import closed_loop_chart
 from thermogrip.mpc.tuning.objective import meets_spec
 from thermogrip.report.console import Cells, Columns, cells, short
 from thermogrip.report.html import Plot, Section, Table, Text
-from thermogrip.report.plots import grasps_chart, steps_chart
+from thermogrip.report.plots import closed_loop_chart, grasps_chart, steps_chart
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

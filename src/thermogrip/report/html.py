@@ -25,9 +25,9 @@ import numpy as np
 
 from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.atomic_files import write_atomic
-from thermogrip.datasets.charts import Chart, Curve, draw_chart, thinned
 from thermogrip.datasets.media import printable
 from thermogrip.datasets.provenance import provenance
+from thermogrip.report.charts import Chart, Curve, draw_chart, thinned
 from thermogrip.report.console import short
 
 if TYPE_CHECKING:

@@ -1,7 +1,7 @@
 """Charts and figures of a plant and of a session: free runs, posterior, closed loops, grasps.
 
 They take records and numbers.  What a reader wants to zoom into is a chart
-(:class:`~thermogrip.datasets.charts.Chart`), the rest are matplotlib figures.  Figures of a classifier's
+(:class:`~thermogrip.report.charts.Chart`), the rest are matplotlib figures.  Figures of a classifier's
 results are in :mod:`thermogrip.classify.figures`.
 """
 
@@ -14,10 +14,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from thermogrip.datasets.arrays import Array
-from thermogrip.datasets.charts import DASHES, INK, PALETTE, SOFT, Chart, Curve, Panel, stretches
 from thermogrip.datasets.errors import UserError, known_names
+from thermogrip.datasets.limits import LARGEST
 from thermogrip.datasets.media import panels
 from thermogrip.datasets.schema import Grasps, Log, column, log_name, names
+from thermogrip.report.charts import DASHES, INK, PALETTE, SOFT, Chart, Curve, Panel, stretches
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -156,6 +157,46 @@ def loops_chart(runs: Mapping[str, Log], targets: Mapping[str, float], output: s
         top = Panel("temperature [degC]", (*others, goal, regulated), title, 2.2)
         columns.append((top, Panel("inputs", drives)))
     return Chart(tuple(columns), wide=3.6)
+
+
+def closed_loop_chart(
+    run: ClosedLoop, title: str = "", *, limits: Mapping[str, tuple[float, float]] | None = None
+) -> Chart:
+    """Return the regulated outputs with target and band, the others with their limits (the tank's) [degC],
+    and the drives; any status but ``ok`` is a cross on the drive."""
+    t, called = run.time, run.sample_time
+    ends = called[[0, -1]]
+    regulated, driven = [], []
+    for k, (name, goal) in enumerate(run.target.items()):
+        band = {"low": goal - run.band, "high": goal + run.band}
+        label = f"target, \N{PLUS-MINUS SIGN}{run.band:g} degC"
+        regulated.append(Curve(label, called, goal, INK, 1.0, "--", step=True, **band))
+        regulated.append(Curve(name, t, run.outputs[name], PALETTE[k % 5], 1.6))
+    settled = tuple(
+        segment.begin_s + segment.settle_s for segment in run.segments if np.isfinite(segment.settle_s)
+    )
+    rows = [Panel("regulated [degC]", tuple(regulated), title, 2.4, marks=settled)]
+    others = [name for name in run.outputs if name not in run.target]
+    if others:
+        curves = []
+        for k, name in enumerate(others):
+            colour = PALETTE[(2 + k) % 5]
+            curves.append(Curve(name, t, run.outputs[name], colour, 1.2))
+            curves += [
+                Curve(f"limits of {name}", ends, np.full(2, end), colour, 1.0, "-.")
+                for end in (limits or {}).get(name, ())
+                if abs(end) < LARGEST  # an open end
+            ]
+        rows.append(Panel("others [degC]", tuple(curves), height=1.3))
+    for k, (name, values) in enumerate(run.drive.items()):
+        driven.append(Curve(name, called, values, PALETTE[(1 + k) % 5], 1.2, step=True))
+        driven += [Curve("range", ends, np.full(2, end), SOFT, 0.9) for end in run.drive_range[name]]
+    odd = np.array([status != "ok" for status in run.status])
+    if odd.any():
+        first = next(iter(run.drive.values()))
+        driven.append(Curve("status not ok", called[odd], first[odd], "#a3262a", dash=""))
+    rows.append(Panel("drive", tuple(driven)))
+    return Chart((tuple(rows),), wide=8.6)
 
 
 def steps_chart(runs: Mapping[str, ClosedLoop]) -> Chart:

@@ -12,9 +12,10 @@ from matplotlib.figure import Figure
 
 from tests.report.conftest import described
 from thermogrip.datasets.limits import LARGEST
-from thermogrip.mpc.tuning.figures import closed_loop_chart, closed_loop_figure
+from thermogrip.report.charts import draw_chart
+from thermogrip.report.plots import closed_loop_chart
 
-DRAWN = Path(__file__).with_name("figures.txt")
+DRAWN = Path(__file__).with_name("closed_loop_chart.txt")
 
 
 def run() -> Any:
@@ -29,11 +30,11 @@ def run() -> Any:
 
 
 def test_each_figure_shows_what_it_should_in_the_colours_widths_and_units_of_the_record() -> None:
-    """``figures.txt`` has every artist; THERMOGRIP_FIGURES=write writes it anew: read the difference."""
+    """``closed_loop_chart.txt`` has every artist; THERMOGRIP_FIGURES=write writes it: read the difference."""
     alone: Any = SimpleNamespace(**{**vars(run()), "outputs": {"skin": run().outputs["skin"]}})
     figures: dict[str, Figure] = {
-        "closed loop": closed_loop_figure(run(), "a run", limits={"tank": (20.0, 45.0)}),
-        "closed loop of one output": closed_loop_figure(alone),
+        "closed loop": draw_chart(closed_loop_chart(run(), "a run", limits={"tank": (20.0, 45.0)})),
+        "closed loop of one output": draw_chart(closed_loop_chart(alone)),
     }
     found = [line for name, figure in figures.items() for line in (f"# {name}", *described(figure))]
     if os.environ.get("THERMOGRIP_FIGURES") == "write":

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from thermogrip.datasets.charts import Chart, Curve, Panel, draw_chart, stretches, thin, thinned
+from thermogrip.report.charts import Chart, Curve, Panel, draw_chart, stretches, thin, thinned
 
 ROWS = st.integers(1, 400).flatmap(
     lambda n: st.lists(
