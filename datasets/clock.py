@@ -82,6 +82,7 @@ _DATES = (
     _Counts(1e-7, -62_135_596_800.0),  # ticks of .NET, since the year 1
     _Counts(86400.0, -25569 * 86400.0, "a spreadsheet"),  # since 30 December 1899
     _Counts(86400.0, -719529 * 86400.0, "MATLAB"),  # datenum
+    _Counts(86400.0, -2440587.5 * 86400.0, "astronomers"),  # Julian
 )
 
 

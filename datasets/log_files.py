@@ -146,8 +146,8 @@ def read_log(
         log = _made(read.clock.seconds, read.values, repairs, read, roles, file)
         log.attrs.update({k: v for k, v in table.meta.items() if k not in ("schema", "version")})
     else:
-        roles = replace(roles, doubts=(*roles.doubts, *_code_doubts(roles.of, read.values)))
         repaired = _repair(read.clock.seconds, read.values, read.units, roles.of, table)
+        roles = replace(roles, doubts=(*roles.doubts, *_reading_doubts(roles.of, repaired)))
         if outputs is None:
             roles = _without_half_lost(roles, repaired.time, repaired.columns)
         repairs = [*read.repairs, *repaired.repairs]
@@ -330,7 +330,8 @@ def _states_as_columns(table: Table, clock: Clock) -> Table:
     notes = []
     for header in [header for header in table.text if header not in clock.columns]:
         counts = Counter(cell for cell in text[header] if cell)
-        if not 2 <= len(counts) <= MOST_STATES or counts.total() < 5 * len(counts):
+        few_words = 2 <= len(counts) <= MOST_STATES and counts.total() >= 5 * len(counts)
+        if not few_words or not all(any(map(str.isalpha, word)) for word in counts):  # numbers, misspelt
             continue
         cells = text.pop(header)
         resting_state = max(counts, key=lambda word: (word.lower() in ("off", "idle", "0"), counts[word]))
@@ -350,7 +351,11 @@ def _one_column_a_signal(table: Table) -> Table:
     clocks += [h for h in table.numbers if read_header(h).name in ("time", "timestamp")]
     states = {h: switched(cells) for h, cells in table.text.items() if h not in clocks}
     named = [h for h in states if states[h] is None and 2 <= len({*table.text[h]}) <= MOST_SIGNALS]
-    clocks = [h for h in clocks if len({*(table.text.get(h) or table.numbers[h].tolist())}) > 1]
+    stamps = {h: table.text.get(h) or table.numbers[h].tolist() for h in clocks}
+    clocks = [h for h in clocks if len({*stamps[h]}) > 1]
+    if len(named) > 1 and clocks and 2 * len({*stamps[clocks[0]]}) <= len(table.lines):
+        # beside each stamp a signal stands once, words of its quality do not
+        named = [max(named, key=lambda h: len({*zip(stamps[clocks[0]], table.text[h])}))]
     if not clocks or len(named) != 1:
         return table
     signals = [name.rpartition(".")[2] for name in table.text[named[0]]]
@@ -426,11 +431,11 @@ def _repair(
     return _Repaired(time, columns, repairs)
 
 
-def _code_doubts(roles: Mapping[str, str], columns: Mapping[str, Floats]) -> list[str]:
-    """Return a line for each reading with runs of what may be a sensor's code that no table has."""
-    inputs = [values for name, values in columns.items() if roles[name] == "input"]
-    readings = {name: v for name, v in columns.items() if roles[name] in ("output", "disturbance")}
-    doubts = (repair.doubt_codes(name, values, inputs) for name, values in readings.items())
+def _reading_doubts(roles: Mapping[str, str], log: _Repaired) -> list[str]:
+    """Return a line for each reading with runs like a sensor's code, or a jump that no input makes."""
+    inputs = [values for name, values in log.columns.items() if roles[name] == "input"]
+    readings = {name: v for name, v in log.columns.items() if roles[name] in ("output", "disturbance")}
+    doubts = (repair.doubt_readings(name, values, inputs, log.time) for name, values in readings.items())
     return [doubt for doubt in doubts if doubt]
 
 

@@ -178,7 +178,28 @@ def drop_codes(name: str, values: Floats) -> tuple[Floats, list[str]]:
     return values, repairs
 
 
-def doubt_codes(name: str, values: Floats, inputs: Sequence[Floats]) -> str:
+def doubt_readings(name: str, values: Floats, inputs: Sequence[Floats], time: Floats) -> str:
+    """Return the doubt on an output's codes, or on its largest jump; empty where there is none."""
+    return _doubt_codes(name, values, inputs) or _doubt_jump(name, values, inputs, time)
+
+
+def _doubt_jump(name: str, values: Floats, inputs: Sequence[Floats], time: Floats) -> str:
+    """Return the doubt on a level that a reading jumps to for good while no input moves."""
+    moves = np.abs(np.diff(values))
+    if not np.isfinite(moves).any():
+        return ""
+    row = int(np.nanargmax(moves))
+    before, after = values[max(row - SPIKE_WINDOW, 0) : row + 1], values[row + 1 : row + 1 + SPIKE_WINDOW]
+    stays = np.abs(np.nanmedian(after) - np.nanmedian(before)) > moves[row] / 2
+    in_gap = time[row + 1] - time[row] > GAP_STEPS * np.median(np.diff(time))
+    driven = any(np.any(np.diff(u[max(row - SPIKE_LENGTH, 0) : row + 2])) for u in inputs)
+    if not stays or in_gap or driven or not _rows_beyond_jumps(values, np.arange(values.size) > row).any():
+        return ""
+    problem = f"{name} jumps from {values[row]:g} to {values[row + 1]:g} and stays there while no input moves"
+    return f"{problem}: if its sensor was changed there, cut the log: LOG@{time[row + 1] - time[0]:g}:"
+
+
+def _doubt_codes(name: str, values: Floats, inputs: Sequence[Floats]) -> str:
     """Return the doubt on the end of an output's range where it is held in runs like a sensor's code, entered
     and left by jumps while no input moves; empty where there is none."""
     for end in (np.nanmin(values), np.nanmax(values)):

@@ -21,7 +21,7 @@ helps to predict an output) is reported as a doubt.  Whoever states the roles ha
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 
@@ -49,14 +49,14 @@ _INPUT = re.compile(
     DRIVE.pattern + r"|(^|_)(pwm|duty|heater|relay)$|^[a-z]?\d?@$"  # @ is the duty of a printer's board
 )
 _READING = re.compile(r"_(temp|temperature)$")  # of a heater too: heater_bed_temp
+_TEMPERATURE = re.compile(r"^(t|temp|temperature)(\d*|_.*)$|" + _READING.pattern)  # of the plant or around it
 _OUTPUT = re.compile(
-    r"^(t|y|temp|temperature|level|outlet|position|speed|pv|angle|velocity|response|measured)(\d*|_.*)$"
-    r"|" + _READING.pattern
+    r"^(y|level|outlet|position|speed|pv|angle|velocity|response|measured)(\d*|_.*)$|" + _TEMPERATURE.pattern
 )
 _INFLOW = re.compile(r"(^|_)(inlet|inflow|supply_air)(_|$)")
 _BOOKKEEPING = re.compile(
     r"^(error|err|control_error|integral|derivative|[pid]_?(term|part|action)|k_?[pidc]|pid_[pid]"
-    r"|hour|day|month|year|week|weekday|row|index|id|iteration|sample|record|counter)(_of_[a-z]+|_?no|_?\d+)?$"
+    r"|ms|msec|hour|day|month|year|week|weekday|row|index|id|iteration|sample|record|counter)(_of_[a-z]+|_?no|_?\d+)?$"
 )
 _MODES = {"auto", "automatic", "manual", "mode", "status"}  # of a controller
 IS_SET_POINT = "its name is that of a set point"
@@ -274,6 +274,12 @@ def _doubts(
     unclear = [n for n in columns if roles[n] == "other" and reasons.get(n, NO_CLUE) == NO_CLUE]
     unclear += [n for n, why in reasons.items() if roles[n] == "other" and why.startswith("it moves in most")]
     moving = [n for n in unclear if np.ptp(columns[n][np.isfinite(columns[n])]) > 0]
+    read = [columns[n] for n in outputs]
+    for name in [n for n in inputs if n in reasons and len(read) > 1 and not _is_held(columns[n])]:
+        # under a proportional controller one reading is enough
+        if _explains(columns[name], *read) and not any(_explains(columns[name], one) for one in read):
+            problem = f"{name} is taken as input, and is computed from {', '.join(outputs)}"
+            doubts.append(f"{problem}: a heat or a flow, or a drive under feedback")
     for name in moving if inputs else ():
         helped = next((n for n in outputs if _helps_beside(columns, name, n, inputs)), None)
         if helped is not None:
@@ -350,7 +356,7 @@ def _unnamed_causes(
     columns: Mapping[str, Floats], guesses: Mapping[str, tuple[str, str]], stated: Mapping[str, str]
 ) -> dict[str, tuple[str, str]]:
     """Return what acts on the outputs although no name says so: held columns that help to predict one are
-    inputs; what no drive moves, and no name calls a reading, is a disturbance."""
+    inputs; what no drive moves beside a reading that one does is a disturbance."""
     roles = {name: role for name, (role, _) in guesses.items()} | dict(stated)
     drives, outputs = ([n for n in columns if roles[n] == role] for role in ("input", "output"))
     if not drives or not outputs:
@@ -361,21 +367,30 @@ def _unnamed_causes(
         if helped is not None:
             out[name] = "input", f"it is held between its moves and helps to predict {helped}"
     drives += out
-    moved = {name: _is_moved(columns, name, drives) for name in outputs}
-    for name in [n for n in outputs if guesses.get(n, ("", ""))[1].startswith((BY_UNIT, FOLLOWS))]:
-        if not moved[name] and any(moved[other] for other in outputs):
+    unnamed = [n for n in outputs if guesses.get(n, ("", ""))[1].startswith((BY_UNIT, FOLLOWS))]
+    # two lags leave some of a smooth weather to be explained by whatever moved meanwhile
+    unmoved = [n for n in outputs if not _is_moved(columns, n, drives, at_lags=all if n in unnamed else any)]
+    moved = [n for n in outputs if n not in unmoved]
+    for name in [n for n in unmoved if n in guesses and moved]:
+        of_temperature = _TEMPERATURE.search(_name_words(name))  # it may follow what a drive moves
+        if name in unnamed or (of_temperature and not _is_moved(columns, name, moved)):
             out[name] = "disturbance", f"it does not respond to {', '.join(drives)}"
     return out
 
 
-def _is_moved(columns: Mapping[str, Floats], name: str, drives: Sequence[str]) -> bool:
+def _is_moved(
+    columns: Mapping[str, Floats],
+    name: str,
+    drives: Sequence[str],
+    at_lags: Callable[[Iterable[bool]], bool] = any,
+) -> bool:
     """Tell whether the past of a drive helps to predict a column, as long as the column is not stuck."""
     is_sound = np.isfinite(drop_stuck(name, columns[name], [columns[n] for n in drives])[0])
     if is_sound.sum() < _ROLES.fewest_rows:
         return True  # nothing of it speaks against
     reading, *moves = _standardised([columns[n][is_sound] for n in (name, *drives)])
-    gains = (_gain(reading, drive, (), lags) for drive in moves for lags in _ROLES.lags)
-    return any(gain > _ROLES.strong_gain for gain in gains)
+    gains = ([_gain(reading, drive, (), lags) for lags in _ROLES.lags] for drive in moves)
+    return any(at_lags(gain > _ROLES.strong_gain for gain in by_lags) for by_lags in gains)
 
 
 def _name_words(name: str) -> str:
@@ -458,6 +473,8 @@ def _explains(y: Floats, *some: Floats) -> bool:
     if min(np.count_nonzero(np.diff(v)) for v in (y, some[-1])) < _ROLES.fewest_moves:
         return False
     x = np.column_stack([np.ones(y.size), *some])
+    whole = np.isfinite(x).all(axis=1) & np.isfinite(y)
+    x, y = x[whole], y[whole]
     moves = np.abs(np.diff(y))
     least = max(_ROLES.exact * float(np.ptp(y)), float(moves[moves > 0].min(initial=np.inf)))
     for rows in (slice(0, 200), slice(None)):

@@ -21,7 +21,7 @@ from collections import Counter
 from collections.abc import Callable, Container, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from itertools import chain, count, islice
+from itertools import chain, count, islice, pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -46,6 +46,7 @@ _LOST_CELLS = frozenset(
 )  # fmt: skip
 _CODINGS = {"cp1252": "Windows-1252", "cp932": "Shift-JIS", "gb18030": "GB 18030"}
 _COMMENT = ("#", "%", "//")  # how a line begins that is no row
+_GOOD = frozenset(["good", "ok", "valid"])  # what servers of readings (OPC) call those that are some
 _LEFT_OUT = "\x1f"  # how the name of a column begins that is not kept
 _NAMELESS = "columns named c1 to c{} by position; --columns a,b,... names them"
 _HEAD_LINES = 200  # of a file, that show how it is a table: the longest preamble seen has 40
@@ -74,8 +75,8 @@ _SWITCH = {
 _NUMBER_CELL = re.compile(
     r"[+-]?(\d+\.?\d*([eE][+-]?\d+)?|\.\d+([eE][+-]?\d+)?|inf|infinity)", re.ASCII | re.IGNORECASE
 )
-# what spreadsheets print within numbers: a minus that is no hyphen, a mark between thousands
-_PRINTED_MINUS, _THOUSANDS = "\u2212", re.compile(r"(?<=\d)[\xa0\u2009\u202f'\u2019](?=\d{3}(?!\d))")
+# what programs print within numbers: a mark between thousands, blanks behind a sign
+_PRINTED_BLANKS = re.compile(r"(?<=\d)[\xa0\u2009\u202f'\u2019](?=\d{3}(?!\d))|(?<=^[+-])\s+(?=\d)")
 _WITH_UNIT = re.compile(r"([+-]?[\d.,]+(?:[eE][+-]?\d+)?)\s*([^\W\d_]{1,4}|%|[°º]\s?[CFK])")
 
 
@@ -142,7 +143,7 @@ def parse_text(data: bytes, file: str, columns: Sequence[str] | None = None) -> 
     text, labelled = _without_labels(text)
     if not labelled:
         text = _stamps_as_column(text)
-    layout = find_layout(text, file)
+    layout = find_layout(text, file, named=columns is not None)
     notes = (*coded, *labelled, *layout.notes)
     if columns is not None:
         named = [name for name in layout.names if not name.startswith(_LEFT_OUT)]
@@ -178,8 +179,9 @@ def check_header(headers: Sequence[str], names: Sequence[str], file: str) -> Non
         raise UserError("has no header", file=file, hint=hint)
 
 
-def find_layout(text: str, file: str) -> Layout:
-    """Return how a text is a table, from its first lines."""
+def find_layout(text: str, file: str, *, named: bool = False) -> Layout:
+    """Return how a text is a table, from its first lines; a header of fewer names than cells is refused, but
+    where the columns are ``named`` otherwise."""
     head = [(place, line) for place, line in enumerate(_head_lines(text), start=1) if line.strip()]
     head = head[:_HEAD_LINES]
     separator, first = _best_separator([line for _, line in head])
@@ -192,9 +194,13 @@ def find_layout(text: str, file: str) -> Layout:
     header, used = _names_above([line for _, line in head[:first]], n, separator)
     hollow = not header[-1] and all(row[-1] == "" for row in rows)  # every line ends with a separator
     nameless = [f"c{place}" for place, name in enumerate(header[: n - hollow], 1) if not name]
+    above = len(_split_cells(head[first - 1][1].lstrip("#%/ "), separator)) if first else 0
+    if 1 < above == n - 1 and any(header) and not (hollow or named):
+        # commas may be decimals, or the first column be without a name: each name would be another column's
+        hint = f"name all with --columns {','.join(['NAME'] * n)}, or write decimals with a point"
+        raise UserError(f"has {n - 1} names above rows of {n} cells", file=file, hint=hint)
     notes = []
     if len(nameless) == n - hollow:
-        above = len(_split_cells(head[first - 1][1].lstrip("#%/ "), separator)) if first else 0
         why = f"{above} names above rows of {n} cells" if above > n else "no header"
         notes = [f"{why}: {_NAMELESS.format(n - hollow)}"]
     elif nameless:
@@ -226,6 +232,10 @@ def _best_separator(lines: Sequence[str]) -> tuple[str, int | None]:
         if n and values > most_values + 1e-9:
             most_values = values
             places = [place for place, length in enumerate(lengths) if length == n]
+            # a line of properties (`Size 8 Size 2`) has words, and half of a row's numbers at most
+            numbers = [sum(_is_value(cell, separator) for cell in row if cell) for row in rows]
+            usual = np.median([numbers[place] for place in places])
+            places = [k for k in places if _number_share(rows[k], separator) == 1 or numbers[k] > usual / 2]
             # one that is alone, without names above it, is of a preamble
             of_table = (k for k in places if k + 1 in places or (k and len(rows[k - 1]) == n))
             best, best_first = separator, next(of_table, places[0])
@@ -246,8 +256,13 @@ def _split_cells(line: str, separator: str) -> list[str]:
         return []
 
 
+def _as_typed(cell: str) -> str:
+    """Return a cell without what programs print within numbers; a minus may be no hyphen."""
+    return _PRINTED_BLANKS.sub("", cell.replace("\u2212", "-"))
+
+
 def _is_value(cell: str, separator: str) -> bool:
-    cell = _THOUSANDS.sub("", cell.replace(_PRINTED_MINUS, "-"))
+    cell = _as_typed(cell)
     plain = cell if separator == "," else cell.replace(",", ".")
     if (
         _NUMBER_CELL.fullmatch(plain)
@@ -266,28 +281,34 @@ def _number_share(row: Sequence[str], separator: str) -> float:
 
 def _names_above(lines: Sequence[str], n: int, separator: str) -> tuple[list[str], int]:
     """Return the names of n columns, empty where the file has none, and the number of their lines."""
-    headers: list[list[str]] = []  # the nearest first: units may stand under the names
+    headers: list[list[str]] = []  # the nearest first
+    counted: list[bool] = []  # those that are no comments
+    units = [""] * n
     for line in reversed(lines):
         comment = line.startswith(_COMMENT)
         cells = _split_cells(line.lstrip("#%/ ") if comment else line, separator)
         if separator == " " and len(cells) != n:
             cells = [cell.strip() for cell in re.split(r"\s{2,}|\t|,|;", line.strip("#%/ "))]
+        words = [*filter(None, cells)]
         fits = len(cells) == n or len(cells) == n - 1 > 1
-        of_words = _number_share([*filter(None, cells)], separator) < 0.5
-        if fits and any(cells) and of_words and not (comment and headers):
+        if fits and words and _number_share(words, separator) < 0.5 and not (comment and headers):
             headers.append([*cells, ""][:n])
-        words = [cell for cell in headers[0] if cell] if headers else []
-        # a line of units has another word above what counts rows or times
-        if len(headers) == 2 or (words and np.mean([_is_unit(word) for word in words]) <= 0.5):
-            break
+            counted.append(not comment)
     if not headers:
-        return [""] * n, 0
-    names = headers[-1]
-    if len(headers) == 2:
-        above = zip(*reversed(headers))
-        names = [f"{name} [{unit.strip('[]()')}]" if _is_unit(unit) else name for name, unit in above]
-    used = sum(not line.startswith(_COMMENT) for line in lines[-len(headers) :])
-    return [from_csv(name) for name in names], used
+        return units, 0
+    # under the names may stand their units, with other words below what counts rows or times
+    of_units = float(np.mean([_is_unit(word) for word in headers[0] if word]))
+    has_units = len(headers) > 1 and (of_units > 0.5 or (of_units == 0.5 and n > 2))
+    if has_units:
+        units = headers.pop(0)
+    # types and statistics of columns repeat themselves; of lines that begin with what each property of a
+    # channel is (`Name a Name b`, `Type x Type y`), the first is the name
+    of_properties = headers[0].count(headers[0][0]) > 1
+    distinct = [len({*filter(None, header)}) for header in headers]
+    best = max(range(len(headers)), key=lambda k: (distinct[k], k if of_properties else -k))
+    above = zip(headers[best], units)
+    names = [f"{name} [{unit.strip('[]()')}]" if _is_unit(unit) else name for name, unit in above]
+    return [from_csv(name) for name in names], counted[best + has_units] + (has_units and counted[0])
 
 
 def _is_unit(word: str) -> bool:
@@ -395,6 +416,11 @@ def _parse_table(
         line, cells = rows.pop()
         notes.append(f"row {line} is the last and was cut off ({len(cells)} of {n} cells): dropped")
     again = [line for line, cells in rows if any(layout.header) and cells == layout.header]
+    for line, cells in rows if tolerated and any(layout.header) else ():
+        is_header = cells[0] and cells[0] in layout.header and _number_share(cells, layout.separator) == 0
+        if is_header and cells != layout.header:
+            problem = f"the header stands again with other columns: {_quoted_cell(','.join(cells))}"
+            raise UserError(problem, file=file, row=line, hint="cut the file there in two")
     if again and tolerated:  # the logger was started again
         notes.append(f"the header stands again in {name_rows(again, 5)}")
         rows = [(line, cells) for line, cells in rows if cells != layout.header]
@@ -402,7 +428,10 @@ def _parse_table(
     if len(ragged) > tolerated * len(rows):
         more = f"; {len(ragged) - 1} more rows do not fit" if len(ragged) > 1 else ""
         problem = f"has {len(dict(rows)[ragged[0]])} cell(s), the header has {n}{more}"
-        raise UserError(problem, file=file, row=ragged[0], hint="complete or remove the row")
+        hint = "complete or remove the row"
+        if len(ragged) > len(rows) / 2:
+            hint = "write one table, with the same columns in each row (lines of several kinds are none)"
+        raise UserError(problem, file=file, row=ragged[0], hint=hint)
     if ragged:
         left_out = f"{len(ragged)} row(s) with too few or too many cells left out"
         notes.append(f"{left_out} ({name_rows(ragged, 5)})")
@@ -422,7 +451,21 @@ def _parse_table(
             faults += [] if name.startswith(_LEFT_OUT) else [fault]
     if faults:
         raise _with_command(faults, names) if tolerated else faults[0]  # what may be broken is a log
+    notes += _left_empty_by_quality(columns) if tolerated else []
     return _table_of(columns, file, lines, notes)
+
+
+def _left_empty_by_quality(columns: Sequence[Column]) -> list[str]:
+    """Leave the readings empty that a column of words behind them does not call good, and return what was."""
+    notes = []
+    for value, quality in pairwise(columns):
+        words = [cell.lower() for cell in quality.text or ()]
+        bad = np.array([word not in _GOOD for word in words])
+        if value.numbers is not None and words and _GOOD & {*words} and bad.any() and bad.mean() < 0.5:
+            value.numbers = np.where(bad, np.nan, value.numbers)
+            which = _quoted_cell(words[int(bad.argmax())])
+            notes.append(f"{value.name}: {bad.sum()} reading(s) left empty, {quality.name} is {which}")
+    return notes
 
 
 def _table_of(columns: Sequence[Column], file: str, lines: NDArray[np.int64], notes: Sequence[str]) -> Table:
@@ -462,12 +505,13 @@ def read_column(
     if (plain := _plain_numbers(cells)) is not None:
         return Column(name, plain)
     printed = [cell.strip() for cell in cells]
-    cells = [_THOUSANDS.sub("", cell.replace(_PRINTED_MINUS, "-")) for cell in printed]
+    cells = [_as_typed(cell) for cell in printed]
     values = _to_numbers(cells)
     notes = [] if cells == printed else ["numbers are as printed: a long minus, marks between thousands"]
     wrong = _not_numbers(cells, values)
     if wrong.size and separator != "," and _has_decimal_comma(cells):
-        values, notes = _to_numbers([cell.replace(",", ".") for cell in cells]), [*notes, _COMMAS]
+        pointed = [cell.replace(".", "").replace(",", ".") for cell in cells]  # 1.234,5 is 1234.5
+        values, notes = _to_numbers(pointed), [*notes, _COMMAS]
         wrong = _not_numbers(cells, values)
     cells_known = len(cells) - sum(cell in _LOST_CELLS for cell in cells)
     if tolerated and wrong.size and (united := _without_unit(name, cells)) is not None:
@@ -523,8 +567,9 @@ def _not_numbers(cells: Sequence[str], values: NDArray[np.float64]) -> NDArray[n
 
 
 def _has_decimal_comma(cells: Sequence[str]) -> bool:
-    comma = re.compile(r"[+-]?\d*,\d+([eE][+-]?\d+)?")
-    return any(map(comma.fullmatch, cells)) and not any("." in cell for cell in cells)
+    comma = re.compile(r"[+-]?(\d*|\d{1,3}(\.\d{3})+),\d+([eE][+-]?\d+)?")
+    thousands = re.compile(r"[+-]?\d{1,3}(\.\d{3})+(,\d+)?")
+    return any(map(comma.fullmatch, cells)) and all(map(thousands.fullmatch, (c for c in cells if "." in c)))
 
 
 def _without_unit(name: str, cells: Sequence[str]) -> tuple[str, list[str]] | None:

@@ -819,6 +819,26 @@ def test_runs_of_an_unknown_code_are_asked_about_unless_a_drive_makes_them(write
     assert ("jumps" in doubts) == bool(said)
 
 
+@pytest.mark.parametrize("swapped", [True, False])
+def test_sensors_changed_over_are_asked_about(write, swapped):
+    heater = np.repeat([20, 80, 50, 90, 30, 70], 100)
+    noise = 0.1 * np.random.default_rng(0).standard_normal((2, 600))
+    near, far = [[1], [0.4]] * np.convolve(heater, np.ones(60) / 60)[:600] + noise
+    late = np.arange(600) >= (370 if swapped else 600)
+    pairs = zip(heater, np.where(late, far, near), np.where(late, near, far))
+    rows = "".join(f"{k},{u},{a:.2f},{b:.2f}\n" for k, (u, a, b) in enumerate(pairs))
+    doubts = read_log(write("time_s,heater,t_a_degC,t_b_degC\n" + rows)).attrs["role_doubts"]
+    assert doubts.count("stays there while no input moves") == 2 * swapped
+    assert ("LOG@370:" in doubts) == swapped
+
+
+def test_a_server_s_readings_of_bad_quality_are_none(write):
+    row = "{0},u,{1},Good\n{0},T,{2},Good\n"
+    rows = "".join(row.format(k, k // 9, 9 + k % 3) for k in range(60)) + "60,u,0,Bad\n60,T,9,Good\n"
+    log = read_log(write("time,item,value,quality\n" + rows))
+    assert column(log, "u").tolist() == [*(k // 9 for k in range(60)), 6]
+
+
 @pytest.mark.parametrize(
     ("rows", "began"),
     [

@@ -438,3 +438,17 @@ def test_what_a_drive_without_a_name_moves_is_no_weather():
     units = {"fan": "1", "chiller": "1", "kettle": "degC", "pipe": "degC"}
     roles = assign_roles(units, columns=columns).of
     assert roles == {"fan": "input", "chiller": "input", "kettle": "output", "pipe": "output"}
+
+
+def test_what_readings_say_of_each_other_is_a_doubt():
+    drive = np.repeat(np.random.default_rng(3).choice([0.0, 40.0, 90.0], 40), 25)
+    t_in = plant_of(drive)
+    columns = {"duty": drive, "t_in": t_in, "t_out": plant_of(t_in, seed=1)}
+    columns |= {
+        "q": 70 * (t_in - columns["t_out"]),
+        "t_hall": np.cumsum(plant_of(0 * drive, noise=1, seed=2)),
+    }
+    roles = assign_roles(dict.fromkeys(columns, "1"), columns=columns)
+    assert list(roles.of.values()) == ["input", "output", "output", "input", "disturbance"]
+    assert "q is taken as input, and is computed from t_in, t_out" in roles.doubts[1]
+    assert roles.doubts[0] == "t_hall is taken as disturbance: it does not respond to duty, q"

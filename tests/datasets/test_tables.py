@@ -96,6 +96,11 @@ def test_the_ending_is_the_format_and_the_rest_is_the_name(name, kind, stem):
         ("channel names:\nHeater\tTank 1\ndt:\n0.5\t0.5\ndata:\n1\t2\n3\t4\n", "Heater|Tank 1", 5, "\t",
          "4 line(s) before the table passed over"),
         ("Nr,U,T\nNO.,%,degC\n1,2,3\n2,2,3\n", "Nr|U [%]|T [degC]", 2, ",", ""),
+        ("t,n,U,T\nTS,RN,V,degC\n,,Avg,Avg\n1,2,3,4\n2,2,3,4\n", "t|n|U|T", 3, ",",
+         "2 line(s) before the table passed over"),  # the line of most names, of Campbell's four
+        ("N,U,N,T\nType,INT,Type,REAL\nSize,2,Size,8\n0,1,0,5\n1,2,1,5\n2,2,2,5\n", "N|U|2_N|T", 3, ",",
+         "N occurs again: named 2_N; 2 line(s) before the table passed over"),
+        ("Unit:;9;\nt;U;T\n1;0;5\n2;0;5\n", "t|U|T", 2, ";", "1 line(s) before the table passed over"),
         ("a,b,c\n1,x,\n2,,5\n", "a|b|c", 1, ",", ""),  # half of the cells
         ("a;b,c\n", "a;b|c", 1, ",", ""),
         ("Log\nversion\t2\nby\tme\n\nTime\tU\tT (C)\n" + "0\t1\t2\n" * 40, "Time|U|T (C)", 5, "\t",
@@ -142,6 +147,9 @@ LEFT = "row(s) with too few or too many cells left out"
         ("a,b\n1,2\n\n\n5,warm\n6,7\n", "", "row 5, column b: 'warm' is not a number"),
         ('a,b\n1,2\n"3,4\n5,6\n', "", "row 3: has 1 cell(s), the header has 2; complete"),
         ("a,b\n1,1_0\n2,3\n", "", "'1_0' is not a number"),
+        ("a,b\n1,2,5\n2,3,5\n", "", "2 names above rows of 3 cells; name all with --columns NAME,NAME"),
+        (rows(9, {4: "b,a\n"}), "", "row 6: the header stands again with other columns: 'b,a'; cut the file"),
+        ('a {"T":1,"U":2}\nb {"T":1}\n' * 9, "", "lines of several kinds are none)"),
         ("a,b\n1," + "x" * 40 + "\n2,3\n", "", f"'{'x' * 40}' is not a number"),
         ("a,b\n1," + "x" * 41 + "\n2,3\n", "", f"'{'x' * 37}...' is not a number"),
         ('a,b,c\n1,"2,5",4\n2,3,4\n', "", "row 2, column b: '2,5' is not a number; write a decimal point, or"
@@ -194,6 +202,11 @@ def test_a_table_has_4096_columns_at_most():
         ("a;b;c\n1;2,5;x\n2;-3,5e2;y\n", {"a": "1 2", "b": "2.5 -350", "c": "x y"}, [2, 3],
          ["numbers have a decimal comma"]),
         ('a,b\n1,"2\n"\n3,4\n', {"a": "1 3", "b": "2 4"}, [2, 4], []),
+        ("a;b\n0,5;+  1,5\n1.234,5;-  2,5\n", {"a": "0.5 1234.5", "b": "1.5 -2.5"}, [2, 3],
+         ["numbers have a decimal comma", "numbers are as printed: a long minus, marks between thousands"]),
+        ("a,b,Quality\n1,5,Good\n2,0,Bad\n3,6,Good\n",
+         {"a": "1 2 3", "b": "5 - 6", "Quality": "Good Bad Good"}, [2, 3, 4],
+         ["b: 1 reading(s) left empty, Quality is 'bad'"]),
         ("a b\n1  2 \n\n3\t4\r\n", {"a": "1 3", "b": "2 4"}, [2, 4], []),
         ("a,b\n1,+.5e-3\n2,-Infinity\n3,\n4,7.\n", {"a": "1 2 3 4", "b": "0.0005 -inf - 7"},
          [2, 3, 4, 5], []),
