@@ -1,10 +1,9 @@
 """The input schedule that shrinks a plant's posterior most, inside its limits.
 
-Schedules are lists of cells of equal length, one level per input in each.  Starting from the best of
-constants and slow square waves, a search exchanges one block of cells of random length after the other, for
-one level or for two in turn, and keeps what gains information
-(:mod:`thermogrip.sysid.experiment.information`) without leaving the limits: coordinate exchange of D-optimal
-design [1]_.
+Schedules are lists of cells of equal length, one level per input in each.  Starting from the best constant, a
+search exchanges one block of cells of random length after the other, for one level or for two in turn, and
+keeps what gains information (:mod:`thermogrip.sysid.experiment.information`) without leaving the limits:
+coordinate exchange of D-optimal design [1]_.
 
 Limits that are kept at the search's step are checked again at the plant's own; a schedule that violates them
 there is shrunk towards the start's level until it keeps them.
@@ -192,8 +191,9 @@ def _search_cells(
 
     rng = np.random.default_rng(seed)
     best, gain = np.tile(frame.still, (frame.n_cell, 1)), -np.inf
-    for cells in [best, *_plain_shapes(frame)]:
-        shrunk, value = _shrunk(frame, evaluate, cells, SEARCH.coarse_halvings)
+    # square waves beside these gained 1 % of the bits of two plants, and nothing of two
+    for ends in (frame.still, frame.high, np.where(frame.switch, 1.0, frame.low)):
+        shrunk, value = _shrunk(frame, evaluate, np.tile(ends, (frame.n_cell, 1)), SEARCH.coarse_halvings)
         if value > gain:
             best, gain = shrunk, value
     for k in range(evaluations):
@@ -204,19 +204,6 @@ def _search_cells(
         if k % 10 == 0:
             report(0.97 * k / evaluations, f"exchanging blocks, {gain:.1f} bits")
     return best
-
-
-def _plain_shapes(frame: _Frame) -> list[Array]:
-    """Return both ends of the range, and square waves between them of a few periods an experiment."""
-    out: list[Array] = []
-    tops, bottoms = frame.high, np.where(frame.switch, 1.0, frame.low)
-    out += [np.tile(ends, (frame.n_cell, 1)) for ends in (tops, bottoms)]
-    place = np.arange(frame.n_cell) / frame.n_cell
-    for periods in (1, 2, 4, 8):
-        for apart in (0.0, 0.25) if frame.low.size > 1 else (0.0,):
-            phase = (periods * place[:, None] + apart * np.arange(frame.low.size)) % 1.0
-            out.append(np.where(phase < 0.5, tops, bottoms))
-    return out
 
 
 def _shrunk(
