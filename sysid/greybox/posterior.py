@@ -58,6 +58,7 @@ from thermogrip.datasets.atomic_files import atomic_path
 from thermogrip.datasets.errors import UserError, known_names
 from thermogrip.datasets.log_files import Logs, as_logs
 from thermogrip.datasets.schema import Log
+from thermogrip.sysid.greybox.fit import levenberg_marquardt
 from thermogrip.sysid.greybox.noise_model import ErrorModel
 from thermogrip.sysid.greybox.problem import Problem, make_problem
 from thermogrip.sysid.greybox.sandwich import ScoreCovariance, score_covariance
@@ -72,7 +73,7 @@ class DrawSettings:
     """Numbers of the draws and of the chain."""
 
     difference_step: float = 1e-4  # of z
-    longest_step: float = 1.0  # prior sd that one step may move a parameter
+    enough: float = 1e-2  # share of the objective by which the last step lowers it
     least_error: float = 1e-3  # of A: the least that V may be in any direction
     unseen_slope: float = 1e-9  # of the largest one: what moves the runs by less is lost in the differences
     proposal_freedom: float = 6.0  # of the t: a tail
@@ -156,23 +157,38 @@ class RandomizedMap:
         moving = np.setdiff1d(np.arange(self.z.size), np.array(columns, dtype=int))
         if held is not None:
             z[:, list(columns)] = held
-        damping, cost = np.full(n, 1e-5), self._cost(z, xi, noise)
-        for iteration in range(iterations):
+        for k in range(n):
             if progress is not None:
-                progress(iteration / iterations, "plants that agree with the logs")
-            gradient, hessian = self._slopes(z, xi, noise, moving)
-            for _ in range(2):  # a refused step is tried again with more damping
-                trial = z.copy()
-                trial[:, moving] += self._steps(z[:, moving], gradient, hessian, damping, moving)
-                trial = np.clip(trial, self.low, self.high)
-                trial_cost = self._cost(trial, xi, noise)
-                better = trial_cost < cost
-                z[better], cost[better] = trial[better], trial_cost[better]
-                damping = np.clip(np.where(better, damping / 10, damping * 10), 1e-8, 1e8)
-                if better.all():
-                    break
-                gradient[better] = 0.0  # has moved: waits for new slopes
+                progress(k / n, "plants that agree with the logs")
+            z[k, moving] = self._draw(z[k], xi[k], noise[k], moving, iterations)
         return z
+
+    def _draw(self, z: Array, xi: Array, noise: Array, moving: NDArray[np.int_], iterations: int) -> Array:
+        """Return the parameters ``moving`` of the least objective, the others at z (n_free,)."""
+
+        def residuals(points: Array) -> Array:
+            whole = np.tile(z, (len(points), 1))
+            whole[:, moving] = points
+            along, off_span = self._moved(whole)
+            return np.hstack([whole - self.z - xi, along - noise, off_span])
+
+        def linearise(point: Array) -> tuple[Array, Array]:
+            sign = np.where(point + DRAW.difference_step > self.high[moving], -1.0, 1.0)
+            ahead = DRAW.difference_step * np.diag(sign)
+            r = residuals(np.vstack([point, point + ahead]))
+            slopes = (r[1:] - r[0]) / (DRAW.difference_step * sign[:, None])
+            return r[0], np.nan_to_num(slopes, nan=0.0, posinf=0.0, neginf=0.0).T  # a run that blew up
+
+        least = levenberg_marquardt(
+            linearise,
+            residuals,
+            z[moving],
+            low=self.low[moving],
+            high=self.high[moving],
+            iterations=iterations,
+            tolerance=DRAW.enough,
+        )
+        return least.z
 
     def _moved(self, z: Array) -> tuple[Array, Array]:
         """Return K^(1/2) Q'd (n, n_free) and d, off the span and weighed (n, m)."""
@@ -180,14 +196,6 @@ class RandomizedMap:
             d = np.concatenate(self.problem.residuals(z, self.starts), axis=1) - self._fitted
             along = d @ self._span
             return along @ self._root.T, self._loose * (d - along @ self._span.T)
-
-    def _cost(self, z: Array, xi: Array, noise: Array) -> Array:
-        """Return half the objective (n,), infinite where a run blew up."""
-        along, off_span = self._moved(z)
-        with np.errstate(over="ignore", invalid="ignore"):
-            squares = ((along - noise) ** 2).sum(axis=1) + (off_span**2).sum(axis=1)
-        cost = 0.5 * ((z - self.z - xi) ** 2).sum(axis=1) + 0.5 * squares
-        return np.where(np.isfinite(cost), cost, np.inf)
 
     def _gradient(self, z: Array) -> tuple[Array, Array]:
         """Return g (n, n_free), with the slopes of the fit, and -ln p (n,); what blew up has no pull."""
@@ -199,36 +207,6 @@ class RandomizedMap:
             )
         finite = np.isfinite(cost) & np.isfinite(gradient).all(axis=1)
         return np.where(finite[:, None], gradient, 0.0), np.where(finite, cost, np.inf)
-
-    def _slopes(self, z: Array, xi: Array, noise: Array, moving: NDArray[np.int_]) -> tuple[Array, Array]:
-        """Return gradient (n, n_moving) and Gauss-Newton Hessian (n, n_moving, n_moving)."""
-        n, d = len(z), moving.size
-        sign = np.where(z[:, moving] + DRAW.difference_step > self.high[moving], -1.0, 1.0)
-        ahead = z[:, None] + DRAW.difference_step * sign[:, :, None] * np.eye(self.z.size)[moving]
-        around = np.concatenate([z[:, None], ahead], axis=1).reshape(-1, self.z.size)
-        gradient, hessian = (z - self.z - xi)[:, moving], np.tile(np.eye(d), (n, 1, 1))
-        along, off_span = self._moved(around)
-        for moves, perturbation in ((along, noise), (off_span, np.zeros((1, 1)))):
-            runs = moves.reshape(n, d + 1, -1)
-            slopes = (runs[:, 1:] - runs[:, :1]) / (DRAW.difference_step * sign[:, :, None])
-            gradient = gradient + np.einsum("kim,km->ki", slopes, runs[:, 0] - perturbation)
-            hessian = hessian + slopes @ slopes.transpose(0, 2, 1)
-        return gradient, hessian
-
-    def _steps(
-        self, z: Array, gradient: Array, hessian: Array, damping: Array, moving: NDArray[np.int_]
-    ) -> Array:
-        """Return one damped step of each draw; what is pushed against a bound stays."""
-        stuck = ((z <= self.low[moving]) & (gradient > 0)) | ((z >= self.high[moving]) & (gradient < 0))
-        out = np.zeros_like(gradient)
-        for k, (g, h, lam) in enumerate(zip(gradient, hessian, damping)):
-            free = np.flatnonzero(~stuck[k])
-            free_hessian = h[np.ix_(free, free)]
-            step = -np.linalg.solve(free_hessian + lam * np.diag(np.diag(free_hessian)), g[free])
-            out[k, free] = step * min(
-                1.0, DRAW.longest_step / max(float(np.abs(step).max(initial=0.0)), 1e-300)
-            )
-        return out
 
 
 LENGTH = 50  # autocorrelation times that make a chain long enough
