@@ -1,9 +1,8 @@
 """Whole files or none: atomic writing, and JSON that says what it is.
 
-A file is written beside its target, forced to disk, then renamed over it, which is atomic on POSIX and
-Windows: Ctrl-C, a full disk or ``kill -9`` leave the old one in place.  A symbolic link of the target's name
-is replaced, where it leads to is left alone.  Every JSON file of the toolkit has the keys ``schema``,
-``version`` (an integer) and ``provenance`` (:mod:`thermogrip.datasets.provenance`); reading it runs no code.
+Ctrl-C, a full disk or ``kill -9`` leave the old file in place.  Every JSON file of the toolkit has the keys
+``schema``, ``version`` (an integer) and ``provenance`` (:mod:`thermogrip.datasets.provenance`); reading it
+runs no code.
 """
 
 from __future__ import annotations
@@ -56,7 +55,7 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         _sync(temporary, os.O_RDWR)  # Windows syncs only what is writable
         if target.is_file() and not target.is_symlink():  # a link is replaced, whatever it leads to
             shutil.copymode(target, temporary)
-        os.replace(temporary, target)
+        os.replace(temporary, target)  # which is atomic on POSIX and Windows
         note_written(target)
         _sync_folder(target.parent)
 

@@ -4,8 +4,7 @@ As CSV a condition is two files, ``NAME.csv``, long, one row a sample, and ``NAM
 in a Parquet file or a DataFrame each row repeats what is known of its grasp.  A missing ``session`` is the
 file, a missing ``block`` the material: so no block is split between training and test by accident.
 
-The grasps of one file share one time axis.  Where their stamps jitter each grasp is interpolated linearly
-onto the common step, and left NaN where the nearest samples are more than 1.5 steps apart.
+The grasps of one file share one time axis.
 """
 
 from __future__ import annotations
@@ -293,6 +292,8 @@ def _onto_one_axis(samples: _Samples, order: Sequence[str], file: str) -> tuple[
         rows_of.append(rows[np.append(True, steps > 0)])
     step = _common_step([time[rows] for rows in rows_of], order, file)
     axis = np.unique(time)
+    # where stamps jitter each grasp is interpolated linearly onto the common step, and left NaN where the
+    # nearest samples are more than 1.5 steps apart
     if not _is_even(axis, step):
         first, last = np.ceil(time.min() / step - 1e-6), np.floor(time.max() / step + 1e-6)
         axis = np.round(step * np.arange(first, last + 1), 9)
@@ -442,8 +443,8 @@ def _of_tables(table: Table, meta: Table | None, name: str) -> Grasps:
     rows = _first_rows(table) if meta is None else _rows_of_meta(meta, order, table.file)
     axis, channels = _onto_one_axis(samples, order, table.file)
     facts = _facts_of(meta or table, rows)
-    known = (*GRASP_NUMBERS, *GRASP_LABELS)
-    unused = _unused(table, known) if meta is None else [*_unused(table, ()), *_unused(meta, known)]
+    of_grasps = (*GRASP_NUMBERS, *GRASP_LABELS)
+    unused = _unused(table, of_grasps) if meta is None else [*_unused(table, ()), *_unused(meta, of_grasps)]
     repairs = [*samples.repairs, *unused]
     attrs = {"name": name, "repairs": "\n".join(repairs)}
     return _record(table.file, name, order, axis, channels | facts, attrs)

@@ -2,8 +2,7 @@
 
 A few kilobytes can claim gigabytes (a compressed line of blanks, an array that was never written), so every
 reader asks here, with what a file declares, before it allocates anything; ``docs/reference/files.md`` lists
-the limits.  What is packed may grow 200 times: a log of 500 000 rows whose sensors never move grows 104 times
-with xz.  ``THERMOGRIP_MAX_MB`` sets the first limit in MB, and the second is then left to it.
+the limits.  ``THERMOGRIP_MAX_MB`` sets the size of a file in MB, and growth is then left to it.
 """
 
 from __future__ import annotations
@@ -33,7 +32,8 @@ STEP_RANGE, LARGEST = (1e-3, 86400.0), 1e12
 
 _BYTES = 2 << 30
 _MB = 1 << 20
-_LARGEST_EXPANSION = 200  # times the packed size
+# times the packed size: a log of 500 000 rows whose sensors never move grows 104 times with xz
+_LARGEST_EXPANSION = 200
 _FLOOR = 8 << 20  # bytes that any packed file may unpack to
 
 

@@ -140,7 +140,7 @@ def _processes(n: int) -> Any:
     from loky import get_reusable_executor
 
     # several threads of linear algebra in each process would get in each other's way
-    kept = {"PYTHONSAFEPATH": "1"} | {name: os.environ.get(name, "1") for name in THREADS}
+    variables = {"PYTHONSAFEPATH": "1"} | {name: os.environ.get(name, "1") for name in THREADS}
     # a Ctrl-C is left to the process that started this one, and that ends it
     ignored = {"initializer": signal.signal, "initargs": (signal.SIGINT, signal.SIG_IGN)}
     with _lock:
@@ -149,7 +149,7 @@ def _processes(n: int) -> Any:
         # process gets no other environment than this one
         os.environ["PYTHONSAFEPATH"] = "1"
         try:
-            pool = get_reusable_executor(n, timeout=_IDLE_S, env=kept, **ignored)
+            pool = get_reusable_executor(n, timeout=_IDLE_S, env=variables, **ignored)
             pool.submit(int)  # which starts them
         finally:
             del os.environ["PYTHONSAFEPATH"]

@@ -1,8 +1,7 @@
 """Where a result comes from: version, date, command, repository, seed, and the SHA-256 of what was read.
 
-Every JSON file has it under the key ``provenance``, every page in its foot: the command line opens a
-:func:`work` with its words, readers and writers of files report to it, and a writer asks :func:`provenance`.
-Two runs of one command with one seed differ in this alone; ``SOURCE_DATE_EPOCH`` sets the date [1]_.
+Every JSON file has it under the key ``provenance``, every page in its foot.  Two runs of one command with one
+seed differ in this alone; ``SOURCE_DATE_EPOCH`` sets the date [1]_.
 
 References
 ----------
@@ -53,7 +52,8 @@ _WORK: ContextVar[_Work | None] = ContextVar("work", default=None)
 
 @contextmanager
 def work(words: Sequence[str]) -> Iterator[None]:
-    """Gather what one command, the words as typed, reads and writes."""
+    """Gather what one command, the words as typed, reads and writes: readers and writers of files report it,
+    and a writer asks :func:`provenance`."""
     if (epoch := os.environ.get("SOURCE_DATE_EPOCH", "")) and not _EPOCH.fullmatch(epoch):
         # numpy and matplotlib read it too, and raise
         raise UserError(f"SOURCE_DATE_EPOCH is {epoch!r}", hint="set it to seconds since 1970, or unset it")

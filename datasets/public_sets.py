@@ -1,20 +1,11 @@
 """Public sets of contacts, read from a folder as their authors published them; nothing is downloaded.
 
 **HOLD** (github ``joshsia/haptics-classification``, ``data/``): six objects that a PR2 held ten times each
-for ten seconds with a BioTac, a finger filled with fluid whose core is warm.  ``F0tdc`` of
-``OBJECT_NUMBER_TRIAL_HOLD.mat`` is the temperature of finger 0's core at 100 Hz, in counts of 4095 to full
-scale; with x the share of full scale the maker's divider and thermistor give
-
-    T = 4025 K / ln((155183 - 46555 x) / x) - 273.15 degC.
-
-The files begin with the hold, and fluid and skin delay what the core feels, so that its first tenth of a
-second counts as the level before contact.
+for ten seconds with a BioTac, a finger filled with fluid whose core is warm.
 
 **ToH** (github ``Healthcare-Robotics/thermal-ambiguity-ToH``, ``robot_study/test/``): 30 sets of nine
 contacts of aluminium, wood and cooled wood with a heated and a passive thermistor at 200 Hz, smoothed by
-their authors.  ``R_SET/KIND_count_NUMBER_sensor_29.5.pkl`` is a pickled array of time, passive, heated
-sensor and force.  A pickle is a program; it is not run here: the array's shape and bytes are taken out of its
-text.
+their authors.
 """
 
 from __future__ import annotations
@@ -37,6 +28,8 @@ _KINDS = {"M": "aluminium", "W": "wood", "CW": "wood_cold"}
 _ARRAY = re.compile(
     rb"\(I(\d+)\nI(\d+)\ntcnumpy\ndtype\n.*?\(S'f8'\n.*?tbI0([01])\n(S['\"].*['\"])\ntb", re.DOTALL
 )
+# counts, and the maker's divider and thermistor: with x the share of full scale
+# T = 4025 K / ln((155183 - 46555 x) / x) - 273.15 degC
 _FULL_SCALE = 4095.0
 _DIVIDER = (155183.0, 46555.0)
 _BETA = 4025.0
@@ -73,24 +66,27 @@ def read_hold(folder: str | Path) -> Grasps:
     """
     from scipy.io import loadmat
 
-    traces, found = [], _found(Path(folder), "*_HOLD.mat", _HOLD)
-    for file, _ in found:
+    traces, files = [], _named_files(Path(folder), "*_HOLD.mat", _HOLD)
+    for file, _ in files:
         wrong = (KeyError, IndexError, TypeError, ValueError, OSError, NotImplementedError)
         with as_user_error(wrong, "has no F0tdc", file=file, hint="give the files as published"):
+            # of finger 0's core at 100 Hz
             share = loadmat(file)["F0tdc"][0].astype(float) / _FULL_SCALE
         with np.errstate(divide="ignore", invalid="ignore"):
             traces.append(_BETA / np.log((_DIVIDER[0] - _DIVIDER[1] * share) / share) - _KELVIN)
     n = min(map(len, traces)) // _AVERAGED
     rows = np.stack([t[: n * _AVERAGED].reshape(n, _AVERAGED).mean(axis=1) for t in traces])
-    own = [name.groupdict() for _, name in found]
+    names = [name.groupdict() for _, name in files]
+    # the files begin with the hold, and fluid and skin delay what the core feels: its first tenth of a second
+    # counts as the level before contact
     return with_lead_in(
         make_grasps(
             _AVERAGED * _STEP * (np.arange(n) + 0.5),
             rows,
-            [f"{o['object']}_{o['trial']}" for o in own],
-            material=[o["object"].replace("_", " ") for o in own],
-            block=[f"{o['object']}_{o['number']}" for o in own],
-            session=[f"pair{(int(o['trial']) + 1) // 2}" for o in own],
+            [f"{name['object']}_{name['trial']}" for name in names],
+            material=[name["object"].replace("_", " ") for name in names],
+            block=[f"{name['object']}_{name['number']}" for name in names],
+            session=[f"pair{(int(name['trial']) + 1) // 2}" for name in names],
             t_gripper=rows[:, 0],
             name="hold",
         )
@@ -125,34 +121,35 @@ def read_toh(folder: str | Path, *, every: int = 10) -> Grasps:
     ...
     thermogrip.datasets.errors.UserError: elsewhere/R_1: holds no *.pkl; give the folder as it was published
     """
-    found = [f for n in range(1, 31) for f in _found(Path(folder) / f"R_{n}", "*.pkl", _TOH)]
-    cube = np.stack([_pickled_array(file)[::every, :3] for file, _ in found])
+    files = [f for n in range(1, 31) for f in _named_files(Path(folder) / f"R_{n}", "*.pkl", _TOH)]
+    cube = np.stack([_pickled_array(file)[::every, :3] for file, _ in files])
     return make_grasps(
         np.round(cube[0, :, 0], 6),
         cube[:, :, 2],
-        [f"{f.parent.name}_{f.stem.split('_sensor')[0]}" for f, _ in found],
+        [f"{f.parent.name}_{f.stem.split('_sensor')[0]}" for f, _ in files],
         t_surface_2=cube[:, :, 1],
-        material=[_KINDS[name["kind"]] for _, name in found],
-        session=[f.parent.name.replace("R_", "set") for f, _ in found],
+        material=[_KINDS[name["kind"]] for _, name in files],
+        session=[f.parent.name.replace("R_", "set") for f, _ in files],
         name="toh",
     )
 
 
-def _found(folder: Path, pattern: str, name: re.Pattern[str]) -> Sequence[tuple[Path, re.Match[str]]]:
+def _named_files(folder: Path, pattern: str, name: re.Pattern[str]) -> Sequence[tuple[Path, re.Match[str]]]:
     """Return the files of a folder with what their names say, in order of name."""
     named = [(file, name.fullmatch(file.name)) for file in sorted(folder.glob(pattern))]
-    found = [(file, match) for file, match in named if match is not None]
-    if not found:
+    files = [(file, match) for file, match in named if match is not None]
+    if not files:
         raise UserError(f"holds no {pattern}", file=folder, hint="give the folder as it was published")
-    return found
+    return files
 
 
 def _pickled_array(file: Path) -> NDArray[np.float64]:
-    """Return the array (n, m) in a pickle of protocol 0, which is not run."""
-    parts = _ARRAY.search(read_bytes(file))
+    """Return the array (n, m) in a pickle of protocol 0: time, passive and heated sensor, force."""
+    # a pickle is a program, which is not run: the array's shape and bytes are taken out of its text
+    array = _ARRAY.search(read_bytes(file))
     wrong = (AttributeError, SyntaxError, TypeError, ValueError)
     with as_user_error(wrong, "is no pickled array of numbers", file=file, hint="give the file as published"):
-        rows, columns, by_column, text = parts.groups()  # type: ignore[union-attr]
+        rows, columns, by_column, text = array.groups()  # type: ignore[union-attr]
         raw = ast.literal_eval("b" + text[1:].decode("ascii"))
         order = "F" if by_column == b"1" else "C"
         return np.frombuffer(raw, "<f8").reshape(int(rows), int(columns), order=order).copy()  # type: ignore[call-overload,no-any-return]

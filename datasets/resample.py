@@ -1,11 +1,6 @@
 """Cuts, gaps and means of logs.
 
-An input is applied from its row until the next (zero-order hold), so with t_i the rows and U(t) the integral
-of the held input up to t, which is piecewise linear, its mean over a cell is exactly
-
-    mean over [a, b) = (U(b) - U(a)) / (b - a)
-
-whatever the jitter of the rows.  Outputs are samples: their mean is over those in the cell that are there.
+An input is applied from its row until the next; outputs are samples.
 """
 
 from __future__ import annotations
@@ -104,6 +99,8 @@ def _filled_blocks(
 
 def held_means(time: Floats, values: Floats, edges: Floats) -> Floats:
     """Return the means of the staircases (n_time, n) over the cells between the edges."""
+    # with U(t) the integral of the held input up to t, which is piecewise linear, its mean over [a, b) is
+    # exactly (U(b) - U(a)) / (b - a), whatever the jitter of the rows
     area = np.zeros_like(values)
     np.cumsum(values[:-1] * np.diff(time)[:, None], axis=0, out=area[1:])
     row = np.clip(np.searchsorted(time, edges, side="right") - 1, 0, None)

@@ -4,15 +4,8 @@ A topic map says which field of which topic is which column (as in ``data/topics
 ``<name>.topics.toml`` or ``topics.toml`` beside the bag.  Without one, every topic of a single number becomes
 a column: a ``sensor_msgs/Temperature`` a temperature, others what their name's suffix says.
 
-**One axis.**  Rows are the times of one topic, the *clock* (by default the output with the most messages).
-An input has the value of its last message at or before the row, for a command holds until the next.  Anything
-else has its nearest message if that is within half a usual step of its own topic, and is lost otherwise:
-nothing is interpolated.
-
-**Cut-off files.**  An MCAP whose writer died has no index and no end; its messages are read up to the first
-damage, and what is missing is noted.  A .bag without its index must be reindexed by ROS (``rosbag reindex``),
-a .db3 is SQLite, which repairs itself.  A folder without ``metadata.yaml``, which the writer makes last, is
-all of its ``.mcap`` and ``.db3`` files.
+Rows are the times of one topic, the *clock* (by default the output with the most messages); nothing is
+interpolated.
 """
 
 from __future__ import annotations
@@ -111,23 +104,23 @@ def _column(name: str, entry: Any, path: str | Path) -> Column:
 def read_rosbag_table(path: str | Path, topics: TopicMap | None = None) -> Table:
     """Return the columns of a bag on one time axis, by this map, the TOML file beside the bag, or guessed."""
     file = Path(path)
-    wanted = _map_beside(file) if topics is None else topics
+    topic_map = topics or _map_beside(file) or TopicMap({})
     notes: list[str] = []
     series: dict[str, tuple[list[float], list[float]]] = {}
-    columns: dict[str, Column] = {} if wanted is None else dict(wanted.columns)
-    stamp = "log" if wanted is None else wanted.stamp
+    columns = dict(topic_map.columns)
+    has_map = bool(columns)
     type_of_topic: dict[str, str] = {}
     for message in _messages(file, notes):
         type_of_topic[message.topic] = message.type
-        if wanted is None:
+        if not has_map:
             _guess_column(message, columns, file)
         for name, column in columns.items():
             if column.topic == message.topic:
                 times, values = series.setdefault(name, ([], []))
-                times.append(_stamped(message, stamp, file))
+                times.append(_stamped(message, topic_map.stamp, file))
                 values.append(_message_number(message, column, name, file))
     _check_found(columns, series, type_of_topic, file)
-    return _bag_table(file, columns, series, "" if wanted is None else wanted.clock, notes)
+    return _bag_table(file, columns, series, topic_map.clock, notes)
 
 
 def bag_messages(path: str | Path) -> list[Message]:
@@ -167,7 +160,7 @@ def bag_parts(folder: str | Path) -> list[Path]:
     ``metadata.yaml`` names is missing."""
     place = Path(folder)
     listed = place / "metadata.yaml"
-    if not listed.is_file():
+    if not listed.is_file():  # which the writer makes last
         if stored := sorted(path for path in place.iterdir() if path.suffix.lower() in (".mcap", ".db3")):
             return stored
         raise UserError("is a folder, and no ROS 2 bag", file=place, hint="name a file in it")
@@ -177,14 +170,14 @@ def bag_parts(folder: str | Path) -> list[Path]:
     data, hint = read_bytes(listed, share=64), "copy the whole bag again"
     with reading("is no metadata of a ROS 2 bag", file=listed, hint=hint):
         about_bag = YAML(typ="safe").load(data)["rosbag2_bagfile_information"]
-        parts = [place / Path(str(name)).name for name in about_bag["relative_file_paths"]]
+        bag_files = [place / Path(str(name)).name for name in about_bag["relative_file_paths"]]
         if str(about_bag.get("compression_mode", "")).lower() == "file":  # unpacked by rosbags without limits
             unpack = "unpack it, or write it anew with `ros2 bag convert`, not compressed as a file"
             raise UserError("names files that are compressed whole", file=listed, hint=unpack)
-    for part in parts:
-        if not part.is_file():
-            raise UserError(f"names {part.name}, which is not there", file=listed, hint=hint)
-    return parts
+    for bag_file in bag_files:
+        if not bag_file.is_file():
+            raise UserError(f"names {bag_file.name}, which is not there", file=listed, hint=hint)
+    return bag_files
 
 
 def _map_beside(file: Path) -> TopicMap | None:
@@ -290,8 +283,9 @@ def _bag_table(
     attrs: dict[str, dict[str, str]] = {"time_s": {}}
     for name, column in columns.items():
         messages = frames[name]
-        rule: dict[str, Any] = {"direction": "backward"}
+        rule: dict[str, Any] = {"direction": "backward"}  # a command holds until the next
         if roles[name] != "input":
+            # the nearest message within half a usual step of its own topic; else the row has lost it
             step = messages["time"].diff().median() if len(messages) > 1 else np.inf
             rule = {"direction": "nearest", "tolerance": 0.5 * step + 1e-6}
         numbers[name] = pd.merge_asof(axis, messages, on="time", **rule)["value"].to_numpy(dtype=float)
@@ -305,16 +299,17 @@ def _bag_table(
 def _messages(file: Path, notes: list[str]) -> Iterator[Message]:
     if not file.exists():
         raise os_fault(FileNotFoundError(2, "missing"), file)
-    parts = bag_parts(file) if os.path.isdir(file) else [file]
+    bag_files = bag_parts(file) if os.path.isdir(file) else [file]
     if os.path.isdir(file) and not (file / "metadata.yaml").is_file():
         notes.append("has no metadata.yaml: its writer died; all of its files are read")
-    elif all(part.suffix.lower() == ".db3" for part in parts):
-        check_size(sum(check_source(part) for part in parts), file=file)
-        parts = parts[:1]  # the reader of one reads all that the metadata name
-    for part in parts:
-        part_notes: list[str] = []
-        yield from _mcap_messages(part, part_notes) if part.suffix.lower() == ".mcap" else _bag_messages(part)
-        notes += [f"{part.name}: {line}" if part != file else line for line in part_notes]
+    elif all(bag_file.suffix.lower() == ".db3" for bag_file in bag_files):
+        check_size(sum(check_source(bag_file) for bag_file in bag_files), file=file)
+        bag_files = bag_files[:1]  # the reader of one reads all that the metadata name
+    for bag_file in bag_files:
+        file_notes: list[str] = []
+        is_mcap = bag_file.suffix.lower() == ".mcap"
+        yield from _mcap_messages(bag_file, file_notes) if is_mcap else _bag_messages(bag_file)
+        notes += [f"{bag_file.name}: {line}" if bag_file != file else line for line in file_notes]
 
 
 def _bag_messages(file: Path) -> Iterator[Message]:
@@ -325,6 +320,7 @@ def _bag_messages(file: Path) -> Iterator[Message]:
 
     bag1 = file.suffix.lower() == ".bag"
     store = get_typestore(Stores.ROS1_NOETIC if bag1 else Stores.ROS2_HUMBLE)
+    # a .db3 is SQLite, which repairs itself; a .bag without its index only ROS can repair
     hint = "run `rosbag reindex` on it" if bag1 else "copy it again, or export it as MCAP"
     with reading("is damaged or no bag", file=file, hint=hint):
         check_size(check_source(file), file=file)
@@ -406,6 +402,7 @@ def _mcap_messages(file: Path, notes: list[str]) -> Iterator[Message]:
     except UserError:
         raise
     except Exception as error:  # whatever damage makes a reader, unpacker or decoder stumble over
+        # one whose writer died has no index and no end, and is whole up to there
         reason = str(error) or type(error).__name__
         if not count:
             hint = "copy it again; nothing could be read"

@@ -1,17 +1,7 @@
 """The TCLab as a rig: a driver that checks every answer, of a board that checks nothing.
 
 The TCLab's protocol has no number, no checksum, no time to live and no trip, so what can be done is done
-here:
-
-* **Which answer is whose.**  Old input is thrown away before each question.  Whenever an answer did not come,
-  or was not what it had to be, silence is waited for before anything is asked again: a late answer would be
-  taken for the next one.  Heaters that are not what was set mean a reset, or an answer that slipped.
-* **What is plausible.**  A jump of more than ``jump`` since the last scan of less than 10 s ago is asked
-  again, and the median of three counts: without a checksum a flipped digit is as good as any other.  A
-  converter at its end is an open or shorted sensor: NaN.
-* **Which board it is.**  After a silence or on a new connection it is the same board where a heater that was
-  on still is, to the last digit.  With the heaters off nothing tells one board from another: it is not driven
-  any more.
+here: to know which answer is whose, what is plausible, and which board it is.
 
 What cannot be done: **nothing ends the heaters when the program is dead or the cable out**; they stay as they
 were until the board loses its power.
@@ -158,7 +148,8 @@ class TCLabRig(SerialRig):
         numbers = self._scan()
         if self._suspect(numbers):
             self._wait_for_silence()
-            # each of the three must be whole; a single spoilt digit loses against two that agree
+            # without a checksum a flipped digit is as good as any other: each of three scans must be whole,
+            # and a single spoilt one loses against two that agree
             scans = [numbers, self._scan(), self._scan()]
             numbers = [median(column) for column in zip(*scans)]
             self._note("damaged", "a scan that could not be right was asked again")
@@ -186,6 +177,8 @@ class TCLabRig(SerialRig):
         version = self._once(b"VER", 1, _VERSION_LINE)
         if not version or not (scan := self._once(b"SCAN", 4, _DECIMAL_LINE)):
             raise PortError("does not answer", file=self.port.url, hint="check cable and power")
+        # the same board where a heater that was on still is, to the last digit; with the heaters off nothing
+        # tells one board from another
         heaters_as_set = all(abs(float(now) - then) <= BOARD.same for now, then in zip(scan[2:], self._set))
         same = any(self._set) and heaters_as_set
         if not same or version[0].decode("ascii").strip() != self.version:
@@ -213,6 +206,7 @@ class TCLabRig(SerialRig):
 
     def _wait_for_silence(self) -> None:
         """Let late answers come, and throw them away; of what never falls silent, those of four lines."""
+        # after an answer that did not come, or was not what it had to be: a late one would count for the next
         # who waits longer for answers need not wait longer for none
         silence = min(self.timeout, BOARD.timeout_s)
         end = time.monotonic() + 4 * silence

@@ -9,9 +9,6 @@
 
 Each session has a run folder of its own in the folder (``01-step``, ``02-loop``, ...), and what is known so
 far stands beside them.  Whatever ended it, the same call goes on from the sessions that are there.
-
-SIMC's integral time is 8 delays of what it controls (or the lag, where that is shorter); a bit of the PRBS
-lasts half of one, the time in which the loop answers a change of its target.
 """
 
 from __future__ import annotations
@@ -260,6 +257,8 @@ class Autotune:
         """Return the targets of a loop's log: held, then moved by a PRBS, each output by its own."""
         from thermogrip.sysid.experiment.schedules import prbs
 
+        # SIMC's integral time is 8 delays of what it controls (or the lag, where that is shorter); a bit
+        # lasts half of one, in which the loop answers a change of its target
         bits = int((seconds - LOG.hold * slowest) / (0.5 * slowest))
         turn = len(self._folders("loop"))
         time = LOG.hold * slowest + 0.5 * slowest * np.repeat(np.arange(max(bits, 0) + 1), 2)[1:-1]

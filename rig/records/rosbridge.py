@@ -6,10 +6,6 @@ here::
     {"op": "advertise", "topic": "/thermogrip/t_surface", "type": "sensor_msgs/Temperature"}
     {"op": "publish",   "topic": "/thermogrip/t_surface", "msg": {"header": {..}, "temperature": 38.0, ..}}
 
-:class:`Messages` is the protocol alone: rows and events in, JSON out; no socket, no clock.
-:class:`Bridge` sends them from a thread of its own: a slow or dead network never delays the loop.  What
-cannot be sent is dropped, oldest first; the run folder is the record, the bridge is a view.
-
 Nothing is subscribed to, and nothing that comes in is taken.  Nothing is encrypted: use it on a network of
 your own.
 """
@@ -40,7 +36,7 @@ _LOOK_S = 0.1  # how often the sender looks whether a try is due, or the server 
 
 
 class Messages:
-    """The protocol: rows and events to JSON texts."""
+    """The protocol alone: rows and events to JSON texts; no socket, no clock."""
 
     def __init__(self) -> None:
         self._advertised: set[str] = set()
@@ -139,6 +135,7 @@ class Bridge:
         self._n_recorded, self._n_reported = 0, 0  # of the reports, and of what was dropped
         self._time_s, self._ending = 0.0, False
         self._link: Any = self._connect()
+        # a thread of its own: a slow or dead network never delays the loop
         self._sender = threading.Thread(target=self._work, daemon=True)
         self._sender.start()
 
@@ -258,6 +255,7 @@ class Bridge:
 
     def _put(self, item: Callable[[], list[str]]) -> None:
         """Queue what makes messages; where the network is too slow the oldest goes."""
+        # the run folder is the record, the bridge is a view
         with self._changed:
             if len(self._waiting) >= _KEEP:
                 self._waiting.popleft()

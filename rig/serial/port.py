@@ -4,10 +4,6 @@
 cable is a ``SerialException`` on reading and a plain ``OSError`` on asking what waits, a closed socket
 reads as an exception, a frozen one as nothing.  All of them are one :class:`PortError` here.
 
-A port is opened ``exclusive``, which stops every program that asks for it too; one that does not can still
-open it and steal bytes, and the protocol's checks then see damage and silence.  Windows lets nobody open a
-serial port twice, and a virtual device serves one socket at a time.
-
 USB devices may return under another number: a name of ``/dev/serial/by-id`` stays the same.  Whether it is
 the same device the driver has to ask.
 """
@@ -70,6 +66,8 @@ class Port:
 
         if self._serial is not None:
             return
+        # ``exclusive`` stops every program that asks for it too; one that does not can still open the port
+        # and steal bytes, which the protocol's checks see.  Windows lets nobody open a serial port twice
         try:
             options = {} if "://" in self.url else {"exclusive": sys.platform != "win32" or None}
             self._serial = serial.serial_for_url(

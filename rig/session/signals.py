@@ -2,10 +2,7 @@
 
 Python turns Ctrl-C into an exception, so that ``finally`` switches off.  A ``kill`` (SIGTERM) and a closed
 terminal (SIGHUP; on Windows SIGBREAK) end the process at once instead: :func:`stop_signals` makes them that
-same exception.  It makes one of all that come: a second Ctrl-C, 10 ms or 10 s after the first, must not end
-what the first one began, which is to switch off and to close the run folder.  An exception can get lost (in
-a callback of C code), and then no later signal would raise another: the loop asks :func:`check_stopped` at
-every sample.
+same exception, and one of all that come.
 
 ``kill -9``, a crash of the interpreter and a frozen computer run no line of ours.  Then the device's own 2 s
 switch off, or nothing does (a TCLab has no such time).
@@ -33,6 +30,8 @@ class _Stop:
         self.came = ""
 
     def __call__(self, number: int, frame: FrameType | None) -> None:
+        # a second Ctrl-C, 10 ms or 10 s after the first, must not end what the first one began, which is to
+        # switch off and to close the run folder
         if not self.came:
             self.came = signal.Signals(number).name
             raise KeyboardInterrupt(self.came)
@@ -56,6 +55,7 @@ def stop_signals() -> Iterator[None]:
 
 def check_stopped() -> None:
     """Raise the KeyboardInterrupt again that a signal of this :func:`stop_signals` raised, if one did."""
+    # an exception can get lost (in a callback of C code), and no later signal raises another
     stop = _in_force()
     if stop is not None and stop.came and threading.current_thread() is threading.main_thread():
         raise KeyboardInterrupt(stop.came)

@@ -3,12 +3,7 @@
 Each drive in turn is at the end of its range until a sensor is half of its way to the target, and off for as
 long, in which the heat that is under way arrives; a drive of both signs goes to its other end likewise.  What
 is known afterwards are the slope and the delay of each response; the slope is gain / lag, which is all that
-the gain of a SIMC loop takes (its integral time is bounded by the delay).  A gain and a lag by themselves
-take a plant at rest, for which nobody has to wait here.
-
-A pump is off for a while once there is heat to stand still.  It ends while a drive is on that was on before:
-the end of a log is what a model is judged by, of one that only cools it may say nothing of the drives, and of
-a drive that comes there for the first time nothing can be learnt.
+the gain of a SIMC loop takes (its integral time is bounded by the delay).
 """
 
 from __future__ import annotations
@@ -48,10 +43,12 @@ class StepTest:
         turns = []
         for name, (low, high) in self._ranges.items():
             turns += [(name, high)] if low >= 0 else [(name, high), (name, low)][::towards]
+        # the end of a log is what a model is judged by: one that only cools may say nothing of the drives,
+        # and of a drive that comes there for the first time nothing can be learnt, so the first comes again
         if len(turns) == 1 or turns[-1][0] != turns[0][0]:
             turns.append(turns[0])
         if self._has_pump:
-            turns.insert(1, (PUMP, 0.0))
+            turns.insert(1, (PUMP, 0.0))  # once there is heat to stand still
         self._turns, self.done = turns, False
         self._most_on_s = self.seconds / (2 * len(turns))
         self._begin(reading)

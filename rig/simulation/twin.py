@@ -331,5 +331,5 @@ class Twin:
 
 def _input_range(plant: Plant, name: str) -> tuple[float, float]:
     unit = plant.units.get(name, "1")
-    seen = plant.valid.get(name) if unit == "1" else None
-    return known_range(name, unit, seen, hint=f"give it: limits={{{name!r}: (lo, hi)}}")
+    logged = plant.valid.get(name) if unit == "1" else None
+    return known_range(name, unit, logged, hint=f"give it: limits={{{name!r}: (lo, hi)}}")

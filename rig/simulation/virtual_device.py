@@ -1,12 +1,8 @@
 """A device without hardware: either protocol on a pty or a socket, a simulated plant, faults on demand.
 
 The device lives in a thread of its own and moves its plant and its firmware ten times a second of its own
-clock.  On the computer's its time stands still while the computer has no time for it: no board is held up,
-and what a host sent meanwhile came in time.
-
-A fault sits where the real one would: a
-sensor's between the true temperature and the device, a stuck driver's between the device and the plant (only
-the supply cuts it), a stalled pump's in the pump, whatever was commanded.
+clock.  A fault sits where the real one would: a sensor's between the true temperature and the device, a stuck
+driver's between the device and the plant (only the supply cuts it), a stalled pump's in the pump.
 """
 
 from __future__ import annotations
@@ -416,6 +412,8 @@ class VirtualDevice:
     def _advance(self) -> None:
         """Let plant and firmware catch up with the clock: samples and the end of a drive, in their order."""
         if self._thread is not None and isinstance(self._clock, ScaledClock):
+            # its time stands still while the computer has none for it: no board is held up, and what a host
+            # sent meanwhile came in time
             behind = self.time - self.bench.time - _HELD_UP_S * self._clock.speed
             self._start += max(0.0, behind)
         now = self._now_ms()
