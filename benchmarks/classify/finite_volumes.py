@@ -42,6 +42,8 @@ class Rig:
         (6.0e-3, 0.6, 4.2e6, 16),  # standing water
     )
     lag: float = 0.12
+    beside: float = 0.0  # share of the reading that a slow mass beside the sensor has
+    tilt: float = 0.0  # K by which the skin is behind its water at contact, on its way to it
     h_c: dict[str, float] = field(default_factory=lambda: {"acrylic": 700.0, "wood": 600.0})
     h_c_else: float = 1400.0
     h_c_sd: float = 0.09
@@ -53,6 +55,7 @@ class Rig:
     grade: dict[str, float] = field(default_factory=dict)  # factor on its k
     t_object_sd: float = 0.35
     natural_sd: float = 0.05  # of ln k of wood
+    scatter: float = 0.0  # and of all others
     onset_sd: float = 0.08
     noise: float = 0.04
     slow: float = 0.018
@@ -128,7 +131,7 @@ def labelled(
 
 def _blocks(names: list[str], rig: Rig, rng: np.random.Generator, unlike: Disturbed | None = None) -> Batch:
     rows = [find_material(name) for name in names]
-    natural = np.where([name == "wood" for name in names], rig.natural_sd, 0.0)
+    natural = np.where([name == "wood" for name in names], rig.natural_sd, rig.scatter)
     k = np.array([row.k * rig.grade.get(name, 1.0) for row, name in zip(rows, names)])
     k = k * np.exp(natural * rng.standard_normal(len(rows)))
     unlike = Disturbed.not_at_all(len(names)) if unlike is None else unlike
@@ -175,22 +178,26 @@ def _touch(
     resistance = dx0 / (2 * rig.layers[0][1]) + blocks.near
     unlike = Disturbed.not_at_all(n) if unlike is None else unlike
     # gripper reversed, so that its face is next to the block's
-    cells = np.concatenate([np.repeat(level[:, None], n_g, axis=1), state], axis=1)
+    skin = level[:, None] - rig.tilt * np.linspace(0.0, 1.0, n_g)
+    cells = np.concatenate([skin, state], axis=1)
     caps = np.concatenate([np.repeat(capacity[None, ::-1], n, axis=0), blocks.capacity], axis=1)
     links = np.concatenate([np.repeat(link[None, ::-1], n, axis=0), np.zeros((n, 1)), blocks.link], axis=1)
     loss = np.concatenate([np.zeros((n, n_g)), blocks.loss], axis=1)
     steps = round((seconds + 0.5) / DT)
     lagged = np.empty((n, steps + 1))
-    lagged[:, 0] = level
-    keep = np.exp(-DT / rig.lag)
     at = n_g - 1 - sensor
+    lagged[:, 0] = skin[:, at]
+    slow = lagged[:, 0]
+    keep, keep_slow = np.exp(-DT / rig.lag), np.exp(-DT / 2.0)
     for i in range(steps):
         t = (i + 0.5) * DT
         grown = h * (1 - 0.97 * np.exp(-((t / tau) ** 0.85))) * (1 + 0.1 * np.sqrt(t / 10))
         grown = grown * unlike.factor(t)
         links[:, n_g - 1] = 1 / (1 / grown + resistance)
         cells = _implicit(cells, caps, links, loss, room)
-        lagged[:, i + 1] = keep * lagged[:, i] + (1 - keep) * cells[:, at]
+        slow = keep_slow * slow + (1 - keep_slow) * cells[:, at]
+        seen = cells[:, at] + rig.beside * (slow - cells[:, at])
+        lagged[:, i + 1] = keep * lagged[:, i] + (1 - keep) * seen
     time = np.round(np.arange(-20, round(10 * seconds) + 1) / 10, 1)
     onset = rig.onset_sd * rng.standard_normal(n)
     clock = np.arange(steps + 1) * DT

@@ -111,12 +111,9 @@ class Answer:
         out: Row = {"grasp_id": self.grasp_id, "material": self.material}
         out |= {f"p_{name}": p for name, p in self.probabilities.items()}
         out |= {"p_unknown": self.p_unknown, "decided_at_s": self.decided_at}
-        out |= {} if self.misfit_sd is None else {"misfit_sd": self.misfit_sd}
-        out |= {"deviates": self.deviates} if self.deviates else {}
-        if self.notes:
-            out["note"] = "; ".join(note.words for note in self.notes)
-            out["note_codes"] = " ".join(note.code for note in self.notes)
-        return out
+        out |= {"misfit_sd": self.misfit_sd, "deviates": self.deviates}
+        out["note"] = "; ".join(note.words for note in self.notes)
+        return out | {"note_codes": " ".join(note.code for note in self.notes)}
 
 
 def answer(
@@ -171,7 +168,7 @@ def classify_grasps(
     classifier: GraspClassifier, X: Records, candidates: Sequence[str] | None = None, **options: Any
 ) -> list[Row]:
     """Return :func:`answer` as rows of a table: ``grasp_id, material, p_<material>..., p_unknown,
-    decided_at_s``, and where there is something to say ``misfit_sd, deviates, note, note_codes``."""
+    decided_at_s, misfit_sd, deviates, note, note_codes``."""
     return [one_answer.row() for one_answer in answer(classifier, X, candidates, **options)]
 
 

@@ -169,7 +169,7 @@ class PosteriorClassifier(GraspClassifier):
         evidence, odds = np.empty((group.size, len(names))), np.full(group.size, np.nan)
         if single.size:
             data = touches(grasps, until=self.longest_, at=single)
-            noise = whiten(graded(data, self.device_.grades), self.device_.noise)
+            noise = whiten(graded(data, self.device_.grades), self.device_.reading_noise)
             fitted = fit_candidates(self.device_, data, names, noise=noise)
             evidence[single] = fitted.mode.log_evidence.reshape(-1, len(names))
             best = np.arange(single.size) * len(names) + evidence[single].argmax(axis=1)
@@ -198,8 +198,11 @@ class PosteriorClassifier(GraspClassifier):
             if words:
                 found.notes[i].append(Note("not_explained", words))
             elif fitted.unlike[k] > _LIKELY:
-                words = "unlike the grasps of the training: answered less surely"
-                found.notes[i].append(Note("beyond_training", words))
+                off = float(fitted.mode.u[best[k], T_OBJECT] - prior.mean[k, T_OBJECT])
+                words = "unlike the grasps of the training"
+                if _UNUSUAL * prior.sd[k, T_OBJECT] < abs(off):  # of which a misstated temperature is one
+                    words = f"as {name} its object is {_warmer(off)} than stated"
+                found.notes[i].append(Note("beyond_training", f"{words}: answered less surely"))
 
     def _touched(
         self, found: Answered, grasps: Grasps, names: list[str], evidence: Floats, odds: Floats, *,
@@ -255,17 +258,21 @@ class PosteriorClassifier(GraspClassifier):
         self.coupling_ = Coupling.load(file) if file.exists() else None
 
 
+def _warmer(off: float) -> str:
+    return f"{abs(off):.1f} K {'warmer' if off > 0 else 'colder'}"
+
+
 def deviation_words(material: str, off: Floats, sd: Floats, misfit: float) -> str:
     """Return in words which unusual values of nuisances (7,) a material requires, ``off`` by so much of a
     mean that is known to ``sd``, or which ``misfit`` [standard deviations]; empty where nothing is
     unusual."""
-    warmer, late = "warmer" if off[T_OBJECT] > 0 else "colder", "late" if off[ONSET] > 0 else "early"
+    late = "late" if off[ONSET] > 0 else "early"
     words = {
         H: f"{np.exp(off[H]):.2f} times the usual contact conductance",
         BUILD_UP: f"a contact that builds up in {np.exp(off[BUILD_UP]):.2f} times the usual time",
         ONSET: f"a contact {abs(off[ONSET]):.2f} s {late}",
         EFFUSIVITY: f"{np.exp(off[EFFUSIVITY]):.2f} times its block's effusivity",
-        T_OBJECT: f"its block {abs(off[T_OBJECT]):.1f} K {warmer} than its nominal temperature",
+        T_OBJECT: f"its block {_warmer(off[T_OBJECT])} than its nominal temperature",
     }
     deviations = [(float(abs(off[k]) / sd[k]), text) for k, text in words.items() if sd[k] > 0]
     deviations.append((misfit, "a trace that is not its own"))

@@ -357,16 +357,15 @@ def _unseen_caution(rows: Sequence[Row], condition: str, classifier: str) -> Cau
     """Return the number of test grasps of materials that training lacks, and how they were answered."""
     unseen = [r for r in rows if not r["known"]]
     n, materials = len(_distinct(unseen)), ", ".join(sorted({str(r["material"]) for r in unseen}))
-    answers = ", ".join(f"{name} {k}" for name, k in Counter(r["predicted"] for r in unseen).most_common())
-    stated = [r["p_unknown"] for r in unseen if r["p_unknown"] is not None]
-    unknown = f" (p_unknown above 0.5 for {sum(p > 0.5 for p in stated)})" if stated else ""
+    named = Counter("unknown" if (r["p_unknown"] or 0.0) > 0.5 else r["predicted"] for r in unseen)
+    answers = ", ".join(f"{name} {k}" for name, k in named.most_common())
     of = f"{n} of {len(_distinct(rows))} test grasps"
     return Caution(
         "unseen_material",
         condition,
         f"{of} are of {materials}, which training lacks, and are not scored",
         classifier,
-        f"{classifier} answered {answers}{unknown}",
+        f"{classifier} answered {answers}",
         f"{n} unseen ({materials}): {answers}",
     )
 

@@ -42,6 +42,7 @@ from thermogrip.datasets.schema import log_name
 from thermogrip.sysid.contact.simulation import TimeNodes
 from thermogrip.sysid.effusivity.data import (
     KNOTS,
+    UNKNOWN_OBJECT_SD,
     Noise,
     Touches,
     at_knots,
@@ -54,7 +55,6 @@ from thermogrip.sysid.effusivity.gripper_model import (
     INSULATOR,
     LEVEL_SD,
     SHARED_NAMES,
-    UNKNOWN_OBJECT_SD,
     Block,
     Discrepancy,
     GripperModel,
@@ -641,10 +641,16 @@ def _with_discrepancy(problem: Problem, theta: Array) -> tuple[Problem, Array]:
     first = len(SHARED_NAMES)
     x = np.log1p((KNOTS + 1.5) / 0.5)
     correlation = np.exp(-0.5 * ((x[:, None] - x) / 0.4) ** 2) + 1e-4 * np.eye(KNOTS.size)
+    # What all grasps have in common and what goes along with the difference between object and skin are told
+    # apart by objects on both sides of the skin.  Else all of it goes along, as heat does: a part that did
+    # not would be what is left of an estimate's error, and at another difference a misfit.
+    differences = problem.data.t_object - problem.data.level
+    both_sides = (differences < 0).any() and (differences > 0).any()
+    always_sd = SETTINGS.always_sd_K if both_sides else SETTINGS.exact * SETTINGS.always_sd_K
     alike = 0.7 + 0.3 * np.eye(n)
     precision = block_diag(
         prior.precision[:first, :first],
-        np.linalg.inv(correlation) / SETTINGS.always_sd_K**2,
+        np.linalg.inv(correlation) / always_sd**2,
         np.kron(np.linalg.inv(alike), np.linalg.inv(correlation)) / SETTINGS.share_sd**2,
         np.eye(n) / SETTINGS.onset_sd_s**2,
         prior.precision[first:, first:],

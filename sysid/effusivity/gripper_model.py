@@ -37,7 +37,7 @@ from thermogrip.datasets.errors import reading
 from thermogrip.datasets.limits import number_within
 from thermogrip.datasets.materials import load_materials
 from thermogrip.sysid.contact.simulation import Grip, Stack
-from thermogrip.sysid.effusivity.data import GRADES, KNOTS, UNKNOWN_OBJECT_RANGE, Grade, Noise, at_knots
+from thermogrip.sysid.effusivity.data import GRADES, KNOTS, Grade, Noise, at_knots
 
 # theta but for the blocks, in the order of the calibration
 SHARED_NAMES = (
@@ -176,7 +176,9 @@ def block_names(labels: Sequence[str]) -> tuple[str, ...]:
 
 INSULATOR = 3000.0  # W s^0.5 m^-2 K^-1: below it a block's effusivity scatters from grasp to grasp
 LEVEL_SD = 3.0  # K: the level before contact is as good as free
-UNKNOWN_OBJECT_SD = UNKNOWN_OBJECT_RANGE / 3**0.5  # K, that of values spread evenly over the range
+# by which the noise counts more beside a learnt discrepancy: what differs from grasp to grasp of it is no
+# noise, and readings say half as much; what is known before them stays
+NOISE_TIMES = 2**0.5
 
 _DEVICE_SCHEMA, _DEVICE_VERSION = "thermogrip.device", 2
 # what the numbers of a file may be
@@ -310,9 +312,14 @@ class GripperModel:
 
     @property
     def grades(self) -> tuple[Grade, ...]:
-        """How unlike the training a grasp may be; of a gripper whose discrepancy was learnt the first grade
-        replaces the others."""
-        return GRADES[:1] if self.discrepancy is not None else GRADES
+        """How unlike the training a grasp may be; a discrepancy that was learnt replaces those of a trace."""
+        return GRADES[:2] if self.discrepancy is not None else GRADES
+
+    @property
+    def reading_noise(self) -> Noise:
+        """The noise with which the readings of a grasp count."""
+        one, times = self.noise, 1.0 if self.discrepancy is None else NOISE_TIMES
+        return replace(one, white=times * one.white, slow=times * one.slow, misfit=times * one.misfit)
 
     @property
     def unlisted(self) -> list[str]:

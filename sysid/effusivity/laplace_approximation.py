@@ -28,15 +28,11 @@ What a hypothesis expects before the data
 What comes from the gripper and the nominal temperature (build-up time, onset, object temperature) is common
 to all of them.
 
-Somebody stated the nominal temperature, and blocks are mistaken, or not at rest: one in twenty is three times
-as far off as the training's were (Tukey's contaminated normal).  T_obj enters linearly, so the readings' own
-say, the ratio of its posterior and prior, gives mode and evidence under the wider prior too, and the answer
-is the mixture (:func:`doubted`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -48,12 +44,12 @@ from thermogrip.datasets.arrays import Array, Mask
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.materials import Material, find_material
 from thermogrip.sysid.contact.simulation import Stack, TimeNodes, gripper_modes, time_nodes
-from thermogrip.sysid.effusivity.data import Touches, Whitened, graded, whiten
+from thermogrip.sysid.effusivity.data import UNKNOWN_OBJECT_SD, Touches, Whitened, graded, whiten
 from thermogrip.sysid.effusivity.gripper_model import (
     INSULATOR,
     LEVEL_SD,
+    NOISE_TIMES,
     STACK_NAMES,
-    UNKNOWN_OBJECT_SD,
     GripperModel,
     stack_numbers,
     stack_of,
@@ -71,9 +67,6 @@ class DoubtSettings:
     # of the size of a grasp's noise beside a learnt discrepancy (ToH: log loss .32 with it, .57 as
     # stated)
     noise_dof: float = 20.0
-    # all evidence beside a learnt discrepancy counts one over this: what differs from grasp to grasp is
-    # no noise
-    evidence_counts: float = 2.0
     # beside a learnt discrepancy an object's distance from the skin is known to this share
     gain_sd: float = 0.1
     # an object that is less well known is one of a range of temperatures, 5 K or more
@@ -81,11 +74,6 @@ class DoubtSettings:
     # probability that a grasp shows what a calibration left open: by ten foreign grippers with one known
     # grasp it takes the largest log loss from 2.64 to 1.37 (chance 1.61) and the others by .01
     gripper_prior: float = 0.2
-    slip_prior: float = 0.05  # probability that a stated temperature of an object is a slip (one in twenty)
-    # a stated temperature that is a slip is so many times as far off (Tukey's contaminated normal)
-    slip_times: float = 3.0
-    # of the prior variance of the temperature: readings that leave more do not tell a slip
-    telling_share: float = 0.5
     # where logarithms of the rest are one off: a message that is late by a third of a second
     unlike_onset_s: float = 0.3
     # of an object's distance from the skin there: one that has gone a fifth of its way
@@ -330,11 +318,18 @@ def second_modes(
     """Return the modes of pairs by the second sensor alone, and its prior; ``mode`` is the first one's."""
     assert gripper.second is not None
     assert data.second is not None
-    second, others = gripper.second, hypotheses_of_second(gripper, gripper.second, hypotheses)
-    second_prior = prior_of(second, data.second.known(row), others)
+    second, read = gripper.second, data.second
+    others = hypotheses_of_second(gripper, second, hypotheses)
+    second_prior = prior_of(second, read.known(row), others)
     begin = second_prior.mean.copy()
-    begin[:, LEVEL], begin[:, T_OBJECT] = data.second.level[row], mode.u[:, T_OBJECT]
-    return _own_modes(second, data.second, row, others, second_prior, begin, None), second_prior
+    begin[:, LEVEL], begin[:, T_OBJECT] = read.level[row], mode.u[:, T_OBJECT]
+
+    def search(some: NDArray[np.int64], start: Array) -> Mode:
+        one = Hypotheses(*(field[some] for field in others))
+        return _own_modes(second, read, row[some], one, second_prior.take(some), start, None)
+
+    beside = search(np.arange(row.size), begin)
+    return restarted(beside, row, ~beside.converged, search), second_prior
 
 
 def _own_modes(
@@ -342,7 +337,7 @@ def _own_modes(
     start: Array | None, noise: Whitened | None, rivals: bool = False,
 ) -> Mode:  # fmt: skip
     """Return the modes of pairs by the first sensor alone."""
-    noise = whiten(data, gripper.noise) if noise is None else noise
+    noise = whiten(data, gripper.reading_noise) if noise is None else noise
     beyond = None if gripper.discrepancy is None else gripper.beyond(data.t[row], prior.mean[:, EFFUSIVITY])
     return find_modes(gripper.stack, data, row, noise, prior, start=start, beyond=beyond, rivals=rivals)
 
@@ -382,45 +377,23 @@ def widened(mode: Mode, prior: Prior, n: NDArray[np.int64], bias: float) -> Mode
 
     A grasp's noise is larger or smaller than the others' as the discrepancy was: with a variance of inverse
     gamma distribution, :math:`\nu = 20`, the misfit S of ``n`` readings counts
-    :math:`(\nu + n) \ln(1 + S / \nu)` in place of S.  All evidence counts half, since what differs from
-    grasp to grasp is not the noise that it is taken for.  The object's temperature is known to a tenth of its
+    :math:`(\nu + n) \ln(1 + S / \nu)` in place of S.  The object's temperature is known to a tenth of its
     distance from the skin at best, and to the thermometer's own ``bias`` [K], of which the discrepancy may
     have taken a part.
     """
-    evidence = mode.log_evidence + 0.5 * (
-        mode.misfit - (DOUBT.noise_dof + n) * np.log1p(mode.misfit / DOUBT.noise_dof)
+    counts = NOISE_TIMES**2  # readings were whitened by so much more variance, S is theirs without it
+    misfit = counts * mode.misfit
+    evidence = mode.log_evidence + 0.5 / counts * (
+        misfit - (DOUBT.noise_dof + n) * np.log1p(misfit / DOUBT.noise_dof)
     )
     measured, width = _seen_temperature(mode, prior)
     x0, v0 = prior.mean[:, T_OBJECT], prior.sd[:, T_OBJECT] ** 2
-    width *= np.maximum(DOUBT.evidence_counts * (DOUBT.noise_dof + mode.misfit) / (DOUBT.noise_dof + n), 1.0)
+    width *= np.maximum((DOUBT.noise_dof + misfit) / (DOUBT.noise_dof + n), 1 / counts)
     width += (DOUBT.gain_sd * (mode.u[:, T_OBJECT] - mode.u[:, LEVEL])) ** 2 + bias**2
     u, covariance = mode.u.copy(), mode.covariance.copy()
     covariance[:, T_OBJECT, T_OBJECT] = v0 * width / (v0 + width)
     u[:, T_OBJECT] = (x0 * width + measured * v0) / (v0 + width)
-    return mode._replace(u=u, covariance=covariance, log_evidence=evidence / DOUBT.evidence_counts)
-
-
-def doubted(data: Touches, prior: Prior, mode: Mode) -> Mode:
-    """Return the modes of pairs, a row of data each, where the stated temperature of an object may be off by
-    more than the training's were: with a probability of 0.05 the sd about it is three times its own."""
-    v0 = prior.sd[:, T_OBJECT] ** 2
-    x0, v = prior.mean[:, T_OBJECT], mode.covariance[:, T_OBJECT, T_OBJECT]
-    # beyond what readings know of it the normal distribution around the mode is no guide
-    telling = np.isfinite(data.t_object) & (v < DOUBT.telling_share * v0) & mode.converged
-    precision = np.where(telling, 1 / v - 1 / v0, 1.0)
-    measured, width = x0 + (mode.u[:, T_OBJECT] - x0) / (v * precision), 1 / precision
-    # no farther than one that nobody stated
-    wide = np.clip(UNKNOWN_OBJECT_SD**2 / v0, 1.0, DOUBT.slip_times**2) * v0
-    ratio = _log_normal(measured - x0, wide + width) - _log_normal(measured - x0, v0 + width)
-    slip = np.where(telling, DOUBT.slip_prior * np.exp(np.clip(ratio, -700.0, 300.0)), 0.0)
-    total = np.where(telling, 1 - DOUBT.slip_prior, 1.0) + slip
-    share, apart = slip / total, (wide * measured + width * x0) / (wide + width) - mode.u[:, T_OBJECT]
-    within = share * (wide * width / (wide + width) - v) + share * (1 - share) * apart**2
-    # the rest of what is unknown goes along with the temperature
-    column = mode.covariance[:, :, T_OBJECT] / v[:, None]
-    u = mode.u + column * (share * apart)[:, None]
-    covariance = mode.covariance + within[:, None, None] * column[:, :, None] * column[:, None, :]
-    return mode._replace(u=u, covariance=covariance, log_evidence=mode.log_evidence + np.log(total))
+    return mode._replace(u=u, covariance=covariance, log_evidence=evidence, misfit=misfit)
 
 
 def _seen_temperature(mode: Mode, prior: Prior) -> tuple[Array, Array]:
@@ -460,10 +433,8 @@ def fit_candidates(
     begin = None
     if start is not None:
         begin = np.repeat(start.reshape(n, m, -1), n_grade, axis=0).reshape(row.size, -1)
-    stated = every.known(row)
-    prior = prior_of(gripper, stated, hypotheses)
+    prior = prior_of(gripper, every.known(row), hypotheses)
     mode = fit_rivals(gripper, every, row, hypotheses, start=begin, noise=noise, prior=prior)
-    mode = doubted(stated, prior, mode)
     place, candidate = np.arange(n)[:, None] * n_grade, np.arange(m)
     first = (place * m + candidate).ravel()
     if gripper.uncertainty is not None and gripper.discrepancy is None:
@@ -493,8 +464,7 @@ def evidence_in_doubt(
     spread = gripper.uncertainty.covariance[np.ix_(place, place)]
     noise = whiten(data, gripper.noise, slopes @ spread @ slopes.transpose(0, 2, 1))
     row = np.arange(data.level.size)
-    again = fit_pairs(gripper, data, row, hypotheses, start=mode.u, noise=noise, prior=prior)
-    return doubted(data.known(row), prior, again).log_evidence
+    return fit_pairs(gripper, data, row, hypotheses, start=mode.u, noise=noise, prior=prior).log_evidence
 
 
 def unexplained(data: Touches, row: NDArray[np.int64], mode: Mode, prior: Prior) -> list[tuple[float, str]]:
@@ -528,19 +498,31 @@ def fit_rivals(
 
     Where nuisances may be far from usual a density may have several modes (a sheet, or a block in poor
     contact): then each hypothesis is also looked for from where the likeliest of its touch ended."""
-    noise = whiten(data, gripper.noise) if noise is None else noise
+    noise = whiten(data, gripper.reading_noise) if noise is None else noise
     mode = fit_pairs(gripper, data, row, hypotheses, start=start, noise=noise, prior=prior, rivals=True)
+
+    def again(some: NDArray[np.int64], begin: Array) -> Mode:
+        one = Hypotheses(*(field[some] for field in hypotheses))
+        return fit_pairs(gripper, data, row[some], one, start=begin, noise=noise, prior=prior.take(some),
+                         rivals=True)  # fmt: skip
+
+    return restarted(mode, row, data.unlike[row] > 0, again)
+
+
+def restarted(
+    mode: Mode, row: NDArray[np.int64], doubtful: Mask, search: Callable[[NDArray[np.int64], Array], Mode]
+) -> Mode:
+    """Return the modes of pairs of touches ``row``, of which the doubtful ones are looked for from where the
+    likeliest of their touch ended, too: ``search`` takes some rows, and from where."""
     order = np.lexsort((mode.log_evidence, row))
-    likeliest = np.empty(data.level.size, dtype=np.int64)
+    likeliest = np.empty(int(row.max()) + 1, dtype=np.int64)
     likeliest[row[order]] = order  # of several the last one stays
-    again_for = np.flatnonzero((data.unlike[row] > 0) & (likeliest[row] != np.arange(row.size)))
+    again_for = np.flatnonzero(doubtful & (likeliest[row] != np.arange(row.size)))
     if not again_for.size:
         return mode
     begin = mode.u[likeliest[row[again_for]]]
     begin[:, EFFUSIVITY] = mode.u[again_for, EFFUSIVITY]
-    some = Hypotheses(*(field[again_for] for field in hypotheses))
-    prior = prior.take(again_for)
-    again = fit_pairs(gripper, data, row[again_for], some, start=begin, noise=noise, prior=prior, rivals=True)
+    again = search(again_for, begin)
     better = again.log_evidence > mode.log_evidence[again_for]
     for whole, field in zip(mode, again):
         whole[again_for[better]] = field[better]

@@ -72,8 +72,8 @@ from thermogrip.datasets.materials import Material
 from thermogrip.datasets.schema import label_values, log_name
 from thermogrip.sysid.contact.simulation import step_response, time_nodes
 from thermogrip.sysid.effusivity import posterior_grid
-from thermogrip.sysid.effusivity.data import Touches, touches, whiten
-from thermogrip.sysid.effusivity.gripper_model import UNKNOWN_OBJECT_SD, GripperModel
+from thermogrip.sysid.effusivity.data import UNKNOWN_OBJECT_SD, Touches, touches, whiten
+from thermogrip.sysid.effusivity.gripper_model import GripperModel
 from thermogrip.sysid.effusivity.laplace_approximation import (
     CAPACITY,
     EFFUSIVITY,
@@ -390,7 +390,7 @@ def free_touch_fit(
     rows = touch_groups(grasps)
     used = coupling or Coupling()
     data = touches(grasps, until=until)
-    whitener, rest_s = whiten(data, gripper.noise), number_values(grasps, "rest")
+    whitener, rest_s = whiten(data, gripper.reading_noise), number_values(grasps, "rest")
 
     def by_loss(group_rows: Rows, x: Array) -> Joint:
         hypotheses = free_hypotheses(gripper, x)
@@ -508,7 +508,7 @@ def _view(
 ) -> _View:
     data = touches(grasps, until=until)
     traces = traces_of(gripper, data, number_values(grasps, "rest"), one)
-    return _View(gripper, data, whiten(data, gripper.noise), one, traces, coupling)
+    return _View(gripper, data, whiten(data, gripper.reading_noise), one, traces, coupling)
 
 
 def _own_views(gripper: GripperModel, grasps: Grasps, coupling: Coupling) -> list[tuple[_View, list[Rows]]]:

@@ -28,7 +28,6 @@ from thermogrip.sysid.effusivity.laplace_approximation import (
     T_OBJECT,
     H,
     Mode,
-    doubted,
     fit_pairs,
     fit_rivals,
     free_hypotheses,
@@ -90,7 +89,7 @@ def grid_posteriors(gripper: GripperModel, data: Touches) -> list[GridPosterior]
 
 def _posteriors(gripper: GripperModel, data: Touches) -> list[GridPosterior]:
     """Return :func:`grid_posteriors` under the grade that each of the touches has."""
-    noise = whiten(data, gripper.noise)
+    noise = whiten(data, gripper.reading_noise)
     x = np.tile(np.linspace(*LN_E_RANGE, GRID.coarse_points), (data.level.size, 1))
     modes = _modes_at(gripper, data, noise, x, None)
     for widen, n_point in REFINEMENTS:
@@ -118,11 +117,9 @@ def _modes_at(gripper: GripperModel, data: Touches, noise: Whitened, x: Array, s
     ...)."""
     n, m = x.shape
     row, hypotheses = np.repeat(np.arange(n), m), free_hypotheses(gripper, x)
-    stated = data.known(row)
-    prior = prior_of(gripper, stated, hypotheses)
+    prior = prior_of(gripper, data.known(row), hypotheses)
     begin = None if start is None else start.reshape(n * m, -1)
     mode = fit_rivals(gripper, data, row, hypotheses, start=begin, noise=noise, prior=prior)
-    mode = doubted(stated, prior, mode)
     fields: Any = (field.reshape(n, m, *field.shape[1:]) for field in mode)
     return Mode(*fields)
 
@@ -154,7 +151,9 @@ def _evidence_about(gripper: GripperModel, data: Touches, noise: Whitened, mode:
     x = low[:, None] + (high - low)[:, None] * np.linspace(0.0, 1.0, _AROUND.size)
     along = mode.covariance[:, :, EFFUSIVITY] / variance[:, None]
     start = mode.u[:, None] + along[:, None] * (x - place[:, None])[:, :, None]
+    # an object of none of the candidates is of something, most likely of a material of the table
     value = _modes_at(gripper, data, noise, x, start).log_evidence
+    value += log_listed(x - gripper.effusivity_scale(x)[0])
     value[:, [0, -1]] -= np.log(2.0)
     return np.asarray(logsumexp(value, axis=1) + np.log((x[:, 1] - x[:, 0]) / (highest - lowest)))
 

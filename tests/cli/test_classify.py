@@ -391,7 +391,7 @@ def test_answers_are_printed_written_and_answered(named: SimpleNamespace) -> Non
     assert named.loaded[0].args == (Path("m"),)
     assert named.warned[0].args[1:] == ([named.record], ["quality"])
     said = words_of(done.out)
-    assert "grasp material probability p unknown decided at [s]" in said
+    assert "grasp material p nearest p unknown decided at [s]" in said
     assert "a iron 0.75 0.125 9 b - - 8" in said
     assert said.count("far; odd: a no contact, so no name: b") == 1
     assert said.endswith(": too cold for iron wrote p.csv")
@@ -461,6 +461,9 @@ def test_materials_are_listed_by_their_effusivity(bench: Bench) -> None:
     known = load_materials()
     done = bench.run("materials")
     assert words_of(done.out).startswith(f"{len(known)} materials, effusivity in W s^0.5 m^-2 K^-1")
+    # a row a material where no terminal reads
+    names = [line.split("  ")[0] for line in done.out.splitlines()]
+    assert set(known) <= set(names)
     listed = json.loads(bench.run("materials", "--json").out)["materials"]
     assert [row["effusivity"] for row in listed] == sorted(m.effusivity for m in known.values())
     copper = known["copper"]

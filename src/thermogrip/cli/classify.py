@@ -360,7 +360,7 @@ def classify(
         )
         for row in rows[:SHOWN]
     ]
-    head = ("grasp", "material", "probability", "p unknown", "decided at [s]", *(_HEADS[key] for key in more))
+    head = ("grasp", "material", "p nearest", "p unknown", "decided at [s]", *(_HEADS[key] for key in more))
     console.table("Materials", head, shown)
     _say_more(console, len(rows))
     say_names(
@@ -528,7 +528,8 @@ def materials(
         (m.name, m.k, m.rho, m.c_p, m.effusivity, 100 * m.effusivity_sd_ln, m.kind, m.source) for m in rows
     ]
     count = f"{len(rows)} material{'s' if len(rows) > 1 else ''}"
-    console.table(f"{count}, effusivity in W s^0.5 m^-2 K^-1", head, body)
+    # for a program that reads lines, such as grep, each material is one
+    console.table(f"{count}, effusivity in W s^0.5 m^-2 K^-1", head, body, wrap=sys.stdout.isatty())
     console.answer({"materials": rows})
     return 0
 

@@ -64,11 +64,14 @@ class Console:
         """Print one warning on stderr, with ``--json`` too."""
         sys.stderr.write(f"{_anew()}thermogrip: warning: {printable(text)}\n")
 
-    def table(self, title: str, head: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
-        """Print a table for people, as wide as the terminal (100 columns of what is none); numbers stand to
-        the right, no word is broken, and where the columns are too many each row is a block of lines."""
+    def table(
+        self, title: str, head: Sequence[str], rows: Sequence[Sequence[Any]], *, wrap: bool = True
+    ) -> None:
+        """Print a table for people, as wide as the terminal (100 columns of what is none), or not wrapped;
+        numbers stand to the right, no word is broken, and where the columns are too many each row is a block
+        of lines."""
         if not self.as_json:
-            sys.stdout.write(_table(title, head, rows, _room()))
+            sys.stdout.write(_table(title, head, rows, _room() if wrap else sys.maxsize))
 
     def early(self, line: str, title: str, head: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
         """Show on stderr, while work goes on, what is known so far: on a terminal a table, else one line."""

@@ -18,8 +18,9 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.datasets.schema import Grasps
 from thermogrip.sysid.contact.simulation import simulate_grasps
-from thermogrip.sysid.effusivity.data import graded, touches, whiten
+from thermogrip.sysid.effusivity.data import KNOTS, graded, touches, whiten
 from thermogrip.sysid.effusivity.gripper_model import (
+    Discrepancy,
     load_default_gripper,
 )
 from thermogrip.sysid.effusivity.laplace_approximation import fit_candidates
@@ -268,9 +269,37 @@ def test_one_block_far_from_its_stated_temperature_makes_no_other_gripper(known:
     )
     one = one.assign(t_object=("grasp", [18.0]))
     (row,) = classify_grasps(known, one)
-    assert (row["material"], "note" in row) == ("copper", False)
+    assert row["material"] == "copper"
+    assert row["note"] == "as copper its object is 1.9 K colder than stated: answered less surely"
     assert row["p_copper"] > 0.8
     assert row["p_unknown"] < 0.1
+
+
+def test_what_no_block_reaches_is_unknown_beside_a_learnt_discrepancy_too() -> None:
+    """Wood is none of a block of two thirds of its effusivity, five times the scatter away, however little
+    its readings count."""
+    device, grasps = load_default_gripper(), load_example_grasps()["exp2_dT20"]
+    wood = device.blocks["wood"]
+    blocks = {**device.blocks, "cedar": replace(wood, ln_effusivity=wood.ln_effusivity - 0.4)}
+    shape = len(blocks), KNOTS.size
+    nothing = Discrepancy(np.zeros(KNOTS.size), np.zeros(shape), np.zeros(len(blocks)))
+    model = PosteriorClassifier().with_device(replace(device, blocks=blocks, discrepancy=nothing))
+    touched = pick(grasps, np.flatnonzero(grasps["material"].values == "wood")[:6])
+    assert model.p_unknown(touched, ["cedar", "copper"]).min() > 0.5
+    assert model.p_unknown(touched, ["copper", "wood"]).max() < 0.05
+
+
+def test_temperatures_stated_wrongly_by_5_K_mislead_less_than_a_quarter_of_chance() -> None:
+    model, losses = PosteriorClassifier().with_device(load_default_gripper()), list[float]()
+    for name in ("exp2_dT20", "exp3C_obj18_grip38"):
+        record = load_example_grasps()[name]
+        test = pick(record, record["split"].values == "test")
+        for off in (-5.0, 5.0):
+            wrong = test.assign(t_object=test["t_object"] + off)
+            p = np.exp(model.candidate_log_proba(wrong, ["copper", "iron", "wood"]))
+            at = np.searchsorted(["copper", "iron", "wood"], test["material"].values)
+            losses += (-np.log(p[np.arange(at.size), at])).tolist()
+    assert np.mean(losses) < 0.25 * np.log(3)
 
 
 def test_grasps_by_another_gripper_are_answered_less_surely_than_known_ones_would_be(

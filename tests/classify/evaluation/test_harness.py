@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -158,6 +159,9 @@ def test_a_material_that_training_lacks_is_counted_with_its_answers(three: Grasp
     answers = [r["predicted"] for r in found.predictions if not r["known"]]
     assert {f"{name} {answers.count(name)}" in caution.detail for name in set(answers)} == {True}
     assert caution.brief.startswith("8 unseen (wood): ")
+    # one that is likelier none of the candidates counts as that, as `classify` says
+    doubting = replace(found, predictions=[row | {"p_unknown": 0.9} for row in found.predictions])
+    assert [one.brief for one in doubting.cautions] == ["8 unseen (wood): unknown 8"]
 
 
 def test_a_fault_of_contacts_touches_the_scores_that_rest_on_them(three: Grasps, make_touches: Maker) -> None:

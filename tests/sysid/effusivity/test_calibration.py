@@ -11,6 +11,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from thermogrip.classify import answer
+from thermogrip.classify.estimators.posterior import PosteriorClassifier
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.datasets.materials import find_material
@@ -108,30 +110,40 @@ def test_the_bundled_gripper_is_what_its_training_grasps_make():
     assert again.trained_on == bundled.trained_on
 
 
-@pytest.fixture(scope="module")
-def heated(files):
-    """A finger whose heater is cut at contact, smoothed over a second, and what it learns of 15 grasps."""
-    record = files["exp2_dT20"]
+def heated(record, cut):
+    """What a finger whose heater is cut at contact reads, smoothed over a second."""
     time, y = record["time"].values, record["t_surface"].values
     window = np.hanning(11) / np.hanning(11).sum()
     smooth = [np.convolve(row, window, "valid") for row in np.pad(y, ((0, 0), (5, 5)), mode="edge")]
-    cut = -1.5 * (1 - np.exp(-np.maximum(time, 0.0) / 1.5))
-    record = record.assign(t_surface=(("grasp", "time"), smooth + cut))
-    return record, calibrate_gripper([split_of(record, "train")])
+    cooler = cut * (1 - np.exp(-np.maximum(time, 0.0) / 1.5))
+    return record.assign(t_surface=(("grasp", "time"), smooth - cooler))
 
 
-def test_what_no_gripper_does_is_a_discrepancy_that_is_learnt(heated, tmp_path):
-    record, device = heated
+def test_what_no_gripper_does_is_a_discrepancy_that_is_learnt(files):
+    """From objects on both sides of the skin, which tell what is common to all."""
+    records = [heated(files[name], 1.5) for name in ("exp2_dT20", "exp3A_obj43_grip23")]
+    training = [split_of(record, "train") for record in records]
+    device = calibrate_gripper(training)
     found = device.discrepancy
     assert device.noise.smooth
     assert found.always[KNOTS == 4.6] < -0.2
-    test = split_of(record, "test")
+    test = split_of(records[0], "test")
     p = material_fit(device, test, ["copper", "iron", "wood"]).probabilities
     assert (np.array(["copper", "iron", "wood"])[p.argmax(axis=1)] == test["material"].values).sum() >= 8
     # a refit from it keeps it
-    again = calibrate_gripper([split_of(record, "train")], start=device)
+    again = calibrate_gripper(training, start=device)
     np.testing.assert_allclose(again.discrepancy.share, found.share)
     np.testing.assert_allclose(again.discrepancy.always, found.always)
+
+
+def test_a_discrepancy_learnt_at_one_difference_holds_at_half_of_it(files):
+    """What objects 20 K above the skin show is no reason to doubt grasps of some 10 K above it."""
+    known = PosteriorClassifier().fit(split_of(heated(files["exp2_dT20"], 0.0), "train"))
+    assert known.device_.discrepancy is not None
+    test = split_of(heated(files["exp2_dT10"], 0.0), "test")
+    found = answer(known, test)
+    assert sum(one.nearest == name for one, name in zip(found, test["material"].values)) >= 8
+    assert not [note.words for one in found for note in one.notes]
 
 
 def test_a_block_at_the_bound_of_insulators_is_none():

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.interpolate import CubicHermiteSpline
 from scipy.optimize import minimize
-from scipy.special import gammaln, logsumexp
+from scipy.special import gammaln
 
 from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.datasets.materials import find_material
@@ -345,13 +345,14 @@ def test_the_more_a_grasp_misfits_the_less_it_says():
     for misfits in pairs:
         one, two = (widened(normal_mode(10.0, 0.2, m, -0.5 * m), prior, n, 0.3) for m in misfits)
         gaps.append(float(one.log_evidence[0] - two.log_evidence[0]))
-    # half of what Student's t says with 20 degrees of freedom
-    np.testing.assert_allclose(gaps, [15 * np.log((20 + b) / (20 + a)) for a, b in pairs])
+    # half of what Student's t says with 20 degrees of freedom, of readings that count half
+    np.testing.assert_allclose(gaps, [15 * np.log((20 + 2 * b) / (20 + 2 * a)) for a, b in pairs])
     assert gaps[2] / 10 < 0.4 * gaps[1] / 10
     small, large = (widened(normal_mode(10.0, 0.2, m), prior, n, 0.3) for m in (10.0, 400.0))
     assert small.covariance[0, 4, 4] < large.covariance[0, 4, 4]
     # a tenth of the distance from the skin, here of 0 degC, and the bias
-    assert small.covariance[0, 4, 4] == pytest.approx(1 / (1 / 1.2903 + 1 / 11.5**2), rel=1e-3)
+    width = 0.2 * (20 + 2 * 10.0) / (20 + 40) + 1.0 + 0.3**2
+    assert small.covariance[0, 4, 4] == pytest.approx(1 / (1 / width + 1 / 11.5**2), rel=1e-3)
 
 
 def test_the_second_sensor_is_asked_about_the_same_material(device):
@@ -368,40 +369,3 @@ def test_the_second_sensor_is_asked_about_the_same_material(device):
     # no block of the second sensor's is of zinc: its conductance is unknown there
     assert other.block.tolist() == [second.materials.index("copper"), -1, -1]
     assert other.ln_h_sd[1] > 2 * other.ln_h_sd[0]
-
-
-@pytest.mark.parametrize("off", [0.0, 0.7, 2.5])
-@pytest.mark.usefixtures("one_grade")
-def test_a_stated_temperature_may_be_a_slip(device, off):
-    """One in twenty is three times as far off: the mixture of the answers under each, put together again."""
-    grasp = load_example_grasps()["exp2_dT20"].isel(grasp=[2])
-    grasp = grasp.assign(t_object=grasp["t_object"] + off, t_object_sd=("grasp", [0.4]))
-    names = ["copper", "iron"]
-    data, one, row = touches(grasp), material_hypotheses(device, names), np.zeros(2, dtype=np.int64)
-    usual = prior_of(device, data.take(row), one)
-    wide = usual._replace(sd=usual.sd * np.where(np.arange(7) == laplace.T_OBJECT, 3.0, 1.0))
-    parts = [laplace.fit_pairs(device, data, row, one, prior=prior) for prior in (usual, wide)]
-    weighed = np.array([np.log(0.95), np.log(0.05)])[:, None] + [p.log_evidence for p in parts]
-    got = laplace.fit_candidates(device, data, names)[0]
-    # the others of a contact are nearly normal given its temperature
-    np.testing.assert_allclose(got.log_evidence, logsumexp(weighed, axis=0), atol=0.15)
-    share = np.exp(weighed - logsumexp(weighed, axis=0))
-    means = np.array([p.u[:, laplace.T_OBJECT] for p in parts])
-    mean = (share * means).sum(axis=0)
-    variance = (share * [p.covariance[:, laplace.T_OBJECT, laplace.T_OBJECT] for p in parts]).sum(axis=0)
-    variance += (share * (means - mean) ** 2).sum(axis=0)
-    np.testing.assert_allclose(got.u[:, laplace.T_OBJECT], mean, atol=0.05)
-    found = got.covariance[:, laplace.T_OBJECT, laplace.T_OBJECT]
-    np.testing.assert_allclose(found, variance, rtol=0.15)
-    assert share[1, 0] > 0.9 if off == 2.5 else share[1, 0] < 0.2
-
-
-@pytest.mark.usefixtures("one_grade")
-def test_a_temperature_that_nobody_stated_is_no_slip(device):
-    grasp = load_example_grasps()["exp2_dT20"].isel(grasp=[2])
-    data = touches(grasp.assign(t_object=("grasp", [np.nan])))
-    one = material_hypotheses(device, ["copper"])
-    plain = laplace.fit_pairs(device, data, np.zeros(1, dtype=np.int64), one)
-    got = laplace.fit_candidates(device, data, ["copper"])[0]
-    for a, b in zip(got, plain):
-        np.testing.assert_array_equal(a, b)

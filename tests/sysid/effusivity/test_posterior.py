@@ -274,8 +274,9 @@ def test_fits_are_laid_out_by_grasp_and_candidate_and_may_start_from_another(dev
     np.testing.assert_allclose(again.log_evidence[near], whole.log_evidence[near], atol=0.5)
 
 
+@pytest.mark.usefixtures("one_grade")
 def test_a_gripper_with_a_discrepancy_answers_as_unsurely_as_its_evidence(device, files):
-    """Its fits count half and its temperatures are those that it was told: no integral makes them sharper."""
+    """Its readings count half, its temperatures are those it was told: no integral makes them sharper."""
     n = len(device.blocks)
     nothing = Discrepancy(np.zeros(KNOTS.size), np.zeros((n, KNOTS.size)), np.zeros(n))
     odd, grasp = replace(device, discrepancy=nothing, bias=0.8), files["exp2_dT20"].isel(grasp=[13])

@@ -533,6 +533,8 @@ def test_a_longer_contact_is_named_by_its_beginning_and_the_answer_reports_it(sh
         "read until 10 s, as long as contacts of the training lasted"
     }
     assert {row.pop("note_codes") for row in rows} == {"readings"}
+    assert {row.pop(column) for row in first for column in ("note", "note_codes")} == {""}
+    assert {row.pop("deviates") for row in rows + first} == {""}
     assert [row.pop("material") for row in rows] == [row.pop("material") for row in first]
     assert [row.pop("grasp_id") for row in rows] == [row.pop("grasp_id") for row in first]
     for row, wanted in zip(rows, first):
