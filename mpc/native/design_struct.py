@@ -90,8 +90,7 @@ _FIELDS: dict[str, tuple[bool, tuple[str, ...], str]] = {
     "on_output": (False, ("NY", "NW"), ""),
     "offset": (False, ("NY",), "sensor offsets [degC]"),
     "R": (False, ("NY",), "variance of a reading"),
-    "Q": (False, ("NZ",), "variance that a sample adds"),
-    "load": (False, ("NX", "NU"), "standard deviation that the white noise of each drive adds to each state"),
+    "Q": (False, ("NZ", "NZ"), "covariance that a sample adds"),
     "P0": (False, ("NW",), "variance of the disturbance states at rest"),
     "R_start": (False, ("NY",), "variance of a reading at rest"),
     "rest": (False, ("NX",), "state at rest where all is at `ambient` and `usual_d`"),
@@ -241,7 +240,7 @@ def numbers_of(controller: ControllerParts, k: Array) -> dict[str, Any]:
         (optimiser.drives, "lowest highest slew neutral safe"),
         (optimiser.weights, "dear zone"),
         (optimiser.at_rest, "strongest seen"),
-        (observer, "fixed offset R Q load P0 R_start"),
+        (observer, "fixed offset R Q P0 R_start"),
         (observer.disturbance, "on_drive on_disturbance on_output"),
     )
     return {name: getattr(source, name) for source, names in same_names for name in names.split()} | {

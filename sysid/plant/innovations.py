@@ -4,10 +4,10 @@ A Kalman filter of the plant with a bias w for each graded input,
 
     x+ = f(x, u + w, d) + noise of sd q s_x,    w+ = w + noise of sd b s_u,    y = C x + noise of sd r,
 
-in a second, where s_x is each state's spread, seen against that of the outputs, and s_u an input's range in
-the logs, makes innovations e of covariance S.  Of q and b on a grid, beside sensors as noisy as the fit found
-them, and the scale of all three that is best for each in closed form, those are kept whose likelihood is
-greatest,
+in a second, where s_x s_x' is the covariance of the states in the data of the fit over that of the outputs,
+and s_u an input's range in the logs, makes innovations e of covariance S.  Of q and b on a grid, beside
+sensors as noisy as the fit found them, and the scale of all three that is best for each in closed form, those
+are kept whose likelihood is greatest,
 
     -2 log L = sum_k log det S + e_k' S^-1 e_k   [1]_.
 
@@ -26,7 +26,7 @@ from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
-from scipy.linalg import solve_discrete_are
+from scipy.linalg import block_diag, solve_discrete_are
 
 from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.schema import Log
@@ -88,18 +88,19 @@ class _Filter:
     level: Array  # (n_y,) readings at states of 0
     offset: Array  # (n_y,) of the sensors
     middle: Array  # (n_y,) mean readings
-    state_unit: Array  # (n_x,) each state's spread, in that of the outputs
+    state_covariance: Array  # (n_x, n_x) over the outputs' largest
     input_range: Array  # (n,) of the graded inputs in the logs
 
     def gains(self, sd: Array, ratios: Sequence[tuple[float, float]]) -> tuple[Array, Array]:
         """Return the gains and the covariances of innovations that the filter settles at, by ratio."""
         dt, r = self.plant.dt, float(np.sqrt(np.mean(sd**2)))
+        states, inputs = r**2 * self.state_covariance, np.diag(self.input_range**2)
         # what moves nothing by itself has a gain all the same
-        trace = 1e-12 * np.diag(np.concatenate([(r * self.state_unit) ** 2, self.input_range**2]))
+        trace = 1e-12 * block_diag(np.diag(np.diag(states)), inputs)
         gains, spreads = [], []
         for q, b in ratios:
-            drift = np.concatenate([(q * r * self.state_unit) ** 2, (b * self.input_range) ** 2])
-            P = solve_discrete_are(self.F.T, self.H.T, dt * np.diag(drift) + trace, np.diag(sd**2))
+            drift = dt * block_diag(q**2 * states, b**2 * inputs)
+            P = solve_discrete_are(self.F.T, self.H.T, drift + trace, np.diag(sd**2))
             S = self.H @ P @ self.H.T + np.diag(sd**2)
             gains.append(np.linalg.solve(S, self.H @ P).T)
             spreads.append(S)
@@ -136,8 +137,8 @@ def _filter_of(plant: PlantData, stretches: Sequence[Stretch], graded: list[int]
     model, p, n_x, n_w = plant.model, plant.p, plant.model.n_x, len(graded)
     offset = np.array([plant.offsets.get(name, 0.0) for name in plant.outputs])
     C, level = output_matrix(plant)
-    spread = np.sqrt(np.maximum(np.diag(np.atleast_2d(model.spread)), 1e-12))
-    unit = spread / np.sqrt(np.einsum("ij,j,ij->i", C, spread**2, C)).max()
+    spread = np.atleast_2d(model.spread)
+    covariance = spread / np.einsum("ij,jk,ik->i", C, spread, C).max()
     u, d, y = (np.concatenate([getattr(stretch, key) for stretch in stretches]) for key in "udy")
     size = np.ptp(u, axis=0)[graded]
     middle = np.nanmean(y, axis=0)
@@ -149,7 +150,7 @@ def _filter_of(plant: PlantData, stretches: Sequence[Stretch], graded: list[int]
         return None
     F = np.block([[A, B[:, :n_w]], [np.zeros((n_w, n_x)), np.eye(n_w)]])
     H = np.hstack([C, np.zeros((len(C), n_w))])
-    return _Filter(plant, graded, F, H, level, offset, middle, unit, size)
+    return _Filter(plant, graded, F, H, level, offset, middle, covariance, size)
 
 
 @dataclass(frozen=True, eq=False)

@@ -325,11 +325,8 @@ static void find_band(const double *row, int *from, int *to)
 static void add_noise(tg_controller *c, double share)
 {
     for (int i = 0; i < TG_Z; i++)
-        c->P[i * TG_Z + i] += c->held[i] ? 0.0 : share * c->design->Q[i];
-    for (int i = 0; i < TG_NX; i++)
-        for (int j = 0; j < TG_NX; j++)
-            for (int k = 0; k < TG_NU; k++)
-                c->P[i * TG_Z + j] += share * c->design->load[i * TG_NU + k] * c->design->load[j * TG_NU + k];
+        for (int j = 0; j < TG_Z; j++) /* a bias that is held drifts no more, and does with no other state */
+            c->P[i * TG_Z + j] += c->held[j] ? 0.0 : share * c->design->Q[i * TG_Z + j];
 }
 
 /* P = J P J', twice by rows of J, which is sparse in its last rows, and often in all: J P, and J times its transpose,

@@ -142,10 +142,25 @@ def test_what_no_set_of_disturbances_explains_is_refused() -> None:
     assert detectability_margin(A, C, unseen, unseen) == 0.0
 
 
+def test_states_wander_as_in_the_logs_whatever_their_coordinates() -> None:
+    T, plant = np.array([[1.0, 0.5], [3.0, -2.0]]), MODEL.plant
+    linear, back = plant.model, np.linalg.inv(T)
+    spread = np.array([[4.0, 0.8], [0.8, 0.25]])
+    moved = replace(
+        linear, A=T @ A @ back, B=T @ linear.B, E=T @ linear.E, C=C @ back, spread=T @ spread @ T.T
+    )
+    one, other = (
+        Observer(PredictionModel(replace(plant, model=states), dt=DT), CHOSEN, NOISE)
+        for states in (replace(linear, spread=spread), moved)
+    )
+    np.testing.assert_allclose(other.Q[:2, :2], T @ one.Q[:2, :2] @ T.T, rtol=1e-9)
+    np.testing.assert_allclose(one.Q[:2, :2], 0.03**2 * DT * spread / (C @ spread @ C.T).max())
+
+
 def test_what_nobody_says_of_noise_is_assumed() -> None:
     found = Observer(model(noise=(("a", 0.2),)), CHOSEN)
     np.testing.assert_allclose(found.R, [0.2**2, 0.05**2])
-    np.testing.assert_allclose(np.sqrt(found.Q / DT)[2:], [0.002, 0.03])
+    np.testing.assert_allclose(np.sqrt(np.diag(found.Q) / DT)[2:], [0.002, 0.03])
     said = Observer(MODEL, CHOSEN, replace(NOISE, reading={"b": 0.1}))
     np.testing.assert_allclose(said.R, [0.2**2, 0.1**2])
 

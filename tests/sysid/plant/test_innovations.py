@@ -45,6 +45,18 @@ def test_noise_is_found_as_it_was(state: float, bias: float, reading: float):
     assert found.fastest == {"q": 60.0 / DT}
 
 
+def test_noise_is_the_same_in_any_coordinates_of_the_states():
+    T, spread = np.array([[1.0, 0.5], [3.0, -2.0]]), np.array([[4.0, 3.8], [3.8, 4.0]])
+    A, B, C = np.array([[0.97, 0.0], [0.4, 0.6]]), np.array([[0.02], [0.0]]), np.array([[0.0, 1.0]])
+    lagged = replace(heater().model, A=A, B=B, C=C, c=[0.0, 0.0], spread=spread)
+    back = np.linalg.inv(T)
+    moved = replace(lagged, A=T @ A @ back, B=T @ B, C=C @ back, spread=T @ spread @ T.T)
+    log = logged(0.05, 0.0, 0.05)
+    one, other = (innovation_noise(replace(heater(), model=model), [log]) for model in (lagged, moved))
+    assert other.state == pytest.approx(one.state, rel=1e-3) != 0.0
+    assert (other.input, other.reading) == (pytest.approx(one.input, rel=1e-3), pytest.approx(one.reading))
+
+
 def test_lost_readings_and_two_logs_change_little():
     log = logged(0.05, 0.0, 0.05)
     holes = log.copy(deep=True)
