@@ -7,7 +7,8 @@ steps and on loads (:mod:`thermogrip.mpc.tuning.objective`). An MPC that
 is worse than the default design by more than 3 % on steps or on loads is not taken, whatever it wins on
 the other: trials are the model's word, and on two of eight plants the truth denied it. The default
 design, the best MPC and the best PI are then compared on draws that the search has not seen, and the one
-of the least score is what is saved, whatever its kind; a tuned MPC where it wins more than 10 %. A PI does
+of the least score is what is saved, whatever its kind; a tuned MPC where it wins more than 20 % and the plant
+has draws: on one plant alone the search has seen all that the comparison shows. A PI does
 not know zones, prices of energy, limits of outputs, ramps or what is switched: where the spec asks for
 one of these the MPC is taken.
 
@@ -66,9 +67,10 @@ if TYPE_CHECKING:
 class SearchSettings:
     """How designs are searched and compared."""
 
-    # relative fall of the score that counts: one noise alone moves a score by a tenth, and of four plants on
-    # whose draws a design won 4 to 8 % the truth gave it .91, .77, 1.23 and 1.76 of the best's error in loads
-    won: float = 0.10
+    # Relative fall of the score that counts. The score of 56 designs of eight plants on unseen draws, over
+    # the default's, is less than the mean of both errors over the default's on the truth by .10 in the
+    # logarithm and a standard deviation of .14 from plant to plant (eight_plants.py): their sum.
+    won: float = 0.20
     worse: float = 0.03  # relative rise of steps or of loads from which an MPC is not taken
     near: float = 1.25  # settling over bound that counts as the actuator's limit
     # by which a search first varies each parameter.  Score over the default's on unseen draws of four plants
@@ -488,16 +490,17 @@ def _tuning(
     """Return what was found, with the best of the candidates for its controller."""
     spec, scored = bench.spec, {n: score(part, bench.spec, bench.scales) for n, part in results.items()}
     scores = {name: part.total for name, part in scored.items()}
-    settled = {name for name, part in results.items() if settles_in_every_trial(part)}
-    saved = kept_of(scores, settled)
+    certain = bench.draws == [0]
+    eligible = may_be_saved(results, certain=certain)
+    saved = kept_of(scores, eligible)
     rows = tuple(row for name, part in results.items() for row in rows_of(name, part, bench.bounds))
     kept_rows = [row for row in rows if row.controller == saved and not row.load]
-    least = min(scores[saved], scores["tuned"] if "tuned" in settled else np.inf)
+    least = min(scores[saved], scores["tuned"] if "tuned" in eligible else np.inf)
     verdict, words = verdict_of(spec, least, scores["baseline"], kept_rows)
     where = "on the search's own draws" if interrupted else "on unseen draws"
-    if bench.draws == [0] and not interrupted:
-        where = "under fresh noise (the plant has no uncertainty)"
-    finding = f"{best_of(scored, settled, where, unknown_to_pi(spec))} {words}"
+    if certain and not interrupted:
+        where = "under fresh noise (no draws of the plant confirm a tuned MPC, so none is saved)"
+    finding = f"{best_of(scored, eligible, where, unknown_to_pi(spec))} {words}"
     if interrupted:
         finding = f"Interrupted after {len(tried)} designs; this is the best of them. {finding}"
     notes = {
@@ -540,17 +543,23 @@ def _final(
     return Controller(bench.plant, design, notes=notes)
 
 
-def settles_in_every_trial(results: Sequence[StepResult]) -> bool:
-    """Return whether each step to a target settled."""
-    return all(np.isfinite(result.settle_s) for result in results if not result.case.load)
+def may_be_saved(results: Mapping[str, Sequence[StepResult]], *, certain: bool) -> set[str]:
+    """Return which settled at each target; a tuned MPC beside a default one where draws confirm it."""
+    names = {
+        name
+        for name, part in results.items()
+        if all(np.isfinite(result.settle_s) for result in part if not result.case.load)
+    }
+    # of a plant that is certain the search has seen all that the comparison shows, but for its noise
+    return names - {"tuned"} if certain and "baseline" in names else names
 
 
-def kept_of(scores: Mapping[str, float], settled: Collection[str]) -> str:
+def kept_of(scores: Mapping[str, float], eligible: Collection[str]) -> str:
     """Return which controller is saved: a tuned MPC only where it wins what counts, a PI where it is best."""
     # where draws differ so much that nothing settles on some of them, scores compare failures
     won = scores["tuned"] < (1 - SEARCH.won) * scores["baseline"]
-    mpc = "tuned" if won and "tuned" in settled else "baseline"
-    return "PI" if "PI" in settled and scores.get("PI", np.inf) < scores[mpc] else mpc
+    mpc = "tuned" if won and "tuned" in eligible else "baseline"
+    return "PI" if "PI" in eligible and scores.get("PI", np.inf) < scores[mpc] else mpc
 
 
 def unknown_to_pi(spec: Spec) -> list[str]:
@@ -565,11 +574,11 @@ def unknown_to_pi(spec: Spec) -> list[str]:
 
 
 def best_of(
-    parts: Mapping[str, Score], settled: Collection[str], where: str, unknown: Sequence[str] = ()
+    parts: Mapping[str, Score], eligible: Collection[str], where: str, unknown: Sequence[str] = ()
 ) -> str:
     """Return the sentence that names the best controller, by how much, and where the other kind loses."""
     scores = {name: part.total for name, part in parts.items()}
-    kept, mpc = kept_of(scores, settled), kept_of(scores, {*settled} - {"PI"})
+    kept, mpc = kept_of(scores, eligible), kept_of(scores, {*eligible} - {"PI"})
     words = {"baseline": "default MPC", "tuned": "tuned MPC", "PI": "PI"}[kept]
     if "PI" not in parts:
         because = f"a PI does not know {', '.join(unknown)}" if unknown else "no PI can be made"
