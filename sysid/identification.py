@@ -8,13 +8,6 @@ given (:mod:`thermogrip.sysid.blackbox.order_selection`); with ``leave_one_out``
 part in that choice either.  The one that is kept, and the network, are scored besides on the last 30 percent
 of each log, fitted without them and run freely from the log's start, where its state is known.  When a plant
 is called good is in :mod:`thermogrip.sysid.validation.verdict`.
-
-**Which candidate is kept.**  Among black boxes the one of the least error on parts held out, a linear one
-where another kind errs less by no more than a standard error and 5 percent.  On another run the gain differs
-besides (:mod:`thermogrip.sysid.validation.prediction_bands`): of one or two logs that is added to the errors,
-and where no error beside white noise would not be 10 percent better either, neural models are not fitted.  On
-whole logs, and beside a network, that of the least held-out error over that of a model without input; the
-network also when it is within 10 percent of the best, for its parameters mean something.
 """
 
 from __future__ import annotations
@@ -22,7 +15,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -63,7 +56,7 @@ from thermogrip.sysid.plant.fit_record import (
     HeldOut,
 )
 from thermogrip.sysid.plant.innovations import innovation_noise
-from thermogrip.sysid.plant.log_grid import match_logs, misfit, moved_before, signals
+from thermogrip.sysid.plant.log_grid import Grid, match_logs, misfit, moved_before, signals
 from thermogrip.sysid.plant.log_grid import rows_of as log_rows
 from thermogrip.sysid.plant.plant import Plant
 from thermogrip.sysid.validation.free_run import FreeRun, free_run, no_input_baseline, warm_up_of
@@ -364,8 +357,13 @@ def _fit_black_boxes(
     for kind in sorted(boxes, key=lambda kind: (kind == "neural") - (kind == "subspace")):
         report = steps.start(kind)
         try:
-            beat = _to_beat(list(fits.values()), task.logs) if kind == "neural" else None
-            fits[kind] = _fit_box(kind, task.logs, task, report, grid=grid, beat=beat)
+            if kind == "neural" and beyond_reach(list(fits.values()), task.logs):
+                raise UserError(
+                    "left out, for even without any error on held-out parts it would not be kept: linear "
+                    "models err by little more than noise, or less than another run differs (--models neural "
+                    "fits it)"
+                )
+            fits[kind] = _fit_box(kind, task.logs, task, report, grid=grid)
         except UserError as error:
             refused[kind] = f"{kind}: {error}"
             continue
@@ -378,23 +376,9 @@ def _fit_black_boxes(
     return _Boxes(in_order, [refused[kind] for kind in boxes if kind in refused], chosen)
 
 
-def _to_beat(others: Sequence[BlackBoxFit], logs: Sequence[Log]) -> dict[str, float] | None:
-    """Return the errors by part that neural models have to come near to; refuse where that is impossible."""
-    if not others:
-        return None
-    if beyond_reach(others, logs):
-        raise UserError(
-            "left out, for even without any error on held-out parts it would not be kept: linear models err "
-            "by little more than noise, or less than another run differs (--models neural fits it)"
-        )
-    choice = min((fit.choice for fit in others), key=lambda choice: choice.error)
-    return dict(zip((fold.label for fold in choice.folds), choice.errors[choice.structure].tolist()))
-
-
 def _fit_box(
-    kind: str, logs: Sequence[Log], task: _Task, report: Progress | None, **more: Any
+    kind: str, logs: Sequence[Log], task: _Task, report: Progress | None, grid: Grid | None = None
 ) -> BlackBoxFit:
-    """Fit a black box to some logs; ``more`` are a grid and errors of :func:`fit_black_box`."""
     return fit_black_box(
         kind,
         logs,
@@ -404,8 +388,8 @@ def _fit_box(
         average=task.options.average,
         order=task.options.order,
         delay=task.options.delay,
+        grid=grid,
         progress=report,
-        **more,
     )
 
 
@@ -583,6 +567,7 @@ def _fitted(
 
 def choose_black_box(fits: Sequence[BlackBoxFit], logs: Sequence[Log]) -> BlackBoxFit:
     """Return the fit of the least error on the parts, a linear one where another kind errs barely less."""
+    # on another run the gain differs besides, which the errors of one or two logs do not show
     run = _run_error(fits, logs)
     most = SIMPLER_MARGIN if len(fits[0].grid.logs) < SEVERAL else SIMPLER_MARGIN_OF_LOGS
     errors = [np.log(np.hypot(fit.choice.errors[fit.choice.structure], run)) for fit in fits]
@@ -628,6 +613,7 @@ def choose_model(rows: Sequence[Row], complete: int) -> str | None:
     if not mean:
         return None
     best = min(mean, key=lambda model: mean[model])
+    # within 10 percent of the best the network is kept, for its parameters mean something
     return "network" if mean.get("network", np.nan) <= WITHIN_NOISE * mean[best] else best
 
 

@@ -20,7 +20,7 @@ References
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from importlib import import_module
@@ -108,16 +108,14 @@ def fit_black_box(
     delay: int | None = None,
     grid: Grid | None = None,
     progress: Callable[[float, str], None] | None = None,
-    beat: Mapping[str, float] | None = None,
 ) -> BlackBoxFit:
     """Fit one kind of :data:`BLACK_BOXES` to one or several logs.
 
     Where absent, signals are known by role, two steps ``average`` [s] are tried (the chosen one and the logs'
     own, or means over five rows), ``order`` (poles of each output; states, of ``subspace`` and ``parsim``)
     and ``delay`` (steps from an input to its effect, of ``arx``, ``oe``, ``armax`` and ``bj``) are searched.
-    ``grid`` has the logs at a step that is known already; ``beat`` are errors by part held out, as shares of
-    the spread, that a fit has to come near to. A UserError where there is no such kind, order or delay, the
-    data are too short, or no structure survives the held-out free run.
+    ``grid`` has the logs at a step that is known already. A UserError where there is no such kind, order or
+    delay, the data are too short, or no structure survives the held-out free run.
 
     >>> from scipy.signal import lfilter
     >>> from thermogrip.datasets.schema import make_log
@@ -147,7 +145,7 @@ def fit_black_box(
                 progress((at + done) / len(grids), f"{kind}, {what}")
 
         try:
-            choice = choose(tried, family, warmup=_warmup_rows(tried), progress=report, beat=beat)
+            choice = choose(tried, family, warmup=_warmup_rows(tried), progress=report)
         except UserError as error:
             refused = refused or error
             continue

@@ -9,15 +9,6 @@ segments, are then fitted by Levenberg-Marquardt with exact sensitivities
 
 s the error of the linear fit in units of the spread and rho = :data:`RIDGE`.  Each segment has an initial
 state of its own.  Several members start from different random W, U, b.
-
-**The mean of members of all sizes.**  The quarter that fits its own data worst is left out (a poor minimum);
-the rest run over the training inputs in reverse order, and the three quarters nearest to their median are
-kept.  Single sizes differ from fold to fold by luck, their mean by less; in the one-standard-error rule it
-counts as no larger than the smallest.
-
-**Members.**  On held-out parts of a two-tank record the error of the mean of n trained members was about
-0.270 + 0.42/n V for n = 6 to 36, so the last fit trains :data:`TOGETHER` times as many as each fold: twelve
-are enough to choose by (the acidity of a stirred tank errs by 0.79 with 12 and 36, by 1.09 with six).
 """
 
 from __future__ import annotations
@@ -110,11 +101,15 @@ def neural_family(
     orders = range(n_y + 1, max(5, n_y + 2)) if states is None else states
     sizes = list(product(orders, units))
     numbers = [n * (n + n_w + 1) + h * (2 * n + n_w + 1) for n, h in sizes]
+    # single sizes differ from fold to fold by luck, their mean by less: it counts as no larger than the least
     structure = Structure("members of all sizes", min(numbers))
     if only is not None and structure not in only:
         return {}
     data = _scaled_data(grid)
     few = sum(int(np.isfinite(y).sum()) for y in data.y) <= MANY
+    # On held-out parts of a two-tank record the mean of n members erred by about .270 + .42/n V, n = 6 to 36:
+    # the last fit trains more than the folds, where twelve are enough to choose by (the acidity of a stirred
+    # tank errs by .79 with 12 and 36, by 1.09 with six).
     starts = members or (2 if few else 1) * (1 if only is None else TOGETHER)
     linear = _linear_starts(grid, data, sorted(set(orders)))
     trained = [
@@ -200,6 +195,7 @@ def _outputs_first(grid: Grid, data: _Data, model: StateSpaceModel) -> _Linear:
 
 def _averaged(grid: Grid, data: _Data, members: Sequence[_Member]) -> NeuralModel:
     """Return the mean of the members that fit and agree."""
+    # what fits its own data worst is a poor minimum
     fitting = np.argsort([some.miss for some in members], kind="stable")[: int(np.ceil(KEPT * len(members)))]
     members = [members[k] for k in np.sort(fitting)]
     n, h = max(len(some.A) for some in members), max(some.h for some in members)

@@ -4,22 +4,15 @@ Every structure is fitted on part of the data and *simulated* over the rest (on 
 alone predicts the next one well). With three or more logs each log is held out in turn: a run from its start.
 Of one or two logs
 
-* each of four consecutive blocks is: the readings of a short warm-up set the state, the others are scored,
-  and the second half is run once more from a warm-up of its own;
-* and the last 30 percent of each log, run from the start of the log: a block is too short to show the drift
-  of an integrator or of a pole that is a little too slow.
-
-A part that alone moves an input is not held out: a model fitted to the others cannot know that input.
+* each of four consecutive blocks is: the readings of a short warm-up set the state, the others are scored;
+* and the last 30 percent of each log, run from the start of the log.
 
 **The one-standard-error rule.** With e_sf the error of structure s on part f and b the best structure, the
 smallest structure is taken for which
 
     mean_f ln(e_sf / e_bf) <= min(se_f ln(e_sf / e_bf), ln 1.05),        ln 1.2 over whole logs,
 
-with the standard error of the paired differences. Logarithms, because a part whose input lies outside of
-what the rest has seen is bad for every structure alike and must not outweigh the others. Models that are
-unstable or diverge on any part are refused, and structures whose fit to all data is, or errs on them far more
-than on any part.
+with the standard error of the paired differences. Models that are unstable or diverge on a part are refused.
 """
 
 from __future__ import annotations
@@ -48,8 +41,6 @@ SIMPLER_MARGIN_OF_LOGS = float(np.log(1.2))  # the same over whole logs, of whic
 # where none does (one structure was asked for, say) no more than twice that.
 _ERROR_ON_ALL_RATIOS = (1.0, 2.0)
 _CUTS = 4  # of one or two logs
-# From twice the error on two parts of five, the other three would have to bring less than 0.6 times it each.
-_HOPELESS_RATIO = 2.0
 MANY_ROWS = 8000  # beyond it a fit to all structures and steps takes minutes, and two parts tell them apart
 FEWEST_HELD_OUT_ROWS = 20  # rows of a block that is held out
 
@@ -128,6 +119,7 @@ def folds(grid: Grid, *, blocks: int = _CUTS) -> list[Fold]:
         ]
     else:
         parts = [*_cut_blocks(grid, blocks), _last_parts(grid)]
+    # a model fitted to the others cannot know an input that one part alone moves
     range_of = np.ptp(np.concatenate([segment.u for segment in grid.segments]), axis=0)
     excited = [part for part in parts if _moves_all(part, least=MOVED * range_of)]
     return excited if len(excited) >= 2 else parts
@@ -145,6 +137,7 @@ def _cut_blocks(grid: Grid, blocks: int) -> list[Fold]:
     parts = []
     for at, (first, last) in enumerate(pairwise(edges)):
         inside, outside = _split_segments(grid.segments, first, last)
+        # the second half is run once more from a warm-up of its own
         halves = [segment.part(len(segment.time) // 2, len(segment.time)) for segment in inside]
         runs = tuple(Run(segment) for segment in (*inside, *halves))
         parts.append(Fold(f"block {at + 1} of {blocks}", grid.having(outside), runs))
@@ -153,6 +146,7 @@ def _cut_blocks(grid: Grid, blocks: int) -> list[Fold]:
 
 def _last_parts(grid: Grid) -> Fold:
     """Return the last part of each log, to be run from the log's start."""
+    # a block is too short to show the drift of an integrator, or of a pole that is a little too slow
     training: list[Segment] = []
     runs: list[Run] = []
     for log in grid.logs:
@@ -222,12 +216,10 @@ def choose(
     *,
     warmup: int,
     progress: Callable[[float, str], None] | None = None,
-    beat: Mapping[str, float] | None = None,
 ) -> Choice:
-    """Fit every structure on every fold and choose by the one-standard-error rule; refuse where after two
-    folds or more all err :data:`_HOPELESS_RATIO` times what they have to ``beat`` (errors by fold)."""
+    """Fit every structure on every fold and choose by the one-standard-error rule."""
     cases = folds(grid)
-    scored = _score(grid, family, cases, warmup, progress, beat or {})
+    scored = _score(grid, family, cases, warmup, progress)
     structure, fitted = _first_sound(grid, family, scored, warmup)
     errors = scored[structure]
     table = {structure_of_table: item.mean for structure_of_table, item in scored.items()}
@@ -270,7 +262,6 @@ def _score(
     cases: Sequence[Fold],
     warmup: int,
     progress: Callable[[float, str], None] | None = None,
-    beat: Mapping[str, float] | None = None,
 ) -> dict[Structure, _Errors]:
     """Return the errors of each structure that the family fits to the rest of the folds."""
     scale, priors = np.maximum(grid.output_spread(), 1e-9), priors_of(grid)
@@ -287,7 +278,6 @@ def _score(
             column.append(free_run_errors(model, runs, dt=grid.dt, scale=scale, warmup=warmup, priors=priors))
         for column in errors.values():  # a structure that could not be fitted on this fold is refused
             column.extend([refused] * (at + 1 - len(column)))
-        _give_up_hopeless(errors, [fold.label for fold in cases[: at + 1]], beat or {}, scale)
         best = _non_dominated(errors, scale)
         if many and at >= 1 and len(best) < len(errors):
             remaining = best
@@ -313,25 +303,6 @@ def _non_dominated(errors: Mapping[Structure, list[Array]], scale: Array) -> lis
         if np.isfinite(point).all()
         and not any(np.all(other <= point) and np.any(other < point) for other in points.values())
     ]
-
-
-def _give_up_hopeless(
-    errors: Mapping[Structure, list[Array]], labels: Sequence[str], beat: Mapping[str, float], scale: Array
-) -> None:
-    wanted = [beat[label] for label in labels if label in beat]
-    if len(wanted) < len(labels) or len(labels) < 2:
-        return
-    best = min(
-        float(
-            np.mean(
-                [np.log(np.min(np.mean(by_prior / scale, axis=1)) / w) for by_prior, w in zip(column, wanted)]
-            )
-        )
-        for column in errors.values()
-    )
-    if best > np.log(_HOPELESS_RATIO):
-        times = f"{np.exp(best):.2g} times what is best so far"
-        raise UserError(f"given up after {len(labels)} parts: errs {times}")
 
 
 def _fit_to_all(
@@ -419,6 +390,7 @@ def smallest_near_the_best(
 ) -> Item:
     """Return by the one-standard-error rule the smallest of items that were scored on the same parts."""
     usable = {item: error for item, error in table.items() if np.isfinite(error).all()}
+    # a part whose input lies outside of what the rest has seen is bad for all alike: it must not outweigh
     logs = {item: np.log(np.maximum(error, 1e-12)) for item, error in usable.items()}
     best = min(logs, key=lambda item: float(logs[item].mean()))
     near_best = [item for item in logs if item == best or excess_within_noise(logs[item] - logs[best], most)]

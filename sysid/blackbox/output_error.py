@@ -10,20 +10,6 @@ output is linear in b, c and in one initial condition per segment (an impulse re
 first na rows), so these are solved for exactly and only the a_i are iterated (Golub and Pereyra's variable
 projection, with Kaufman's Jacobian). Steps are Levenberg-Marquardt; a step that moves a root out of the
 unit circle is refused.
-
-**Columns are shifts.** Each drive less its first row, a step and an impulse are filtered by 1/A once. Every
-lag of a drive is a shift of its filtered rows plus its first value times the step response (before a
-segment the first row was held), every initial condition a shift of the impulse response, and with the model
-output v
-
-    dv/da_i = - q^-i v / A(q)
-
-is a shift of one filtered row as well.  Shifts are nearly alike where poles are slow: hence a QR.
-
-**Many structures, few searches.** The first structure of each denominator order starts from the ARX fit,
-from real poles at several time constants and from the order below with one fast pole more; all go a few
-steps, and the best two to the end. Every other structure of that order starts from its own ARX fit and from
-the denominators found so far: one that suits one delay is a few steps from that of another.
 """
 
 from __future__ import annotations
@@ -96,7 +82,7 @@ class Solution:
         """Return T and t of |T da - t|^2, the cost with the linear columns projected out of dv/da."""
         na, rows = len(self.a), []
         for v, miss, X, is_read in zip(self.outputs, self.misses, self.columns, records.known):
-            filtered = lfilter([1.0], np.append(1.0, self.a), v)
+            filtered = lfilter([1.0], np.append(1.0, self.a), v)  # dv/da_i = -q^-i v / A(q): shifts too
             J = np.zeros((na, len(v)))
             for i in range(1, na + 1):
                 J[i - 1, i:] = -filtered[:-i]
@@ -158,6 +144,7 @@ def refine(
 def _triangles(parts: Sequence[Array], na: int) -> tuple[Array, list[Array]]:
     """Return R of the QR of all rows [own | rest], the own columns of each part (na + n_rest, n) projected
     out, and R by part."""
+    # shifts are nearly alike where poles are slow: hence a QR
     triangles = [_square_r(rows.T) for rows in parts]
     shared_triangles = [R[na:, na:] for R in triangles]
     one_part = len(shared_triangles) == 1
@@ -266,6 +253,9 @@ def columns_of(
     moves, is_read = records.moves[at], records.known[at]
     n_drive, n = moves.shape
     na, end = len(a), n_drive * nb
+    # Columns are shifts: each drive less its first row, a step and an impulse are filtered by 1/A once.
+    # Every lag of a drive is a shift of its filtered rows plus its first value times the step response
+    # (before a segment the first row was held), every initial condition a shift of the impulse response.
     filtered = lfilter([1.0], np.append(1.0, a), moves, axis=1)
     X = np.zeros((end + 1 + na, n))
     for lag in range(nb):
@@ -391,6 +381,10 @@ class Search:
     def _search(
         self, records: Records, na: int, nb: int, delay: int, at: Callable[[Array], Solution | None]
     ) -> Solution | None:
+        # The first structure of an order starts from ARX, from real poles at several time constants and from
+        # the order below with one fast pole more; all go a few steps, the best two to the end.  Every other
+        # starts from its own ARX fit and from denominators found so far: one that suits one delay is a few
+        # steps from that of another.
         denominators = self._found.get(na, [])
         starts = denominators or self.starts(records, na)
         regressed = arx_start(records, na, nb, delay)

@@ -14,13 +14,6 @@ Beside the free run stand
 
 The residual is tested (:mod:`thermogrip.sysid.validation.residual_tests`), the verdict goes by its size
 (:mod:`thermogrip.sysid.validation.verdict`).
-
-After a gap of more than 10 s the input is unknown: the run starts afresh from its own warm-up, the next
-60 s are not scored, and the figure with the last row held through the gap is given with it.
-
-**Warm-up.**  A network has few states, and begins at rest where its sensors agree: 5 s.  A black box of one
-or two logs was scored with the steady start of a part of a log, fifty rows, and its slowest state needs a
-tenth of its time constant to show; no run spends more than a tenth of its log on that.
 """
 
 from __future__ import annotations
@@ -156,6 +149,7 @@ def free_run(
     pairs = _beside(plant, log, simulated, average)
     scores, naive = _scores(plant, log, pairs), _baselines(plant, log, pairs)
     held = {}
+    # through a gap of more than 10 s the input is unknown: the run starts afresh after it, unscored for 60 s
     if gaps(log):
         through = plant.simulate(log, warmup=warmup, score_from=score_from, gaps="hold")
         held = _scores(plant, log, _beside(plant, log, through, average))
@@ -187,9 +181,11 @@ def free_run(
 
 
 def usual_warmup(plant: Plant, log: Log) -> float:
-    """Return the seconds of readings that set the state where nothing is said; see the module's theory."""
-    if not plant.scores.held_out_by_part:
+    """Return the seconds of readings that set the state where nothing is said."""
+    if not plant.scores.held_out_by_part:  # a network has few states, and begins at rest where sensors agree
         return max(5.0, plant.dt)
+    # one of one or two logs was scored from the steady start of a part, fifty rows, and its slowest state
+    # needs a tenth of its time constant to show; no run spends more than a tenth of its log on that
     return max(5.0, plant.dt, warm_up_of_fit(plant, log), start_seconds(plant, log))
 
 

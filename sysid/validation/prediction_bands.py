@@ -6,8 +6,7 @@ those of the fit (:func:`expected_error`); bands and `validate` are made of it. 
 *Parts held out.*  Each of n parts (blocks of a log and its last part, or whole logs) has an error e_f.  The
 error of one part more lies about them as they do about each other: ln e^2 is Student's t about their mean,
 with the scale s sqrt(1 + 1/n).  A few numbers barely show a spread, so s^2 is taken with a prior of
-:data:`PRIOR_PARTS` parts that differ by :data:`PRIOR_SPREAD`.  The median is the geometric mean of
-the e_f: one part unlike all others (a tank that overflows once) would make an rms three times too wide.
+:data:`PRIOR_PARTS` parts that differ by :data:`PRIOR_SPREAD`.  The median is the geometric mean of the e_f.
 
 *What differs between runs* (supply voltage, air about the plant, a sensor that was glued anew) is in the
 errors of whole logs that were held out. A plant of one or two logs cannot show it. Then the gain of the
@@ -23,19 +22,8 @@ median of both parts, its ends the 5 and 95 % quantiles of their sum.
 
     v +- z sqrt(var_k v_k + s^2 + (median g)^2 (effect^2 + mean effect^2)/2 + unlike^2),   z = 1.645 for 90 %,
 
-of which the constant half is for a level that is off on another day where the inputs are 0 as well (without
-it the bands of two such heaters held 69 and 52 percent).  Here v_k are the free runs of draws of the
-parameters, each with a start of its own, and s^2 what these do not explain of the error of parts held out.
-A plant that was not compared has the error of its fit, and the white noise of one reading where that was of
-means (:func:`thermogrip.sysid.data.data_quality.reading_excess`).
-
-**A run unlike the fit.** Added to the variance of a black box are the part of v that lies beyond the range of
-the readings of the fit, and by how much the readings of the warm-up lie beyond it.
-
-**Ensemble disagreement.** The members of a :class:`~thermogrip.sysid.models.neural.NeuralModel` agree where
-the data constrain them, and their mean errs by about as much as they differ.  Their standard deviation s over
-a run, beside the spread S of the output in the data of the fit, depends on the drives alone, so a run is
-refused before its readings are used where s > :data:`MOST_DISAGREEMENT` S.
+with v_k the free runs of draws of the parameters, each with a start of its own, and s^2 what these do not
+explain of the error of parts held out.  A plant that was not compared has the error of its fit.
 """
 
 from __future__ import annotations
@@ -88,6 +76,7 @@ def expected_error(errors: Sequence[float], gain_effect: float) -> ExpectedError
     >>> round(found.rmse, 3), round(found.low, 3), round(found.high, 3)
     (0.1, 0.048, 0.208)
     """
+    # one part unlike all others (a tank that overflows once) would make an rms three times too wide
     logs, n = 2 * np.log(np.maximum(errors, 1e-12)), len(errors)
     middle, freedom = float(logs.mean()), PRIOR_PARTS + n - 1
     squares = PRIOR_PARTS * (2 * PRIOR_SPREAD) ** 2 + float(np.sum((logs - middle) ** 2))
@@ -134,6 +123,8 @@ def free_run_band(
         error_of_parts = expected_error(errors, 0.0).rmse
         effect = (MEDIAN * other_run.get(name, np.zeros(1))) ** 2
         explained = variance.mean() if compared else 0.0  # errors of a fit have no part of its draws
+        # half of it constant, for a level that is off on another day where the inputs are 0 as well (without
+        # it the bands of two such heaters held 69 and 52 percent)
         gain_and_level = (effect + effect.mean()) / 2
         like_fit = variance + max(error_of_parts**2 - explained, 0.0) + gain_and_level
         added = unlike.get(name, 0.0) ** 2
@@ -171,6 +162,7 @@ def part_errors(plant: Plant, name: str) -> list[float]:
         held_out = whole
     errors = [score.rmse for score in held_out] or scores.held_out_by_part.get(name, [])
     errors = errors or [error for score, error in scores.held_out_rmse.items() if score == name]
+    # a fit to means adds the white noise of one reading
     return errors or [float(np.hypot(plant.noise.get(name, 0.0), scores.reading_excess.get(name, 0.0)))]
 
 
@@ -186,6 +178,7 @@ def unlike_fit(plant: Plant, log: Log, simulated: Log, warmup: float) -> dict[st
         first = column(log, name)[begin]
         first = first[np.isfinite(first)]
         start = float(np.mean(first - np.clip(first, low, high))) if first.size else 0.0
+        # the part of the run beyond the readings of the fit, and how far those of the warm-up lie beyond
         added = np.hypot(run - np.clip(run, low, high), start)
         out[name] = np.asarray(added)
     return out
@@ -272,6 +265,8 @@ def ensemble_disagreement(plant: Plant, log: Log, *, warmup: float = 5.0) -> dic
     model = plant.model
     if not isinstance(model, NeuralModel) or len(model.A) < 2:
         return {}
+    # members agree where the data constrain them, and their mean errs by about as much as they differ; that
+    # depends on the drives alone, so that a run is refused before its readings are used
     stretches, n_y = cut_stretches(plant, log), len(model.outputs)
     rows = max(1, _STATES_AT_ONCE // model.n_x)
     variance, count = np.zeros(n_y), 0

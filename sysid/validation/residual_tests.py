@@ -16,14 +16,8 @@ gives the probability p of at least this much. Of all pairs of an output and a s
 whose p is too small by Holm's rule at :data:`LEVEL`: at most one right model in a hundred has any, whatever
 the correlation time of its errors and the number of pairs.
 
-w is the sum of white noise and slow errors, Ornstein-Uhlenbeck processes with correlation times tau on a
-grid, averaged over blocks as readings are: with the block as the unit of time and s = 1/tau,
-
-    c(0) = 2 (s - 1 + exp(-s)) / s^2,       c(k) = (2 sinh(s/2) / s)^2 exp(-k s)    for k > 0.
-
-(The sampled form exp(-k s) loses a third of the variance at low frequencies, where inputs act.)  Their
-variances maximise the likelihood of e with beta = 0, under wide log-normal priors.  What it rarely finds
-is in ``docs/explanation/validation.md``.
+w is the sum of white noise and slow errors (:func:`learn_noise`).  What it rarely finds is in
+``docs/explanation/validation.md``.
 """
 
 from __future__ import annotations
@@ -273,7 +267,12 @@ class _Null:
 
 
 def learn_noise(block: NDArray[np.int_], residual: Array, columns: Array) -> Array:
-    """Return the covariance of w over blocks (n,) that a residual with columns N supports best."""
+    """Return the covariance of w over blocks (n,) that a residual with columns N supports best: variances of
+    the likeliest sum of white noise and slow errors with beta = 0, under wide log-normal priors."""
+    # Slow errors are Ornstein-Uhlenbeck processes with correlation times tau on a grid, averaged over blocks
+    # as readings are: with the block as the unit of time and s = 1/tau,
+    #     c(0) = 2 (s - 1 + exp(-s)) / s^2,       c(k) = (2 sinh(s/2) / s)^2 exp(-k s)    for k > 0.
+    # The sampled form exp(-k s) loses a third of the variance at low frequencies, where inputs act.
     lag = np.abs(np.subtract.outer(block, block))
     kernels = [np.eye(len(block))]
     for s in 1 / np.array(_SCORE_TEST.noise_taus):

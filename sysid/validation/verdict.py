@@ -3,14 +3,9 @@
 **Good** (`identify`).  Over all parts held out, and over the logs of the fit, each output errs by less than
 half of the error without input; a part in which nothing moves weighs nothing.  On another run like these it
 errs by X (:func:`thermogrip.sysid.validation.prediction_bands.expected_error`), and X is below half of the
-error without input over whole logs.  A single part that was much worse than the others, of moves that no
-other part has, widens the range of X and condemns no plant: the fit has seen that part in the end.
-
-An output that half of the parts barely excite may be worse than no input on another run. So where two or more
-parts have moves it has to err less than no input on another part in 19 cases of 20: with e_f and b_f the
-errors on part f and those without input, ln (e_f / b_f) is Student's t about its mean, weighted by b_f^2,
-with the same prior for its spread as in the error of another run.  (Of 11 outputs of public logs one was so,
-with .95 of parts below 1.17, the others below .06 to .79.)
+error without input over whole logs.  Where two or more parts have moves, it errs less than no input on
+another part in 19 cases of 20: with e_f and b_f the errors on part f and those without input, ln (e_f / b_f)
+is Student's t about its mean, weighted by b_f^2, with the prior of the error of another run for its spread.
 
 **A free run** (`validate`) is judged by size (``docs/explanation/validation.md``). A plant states for this
 run the rms error X of each output, and the ends that 9 of 10 runs lie within
@@ -169,6 +164,8 @@ def verdict_of(
     for name, error in expected.items():
         part_error, parts_idle = _pooled([row for row in own_rows if row.output == name and row.held_out])
         whole, whole_idle = _pooled([row for row in own_rows if row.output == name and not row.held_out])
+        # a single part that was much worse, of moves that no other part has, widens the stated range and
+        # condemns no plant: the fit has seen that part in the end
         if not part_error < USEFUL * parts_idle:
             errs = f"on parts held out {name} errs by {part_error:.2g}, without input by {parts_idle:.2g}"
             return False, f"Not good ({label}): {errs}; it needs more excitation, or another model. {another}"
@@ -204,6 +201,8 @@ def _ratio_on_another_part(rows: Sequence[Row]) -> float:
 
     from thermogrip.sysid.validation.prediction_bands import PRIOR_PARTS, PRIOR_SPREAD
 
+    # An output that half of the parts barely excite may be worse than no input on another run.  Of 11 outputs
+    # of public logs one was so, with .95 of parts below 1.17, the others below .06 to .79.
     no_input = np.array([row.no_input_rmse for row in rows if row.no_input_rmse > 0])
     if not no_input.size:
         return 0.0

@@ -250,7 +250,7 @@ def test_a_plant_keeps_what_the_choice_found(monkeypatch, dt, share):
 def test_a_second_step_is_tried_beside_the_chosen_one(monkeypatch, kind, dt, rows, average, errors, kept):
     tried, said = [], []
 
-    def choose_by_step(grid, family, *, warmup, progress, beat):
+    def choose_by_step(grid, family, *, warmup, progress):
         tried.append(grid.dt)
         progress(0.5, "x")
         if errors[grid.dt] is None:

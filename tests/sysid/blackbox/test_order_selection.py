@@ -312,31 +312,3 @@ def test_squares_of_inputs_of_one_sign_are_tried_where_a_line_would_show(levels,
     rows = segment(np.zeros((len(u), 1)), u)
     grid = grid_of(rows, inputs=("q", "pump"), switches=("pump",))
     assert list(selection.default_terms(grid)) == [(), *terms]
-
-
-@pytest.mark.parametrize(
-    ("errors", "parts"), [((0.3, 0.5, 0.1), None), ((0.41, 0.41, 0.1), 2), ((0.2, 0.4, 9.9), 3)]
-)
-def test_a_kind_that_cannot_be_kept_any_more_is_given_up(monkeypatch, errors, parts):
-    """Neural models take longest: of five parts and a last fit two show that they err twice as much."""
-    grid = grid_of(*(segment(np.outer([0, 1] * 15, [4]), log=n) for n in "abc"))
-    asked = []
-
-    def errors_of(model, runs, *, dt, scale, warmup, priors):
-        asked.append(runs[0].segment.log)
-        error = 0.1 if len(priors) == 1 else dict(zip("abc", errors))[runs[0].segment.log]
-        return np.full((len(priors), 1), error) * scale
-
-    monkeypatch.setattr(selection, "free_run_errors", errors_of)
-
-    def family(part, *, only=None):
-        return {SMALL: SMALL}
-
-    beat = dict.fromkeys("abc", 0.2)
-    if parts is None:
-        assert selection.choose(grid, family, warmup=6, beat=beat).structure == SMALL
-    else:
-        with pytest.raises(UserError, match=f"given up after {parts} parts: errs "):
-            selection.choose(grid, family, warmup=6, beat=beat)
-        assert asked == list("abc")[:parts]
-    assert selection.choose(grid, family, warmup=6).structure == SMALL
