@@ -42,7 +42,6 @@ if TYPE_CHECKING:
     from thermogrip.datasets.schema import Grasps
 
 Floats = NDArray[np.float64]
-Rows = NDArray[np.int64]
 #: What is taken for grasps: themselves, long DataFrames, paths of files; one or several.
 Records: TypeAlias = "Grasps | DataFrame | str | Path | Sequence[Grasps | DataFrame | str | Path]"
 

@@ -1,12 +1,7 @@
 """Where a result comes from: version, date, command, repository, seed, and the SHA-256 of what was read.
 
 Every JSON file has it under the key ``provenance``, every page in its foot.  Two runs of one command with one
-seed differ in this alone; ``SOURCE_DATE_EPOCH`` sets the date [1]_.
-
-References
-----------
-.. [1] https://reproducible-builds.org/specs/source-date-epoch/
-.. [2] https://git-scm.com/docs/git-rev-parse
+seed differ in this alone; ``SOURCE_DATE_EPOCH`` sets the date.
 """
 
 from __future__ import annotations
@@ -89,7 +84,7 @@ def provenance() -> dict[str, Any]:
     from thermogrip import __version__
 
     now = _WORK.get() or _Work([Path(sys.argv[0]).name, *sys.argv[1:]])
-    epoch = os.environ.get("SOURCE_DATE_EPOCH", "")
+    epoch = os.environ.get("SOURCE_DATE_EPOCH", "")  # https://reproducible-builds.org/specs/source-date-epoch/
     seconds = int(epoch) if _EPOCH.fullmatch(epoch) else None
     try:
         folder = os.getcwd()
@@ -117,8 +112,8 @@ def hash_file(path: str | Path) -> str:
 
 def _commit_of(folder: str) -> str | None:
     """Return the commit that is checked out in the repository around a folder, None where there is none."""
-    # of Git's commands rev-parse reads names and their commits alone [2]: it starts none of the programs that
-    # a repository's configuration, which an unpacked archive may bring, can name
+    # rev-parse reads names and their commits alone (https://git-scm.com/docs/git-rev-parse): it starts none
+    # of the programs that a repository's configuration, which an unpacked archive may bring, can name
     git = shutil.which("git")
     if git is None or Path(git).parent == Path(folder):  # on Windows the working folder is searched first
         return None
