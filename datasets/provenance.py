@@ -84,7 +84,8 @@ def provenance() -> dict[str, Any]:
     from thermogrip import __version__
 
     now = _WORK.get() or _Work([Path(sys.argv[0]).name, *sys.argv[1:]])
-    epoch = os.environ.get("SOURCE_DATE_EPOCH", "")  # https://reproducible-builds.org/specs/source-date-epoch/
+    # https://reproducible-builds.org/specs/source-date-epoch/
+    epoch = os.environ.get("SOURCE_DATE_EPOCH", "")
     seconds = int(epoch) if _EPOCH.fullmatch(epoch) else None
     try:
         folder = os.getcwd()
