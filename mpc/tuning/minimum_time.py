@@ -4,18 +4,8 @@ To settle in the band is to have arrived in it.  The earliest arrival is the lea
 
     max over u of  s y(T)  >=  s r - band,     s = sign(r - y(0)),
 
-with u inside its range, its slew limit kept, from no drive on, and changed at the controller's samples only.
-For a plant that answers to every earlier move in one direction, g_k = s dy(T)/du_k >= 0 for all k, the best u
-is as much as there is, all the time, reached as fast as the slew allows.  That is tried first, and where the
-gradient along it (:meth:`PredictionModel.trajectory`) has no other sign, it stays: for a linear plant the
-true bound, since y(T) is linear in u.
-
-Elsewhere (a Peltier element past its optimum, an output that first goes the wrong way) y(T) is climbed from
-the best constant level on: towards the plan that heads for the better end of each drive, by g, as fast as the
-slew allows, by the share of the way that is best (Frank and Wolfe).  The answer is the best that was found.
-
-Of several regulated outputs each is asked alone, with all drives at its service, and the latest counts:
-together they cannot be sooner.
+with u inside its range, its slew limit kept, from the drive that holds the start on, and changed at the
+controller's samples only.
 """
 
 from __future__ import annotations
@@ -40,6 +30,7 @@ _SHARES = 0.5 ** np.arange(6)  # of the way to a better plan
 def full_drive_bound(plant: Plant, design: Design, step: tuple[float, float], spec: Spec) -> float:
     """Return the shortest time [s] in which a step (start, target) [degC] can settle, whatever the
     controller; inf where it cannot within ``hold_s``."""
+    # each output is asked alone, with all drives at its service: together they cannot be sooner
     return max(_Race(plant, design, step, spec, name).shortest_time() for name in design.controlled)
 
 
@@ -72,10 +63,15 @@ class _Race:
         # the end of each drive (n_u,) that helps: by its gain over the whole time, at rest
         _, G = self.coarse.trajectory(self.x, self.neutral[None], self.d, [self.n])
         direction = np.where(self.side * G[-1, self.row, 0] >= 0, self.high, self.low)
+        # For a plant that answers to every earlier move in one direction, g_k = s dy(T)/du_k >= 0 for all k,
+        # the best is as much as there is, all the time: the first plan, which no climb betters.
         levels = np.clip(_DRIVE_LEVELS[:, None] * direction, self.low, self.high)
         plans = self._headed_for(np.repeat(levels[:, None], self.n, axis=1))
         heights = self._heights(plans)
         best = int(np.lexsort((-heights.max(axis=1), self._arrivals(heights)))[0])
+        # Elsewhere (a Peltier element past its optimum, an output that first goes the wrong way) y(T) climbs
+        # towards the plan that heads for the better end of each drive, by g, by the share of the way that is
+        # best (Frank and Wolfe). For a linear plant whose g has one sign the bound is the true one.
         for _ in range(_CLIMBS):
             plan, height = plans[best], heights[best]
             arrival = float(self._arrivals(height[None])[0])

@@ -1,41 +1,15 @@
 r"""What a controller is tried on, and what that costs.
 
-**Trials.**  A step of the spec begins where drives have held its start for long, and the controller knows
-these drives, as a running loop knows them; the moves M count from there.  Readings are as noisy as those of
-the logs were found to be (which includes the logs' quantum), unless the spec states a noise; where the logs
-did not tell, they have the spec's and a thermocouple's quantum.  An MPC's filter takes every reading that
-comes between two moves; of n it is shown one here, with the noise of their mean.  A PI has the last one.
-Plants are draws of the posterior.  A step is run for twice as long as the default design takes on the slowest
-draw, since the moves of a longer rest say nothing of the step.
-
-**Loads.**  At rest at the first target comes a load, and stays: on each drive a tenth of its range, on each
-controlled output a tenth of the first step (four times the band that a spec has by default), with the
-apparent delay of that output for its lag.  A load on a drive is what it does to the outputs of the
-undisturbed plant there, added to them: the same thing where the plant is linear.  A trial lasts
-six integral times of the slowest PI by SIMC, in which that PI has settled, and as long as a drive
-takes to go as far as its load.  Readings have neither
-noise nor offset then, so that all of the error is the load's: over such a time noise alone would make most of
-it, and steps show what noise does.
-
-**Score.**  A step's settling time counts in units of the bound, so that short and long steps weigh alike;
-what the spec forbids is charged on top, steeply:
+Steps of the spec, and loads at rest at the first target, on draws of the posterior.  A step's settling time
+counts in units of the bound, so that short and long steps weigh alike; what the spec forbids is charged on
+top, steeply:
 
     step = (settle + energy_weight E) / bound + moves_weight M
            + 3 (overshoot / allowed - 0.9)+ + (|bias| / allowed - 0.9)+ / 2 + 3 (M / allowed - 0.9)+
     load = IAE / (IAE of the reference) + moves_weight M + 3 (M / allowed - 0.9)+
 
-The reference is the PI by SIMC or the default MPC, whichever has the smaller IAE of that load.  The moves
-allowed are ``moves_limit`` times those of the default MPC in the same trial: what moves more wears a valve
-for little.  What never settles is charged half of its last error in bands, a step
-its whole length besides.  A trial in several noises costs their mean; steps as well as loads cost the mean
-of their trials plus half of what the worst is above it, since the draws stand for what the plant may be, and
-the score is the sum of both.
-
-All draws have the model's structure.  What a spec states that this may lack (sensors that are slower, a
-longer delay, a weaker drive) is tried on the first draw, and counts as any other.
-
-**Bound.**  Before :func:`thermogrip.mpc.tuning.minimum_time.full_drive_bound`, or before its ramp is there,
-no target is reached: a settling time near it cannot be improved by weights, the actuator is the limit.
+The reference is the PI by SIMC or the default MPC, whichever has the smaller IAE of that load.  The score is
+the sum of both.
 """
 
 from __future__ import annotations
@@ -173,7 +147,7 @@ def lacking(plant: Plant, spec: Spec, controlled: Sequence[str]) -> dict[str, di
 
 
 def loads_of(plant: Plant, spec: Spec, design: Design) -> list[Load]:
-    """Return the loads that are tried, see the module's text; a drive's goes where it has more room."""
+    """Return the loads that are tried; a drive's goes where it has more room."""
     (start, target), loads = spec.steps[0], []
     model = prediction_model(plant, plant.dt)
     d = tuple(model.undisturbed(spec.ambient_degC).tolist())
@@ -182,13 +156,17 @@ def loads_of(plant: Plant, spec: Spec, design: Design) -> list[Load]:
         low, high = design.drive_range[name]
         drive = 0.0 if holding_drive is None else float(holding_drive[model.drives.index(name)])
         side = 1.0 if high - drive >= drive - low else -1.0
+        # on a drive it is what it does to the outputs of the undisturbed plant there, added to them: the same
+        # thing where the plant is linear
         loads.append(Load(name, side * COSTS.load * (high - low)))
+    # on an output four times the band that a spec has by default, as late as a drive's would be seen
     delays = zip(design.controlled, apparent_delays(plant, design.controlled))
     return loads + [Load(name, COSTS.load * (start - target), delay) for name, delay in delays]
 
 
 def load_seconds(design: Design) -> float:
-    """Return how long the trial of a load lasts [s], see the module's text."""
+    """Return how long the trial of a load lasts [s]."""
+    # as long as a drive takes to go as far as its load, and until the slowest PI by SIMC has settled
     spans = {name: high - low for name, (low, high) in design.drive_range.items()}
     moving = max(COSTS.load * span / design.slew_per_s[name] for name, span in spans.items())
     slowest = max((loop.Ti for loop in design.loops), default=0.0)
@@ -207,6 +185,7 @@ def meets_spec(result: StepResult | Segment, spec: Spec) -> bool:
 @lru_cache(maxsize=64)
 def drawn(plant: Plant, draw: int) -> Plant:
     """Return a draw, the same one each time: its models and held states are worked out once."""
+    # all draws have the model's structure: what it may lack besides is tried where the spec states it
     return plant.draw(draw)
 
 
@@ -220,6 +199,7 @@ def readings_a_move(plant: Plant, output: str, dt: float) -> float:
 
 def as_tried(design: Design, plant: Plant) -> Design:
     """Return the design of an MPC whose filter expects the mean of the readings that come between moves."""
+    # it takes all of them; a trial shows it one, with the noise of their mean, and a PI the last one
     reading_sd = {name: design.noise.reading.get(name, reading_noise(plant, name)) for name in plant.outputs}
     means = {
         name: sd / readings_a_move(plant, name, design.dt) ** 0.5
@@ -245,7 +225,7 @@ def surroundings_of(
 ) -> Surroundings:
     """Return the room and the sensors of the trials, with the noise of the mean of the readings in
     ``filtered_s``, where that is given."""
-    # of which the logs' quantum is a part
+    # of the logs, of which their quantum is a part; where they did not tell, the spec's and a thermocouple's
     reading_sd = {name: sd for name, sd in plant.scores.reading_sd.items() if np.isfinite(sd)}
     stated = "noise_degC" in spec.model_fields_set
     offset = dict.fromkeys(controlled, spec.sensor_offset_degC)
@@ -298,6 +278,7 @@ def trial(
     seed: int = 0,
 ) -> ClosedLoop:
     """Run a case, wholly in C where the controller is in C."""
+    # drives have held the start for long, and the controller knows them, as a running loop knows its own
     seconds = spec.hold_s if case.seconds is None else case.seconds
     truth, controlled = drawn(plant, case.draw), tuple(controller.controlled)
     filtered_s = controller.dt if isinstance(controller, Controller) else 0.0
@@ -307,6 +288,8 @@ def trial(
     if case.load is not None:
         n = round(seconds / truth.dt) + 1
         load = signal_of(case.load, truth, controlled, case.target, spec.ambient_degC, n)
+        # All of the error is the load's: noise alone would make most of it. With noise filters that hardly
+        # move win, and on the truth of a sous-vide bath meet loads with five times the error.
         around = replace(around, load=load, noise=0.0, noises={}, quantum=0.0, quanta={}, offset={})
     about: dict[str, Any] = {
         "start": case.start,
@@ -388,13 +371,14 @@ class Score:
 
 
 def score(results: Sequence[StepResult], spec: Spec, scales: Scales) -> Score:
-    """Return the score of a set of trials, see the module's text."""
+    """Return the score of a set of trials; one in several noises costs their mean."""
     costs: dict[Case, list[float]] = {}
     for result in results:
         case, cost_of = result.case, _cost_of_load if result.case.load else _cost_of_step
         cost = cost_of(result, spec, scales)
         # a plant that lacks structure is run for longer than the reference was
         default_moves = np.inf if case.lacks else scales.moves.get(case.key, np.inf)
+        # what moves more than the default design wears a valve for little
         most = (spec.moves_limit or np.inf) * default_moves
         cost += spec.moves_weight * result.travel + COSTS.moves * max(0.0, result.travel / most - COSTS.free)
         costs.setdefault(case, []).append(cost)
@@ -405,15 +389,18 @@ def score(results: Sequence[StepResult], spec: Spec, scales: Scales) -> Score:
 
 def _mean_and_worst(costs: Sequence[float]) -> float:
     """Return the mean, and half of what the worst is above it."""
+    # the draws stand for what the plant may be
     return float(0.5 * (np.mean(costs) + np.max(costs))) if costs else 0.0
 
 
 def _cost_of_step(result: StepResult, spec: Spec, scales: Scales) -> float:
+    # before the bound no target is reached: a time near it is the actuator's, and no weight's
     bound = scales.bounds[(*result.case.step, result.case.draw)]
     unit = max(bound if np.isfinite(bound) else result.length_s, 1.0)
     if np.isfinite(result.settle_s):
         cost = result.settle_s / unit + COSTS.bias * max(0.0, abs(result.bias) / spec.bias_degC - COSTS.free)
     else:
+        # of what never settles the error says how far it was from it
         cost = result.length_s / unit + COSTS.error * abs(result.last_error) / spec.band_degC
     cost += COSTS.overshoot * max(0.0, result.overshoot / spec.overshoot_degC - COSTS.free)
     return float(cost + spec.energy_weight * result.energy_s / unit)

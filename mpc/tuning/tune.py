@@ -1,16 +1,9 @@
 r"""Find the best controller of all kinds for what is wanted, and say whether weights were the limit.
 
-**Search.** An MPC is varied by five factors of its default design, a PI by three of SIMC's settings, each
-by its logarithm, by NLopt's simplex search [1]_ from a factor of 2 on.
-Each design is scored in closed loop on draws of the plant's posterior, never on the model itself, on
-steps and on loads (:mod:`thermogrip.mpc.tuning.objective`). An MPC that
-is worse than the default design by more than 3 % on steps or on loads is not taken, whatever it wins on
-the other: trials are the model's word, and on two of eight plants the truth denied it. The default
-design, the best MPC and the best PI are then compared on draws that the search has not seen, and the one
-of the least score is what is saved, whatever its kind; a tuned MPC where it wins more than 20 % and the plant
-has draws: on one plant alone the search has seen all that the comparison shows. A PI does
-not know zones, prices of energy, limits of outputs, ramps or what is switched: where the spec asks for
-one of these the MPC is taken.
+An MPC is varied by five factors of its default design, a PI by three of SIMC's settings, each by its
+logarithm, by NLopt's simplex search [1]_, and scored in closed loop on draws of the plant's posterior
+(:mod:`thermogrip.mpc.tuning.objective`).  The default design, the best MPC and the best PI are then compared
+on draws that the search has not seen; the one of the least score is what is saved, whatever its kind.
 
 References
 ----------
@@ -71,7 +64,9 @@ class SearchSettings:
     # the default's, is less than the mean of both errors over the default's on the truth by .10 in the
     # logarithm and a standard deviation of .14 from plant to plant (eight_plants.py): their sum.
     won: float = 0.20
-    worse: float = 0.03  # relative rise of steps or of loads from which an MPC is not taken
+    # relative rise of steps or of loads from which an MPC is not taken, whatever it wins on the other: trials
+    # are the model's word, and on two of eight plants the truth denied it
+    worse: float = 0.03
     near: float = 1.25  # settling over bound that counts as the actuator's limit
     # by which a search first varies each parameter.  Score over the default's on unseen draws of four plants
     # (geometric mean): .971; subplex .982 from 2 and from 4 on; a compass search .970
@@ -563,7 +558,7 @@ def kept_of(scores: Mapping[str, float], eligible: Collection[str]) -> str:
 
 
 def unknown_to_pi(spec: Spec) -> list[str]:
-    """Return what a spec asks for that a PI does not know."""
+    """Return what a spec asks for that a PI does not know: the MPC is taken there."""
     wishes = {
         "zones": spec.zones,
         "energy prices": spec.energy_price,
