@@ -437,8 +437,6 @@ class VirtualDevice:
         self.trace.append(self.bench.moment())
 
     def _spoilt(self, data: bytes) -> bytes:
-        if not self._garbage or not data:
-            return data
         lines = data.splitlines(keepends=True)
         return b"".join(
             spoil(line, self._rng) if self._rng.random() < self._garbage else line for line in lines

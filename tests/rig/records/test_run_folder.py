@@ -404,13 +404,17 @@ def test_a_line_counts_if_it_is_whole_and_the_others_are_named(
         assert len(again) == len(lost) + 2  # its verdict is interrupted already
 
 
-@pytest.mark.parametrize("samples", ["", "t,x\n0,1\n", "time_s\0\n0\n1\n"])
-def test_samples_without_their_header_are_none(tmp_path: Path, samples: str) -> None:
+@pytest.mark.parametrize(
+    ("samples", "lost"),
+    [("", []), ("t,x\n0,1\n", ["samples.csv, line 1: is damaged (3 bytes); left out"]),
+     ("t,x\n\0\n", [f"samples.csv: the last 6 {CUT}"])],
+)  # fmt: skip
+def test_samples_without_their_header_are_none(tmp_path: Path, samples: str, lost: list[str]) -> None:
     write(tmp_path / "run", 0).close()
     (tmp_path / "run" / "samples.csv").write_text(samples)
     run = read_run(tmp_path / "run")
     assert (run.log, run.grasps) == (None, None)
-    assert len(run.lost) == bool(samples)
+    assert list(run.lost) == lost
 
 
 def test_events_that_make_no_sense_are_left_out_and_a_lost_run_json_is_a_run_that_did_not_end(
