@@ -177,6 +177,7 @@ def figures(trade: Trade, parts: Sequence[tuple[Array, Array, Array]], loads: in
 
 def identified(trade: Trade, keep: Path) -> Model:
     """Return the plant of the log, from the folder where it is there."""
+    keep.mkdir(parents=True, exist_ok=True)
     path = keep / f"{trade.case.name}.plant.json"
     if not path.exists():
         times, columns = record(trade.case, 0)

@@ -4,9 +4,8 @@
 
 Each name is a process of its own (Linux) on the four rig logs that come with the package:
 
-    fit         network "gripper" from its priors (cold), and from the fit to the first three logs (warm);
-                logs are read and the kernel is compiled before the clock starts
-    first       the cold fit in a new process: imports, reading, compiling, fitting
+    fit         network "gripper" from its priors; logs are read, the kernel is compiled before the clock starts
+    first       the same in a new process: imports, reading, compiling, fitting
     identify    ``thermogrip identify LOGS --report``: black boxes, held-out scores, intervals, figures
     posterior   ``thermogrip identify LOGS --models network --posterior``
 
@@ -51,10 +50,8 @@ def fit() -> list[Row]:
     model.rollout(
         np.full((1, model.n_x), 25.0), np.ones((1, 1, 2)), np.full((1, 1, 1), 25.0), model.prior[None], 0.5
     )
-    cold, plant = clocked("fit, cold", lambda: fit_network("gripper", logs))
-    three = fit_network("gripper", logs[:3])
-    warm, again = clocked("fit, warm", lambda: fit_network("gripper", logs, near=three.values))
-    return [cold | _said(plant), warm | _said(again)]
+    row, plant = clocked("fit", lambda: fit_network("gripper", logs))
+    return [row | _said(plant)]
 
 
 def _said(plant: Any) -> Row:
