@@ -4,7 +4,7 @@
 
 Each name is a process of its own (Linux) on the four rig logs that come with the package:
 
-    fit         network "gripper" from its priors; logs are read, the kernel is compiled before the clock starts
+    fit         network "gripper" from its priors; logs and kernel are there before the clock starts
     first       the same in a new process: imports, reading, compiling, fitting
     identify    ``thermogrip identify LOGS --report``: black boxes, held-out scores, intervals, figures
     posterior   ``thermogrip identify LOGS --models network --posterior``
