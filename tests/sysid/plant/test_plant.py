@@ -35,7 +35,7 @@ def _plants() -> list[Plant]:
     samples = middle * (1 + 0.05 * np.random.default_rng(0).uniform(-1, 1, (7, middle.size)))
     block = StateSpaceModel(("q",), (), ("t",), A=[[0.9]], B=[[4.0]], C=[[1.0]], dt=10.0)
     black = Plant(block, {}, dt=10.0, units={"q": "1", "t": "degC"}, valid={"q": (-np.inf, 1.0)})
-    scores = PlantScores(cost=1.5, per_log={"a": {"bias": (0.5, 0.1)}})
+    scores = PlantScores(average_s=1.5, weight_s={"a": 0.5})
     return [fitted, replace(fitted, samples=samples, scores=scores, verdict="good"), black]
 
 
