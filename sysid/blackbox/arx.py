@@ -26,6 +26,7 @@ from thermogrip.sysid.blackbox.order_selection import (
     column_sizes,
     default_terms,
     drives,
+    first_readings,
     with_spread,
 )
 from thermogrip.sysid.models.state_space import StateSpaceModel
@@ -128,8 +129,7 @@ def _at_rest(grid: Grid, terms: tuple[str, ...], orders: _Orders) -> list[Array]
     """Return the state in which each segment's first reading and first drives have always stood."""
     out = []
     for segment, w in zip(grid.segments, drives(grid, terms)):
-        first = segment.y[np.argmax(np.isfinite(segment.y), axis=0), np.arange(len(grid.outputs))]
-        middle = np.nan_to_num(first, nan=0.0)
+        middle = np.nan_to_num(first_readings(segment), nan=0.0)
         past_drives = np.tile(w[0], orders.delay + orders.poles - 2)
         out.append(np.concatenate([np.tile(middle, orders.poles), past_drives]))
     return out

@@ -24,7 +24,7 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.linalg.blas import dsyrk
 
 from thermogrip.datasets.arrays import Array
-from thermogrip.sysid.blackbox.order_selection import Structure
+from thermogrip.sysid.blackbox.order_selection import Structure, state_spread
 from thermogrip.sysid.blackbox.subspace import subspace_family
 from thermogrip.sysid.models.neural import NeuralModel
 from thermogrip.sysid.models.state_space import StateSpaceModel
@@ -197,11 +197,10 @@ def _averaged(grid: Grid, data: _Data, members: Sequence[_Member]) -> NeuralMode
     """Return the mean of the members that fit and agree."""
     # what fits its own data worst is a poor minimum
     fitting = np.argsort([some.miss for some in members], kind="stable")[: int(np.ceil(KEPT * len(members)))]
-    members = [members[k] for k in np.sort(fitting)]
-    n, h = max(len(some.A) for some in members), max(some.h for some in members)
-    nearest = _nearest_to_median(data, [some.padded(n, h) for some in members], h)
-    model = _as_model(grid, data, [members[k].padded(n, h) for k in nearest], h)
-    return _with_spread(model, grid, np.stack([members[k].padded(n, h).x0 for k in nearest]))
+    n, h = max(len(members[k].A) for k in fitting), max(members[k].h for k in fitting)
+    alike = [members[k].padded(n, h) for k in np.sort(fitting)]
+    kept = [alike[k] for k in _nearest_to_median(data, alike, h)]
+    return _with_spread(_as_model(grid, data, kept, h), grid, np.stack([some.x0 for some in kept]))
 
 
 def _train_member(data: _Data, linear: _Linear, h: int, *, seed: int) -> _Member:
@@ -327,5 +326,4 @@ def _as_model(grid: Grid, data: _Data, members: Sequence[_Member], h: int) -> Ne
 def _with_spread(model: NeuralModel, grid: Grid, starts: Array) -> NeuralModel:
     """Return the model with the covariance of its states over the training data; starts (K, n_segment, n)."""
     rows = [model.states(starts[:, segment], s.u, s.d, grid.dt) for segment, s in enumerate(grid.segments)]
-    spread = np.atleast_2d(np.cov(np.concatenate(rows).T))
-    return replace(model, spread=spread + 1e-8 * np.trace(spread) * np.eye(model.n_x))
+    return replace(model, spread=state_spread(np.concatenate(rows)))

@@ -23,8 +23,8 @@ from itertools import pairwise, product
 from typing import Any, NamedTuple, Protocol, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.errors import UserError
 from thermogrip.sysid.models.lti import StartPrior, estimate_starts, evaluate_terms
 from thermogrip.sysid.models.model import Model as PlantModel
@@ -32,7 +32,6 @@ from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.fit_record import HELD_OUT_SHARE, SEVERAL, TAIL
 from thermogrip.sysid.plant.log_grid import MOVED, Grid, Segment
 
-Array = NDArray[np.float64]
 Item = TypeVar("Item")
 
 SIMPLER_MARGIN = float(np.log(1.05))  # of log errors
@@ -373,11 +372,19 @@ def with_spread(model: StateSpaceModel, grid: Grid, starts: Sequence[Array]) -> 
         for x0, segment in zip(starts, grid.segments)
     ]
     x = np.concatenate(rows)
-    if not np.isfinite(x).all():
-        return model
+    return replace(model, spread=state_spread(x)) if np.isfinite(x).all() else model
+
+
+def state_spread(x: Array) -> Array:
+    """Return the covariance of states (n, n_x)."""
     spread = np.atleast_2d(np.cov(x.T))
     # a state that never moved (a constant input in a delay line) keeps a trace of variance
-    return replace(model, spread=spread + 1e-8 * max(np.trace(spread), 1e-12) * np.eye(model.n_x))
+    return np.asarray(spread + 1e-8 * max(np.trace(spread), 1e-12) * np.eye(len(spread)))
+
+
+def first_readings(segment: Segment) -> Array:
+    """Return the first reading (n_y,) of each output that there is."""
+    return np.asarray(segment.y[np.argmax(np.isfinite(segment.y), axis=0), np.arange(segment.y.shape[1])])
 
 
 def excess_within_noise(excess: Array, most: float = SIMPLER_MARGIN) -> bool:

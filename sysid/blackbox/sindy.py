@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thermogrip.datasets.arrays import Array
-from thermogrip.sysid.blackbox.order_selection import Structure
+from thermogrip.sysid.blackbox.order_selection import Structure, first_readings, state_spread
 from thermogrip.sysid.models.polynomial import SindyModel
 from thermogrip.sysid.plant.log_grid import Grid, whole_readings
 
@@ -126,24 +126,14 @@ def _bounded_model(grid: Grid, exponents: NDArray[np.int_], natural: Array, memo
         return None
     labels = (grid.inputs, grid.disturbances, grid.outputs, grid.switches)
     model = SindyModel(*labels, grid.dt, memory, exponents, natural, low, high)
-    longest = max(len(segment.time) for segment in grid.segments)
-    starts = []
     states = []
     for segment in grid.segments:
-        first = segment.y[np.argmax(np.isfinite(segment.y), axis=0), np.arange(len(grid.outputs))]
-        starts.append(model.rest(first, (), (), ()))
-    u, d = (  # all segments at once, the shorter ones with their last row held
-        np.stack([signal[np.minimum(np.arange(longest), len(signal) - 1)] for signal in signals])
-        for signals in ([s.u for s in grid.segments], [s.d for s in grid.segments])
-    )
-    runs, _ = model.rollout(np.stack(starts), u, d, (), grid.dt)
-    for run, segment in zip(runs, grid.segments):
-        outputs = run[: len(segment.time) + 1]
+        start = model.rest(first_readings(segment), (), (), ())
+        (outputs,), _ = model.rollout(start[None], segment.u[None], segment.d[None], (), grid.dt)
         if not np.isfinite(outputs).all():
             return None
         states.append(np.hstack([outputs[memory - 1 - lag : len(outputs) - lag] for lag in range(memory)]))
-    spread = np.atleast_2d(np.cov(np.concatenate(states).T))
-    return replace(model, spread=spread + 1e-8 * max(np.trace(spread), 1e-12) * np.eye(model.n_x))
+    return replace(model, spread=state_spread(np.concatenate(states)))
 
 
 class _Trajectory(NamedTuple):

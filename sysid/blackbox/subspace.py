@@ -39,8 +39,8 @@ from typing import NamedTuple
 from weakref import WeakKeyDictionary
 
 import numpy as np
-from numpy.typing import NDArray
 
+from thermogrip.datasets.arrays import Array
 from thermogrip.sysid.blackbox.order_selection import (
     Structure,
     as_state_space,
@@ -52,8 +52,6 @@ from thermogrip.sysid.blackbox.order_selection import (
 from thermogrip.sysid.blackbox.output_error import least_squares
 from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.log_grid import Grid, Segment, whole_readings
-
-Array = NDArray[np.float64]
 
 DEPENDENT = 1e-8  # of the largest singular value: what is less is none
 
@@ -109,14 +107,14 @@ def _realised(
             if weighting == "parsim":
                 gamma = predictor_observability(triangle, f, n_y)
             else:
-                gamma, _ = extended_observability(*_factorise(triangle, f, n_y), n_y=n_y, weighting=weighting)
+                gamma = extended_observability(*_factorise(triangle, f, n_y), weighting=weighting)
             for n in (n for size, w, n in wanted if (size, w) == (f, weighting) and n < gamma.shape[1]):
                 out[f, weighting, n] = _realise(grid, gamma[:, :n], terms)
     return out
 
 
-def extended_observability(L32: Array, L33: Array, *, n_y: int, weighting: str) -> tuple[Array, Array]:
-    """Return the columns that span Gamma, scaled by the roots of the singular values, and those values."""
+def extended_observability(L32: Array, L33: Array, *, weighting: str) -> Array:
+    """Return the columns that span Gamma, scaled by the roots of the singular values."""
     if weighting == "cva":
         size, vectors = np.linalg.eigh(L32 @ L32.T + L33 @ L33.T)
         size = np.maximum(size, 1e-10 * size.max())
@@ -126,7 +124,7 @@ def extended_observability(L32: Array, L33: Array, *, n_y: int, weighting: str) 
     else:
         raise ValueError(f"weighting must be 'moesp' or 'cva', got {weighting!r}")
     left_vectors, values, _ = np.linalg.svd(weight @ L32, full_matrices=False)
-    return back @ (left_vectors * np.sqrt(values)), values
+    return np.asarray(back @ (left_vectors * np.sqrt(values)))
 
 
 def fit_inputs(grid: Grid, A: Array, C: Array, terms: tuple[str, ...] = ()) -> StateSpaceModel:
