@@ -36,15 +36,8 @@ difference of 1 K. The two shrinkages, :math:`\nu_0` of the covariance and :math
 in which a grasp counts for :math:`\Delta T^2 / (\Delta T^2 + 4\,\mathrm{K}^2)`. A feature that a grasp does
 not have (a response at 40 s in one of 10 s) is marginalised, in training and after.
 
-Where the object's temperature is **unknown** the density is the mean of those at temperatures 2 K apart, up
-to 20 K from the room's; where its stated sd is more than 2 K, the mean over that normal distribution.  The
-mean of a **material that was not trained** is drawn as those of the k trained ones were, from
-:math:`N(\bar\mu, B)` with
-
-.. math:: B = \frac{k + 1}{k (k - 1)} \sum_m (\mu_m - \bar\mu)(\mu_m - \bar\mu)^T,
-
-so that its grasps are Student-t distributed with k - 1 degrees of freedom and scale :math:`\Delta T^2 (B +
-\Sigma) + N`; beside it the mean density of the candidates gives the probability that it is none of them.
+The mean density of the candidates beside that of a material that was not trained gives the probability that a
+grasp is of none of them.
 """
 
 from __future__ import annotations
@@ -337,6 +330,8 @@ class BayesClassifier(GraspClassifier):
         out[~wide] = self._log_t_of(_rows_of_readings(read, ~wide))
         if not wide.any():
             return out
+        # Of an unknown temperature the density is the mean of those at temperatures 2 K apart, up to 20 K
+        # from the room's; where its stated sd is more than 2 K, the mean over that normal distribution.
         record = pick(grasps, wide)
         unknown = unknown[wide]
         some = _rows_of_readings(read, wide)
@@ -362,6 +357,9 @@ class BayesClassifier(GraspClassifier):
         y, noise = self._scaled(read)
         sd = np.where(np.isfinite(read.t_object_sd), read.t_object_sd, self.t_object_sd_)
         k, zero = self.classes_.size, self.center_ / self.scale_
+        # The mean of a material that was not trained is drawn as those of the k trained ones were, from
+        # N(middle, B) with B = (k + 1) / (k (k - 1)) sum (mu_m - middle)(mu_m - middle)^T, so that its grasps
+        # are Student-t distributed with k - 1 degrees of freedom and scale gain^2 (B + Sigma) + N.
         middle = self.means_.mean(axis=0)
         off = self.means_ - middle
         strange = (k + 1) / (k * (k - 1)) * off.T @ off

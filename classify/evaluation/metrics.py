@@ -6,40 +6,11 @@ r"""Scores of predictions, each with the interval that its sample size allows.
   :math:`\mathrm{var}(c_i)/m \le \hat p (1 - \hat p) / m`: Clopper-Pearson with n = m distinct grasps (and k =
   m p, which need not be whole) is conservative, and does not collapse to a point where all were right.
 - **Log loss** :math:`-\ln p_{true}` and **Brier** :math:`\sum_k (p_k - y_k)^2` score probabilities.
-- **Calibration**: confidence beside accuracy in bins; their mean absolute gap, weighted by bin, is the ECE.
+- **Calibration**: confidence beside accuracy in bins; their mean absolute gap, weighted by bin, is the ECE;
+  beside it what a perfectly calibrated forecaster of the same confidences would show.
+- **Intervals** are over grasps: whole grasps are drawn anew, each with all of its tests.
 - **Two classifiers on the same grasps**: exact McNemar; for repeated splits a sign-flip test on each grasp's
   mean difference.
-
-Intervals by drawing whole grasps anew: of means, and of the calibration error
-------------------------------------------------------------------------------
-
-The tests of one grasp in several splits agree with each other more than with those of other grasps.  So what
-is drawn with replacement is the grasp, with all of its tests: with the sum :math:`S_i` of a score over the
-:math:`R_i` tests of grasp i, and multinomial counts w,
-
-.. math:: \hat\theta = \frac{\sum_i S_i}{\sum_i R_i}, \qquad
-          \theta^* = \frac{\sum_i w_i S_i}{\sum_i w_i R_i}.
-
-The interval of a mean is Efron's BCa (J. Am. Stat. Assoc. 82, 1987): quantiles of :math:`\theta^*`, shifted
-for its median bias and its skewness, which log losses have.  Of few grasps it covers less than stated.
-Losses that no grasp showed are in no draw: where none was wrong, the upper end is too low, and the interval
-of the accuracy (Clopper-Pearson) shows by how much.  One grasp shows nothing of how grasps differ, and has no
-interval.
-
-**Calibration error.**  With the mean gaps :math:`D_b` between confidence and truth in bin b, as shares of all
-tests, the ECE is :math:`\theta = \sum_b |D_b|`.  It is biased upwards: noise never cancels in an absolute
-value.  The draws have the noise twice, so their quantiles are no interval of :math:`\theta`.  But
-
-.. math:: \hat\theta - \theta \le \sum_b |\hat D_b - D_b|, \qquad
-          \theta - \hat\theta \le \sum_b s_b (D_b - \hat D_b), \quad s_b = \mathrm{sign}\, D_b,
-
-and the draws do have the distribution of the right-hand sides (with the signs that were found), since they
-contain no absolute value of a mean.  Their quantiles give an interval that covers at least the stated share.
-
-Beside it is what a *perfectly calibrated* forecaster of the same confidences would show: each grasp draws
-one uniform number u and is right in all tests whose confidence exceeds it.  That is the mean of the bias, and
-the share of such forecasters with an ECE as large or larger is a p-value for "calibrated".  Taking all tests
-of a grasp to be right or wrong together overstates the bias a little, on the cautious side.
 """
 
 from __future__ import annotations
@@ -184,10 +155,13 @@ def mean_intervals(
     ``grasp`` (n_test,) counts from 0."""
     rows, of = np.asarray(values, dtype=float), np.asarray(grasp, dtype=int)
     sums, tests = _by_grasp(rows, of), np.bincount(of).astype(float)
+    # The tests of one grasp in several splits agree with each other more than with those of other grasps, so
+    # what is drawn with replacement is the grasp with all its tests: with the sum S_i of a score over the R_i
+    # tests of grasp i, and multinomial counts w, a draw is sum w_i S_i / sum w_i R_i.
     counts = grasp_counts(tests.size, draws=draws, seed=seed)
     means = (counts @ sums) / (counts @ tests)[:, None]
     value = rows.mean(axis=0)
-    if tests.size < 2:
+    if tests.size < 2:  # one grasp shows nothing of how grasps differ
         return [Interval(float(v), np.nan, np.nan) for v in value]
     influence = sums - value * tests[:, None]
     return [
@@ -219,6 +193,10 @@ def calibration_interval(
     if tests.size < 2:
         return CalibrationError(value, np.nan, np.nan, float(chance.mean()), p)
     counts = grasp_counts(tests.size, draws=draws, seed=seed)
+    # With the mean gaps D_b in bin b the ECE is sum |D_b|, biased upwards, as noise never cancels in an
+    # absolute value, and the draws have the noise twice: their quantiles are no interval.  But
+    #     found - true <= sum |found D_b - D_b|,   true - found <= sum s_b (D_b - found D_b),  s_b = sign D_b,
+    # and the draws have the distribution of the right-hand sides, which hold no absolute value of a mean.
     off = (counts @ gaps) / (counts @ tests)[:, None] - mean_gaps
     tail = (1 + level) / 2
     low = value - float(np.quantile(np.abs(off).sum(axis=1), tail))
@@ -233,6 +211,10 @@ def _by_grasp(rows: Floats, of: NDArray[np.int64]) -> Floats:
 
 def _bca(draws: Floats, value: float, influence: Floats, level: float) -> tuple[float, float]:
     """Return the bias-corrected and accelerated interval; a point where all grasps are alike."""
+    # Efron's (J. Am. Stat. Assoc. 82, 1987): quantiles of the draws, shifted for their median bias and their
+    # skewness, which log losses have.  Of few grasps it covers less than stated.  Losses that no grasp showed
+    # are in no draw: where none was wrong the upper end is too low, and the interval of the accuracy shows by
+    # how much.
     power = float(np.sum(influence**2))
     if power < 1e-24:
         return value, value
@@ -256,6 +238,8 @@ def _ece_of_calibrated(c: Floats, of: NDArray[np.int64], bins: Floats, m: int, s
     rng = np.random.default_rng(seed + 1)
     stated = c @ bins
     ece = np.empty(_FORECASTERS)
+    # Each grasp draws one number and is right in all tests whose confidence exceeds it: to take the tests of
+    # a grasp to be right or wrong together overstates the bias a little, on the cautious side.
     for start in range(0, _FORECASTERS, 100):  # a block at a time: a hundred by all tests
         right = (rng.random((100, m))[:, of] < c).astype(float)
         ece[start : start + 100] = np.abs(stated - right @ bins).sum(axis=1) / c.size

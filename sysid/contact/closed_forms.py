@@ -34,29 +34,12 @@ domain:
     layer        Z = (1/e1) (Z2 e1 cosh + sinh / sqrt(s)) / (cosh + Z2 e1 sqrt(s) sinh), of sqrt(s) z1, on a
     body Z2
 
-C = rho c_p L.  Two bodies meet through h_c, q(s) = dT/s / (1/h_c + Z_dev + Z_obj), and the inverse
-transform below gives fluxes and temperatures to 1e-11 of themselves for any effusivity ratio.  So it does
-where a surface or a fluid has a given temperature: in a slab, of times in units of L^2 / alpha, q = sqrt(s),
+C = rho c_p L.  Two bodies meet through h_c, q(s) = dT/s / (1/h_c + Z_dev + Z_obj), and
+:func:`invert_laplace` gives fluxes and temperatures to 1e-11 of themselves for any effusivity ratio.  So it
+does where a surface or a fluid has a given temperature: in a slab, of times in units of L^2 / alpha, with
+q = sqrt(s),
 
     rise(x) = cosh(q (1 - x)) / (s (cosh(q) + (q / Bi) sinh(q))),   Bi = h L / k, infinite at a held surface.
-
-Numerical inversion of Laplace transforms of heat conduction
-------------------------------------------------------------
-
-    f(t) = 1/(2 pi i) * integral of F(s) exp(s t) ds
-
-along a path from below to above that leaves every singularity of F on its left.  Transforms of conduction
-have theirs on the negative real axis (poles of finite bodies, branch cuts of infinite ones), so the path
-may come in from minus infinity.  On the cotangent contour
-
-    s(phi) = (n / t) (-0.6122 + 0.5017 phi cot(0.6407 phi) + 0.2645 i phi),   -pi < phi < pi,
-
-the midpoint rule with n points converges as exp(-1.358 n); its constants make the discretisation and
-truncation errors fall together.  Rounding grows as exp(0.17 n), so n = 24 gives 1e-13 in double precision,
-relative to the size of f around t.  It cannot give relative accuracy where f is exponentially small, deep
-inside a body.
-
-The contour is of Talbot's kind; the tests measure its convergence rate.
 
 References
 ----------
@@ -251,7 +234,14 @@ def invert_laplace(transform: Callable[[Complex], Complex], t: ArrayLike, *, n: 
     t = np.asarray(t, dtype=float)
     if not (np.all(t > 0) and np.all(np.isfinite(t))):
         raise ValueError("times of a Laplace inversion must be positive and finite")
-    # conjugate symmetry: the upper half is enough
+    # f(t) is 1/(2 pi i) times the integral of F(s) exp(s t) along a path from below to above that leaves
+    # every singularity of F on its left.  Transforms of conduction have theirs on the negative real axis
+    # (poles of finite bodies, branch cuts of infinite ones), so the path may come in from minus infinity, as
+    # Talbot's do.  On the cotangent contour s = (n / t) (-0.6122 + 0.5017 phi cot(0.6407 phi) + 0.2645 i phi)
+    # with -pi < phi < pi the midpoint rule with n points converges as exp(-1.358 n); its constants make the
+    # errors of discretisation and truncation fall together.  Rounding grows as exp(0.17 n), so n = 24 gives
+    # 1e-13 in double precision, relative to the size of f around t: not of itself where f is exponentially
+    # small, deep inside a body.  By conjugate symmetry the upper half is enough.
     phi = (2 * np.arange(n // 2) + 1) * np.pi / n
     cot = 1 / np.tan(0.6407 * phi)
     z = n * (-0.6122 + 0.5017 * phi * cot + 0.2645j * phi)

@@ -168,6 +168,11 @@ def far_response(
     sensor, per degree from block to room, (n, n_node)."""
     from scipy.interpolate import make_interp_spline
 
+    # A block of capacity C per face whose far face loses U (T_obj - T_room) warms or cools at its near face,
+    # untouched there, by d(t) = (U / C) (T_room - T_obj) max(t - L^2 / 6 alpha, 0), the mean time of the way
+    # through the slab being L^2 / 6 alpha = C^2 / 6 e^2: 0.6 s in 20 mm of copper, 3 s in iron, minutes in
+    # wood.  The sensor answers to d by its step response, so the reading gains the integral of that.  It is
+    # the first order in U: the loss of what the gripper has warmed is left out (U t / C, 2 % in 10 s).
     e, c = (np.broadcast_to(np.asarray(v, dtype=float), rise.shape[:1]) for v in (effusivity, capacity))
     since = np.maximum(nodes.t - (c**2 / (6 * e**2))[:, None], 0.0)
     total = [make_interp_spline(nodes.t, f, k=1).antiderivative()(s) for f, s in zip(rise, since)]

@@ -21,33 +21,6 @@ one by ln e or ln C, which move the block's modes, gains dE x + d(E b + a) q.  A
 One function is compiled, in which it is all written out: a function that calls others is optimised whole with
 each of them, and what NumPy does for many contacts at once costs no compilation.  This file and those that
 build on it import numba, so nothing pays for the compiler before it is used.
-
-Modes of the block
-------------------
-
-The face of a slab whose far one loses U per degree falls, per unit flux, by modes j = 0, 1, ... of rate
-
-    lam_j = (beta_j e / C)^2,   beta_j = j pi + arctan(Bi / beta_j),   Bi = U C / e^2,
-
-and weight 2/C (beta^2 + Bi^2) / (beta^2 + Bi^2 + Bi): j pi and 2/C (1/C of j = 0) where nothing is lost.
-Those beyond the first dozen are grouped by Gauss quadrature over ln j from j = 11.5 (Euler-Maclaurin's
-midpoint rule, with its next term), those faster than a millisecond are a series resistance.
-
-Heat loss of the block by its far face
---------------------------------------
-
-A block of capacity C per face whose far face loses U (T_obj - T_room) warms or cools at its near face,
-untouched there, by
-
-.. math:: d(t) \approx \frac{U (T_{room} - T_{obj})}{C} \max(t - L^2 / 6 \alpha, 0),
-
-since the mean time of the way through the slab is :math:`L^2 / 6 \alpha = C^2 / 6 e^2`: 0.6 s in 20 mm of
-copper, 3 s in iron, minutes in wood.  The sensor answers to d by the step response F, so the reading gains
-
-.. math:: \frac{U}{C} (T_{room} - T_{obj}) G(t), \quad G(t) = \int_0^{t - C^2 / 6 e^2} F(s) ds.
-
-That is the first order in U: the loss of what the gripper itself has warmed is left out (of the size of
-U t / C, 2 % in 10 s, of a few kelvin).
 """
 
 from __future__ import annotations
@@ -108,6 +81,12 @@ def slab_modes(
 
     ``contact`` (n, 2 or more) begins with effusivity and heat capacity, ``numbers`` are those of
     :class:`Gripper`, ``node`` and ``shares`` those of the quadrature."""
+    # The face of a slab whose far one loses U per degree falls, per unit flux, by modes j = 0, 1, ... of rate
+    #     lam_j = (beta_j e / C)^2,   beta_j = j pi + arctan(Bi / beta_j),   Bi = U C / e^2,
+    # and weight 2/C (beta^2 + Bi^2) / (beta^2 + Bi^2 + Bi): j pi and 2/C (1/C of j = 0) where nothing is
+    # lost. Those beyond the first dozen are grouped by Gauss quadrature over ln j from j = 11.5
+    # (Euler-Maclaurin's midpoint rule, with its next term), those faster than a millisecond are a series
+    # resistance.
     start = _N_EXACT - 0.5
     for p in range(contact.shape[0]):
         e = contact[p, 0]

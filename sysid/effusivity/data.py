@@ -1,10 +1,8 @@
 """Grasps as the arrays that the posterior engine works on.
 
-A response to contact is sharp at first and smooth later, so samples are averaged in bins that widen with
-time: every sample (0.1 s) around contact, half a second by 10 s, seconds by 40 s.  Averages of white noise
-lose nothing, and 121 samples become 47 numbers.  Bins are fixed in time, not in samples, so any sampling
-rate works; a missing sample is missing from its average only, and so is a spike, or a sample at the end of
-its sensor's range (:mod:`~thermogrip.sysid.effusivity.quality`).
+Samples are averaged in bins that widen with time, fixed in time, not in samples, so any sampling rate works;
+a missing sample is missing from its average only, and so is a spike, or a sample at the end of its sensor's
+range (:mod:`~thermogrip.sysid.effusivity.quality`).
 
 The noise of the averages is a sum of three parts,
 
@@ -22,19 +20,14 @@ block, a slower sensor, a heater nearby.  There is no end of these, and what has
 wrong material, which is then sure.  So the model is right but for
 
 - a discrepancy of its trace, a Gaussian process of sd s A (s is the ``share``) whose correlation is the mean
-  of exp(-|dt| / l) for l of 0.5, 2.5 and 10 s, from a slip to a contact's length;
+  of exp(-|dt| / l) for l of 0.5, 2.5 and 10 s;
 - nuisances farther from where the training has them, by w in the logarithm of contact conductance, build-up
   time and the block's heat capacity (a block of another thickness), by proportional amounts in onset and
   object temperature (:func:`~thermogrip.sysid.effusivity.laplace_approximation.prior_of`).
 
-A slip, or a finger that closes again, leaves what came before it sound: then the discrepancy is anything, s =
-0.3, from a time of 1, 2 or 4 s on, and nothing before.
-
 Nobody knows which it is of a grasp, so each is looked at under the :data:`GRADES`, and the evidence of
 whatever is asked (a material, an effusivity, a material of none of the blocks) is its sum over them, each
-times its prior probability.  A larger s pays for itself by the determinant of its covariance: grasps like
-those of the training are answered by the first grade as if there were no others, and what gross misfit leaves
-is flat.
+times its prior probability.
 """
 
 from __future__ import annotations
@@ -58,6 +51,8 @@ if TYPE_CHECKING:
 
 UNKNOWN_OBJECT_RANGE = 20.0  # K about the room, or the gripper where no room is stated
 UNKNOWN_OBJECT_SD = UNKNOWN_OBJECT_RANGE / 3**0.5  # K, that of values spread evenly over the range
+# A response to contact is sharp at first and smooth later: every sample (0.1 s) around contact, half a second
+# by 10 s, seconds by 40 s.  Averages of white noise lose nothing, and 121 samples become 47 numbers.
 _BIN_EDGES = np.concatenate(
     [
         np.arange(-60.65, -0.7, 0.5),
@@ -97,6 +92,10 @@ class Grade(NamedTuple):
     misstated_K: float = 0.0  # sd of the object's temperature about what was stated
 
 
+# A slip, or a finger that closes again, leaves what came before it sound: then the discrepancy is anything
+# from a time of 1, 2 or 4 s on.  A larger share pays for itself by the determinant of its covariance: grasps
+# like those of the training are answered by the first grade as if there were no others, and what gross misfit
+# leaves is flat.
 # Three grasps in ten are unlike the training: one cannot know from a training, however clean, that none will
 # be.  Evidence differs by some ten nats between grades, so that their odds barely count.  Log loss of
 # disturbed grasps (two finite-volume fingers; the rig): .66, .47; without the last three .74, .51.
@@ -108,7 +107,7 @@ GRADES = (
     Grade(0.003, 1.0, 0.05), Grade(0.1, 1.0, 0.05), Grade(0.3, 0.0, 0.05, since=1.0),
     Grade(0.3, 0.0, 0.05, since=2.0), Grade(0.3, 0.0, 0.05, since=4.0),
 )  # fmt: skip
-_DISCREPANCY_TIMES_S = (0.5, 2.5, 10.0)  # s, of the discrepancy of a trace
+_DISCREPANCY_TIMES_S = (0.5, 2.5, 10.0)  # of a trace: from a slip to a contact's length
 KNOTS = np.array([-1.0, -0.6, -0.3, 0.0, 0.3, 0.6, 1.0, 1.5, 2.2, 3.2, 4.6, 6.6, 10.0, 16.0, 25.0, 40.0])
 
 

@@ -29,26 +29,13 @@ initial difference, the drop
 
     rho = sum_j w_j int_0^t1 q(tau) exp(-lam_j (t1 + rest - tau)) d tau
 
-of the block's modes (lam_j, w_j) under the flux q of the first touch: in a metal the heat that left over the
-heat capacity, since its temperature is even after seconds; in wood more than that, since the heat is still
-near the face.  A share a of it is left to find (a block stores heat beside the part that a touch sees, and
-may be touched at another face).  Meanwhile the block relaxes towards the room with time constant C / U, so
+of the block's modes (lam_j, w_j) under the flux q of the first touch.  A share a of it is left to find.
+Meanwhile the block relaxes towards the room with time constant C / U, so
 
     T_2 = T_room + exp(-U rest / C) (T_1 - a rho (T_1 - T_grip) - T_room) + N(0, s^2 + (law way)^2).
 
-One time constant is not the law of a slab, least of one that has not become even since: of the way that the
-block went towards the room law = 0.15 + 0.25 exp(-lam_1 rest) is uncertain, a sixth in metals, two fifths in
-wood.  Blocks of another shape or in another place lose k times as much: k is a nuisance of a record, 1 with a
-probability of .8, else log-normal, on a few nodes.  A group i is answered under each by what the others say,
-
-    p(k | others) ~ p_k prod_{j != i} [0.9 Z_jk + 0.1 max_l Z_jl],
-
-of which each decides no more than a factor of ten: it may be of no candidate.
-
-A block's temperature is known to 3 % of its distance from the skin beyond 15 K, as far as they lay
-from the skin where s was learnt.  Contact conductance scatters from touch to touch about the block's own by
-``ln_h_sd``, which may be wider than between grasps of a series.  All of it is learnt from groups of known
-material by maximum likelihood (:func:`learn_coupling`); the defaults are those of the example rig.
+All of it is learnt from groups of known material by maximum likelihood (:func:`learn_coupling`); the defaults
+are those of the example rig.
 """
 
 from __future__ import annotations
@@ -185,11 +172,15 @@ class Traces:
 
     def law(self, rest: float) -> Array:
         """Return which share of the way to the room is uncertain under each hypothesis, (m,)."""
+        # One time constant is not the law of a slab, least of one that has not become even since: of the way
+        # that the block went towards the room a sixth is uncertain in metals, two fifths in wood.
         slowest = np.where(self.decay > 0, self.decay, np.inf).min(axis=1)
         return np.asarray(BLOCK.law_sd + BLOCK.uneven_sd * np.exp(-slowest * rest))
 
     def drop(self, rest: float) -> Array:
         """Return rho of each hypothesis after a rest [s], (m,)."""
+        # in a metal the heat that left over the heat capacity, since its temperature is even after seconds;
+        # in wood more than that, since the heat is still near the face
         return np.asarray((self.moved * np.exp(-self.decay * (rest + BLOCK.into_s))).sum(axis=1))
 
 
@@ -230,6 +221,8 @@ def joint_prior(
     p[:, 0, 0, 0, 0] = variance
     for k in range(1, n):
         before, rest_s = int(rows[k - 1]), float(traces.rest[rows[k]])
+        # a share of the drop is left to find: a block stores heat beside the part that a touch sees, and may
+        # be touched at another face
         drop = coupling.found * traces.drop(rest_s)
         skin, room = traces.skin[before], traces.room[before]
         stay = np.exp(-coupling.loss * rest_s / traces.capacity) if np.isfinite(room) else 1.0
@@ -602,6 +595,7 @@ def _fits(view: _View, groups: list[Rows]) -> list[Joint]:
 def _by_loss(view: _View, at: Rows, factor: Factor) -> Joint:
     """Return evidence and posterior of one group at each loss, of leading shape (n_loss, m); what a block
     loses during a touch is little beside what it loses between two, so that one factor serves all."""
+    # blocks of another shape or in another place lose k times as much: k is a nuisance of the record
     fits = []
     for ln_loss in BLOCK.ln_loss:
         losing = replace(view.coupling, loss=view.coupling.loss * float(np.exp(ln_loss)))
@@ -612,6 +606,8 @@ def _by_loss(view: _View, at: Rows, factor: Factor) -> Joint:
 def _loss_priors(evidence: Sequence[Array]) -> Array:
     """Return the log probability of each loss for each group, (n, n_loss), by the evidence of the record's
     other groups."""
+    # p(k | others) ~ p_k prod_{j != i} [0.9 Z_jk + 0.1 max_l Z_jl]: each group decides no more than a factor
+    # of ten, as it may be of no candidate
     by_loss = np.array(evidence)
     some = np.log1p(-BLOCK.no_candidate) + by_loss
     says = np.logaddexp(some, np.log(BLOCK.no_candidate) + by_loss.max(axis=1, keepdims=True))

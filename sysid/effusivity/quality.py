@@ -1,41 +1,8 @@
 r"""Which grasps, and which of their samples, are usable: :func:`check_grasps` decides it for everybody.
 
-No contact
-----------
-
-10 K or more from its object, a skin moves by a share of the difference in any contact: on the example rig's
-gripper by 1.0 % in 10 s for the least of the library, expanded polystyrene, by 3.5 % for cork; alone by up to
-0.5 % of 20 K as its pump stops.  So a trace whose last second lies within 0.6 % of its level before shows no
-contact.
-
-A skin that moves the other way, by a twentieth of the difference or more, contradicts its object's
-temperature: the number is wrong, or not in degC.  Of touches of one block an unusable one is left out, and
-the block has rested longer before the next of them.
-
-Saturated sensors
------------------
-
-A skin that is pulled past the last reading of its sensor goes on moving; its trace does not, as if the heat
-flow had stopped.  So a trace **saturates** at its highest or lowest reading where it stays for 2 s or more,
-and
-
-- had moved by more than five of its steps in the second before it got there (an exponential that does this
-  and then stays within one step for two seconds has a time constant below 0.6 s: no block has), or
-- jitters over three of its steps or more before contact, and not at all for 30 samples there (normal jitter
-  of half a step stays in one of its steps for so long once in 100 000 traces).
-
-Where no reading of the record lies beyond, that is the rail of the sensor, and the samples at it are clipped
-in every grasp of the record, with those between the first and the last of them: jitter that dips below a
-rail is half a jitter.  Of a trace that others pass, the sensor stuck, and its own stretch is clipped alone.
-Clipped samples are masked as lost ones are; that the skin was "at least this warm" is not used.
-
-A **spike** (a bus that answered 85 or -127 degC, or 0 for a lost reading) is masked too: one to three samples
-that a trace leaves for and comes back from, by the rule of :mod:`thermogrip.datasets.repair`, or with which
-it begins or ends, a leap of 10 K away from the rest.
-
-**Contacts longer than those of the calibration** show what that could not identify, such as water behind a
-cast layer.  Their beginning alone is read, and the answer reports it.  Touches of one block are read whole:
-each leaves in the block what it took as long as it lasted.
+A grasp shows no contact, or contradicts its object's temperature, or its sensor saturates: then it is
+unusable, or clipped samples and spikes of it are masked as lost ones are.  Of touches of one block an
+unusable one is left out, and the block has rested longer before the next of them.
 """
 
 from __future__ import annotations
@@ -74,7 +41,8 @@ class ContactSettings:
     finest_step_K: float = 1e-3  # no thermometer's step is smaller
     silent_samples: int = 30  # normal jitter stays within one step for so long once in 100 000 traces
     telling_difference_K: float = 10.0  # a smaller one does not show whether there was a contact
-    # what a skin moves by at most without a contact: 0.5 % of 20 K as a pump stops
+    # what a skin moves by at most without a contact: 0.5 % of 20 K as a pump stops; in any contact of 10 s it
+    # moves by 1.0 % for the least of the library, expanded polystyrene, by 3.5 % for cork
     no_contact_share: float = 0.006
     odd_share: float = 0.015  # less is odd; cork, the least of the examples, moves it by 0.035
     contrary_share: float = 0.05  # beyond ten times what a skin moves by without a contact
@@ -172,6 +140,8 @@ def check_grasps(grasps: Grasps, *, longest: float = np.inf, whole_traces: bool 
     ever = np.asarray(clipped.any(axis=1))
     since = np.where(ever, time[first_clipped], np.nan)
     reading = np.where(ever, raw[row, first_clipped], np.nan)
+    # Longer contacts than the calibration's show what that could not identify, such as water behind a cast
+    # layer.  Touches of one block are read whole: each leaves in it what it took as long as it lasted.
     single = not has_touch_groups(grasps)
     last = _last_sample_times(time, np.isfinite(raw))
     shortened = np.asarray((last > LIMITS.read_whole * longest) & single)
@@ -390,6 +360,8 @@ def _grasp_count(n: int) -> str:
 
 def _spiked(data: Floats) -> Flags:
     """Return which samples are spikes, (n, n_time)."""
+    # a bus that answered 85 or -127 degC, or 0 for a lost reading: one to three samples that a trace leaves
+    # for and comes back from, or with which it begins or ends
     spiked = np.zeros(data.shape, dtype=bool)
     jumps = np.diff(data, axis=1)
     # a contact moves one way, or there and back slowly: only few traces need a closer look
@@ -416,6 +388,9 @@ def _clipped(time: Floats, clean: Floats) -> Flags:
         # seconds at the top are needed: most traces have none, and cost nothing more
         often = (at_top & (time > 0)).sum(axis=1) > 2
         saturated = [i for i in np.flatnonzero(often) if _saturates(time, data[i], float(top[i]))]
+        # Where no reading of the record lies beyond, that is the rail of the sensor, and samples at it are
+        # clipped in every grasp, with those between: jitter that dips below a rail is half a jitter.  Of a
+        # trace that others pass the sensor stuck, and its own stretch is clipped alone.
         rail = any(top[i] == top.max() for i in saturated)
         for i in {*saturated, *(np.flatnonzero(top == top.max()) if rail else ())}:
             first, last = np.flatnonzero(at_top[i])[[0, -1]]
@@ -425,6 +400,10 @@ def _clipped(time: Floats, clean: Floats) -> Flags:
 
 def _saturates(time: Floats, row: Floats, top: float, stays_for: float = LIMITS.saturated_s) -> bool:
     """Return whether a trace gets to its highest reading in full motion, or falls silent there."""
+    # A skin that is pulled past the last reading of its sensor goes on moving; its trace does not, as if the
+    # heat flow had stopped: it stays after it moved by five steps in a second (an exponential that does this
+    # and stays within one step for two has a time constant below 0.6 s, as no block has), or it jittered
+    # before contact and does not at all there.  That the skin was "at least this warm" is not used.
     has_reading = np.isfinite(row)
     t, y = time[has_reading], row[has_reading]
     at_top = (y == top) & (t > 0)
