@@ -11,10 +11,12 @@ import io
 import math
 import os
 import stat
-from collections.abc import Mapping
+import sys
+from collections.abc import Callable, Mapping
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO
+from typing import TYPE_CHECKING, Any, BinaryIO, TypeVar, cast
+from warnings import catch_warnings, simplefilter
 
 from thermogrip.datasets.errors import UserError, os_faults
 from thermogrip.datasets.provenance import note_read
@@ -35,6 +37,10 @@ _MB = 1 << 20
 # times the packed size: a log of 500 000 rows whose sensors never move grows 104 times with xz
 _LARGEST_EXPANSION = 200
 _FLOOR = 8 << 20  # bytes that any packed file may unpack to
+_READ_S, _SLOWEST_DISK = 10.0, 1e6  # a small file takes .05; bytes a second from a disk of the network
+_COPIES = 4  # of a file's content that its reader may hold: packed, unpacked, as arrays, and to be sent
+_DAMAGED = "it is damaged: copy or write it again"
+_Record = TypeVar("_Record")
 
 
 def most_bytes(share: int = 1) -> int:
@@ -85,6 +91,47 @@ def read_within(stream: BinaryIO, most: int) -> bytes:
         content.write(piece)
         bytes_left -= len(piece)
     return content.getvalue()
+
+
+def in_own_process(read: Callable[[Path], _Record], path: str | Path) -> _Record:
+    """Return ``read(path)`` from a process of its own, for readers in C, which a damaged file may crash or
+    keep for ever; UserError where it does.  Other systems than Linux read it in this one."""
+    import multiprocessing as mp
+
+    size = check_source(path)  # which notes here that it is read
+    if sys.platform != "linux" or mp.current_process().daemon:
+        return read(Path(path))
+    receiver, sender = mp.get_context("fork").Pipe(duplex=False)
+    reader = mp.get_context("fork").Process(target=_send_record, args=(sender, read, Path(path)), daemon=True)
+    with catch_warnings():
+        simplefilter("ignore", DeprecationWarning)  # of forks beside threads: none holds a reader's lock
+        reader.start()
+    sender.close()
+    try:
+        if not receiver.poll(_READ_S + size / _SLOWEST_DISK):
+            raise UserError("its reader does not come to an end", file=path, hint=_DAMAGED)
+        record, fault = receiver.recv()
+    except EOFError as error:
+        raise UserError("its reader crashed", file=path, hint=_DAMAGED) from error
+    finally:
+        reader.kill()
+        reader.join()
+        receiver.close()
+    if fault is not None:
+        raise fault
+    return cast("_Record", record)
+
+
+def _send_record(sender: Any, read: Callable[[Path], Any], path: Path) -> None:
+    import resource  # no Windows has it
+
+    pages, (_, hard) = Path("/proc/self/statm").read_text().split()[0], resource.getrlimit(resource.RLIMIT_AS)
+    most = int(pages) * resource.getpagesize() + _COPIES * most_bytes()
+    resource.setrlimit(resource.RLIMIT_AS, (most if hard < 0 else min(most, hard), hard))
+    try:
+        sender.send((read(path), None))
+    except Exception as fault:
+        sender.send((None, fault))
 
 
 class Unpacker:

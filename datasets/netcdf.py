@@ -17,7 +17,13 @@ from numpy.typing import NDArray
 
 from thermogrip.datasets.atomic_files import atomic_path
 from thermogrip.datasets.errors import UserError, os_faults, reading
-from thermogrip.datasets.limits import check_source, check_unpacked, most_bytes, most_unpacked
+from thermogrip.datasets.limits import (
+    check_source,
+    check_unpacked,
+    in_own_process,
+    most_bytes,
+    most_unpacked,
+)
 from thermogrip.datasets.units import UNITS, any_unit, to_record_unit
 
 if TYPE_CHECKING:
@@ -28,14 +34,7 @@ _PART = 16 << 20  # bytes of text that are looked at in one piece
 
 
 def check_netcdf(path: str | Path) -> None:
-    """Refuse what is no NetCDF-4 file, or declares more than it may hold, before xarray is loaded."""
-    check_source(path)
-    with os_faults(path), Path(path).open("rb") as stream:
-        magic = stream.read(8)
-    if magic[:3] == b"CDF":
-        raise UserError("is NetCDF-3", file=path, hint="convert it with: nccopy -k nc4 OLD NEW")
-    if magic != b"\x89HDF\r\n\x1a\n":
-        raise UserError("is not NetCDF", file=path, hint="give a NetCDF-4 file or the right ending")
+    """Refuse a NetCDF-4 file that is damaged, or declares more than it may hold."""
     h5py = import_module("h5py")
     # damage here leaves h5netcdf half built, and complaining when it is collected
     with _not_damaged(path), h5py.File(path, "r") as tried:
@@ -46,9 +45,21 @@ def check_netcdf(path: str | Path) -> None:
 def open_netcdf(path: str | Path) -> xr.Dataset:
     """Return the dataset in a NetCDF-4 file, loaded, with times as numbers and text as str; UserError if it
     is missing, unreadable, damaged, or not NetCDF-4."""
-    check_netcdf(path)
+    check_source(path)
+    with os_faults(path), Path(path).open("rb") as stream:
+        magic = stream.read(8)
+    if magic[:3] == b"CDF":
+        raise UserError("is NetCDF-3", file=path, hint="convert it with: nccopy -k nc4 OLD NEW")
+    if magic != b"\x89HDF\r\n\x1a\n":
+        raise UserError("is not NetCDF", file=path, hint="give a NetCDF-4 file or the right ending")
+    import_module("xarray"), import_module("h5netcdf")  # here, so that each reader need not load them
+    return in_own_process(_open_dataset, path)
+
+
+def _open_dataset(path: Path) -> xr.Dataset:
     import xarray as xr
 
+    check_netcdf(path)
     options: dict[str, Any] = {"engine": "h5netcdf", "decode_times": False, "decode_timedelta": False}
     with _not_damaged(path), xr.open_dataset(path, **options) as data:
         return _of_versions(_text_as_str(data.load()))

@@ -21,6 +21,8 @@ from collections import Counter
 from collections.abc import Callable, Container, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from functools import partial
+from importlib import import_module
 from itertools import chain, count, islice, pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -639,6 +641,11 @@ def frame_table(
 def read_matlab_table(path: str | Path, columns: Sequence[str] | None = None) -> Table:
     """Return the columns of a MATLAB file (up to version 7): vectors and columns of matrices of one length (a
     matrix alone without names); a scalar ``Ts``, ``dt`` or ``fs`` is the step (``meta["dt"]``)."""
+    import_module("scipy.io.matlab")  # here, so that each reader need not load it
+    return limits.in_own_process(partial(_matlab_table, columns=columns), path)
+
+
+def _matlab_table(path: Path, columns: Sequence[str] | None) -> Table:
     raw = read_bytes(path)
     if raw[:10] == b"MATLAB 7.3":
         raise UserError("is MATLAB 7.3", file=path, hint="save('x.mat', ..., '-v7') in MATLAB, or export CSV")

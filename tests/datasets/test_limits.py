@@ -9,6 +9,7 @@ import json
 import lzma
 import os
 import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -319,3 +320,24 @@ def test_a_file_of_as_many_members_as_its_limit_is_checked(
             assert "has more than 2 members" in refused(netcdf.check_netcdf, path)
         else:
             netcdf.check_netcdf(path)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere files are read in the process itself")
+@pytest.mark.parametrize(
+    ("read", "said"),
+    [(lambda path: os._exit(1), "its reader crashed"), (lambda path: time.sleep(600), "not come to an end"),
+     (lambda path: int("x"), "invalid literal")],
+)  # fmt: skip
+def test_a_reader_that_crashes_or_never_returns_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, read: Callable[[Path], Any], said: str
+) -> None:
+    (tmp_path / "a.mat").write_bytes(b"a")
+    monkeypatch.setattr(limits, "_READ_S", 0.5)
+    with pytest.raises(ValueError, match=said):
+        limits.in_own_process(read, tmp_path / "a.mat")
+
+
+def test_a_file_that_is_sound_is_read_in_a_process_of_its_own(tmp_path: Path) -> None:
+    assert (limits.in_own_process(lambda path: os.getpid(), SCRIPT) == os.getpid()) == (
+        sys.platform != "linux"
+    )
