@@ -38,7 +38,7 @@ class DriveLimits:
 
     def cut(self, u: Array) -> Array:
         """Return drives (..., n_u) inside their ranges."""
-        return np.asarray(np.clip(u, self.lowest, self.highest))
+        return np.asarray(np.minimum(np.maximum(u, self.lowest), self.highest))
 
     def follow(self, u: Array, before: Array, samples: float) -> Array:
         """Return drives (n_u,) that are finite, in range, and within the slew limit of so many samples of

@@ -149,6 +149,7 @@ class PredictionModel:
         self.sub = max(1, round(wanted / plant.dt))
         self.dt = self.sub * plant.dt
         self._responses: dict[tuple[int, ...], Response] = {}
+        self._directions: dict[tuple[int, ...], list[Array]] = {}
         self.sub = self._fewest_steps()
 
     def _fewest_steps(self) -> int:
@@ -234,11 +235,10 @@ class PredictionModel:
             return self.affine._replace(after=self.next_state(x, u, d))
         if self._kernel is None:
             return self._by_casadi(x, u, d)
-        places = [self.n_x, self.n_x + self.n_u]  # behind the derivatives by the states, and by the drives
-        by_x, by_u, by_d = np.split(np.eye(self.n_x + self.n_u + self.n_d), places, axis=1)
-        by_u, by_d = (np.repeat(by[:, None], self.sub, axis=1) for by in (by_u, by_d))
-        _, ends = self._along(self._kernel, x, np.tile(u, (self.sub, 1)), d, by_x, by_u, by_d)
-        return LinearStep(ends[0, : self.n_x], *np.split(ends[:, self.n_x :].T, places, axis=1))
+        _, ends = self._along(self._kernel, self._sample_directions, x, u, d)
+        after, by = ends[0, : self.n_x], ends[:, self.n_x :].T
+        n_xu = self.n_x + self.n_u
+        return LinearStep(after, by[:, : self.n_x], by[:, self.n_x : n_xu], by[:, n_xu:])
 
     @cached_property
     def affine(self) -> LinearStep | None:
@@ -264,17 +264,32 @@ class PredictionModel:
         steps = _TangentSteps(self)
         return Kernel(steps) if steps.are_arithmetic else None
 
+    @cached_property
+    def _sample_directions(self) -> list[Array]:
+        """Room for a sample from x, u, d in front of each direction of these."""
+        n_xu = self.n_x + self.n_u
+        by_x, by_u, by_d = np.split(np.eye(n_xu + self.n_d), [self.n_x, n_xu], axis=1)
+        by_u, by_d = (np.repeat(by[:, None], self.sub, axis=1) for by in (by_u, by_d))
+        return [np.concatenate([0 * by, by], axis=-1) for by in (by_x, by_u, by_d)]
+
+    def _plan_directions(self, blocks: tuple[int, ...]) -> list[Array]:
+        """Room for a run along a plan in front of each direction of the plan, the same for these blocks."""
+        if blocks not in self._directions:
+            n = len(blocks) * self.n_u
+            by_u = np.repeat(np.eye(n).reshape(n, -1, self.n_u), np.multiply(blocks, self.sub), axis=1)
+            by_x, by_d = np.zeros((n, 2 * self.n_x)), np.zeros((n, by_u.shape[1], 2 * self.n_d))
+            self._directions[blocks] = [by_x, np.concatenate([0 * by_u, by_u], axis=2), by_d]
+        return self._directions[blocks]
+
     def _along(
-        self, kernel: Kernel, x: Array, u: Array, d: Array, by_x: Array, by_u: Array, by_d: Array
+        self, kernel: Kernel, directions: list[Array], x: Array, u: Array, d: Array
     ) -> tuple[Array, Array]:
-        """Return outputs (B, n + 1, 2 n_y) and last states (B, 2 n_x) of a run, each followed by its
-        derivatives in directions by_x (B, n_x), by_u (B, n, n_u), by_d (B, n, n_d)."""
-        start = np.hstack([np.broadcast_to(x, by_x.shape), by_x])
-        drives, disturbances = (
-            np.concatenate([np.broadcast_to(value, by.shape), by], axis=2)
-            for value, by in ((u, by_u), (d, by_d))
-        )
-        return kernel.rollout(start, drives, disturbances, np.zeros((1, 0)), self.dt / self.sub)
+        """Return outputs (B, n + 1, 2 n_y) and last states (B, 2 n_x) of a run from x under u (n, n_u) or
+        (n_u,) and d, each followed by its derivatives in the directions behind."""
+        run = [room.copy() for room in directions]  # a model is shared, also by threads
+        for values, now in zip(run, (x, u, d)):
+            values[..., : values.shape[-1] // 2] = now
+        return kernel.rollout(*run, np.zeros((1, 0)), self.dt / self.sub)
 
     @cached_property
     def C(self) -> Array:
@@ -293,11 +308,8 @@ class PredictionModel:
             return y + self.output(np.zeros(self.n_x)), G
         if self._kernel is None:
             return self._trajectory_by_casadi(x, plan, d, blocks)
-        block = np.repeat(np.arange(len(blocks)), np.asarray(blocks) * self.sub)  # of each step
-        n = plan.size
-        by_u = np.eye(n).reshape(n, *plan.shape)[:, block]
-        by_d = np.zeros((n, len(block), self.n_d))
-        y, _ = self._along(self._kernel, x, plan[block], d, np.zeros((n, self.n_x)), by_u, by_d)
+        of_steps = np.repeat(plan, np.multiply(blocks, self.sub), axis=0)
+        y, _ = self._along(self._kernel, self._plan_directions(tuple(blocks)), x, of_steps, d)
         y = y[:, self.sub :: self.sub]
         return y[0, :, : self.n_y], y[:, :, self.n_y :].transpose(1, 2, 0).reshape(-1, self.n_y, *plan.shape)
 

@@ -543,7 +543,7 @@ class NetworkModel(Described):
         x0, u, d, p = (np.ascontiguousarray(value, dtype=float) for value in (x0, u, d, p))
         switched = [self.inputs.index(name) for name in self.switches]
         renew = np.ones(u.shape[1], dtype=bool)
-        renew[1:] = np.any(u[:, 1:, switched] != u[:, :-1, switched], axis=(0, 2))
+        renew[1:] = np.any(u[:, 1:, switched] != u[:, :-1, switched], axis=(0, 2)) if switched else False
         return _kernel(self.steps).rollout(x0, u, d, p, float(dt), renew)
 
     def to_dict(self) -> dict[str, Any]:
