@@ -355,16 +355,24 @@ def default_noise(plant: Plant, controlled: Sequence[str], dt: float) -> Observe
         moved = max(answers, key=lambda output: abs(np.nan_to_num(answers[output].gain)) / unit[output])
         answer, noise = answers[moved], reading_noise(plant, moved) or NOISE * unit[moved]
         delayed = answer.delay > _SEEN * plant.dt
-        # a model without a delay does not say how soon its plant answers: then by its lag
+        # A log without loads says nothing of loads.  Of an output that a drive of gain k raises at the rate
+        # k / T, with readings of noise r each dt, the filter of a bias that drifts by q in a second has the
+        # bandwidth omega^2 = q k / (T r sqrt(dt)) (Anderson and Moore, "Optimal Filtering", 1979: two
+        # integrators, one reading): a load is known soon after the loop can answer it from omega = 1 / theta
+        # on.  A model without a delay does not say how soon its plant answers: then by its lag.
         theta = dt + (answer.delay if delayed else answer.lag)
         drift = noise * dt**0.5 * answer.lag / (abs(answer.gain) * theta**2) if answer.gain else 0.0
         if delayed:
+            # noise that is taken for a load is a bias of q / sqrt(omega), and moves the output for theta
+            # before that is seen, by r (omega theta)^(3/2) sqrt(dt / theta): a quiet sensor lets omega be larger
             quiet = (LOADS.wander * _BAND * unit[moved] / noise) ** (2 / 3) * (theta / dt) ** (1 / 3)
             drift *= max(1.0, float(quiet)) ** 2
         elif record is None:
             drift = DRIFT  # nothing says more
         seen = record.input.get(drive, 0.0) / span if record else 0.0
         most = LOADS.drift / dt**0.5
+        # a load jumps, too: white noise on the drive's way to the states, as large as the drift of some
+        # theta.  It damps: with a bias alone all that a reading shows of a load comes an integration late
         drifts[drive] = float(np.nan_to_num(min(most, max(seen, drift)), nan=DRIFT))
         jumps[drive] = min(LOADS.most, LOADS.jumps * theta * drifts[drive] / dt**0.5) if delayed else 0.0
     state = record.state if record else ObserverNoise.state

@@ -8,13 +8,8 @@ innovation is psi = (e' - e) / 0.1, and of a drive whose gain is 1 + g times the
 
     g = sum(psi e / R) / sum(psi^2 / R),     sd^2 = sum((psi e / R)^2) / sum(psi^2 / R)^2,
 
-over the samples from a new target on until the loop has settled; loads are in sd, which trusts no model of
-them.  A model's own gain may be wrong (of a kiln by 30 %) and no fault, so what is compared is 1 + g of the
-last four targets and of all before, g of those shrunk by the share of a prior variance (three times that of
-gains from run to run) in the sum of prior and sd^2.  Four are as many moves up as down, for which a load that
-stays has opposite signs.  A change is reported where this ratio is beyond .775 or its inverse, half way (as a
-ratio) from 1 to a loss of 40 %, at two new targets in a row, and taken back at the first where it is not;
-windows of a drive that has changed are not added to those before.
+over the samples from a new target on until the loop has settled.  A model's own gain may be wrong (of a kiln
+by 30 %) and no fault, so what is compared is 1 + g of the last four targets and of all before.
 
 What this cannot tell: anything before five changes of target; a drive that did another share of its model
 from the start; a loss of less than a fifth; and a load that comes with each of several targets from a loss.
@@ -43,8 +38,8 @@ if TYPE_CHECKING:
 
 _LESS = 0.1  # of a drive: a derivative by differences
 _PRIOR_SD = 3.0 * RUN_GAIN_SD  # of what a model's gain is off by
-# up, down, up and down: on four plants with moving targets and loads (false_alarms.py, three
-# seeds) three targets had a false word (5.5 % of three hours of an extruder), two had one too, four had none
+# up, down, up and down, for which a load that stays has opposite signs: on four plants with moving targets
+# and loads (false_alarms.py, three seeds) three targets had a false word (5.5 % of three hours of an extruder), two had one too, four had none
 _LAST_TARGETS = 4
 # share of a drive's gain: the geometric middle of 1 and .6.  Without a fault it was .80 to 1.11 on those
 # plants, with a loss of 40 % .49 to .74
@@ -98,15 +93,16 @@ class GainMonitor:
         if self._window[0].any():
             self._last.append(self._window)
         self._window = np.zeros_like(self._window)
-        changed = self._changed()
+        changed = self._changed()  # windows of a drive that has changed are not added to those before
         if len(self._last) > _LAST_TARGETS:
             self._before = self._before + np.where(changed, 0.0, self._last.popleft())
         if len(self._last) == _LAST_TARGETS and self._before[0].all():
             power, effect, _ = np.sum(self._last, axis=0)
-            variance = self._before[2] / self._before[0] ** 2
+            variance = self._before[2] / self._before[0] ** 2  # loads are in it, without a model of them
+            # shrunk by the share of the prior in prior and variance: few windows before say little
             known = self._before[1] / self._before[0] * _PRIOR_SD**2 / (_PRIOR_SD**2 + variance)
             self.share = (1.0 + effect / power) / (1.0 + known)
-        self._reported = changed & self._changed()
+        self._reported = changed & self._changed()  # at two new targets in a row
 
     def _changed(self) -> Mask:
         """Return of each drive (n_u,) whether it does another share."""

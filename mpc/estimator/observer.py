@@ -17,71 +17,26 @@ together with detectability of (A, C) itself.  ``choose_disturbances`` tests it 
 that passes, in this order: a bias on each drive (a heat flow that is wrong by a few watts), a bias on the
 controlled outputs (a thermocouple that sits elsewhere), on the other outputs, on the measured disturbances.
 
-The filter uses the Jacobian of the whole sample, delays included, at the current estimate.  A reading that
-is NaN is left out of the update: the prediction replaces it.  The bias of a drive ends at its whole
-range: what is larger, no drive could make up for.
-Near the optimum of a Peltier element a bias of the drive cannot be seen, and past it, it would be learnt
-with the wrong sign: it is held there.
+The filter uses the Jacobian of the whole sample, delays included, at the current estimate.  It starts from a
+plant at rest whose sensors are off: where an output has an offset among the disturbance states, that is where
+the start finds it, and it may drift; of the other outputs the start keeps a constant offset.
 
-**The numbers.**  State and reading noise are those of the plant's record, by maximum likelihood on the logs
-of its fit (:mod:`thermogrip.sysid.plant.innovations`).  What a log has no loads in says nothing of loads, so
-the bias of a drive drifts by what its logs show, and at least by so much that a load is known soon after the
-loop can answer it: of an output that a drive of gain k / T raises at the rate k / T, and readings of noise r
-each dt, the filter of a bias that drifts by q in a second has the bandwidth
+**At rest** the state stays where it is under some past drive v, but for a small rate r, and each reading is
+off by an offset b of its own,
 
-    omega^2 = q k / (T r sqrt(dt)),    which is to be 1 / theta^2 at least,    theta = delay + dt  [2]_,
+    x = f(x, v, d) + r,     v ~ N(rest, span^2),     r ~ N(0, rate^2),     b ~ N(0, offset^2),
 
-or lag + dt of a model that has no delay: it does not say how soon its plant can answer.  Noise that is taken
-for a load is a bias of q / sqrt(omega), and moves the output for theta before that is seen, by
+so that one Kalman update with the readings is the weighted least-squares answer for state, offsets and past
+drive together.
 
-    (k / T) theta q / sqrt(omega) = r (omega theta)^(3/2) sqrt(dt / theta),
-
-so a quiet sensor lets omega be larger.  And a load does not drift alone, it jumps: white noise on the drive's
-way to the states, as large as the drift of some theta.  It is what damps: with a bias alone all that a
-reading shows of a load comes an integration late.
-
-The filter starts from a plant at rest whose sensors are off (see below).
-Where an output has an offset among the disturbance states, that is where the start finds it, and it may
-drift; of the other outputs the start keeps a constant offset.
-
-**Between samples.**  Readings come when they come, and a model whose delays are shift registers can be
-advanced by whole samples alone.  So x stays on a grid of samples, each predicted under the mean of the
-drives that were applied in it, and a reading that comes the share s of a sample after x is one of
-
-    x_s = (1 - s) x + s f(x, u, d),     H_s = H ((1 - s) 1 + s F),
-
-u the mean of the drives since x and F the Jacobian of the sample.  A register between two samples holds the
-mean of its neighbours, and nothing is smeared from sample to sample, because x itself is never interpolated.
-The noise of the states grows with the seconds, by s Q in the share s of a sample.  Every reading counts, also
-one that comes before a move is due; but where the output moves, a straight line between two samples is not
-its path, and the standard deviation of such a reading is larger by 4 s (1 - s) times its move.
+**Between samples** x stays on a grid of samples, each predicted under the mean of the drives that were
+applied in it, for a model whose delays are shift registers can be advanced by whole samples alone.  Every
+reading counts, also one that comes before a move is due.
 
 References
 ----------
 .. [1] U. Maeder, F. Borrelli, M. Morari, "Linear offset-free model predictive control", Automatica 45(10),
    2009.
-.. [2] B. D. O. Anderson, J. B. Moore, "Optimal Filtering", Prentice-Hall, 1979: two integrators, one reading.
-
-What state a plant at rest is in, when its sensors do not agree
----------------------------------------------------------------
-
-At rest the state stays where it is under some past drive v, but for a small rate r,
-
-    x = f(x, v, d) + r,     v ~ N(rest, span^2),     r ~ N(0, (0.2 units a sample)^2),
-
-and each reading is off by an offset of its own, b ~ N(0, (0.3 units)^2), with the unit of an output
-(:attr:`thermogrip.mpc.plant.prediction.PredictionModel.unit`).  Linearised, x is Gaussian with
-
-    (I - A) x = h + B (v - rest) + r,     P^-1 = (I - A)' S^-1 (I - A),     S = B span^2 B' + diag(rates^2),
-
-and one Kalman update with the readings is the weighted least-squares answer for state, offsets and past drive
-together.  A state that would leave its place by units within a sample is not accepted, whatever the sensors
-read: they are off.  What is left open between a state that moves and a sensor that is off is in the
-covariance, and the next readings decide.  A slow mode moves little wherever it is; what no reading shows of
-it stays within 10 units of where the plant's own ``rest`` has it at the mean of the readings; of outputs in
-several units the temperatures alone share a mean, others are as they read.
-
-For a nonlinear plant the update is repeated at its own answer (Gauss-Newton).
 """
 
 from __future__ import annotations
@@ -145,14 +100,19 @@ def _resting_state(model: PredictionModel, *at: tuple[float, ...]) -> RestingSta
     after, A, B, E = model.linearise(x, v, d)
     away = np.eye(model.n_x) - A
     push = after - A @ x + B @ (model.neutral - v)
+    # linearised, (I - A) x = push + B (v - rest) + r with S = B span^2 B' + diag(rate^2), and so
+    # P^-1 = (I - A)' S^-1 (I - A): a state that would leave its place by units within a sample is not
+    # accepted, whatever the sensors read, and what is left open the next readings decide
     scaled = B * model.span
     S = scaled @ scaled.T + np.diag((_RATE * unit) ** 2)
     weighted = np.linalg.solve(S, away).T  # (I - A)' S^-1
+    # a slow mode moves little wherever it is: what no reading shows of it stays near the plant's own rest
     weak = 1.0 / (_FAR * unit) ** 2
     information = weighted @ away + np.diag(weak)
     P = np.linalg.inv(0.5 * (information + information.T))
 
     def own(step: float, change: Array) -> Array:
+        # temperatures share a mean, outputs in other units are as they read
         return model.rest(np.where(model.warm, y + step, y), d + change)
 
     still = np.zeros(model.n_d)
@@ -166,7 +126,7 @@ def _resting_state(model: PredictionModel, *at: tuple[float, ...]) -> RestingSta
 
 
 _REPEATS, _STEADY = 5, 1e-3  # of the start on a nonlinear plant, and when it is still [units]
-#: Of a drive, in fractions of its range: no drive makes up for more.
+#: Of a drive, in fractions of its range: what is larger, no drive could make up for.
 LARGEST_BIAS = 1.0
 
 
@@ -343,8 +303,9 @@ class Observer:
         self._on_sample()
 
     def hold_drives(self, weak: Mask) -> None:
-        """Stop learning the bias of drives (n_u,) whose gain is weak or has turned over, where a bias
-        explains nothing or everything with the wrong sign; the other disturbances go on."""
+        """Stop learning the bias of drives (n_u,) whose gain is weak or has turned over."""
+        # near the optimum of a Peltier element a bias of the drive cannot be seen, and past it, it would be
+        # learnt with the wrong sign; the other disturbances go on
         self._held[self.model.n_x : self._n] = (self.disturbance.on_drive * weak[:, None]).any(axis=0)
 
     def reset(self, y: Array, d: Array) -> None:
@@ -353,7 +314,7 @@ class Observer:
         levels = np.where(np.isfinite(y), y - self.offset, model.usual(self.ambient))
         rests = np.where(model.warm, level, levels)
         x, v = model.rest(rests, d), model.neutral
-        for _ in range(_REPEATS):
+        for _ in range(_REPEATS):  # Gauss-Newton: of a nonlinear plant the update is repeated at its answer
             resting = resting_state(model, x, v, rests, d, unit=self._step_unit)
             self._begin(resting.x, resting.P, y)
             moved = np.max(np.abs(self.x - x) / self.unit)
@@ -454,7 +415,7 @@ class Observer:
     def _correct(self, y: Array, R: Array) -> Array:
         """Correct the estimate with a reading whose variances are R (n_y,), but for states that are held."""
         innovation = y - self.reading()
-        read = np.flatnonzero(np.isfinite(y))
+        read = np.flatnonzero(np.isfinite(y))  # the prediction replaces the others
         if read.size:
             H = self._H[read] @ self._way if self._share else self._H[read]
             PH = self._P @ H.T
@@ -498,12 +459,16 @@ class Observer:
         if share <= SAME:
             return
         after, step = self._sample(self._dose / self._into, d)
-        P = self._P + self._noise(share - self._noised)
+        P = self._P + self._noise(share - self._noised)  # the states' noise grows with the seconds
         self._P = P
         self._share = share
         self._noised = share
+        # x_s = (1 - s) x + s f(x, u, d) and H_s = H ((1 - s) 1 + s F), u the mean of the drives since x: a
+        # register between two samples holds the mean of its neighbours, and since x itself is never
+        # interpolated nothing is smeared from sample to sample
         self._ahead = (1 - share) * self.x + share * after
         self._way = (1 - share) * np.eye(len(P)) + share * step
+        # a straight line between two samples is not the path of an output that moves
         self._bent = 4 * share * (1 - share) * (self.model.C @ (after - self.x))
 
     def _sample(self, u: Array, d: Array) -> tuple[Array, Array]:

@@ -9,29 +9,11 @@ z = v/span. With y(v) ~ y0 + G (v - v0) over the horizon and Delta the differenc
 where e has the drive that is applied now.  Rows: range and slew of each block (hard), the overshoot
 band of the controlled outputs and the limits of any output at every sample (soft).
 
-Near the optimum of a Peltier element the linearisation predicts cooling that a whole step does not give,
-and beyond it more current heats. Three guards stand there. A Peltier's gain fades in proportion to its
-drive, to nothing at the optimum: from what is left of it along the guess, against that at rest, follows
-where the optimum is, and how far a block may go, as a share of the way there,
-
-    share = max(17/20, min(e, 3 - 2 e)),     e = end of the range / optimum
-
-(``docs/explanation/mpc.md`` says what that costs).  The bias of the drive that the observer has found is
-counted where the gain is evaluated, not in the share: it is a heat flow, and heat moves no optimum.  A
-drive that serves a limit and no loop is not held so, nor is any where a plan is improved until it stays.
-Where the QP's plan costs more than the guess in the nonlinear simulation, it is taken only part of the way.
-And since the far side is a trap (there, heating seems to ask for still more cooling current), plain ramps
-that take the drive back, to none and to the other end, are looked at every fifth sample; so a drive does not
-stay at an end of its range either, where a black box answers nothing at all.
-
-A soft row that is exceeded by s costs its price times (s / 5 + s^2).  **Zones** replace the squared error of
-an output by rows about its target, beyond which it costs that and its size, (s + s^2) for each sample's
-weight: the size makes the edge one that a price does not cross by a little.  An energy price adds
-``price_k u_k / span`` for each sample.  Rows of a hard limit cost a thousand times as much as of a soft one:
-they give way where nothing else can.
-
-A linear plant has none of those guards: G, H and the rows of the program are made once, only the free
-response, f and the bounds are new in a sample, and the program's plan is the best there is.
+Near the optimum of a Peltier element the linearisation predicts cooling that a whole step does not give, and
+beyond it more current heats. Three guards stand there: a block's range ends where its gain will have faded, a
+plan that costs more than the guess in the nonlinear simulation is taken only part of the way, and ramps that
+take the drive back are looked at. A drive that serves a limit and no loop is not held so, nor is any where a
+plan is improved until it stays, and a linear plant has none of the guards.
 """
 
 from __future__ import annotations
@@ -58,7 +40,7 @@ LITTLE = 1e-7  # of its range, that a parked drive may be off in the program
 #: Of the price of a square of 1, that a distance of 1 beyond a soft row costs: at 1 the noise of a reading,
 #: which moves all of a prediction, was answered with full drive wherever the band was used.
 FIRST = 0.2
-_DEAR = 1000.0  # times the price of a soft limit, of a hard one
+_DEAR = 1000.0  # times the price of a soft limit, of a hard one: it gives way where nothing else can
 #: Of its unit, by which an output breaks its limit: it is reported, and the target cannot be had.
 BREAKS, BREAKS_FAR = 0.1, 0.5
 BARELY = 1.02  # a plan that is barely better than the QP's is not worth a jump
@@ -203,7 +185,7 @@ class Optimiser:
         self._differences = np.kron(np.eye(self.n_b) - np.eye(self.n_b, k=-1), np.eye(model.n_u))
         self.qp = self._program()
         self._solves = 0
-        # of a linear plant: G in the drives' ranges, the rows of the program, and H for what counts
+        # of a linear plant, made once: G in the drives' ranges, the program's rows, and H for what counts
         self._G: Array | None = None
         self._A: Array | None = None
         self._kept: tuple[Any, Array, list[Array]] | None = None
@@ -215,6 +197,8 @@ class Optimiser:
         n = self._differences.shape[0]
         zoned, by_zone = weights.zone[:, None] > 0, weights.output[:, None] * weights.sample
         limited = np.repeat(weights.dear, self.N)
+        # a row that is exceeded by s costs its price times (FIRST s + s^2); that of a zone, which replaces
+        # the squared error of its output, (s + s^2) times each sample's weight
         controlled = np.where(zoned, by_zone, design.price).ravel()
         first = np.where(zoned, by_zone, FIRST * design.price).ravel()
         prices = np.concatenate([np.full(2 * n, design.price), controlled, limited])
@@ -307,6 +291,8 @@ class Optimiser:
         others = np.zeros((0, *plan.shape))
         if cost > at_guess:
             others = guess + np.array(SHARES)[:, None, None] * (plan - guess)
+        # the far side is a trap: there, heating seems to ask for still more cooling current.  Nor does a
+        # drive stay at an end of its range so, where a black box answers nothing at all
         if self._solves % LOOK_AROUND == 1:
             others = np.concatenate([others, self._ramps(problem)])
         if not len(others):
@@ -333,6 +319,9 @@ class Optimiser:
         away, last_away = guess - drives.neutral, problem.last - drives.neutral
         reach = (self.reach[:, None] + problem.more) * drives.slew
         least = np.where(away * last_away > 0, np.abs(last_away) - reach, 0.0)  # what the slew allows
+        # a Peltier's gain fades in proportion to its drive, to nothing at the optimum: what is left of it
+        # along the guess says where that is.  The bias counts where the gain is evaluated, not in the share
+        # of the way there: it is a heat flow, and heat moves no optimum
         fades = authority < 1 - FADING
         best = np.abs(away + drive_bias) / np.maximum(1 - authority, FADING)  # where the gain is nothing
         end = np.abs(np.where(away < 0, drives.lowest, drives.highest) - drives.neutral)
@@ -361,6 +350,7 @@ class Optimiser:
         for i in problem.counted:
             error = y[:, :, self._rows[i]] - problem.target[:, i]
             if weights.zone[i]:
+                # the size beside the square makes the edge one that a price does not cross by a little
                 slack = np.maximum(0.0, np.abs(error) - weights.zone[i])
                 cost += weights.output[i] * ((slack + slack**2) @ weights.sample)
                 continue
@@ -449,6 +439,7 @@ class Optimiser:
 
 def allowed_share(end: Array, best: Array, span: Array) -> Array:
     """Return how far a drive may go, as a share of the way to its optimum; its range ends at ``end``."""
+    # docs/explanation/mpc.md says what that costs
     share = end / np.maximum(best, 1e-9 * span)
     return np.asarray(np.maximum(SAFE, np.minimum(share, 3 - 2 * share)))
 
