@@ -193,7 +193,8 @@ def _random_loop(controller: Controller, samples: int, seed: int, progress: Prog
         begins = k % _LOOP == 0
         if begins:
             level = rng.uniform(low, high) + 0.02 * (high - low) * rng.normal(size=model.n_y)
-            d = model.undisturbed(twin.design.ambient) + 2 * model.close_d * rng.normal(size=model.n_d)
+            d = model.undisturbed(twin.design.ambient)
+            d = d + np.fmax(0.05 * np.ptp(model.seen_d, axis=1), 0.02 * abs(d)) * rng.normal(size=model.n_d)
             x = model.rest(level, d)
             # from next to settled to far away, so that the drive is at its limits in some loops
             distance = 10 ** rng.uniform(-3.0, 0.0) * (high - low)

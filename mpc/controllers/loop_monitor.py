@@ -14,10 +14,6 @@ the PI by Skogestad's rule.
 
 **Reach.**  At a new target, and while an output stays off its own, the drives are sought that hold all
 targets within the limits, with the biases that the filter has found: a dead heater is a bias of its range.
-
-**Another plant.**  A drive whose estimated bias is beyond 30 % of its range, or an output's beyond a third of
-a jump, for as long as the loop takes to arrive: a draw is over by then.  Besides,
-:mod:`thermogrip.mpc.estimator.fault_monitors` and :mod:`thermogrip.mpc.estimator.oscillation`.
 """
 
 from __future__ import annotations
@@ -186,7 +182,7 @@ class LoopMonitor:
             self._unreachable = ""
         elif self._looked_s >= self._look_s:
             self._unreachable, self._looked_s = self._missed(target, d), 0.0
-        lasts = self._strange_s > np.max(self._promised, initial=0.0)
+        lasts = self._strange_s > np.max(self._promised, initial=0.0)  # a draw is over by then
         if message := self.stuck.message or self._unreachable:
             return message
         if swings:

@@ -9,8 +9,6 @@ Temperatures count in degC, so ``move = 1`` means: one whole range in one sample
 for one sample.  ``default_design`` takes everything from the plant: sample time and horizon from its delay
 and lag, blocks that double from one sample on, and one move weight that the tuner then improves.
 
-**Checks.**  Either a loop does what its file says or one line says which field cannot be.
-
 **PI loops** follow Skogestad's rule (SIMC), with gain k, delay L and lag T of the step response:
 
     Kc = T / (k (tau_c + L)),   Ti = min(T, 4 (tau_c + L)),   tau_c = L   [1]_.
@@ -24,7 +22,7 @@ References
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cache
 from typing import TYPE_CHECKING, Annotated, Any
@@ -229,8 +227,6 @@ _TAGS = (
     "str",
 )  # pydantic's names for one of several forms
 SCHEMA = "thermogrip.controller"
-#: Fields of 0.2.0 that are gone, and their value in a design that did without.
-_WITHOUT: dict[str, Any] = {"travel": 0.0, "tariff": [], "on_off": {}, "offset_free": True, "move_delay": 0}
 
 
 @dataclass(frozen=True)
@@ -285,18 +281,7 @@ class Design:
     @classmethod
     def from_dict(cls, content: Mapping[str, Any]) -> Design:
         """Return the design that :meth:`to_dict` wrote; a missing or wrong field is a :class:`UserError`."""
-        values = {key: value for key, value in content.items() if _WITHOUT.get(key, ...) != value}
-        if isinstance(loops := values.get("loops"), list):  # those of an MPC never fed a target forward
-            values["loops"] = [
-                {key: value for key, value in loop.items() if key not in ("Tt", "feedforward")}
-                if isinstance(loop, dict)
-                else loop
-                for loop in loops
-            ]
-        noise, ranges = values.get("noise"), values.get("drive_range")
-        if isinstance(noise, dict) and isinstance(ranges, dict):
-            values["noise"] = _noise_of(noise, ranges)
-        return _validated(values)
+        return _validated(content)
 
 
 def make_blocks(horizon: int, count: int) -> tuple[int, ...]:
@@ -364,7 +349,7 @@ def default_noise(plant: Plant, controlled: Sequence[str], dt: float) -> Observe
         drift = noise * dt**0.5 * answer.lag / (abs(answer.gain) * theta**2) if answer.gain else 0.0
         if delayed:
             # noise that is taken for a load is a bias of q / sqrt(omega), and moves the output for theta
-            # before that is seen, by r (omega theta)^(3/2) sqrt(dt / theta): a quiet sensor lets omega be larger
+            # before that is seen, by r (omega theta)^(3/2) sqrt(dt / theta): a quiet sensor lets it be larger
             quiet = (LOADS.wander * _BAND * unit[moved] / noise) ** (2 / 3) * (theta / dt) ** (1 / 3)
             drift *= max(1.0, float(quiet)) ** 2
         elif record is None:
@@ -385,15 +370,6 @@ def _slew(plant: Plant, name: str, dt: float, span: float) -> float:
     record = plant.scores.innovations
     fastest = record.fastest.get(name, 0.0) if record else 0.0
     return min(max(fastest, 0.125 * span), span / dt)
-
-
-def _noise_of(noise: Mapping[str, Any], drives: Iterable[str]) -> dict[str, Any]:
-    """Return the noise of a file; of 0.2.0 every drive's was the same, and the plant says the readings'."""
-    drive, readings = noise.get("drive"), noise.get("reading")
-    return dict(noise) | {
-        "drive": drive if isinstance(drive, dict) else dict.fromkeys(drives, drive),
-        "reading": readings if isinstance(readings, dict) else {},
-    }
 
 
 def default_design(

@@ -38,8 +38,7 @@ if TYPE_CHECKING:
 
 SPEC_TEMPLATE = (files(__package__) / "spec.toml").read_text(encoding="utf-8")
 
-#: Of a tank of water [degC]: 2 K inside of where the firmware switches off (rig/firmware/config.h), since
-#: readings scatter about a soft limit.
+#: Of a tank of water [degC]: 2 K inside of where the firmware switches off, for readings scatter about it.
 _WATER = (4.0, 58.0)
 _SAMPLES = 5  # of a step, at least
 _LEAST_SEEN = 1.0  # range of the logs [degC] within which steps would be lost in the noise

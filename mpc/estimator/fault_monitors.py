@@ -39,7 +39,8 @@ if TYPE_CHECKING:
 _LESS = 0.1  # of a drive: a derivative by differences
 _PRIOR_SD = 3.0 * RUN_GAIN_SD  # of what a model's gain is off by
 # up, down, up and down, for which a load that stays has opposite signs: on four plants with moving targets
-# and loads (false_alarms.py, three seeds) three targets had a false word (5.5 % of three hours of an extruder), two had one too, four had none
+# and loads (false_alarms.py, three seeds) three targets had a false word (5.5 % of three hours of an
+# extruder), two had one too, four had none
 _LAST_TARGETS = 4
 # share of a drive's gain: the geometric middle of 1 and .6.  Without a fault it was .80 to 1.11 on those
 # plants, with a loss of 40 % .49 to .74

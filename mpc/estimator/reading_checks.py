@@ -14,10 +14,6 @@ the changes that the model expects of it sum up,
 Beyond 2 degC (of a wide range: a thirtieth of it, for readings in coarse steps stay where they are while a
 model is a little off) it is taken for lost until it moves.  (The estimate follows the frozen reading
 meanwhile, so that only what each sample adds is summed, not where the model would have gone by itself.)
-
-**A plant that does not follow.**  The bias that the observer had to assume for the drive is beyond 30 % of
-its range, or that of an output 2 degC, or a thirtieth of a wide range: a pump that is off, a plug that has
-fallen off, another plant.
 """
 
 from __future__ import annotations
@@ -38,7 +34,7 @@ LEFT_OUT = 3  # samples in a row, at most, that a jump is left out for
 #: Of a jump (6 degC, or a tenth of a wide range): what the model expects of a reading that has not moved at
 #: all, and a bias of an output that is no small error of the model.
 SHARE = 1 / 3
-FOLLOWS_DRIVE = 0.3  # of its range: a larger bias of a drive is not a small error of the model
+FOLLOWS_DRIVE = 0.3  # of its range: a larger bias of a drive is a pump that is off, or another plant
 
 
 class ReadingMonitor:

@@ -25,11 +25,11 @@ _SHARED: dict[ModuleType, tuple[str, ...]] = {
         "BREAKS",
         "BREAKS_FAR",
         "FADING",
-        "FIRST",
         "LITTLE",
         "LOOK_AROUND",
         "SAFE",
         "SHARES",
+        "SHORTEST",
     ),
 }
 

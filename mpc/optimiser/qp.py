@@ -15,8 +15,6 @@ H = L L': the factor and A L^-T are LAPACK's and BLAS', which take less time for
 its length r_i in units in which H has a diagonal of 1, so that tolerances are of the row; a slack becomes
 s/r, and its penalties w r and q r^2.
 
-A failed solve is an answer with a status, never an exception.
-
 References
 ----------
 .. [1] D. Arnstrom, A. Bemporad, D. Axehill, "A dual active-set solver for embedded quadratic programming

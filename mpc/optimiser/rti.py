@@ -37,12 +37,10 @@ SAFE = 0.85  # of the way to the optimum, where the range runs on beyond it
 FADING = 0.3  # of the gain at rest lost, from which on it is foreseen where it fades
 LOOK_AROUND = 5  # samples between two trials of the ramps
 LITTLE = 1e-7  # of its range, that a parked drive may be off in the program
-#: Of the price of a square of 1, that a distance of 1 beyond a soft row costs: at 1 the noise of a reading,
-#: which moves all of a prediction, was answered with full drive wherever the band was used.
-FIRST = 0.2
 _DEAR = 1000.0  # times the price of a soft limit, of a hard one: it gives way where nothing else can
 #: Of its unit, by which an output breaks its limit: it is reported, and the target cannot be had.
 BREAKS, BREAKS_FAR = 0.1, 0.5
+SHORTEST = 1e-12  # price, of which a root is taken
 BARELY = 1.02  # a plan that is barely better than the QP's is not worth a jump
 
 
@@ -183,6 +181,9 @@ class Optimiser:
         self._gaps = np.concatenate([[1.0], np.diff(middles)])
         self.reach = np.cumsum(self._gaps)  # samples of slew (n_b,) from now to the middle of each block
         self._differences = np.kron(np.eye(self.n_b) - np.eye(self.n_b, k=-1), np.eye(model.n_u))
+        # beyond a soft row by this, 0.2 of a price of 25, the distance costs as much as its square: at 1 the
+        # noise of a reading, which moves all of a prediction, was answered with full drive near the band
+        self._first = max(design.price, SHORTEST) ** -0.5
         self.qp = self._program()
         self._solves = 0
         # of a linear plant, made once: G in the drives' ranges, the program's rows, and H for what counts
@@ -197,14 +198,14 @@ class Optimiser:
         n = self._differences.shape[0]
         zoned, by_zone = weights.zone[:, None] > 0, weights.output[:, None] * weights.sample
         limited = np.repeat(weights.dear, self.N)
-        # a row that is exceeded by s costs its price times (FIRST s + s^2); that of a zone, which replaces
+        # a row that is exceeded by s costs its price times (first s + s^2); that of a zone, which replaces
         # the squared error of its output, (s + s^2) times each sample's weight
         controlled = np.where(zoned, by_zone, design.price).ravel()
-        first = np.where(zoned, by_zone, FIRST * design.price).ravel()
+        first = np.where(zoned, by_zone, self._first * design.price).ravel()
         prices = np.concatenate([np.full(2 * n, design.price), controlled, limited])
         return CondensedQP(
             soft=np.arange(prices.size) >= 2 * n,
-            linear=np.concatenate([np.full(2 * n, design.price), first, FIRST * limited]),
+            linear=np.concatenate([np.full(2 * n, design.price), first, self._first * limited]),
             quadratic=2 * prices,
             time_limit_s=max(design.deadline_s, 1e-3),
         )
@@ -362,7 +363,7 @@ class Optimiser:
         for price, excess in beyond:
             if not excess.max() <= 0.0:
                 slack = np.maximum(0.0, excess)
-                cost += price * (FIRST * slack.sum(axis=1) + np.einsum("ij,ij->i", slack, slack))
+                cost += price * (self._first * slack.sum(axis=1) + np.einsum("ij,ij->i", slack, slack))
         return np.asarray(cost)
 
     def forget(self) -> None:

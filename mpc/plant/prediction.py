@@ -72,8 +72,7 @@ ROOM = 25.0
 PLAUSIBLE = (-60.0, 200.0)
 #: A reading so far from the prediction is a loose plug, unless it stays [degC]; of a wide range, a tenth.
 SPIKE = 6.0
-# of a disturbance that is no temperature, in ranges of the logs: how far outside none is, what is no change
-_FAR, _CLOSE = 10.0, 0.02
+_FAR = 10.0  # ranges of the logs outside of them, where no disturbance is that is no temperature
 _UNBOUNDED = 1e30
 _KNOWN_BEYOND_LOGS = 5.0  # units from what the logs showed, where a black box still knows what it does
 
@@ -142,9 +141,6 @@ class PredictionModel:
         width_allowed = np.where(high > low, _FAR * (high - low), _UNBOUNDED)
         self.least_d = np.where(self.rooms, self.coldest, low - width_allowed)
         self.most_d = np.where(self.rooms, self.hottest, high + width_allowed)
-        some = np.where(high > low, high - low, np.maximum(1.0, np.abs(high)))
-        # a difference that is none
-        self.close_d = np.where(self.rooms, 0.5, _CLOSE * some)
         wanted = sample_time(plant) if dt is None else float(dt)
         self.sub = max(1, round(wanted / plant.dt))
         self.dt = self.sub * plant.dt
@@ -609,13 +605,21 @@ def holding_drive(
         y = model.steady_output(scaled * model.span, d)[rows]
         return np.where(np.isfinite(y), y - wanted, 1e3)
 
+    def slope(scaled: Array) -> Array:
+        # of what is at rest, C (I - A)^-1 B: near no drive differences of two steady states are noise
+        u = scaled * model.span
+        x = model.steady_state(u, d)
+        step = model.linearise(np.nan_to_num(x), u, d)
+        moved = np.linalg.lstsq(np.eye(model.n_x) - step.A, step.B * model.span, rcond=None)[0]
+        return np.asarray((model.C @ moved)[rows] * np.isfinite(x).all())
+
     low, high = (ends / model.span for ends in within or (model.lowest, model.highest))
-    starts = [low + share * (high - low) for share in (0.1, 0.3, 0.5, 0.7, 0.9)]
+    # the first step is as long as the start, but where that is zero: 1e-17 would be the end
+    starts = [np.round(low + share * (high - low), 9) for share in (0.1, 0.3, 0.5, 0.7, 0.9)]
     # a small weight of the drive itself picks the smaller of two that hold the same temperature
     costs = [float(np.sum(miss(start) ** 2) + 1e-2 * np.sum(start**2)) for start in starts]
-    solution = least_squares(
-        miss, starts[int(np.argmin(costs))], bounds=(low, high), diff_step=[1e-3] * model.n_u, xtol=1e-10
-    )
+    begin = starts[int(np.argmin(costs))]
+    solution = least_squares(miss, begin, slope, bounds=(low, high), xtol=1e-10)
     u = solution.x * model.span
     x = model.steady_state(u, d)
     if not np.isfinite(x).all():

@@ -38,6 +38,7 @@ from thermogrip.sysid.plant.plant import said_not_good
 Reviewed: TypeAlias = Controller | PIController
 _RANK = {"pass": 0, "warn": 1, "fail": 2}
 _FAR_BEYOND = 3.0  # bands
+_BARELY_BEYOND = 0.01  # of the range of the logs, outside of it
 #: What a plant may have that its model lacks, where the spec does not state it: see the keys of a spec.
 _DOUBTS = {"extra_lag": 0.5, "extra_delay": 0.5, "lost_gain": 0.15}
 
@@ -91,8 +92,7 @@ def review(
         Room temperatures in which the range must be reachable [degC]; by default the design's, and those of
         the logs are tried.
     draws : int, optional
-        Posterior draws, besides the plant itself, on which the closed loop is run; by default those on which
-        it was tuned, else 2.
+        Draws, besides the plant itself, that close the loop; by default those of its tuning, else 2.
 
     Examples
     --------
@@ -237,13 +237,12 @@ def reachable(
 ) -> Check:
     """Each end of the wanted range [degC] must be held by a drive inside its limits, in every room [degC]
     that was asked for: else in the design's, and those of the logs are warned of."""
-    design, model = controller.design, controller.model
+    design, model, plant = controller.design, controller.model, controller.plant
     low, high = np.array([design.drive_range[name] for name in model.drives]).T
     required = [design.ambient] if asked is None else asked
     rooms = list(required if model.rooms.any() else required[:1])
     for name in model.disturbances if asked is None else ():
-        if controller.plant.is_room(name):
-            rooms += np.round(controller.plant.valid.get(name, ()), 1).tolist()
+        rooms += np.round(plant.valid.get(name, ()) if plant.is_room(name) else (), 1).tolist()
     rooms = list(dict.fromkeys(rooms))
     missed, missed_elsewhere, barely_held = list[str](), list[str](), list[str]()
     for room in rooms:
@@ -308,7 +307,8 @@ def beyond_logs(
     sentences = []
     for output, value in wanted.items():
         low, high = controller.plant.valid.get(output, (-np.inf, np.inf))
-        if not low - 0.5 <= value <= high + 0.5:
+        margin = _BARELY_BEYOND * (high - low)
+        if not low - margin <= value <= high + margin:
             logged = f"{output} was {low:.1f} to {high:.1f} degC in them"
             sentences.append(
                 f"{value:g} degC lies outside the logs that the plant was identified from: {logged}"

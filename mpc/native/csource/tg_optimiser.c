@@ -243,16 +243,22 @@ static const double *goals_of(const tg_controller *c, const double *target, int 
     return target + r;
 }
 
+/* By how much a soft row is exceeded where that costs as much by itself as by its square. */
+static double first(const tg_design *s)
+{
+    return 1.0 / sqrt(s->price > TG_SHORTEST ? s->price : TG_SHORTEST);
+}
+
 /* What values, TG_NY apart, cost that are less than low or more than high. */
 static double cost_beyond(const tg_design *s, const double *values, double low, double high)
 {
-    double cost = 0.0;
+    double cost = 0.0, one = first(s);
     for (int k = 0; k < s->N; k++) {
         double under = low - values[k * TG_NY], over = values[k * TG_NY] - high;
         if (under > 0.0)
-            cost += TG_FIRST * under + under * under;
+            cost += one * under + under * under;
         if (over > 0.0)
-            cost += TG_FIRST * over + over * over;
+            cost += one * over + over * over;
     }
     return cost;
 }
@@ -261,7 +267,7 @@ static double cost_beyond(const tg_design *s, const double *values, double low, 
 static double cost_of(const tg_controller *c, const double *values, const double *goal, int apart, int r, double side)
 {
     const tg_design *s = c->design;
-    double sum = 0.0, over = 0.0, last = 0.0;
+    double sum = 0.0, over = 0.0, last = 0.0, one = first(s);
     if (s->zone[r] > 0.0) {
         for (int k = 0; k < s->N; k++) {
             double slack = fabs(values[k * TG_NY] - goal[k * apart]) - s->zone[r];
@@ -275,7 +281,7 @@ static double cost_of(const tg_controller *c, const double *values, const double
         last = error * error;
         sum += last;
         if (slack > 0.0 && side != 0.0)
-            over += TG_FIRST * slack + slack * slack;
+            over += one * slack + slack * slack;
     }
     return s->weight[r] * (s->track * sum + s->terminal * last) + s->price * over;
 }
@@ -596,11 +602,12 @@ static void find_broken(tg_controller *c)
 
 static void set_prices(const tg_design *s, tg_qp *q)
 {
+    double one = first(s);
     q->per = s->n_c + s->n_l;
     for (int r = 0; r < q->per; r++) {
         int zone = r < s->n_c && s->zone[r] > 0.0;
-        q->price[r] = zone ? s->weight[r] * s->track : TG_FIRST * (r >= s->n_c ? s->dear[r - s->n_c] : s->price);
-        q->ratio[r] = zone ? 2.0 : 2.0 / TG_FIRST;
+        q->price[r] = zone ? s->weight[r] * s->track : one * (r >= s->n_c ? s->dear[r - s->n_c] : s->price);
+        q->ratio[r] = zone ? 2.0 : 2.0 / one;
         q->at_end[r] = zone ? s->weight[r] * (s->track + s->terminal) : q->price[r];
     }
 }

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from itertools import count
 
@@ -10,8 +9,6 @@ import numpy as np
 import pytest
 
 from tests.mpc.makers import crossed
-from thermogrip.datasets.errors import UserError
-from thermogrip.mpc.controllers.mpc import load_controller
 from thermogrip.mpc.controllers.pi import PIController, held_drive
 from thermogrip.mpc.design.design import PILoop, default_design
 from thermogrip.mpc.plant.prediction import PredictionModel
@@ -156,16 +153,3 @@ def test_a_start_under_a_drive_that_is_told_goes_on_from_it():
     # 2 a second from there on, up and down
     moved = controller.step(here, {"a": 60.0, "b": 20.0}).drive
     assert moved == pytest.approx({"q1": 21.0, "q2": 39.0}, abs=1e-4)
-
-
-@pytest.mark.parametrize(("share", "is_read"), [(0.0, True), (0.5, False)])
-def test_a_file_of_loops_that_fed_the_target_forward_is_refused(share: float, is_read: bool, tmp_path):
-    made = pi()
-    content = json.loads(made.save(tmp_path / "pi.json").read_text())
-    content["design"]["loops"][0]["feedforward"] = share
-    (tmp_path / "old.json").write_text(json.dumps(content))
-    if is_read:
-        assert load_controller(tmp_path / "old.json").loops == made.loops
-        return
-    with pytest.raises(UserError, match="feed the target forward"):
-        load_controller(tmp_path / "old.json")

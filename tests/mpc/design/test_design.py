@@ -193,7 +193,6 @@ GONE = {
     "offset_free": False,
     "move_delay": 1,
 }
-UNUSED = {"travel": 0.0, "tariff": [], "on_off": {}, "offset_free": True, "move_delay": 0}
 LOOP = {"drive": "drive", "output": "t_surface", "Kc": 0.1, "Ti": 50.0}
 
 
@@ -269,10 +268,6 @@ def test_a_field_at_the_end_of_what_can_be_is_taken(tank, design, change):
     found = check_design(Design.from_dict({**design, **change}), tank).to_dict()
     for key, value in change.items():
         assert found[key] == value
-
-
-def test_a_file_with_fields_that_are_gone_and_did_nothing_loads(tank, design):
-    assert Design.from_dict(design | UNUSED).to_dict() == design
 
 
 @pytest.mark.parametrize("spec", [{"steps": "abc"}, {"steps": [[1], [None]]}])

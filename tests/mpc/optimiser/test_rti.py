@@ -135,7 +135,7 @@ def cost(plan: np.ndarray, side: tuple[float, float] = (0.0, 0.0), limits: bool 
         errors, slack = (b - 27.0, a - 26.5), [max(0.0, 16.0 - a), max(0.0, a - 28.0)] if limits else []
         total += (1.5 + 5.0 * (k == 5)) * (errors[0] ** 2 + errors[1] ** 2)
         slack += [max(0.0, way * e - 0.2) for way, e in zip(side, errors, strict=True) if way]
-        total += 7.0 * sum(0.2 * s + s**2 for s in slack)
+        total += sum(7.0**0.5 * s + 7.0 * s**2 for s in slack)
     return float(total)
 
 
@@ -155,7 +155,7 @@ def test_the_merit_of_a_plan_is_its_cost(optimiser, side):
     weights = np.array([1.5] * 5 + [6.5])
     off = (y[:, :, 1] - 27.0) * (side[0] or 1.0)
     over = np.maximum(0.0, off - 0.2) * bool(side[0])
-    np.testing.assert_allclose(found - rest, off**2 @ weights + 7.0 * (0.2 * over + over**2).sum(axis=1))
+    np.testing.assert_allclose(found - rest, off**2 @ weights + (7.0**0.5 * over + 7.0 * over**2).sum(axis=1))
 
 
 def test_the_program_costs_what_the_plan_costs_and_its_minimum_is_the_linear_law(optimiser):
@@ -196,7 +196,7 @@ def test_the_rows_of_the_program_are_what_a_plan_has_left_to_its_limits(optimise
         )
     qp = optimiser.qp
     assert qp.soft.tolist() == [False] * 12 + [True] * 18
-    assert sorted(set(qp.linear.tolist())) == pytest.approx([1.4, 7.0])  # the larger one is of hard rows
+    assert sorted(set(qp.linear.tolist())) == pytest.approx([7.0**0.5, 7.0])  # the larger one is of hard rows
     assert (set(qp.quadratic), qp.time_limit_s) == ({14.0}, 1e-3)
 
 

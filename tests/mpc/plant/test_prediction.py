@@ -365,6 +365,9 @@ def test_the_holding_drive_holds_and_says_what_it_misses(tank):
     # the skin reads 0.98 of the tank, which a drive of 1 warms by 0.11 K a second
     assert held.u == pytest.approx([13.0 / 0.98 * (1 - np.exp(-1 / 700)) / 0.11])
     assert held.y == pytest.approx([25.0 + 13.0 / 0.98, 38.0])
+    # a search that begins at a tenth of this range, -7e-18, must leave it
+    within = np.array([-0.07]), np.array([0.63])
+    assert holding_drive(model, ("t_surface",), [26.0], ROOM, within=within).miss < 1e-6
     for target, u in ((500.0, 1.0), (-300.0, -1.0)):
         beyond = holding_drive(model, ("t_surface",), [target], ROOM)
         assert beyond.u == pytest.approx([u])

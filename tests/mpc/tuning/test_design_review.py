@@ -55,9 +55,9 @@ def test_a_target_beyond_the_logs_is_reported_before_a_run(tank):
 
 
 @pytest.mark.parametrize(
-    ("target", "inside"), [(7.5, True), (7.4, False), (52.5, True), (52.6, False), (30.0, True)]
+    ("target", "inside"), [(7.6, True), (7.5, False), (52.4, True), (52.5, False), (30.0, True)]
 )
-def test_half_a_degree_beyond_the_logs_is_forgiven_on_either_side(tank, target: float, inside: bool):
+def test_a_hundredth_of_their_range_beyond_the_logs_is_forgiven(tank, target: float, inside: bool):
     controller = design_controller(tank, dt=2.0)
     assert (checks.beyond_logs(controller, target) == []) == inside
     for span in ((target, 30.0), (30.0, target)):
