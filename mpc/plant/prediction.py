@@ -282,10 +282,11 @@ class PredictionModel:
     ) -> tuple[Array, Array]:
         """Return outputs (B, n + 1, 2 n_y) and last states (B, 2 n_x) of a run from x under u (n, n_u) or
         (n_u,) and d, each followed by its derivatives in the directions behind."""
-        run = [room.copy() for room in directions]  # a model is shared, also by threads
-        for values, now in zip(run, (x, u, d)):
-            values[..., : values.shape[-1] // 2] = now
-        return kernel.rollout(*run, np.zeros((1, 0)), self.dt / self.sub)
+        start, drives, disturbances = (room.copy() for room in directions)  # threads share a model
+        start[:, : self.n_x] = x
+        drives[..., : self.n_u] = u
+        disturbances[..., : self.n_d] = d
+        return kernel.rollout(start, drives, disturbances, np.zeros((1, 0)), self.dt / self.sub)
 
     @cached_property
     def C(self) -> Array:
