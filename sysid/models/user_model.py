@@ -12,8 +12,8 @@
 
 The arguments are named tuples.  The same lines run on numbers, on rows of a batch, compiled
 (:mod:`thermogrip.sysid.models.jit_rollout`), and on CasADi symbols, so a choice between two values is
-``np.where`` or ``np.maximum``, never ``if``; what vectors cannot say (sorting, a function of SciPy) NumPy
-runs on whole batches, more slowly.
+``np.where`` or ``np.maximum``, never ``if``, and comparisons are joined by ``np.logical_and``, for symbols know
+no ``&``; what vectors cannot say (sorting, a function of SciPy) NumPy runs on whole batches, more slowly.
 
 **In time.**  With dx/dt = f(x, u, d, p) and u, d held over a step, each step of the simulation is cut into n
 pieces, each a step of the classical Runge-Kutta rule of fourth order, after which a state with limits is put
@@ -46,7 +46,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Self
 
 import numpy as np
-from numpy.lib.mixins import NDArrayOperatorsMixin
 from numpy.typing import ArrayLike
 from pydantic import (
     AfterValidator,
@@ -259,6 +258,8 @@ class OwnCode:
             hint, fields = f"correct {what}", getattr(getattr(error, "obj", None), "_fields", None)
             if fields is not None:  # of a named tuple of the arguments
                 hint = f"the {type(error.obj).__name__} are {', '.join(fields) or 'none'}"  # type: ignore[attr-defined]
+            elif "ArrayInterface" in str(error):
+                hint = "what is controlled or exported joins comparisons with np.logical_and, not with &"
             elif "truth value" in str(error):
                 hint = "an if about many values at once: choose with np.where or np.maximum"
             problem = f"fails in {what}: {type(error).__name__}: {error}"
@@ -517,33 +518,6 @@ class OwnModel(Described):
         return bool(np.max(rms) < OWN.step_error and np.max(most) < 1)  # NaN is not less
 
 
-_OF_TRUTHS = {np.bitwise_and: np.logical_and, np.bitwise_or: np.logical_or, np.invert: np.logical_not}
-
-
-class _Symbol(NDArrayOperatorsMixin):
-    """A scalar symbol of CasADi that NumPy's functions take as they take a number."""
-
-    def __init__(self, view: Any) -> None:
-        self.view = view  # CasADi's own that follows NumPy; by itself it cannot stand in an array
-
-    def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, **kwargs: Any) -> Any:
-        ufunc = _OF_TRUTHS.get(ufunc, ufunc)
-        return self._of(getattr(ufunc, method)(*map(self._inside, inputs), **kwargs))
-
-    def __array_function__(self, function: Any, _types: Any, inputs: Any, options: Any) -> Any:
-        return self._of(function(*map(self._inside, inputs), **options))
-
-    def __bool__(self) -> bool:
-        return bool(self.view)  # CasADi says that a symbol has no truth
-
-    def _of(self, value: Any) -> Any:
-        return _Symbol(value) if isinstance(value, sys.modules["casadi"].ArrayInterface) else value
-
-    @staticmethod
-    def _inside(value: Any) -> Any:
-        return value.view if isinstance(value, _Symbol) else value
-
-
 def _for_numpy(values: Values) -> list[Any]:
     """Return values with CasADi's symbols made such that NumPy's functions take them."""
     casadi = sys.modules.get("casadi")  # not loaded: there is no symbol
@@ -551,14 +525,14 @@ def _for_numpy(values: Values) -> list[Any]:
     if casadi is None or view is None:
         return list(values)
     kinds = (casadi.SX, casadi.MX)
-    return [_Symbol(view(value, ndim=0)) if isinstance(value, kinds) else value for value in values]
+    return [view(value, ndim=0) if isinstance(value, kinds) else value for value in values]
 
 
 def _plain(values: Values) -> list[Any]:
     """Return values with CasADi's symbols as CasADi knows them."""
-    return [
-        sys.modules["casadi"].vertcat(value.view) if isinstance(value, _Symbol) else value for value in values
-    ]
+    casadi: Any = sys.modules.get("casadi")
+    kind = getattr(casadi, "ArrayInterface", ())
+    return [casadi.vertcat(value) if isinstance(value, kind) else value for value in values]
 
 
 def own_model(kind: Any) -> OwnModel:

@@ -62,7 +62,7 @@ class Tanks:
     def rhs(self, x: Any, u: Any, d: Any, p: Any) -> list[Any]:
         over = np.maximum(x.upper - self.height, 0.0)
         out = p.drain * np.sqrt(np.maximum(x.upper, 0.0))
-        wet = (x.lower > 0.0) & (x.lower > -1.0)
+        wet = np.logical_and(x.lower > 0.0, x.lower > -1.0)
         drained = np.where(wet, p.drain * np.sqrt(np.maximum(x.lower, 0.0)), 0.0)
         return [p.gain * u.pump - out - p.spill * over**1.5, out - drained]
 
