@@ -9,10 +9,7 @@ sigma_j, one independent reading every tau_j seconds, adds
 and leaves (P^-1 + F)^-1 = R (1 + R'F R)^-1 R': a gain of 1/2 log2 det(1 + R'F R) bits [1]_. All is linear
 about the plant's values.  Every experiment begins at rest in the room.
 
-sigma and tau are the weights of the fit, sd of the sensors and seconds of an independent reading.  A log has
-T times less information than these weights assume (:mod:`thermogrip.sysid.greybox.sandwich`), so tau is T
-times as long.  After the experiment 12 simulated rigs stated intervals 1.7 times as wide as was predicted
-(geometric mean), 2.0 without T.
+sigma and tau are the weights of the fit, sd of the sensors and seconds of an independent reading.
 
 References
 ----------
@@ -190,6 +187,9 @@ def reading_noise(plant: Plant) -> tuple[Array, Array]:
         raise UserError("the plant's sensors have no stated error", hint="identify a network")
     scores = plant.scores
     coarsening = 1.0 if scores.intervals is None else scores.intervals.coarsening
+    # A log has T times less information than the fit's weights assume (sysid.greybox.sandwich).  After the
+    # experiment 12 simulated rigs stated intervals 1.7 times as wide as was predicted (geometric mean), 2.0
+    # without T.
     seconds = [coarsening * scores.weight_s.get(name, model.independent) for name in plant.outputs]
     return np.array([model.sensor_sd[name] for name in plant.outputs]), np.array(seconds)
 

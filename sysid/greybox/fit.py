@@ -2,9 +2,8 @@
 
 1. Levenberg-Marquardt with priors as residuals, from the prior medians
    (:mod:`thermogrip.sysid.greybox.problem`).
-2. The correlation of residuals (tau) is measured on the fit. The estimate gives the data at least the
-   weight of one reading a minute, so that a slow error of the model does not leave the fit to the priors;
-   where residuals are whiter than that the fit is repeated with more weight.
+2. The correlation of residuals (tau) is measured on the fit, which is repeated with more weight where they
+   are whiter than one reading a minute.
 3. Covariance (:mod:`thermogrip.sysid.greybox.sandwich`), and which parameters are practically identifiable
    (:mod:`thermogrip.sysid.greybox.identifiability`).
 
@@ -14,9 +13,7 @@ determine make the cost |r(z)|^2 a narrow curved valley, which straight steps le
     v = -(J'J + lambda)^-1 J'r            is followed by half of
     a = -(J'J + lambda)^-1 J' r_vv,       r_vv = (2 / h^2) (r(z + h v) - r(z) - h J v),
 
-which bends with the valley [1]_. Several lambda are tried at once, straight and bent, in one batch. A
-coordinate on its bound whose step would leave the box is held there.  (SciPy's trust region stops in such
-valleys: at 303 for 51 on a printer's heater block.)
+which bends with the valley [1]_.
 
 References
 ----------
@@ -112,7 +109,9 @@ def _best_trial(
     residuals: Callable[[Array], Array], z: Array, r: Array, J: Array, low: Array, high: Array, damping: float
 ) -> _Trial:
     """Return the best of several damped steps, straight and bent."""
+    # SciPy's trust region stops in such valleys: at 303 for 51 on a printer's heater block
     gradient, normal = J.T @ r, J.T @ J
+    # a coordinate on its bound whose step would leave the box is held there
     on_bound = ((z <= low) & (gradient > 0)) | ((z >= high) & (gradient < 0))
     free = np.flatnonzero(~on_bound)
     if free.size == 0:
@@ -220,6 +219,8 @@ def fit_network(
     report(0.0, "fitting from the priors")
     solution = _descend(problem, np.zeros(len(problem.free)), report, (0.0, 0.6))
     tau = residual_tau(problem.errors(solution.z), problem.tau)
+    # data have at least the weight of one reading a minute: a slow error of the model must not leave the fit
+    # to the priors
     whiter = tau < 0.8 * problem.tau
     if whiter.any():
         problem = problem.with_tau(np.where(whiter, tau, problem.tau))

@@ -11,16 +11,10 @@ noise and two slow errors of the model with correlation times tau_m,
     cov(e_j(t), e_k(t')) = w_j^2 [t = t'] [j = k] + sum_m R_m,jk a_mj a_mk exp(-|t - t'| / tau_m).
 
 **Cosine coordinates.** Such a covariance is nearly diagonal after a discrete cosine transform [1]_, its
-diagonal sum_k W_fk c(k) with the autocovariance c and weights W of the number of bins. It is smooth in f, so
-frequencies are taken in bands with one small matrix S_b each, and of the data only the sums of products over
-each band are needed: a likelihood costs the same for an hour as for a day.
+diagonal sum_k W_fk c(k) with the autocovariance c and weights W of the number of bins.
 
 **Learning.** The numbers maximise the likelihood with z, c and all b_l integrated out (restricted maximum
-likelihood), under weak log-normal priors. Its slope in a number v of S, and in ln s of a kind, is
-
-    1/2 sum_b tr[(alpha alpha' - S^-1 + S^-1 X P X' S^-1) dS/dv],       sum_i (E[b_i]^2 + P_ii - 1),
-
-with alpha = S^-1 (r - X E[z, b]), P the posterior covariance of (z, b_l), and b in units of its s.
+likelihood), under weak log-normal priors.
 
 References
 ----------
@@ -208,6 +202,7 @@ def _evidence(v: Array, logs: Sequence[LogData], ref: Array, n_y: int, n_kind: i
     numbers = _unpack(v, n_y, n_kind)
     posterior = information(numbers, logs, ref)
     slope = np.zeros(v.size)
+    # in ln s of a kind, with b in units of its s and P the posterior covariance:  sum_i (E[b_i]^2 + P_ii - 1)
     by_kind = np.zeros(n_kind + 1)
     n = posterior.mean.size
     np.add.at(by_kind, logs[0].kind[:n], posterior.mean**2 + np.diag(posterior.covariance) - 1)
@@ -230,6 +225,8 @@ def _slopes(v: Array, numbers: ErrorModel, block: Block, uncertain: Array) -> Ar
     out = np.zeros(v.size)
     lag = np.arange(block.n)
     inverse = np.linalg.inv(block.covariance(numbers))
+    # in a number v of S, with alpha = S^-1 (r - X E[z, b]) and P the posterior covariance of (z, b_l):
+    # 1/2 sum_b tr[(alpha alpha' - S^-1 + S^-1 X P X' S^-1) dS/dv]
     # sum over the band of E[(r - X zcb)(r - X zcb)'] by pair of outputs
     square = np.tensordot(block.products, uncertain, axes=2)
     pressed = 0.5 * (inverse @ square @ inverse - block.sizes[:, None, None] * inverse)
@@ -255,6 +252,9 @@ def _slopes(v: Array, numbers: ErrorModel, block: Block, uncertain: Array) -> Ar
 @lru_cache(maxsize=64)
 def _frequency_bands(n: int) -> tuple[int, ...]:
     """Return the edges of the bands of n frequencies."""
+    # The diagonal is smooth in f, so frequencies are taken in bands with one small matrix S_b each, and of
+    # the data only the sums of products over each band are needed: a likelihood costs the same for an hour as
+    # for a day.
     edges = list(range(min(n, _SINGLE) + 1))
     while edges[-1] < n:
         edges.append(min(n, max(edges[-1] + 1, int(edges[-1] * _GROWTH))))

@@ -18,7 +18,8 @@ tr(P^-1 A) [1]_.
 
     minimise  |z - z_fit - xi|^2 + |K^(1/2) Q'd(z) - e|^2 + |d(z) - Q Q'd(z)|^2 / T,      xi, e ~ N(0, 1),
 
-a draw from p where the model is linear; along a valley that no run sees it may stop short of its end.
+a draw from p where the model is linear.  Draws of the normal approximation move runs 4 to 40 times as far as
+these (the rig's logs), for they leave the valley that the logs see.
 
 **Sampling.** emcee moves the few parameters z_s that the data determine best relative to the prior; the
 others are integrated out to second order about one Gauss-Newton step from their conditional mean, with the
@@ -27,9 +28,8 @@ slopes J_o of the fit and H = 1 + A V^-1 A,
     z_o = z_fit - H_oo^-1 H_os (z_s - z_fit) - H_oo^-1 g_o,     g = z - z_fit + J'Q K Q'd,
     ln p(z_s) = ln p(z_s, z_o) + g_o' H_oo^-1 g_o / 2,
 
-and drawn afterwards, each as a fit of its own. Half of the moves are differential evolution, half proposals
-x' ~ t_6(m, s^2 C) about the normal approximation, accepted with min(1, p(x') t(x) / (p(x) t(x'))).
-**Converged** means that the chain is longer than 50 integrated autocorrelation times of every parameter [3]_.
+and drawn afterwards, each as a fit of its own. **Converged** means that the chain is longer than 50
+integrated autocorrelation times of every parameter [3]_.
 
 References
 ----------
@@ -247,7 +247,10 @@ def run_chain(
     import emcee
 
     n_walkers, n_dim = start.shape
-    # no snooker moves: those of emcee 3.1.6 sample a 6-D standard normal with sd 0.82
+    # no snooker moves: those of emcee 3.1.6 sample a 6-D standard normal with sd 0.82.  With half of the
+    # moves proposals x' ~ t_6(m, s^2 C) about the normal approximation, accepted with min(1, p(x') t(x) /
+    # (p(x) t(x'))), chains converge in 400 steps for 1,100 and in 650 for 1,500 (the gripper's, two logs and
+    # one)
     moves = [emcee.moves.DEMove()]
     if normal is not None:
         moves.append(emcee.moves.MHMove(_proposals(*normal), n_dim))

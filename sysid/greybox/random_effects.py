@@ -7,16 +7,10 @@
     start                 of the state at its first row: the model's ``spread``
     a parameter           one with ``per_log`` in the network (relative if it is positive)
 
-A log that began at rest has measured its sensors' offsets in its first seconds. What the warm-up says of any
-other start is not counted: with it 90 per cent intervals of logs that begin warm covered 71 (four logs) and
-81 per cent (one) for 74 and 87 without (40 rigs of ``benchmarks/coverage``, their first third cut off).
-
 **Model discrepancy** responds to the inputs in every log alike and does not average out over logs. A bank of
-responses represents all that may be missing: every input u, its size |u|,
-u v, v |v| and every disturbance, with v the first output above the ambient (else about its mean), each
-through first-order lags of 2, 8 and 32 bins, on all outputs alike. The error model learns one s per signal
-from the residuals; at s = 1 all of them together have an rms of half a sensor's sd. Without it intervals are
-0.83 times as wide and cover 4 per cent less (48 simulated rigs of ``benchmarks/coverage``).
+responses represents all that may be missing, each through first-order lags, on all outputs alike; the error
+model learns one s per signal from the residuals. Without it intervals are 0.82 times as wide and cover 3 per
+cent less (48 simulated rigs of ``benchmarks/coverage``; of one log 8 per cent less).
 """
 
 from __future__ import annotations
@@ -78,6 +72,8 @@ def discrepancy_responses(problem: Problem, runs: Sequence[Sequence[Array]]) -> 
 
 def signals(model: Model, u: Array, d: Array, run: Array) -> dict[str, Array]:
     """Return the signals (N,) to which the discrepancy may respond, by name."""
+    # every input u, its size |u|, u v, v |v| and every disturbance, v the first output above the ambient,
+    # else about its mean
     v = run[:-1, 0] - (d[:, 0] if d.shape[1] else float(run[:, 0].mean()))
     out = {"v |v|": v * np.abs(v)}
     for k, name in enumerate(model.inputs):
@@ -162,6 +158,10 @@ def _log_effects(
 ) -> list[_Column]:
     """Return everything that is the log's own."""
     plant, (stretches, bins) = problem.plant, problem.logs[at]
+    # A log that began at rest has measured its sensors' offsets in its first seconds.  What the warm-up says
+    # of any other start is not counted: with it 90 per cent intervals of logs that begin warm covered 71
+    # (four logs) and 81 per cent (one) for 74 and 87 without (40 rigs of benchmarks/coverage, their first
+    # third cut).
     most = EFFECTS.measured_offset_sd if starts[0].level is not None else np.inf
     out = []
     for j, name in enumerate(plant.outputs):

@@ -14,15 +14,7 @@ boundary temperatures (disturbances, then fixed ones).  Heat flows through
 
 and C_i dx_i/dt = sum of q.  A sensor is a state too: its time constant is C, a unit flow from its
 node for q.  Conductances and flows may hang on a switch u_s (a pump): they have off + (1 - off) u_s of their
-value. The current follows the command v = u / full + u_0 by two gains, I = I_max (g_heat max(v, 0) + g_cool
-min(v, 0)), and droops by r per 50 K between face and sink.  A pulse-width driver ("duty") pushes I_max (1 -
-r dT / 50) for the share v of the time, so that its Joule heat is proportional to v, not to its square.
-Beyond a dead zone v_d, v - v_d replaces v.  a and R may follow the mean temperature of the element by a share
-per kelvin from 25 degC.
-
-**At rest** (:meth:`NetworkModel.rest`) a plant whose sensors read y was held there by some input v, inside
-its range and not necessarily that of the first row:  min |heat(x, v)|^2 + w_y |y - output(x)|^2 + w_u |v -
-u|^2.
+value.
 
 **Time step.**  ROS2 of Verwer et al. [1]_, for dx/dt = f(x) over a step h with the input held:
 
@@ -30,12 +22,7 @@ u|^2.
 
 is of second order for *any* matrix A, and L-stable with g = 1 - 1/sqrt(2) where A is the Jacobian.  A holds
 the conductances and flows, the only stiff terms, so it changes with the switches alone and is factorised once
-per change.  1 - g h A is diagonally dominant by columns and needs no pivots: the elimination is found once
-per network, in minimum-degree order, and written down as a list of multiplications.
-
-**Layout.**  States are numbered nodes first, then the cells of the pipes (water, then wall), then the sensors
-that lag.  A pipe of n cells with flow F and delay t holds F t of water, so each cell has the capacity F t /
-n; the chain's mean delay is t exactly and its spread t / sqrt(n), as in a tube with some mixing.
+per change.
 
 References
 ----------
@@ -260,6 +247,7 @@ class ThermalSteps:
                     share = gh * conductance / c.capacity[j]
                     add(j, j, share)
                     add(j, i, -share)
+        # 1 - gh A is diagonally dominant by columns and needs no pivots for its size
         factors, remaining = [], set(range(len(rows)))
         while remaining:
             # the state with the fewest neighbours first, so that little is filled in
@@ -279,16 +267,21 @@ class ThermalSteps:
 def _peltier_heat(element: dict[str, Any], u: Any, t_face: Any, t_sink: Any, duty: bool) -> tuple[Any, Any]:
     """Return the heat that face and sink of an element receive [W]."""
     v, dead = u / element["full"] + element["offset"], element["dead_zone"]
+    # beyond a dead zone v_d, v - v_d replaces the command v
     v = v - 0.5 * (abs(v + dead) - abs(v - dead))
+    # the current follows by two gains, I = I_max (g_heat max(v, 0) + g_cool min(v, 0)), and droops by a share
+    # per 50 K between face and sink
     size = abs(v)
     up, down = element["heating_gain"] * 0.5 * (v + size), element["cooling_gain"] * 0.5 * (v - size)
     droop = element["droop"] / DROOP_SPAN * (t_face - t_sink)
     if duty:
+        # pulses of I_max (1 - r dT / 50) for the share v of the time: Joule heat goes with v, not its square
         on = element["current"] * (1.0 - droop)
         current, square = up * on, up * on * on
     else:
         current = element["current"] * ((up + down) - droop * (up - down))
         square = current * current
+    # a and R follow the mean temperature of the element by a share per kelvin
     warm = 0.5 * (t_face + t_sink) - REFERENCE
     pumped = element["seebeck"] * (1.0 + element["seebeck_slope"] * warm) * current
     joule = 0.5 * element["resistance"] * (1.0 + element["resistance_slope"] * warm) * square
@@ -372,6 +365,8 @@ def _capacities(network: Network, at: _Places) -> Iterator[Coefficient]:
     """Yield the capacity of each state in order."""
     for node in network.nodes.values():
         yield at.coefficient(node.capacity)
+    # A pipe of n cells with flow F and delay t holds F t of water.  The mean delay of the chain is t exactly
+    # and its spread t / sqrt(n), as in a tube with some mixing.
     for pipe in network.pipes.values():
         for _ in range(pipe.cells):
             yield at.coefficient(pipe.flow, pipe.delay, scale=1.0 / pipe.cells)
@@ -502,6 +497,8 @@ class NetworkModel(Described):
         full = np.array([self.network.inputs[self.inputs[i]].full_scale for i in moved])
         low, high = low / full, high / full
         z = np.concatenate([np.full(self.n_x, level), np.clip(u[moved] / full, low, high)])
+        # a plant at rest was held by some input v inside its range, not necessarily that of the first row:
+        # min |heat(x, v)|^2 + w_y |y - output(x)|^2 + w_u |v - u|^2
         z, ahead = np.tile(z, (len(p), 1)), 1e-4 * np.eye(len(z))
         unsettled = np.arange(len(p))  # each until it has settled by itself, whoever is beside it
         for _ in range(8):  # bilinear and T^4 at most: Gauss-Newton settles in three or four

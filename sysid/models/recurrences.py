@@ -4,14 +4,8 @@
 
     t = tanh(W x + U w + b),        x+ = A x + B w + c + V t,
 
-where the first n_y states are the outputs and are clipped to [low, high] after each step.  The sensitivity
-S = dx/dtheta runs beside the state: with s = 1 - t^2,
-
-    S+ = (A + V diag(s) W) S + E,
-
-where E is sparse: a step adds w_j to the row of B_ij, t_k to that of V_ik, V_:k s_k x_j to all rows for W_kj,
-and so on; a clipped state has no slope.  The weights are one vector theta = [B, c, V, W, U, b], each array
-row by row.
+where the first n_y states are the outputs and are clipped to [low, high] after each step.  The weights are
+one vector theta = [B, c, V, W, U, b], each array row by row.
 
 This file alone of the models imports numba, so nothing pays for the compiler before a model is simulated.
 """
@@ -232,13 +226,15 @@ def run_with_slopes(
             for q in range(n_p + n):
                 slopes[row, i, q] = S[i, q]
         _units(p, x, w[row], t)
+        # the sensitivity S = dx/dtheta beside the state: S+ = (A + V diag(s) W) S + E with s = 1 - t^2, E
+        # sparse
         for i in range(h):
             s[i] = 1.0 - t[i] * t[i]
         _advance(A, p, x, w[row], t, after)
         _propagate(A, p, w.shape[1], s, S, S_after)
         _add_direct(p, x, w[row], t, s, S_after)
         for i in range(n_y):
-            if not low[i] < after[i] < high[i]:
+            if not low[i] < after[i] < high[i]:  # a clipped state has no slope
                 after[i] = min(max(after[i], low[i]), high[i])
                 S_after[i].fill(0.0)
         for i in range(n):

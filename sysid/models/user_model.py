@@ -12,14 +12,12 @@
 
 The arguments are named tuples.  The same lines run on numbers, on rows of a batch, compiled
 (:mod:`thermogrip.sysid.models.jit_rollout`), and on CasADi symbols, so a choice between two values is
-``np.where`` or ``np.maximum``, never ``if``, and comparisons are joined by ``np.logical_and``, for symbols know
-no ``&``; what vectors cannot say (sorting, a function of SciPy) NumPy runs on whole batches, more slowly.
+``np.where`` or ``np.maximum``, never ``if``, and comparisons are joined by ``np.logical_and``, not by ``&``;
+what vectors cannot say (sorting, a function of SciPy) NumPy runs on whole batches, more slowly.
 
 **In time.**  With dx/dt = f(x, u, d, p) and u, d held over a step, each step of the simulation is cut into n
 pieces, each a step of the classical Runge-Kutta rule of fourth order, after which a state with limits is put
-back inside them.  :meth:`OwnModel.prepared` doubles n until the logs simulated with n and with 2 n pieces
-differ by less than a tenth of each output's sensor ``sd`` (rms), and by less than that ``sd`` anywhere: for a
-smooth f the error of 2 n is a sixteenth of that difference.
+back inside them.  :meth:`OwnModel.prepared` doubles n until that changes the logs' simulations little.
 
 **The state at rest** of a class that has no ``rest`` of its own is the state x that some input v near u holds
 still and whose outputs read y,
@@ -448,6 +446,8 @@ class OwnModel(Described):
         model = replace(self, sd=sd)
         p_tried = self.prior if p is None else np.asarray(p, dtype=float)
         runs, n = free_runs(model, p_tried), model.pieces
+        # until runs with n and with 2 n pieces differ by less than a tenth of each sensor's sd (rms), and by
+        # less than that sd anywhere: for a smooth f the error of 2 n is a sixteenth of that difference
         while n <= OWN.most_pieces:
             finer = replace(model, pieces=2 * n)
             again = free_runs(finer, p_tried)

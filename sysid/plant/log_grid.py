@@ -5,18 +5,12 @@ After a gap of more than 10 s (and of five steps of a slow log) a stretch with a
 **Inputs.**  With the grid t_k = t_0 + k dt of a stretch, an input is the exact mean of its held value over
 [t_k, t_k + dt).  A plant (:func:`cut_stretches`) has a grid of its own step: a command that its driver rounds
 is what the driver made of it, and a measured ambient is smoothed over 20 s, for its sensor is slow and
-coarse.  Readings stay at their own times, and the outputs of the model are interpolated to them (the middle
-of the blocks of an averaged log).  Logs of a rig that says of an input what was applied up to the row
-(``ends``) are moved by one row.
+coarse.  Readings stay at their own times, and the outputs of the model are interpolated to them.  Logs of a
+rig that says of an input what was applied up to the row (``ends``) are moved by one row.
 
 **Readings on the grid.**  For a black box (:func:`make_grid`) a reading is the mean of the line through the
 samples over [t_k - dt/2, t_k + dt/2], so that it is not shifted in time; where the grid is the log's own,
 the samples stand as they are.  A reading lost while the input is known stays NaN.
-
-**Why average.**  Once the output moves less than the quantum of its converter in one step of the grid, most
-of what an equation-error fit sees is rounding.  The step chosen here is the longest of 1, 2, 3, 4, 5, 6, 8 ..
-50 samples in which the output moves less than one quantum (rms; the next one is beyond it), at least a
-hundredth of the dominant time constant (finer ones add nothing) and at most a tenth of it.
 
 **Roles and units** of a model at hand are used (:func:`match_logs`).  Shares of full scale come as ``1`` (-1
 to 1), ``percent`` or ``0_255`` and are converted; values beyond 1 tell a column without a unit to be in the
@@ -377,6 +371,8 @@ def _chosen_step(logs: Sequence[Rows], outputs: Sequence[str], native: float) ->
     most = min(slow / 10, longest / 200)  # whatever the time constant, rows must be left to fit
     needed = max(native, slow / 100)  # finer steps cost time and add nothing
     why = "the logs' own" if needed == native else f"a hundredth of the dominant time constant, {slow:.3g} s"
+    # Once the output moves less than the quantum of its converter in one step of the grid, most of what an
+    # equation-error fit sees is rounding: the step is the longest in which it does (rms).
     for k, name in enumerate(outputs):
         q = max(quantum(rows.y[:, k]) for rows in logs)
         for times in (1, 2, 3, 4, 5, 6, 8, 10, 12, 15, 20, 25, 30, 40, 50):
