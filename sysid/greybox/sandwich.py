@@ -58,14 +58,13 @@ class ErrorPriors:
 PRIORS = ErrorPriors()
 
 
-@dataclass(frozen=True, eq=False)
-class LogScores:
-    """What each log (or piece of one) adds to the score."""
+class LogScores(NamedTuple):
+    """What a log adds to the score, or what each of (n_log, ...) adds."""
 
-    hessian: Array  # A_l (n_log, n, n)
-    spread: Array  # V_l (n_log, n, n)
-    score: Array  # J_l' r_l (n_log, n)
-    discrepancy: Array  # J_l' F_l s (n_log, n, n_term)
+    hessian: Array  # A_l (n, n)
+    spread: Array  # V_l (n, n)
+    score: Array  # J_l' r_l (n,)
+    discrepancy: Array  # J_l' F_l s (n, n_term)
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,16 +147,8 @@ def common_factor(q: Array, n_log: int) -> float:
     return max(phi, (1 + freedom * phi) / n_log)
 
 
-class _LogScore(NamedTuple):
-    """What one log adds; the score is of reading less model, so that it pulls upwards."""
-
-    hessian: Array
-    spread: Array
-    score: Array
-    discrepancy: Array
-
-
-def _one_log(log: LogData, merge: float, numbers: ErrorModel, n: int, n_shared: int) -> _LogScore:
+def _one_log(log: LogData, merge: float, numbers: ErrorModel, n: int, n_shared: int) -> LogScores:
+    """Return what one log adds; the score is of reading less model, so that it pulls upwards."""
     scale = np.append(numbers.scale(log.kind), 1.0)
     products, noise = np.zeros((scale.size, scale.size)), np.zeros((n, n))
     for block in log.blocks:
@@ -165,7 +156,7 @@ def _one_log(log: LogData, merge: float, numbers: ErrorModel, n: int, n_shared: 
         noise += merge**2 * np.tensordot(block.covariance(numbers), block.products[..., :n, :n], axes=3)
     products = products * scale * scale[:, None]
     effects = products[:n, n_shared:-1]
-    return _LogScore(
+    return LogScores(
         hessian=products[:n, :n],
         spread=noise + effects @ effects.T,
         score=products[:n, -1],

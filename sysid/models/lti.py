@@ -16,19 +16,27 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from thermogrip.datasets.arrays import Array, Values
+from thermogrip.datasets.arrays import Array
 
 if TYPE_CHECKING:
     from thermogrip.sysid.models.model import Model
 
 
+def products(terms: Sequence[str], names: Sequence[str], signals: Sequence[Any]) -> list[Any]:
+    """Return the products ``terms`` of the signals ``names`` (numbers, columns or symbols)."""
+    out = []
+    for factors in read_terms(terms, names):
+        value: Any = 1.0
+        for index, magnitude in factors:
+            value = value * (abs(signals[index]) if magnitude else signals[index])
+        out.append(value)
+    return out
+
+
 def evaluate_terms(terms: Sequence[str], names: Sequence[str], rows: Array) -> Array:
     """Return the products ``terms`` of the columns ``names``."""
-    out = np.ones((*rows.shape[:-1], len(terms)))
-    for column, factors in enumerate(read_terms(terms, names)):
-        for index, magnitude in factors:
-            out[..., column] *= np.abs(rows[..., index]) if magnitude else rows[..., index]
-    return out
+    columns = products(terms, names, list(np.moveaxis(rows, -1, 0)))
+    return np.stack(columns, axis=-1) if columns else np.ones((*rows.shape[:-1], 0))
 
 
 def constrained_lstsq(rows: Array, right: Array, fixed: Array, value: Array) -> Array:
@@ -65,15 +73,6 @@ def read_terms(terms: Sequence[str], names: Sequence[str]) -> list[list[tuple[in
             raise ValueError(f"term {term!r} names {unknown[0]!r}, which is not among {', '.join(names)}")
         out.append([(list(names).index(name), word.startswith("|")) for name, word in zip(bare, words)])
     return out
-
-
-def product_of(factors: Sequence[tuple[int, bool]], u: Values, d: Values, n_u: int) -> Any:
-    """Return one product of inputs and disturbances in plain arithmetic (numbers or symbols)."""
-    value: Any = 1.0
-    for index, magnitude in factors:
-        signal = u[index] if index < n_u else d[index - n_u]
-        value = value * (abs(signal) if magnitude else signal)
-    return value
 
 
 def join_columns(u: Array, d: Array) -> Array:

@@ -33,7 +33,7 @@ from thermogrip.sysid.models.lti import (
     estimate_starts,
     evaluate_terms,
     join_columns,
-    product_of,
+    products,
     read_terms,
     whole_steps,
 )
@@ -104,10 +104,7 @@ class StateSpaceModel(BlackBox):
 
     def step(self, x: Values, u: Values, d: Values, p: Values, dt: float) -> list[Any]:
         """Return the state one step later, in plain arithmetic (numbers, NumPy rows or CasADi symbols)."""
-        phi = [
-            product_of(factors, u, d, len(self.inputs))
-            for factors in read_terms(self.terms, self.inputs + self.disturbances)
-        ]
+        phi = products(self.terms, self.inputs + self.disturbances, [*u, *d])
         push = [
             self.c[i] + _dot(self.B[i], u) + _dot(self.E[i], d) + _dot(self.F[i], phi)
             for i in range(self.n_x)

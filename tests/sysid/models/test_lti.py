@@ -17,7 +17,7 @@ from thermogrip.sysid.models.lti import (
     estimate_starts,
     evaluate_terms,
     join_columns,
-    product_of,
+    products,
     read_terms,
     whole_steps,
 )
@@ -104,8 +104,7 @@ def test_products_are_of_the_columns_that_they_name():
     terms = {"q*|q|": -4.0, "pump*room": -15.0, "|room|*sun": 35.0, "q*q*sun": 28.0}
     rows = np.array([[*u, *d]])
     np.testing.assert_array_equal(evaluate_terms(list(terms), names, rows), [list(terms.values())])
-    read = read_terms(list(terms), names)
-    assert [product_of(factors, u, d, 2) for factors in read] == list(terms.values())
+    assert products(list(terms), names, [*u, *d]) == list(terms.values())
     with pytest.raises(ValueError, match="names 'moon', which is not among q, pump"):
         read_terms(["q*moon"], names)
 
