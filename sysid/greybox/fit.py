@@ -295,7 +295,9 @@ def _as_plant(problem: Problem, solution: Solution) -> Plant:
         average_s=problem.average,
         weight_s={k: float(t * problem.average) for k, t in zip(model.outputs, problem.tau)},
         intervals=fit_record.Intervals(
-            numbers=spread.numbers, between_logs=round(spread.phi, 3), coarsening=round(spread.coarsening, 3)
+            numbers=fit_record.ErrorNumbers(**vars(spread.numbers)),
+            between_logs=round(spread.phi, 3),
+            coarsening=round(spread.coarsening, 3),
         ),
     )
     return replace(

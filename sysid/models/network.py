@@ -87,7 +87,7 @@ _NONE, _ONE = Coefficient(0.0), Coefficient(1.0)
 
 
 class _Link(NamedTuple):
-    """A conductance or flow from ``source``, an index into z, to a state; ``both``: taken from there too."""
+    """What heat flows along from ``source``, an index into z, to a state; ``both``: taken from there too."""
 
     to: int
     source: int
@@ -96,14 +96,6 @@ class _Link(NamedTuple):
     switch: int = -1  # an input, or -1
     off: Coefficient = _NONE  # the share that is left with the switch off
     bend: Coefficient | None = None
-
-
-class _Exchange(NamedTuple):
-    """Radiation to a state from a place."""
-
-    to: int
-    source: int
-    value: Coefficient
 
 
 class _Heater(NamedTuple):
@@ -152,7 +144,7 @@ class ThermalSteps:
     capacities: tuple[Coefficient, ...]  # by state
     fixed: tuple[Coefficient, ...]  # temperatures of the boundaries
     links: tuple[_Link, ...]
-    radiation: tuple[_Exchange, ...]
+    radiation: tuple[_Link, ...]
     heaters: tuple[_Heater, ...]
     peltiers: tuple[_Peltier, ...]
     output: tuple[int, ...]  # (n_y,) state that each output reads
@@ -219,9 +211,9 @@ class ThermalSteps:
             if bend is not None:
                 rise = z[link.source] - z[link.to]
                 move(link.to, link.source, conductance * bend / BEND_SPAN * rise * abs(rise), link.both)
-        for (i, j, _), factor in zip(self.radiation, c.radiation):
-            a, b = z[i] + KELVIN, z[j] + KELVIN
-            move(i, j, factor * (b * b * b * b - a * a * a * a))
+        for link, factor in zip(self.radiation, c.radiation):
+            a, b = z[link.to] + KELVIN, z[link.source] + KELVIN
+            move(link.to, link.source, factor * (b * b * b * b - a * a * a * a))
         for (i, source, measured, _), power in zip(self.heaters, c.heater):
             q[i] = q[i] + power * (z[source] if measured else u[source])
         for (face, sink, by, duty, _), element in zip(self.peltiers, c.peltier):
@@ -350,7 +342,7 @@ def thermal_steps(network: Network) -> ThermalSteps:
         fixed=tuple(at.coefficient(item.temperature) for item in network.boundaries.values()),
         links=tuple(_links(network, at)),
         radiation=tuple(
-            _Exchange(*at.receiver(r.between), at.coefficient(r.area, r.emissivity, scale=STEFAN_BOLTZMANN))
+            _Link(*at.receiver(r.between), at.coefficient(r.area, r.emissivity, scale=STEFAN_BOLTZMANN), True)
             for r in network.radiation.values()
         ),
         heaters=tuple(_heater(network, heater, at) for heater in network.heaters.values()),

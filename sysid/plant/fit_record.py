@@ -9,7 +9,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
+
+from pydantic import AliasChoices, Field, TypeAdapter, ValidationError
 
 if TYPE_CHECKING:
     from thermogrip.datasets.schema import Log
@@ -57,7 +59,8 @@ class Identifiability:
     condition: float  # of the scaled Hessian
     weakest: str  # the direction of the smallest, in words
     flat: list[str]  # all directions that the logs barely determine, in words
-    identifiable: bool  # False: a direction changes no output at all
+    # False: a direction changes no output at all (``told`` in files of 0.2.0 and before)
+    identifiable: Annotated[bool, Field(validation_alias=AliasChoices("identifiable", "told"))]
     prior_only: list[str]  # names
     on_bound: dict[str, str]  # name -> "low" or "high"
 
@@ -131,25 +134,13 @@ class PlantScores:
     def to_json(self) -> dict[str, Any]:
         """Return the content of key ``scores`` of ``plant.json``; a default is left out."""
         default = asdict(PlantScores())
-        content = {key: value for key, value in asdict(self).items() if value != default[key]}
-        if self.identifiability is not None:
-            report = content["identifiability"]
-            content["identifiability"] = {
-                "told" if key == "identifiable" else key: value for key, value in report.items()
-            }
-        return content
+        return {key: value for key, value in asdict(self).items() if value != default[key]}
 
     @classmethod
     def from_json(cls, content: Mapping[str, Any]) -> PlantScores:
         """Return what :meth:`to_json` wrote; keys that it does not know are left out."""
-        from pydantic import TypeAdapter, ValidationError
-
-        fields = dict(content)
-        if isinstance(fields.get("identifiability"), Mapping):
-            report = dict(fields["identifiability"])
-            fields["identifiability"] = report | {"identifiable": report.get("told")}
         try:
-            return TypeAdapter(cls).validate_python(fields)
+            return TypeAdapter(cls).validate_python(dict(content))
         except ValidationError as error:
             first = error.errors()[0]
             where = ".".join(str(key) for key in ("scores", *first["loc"]))

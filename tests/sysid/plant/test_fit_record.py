@@ -35,7 +35,8 @@ BLACK_BOX = {
 @pytest.mark.parametrize("content", [NETWORK, BLACK_BOX, {}], ids=["network", "black box", "nothing"])
 def test_scores_of_an_older_file_come_back_key_by_key(content):
     again = PlantScores.from_json(content).to_json()
-    assert json.dumps(again) == json.dumps(content)
+    assert json.dumps(again) == json.dumps(content).replace("told", "identifiable")
+    assert PlantScores.from_json(again).to_json() == again
 
 
 def test_what_a_later_version_adds_is_left_out_and_what_an_earlier_one_lacked_has_its_default():
