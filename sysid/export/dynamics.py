@@ -150,26 +150,13 @@ class Dynamics:
 
     def rows(self) -> list[dict[str, Any]]:
         """Return a record for each pair of an input and an output: gain with interval, times [s], unit."""
-        gain = self.gain
-        dead = self.dead_time
-        rise = self.rise_time
+        table = np.array([*self.gain, self.dead_time, self.rise_time])
         out = []
-        for j, name in enumerate(self.linear.inputs):
-            for i, output in enumerate(self.linear.outputs):
-                numbers = (float(quantity[i, j]) for quantity in (*gain, dead, rise))
-                value, low, high, late, risen = (v if np.isfinite(v) else None for v in numbers)
-                out.append(
-                    {
-                        "input": name,
-                        "output": output,
-                        "gain": value,
-                        "low": low,
-                        "high": high,
-                        "unit": _per(self.units.get(output, "1"), self.units.get(name, "1")),
-                        "dead_time_s": late,
-                        "rise_time_s": risen,
-                    }
-                )
+        for (j, name), (i, output) in product(enumerate(self.linear.inputs), enumerate(self.linear.outputs)):
+            value, low, high, late, risen = (v if np.isfinite(v) else None for v in table[:, i, j].tolist())
+            unit = _per(self.units.get(output, "1"), self.units.get(name, "1"))
+            pair = {"input": name, "output": output, "gain": value, "low": low, "high": high, "unit": unit}
+            out.append(pair | {"dead_time_s": late, "rise_time_s": risen})
         return out
 
     def to_dict(self) -> dict[str, Any]:

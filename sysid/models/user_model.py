@@ -376,7 +376,6 @@ class OwnModel(Described):
     code: OwnCode  # the class, see :func:`own_model`
     pieces: int = 1  # Runge-Kutta steps in ``code.dt``
     sd: Mapping[str, float] | None = None  # sensor sd of outputs for which the class states none
-    compiled: bool = True  # False leaves all rollouts to NumPy
 
     kind = "own"
     smooth = 0.0  # nothing says that its disturbances are of heat
@@ -397,7 +396,7 @@ class OwnModel(Described):
     @property
     def slow_because(self) -> str:
         """Why NumPy does the rollouts though they should be compiled; "" where it does not."""
-        return compile_steps(self.code)[1] if self.compiled else ""
+        return compile_steps(self.code)[1]
 
     def step(self, x: Values, u: Values, d: Values, p: Values, dt: float) -> list[Any]:
         """Return the state after ``dt`` seconds; numbers, NumPy rows or CasADi symbols alike."""
@@ -435,7 +434,7 @@ class OwnModel(Described):
         """Simulate a batch."""
         x0, u, d, p = (np.ascontiguousarray(value, dtype=float) for value in (x0, u, d, p))
         n = self._pieces(dt)
-        kernel = compile_steps(self.code)[0] if self.compiled else None
+        kernel = compile_steps(self.code)[0]
         if kernel is None:
             return roll_rows(self.code, x0, u, d, p, dt / n, pieces=n)
         return kernel.rollout(x0, u, d, p, dt / n, pieces=n)

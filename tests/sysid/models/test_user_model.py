@@ -20,6 +20,7 @@ from thermogrip.datasets.schema import Log, make_log
 from thermogrip.sysid.greybox.fit import fit_network, free_runs
 from thermogrip.sysid.greybox.posterior import fit_problem, with_draws
 from thermogrip.sysid.greybox.problem import prior_plant
+from thermogrip.sysid.models.model import roll_rows
 from thermogrip.sysid.models.user_model import OwnModel, load_object, own_model
 from thermogrip.sysid.plant.plant import Plant
 
@@ -152,21 +153,21 @@ def test_a_long_run_agrees_with_an_independent_solver():
 
 def test_compiled_rows_and_symbols_agree():
     fast = replace(own_model(Tanks), pieces=3)
-    slow = replace(fast, compiled=False)
     rng = np.random.default_rng(0)
     x0, pump = rng.uniform(0.0, 12.0, (5, 2)), rng.uniform(0, 9, (1, 200, 1))
-    p = slow.prior * rng.uniform(0.5, 2.0, (5, 3))
-    ends = [model.rollout(x0, pump, np.zeros((1, 200, 0)), p, 4.0) for model in (slow, fast)]
+    p = fast.prior * rng.uniform(0.5, 2.0, (5, 3))
+    run = x0, pump, np.zeros((1, 200, 0)), p
+    ends = [roll_rows(fast.code, *run, 4.0 / 3, pieces=3), fast.rollout(*run, 4.0)]
     assert fast.slow_because == ""
     np.testing.assert_allclose(ends[0][0], ends[1][0], atol=1e-10)
     np.testing.assert_allclose(ends[0][1], ends[1][1], atol=1e-10)
     x, u, q = (casadi.SX.sym(name, n) for name, n in (("x", 2), ("u", 1), ("p", 3)))
     with warnings.catch_warnings():
         warnings.simplefilter("error")  # casadi warns of what numpy will make of its bare symbols
-        symbols = slow.step(casadi.vertsplit(x), casadi.vertsplit(u), [], casadi.vertsplit(q), 4.0)
+        symbols = fast.step(casadi.vertsplit(x), casadi.vertsplit(u), [], casadi.vertsplit(q), 4.0)
     step = casadi.Function("step", [x, u, q], [casadi.vertcat(*symbols)])
     for b in range(5):
-        _, after = slow.rollout(x0[b : b + 1], pump[:, :1], np.zeros((1, 1, 0)), p[b : b + 1], 4.0)
+        _, after = fast.rollout(x0[b : b + 1], pump[:, :1], np.zeros((1, 1, 0)), p[b : b + 1], 4.0)
         np.testing.assert_allclose(np.array(step(x0[b], pump[0, 0], p[b]))[:, 0], after[0], atol=1e-12)
 
 
@@ -180,9 +181,8 @@ def test_a_limit_holds_the_level_and_lets_it_go_at_once():
             return [p.gain * u.pump]
 
     pump = np.repeat([1.0, -1.0], [10, 2])[None, :, None]
-    for compiled in (False, True):
-        model = replace(own_model(Bucket), compiled=compiled)
-        y, _ = model.rollout([[0.0]], pump, np.zeros((1, 12, 0)), [[1.0]], 1.0)
+    run = np.zeros((1, 1)), pump, np.zeros((1, 12, 0)), np.ones((1, 1)), 1.0
+    for y, _ in (own_model(Bucket).rollout(*run), roll_rows(own_model(Bucket).code, *run)):
         np.testing.assert_allclose(y[0, :, 0], [0, 1, 2, 3, 3, 3, 3, 3, 3, 3, 3, 2, 1], atol=1e-12)
 
 
@@ -262,23 +262,12 @@ def test_what_a_class_does_not_state_follows_from_its_step():
     plain, said = own_model(Block), own_model(varied(Block, average=7.0, warmup=33.0, dt=0.5))
     assert (plain.average, plain.independent, plain.warmup) == (5.0, 20.0, 50.0)
     assert (said.average, said.independent, said.warmup) == (7.0, 28.0, 33.0)
-    assert (plain.pieces, plain.compiled, plain.sensor_sd, plain.spread.tolist()) == (
-        1,
-        True,
-        {"t": 0.05},
-        [[0.25]],
-    )
+    assert (plain.pieces, plain.sensor_sd, plain.spread.tolist()) == (1, {"t": 0.05}, [[0.25]])
     unknown = own_model(varied(Block, outputs={"t": "degC"}))
     assert unknown.sensor_sd == {"t": 1.0}
     assert replace(unknown, sd={"t": 0.3}).sensor_sd == {"t": 0.3}
     assert own_model(Tanks).code.limits.tolist() == [[-np.inf, np.inf], [0.0, 10.0]]
     assert [replace(own_model(Tanks), pieces=3)._pieces(dt) for dt in (4.0, 2.0, 0.1, 8.0)] == [3, 2, 1, 6]
-    assert (
-        replace(
-            own_model(varied(Block, rhs=lambda s, x, u, d, p: [np.sort(x.t)])), compiled=False
-        ).slow_because
-        == ""
-    )
     assert unknown.to_dict() == {
         "kind": "own", "class": "Block", "file": Path(__file__).name, "sha256": unknown.code.sha256,
         "inputs": ["q"], "disturbances": ["air"], "outputs": ["t"], "states": ["t"], "pieces": 1,
