@@ -10,8 +10,11 @@ from thermogrip.datasets.log_files import write_log
 from thermogrip.datasets.schema import Log, make_log
 from thermogrip.mpc import Controller, default_design, tune
 from thermogrip.mpc.design.spec import Spec
+from thermogrip.report.html import Plot
+from thermogrip.report.plant import identification_sections
 from thermogrip.sysid import Plant, identify
 from thermogrip.sysid.export.dynamics import plant_dynamics
+from thermogrip.sysid.identification import Identification
 from thermogrip.sysid.models.network import load_network
 
 CAPACITY, LOSS, HEATER_W, LAMP_W = 4000.0, 2.0, 60.0, 10.0  # J/K, W/K
@@ -66,11 +69,30 @@ def log() -> Log:
 
 
 @pytest.fixture(scope="module", params=["network", "subspace"])
-def plant(request: pytest.FixtureRequest, log: Log, tmp_path_factory: pytest.TempPathFactory) -> Plant:
+def found(
+    request: pytest.FixtureRequest, log: Log, tmp_path_factory: pytest.TempPathFactory
+) -> Identification:
     file = tmp_path_factory.mktemp("lamp") / "tank.toml"
     file.write_text(NETWORK)
     network = load_network(file) if request.param == "network" else None
-    return identify([log], network, models=[request.param], draws=4).plant
+    return identify([log], network, models=[request.param], draws=4)
+
+
+@pytest.fixture(scope="module")
+def plant(found: Identification) -> Plant:
+    return found.plant
+
+
+def test_each_band_of_the_page_is_of_the_size_of_what_it_is_about(found: Identification, log: Log) -> None:
+    sections = identification_sections(found, [log], found.plant, None)
+    charts = [item.chart for section in sections for item in section.parts if isinstance(item, Plot)]
+    panels = [panel for chart in charts for column in chart.columns for panel in column]
+    bands = [(panel, c) for panel in panels for c in panel.curves if c.low is not None and c.high is not None]
+    assert len(bands) == 2
+    for panel, band in bands:
+        drawn = np.concatenate([curve.y for curve in panel.curves])
+        widest = max(float(np.ptp(drawn)), 5.0)  # 20 K at full drive, 5 % of it assumed to vary: 2 K
+        assert np.max(band.high - band.low) < widest, panel.label
 
 
 def test_the_gain_of_a_lamp_is_its_power_over_the_loss(plant: Plant) -> None:
