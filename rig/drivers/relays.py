@@ -93,6 +93,7 @@ class RelayRig:
         self.rig = rig
         self.expires_s = rig.expires_s
         self.has_pump = rig.has_pump
+        self.clear = getattr(rig, "clear", None)  # the latch of a device that has one
         self.relays = dict(relays)
         self._clock = clock
         for relay in self.relays.values():

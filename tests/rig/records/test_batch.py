@@ -17,6 +17,7 @@ import pytest
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.grasp_files import read_grasps
 from thermogrip.datasets.schema import Grasps, make_grasps
+from thermogrip.rig.drivers.relays import Relay, RelayRig
 from thermogrip.rig.guard.guard import Guard
 from thermogrip.rig.guard.trip import Trip
 from thermogrip.rig.interface import DeviceRefusedError
@@ -270,6 +271,9 @@ def test_a_cleared_trip_clears_the_latch_of_the_device(monkeypatch: pytest.Monke
     rig.clear.side_effect = DeviceRefusedError("active", "the cause is still there")
     source.clear()  # the next session says so
     assert rig.clear.call_count == 2
+    rig.units, rig.clear.side_effect = {"q": "percent"}, None
+    batch._Source(lambda: RelayRig(rig, {"q": Relay("q")}, lambda: 0.0)).clear()
+    assert rig.clear.call_count == 3
 
 
 def test_a_trial_that_was_marked_while_it_ran_is_done_again_and_nobody_is_asked(
