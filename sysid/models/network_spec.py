@@ -176,11 +176,12 @@ class Radiation(_Table):
 
 
 class Heater(_Table):
-    """A resistor, or what else brings heat; ``power`` at the ``full_scale`` of its input or disturbance."""
+    """What brings heat, or a load that takes it, of a power below 0; ``power`` at the ``full_scale`` of its
+    input or disturbance."""
 
     node: OfNode
     input: Annotated[Name, Refers("heat")]
-    power: Annotated[Name, Quantity("W")]
+    power: Annotated[Name, Quantity("W", "any")]
 
 
 class Peltier(_Table):

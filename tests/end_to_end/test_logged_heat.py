@@ -136,6 +136,8 @@ def test_a_lamp_joins_no_nodes_and_a_temperature_heats_nothing(log: Log, bench: 
         bench.write("tank.toml", NETWORK.replace(old, new))
         done = bench.run("identify", "tank.csv", "--network", "tank.toml", "--out", "p.json")
         assert (done.code, said in done.said[0]) == (2, True), done.err
+    load = bench.write("load.toml", NETWORK.replace("value = 20.0, sd_log = 1.0", "value = -20.0, sd = 20.0"))
+    assert load_network(load).specs["P_lamp"].value == -20.0  # one that takes heat
 
 
 def test_what_may_be_a_lamp_is_asked_about(log: Log, bench: Bench) -> None:
