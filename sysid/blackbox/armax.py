@@ -8,9 +8,7 @@ C is iterated (variable projection, as in :mod:`thermogrip.sysid.blackbox.output
 
     de/dc_i = - q^-i e / C(q).
 
-Rows before the record enter A y in its first na rows alone, where an impulse each takes them up.  A line
-replaces a lost reading, and rows that need one carry no weight.  The plant keeps B/A, with constant and
-initial conditions fitted to its free run; noise is not simulated.
+The plant keeps B/A; noise is not simulated.
 """
 
 from __future__ import annotations
@@ -33,6 +31,8 @@ def solve_armax(c: Array, records: output_error.Records, nb: int, delay: int) ->
     impulse, step = output_error.responses(c, records)
     columns, right = [], []
     for segment, (y, is_read) in enumerate(zip(records.y, records.known)):
+        # a line replaces a lost reading, and rows that need one carry no weight; rows before the record enter
+        # A y in its first na rows alone, where an impulse each takes them up
         rows = np.arange(len(y))
         whole = np.interp(rows, rows[is_read], y[is_read]) if is_read.any() else np.zeros(len(y))
         late = np.zeros((na, len(y)))
@@ -76,6 +76,7 @@ class ArmaxSearch(output_error.Search):
         best = self._search(records, na, nb, delay, partial(solve_armax, records=records, nb=nb, delay=delay))
         if best is None or not output_error.is_stable(best.shared[:na]):
             return None
+        # constant and initial conditions are fitted to the free run
         b = best.shared[na:-1].reshape(-1, nb)
         return output_error.fit_rest(
             output_error.Filter(best.shared[:na], b, 0.0, delay, np.zeros((len(records.y), na))), records

@@ -3,12 +3,8 @@
     y[k] = sum_i A_i y[k - i] + sum_l B_l w[k - n_k - l] + c + e[k],     i, l = 1..n or 0..n-1,  n_k >= 1,
 
 w are inputs, disturbances and products of inputs (``|drive|``: a Peltier element heats and cools unequally;
-``drive*drive``: Joule heat).  It is one linear regression: the normal equations of the largest structure
-hold those of all smaller ones, and several logs only add rows.  Rows that would reach across a gap or use a
-lost reading are left out.
-
-Noise on the *regressors* pulls the poles towards fast ones, the more the finer the sampling: hence block
-averages first, and a choice by free run.
+``drive*drive``: Joule heat).  Noise on the *regressors* pulls the poles towards fast ones, the more the finer
+the sampling: hence block averages first, and a choice by free run.
 """
 
 from __future__ import annotations
@@ -89,6 +85,8 @@ def arx_family(
 
 def _regress(grid: Grid, terms: tuple[str, ...], deep: int) -> _Regression | None:
     """Form X'X and X'Y, columns [y lags | w lags | 1], every lag from 1 to one depth."""
+    # the normal equations of the largest structure hold those of all smaller ones; several logs only add
+    # rows, and rows that would reach across a gap or use a lost reading are left out
     blocks, targets = [], []
     for segment, w in zip(grid.segments, drives(grid, terms)):
         y, n = segment.y, len(segment.y)

@@ -8,8 +8,7 @@ by the Yule-Walker equations, its order by the Bayesian information criterion, s
 (generalised least squares, [1]_ chapter 7).  One D an output serves all structures: it is that of the largest
 one.
 
-The plant keeps G alone: noise is not simulated.  So c and the initial conditions, which D nearly removes
-where the noise is slow, are fitted to the readings themselves.
+The plant keeps G alone: noise is not simulated.
 
 References
 ----------
@@ -47,6 +46,7 @@ def with_noise(found: Filter, records: Records) -> Filter:
             break
         solve_at = partial(solve, records=white, nb=nb, delay=found.delay)
         better = refine(start, white, solve_at).filter(white, nb, found.delay)
+        # D nearly removes c and the initial conditions where the noise is slow: the readings give them
         found, misses = fit_rest(better, records)
     return found
 

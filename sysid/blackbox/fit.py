@@ -1,17 +1,13 @@
 """Black-box fits: choose a structure, fit it to all logs, resample it to see how certain it is.
 
 The kinds (:data:`BLACK_BOXES`) differ in the family of models
-(:class:`thermogrip.sysid.blackbox.order_selection.Family`).  Where the averaging is not prescribed, both the
-averaged rate and the logs' own are tried: a coarse converter calls for the former, a delay for the latter.
-The step that subspace models choose serves the other kinds as well (14 public logs: no choice differs).
+(:class:`thermogrip.sysid.blackbox.order_selection.Family`).
 
 **Uncertainty: dependent wild bootstrap** [1]_.  A black box has no parameters whose prior and likelihood
 could be written down, and its errors are not white.  So the chosen structure is fitted anew to readings that
 might have been: the free run of the fit plus its error times a random course w of mean 0, variance 1 and the
 correlation exp(-(t - s)^2 / l^2), l longer than the errors are correlated.  The spread of the refits
-estimates how the fit would differ had the same rig been logged again.  The structure is not chosen again:
-held-out free runs show how good it is.  Refits whose free run over all logs errs more than 1.5 times
-as much as that of the fit do not agree with the logs and are rejected.
+estimates how the fit would differ had the same rig been logged again.
 
 References
 ----------
@@ -132,7 +128,7 @@ def fit_black_box(
     best: tuple[float, Grid, Choice] | None = None
     refused: UserError | None = None
     if grid is not None and kind not in _AVERAGED:
-        grids = [grid]
+        grids = [grid]  # what subspace models chose serves the others (14 public logs: no choice differs)
     else:
         grids = _grids(kind, logs, inputs, outputs, disturbances, average)
     # of few rows a search of its own for each part takes little, and may find another optimum
@@ -168,6 +164,7 @@ def _grids(
 ) -> list[Grid]:
     """Return the logs at the steps that are tried: the averaged one and the logs' own, or where that is the
     logs' own, five times it too."""
+    # a coarse converter calls for the averaged rate, a delay for the logs' own
     first = make_grid(logs, inputs=inputs, outputs=outputs, disturbances=disturbances, average=average)
     rows = sum(len(segment.time) for segment in first.segments) * first.dt / first.native
     if average is not None or kind in _AVERAGED or rows > MANY_ROWS:
@@ -259,6 +256,8 @@ def with_refits(
             _resampled(fit.grid.segments, misses, max(_MEMORY_ROWS, rows // _MEMORIES), rng)
         )
         model, tried = family(drawn, only=(fit.choice.structure,)).get(fit.choice.structure), tried + 1
+        # the structure is not chosen again, for held-out runs show how good it is; a refit that errs far more
+        # over the logs than the fit does not agree with them
         if model is not None and _error(fit, model) <= most:
             refits.append(model)
     if len(refits) < n:

@@ -6,8 +6,7 @@ unit spread,
     y[k+1] = y[k] + Xi' Theta(z[k]),
 
 Theta all monomials up to a degree, and Xi sparse: sequentially thresholded least squares (STLSQ; Brunton,
-Proctor, Kutz) drops what is smaller than a threshold, refits, and repeats.  The increment is fitted rather
-than the next value, so that the threshold weighs what moves the plant and not its persistence.
+Proctor, Kutz) drops what is smaller than a threshold, refits, and repeats.
 
 Degree, threshold and memory are chosen by held-out free run; an equation whose simulation leaves ten times
 the range of the data is refused.
@@ -99,6 +98,7 @@ def _features(grid: Grid, degree: int, memory: int) -> _Features | None:
 def _fit_terms(grid: Grid, terms: _Features, threshold: float) -> SindyModel | None:
     import pysindy
 
+    # the increment and not the next value: so the threshold weighs what moves the plant, not its persistence
     theta, move = terms.theta, terms.move
     weight = np.maximum(move.std(axis=0), 1e-12)
     if len(theta) < 2 * theta.shape[1]:

@@ -24,10 +24,6 @@ output linearly, so they are a least-squares fit of the free run, not of one ste
 
 H_K and G_K strictly lower triangular.  The e of a row depends on none of what it is regressed on, even where
 w was fed back from y; PO-MOESP and CVA are biased by feedback.
-
-Several logs are side by side in the Hankel matrices; a window that touches a gap or a lost reading is left
-out. Where less than half of the windows are whole, short holes are lines
-(:func:`thermogrip.sysid.plant.log_grid.whole_readings`); B, E and the rest are fitted to what was read alone.
 """
 
 from __future__ import annotations
@@ -198,6 +194,8 @@ Triangles = WeakKeyDictionary[Segment, dict[tuple[int, tuple[str, ...], bool], _
 
 def _triangle(grid: Grid, f: int, terms: tuple[str, ...], triangles: Triangles) -> Array | None:
     """Return R of the QR of all windows, signals at unit spread; None with too few windows."""
+    # Several logs are side by side in the Hankel matrices; a window that touches a gap or a lost reading is
+    # left out.  Where less than half of the windows are whole, short holes are lines.
     readings = whole_readings(grid.segments, 2 * f)
     whole = np.hstack([np.concatenate(drives(grid, terms)), np.concatenate(readings)])
     mean, size = np.nanmean(whole, axis=0), np.nanstd(whole, axis=0)
