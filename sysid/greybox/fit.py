@@ -35,7 +35,7 @@ from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.log_files import Logs
 from thermogrip.datasets.parallel import Progress
-from thermogrip.datasets.schema import Log, log_name
+from thermogrip.datasets.schema import Log, columns, log_name
 from thermogrip.sysid.data.data_quality import reading_excess
 from thermogrip.sysid.greybox.identifiability import describe
 from thermogrip.sysid.greybox.problem import Problem, make_problem, start_seconds
@@ -203,14 +203,7 @@ def fit_network(
     report(0.0, "preparing the model")
     signals = (*model.inputs, *model.disturbances, *model.outputs)
     rows = [rows_of(log, model.inputs, model.outputs, model.disturbances) for log in logs]
-    logged = dict(
-        zip(
-            signals,
-            np.concatenate(
-                [np.hstack([signals_of_log.u, signals_of_log.d, signals_of_log.y]) for signals_of_log in rows]
-            ).T,
-        )
-    )
+    logged = dict(zip(signals, np.concatenate([columns(log, signals) for log in logs]).T))
     spread = {name: float(np.nanstd(logged[name])) for name in model.outputs}
     runs = partial(free_runs, logs)
     model = model.prepared(runs, spread)

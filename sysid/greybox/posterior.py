@@ -441,9 +441,8 @@ def with_draws(
     if intervals is not None and intervals.numbers is not None and problem.names == tuple(plant.logs):
         numbers = ErrorModel(**vars(intervals.numbers))  # the fit has learnt it already
     target = RandomizedMap(problem, z, score_covariance(problem, z, numbers=numbers))
-    free_columns = [problem.model.parameters.index(name) for name in plant.free]
-    drawn = problem.parameters(target.draws(n, seed=seed, progress=progress))[:, free_columns]
-    return replace(plant, samples=drawn)
+    drawn = problem.parameters(target.draws(n, seed=seed, progress=progress))
+    return replace(plant, samples=drawn[:, list(problem.free)])
 
 
 def fit_problem(plant: Plant, logs: Sequence[Log]) -> Problem:
@@ -495,12 +494,11 @@ def _record(
 ) -> Posterior:
     """Return the record, in natural units."""
     names = tuple(plant.free[i] for i in sampled)
-    free_columns = [problem.model.parameters.index(name) for name in plant.free]
     full = np.tile(z, (*chain.steps.shape[:2], 1))
     full[..., list(sampled)] = chain.steps
-    steps = problem.parameters(full.reshape(-1, z.size))[:, [free_columns[i] for i in sampled]]
+    steps = problem.parameters(full.reshape(-1, z.size))[:, [problem.free[i] for i in sampled]]
     drawn = replace(chain, steps=steps.reshape(chain.steps.shape))
-    samples = problem.parameters(whole)[:, free_columns]
+    samples = problem.parameters(whole)[:, list(problem.free)]
     low, mid, high = np.quantile(samples, [0.05, 0.5, 0.95], axis=0)
     length = len(chain.steps) / float(np.max(chain.tau))
     verdict = f"{'converged' if chain.converged else 'not converged'}: {length:.0f} autocorrelation times"

@@ -21,11 +21,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from thermogrip.datasets.arrays import Array, Mask
+from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log, log_name
 from thermogrip.sysid.models.model import GreyModel
-from thermogrip.sysid.models.network_spec import Parameter
 from thermogrip.sysid.plant.log_grid import Stretch, cut_stretches
 from thermogrip.sysid.plant.plant import Plant
 from thermogrip.sysid.plant.simulation import Start, find_starts, predict
@@ -75,28 +74,20 @@ class Problem:
     @property
     def box(self) -> tuple[Array, Array]:
         """Lower and upper bounds of z, each (n_free,)."""
-        ends = np.array([spec.bounds for spec in self._free_specs], dtype=float)
-        logs = np.array([spec.scale == "log" for spec in self._free_specs])
-        theta = np.where(logs[:, None], np.log(np.where(logs[:, None], np.maximum(ends, 1e-300), 1.0)), ends)
-        z = (theta - self._centre[:, None]) / self.width[:, None]
-        return z[:, 0], z[:, 1]
+        ends = np.array([self.plant.bounds[name] for name in self.plant.free], dtype=float).reshape(-1, 2)
+        low, high = (self.plant.on_scale(ends.T) - self.plant.theta) / self.width
+        return low, high
 
     def parameters(self, z: Array) -> Array:
         """Return p (k, n_p) for z (k, n_free)."""
         p = np.repeat(self.plant.p[None], len(z), axis=0)
-        theta = self._centre + z * self.width
-        p[:, list(self.free)] = np.where(self._log, np.exp(np.where(self._log, theta, 0.0)), theta)
+        p[:, list(self.free)] = self.plant.natural(self.plant.theta + z * self.width)
         return p
 
     def standard(self, values: Mapping[str, float]) -> Array:
         """Return z (n_free,) of parameters by name, inside the box; 0, the prior, for what is not named."""
-        out = np.zeros(len(self.free))
-        for k, i in enumerate(self.free):
-            value = values.get(self.model.parameters[i])
-            if value is not None:
-                theta = np.log(max(value, 1e-300)) if self._log[k] else value
-                out[k] = (theta - self._centre[k]) / self.width[k]
-        return np.asarray(np.clip(out, *self.box))
+        named = np.array([values.get(name, self.plant.values[name]) for name in self.plant.free])
+        return np.asarray(np.clip((self.plant.on_scale(named) - self.plant.theta) / self.width, *self.box))
 
     def start(self, z: Array) -> list[list[Start]]:
         """Return the starts of all stretches at z."""
@@ -168,22 +159,10 @@ class Problem:
         return self._starts.linearised
 
     @property
-    def _free_specs(self) -> list[Parameter]:
-        specs = list(self.model.specs.values())
-        return [specs[i] for i in self.free]
-
-    @property
-    def _log(self) -> Mask:
-        return np.array([spec.sd_log is not None for spec in self._free_specs], dtype=bool)
-
-    @property
-    def _centre(self) -> Array:
-        return np.array([s.value if s.sd_log is None else float(np.log(s.value)) for s in self._free_specs])
-
-    @property
     def width(self) -> Array:
         """Prior sd of theta, (n_free,)."""
-        return np.array([spec.sd_log or spec.sd for spec in self._free_specs], dtype=float)
+        specs = (self.model.specs[name] for name in self.plant.free)
+        return np.array([spec.sd_log or spec.sd for spec in specs], dtype=float)
 
 
 def prior_plant(model: GreyModel) -> Plant:

@@ -164,12 +164,15 @@ class PlantData:
     @property
     def theta(self) -> Array:
         """The free parameters (n_free,) as ``covariance`` has them: logarithms of the ``"log"`` ones."""
-        natural = np.array([self.values[name] for name in self.free], dtype=float)
+        return self.on_scale(np.array([self.values[name] for name in self.free], dtype=float))
+
+    def on_scale(self, natural: Array) -> Array:
+        """Return free parameters (..., n_free) on the scale of ``theta``."""
         logs = self.log_scaled
-        return np.where(logs, np.log(np.where(logs, natural, 1.0)), natural)
+        return np.where(logs, np.log(np.where(logs, np.maximum(natural, 1e-300), 1.0)), natural)
 
     def natural(self, theta: Array) -> Array:
-        """Return the free parameters (n_free,) in their units, wherever ``theta`` is."""
+        """Return the free parameters (..., n_free) in their units, wherever ``theta`` is."""
         return np.where(self.log_scaled, np.exp(np.where(self.log_scaled, theta, 0.0)), theta)
 
     def _inside(self, theta: Array) -> Array:
