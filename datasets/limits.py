@@ -72,7 +72,9 @@ def check_size(size: int, *, file: str | Path, what: str = "is", share: int = 1)
     most = most_bytes(share)
     if size > most:
         problem = f"{what} {_megabytes(size)}, more than the {_megabytes(most)} of a file"
-        raise UserError(problem, file=file, hint=_raise_hint(share * size))
+        enough = max(1, -(-share * size // _MB))
+        hint = f"if it is what you want to read, set {LIMIT_VARIABLE}={enough}"
+        raise UserError(problem, file=file, hint=hint if enough <= 1e9 else "write it anew")
 
 
 def check_unpacked(packed: int, unpacked: int, *, file: str | Path, what: str = "unpacks to") -> None:
@@ -225,13 +227,6 @@ def _chosen() -> int | None:
     if not 1 <= size <= 1e9:
         raise UserError(f"{LIMIT_VARIABLE} is {text!r}", hint="set it to a number of MB, such as 4096")
     return int(size) * _MB
-
-
-def _raise_hint(size: int) -> str:
-    """Return what lets a file of this size through."""
-    if size > 1e9 * _MB:
-        return "write it anew"
-    return f"if it is what you want to read, set {LIMIT_VARIABLE}={max(1, -(-size // _MB))}"
 
 
 def _megabytes(size: float) -> str:

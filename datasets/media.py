@@ -31,7 +31,7 @@ _MARKDOWN = re.compile(r"[\\`\[\]<>|*#!]")
 
 def printable(text: str) -> str:
     r"""Return text with every control character written out."""
-    return _CONTROL.sub(_written_out, text)
+    return _CONTROL.sub(lambda found: found[0].encode("unicode_escape").decode(), text)
 
 
 def without_password(address: str) -> str:
@@ -88,11 +88,6 @@ def panels(
         axis.grid(True, lw=0.4, color="#e6eaef")
         axis.set_axisbelow(True)
     return figure, axes
-
-
-def _written_out(found: re.Match[str]) -> str:
-    code = ord(found[0])
-    return f"\\x{code:02x}" if code < 256 else f"\\u{code:04x}"
 
 
 class Shown:

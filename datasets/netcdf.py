@@ -61,8 +61,12 @@ def _open_dataset(path: Path) -> xr.Dataset:
 
     check_netcdf(path)
     options: dict[str, Any] = {"engine": "h5netcdf", "decode_times": False, "decode_timedelta": False}
-    with _not_damaged(path), xr.open_dataset(path, **options) as data:
-        return _of_versions(_text_as_str(data.load()))
+    with _not_damaged(path), xr.open_dataset(path, **options) as opened:
+        data = _text_as_str(opened.load())
+    if "grasp_id" in data.variables and data["grasp_id"].dims == ("grasp",) and "grasp" not in data.variables:
+        # version 0.2 had the names of grasps there
+        data = data.assign_coords(grasp=data["grasp_id"].astype(str).values).drop_vars("grasp_id")
+    return data
 
 
 def _not_damaged(path: str | Path) -> AbstractContextManager[None]:
@@ -152,11 +156,3 @@ def _text_as_str(data: xr.Dataset) -> xr.Dataset:
     """Turn the object arrays that variable-length text is read as into arrays of str."""
     texts = [key for key, variable in data.variables.items() if variable.dtype.kind in "OS"]
     return data.assign({key: data[key].astype(str) for key in texts})
-
-
-def _of_versions(data: xr.Dataset) -> xr.Dataset:
-    """Return the record that a file holds; one of version 0.2 has the names of grasps elsewhere."""
-    if "grasp_id" in data.variables and data["grasp_id"].dims == ("grasp",) and "grasp" not in data.variables:
-        names = data["grasp_id"].values.astype(str)
-        data = data.drop_vars("grasp_id").assign_coords(grasp=("grasp", names))
-    return data

@@ -404,7 +404,9 @@ def recover(folder: str | Path) -> Recovery:
     samples, events = path / "samples.csv", path / "events.jsonl"
     for name, whole in ((samples.name, _read_samples(samples).whole), (events.name, _events(events)[1])):
         if whole.lost:
-            damaged_name = _keep(path / name)
+            copies = (f"{name}.damaged" + ("" if k == 1 else f"-{k}") for k in count(1))
+            damaged_name = next(copy for copy in copies if not (path / copy).exists())
+            write_atomic(path / damaged_name, read_bytes(path / name))
             findings.append(f"{name} as it was found is kept as {damaged_name}")
             write_atomic(path / name, b"".join(line + b"\n" for line in whole.lines))
     verdict = run.about.get("verdict", "running")
@@ -544,11 +546,3 @@ def _rooms(header: list[str], events: tuple[Event, ...]) -> frozenset[str]:
         if isinstance(recorded, list)
         else room_sensors(readings)
     )
-
-
-def _keep(path: Path) -> str:
-    """Copy a file beside itself, byte for byte, under a name that is free; return the name."""
-    names = (f"{path.name}.damaged" + ("" if k == 1 else f"-{k}") for k in count(1))
-    name = next(name for name in names if not (path.parent / name).exists())
-    write_atomic(path.parent / name, read_bytes(path))
-    return name

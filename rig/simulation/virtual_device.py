@@ -12,6 +12,7 @@ import threading
 from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from random import Random
 from typing import Any
 
@@ -243,7 +244,10 @@ class VirtualDevice:
         self._start, self._next_ms = self._clock(), 0
         self.ordered = -float("inf")
         self._rng = Random(seed)
-        self._link = _link(link, socket_port)
+        cables = {"pty": PtyLink, "socket": partial(SocketLink, socket_port), "none": lambda: None}
+        if link not in cables:
+            raise ValueError(f"link {link!r} is none of {', '.join(cables)}")
+        self._link: PtyLink | SocketLink | None = cables[link]()
         self._lock = threading.RLock()
         self._cable = threading.Lock()  # of who reads, writes, pulls or plugs
         self._stop = threading.Event()
@@ -358,20 +362,19 @@ class VirtualDevice:
                 self._stop.wait(_POLL_S)
                 self.exchange(b"")
                 continue
+            patience_s = _POLL_S
+            if isinstance(
+                self._clock, ScaledClock
+            ):  # not beyond the next sample, whose work holds up an answer
+                with self._lock:
+                    remaining_s = (self._due() / 1000 - self.time) / self._clock.speed
+                patience_s = min(_POLL_S, max(0.0, remaining_s))
             with self._cable:
-                heard = b"" if self.is_pulled else self._link.read(self._patience())
+                heard = b"" if self.is_pulled else self._link.read(patience_s)
             answer = self.exchange(heard)
             with self._cable:
                 if answer and not self.is_pulled:
                     self._link.write(answer)
-
-    def _patience(self) -> float:
-        """Return how long to listen: not beyond the next sample, or its work would hold up an answer [s]."""
-        if not isinstance(self._clock, ScaledClock):
-            return _POLL_S
-        with self._lock:
-            remaining_s = self._due() / 1000 - self.time
-        return min(_POLL_S, max(0.0, remaining_s / self._clock.speed))
 
     def _pull_or_plug(self, *, pull: bool) -> None:
         """Pull the cable or plug it in, between two reads of the thread that serves."""
@@ -456,9 +459,3 @@ def example_plant(protocol: str = "thermogrip", *, room: float | None = None) ->
     if protocol == "tclab":
         values |= _BOARD | ({} if room is None else {"t_room": room})
     return Plant(model, values, dt=model.dt, units=dict(model.units))
-
-
-def _link(kind: str, socket_port: int) -> PtyLink | SocketLink | None:
-    if kind not in ("pty", "socket", "none"):
-        raise ValueError(f"link {kind!r} is none of pty, socket, none")
-    return None if kind == "none" else PtyLink() if kind == "pty" else SocketLink(socket_port)
