@@ -244,10 +244,11 @@ class VirtualDevice:
         self._start, self._next_ms = self._clock(), 0
         self.ordered = -float("inf")
         self._rng = Random(seed)
+        cables: dict[str, Callable[[], PtyLink | SocketLink | None]]
         cables = {"pty": PtyLink, "socket": partial(SocketLink, socket_port), "none": lambda: None}
         if link not in cables:
             raise ValueError(f"link {link!r} is none of {', '.join(cables)}")
-        self._link: PtyLink | SocketLink | None = cables[link]()
+        self._link = cables[link]()
         self._lock = threading.RLock()
         self._cable = threading.Lock()  # of who reads, writes, pulls or plugs
         self._stop = threading.Event()
