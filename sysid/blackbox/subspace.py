@@ -94,18 +94,22 @@ def _realised(
 ) -> dict[tuple[int, str, int], StateSpaceModel]:
     """Return the models of these block rows, weightings and orders."""
     out: dict[tuple[int, str, int], StateSpaceModel] = {}
+    n_y, scale = len(grid.outputs), np.maximum(grid.output_spread(), 1e-9)
+    longest = max(len(segment.time) for segment in grid.segments)
     for f in dict.fromkeys(f for f, _, _ in wanted):
         triangle = _triangle(grid, f, terms, triangles)
         if triangle is None:
             continue
-        n_y = len(grid.outputs)
         for weighting in dict.fromkeys(w for size, w, _ in wanted if size == f):
             if weighting == "parsim":
                 gamma = predictor_observability(triangle, f, n_y)
             else:
                 gamma = extended_observability(*_factorise(triangle, f, n_y), weighting=weighting)
             for n in (n for size, w, n in wanted if (size, w) == (f, weighting) and n < gamma.shape[1]):
-                out[f, weighting, n] = _realise(grid, gamma[:, :n], terms)
+                before, after = gamma[:-n_y, :n], gamma[n_y:, :n]
+                shift = np.asarray(np.linalg.lstsq(before, after, rcond=None)[0], dtype=float)
+                A = stabilised(shift, longest)
+                out[f, weighting, n] = fit_inputs(grid, A, gamma[:n_y, :n] * scale[:, None], terms)
     return out
 
 
@@ -157,15 +161,6 @@ def _unit_responses(drive: Array, A: Array, C: Array) -> Array:
     pushes, nothing = push.reshape(-1, rows - 1, n), np.zeros((1, rows - 1, 0))
     runs = run_linear(np.ascontiguousarray(A.T)[None], nothing, pushes, starts.reshape(-1, n), 1)
     return np.asarray(np.moveaxis(runs.reshape(n_y, len(w), rows, n), 1, 2).reshape(n_y, rows, -1))
-
-
-def _realise(grid: Grid, gamma: Array, terms: tuple[str, ...]) -> StateSpaceModel:
-    """Return the model of these columns of Gamma."""
-    n_y = len(grid.outputs)
-    A = np.asarray(np.linalg.lstsq(gamma[:-n_y], gamma[n_y:], rcond=None)[0], dtype=float)
-    A = stabilised(A, max(len(segment.time) for segment in grid.segments))
-    C = gamma[:n_y] * np.maximum(grid.output_spread(), 1e-9)[:, None]
-    return fit_inputs(grid, A, C, terms)
 
 
 def stabilised(A: Array, rows: int) -> Array:

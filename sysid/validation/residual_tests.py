@@ -110,10 +110,11 @@ def residual_correlations(
     start_share: dict[str, float] = {}
     for j, name in enumerate(plant.outputs):
         means = partial(_block_means, block=block, read=read[:, j])
+        modes = starts[j] @ np.linalg.eigh(starts[j].T @ starts[j])[1] / rms[j]
         null = _Null.of(
             block=np.unique(block[read[:, j]]),
             residual=means(residual[:, j] / rms[j]),
-            starts=_modes(starts[j] / rms[j]),
+            starts=modes[:, np.abs(modes).max(axis=0, initial=0.0) > _SCORE_TEST.least_start],
             drawn=means(drawn[:, j] / rms[j]),
         )
         start_share[name] = null.start_share()
@@ -195,11 +196,6 @@ def _start_changes(
                 means = _block_means(change[:, :, j].T, block[stretch.rows], read[stretch.rows, j])
                 columns[j][inside, first : first + len(moved)] = means
     return columns
-
-
-def _modes(starts: Array) -> Array:
-    modes = starts @ np.linalg.eigh(starts.T @ starts)[1]
-    return np.asarray(modes[:, np.abs(modes).max(axis=0, initial=0.0) > _SCORE_TEST.least_start])
 
 
 def _signals(plant: Plant, stretches: Sequence[Stretch], run: Array, width: float) -> dict[str, Array]:
