@@ -18,13 +18,6 @@ what vectors cannot say (sorting, a function of SciPy) NumPy runs on whole batch
 **In time.**  With dx/dt = f(x, u, d, p) and u, d held over a step, each step of the simulation is cut into n
 pieces, each a step of the classical Runge-Kutta rule of fourth order, after which a state with limits is put
 back inside them.  :meth:`OwnModel.prepared` doubles n until that changes the logs' simulations little.
-
-**The state at rest** of a class that has no ``rest`` of its own is the state x that some input v near u holds
-still and whose outputs read y,
-
-    min  |T f(x, v) / s|^2 + w_y |(output(x) - y) / sd|^2 + w_u |(v - u) / range|^2,
-
-inside the limits, with s the class's spread of each state and T the seconds of a warm-up.
 """
 
 from __future__ import annotations
@@ -350,6 +343,9 @@ def still(code: OwnCode, y: Array, u: Array, d: Array, p: Array, *, sd: Array, s
     wide = np.array([ends[1] - ends[0] if ends else 1.0 for ends in ranges])
     moved = np.array([not item.switch for item in code.inputs.values()], dtype=bool)
 
+    # the state x, inside the limits, that some input v near u holds still and whose outputs read y, with s
+    # the class's spread of each state and T the seconds of a warm-up: min |T f(x, v) / s|^2 + w_y |(output(x)
+    # - y) / sd|^2 + w_u |(v - u) / range|^2
     def residuals(z: Array) -> Array:
         """Return the residuals (n_r,) at states, then inputs, in units of their scale."""
         x, v = z[:n_x] * scale, np.where(moved, z[n_x:] * wide, u)

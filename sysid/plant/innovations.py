@@ -11,9 +11,6 @@ are kept whose likelihood is greatest,
 
     -2 log L = sum_k log det S + e_k' S^-1 e_k   [1]_.
 
-The gains are those that the filter settles at, with the plant linearised once, amid the logs; predictions are
-the plant's own.
-
 References
 ----------
 .. [1] K. J. Astrom, "Maximum likelihood and prediction error methods", Automatica 16(5), 1980.
@@ -100,6 +97,7 @@ class _Filter:
         gains, spreads = [], []
         for q, b in ratios:
             drift = dt * block_diag(q**2 * states, b**2 * inputs)
+            # the gains that the filter settles at; predictions are the plant's own
             P = solve_discrete_are(self.F.T, self.H.T, drift + trace, np.diag(sd**2))
             S = self.H @ P @ self.H.T + np.diag(sd**2)
             gains.append(np.linalg.solve(S, self.H @ P).T)

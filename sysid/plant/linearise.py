@@ -5,13 +5,8 @@ About inputs u0, disturbances d0 and a state x0, by default the one in which the
     x = x0 + dx,  w = (u0, d0) + dw,  y = y0 + dy:      dx+ = A dx + B dw,   dy = C dx        (step dt)
                                                   or   dx/dt = A dx + B dw,  dy = C dx        (continuous).
 
-Matrices are central differences, exact for anything bilinear.  A switch stays where it is put.  Where a drive
-of a Peltier heats and cools with different gains the model at zero is the mean of the two.
-
-**Discrete** at a whole multiple of the plant's step, inputs held (zero-order hold): the plant's own
-arithmetic, n steps composed.  **Continuous**: the heat balance itself for a network, the class's ``rhs`` for
-a model of the user's own, and for a black box the logarithm of [[A, B], [0, 1]] over its step, which undoes
-the hold; a delay (a pole at zero) has no such logarithm and is refused.
+A switch stays where it is put.  Discrete is at a whole multiple of the plant's step, inputs held (zero-order
+hold): the plant's own arithmetic, n steps composed.
 
 python-control and scipy are handed these; CasADi one step of the plant itself, with exact derivatives.
 """
@@ -223,6 +218,8 @@ def _jacobians(
     function: Callable[[Array, Array, Array], Array], x: Array, u: Array, d: Array, moved: Sequence[int]
 ) -> tuple[Array, Array]:
     """Return central differences of function(x, u, d) by x, and by moved inputs and disturbances."""
+    # exact for anything bilinear; where a drive of a Peltier heats and cools with different gains the slope
+    # at zero is the mean of the two
     point, ends = np.concatenate([x, u, d]), [x.size, x.size + u.size]
     columns = [*range(x.size), *(x.size + k for k in moved), *range(ends[1], point.size)]
     size = LINEAR.difference_step * np.maximum(1.0, np.abs(point[columns]))
@@ -261,6 +258,8 @@ def composed(A: Array, B: Array, n: int) -> tuple[Array, Array]:
 def _continuous(
     plant: PlantData, x: Array, u: Array, d: Array, moved: Sequence[int], A: Array, B: Array
 ) -> tuple[Array, Array]:
+    # of a network the heat balance itself, of a class its rhs, of a black box the logarithm of [[A, B], [0,
+    # 1]] over its step, which undoes the hold; a delay (a pole at zero) has none
     rate = _rate(plant)
     if rate is not None:
         return _jacobians(rate, x, u, d, moved)

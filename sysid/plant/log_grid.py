@@ -12,9 +12,7 @@ rig that says of an input what was applied up to the row (``ends``) are moved by
 samples over [t_k - dt/2, t_k + dt/2], so that it is not shifted in time; where the grid is the log's own,
 the samples stand as they are.  A reading lost while the input is known stays NaN.
 
-**Roles and units** of a model at hand are used (:func:`match_logs`).  Shares of full scale come as ``1`` (-1
-to 1), ``percent`` or ``0_255`` and are converted; values beyond 1 tell a column without a unit to be in the
-model's own.  Any other difference of units is refused.
+**Roles and units** of a model at hand are used (:func:`match_logs`).
 """
 
 from __future__ import annotations
@@ -558,6 +556,8 @@ def match_logs(model: Signals, logs: Logs, *, keep_others: bool = False) -> tupl
 def _converted(model: Signals, name: str, unit: str, largest: float, log: str) -> tuple[float, str] | None:
     """Return a signal's factor to the model's unit and a note (None where it is in it), given the ``largest``
     size of its values in all logs; refuse another unit."""
+    # Shares of full scale come as 1 (-1 to 1), percent or 0_255 and are converted; values beyond 1 tell a
+    # column without a unit to be in the model's own.  Any other difference of units is refused.
     want = model.units.get(name)
     if want is None or unit == want:
         return None

@@ -1,20 +1,11 @@
 """Free run of a plant over a log: the start, the gaps.
 
 **Start.**  What a log does not say is estimated from its warm-up, the first few seconds, and from nothing
-later:
+later: x0 = x_rest + s with s ~ N(0, P) and sensor offsets o ~ N(pooled, q^2), but for a log that starts at
+rest.
 
-* A log that starts *at rest* (all sensors within 1 K of each other, the ambient among them) was uniformly
-  at the temperature T0 of the reference sensor.  What the other sensors read beside T0 is their offset in
-  this log.
-* Any other start is x0 = x_rest + s with s ~ N(0, P) and sensor offsets o ~ N(pooled, q^2).  The readings
-  of the warm-up are linear in (s, o) to first order, so their estimate is a ridge regression, done twice.
-  The warm-up counts as one independent reading every 10 s, for the model's error is not white.
-  Where the fit found that a log's own offset fades, it falls from the middle of the warm-up
-  on as exp(-t / plant.offset_memory) to the pooled one.
-
-**Gaps.**  Over a gap of more than 10 s the input is unknown.  It is taken to have changed once, from the row
-before to the row after, at a time chosen by the warm-up after the gap; the state propagated to there is
-then corrected like a start.  The 60 s after it are not scored.  ``gaps="hold"`` holds the last row instead.
+**Gaps.**  Over a gap of more than 10 s the input is unknown, and the 60 s after it are not scored.
+``gaps="hold"`` holds the last row instead.
 """
 
 from __future__ import annotations
@@ -50,7 +41,7 @@ class StartSettings:
 
 START = StartSettings()
 
-READING_EVERY = 10.0  # [s] between independent readings of a warm-up
+READING_EVERY = 10.0  # [s] between independent readings of a warm-up, for the model's error is not white
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,6 +65,7 @@ class Start:
         """Return the offset (n, n_y) at seconds ``time`` of the stretch; (n_y,) of one that lasts."""
         if np.isinf(self.memory):
             return self.y_offset
+        # where the fit found that a log's own offset fades, it does to the pooled one
         lost = -np.expm1(-np.maximum(time - self.warm, 0.0) / self.memory)
         return np.asarray(self.y_offset - self.fading * lost[:, None])
 
@@ -184,6 +176,8 @@ def _start_level(plant: PlantData, stretch: Stretch, warmup: float) -> _LevelSta
     early = stretch.time <= seconds
     if not np.isfinite(stretch.y[early]).any(axis=0).all():
         return None
+    # at rest all sensors, the ambient's among them, read the same, the temperature of the reference sensor:
+    # what another reads beside it is its offset in this log
     y = np.nanmean(stretch.y[early], axis=0)
     d = stretch.d[: max(1, round(seconds / plant.dt))].mean(axis=0)
     if np.ptp(np.concatenate([y, d])) > START.rest_band:
@@ -200,6 +194,7 @@ def _corrected(
     root = symmetric_root(plant.model.spread)
     size = np.linalg.norm(root, axis=0)  # its columns are orthogonal
     along = np.divide(root, size**2, out=np.zeros_like(root), where=size > START.rounding * size.max())
+    # readings of the warm-up are linear in (s, o) to first order: a ridge regression, done twice
     for _ in range(2):
         residual, response = _warm(plant, p, stretch, start, start.x0[None], warmup)
         offsets_of_bin = np.diag(free / _reading_sd(plant, stretch, warmup))
@@ -231,6 +226,8 @@ def _after_gap(
     runs = plant.model.rollout(
         start.x0[None], before.u[None], before.d[None] - start.d_offset, p[None], plant.dt
     )
+    # the input is taken to have changed once, from the row before to the row after, when the warm-up after
+    # the gap fits best; the state propagated to there is corrected like a start
     same = np.array_equal(before.u[-1], stretch.u[0])
     most = max(2, START.change_steps // max(1, round(stretch.gap / plant.dt)))
     count = min(int(np.ceil(2 * stretch.gap)) + 1, most)
