@@ -49,12 +49,16 @@ def _bundled() -> dict[str, Material]:
     for row in csv.DictReader(io.StringIO(text)):
         k, rho, c_p = (float(row[key]) for key in ("k", "rho", "c_p"))
         materials[row["name"]] = Material(
-            row["name"], k, rho, c_p,
+            row["name"],
+            k,
+            rho,
+            c_p,
             effusivity=math.sqrt(k * rho * c_p),
             effusivity_sd_ln=float(row["effusivity_sd_percent"]) / 100,
-            source=row["source"], kind=row["kind"],
+            source=row["source"],
+            kind=row["kind"],
             aliases=tuple(filter(None, row["aliases"].split(";"))),
-        )  # fmt: skip
+        )
     return materials
 
 

@@ -26,12 +26,10 @@ _SUFFIXES = " ".join(f"_{unit}" for unit in UNITS)
 _TIME_UNITS, _TEMPERATURE_UNITS = ("s", "ms", "min"), ("degC", "K", "degF")
 
 # suffix as people write it -> unit, "" where the toolkit has none, and the factor to it
-_SPELT = {
-    "degC": "C celsius Celsius deg degCelsius", "degF": "F fahrenheit Fahrenheit", "K": "degK kelvin Kelvin",
-    "percent": "pct perc %", "s": "sec secs seconds second", "ms": "milliseconds msec",
-    "min": "minutes minute mins", "V": "volt volts", "A": "amp amps ampere", "W": "watt watts",
-    "": "Hz kHz Pa kPa bar rpm kg mm Ohm ohm kOhm J kJ N lpm LPM",
-}  # fmt: skip
+_SPELT = {"degC": "C celsius Celsius deg degCelsius", "degF": "F fahrenheit Fahrenheit"}
+_SPELT |= {"K": "degK kelvin Kelvin", "percent": "pct perc %", "V": "volt volts", "A": "amp amps ampere"}
+_SPELT |= {"W": "watt watts", "s": "sec secs seconds second", "ms": "milliseconds msec"}
+_SPELT |= {"min": "minutes minute mins", "": "Hz kHz Pa kPa bar rpm kg mm Ohm ohm kOhm J kJ N lpm LPM"}
 _MULTIPLES = {
     "s": {"h": 3.6e3, "hr": 3.6e3, "hour": 3.6e3, "hours": 3.6e3, "us": 1e-6, "ns": 1e-9, "days": 86.4e3},
     "V": {"mV": 1e-3, "kV": 1e3},

@@ -175,10 +175,7 @@ def choose_next_touch(
     if not (np.isfinite(levels).all() and levels.size and np.isfinite(price) and price >= 0):
         raise UserError("a temperature or the price is no number", hint="give degC, and a price of 0 or more")
     names = model.asked(candidates)
-    forecast = next_touch(
-        model.device_, grasps, names, levels,
-        coupling=model.coupling_, rest=rest, end=end,
-    )  # fmt: skip
+    forecast = next_touch(model.device_, grasps, names, levels, coupling=model.coupling_, rest=rest, end=end)
     forecast = forecast._replace(log_p=normalised(forecast.log_p + model.log_prior(names)))
     expected = expected_information(forecast, draws=draws, seed=seed)
     reach = np.array([0.0 if seconds is None else float(seconds(float(t))) for t in levels])

@@ -117,9 +117,14 @@ class Answer:
 
 
 def answer(
-    classifier: GraspClassifier, X: Records, candidates: Sequence[str] | None = None, *,
-    rule: StopRule | None = None, object_range: tuple[float, float] | None = None, nearest: bool = False,
-) -> list[Answer]:  # fmt: skip
+    classifier: GraspClassifier,
+    X: Records,
+    candidates: Sequence[str] | None = None,
+    *,
+    rule: StopRule | None = None,
+    object_range: tuple[float, float] | None = None,
+    nearest: bool = False,
+) -> list[Answer]:
     """Return what each grasp touched, by all that one needs to know of it.
 
     Parameters
@@ -180,9 +185,14 @@ class AnsweredRecord(NamedTuple):
 
 
 def answer_record(
-    classifier: GraspClassifier, as_read: Grasps, candidates: Sequence[str] | None, rule: StopRule | None,
-    object_range: tuple[float, float] | None, *, nearest: bool,
-) -> AnsweredRecord:  # fmt: skip
+    classifier: GraspClassifier,
+    as_read: Grasps,
+    candidates: Sequence[str] | None,
+    rule: StopRule | None,
+    object_range: tuple[float, float] | None,
+    *,
+    nearest: bool,
+) -> AnsweredRecord:
     """Return :func:`answer` of one record: answers that can be given, and what the others get."""
     names = [str(c) for c in (classifier.classes_ if candidates is None else candidates)]
     if len(set(names)) < len(names):
@@ -206,9 +216,12 @@ def answer_record(
             # without contact it is none of the candidates for certain
             p_unknown = 1.0 if quality.reason[i] == NO_CONTACT else None
             one = Answer(
-                grasp_id="", material="", probabilities=dict.fromkeys(names), p_unknown=p_unknown,
+                grasp_id="",
+                material="",
+                probabilities=dict.fromkeys(names),
+                p_unknown=p_unknown,
                 decided_at=float(last[i]),
-            )  # fmt: skip
+            )
         answers.append(replace(one, grasp_id=grasp_id, notes=notes))
     return AnsweredRecord(answers, quality)
 
@@ -229,12 +242,16 @@ def _answers_of_usable(
         none = p_unknown is not None and p_unknown > _STRANGE
         out.append(
             Answer(
-                grasp_id="", material=UNKNOWN if none and not nearest else names[int(row.argmax())],
-                probabilities={name: float(p) for name, p in zip(names, np.exp(row))}, p_unknown=p_unknown,
-                decided_at=float(decided[i]), misfit_sd=misfit,
-                deviates=answered.deviates[i] if none else "", notes=tuple(answered.notes[i]),
+                grasp_id="",
+                material=UNKNOWN if none and not nearest else names[int(row.argmax())],
+                probabilities={name: float(p) for name, p in zip(names, np.exp(row))},
+                p_unknown=p_unknown,
+                decided_at=float(decided[i]),
+                misfit_sd=misfit,
+                deviates=answered.deviates[i] if none else "",
+                notes=tuple(answered.notes[i]),
             )
-        )  # fmt: skip
+        )
     return out
 
 

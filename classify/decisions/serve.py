@@ -39,8 +39,10 @@ HOST = "127.0.0.1"
 Rows: TypeAlias = "Callable[[Grasps], list[dict[str, Any]]]"
 
 _TRACES = {"time_s": "time", "t_surface_degC": "t_surface", "t_surface_2_degC": "t_surface_2"}
-_META_FIELDS = {META_NAMES.get(name, name) + ("" if unit == "1" else f"_{unit}"): name
-            for name, unit in GRASP_NUMBERS.items()}  # fmt: skip
+_META_FIELDS = {
+    META_NAMES.get(name, name) + ("" if unit == "1" else f"_{unit}"): name
+    for name, unit in GRASP_NUMBERS.items()
+}
 
 
 def reply(answer: Rows, request: bytes) -> dict[str, Any]:
@@ -51,8 +53,9 @@ def reply(answer: Rows, request: bytes) -> dict[str, Any]:
         (row,) = answer(grasp_of(content))
         response = {
             key: None if isinstance(value, float) and not math.isfinite(value) else value  # JSON has no NaN
-            for key, value in row.items() if key != "grasp_id"
-        }  # fmt: skip
+            for key, value in row.items()
+            if key != "grasp_id"
+        }
     except UserError as error:
         response = {"error": str(error)}
     return ({"id": content["id"]} if "id" in content else {}) | response

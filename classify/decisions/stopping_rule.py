@@ -412,9 +412,10 @@ def stop_callback(
             reading[: len(stream._time)], stream._reading, equal_nan=True
         ):
             temperatures = {
-                name: float(grasp[name].values[0]) for name in ("t_object", "t_object_sd", "t_ambient")
+                name: float(grasp[name].values[0])
+                for name in ("t_object", "t_object_sd", "t_ambient")
                 if name in grasp
-            }  # fmt: skip
+            }
             stream = Stream(classifier, candidates=candidates, rule=rule, **temperatures)
         for sample in range(len(stream._time), time.size):
             probabilities = stream.update(float(time[sample]), float(reading[sample]))

@@ -136,9 +136,13 @@ class LstmClassifier(JoinedClassifier):
     ) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
         """Return augmented series of traces, and their classes."""
         made = augment(
-            real, target, series_per_class=self.series_per_class, noise_sd=self.noise_sd,
-            shift_sd=self.shift_sd, seed=self.random_state,
-        )  # fmt: skip
+            real,
+            target,
+            series_per_class=self.series_per_class,
+            noise_sd=self.noise_sd,
+            shift_sd=self.shift_sd,
+            seed=self.random_state,
+        )
         return self._series(made.traces), target[made.source]
 
     def _check_params(self) -> None:

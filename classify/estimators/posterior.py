@@ -185,9 +185,14 @@ class PosteriorClassifier(GraspClassifier):
         return answered._replace(log_p=log_p, p_unknown=expit(logit(self.prior_unknown) - odds))
 
     def _explain(
-        self, found: Answered, at: NDArray[np.int64], data: Touches, names: list[str], fitted: Fitted,
+        self,
+        found: Answered,
+        at: NDArray[np.int64],
+        data: Touches,
+        names: list[str],
+        fitted: Fitted,
         best: NDArray[np.int64],
-    ) -> None:  # fmt: skip
+    ) -> None:
         """Add to the answers what the likeliest candidate does not explain of single touches, and what it
         requires that is unusual; ``best`` is its row of ``fitted``."""
         mode, prior = fitted.plain.take(best), fitted.plain_prior.take(best)

@@ -140,9 +140,14 @@ class ContactResponse(NamedTuple):
 
 
 def step_response(
-    stack: Stack, nodes: TimeNodes, *, effusivity: ArrayLike, capacity: ArrayLike, h_c: ArrayLike,
+    stack: Stack,
+    nodes: TimeNodes,
+    *,
+    effusivity: ArrayLike,
+    capacity: ArrayLike,
+    h_c: ArrayLike,
     build_up: ArrayLike | None = None,
-) -> ContactResponse:  # fmt: skip
+) -> ContactResponse:
     """Return the sensor's rise and slope and the flux at the nodes, per degree of initial difference.
 
     ``effusivity``, ``capacity``, settled ``h_c`` and ``build_up`` (default the stack's) are (n,);

@@ -568,10 +568,14 @@ def _calibrated_sensors(
     t_object = np.where(problem.known, data.t_object, mode.u[:, T_OBJECT])
     sd = np.where(problem.known, data.t_object_sd, np.sqrt(mode.covariance[:, T_OBJECT, T_OBJECT]))
     beside = _calibrated_sensors(
-        replace(data.second, t_object=t_object, t_object_sd=sd), materials,
-        None if start is None else start.second, None if prior is None else prior.second, length, names,
+        replace(data.second, t_object=t_object, t_object_sd=sd),
+        materials,
+        None if start is None else start.second,
+        None if prior is None else prior.second,
+        length,
+        names,
         report,
-    )  # fmt: skip
+    )
     return replace(gripper, second=beside)
 
 
@@ -681,10 +685,14 @@ def _problem(
     if prior is not None:
         theta = prior_of_gripper(prior, labels, [*anchor_of.values()])
     return Problem(
-        data, nodes_for(data), tuple(labels), tuple(anchor_of.values()),
-        np.array([labels.index(m) for m in data.material.tolist()]), theta,
+        data,
+        nodes_for(data),
+        tuple(labels),
+        tuple(anchor_of.values()),
+        np.array([labels.index(m) for m in data.material.tolist()]),
+        theta,
         np.log([row.heat_capacity * block_length for row in anchor_of.values()]),
-    )  # fmt: skip
+    )
 
 
 def _first_nuisances(problem: Problem, theta: Array, spread: Spread) -> Array:
@@ -808,10 +816,13 @@ def _least(
 
     # ftol 0: the slopes alone say when it is over
     best = minimize(
-        scaled, first / _NOISE_STEPS, jac=True, method="L-BFGS-B",
+        scaled,
+        first / _NOISE_STEPS,
+        jac=True,
+        method="L-BFGS-B",
         bounds=_NOISE_RANGE / _NOISE_STEPS[:, None],
         options={"maxiter": SETTINGS.noise_steps, "ftol": 0.0, "gtol": slope},
-    )  # fmt: skip
+    )
     if not best.success:
         warnings.warn(
             f"the search for the noise of {n_grasp} grasps ended after {best.nit} steps before it settled "

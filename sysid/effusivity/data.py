@@ -148,8 +148,11 @@ class Touches:
     def known(self, index: NDArray[np.int64]) -> Touches:
         """Return what was known of the touches at these rows, with no readings."""
         per_grasp = ("level", "t_object", "t_object_sd", "t_ambient", "excursion", "share", "unlike", "since")
-        numbers = {f.name: getattr(self, f.name)[index if f.name in per_grasp else slice(0)]
-                   for f in fields(self) if f.name != "second"}  # fmt: skip
+        numbers = {
+            f.name: getattr(self, f.name)[index if f.name in per_grasp else slice(0)]
+            for f in fields(self)
+            if f.name != "second"
+        }
         return Touches(**numbers)
 
     @property

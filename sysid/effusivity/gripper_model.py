@@ -47,10 +47,9 @@ SHARED_NAMES = (
 )  # fmt: skip
 
 # what the files of earlier versions call them
-_FILE_KEYS = {
-    "build_up": "build", "ln_build_up": "ln_build", "transit_loss": "carry", "correlation_time": "memory",
-    "ln_h_of_blocks": "finish", "ln_h_level": "finish_level", "ln_h_slope": "finish_slope",
-}  # fmt: skip
+_FILE_KEYS = {"build_up": "build", "ln_build_up": "ln_build", "transit_loss": "carry"}
+_FILE_KEYS |= {"ln_h_of_blocks": "finish", "ln_h_level": "finish_level", "ln_h_slope": "finish_slope"}
+_FILE_KEYS["correlation_time"] = "memory"
 WIDER = 1.5  # GripperSpread's numbers are guesses themselves: so wide, answers are right as often as stated
 NOTHING = 1e-3  # in place of a conductance of nothing, which has no logarithm
 STACK_NAMES = SHARED_NAMES[: SHARED_NAMES.index("onset")]  # these make a Stack
@@ -164,9 +163,10 @@ def another_gripper(gripper: GripperModel) -> GripperModel:
         covariance = ParameterCovariance(names, np.zeros((len(names), len(names))))
     extra = WIDER**2 * GripperSpread().covariance(covariance.names)
     return replace(
-        gripper, uncertainty=ParameterCovariance(covariance.names, covariance.covariance + extra),
+        gripper,
+        uncertainty=ParameterCovariance(covariance.names, covariance.covariance + extra),
         second=None if gripper.second is None else another_gripper(gripper.second),
-    )  # fmt: skip
+    )
 
 
 def block_names(labels: Sequence[str]) -> tuple[str, ...]:
@@ -190,24 +190,24 @@ _CONDUCTANCE = (0.0, 1e7)
 _STORE = (1e-9, 1e9)
 _EFFUSIVITY = (1.0, 1e6)
 _DEPTH = (1e-3, 1e3)
-_OF_STACK = {
-    "e_outer": _EFFUSIVITY, "z_outer": _DEPTH, "e_inner": _EFFUSIVITY, "z_inner": _DEPTH,
-    "g_back": _CONDUCTANCE, "lag": _SECONDS, "first": (0.0, 1.0), "build_up": _SECONDS, "creep": (-0.2, 10.0),
-    "leak": _RATIO, "g_side": _CONDUCTANCE, "c_side": _STORE, "settle": _SECONDS, "g_far": _CONDUCTANCE,
-}  # fmt: skip
+_OF_STACK = {"leak": _RATIO, "c_side": _STORE, "first": (0.0, 1.0), "creep": (-0.2, 10.0)}
+_OF_STACK |= dict.fromkeys(("e_outer", "e_inner"), _EFFUSIVITY) | dict.fromkeys(
+    ("z_outer", "z_inner"), _DEPTH
+)
+_OF_STACK |= dict.fromkeys(("g_back", "g_side", "g_far"), _CONDUCTANCE)
+_OF_STACK |= dict.fromkeys(("lag", "build_up", "settle"), _SECONDS)
 _OF_NOISE = {"white": _SD, "slow": _SD, "correlation_time": _SECONDS, "misfit": _SD, "growth": _RATIO}
-_OF_SPREADS = {
-    "ln_h": _SD, "ln_effusivity": _SD, "ln_h_of_blocks": _SD, "dof": _STORE, "insulator_dof": _STORE,
-    **dict.fromkeys(("ln_build_up", "onset", "t_object"), (1e-12, 100.0)),  # whose precision is needed
-}  # fmt: skip
-_OF_BLOCK = {
-    "ln_h": _LOGARITHM, "ln_h_sd": _SD, "ln_effusivity": _LOGARITHM, "ln_effusivity_sd": _SD,
-    "library_effusivity": _EFFUSIVITY, "library_sd_ln": _SD, "heat_capacity": _STORE, "n_grasp": (0.0, 1e9),
-}  # fmt: skip
-_OF_GRIPPER = {
-    "onset": (-100.0, 100.0), "transit_loss": _RATIO, "bias": (-1e3, 1e3), "depth_share": (1e-9, 10.0),
-    "block_length": (1e-9, 10.0), "ln_h_level": _LOGARITHM, "ln_h_slope": _LOGARITHM,
-}  # fmt: skip
+_OF_SPREADS = dict.fromkeys(("ln_h", "ln_effusivity", "ln_h_of_blocks"), _SD)
+_OF_SPREADS |= dict.fromkeys(("dof", "insulator_dof"), _STORE)
+_OF_SPREADS |= dict.fromkeys(
+    ("ln_build_up", "onset", "t_object"), (1e-12, 100.0)
+)  # whose precision is needed
+_OF_BLOCK = {"library_effusivity": _EFFUSIVITY, "heat_capacity": _STORE, "n_grasp": (0.0, 1e9)}
+_OF_BLOCK |= dict.fromkeys(("ln_h", "ln_effusivity"), _LOGARITHM)
+_OF_BLOCK |= dict.fromkeys(("ln_h_sd", "ln_effusivity_sd", "library_sd_ln"), _SD)
+_OF_GRIPPER = {"onset": (-100.0, 100.0), "transit_loss": _RATIO, "bias": (-1e3, 1e3)}
+_OF_GRIPPER |= dict.fromkeys(("depth_share", "block_length"), (1e-9, 10.0))
+_OF_GRIPPER |= dict.fromkeys(("ln_h_level", "ln_h_slope"), _LOGARITHM)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -403,10 +403,12 @@ class GripperModel:
     def readings(self) -> dict[str, float]:
         """Return noise and drift of its readings, as options of the simulation."""
         noise = self.noise
-        return {
-            "noise": noise.white, "slow_noise": noise.slow, "correlation_time": noise.correlation_time,
-            "leak": self.stack.leak, "quantum": 0.0,
-        }  # fmt: skip
+        drift = {
+            "slow_noise": noise.slow,
+            "correlation_time": noise.correlation_time,
+            "leak": self.stack.leak,
+        }
+        return {"noise": noise.white, "quantum": 0.0} | drift
 
     def to_dict(self) -> dict[str, Any]:
         """Return a JSON-able description."""

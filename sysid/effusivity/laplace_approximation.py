@@ -419,9 +419,13 @@ class Fitted(NamedTuple):
 
 
 def fit_candidates(
-    gripper: GripperModel, data: Touches, candidates: Sequence[str | Material], *,
-    start: Array | None = None, noise: Whitened | None = None,
-) -> Fitted:  # fmt: skip
+    gripper: GripperModel,
+    data: Touches,
+    candidates: Sequence[str | Material],
+    *,
+    start: Array | None = None,
+    noise: Whitened | None = None,
+) -> Fitted:
     """Return the modes of every touch under every candidate, from nuisances ``start`` (n, m, 7), and evidence
     that is the sum over the gripper's grades; ``noise`` whitens the graded touches, where a caller has it."""
     n = data.level.size
@@ -448,9 +452,12 @@ def fit_candidates(
     by_grade = logsumexp(by_grade_and_candidate, axis=2)
     return Fitted(
         mode.take(best_grade)._replace(log_evidence=logsumexp(by_grade_and_candidate, axis=1).ravel()),
-        prior.take(best_grade), np.repeat(np.arange(n), m), mode.take(first), prior.take(first),
+        prior.take(best_grade),
+        np.repeat(np.arange(n), m),
+        mode.take(first),
+        prior.take(first),
         -np.expm1(by_grade[:, 0] - logsumexp(by_grade, axis=1)),
-    )  # fmt: skip
+    )
 
 
 def evidence_in_doubt(
@@ -503,8 +510,9 @@ def fit_rivals(
 
     def again(some: NDArray[np.int64], begin: Array) -> Mode:
         one = Hypotheses(*(field[some] for field in hypotheses))
-        return fit_pairs(gripper, data, row[some], one, start=begin, noise=noise, prior=prior.take(some),
-                         rivals=True)  # fmt: skip
+        return fit_pairs(
+            gripper, data, row[some], one, start=begin, noise=noise, prior=prior.take(some), rivals=True
+        )
 
     return restarted(mode, row, data.unlike[row] > 0, again)
 

@@ -416,9 +416,10 @@ def search(asked: Asked, whitener: Any, law: Law, sd: Array, u: Array, *, rivals
         )
         step_share = np.where(state.stale, 0.0, step_share)  # slopes anew before another step
         state = state._replace(
-            trial=state.point + step_share[:, None] * move, slope_gain=2.0 * step_share * gain,
+            trial=state.point + step_share[:, None] * move,
+            slope_gain=2.0 * step_share * gain,
             bend=step_share * step_share * (gain - damping_loss),
-        )  # fmt: skip
+        )
     return ended
 
 
@@ -484,10 +485,13 @@ def _search_moved(here: _Search, there: Array, stale: Mask, step: int) -> _Searc
         return new
     row = better[:, None]
     return new._replace(
-        point=np.where(row, here.trial, here.point), cost=np.where(better, tried, here.cost),
-        matrix=np.where(row[:, :, None], there, here.matrix), slope=np.where(row, off.slope, here.slope),
-        bound=np.where(row, off.bound, here.bound), stale=np.where(better, stale, here.stale),
-    )  # fmt: skip
+        point=np.where(row, here.trial, here.point),
+        cost=np.where(better, tried, here.cost),
+        matrix=np.where(row[:, :, None], there, here.matrix),
+        slope=np.where(row, off.slope, here.slope),
+        bound=np.where(row, off.bound, here.bound),
+        stale=np.where(better, stale, here.stale),
+    )
 
 
 def curvature(matrix: Array, own: Array) -> tuple[Array, Array]:

@@ -81,10 +81,9 @@ if TYPE_CHECKING:
     from thermogrip.datasets.schema import Grasps
 
 _COUPLING_SCHEMA, _COUPLING_VERSION = "thermogrip.coupling", 1
-_FILE_RANGES = {  # of the numbers of a file
-    "found": (0.0, 2.0), "loss": (0.0, 1e9), "sd": (1e-9, 1e6), "ln_h_sd": (1e-9, 100.0),
-    "longest_rest": (0.0, np.inf),
-}  # fmt: skip
+# of the numbers of a file
+_FILE_RANGES = {"found": (0.0, 2.0), "loss": (0.0, 1e9), "sd": (1e-9, 1e6), "ln_h_sd": (1e-9, 100.0)}
+_FILE_RANGES["longest_rest"] = (0.0, np.inf)
 #: Time between two touches, where the record does not say [s].
 REST = 60.0
 
@@ -199,15 +198,23 @@ def traces_of(gripper: GripperModel, data: Touches, rest: Array, hypotheses: Hyp
     lam, weight, _ = slabs(effusivity, capacity, 0.0)
     history = np.exp(-lam[:, :, None] * (data.end - t)) * q[:, None, :]
     return Traces(
-        moved=weight * np.trapezoid(history, t, axis=2), decay=lam, capacity=capacity, skin=data.level,
-        room=data.t_ambient, rest=np.where(np.isfinite(rest), rest, REST),
-    )  # fmt: skip
+        moved=weight * np.trapezoid(history, t, axis=2),
+        decay=lam,
+        capacity=capacity,
+        skin=data.level,
+        room=data.t_ambient,
+        rest=np.where(np.isfinite(rest), rest, REST),
+    )
 
 
 def joint_prior(
-    coupling: Coupling, traces: Traces, rows: NDArray[np.int64], one: tuple[Array, Array],
-    shared: tuple[Array, Array, Array], about: Array | None = None,
-) -> tuple[Array, Array]:  # fmt: skip
+    coupling: Coupling,
+    traces: Traces,
+    rows: NDArray[np.int64],
+    one: tuple[Array, Array],
+    shared: tuple[Array, Array, Array],
+    about: Array | None = None,
+) -> tuple[Array, Array]:
     """Return mean (m, 4 n) and covariance (m, 4 n, 4 n) of the x of n touches of one block that is found at
     ``about`` (m, n) [degC]; None: nothing of its way to the room is uncertain."""
     mean, variance = one
@@ -354,9 +361,13 @@ def _longest_rests(grasps: Grasps) -> dict[str, float]:
 
 
 def two_touch_fit(
-    gripper: GripperModel, grasps: Grasps, candidates: Sequence[str | Material], *,
-    coupling: Coupling | None = None, until: float | None = None,
-) -> TouchGroups:  # fmt: skip
+    gripper: GripperModel,
+    grasps: Grasps,
+    candidates: Sequence[str | Material],
+    *,
+    coupling: Coupling | None = None,
+    until: float | None = None,
+) -> TouchGroups:
     """Return the evidence of each candidate from all touches, any number, of each ``touch_group``; the
     nominal temperature of the first alone counts, for the later ones it is what the touches before left."""
     rows = touch_groups(grasps)
@@ -442,9 +453,12 @@ def learn_coupling(gripper: GripperModel, grasps: Grasps, *, start: Coupling | N
     def coupling(q: Array) -> Coupling:
         found_share, loss, sd, ln_h_sd = np.exp(np.clip(q, first - 3, first + 3))
         return Coupling(
-            found=min(float(found_share), 2.0), loss=float(loss), sd=float(sd), ln_h_sd=float(ln_h_sd),
+            found=min(float(found_share), 2.0),
+            loss=float(loss),
+            sd=float(sd),
+            ln_h_sd=float(ln_h_sd),
             longest_rest=longest,
-        )  # fmt: skip
+        )
 
     def cost(q: Array) -> float:
         now = coupling(q)
@@ -457,9 +471,13 @@ def learn_coupling(gripper: GripperModel, grasps: Grasps, *, start: Coupling | N
 
 
 def next_touch_prior(
-    gripper: GripperModel, grasps: Grasps, candidates: Sequence[str | Material], *,
-    coupling: Coupling | None = None, rest: float = 60.0,
-) -> Joint:  # fmt: skip
+    gripper: GripperModel,
+    grasps: Grasps,
+    candidates: Sequence[str | Material],
+    *,
+    coupling: Coupling | None = None,
+    rest: float = 60.0,
+) -> Joint:
     """Return the log evidence (m,) from the touches of one block, and the prior mean (m, 4) and covariance
     (m, 4, 4) of another touch's x = (T_obj, ln h, ln e, ln C) after a ``rest`` [s]."""
     block_rows = np.array([0])

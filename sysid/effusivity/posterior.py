@@ -61,9 +61,13 @@ class MaterialFit:
 
 
 def material_fit(
-    gripper: GripperModel, grasps: Grasps, candidates: Sequence[str | Material], *,
-    until: float | None = None, start: Array | None = None,
-) -> MaterialFit:  # fmt: skip
+    gripper: GripperModel,
+    grasps: Grasps,
+    candidates: Sequence[str | Material],
+    *,
+    until: float | None = None,
+    start: Array | None = None,
+) -> MaterialFit:
     """Return the fit of each candidate to each grasp.
 
     Candidates are labels that the gripper was calibrated with, or names or rows of the library, whose contact
@@ -76,10 +80,11 @@ def material_fit(
     mode = fit_candidates(gripper, data, candidates, start=start).mode
     n, m = data.level.size, len(candidates)
     return MaterialFit(
-        log_evidence=mode.log_evidence.reshape(n, m), t_object=mode.u[:, T_OBJECT].reshape(n, m),
+        log_evidence=mode.log_evidence.reshape(n, m),
+        t_object=mode.u[:, T_OBJECT].reshape(n, m),
         t_object_sd=np.sqrt(mode.covariance[:, T_OBJECT, T_OBJECT]).reshape(n, m),
         u=mode.u.reshape(n, m, -1),
-    )  # fmt: skip
+    )
 
 
 def effusivity_posterior(

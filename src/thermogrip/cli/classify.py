@@ -335,11 +335,15 @@ def classify(
     console = Console(as_json)
     anywhere = Path.absolute if cluster else Path  # its workers run in other folders
     ask = _Question(
-        anywhere(model_dir), cli.comma(candidates), stated, early=early, next_touch=next_touch,
+        anywhere(model_dir),
+        cli.comma(candidates),
+        stated,
+        early=early,
+        next_touch=next_touch,
         nearest=nearest,
         known=tuple(str(anywhere(Path(path))) for path in known or ()),
         changed_at=_changed_at([model_dir, *(known or ())]),
-    )  # fmt: skip
+    )
     if serve and pool != 1:
         raise UserError("--serve answers one after the other", hint="leave --workers and --cluster out")
     if serve:

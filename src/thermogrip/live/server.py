@@ -313,11 +313,9 @@ def _server(state: State, token: str, listener: socket.socket) -> Server:
     from uvicorn import Config, Server
 
     app = application(state, _send_to_session, port=listener.getsockname()[1], token=token)
-    config = Config(
-        app, loop="asyncio", http="h11", ws="none", lifespan="off", log_level="critical", access_log=False,
-        server_header=False, proxy_headers=False, timeout_graceful_shutdown=1,
-    )  # fmt: skip
-    return Server(config)
+    plain: Any = {"loop": "asyncio", "http": "h11", "ws": "none", "lifespan": "off", "proxy_headers": False}
+    quiet: Any = {"log_level": "critical", "access_log": False, "server_header": False}
+    return Server(Config(app, **plain, **quiet, timeout_graceful_shutdown=1))
 
 
 def _send_to_session(content: dict[str, Any]) -> None:
