@@ -255,9 +255,14 @@ class Grip:
         return self.draw_many([material], t_object, rng, ambient=ambient)[0]
 
     def draw_many(
-        self, materials: Sequence[str], t_object: float, rng: np.random.Generator, *, ambient: float,
+        self,
+        materials: Sequence[str],
+        t_object: float,
+        rng: np.random.Generator,
+        *,
+        ambient: float,
         blocks: Blocks | None = None,
-    ) -> list[Touch]:  # fmt: skip
+    ) -> list[Touch]:
         """Return one grasp per entry of ``materials``, or of ``blocks``, whose numbers have no spread."""
         normal = rng.standard_normal((5, len(materials)))
         if blocks is None:

@@ -103,10 +103,15 @@ class Grade(NamedTuple):
 # hundred, of 3 K, grasps of the examples that are stated 5 K off have a log loss of .05 (without .35), and
 # cork's p_unknown stays .98; one in twenty, of anything within 20 K, takes it to .21.
 GRADES = (
-    Grade(0.0, 0.0, 0.69), Grade(0.0, 0.0, 0.01, misstated_K=3.0), Grade(0.001, 0.3, 0.05),
-    Grade(0.003, 1.0, 0.05), Grade(0.1, 1.0, 0.05), Grade(0.3, 0.0, 0.05, since=1.0),
-    Grade(0.3, 0.0, 0.05, since=2.0), Grade(0.3, 0.0, 0.05, since=4.0),
-)  # fmt: skip
+    Grade(0.0, 0.0, 0.69),
+    Grade(0.0, 0.0, 0.01, misstated_K=3.0),
+    Grade(0.001, 0.3, 0.05),
+    Grade(0.003, 1.0, 0.05),
+    Grade(0.1, 1.0, 0.05),
+    Grade(0.3, 0.0, 0.05, since=1.0),
+    Grade(0.3, 0.0, 0.05, since=2.0),
+    Grade(0.3, 0.0, 0.05, since=4.0),
+)
 _DISCREPANCY_TIMES_S = (0.5, 2.5, 10.0)  # of a trace: from a slip to a contact's length
 KNOTS = np.array([-1.0, -0.6, -0.3, 0.0, 0.3, 0.6, 1.0, 1.5, 2.2, 3.2, 4.6, 6.6, 10.0, 16.0, 25.0, 40.0])
 

@@ -191,17 +191,15 @@ _STORE = (1e-9, 1e9)
 _EFFUSIVITY = (1.0, 1e6)
 _DEPTH = (1e-3, 1e3)
 _OF_STACK = {"leak": _RATIO, "c_side": _STORE, "first": (0.0, 1.0), "creep": (-0.2, 10.0)}
-_OF_STACK |= dict.fromkeys(("e_outer", "e_inner"), _EFFUSIVITY) | dict.fromkeys(
-    ("z_outer", "z_inner"), _DEPTH
-)
+_OF_STACK |= dict.fromkeys(("e_outer", "e_inner"), _EFFUSIVITY)
+_OF_STACK |= dict.fromkeys(("z_outer", "z_inner"), _DEPTH)
 _OF_STACK |= dict.fromkeys(("g_back", "g_side", "g_far"), _CONDUCTANCE)
 _OF_STACK |= dict.fromkeys(("lag", "build_up", "settle"), _SECONDS)
 _OF_NOISE = {"white": _SD, "slow": _SD, "correlation_time": _SECONDS, "misfit": _SD, "growth": _RATIO}
 _OF_SPREADS = dict.fromkeys(("ln_h", "ln_effusivity", "ln_h_of_blocks"), _SD)
 _OF_SPREADS |= dict.fromkeys(("dof", "insulator_dof"), _STORE)
-_OF_SPREADS |= dict.fromkeys(
-    ("ln_build_up", "onset", "t_object"), (1e-12, 100.0)
-)  # whose precision is needed
+# whose precision is needed
+_OF_SPREADS |= dict.fromkeys(("ln_build_up", "onset", "t_object"), (1e-12, 100.0))
 _OF_BLOCK = {"library_effusivity": _EFFUSIVITY, "heat_capacity": _STORE, "n_grasp": (0.0, 1e9)}
 _OF_BLOCK |= dict.fromkeys(("ln_h", "ln_effusivity"), _LOGARITHM)
 _OF_BLOCK |= dict.fromkeys(("ln_h_sd", "ln_effusivity_sd", "library_sd_ln"), _SD)
@@ -403,12 +401,8 @@ class GripperModel:
     def readings(self) -> dict[str, float]:
         """Return noise and drift of its readings, as options of the simulation."""
         noise = self.noise
-        drift = {
-            "slow_noise": noise.slow,
-            "correlation_time": noise.correlation_time,
-            "leak": self.stack.leak,
-        }
-        return {"noise": noise.white, "quantum": 0.0} | drift
+        slow = {"slow_noise": noise.slow, "correlation_time": noise.correlation_time}
+        return {"noise": noise.white, "leak": self.stack.leak, "quantum": 0.0} | slow
 
     def to_dict(self) -> dict[str, Any]:
         """Return a JSON-able description."""

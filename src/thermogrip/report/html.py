@@ -27,7 +27,7 @@ from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.atomic_files import write_atomic
 from thermogrip.datasets.media import printable
 from thermogrip.datasets.provenance import provenance
-from thermogrip.report.charts import Chart, Curve, draw_chart, thinned
+from thermogrip.report.charts import Chart, Curve, Panel, draw_chart, thinned
 from thermogrip.report.console import short
 
 if TYPE_CHECKING:
@@ -158,18 +158,17 @@ class Plot:
             return look | numbers | {"step": few.step}
 
         unit = re.search(r"\[(.+)\]", self.chart.x_label)
+
+        def plain_panel(panel: Panel, *, last: bool) -> dict[str, Any]:
+            words = {"label": printable(panel.label), "title": printable(panel.title)}
+            look = {"height": panel.height, "log": panel.log, "shaded": panel.shaded, "marks": panel.marks}
+            axis = {"last": last, "unit": f" {unit[1]}" if unit else ""}
+            return words | look | axis | {"curves": [plain_curve(curve) for curve in panel.curves]}
+
         columns = [
-            [
-                {
-                    "label": printable(panel.label), "title": printable(panel.title), "height": panel.height,
-                    "log": panel.log, "shaded": panel.shaded, "marks": panel.marks,
-                    "last": panel is column[-1], "unit": f" {unit[1]}" if unit else "",
-                    "curves": [plain_curve(curve) for curve in panel.curves],
-                }
-                for panel in column
-            ]
+            [plain_panel(panel, last=panel is column[-1]) for panel in column]
             for column in self.chart.columns
-        ]  # fmt: skip
+        ]
         head = {"x_label": self.chart.x_label, "log": self.chart.log}
         text = json.dumps(head | {"columns": columns, "arrays": list(arrays)}, allow_nan=False)
         return Markup(text.replace("<", "\\u003c"))
