@@ -15,6 +15,8 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.mpc.controllers.mpc import Controller, design_controller
 from thermogrip.mpc.design.design import Design, default_design
 from thermogrip.mpc.interface import STATUSES
+from thermogrip.sysid.models.state_space import StateSpaceModel
+from thermogrip.sysid.plant.plant import Plant
 
 REST = {"t_tank": 25.0, "t_surface": 25.0, "t_ambient": 25.0}
 NAN = float("nan")
@@ -149,3 +151,26 @@ def test_numbers_that_make_no_controller_are_reported_shortly(tank, tmp_path, mo
         Controller.load(path)
     assert caught.value.problem == f"its numbers make no controller (LinAlgError: {'x' * 200})"
     assert (caught.value.hint, caught.value.file) == ("tune the controller again", path)
+
+
+def test_a_plant_whose_output_counts_in_another_unit_gets_the_same_moves():
+    def moves(unit: float) -> list[float]:
+        """Return the drives [%] of two steps and a load; ``unit`` is how many one of the other's are."""
+        noise = 0.05 * np.random.default_rng(0).normal(size=150)
+        near, far = np.exp(-1 / 60), np.exp(-1 / 5)
+        A, B, C = [[near, 1 - near], [0.0, far]], [[0.0], [0.4 * (1 - far)]], [[unit, 0.0]]
+        model = StateSpaceModel(("q",), (), ("t",), A=A, B=B, C=C, dt=1.0, y0=[25.0 * unit])
+        valid = {"q": (0.0, 100.0), "t": (25.0 * unit, 60.0 * unit)}
+        plant = Plant(model, {}, dt=1.0, units={"q": "percent"}, valid=valid, noise={"t": 0.05 * unit})
+        controller, drives, x = design_controller(plant), [], np.zeros(2)
+        controller.reset({"t": 25.0 * unit})
+        for k in range(150):
+            target = (40.0 if k < 75 else 55.0) * unit
+            t = (25.0 + x[0] + noise[k]) * unit
+            move = controller.step({"time_s": 1.0 * k, "t": t}, target)
+            drives.append(move.drive)
+            x = np.array(A) @ x + np.array(B)[:, 0] * (move.drive - (5.0 if k > 110 else 0.0))
+        return drives
+
+    # one degC too many in a soft row's price alone made 4 % of the range
+    np.testing.assert_allclose(moves(10.0), moves(1.0), atol=1.0)
