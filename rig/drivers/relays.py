@@ -22,7 +22,7 @@ from pydantic import ConfigDict, Field, Strict, TypeAdapter, ValidationError
 from thermogrip.datasets.atomic_files import read_toml
 from thermogrip.datasets.errors import UserError, known_names
 from thermogrip.mpc.design.design import problem_of
-from thermogrip.rig.interface import UNIT_RANGES, Event, Reading, Rig, check_order
+from thermogrip.rig.interface import UNIT_RANGES, Reading, Rig, check_order
 
 
 @dataclass(frozen=True)
@@ -93,7 +93,12 @@ class RelayRig:
         self.rig = rig
         self.expires_s = rig.expires_s
         self.has_pump = rig.has_pump
-        self.clear = getattr(rig, "clear", None)  # the latch of a device that has one
+        # what relays do not change is the device's own; its latch, if it has one, too
+        self.grasp = rig.grasp
+        self.release = rig.release
+        self.notices = rig.notices
+        self.close = rig.close
+        self.clear = getattr(rig, "clear", None)
         self.relays = dict(relays)
         self._clock = clock
         for relay in self.relays.values():
@@ -160,22 +165,6 @@ class RelayRig:
             self._pass_time()
             if remaining_s > _SWITCHING.now_s and self._switch():
                 self.rig.apply(self._orders(), self._pump)
-
-    def grasp(self, material: str, t_object: float) -> None:
-        """Close the gripper."""
-        self.rig.grasp(material, t_object)
-
-    def release(self) -> None:
-        """Open the gripper."""
-        self.rig.release()
-
-    def notices(self) -> list[Event]:
-        """Return what happened since the last call."""
-        return self.rig.notices()
-
-    def close(self) -> None:
-        """Switch everything off and let the rig go."""
-        self.rig.close()
 
     def _full(self, name: str) -> float:
         """Return what an input of the device is when it is full on."""

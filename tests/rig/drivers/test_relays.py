@@ -23,6 +23,7 @@ class Board:
     """Inputs of a device, and when each was set to what."""
 
     expires_s, has_pump = 2.0, True
+    grasp = release = notices = close = None
 
     def __init__(self, **units: str) -> None:
         self.units, self.now = units, 0.0
