@@ -12,6 +12,7 @@ import pytest
 from tests.mpc.makers import crossed, heater, make_tank, network_plant
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.limits import LARGEST
+from thermogrip.mpc.design.design import default_design
 from thermogrip.mpc.design.spec import SPEC_TEMPLATE, Spec, _spec_drive_ranges, read_spec, spec_from_dict
 from thermogrip.mpc.plant.prediction import drive_range
 
@@ -165,6 +166,7 @@ def test_the_spec_reaches_the_design(tank):
     assert design.drive_range == {"drive": (-0.5, 0.8)}
     assert design.slew_per_s == {"drive": 0.1}
     assert (design.dt, design.overshoot, design.ambient) == (3.0, 0.1, 20.0)
+    assert Spec(overshoot_degC=2.0).design(tank).overshoot == default_design(tank).overshoot
     assert design.limits == {"t_tank": (4.0, 58.0)}
     assert Spec(output="t_tank").design(tank).limits == {}  # what is regulated has its targets
     ends = {"t_surface": (18.0, 43.0), "t_tank": (30.0, 31.0)}  # targets 18 to 43; of the tank there is none
