@@ -87,7 +87,11 @@ class Dynamics:
     @property
     def poles(self) -> NDArray[np.complex128]:
         """Continuous equivalents [1/s] of the poles that are no delay, the slowest first."""
-        return poles_of(self.linear)
+        A = self.linear.A  # rounding of a difference in a delay of n steps makes a pole of its n-th root
+        is_seen = np.abs(A) > RESPONSE.rounding * np.abs(A).max()
+        z = np.linalg.eigvals(np.where(is_seen, A, 0.0)).astype(complex)
+        s = np.log(z[np.abs(z) > RESPONSE.delay]) / self.dt
+        return np.asarray(s[np.argsort(-s.real, kind="stable")])
 
     @property
     def time_constants(self) -> Array:
@@ -210,15 +214,6 @@ class Dynamics:
         sd = np.sqrt(variance + ((self.gain_sd if gain_sd is None else gain_sd) * value) ** 2)
         half = NormalDist().inv_cdf(0.5 + self.level / 2) * sd
         return Estimate(value, value - half, value + half)
-
-
-def poles_of(near: LinearPlant) -> NDArray[np.complex128]:
-    """Return the continuous equivalents [1/s] of the poles that are no delay, the slowest first."""
-    A = near.A  # rounding of a difference in a delay of n steps makes a pole of its n-th root
-    z = np.linalg.eigvals(np.where(np.abs(A) > RESPONSE.rounding * np.abs(A).max(), A, 0.0)).astype(complex)
-    assert near.dt is not None
-    s = np.log(z[np.abs(z) > RESPONSE.delay]) / near.dt
-    return np.asarray(s[np.argsort(-s.real, kind="stable")])
 
 
 def _rise(near: LinearPlant, steps: int, n: int) -> Array:

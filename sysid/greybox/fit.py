@@ -319,7 +319,7 @@ def _fit_verdict(problem: Problem, solution: Solution, identifiability: fit_reco
     if max(rms) > _STUCK:
         clauses.append("it does not explain the logs, do not use it")
     if not identifiability.identifiable:
-        clauses.append(f"not practically identifiable: {identifiability.weakest}")
+        clauses.append(f"not practically identifiable: {identifiability.flat[0]}")
     if identifiability.on_bound:
         clauses.append(f"on bounds: {', '.join(identifiability.on_bound)}")
     if identifiability.prior_only:

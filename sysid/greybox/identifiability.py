@@ -152,7 +152,6 @@ def describe(
     sd = np.sqrt(np.diag(covariance))
     return Identifiability(
         condition=float(values[-1] / max(least, 1e-18)),
-        weakest=_in_words(axes[:, 0], names),
         flat=[
             _in_words(axis, names) for value, axis in zip(values, axes.T) if value < REPORT.flat_eigenvalue
         ],

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from math import prod
 from typing import Any
 
 import numpy as np
@@ -73,7 +74,10 @@ class SindyModel(BlackBox):
         n_y = len(self.outputs)
         for _ in range(whole_steps(dt, self.dt)):
             variables = [*now, *outside]
-            terms = [_monomial(row, variables) for row in self.exponents]
+            terms = [
+                prod(variable for power, variable in zip(row, variables) for _ in range(power))
+                for row in self.exponents.tolist()
+            ]
             after = [sum(float(c) * t for c, t in zip(row, terms) if c) for row in self.coefficients]
             now = [*after, *now[: self.n_x - n_y]]
         return now
@@ -121,14 +125,6 @@ class SindyModel(BlackBox):
         """Return exponents and memory."""
         powers = array_within(data, "exponents", _MOST_DEGREE).astype(int)
         return {"exponents": powers, "memory": int(number_within(data, "memory", 1, _MOST_MEMORY))}
-
-
-def _monomial(row: NDArray[np.int_], variables: Values) -> Any:
-    value: Any = 1.0
-    for power, variable in zip(row.tolist(), variables):
-        for _ in range(power):
-            value = value * variable
-    return value
 
 
 def _polynomial_text(row: Array, exponents: NDArray[np.int_], names: Sequence[str]) -> str:

@@ -57,8 +57,7 @@ class Identifiability:
     """What the logs say of the free parameters (:mod:`thermogrip.sysid.greybox.identifiability`)."""
 
     condition: float  # of the scaled Hessian
-    weakest: str  # the direction of the smallest, in words
-    flat: list[str]  # all directions that the logs barely determine, in words
+    flat: list[str]  # all directions that the logs barely determine, in words, the weakest first
     # False: a direction changes no output at all (``told`` in files of 0.2.0 and before)
     identifiable: Annotated[bool, Field(validation_alias=AliasChoices("identifiable", "told"))]
     prior_only: list[str]  # names

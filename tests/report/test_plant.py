@@ -219,7 +219,7 @@ def test_parameters_answer_for_themselves_and_the_sampler_only_where_it_failed()
     unsure = plant.parameters_section(board, record)
     assert unsure.tone == "warn"
     assert unsure.verdict.endswith("The sampler has not converged: 9 autocorrelation times.")
-    flat = Identifiability(1e6, "a up", ["a up, b up"], True, [], {})
+    flat = Identifiability(1e6, ["a up, b up"], True, [], {})
     loose = plant.parameters_section(replace(board, scores=replace(board.scores, identifiability=flat)))
     assert (loose.tone, loose.verdict) == ("warn", section.verdict)
     assert loose.parts[2] == Text("These cannot be estimated separately: a up, b up.")

@@ -42,7 +42,7 @@ def test_two_conductances_side_by_side_are_not_identifiable():
     plant = fit_network(model, [made(0, seconds=500.0)])
     report = plant.scores.identifiability
     assert not report.identifiable
-    assert set(report.weakest.replace(" up", "").replace(" down", "").split(", ")) == {"G", "G2"}
+    assert set(report.flat[0].replace(" up", "").replace(" down", "").split(", ")) == {"G", "G2"}
     assert "not practically identifiable" in plant.verdict
     assert plant.values["G"] + plant.values["G2"] == pytest.approx(TRUTH["G"], rel=0.05)
 

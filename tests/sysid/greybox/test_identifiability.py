@@ -144,7 +144,7 @@ def test_what_a_fit_says_of_its_parameters():
             flat if least < 1e-4 or len(flat) == 1 else ["c up"]
         )
     assert found.prior_only == ["b", "c"]
-    assert (found.identifiable, found.weakest, found.on_bound) == (False, "c up", {"a": "low"})
+    assert (found.identifiable, found.flat[0], found.on_bound) == (False, "c up", {"a": "low"})
     assert found.condition == pytest.approx((2 - least) / 1e-18, rel=1e-3)
     # what was moved by more than data that narrow it by a tenth may do is not the prior's
     pulled = describe("abc", jacobian, np.diag(sd**2), {}, shift=np.array([0.0, 0.5, -2.4]))

@@ -12,7 +12,7 @@ from thermogrip.sysid.plant.fit_record import TAIL, FitLog, Intervals, PlantScor
 # as version 0.1.0 wrote them for a network and for a black box, shortened
 NETWORK = {
     "identifiability": {
-        "condition": 3.5e16, "weakest": "loss up, power up", "flat": [],
+        "condition": 3.5e16, "flat": ["loss up, power up"],
         "told": False, "prior_only": ["room"], "on_bound": {"room": "low"},
     },
     "average_s": 10.0, "reading_excess": {"t": 0.048},
