@@ -75,11 +75,15 @@ class ExperimentForecast:
 
     def stays(self, u: Array, *, margin: float = 0.0) -> bool:
         """Say whether all outputs in degC stay inside the limits, by so much, under u (N, n_u)."""
-        return self._inside(self.outputs(u), margin)
+        y = self.outputs(u)
+        temperatures = y[:, :, [_is_celsius(self.plant, name) for name in self.plant.outputs]]
+        low, high = temperatures.min(initial=np.inf), temperatures.max(initial=-np.inf)
+        return bool(np.isfinite(y).all() and low >= self.lowest + margin and high <= self.highest - margin)
 
     def bits(self, u: Array) -> float:
         """Return the expected gain of information of an experiment u (N, n_u) [bits]."""
-        return _bits(self._gain(self._run(u, *self._moved)))
+        gain = self._gain(self._run(u, *self._moved))
+        return float(0.5 * np.linalg.slogdet(gain)[1] / np.log(2.0))
 
     def covariance(self, u: Array) -> Array:
         """Return the covariance (n_free, n_free) of theta expected after an experiment u (N, n_u)."""
@@ -87,13 +91,8 @@ class ExperimentForecast:
         return np.asarray(0.5 * (after + after.T))
 
     def evaluate(self, u: Array, *, margin: float = 0.0) -> float:
-        """Return the bits of u (N, n_u), minus infinity where it leaves the limits; one batch for both."""
-        n_moved = len(self._moved.p)
-        together = (np.vstack([moved, drawn[1:]]) for moved, drawn in zip(self._moved, self._cautious))
-        y = self._run(u, *together)
-        if not self._inside(np.vstack([y[:1], y[n_moved:]]), margin):
-            return -np.inf
-        return _bits(self._gain(y[:n_moved]))
+        """Return the bits of u (N, n_u), minus infinity where it leaves the limits."""
+        return self.bits(u) if self.stays(u, margin=margin) else -np.inf
 
     def _gain(self, y: Array) -> Array:
         """Return the inverse (n_free, n_free) of the covariance after an experiment, where it is 1 now, from
@@ -104,15 +103,6 @@ class ExperimentForecast:
         sd, seconds = reading_noise(self.plant)
         flat = (rise * np.sqrt(self.dt / seconds) / sd).reshape(n, -1)
         return np.asarray(np.eye(n) + flat @ flat.T)
-
-    def _inside(self, y: Array, margin: float) -> bool:
-        warm = [k for k, name in enumerate(self.plant.outputs) if _is_celsius(self.plant, name)]
-        if not np.isfinite(y).all():
-            return False
-        temperatures = y[:, :, warm]
-        return not temperatures.size or bool(
-            temperatures.min() >= self.lowest + margin and temperatures.max() <= self.highest - margin
-        )
 
     def _run(self, u: Array, p: Array, x0: Array) -> Array:
         d = np.tile(self._d, (1, len(u), 1))
@@ -198,10 +188,6 @@ def interval_widths(plant: Plant, covariance: Array, level: float = 0.9) -> dict
     """Return the width of each free parameter's central interval, in natural units, at a covariance."""
     expected = replace(plant, covariance=covariance, samples=None)
     return {name: high - low for name, (low, high) in expected.intervals(level).items()}
-
-
-def _bits(gain: Array) -> float:
-    return float(0.5 * np.linalg.slogdet(gain)[1] / np.log(2.0))
 
 
 def _is_celsius(plant: Plant, name: str) -> bool:
