@@ -395,9 +395,18 @@ def _repair(
     time: Floats, columns: dict[str, Floats], units: dict[str, str], roles: dict[str, str], table: Table
 ) -> _Repaired:
     """Return the repaired time and columns."""
-    ordered = repair.order_rows(time, table.lines, table.file)
+    again = np.diff(time) == 0
+    alike = np.all([(v[1:] == v[:-1]) | np.isnan(v[1:]) for v in columns.values()], axis=0)
+    # else the clock is coarse; where nothing moves nobody can tell
+    written_twice = (
+        again.any() and alike[again].all() and 2 * np.count_nonzero(alike[~again]) < (~again).sum()
+    )
+    kept = np.flatnonzero(np.append(True, ~again) if written_twice else np.ones(time.size, dtype=bool))
+    ordered = repair.order_rows(time[kept], table.lines[kept], table.file)
     time, repairs = ordered.time, ordered.repairs
-    columns = {name: values[ordered.rows] for name, values in columns.items()}
+    if written_twice:
+        repairs.append(f"{again.sum()} rows dropped that repeat the one before and its time")
+    columns = {name: values[kept][ordered.rows] for name, values in columns.items()}
     if time.size < 2:
         raise UserError(f"{time.size} row(s) are not a log", file=table.file, hint="give at least two rows")
     time, findings = since_first_row(time)

@@ -179,41 +179,38 @@ def drop_codes(name: str, values: Floats) -> tuple[Floats, list[str]]:
 
 
 def doubt_readings(name: str, values: Floats, inputs: Sequence[Floats], time: Floats) -> str:
-    """Return the doubt on an output's codes, or on its largest jump; empty where there is none."""
-    return _doubt_codes(name, values, inputs) or _doubt_jump(name, values, inputs, time)
-
-
-def _doubt_jump(name: str, values: Floats, inputs: Sequence[Floats], time: Floats) -> str:
-    """Return the doubt on a level that a reading jumps to for good while no input moves."""
+    """Return the doubt on the ends of an output's range or on its largest jump, empty where there is none."""
     moves = np.abs(np.diff(values))
-    if not np.isfinite(moves).any():
+    if values.size < SPIKE_WINDOW or not np.isfinite(moves).any():
         return ""
+    for end in (np.nanmin(values), np.nanmax(values)):
+        rows = _rows_beyond_jumps(values, values == end)
+        edges = np.flatnonzero(np.diff(rows.astype(int)))
+        quiet = [not _any_moves(inputs, edge) for edge in edges.tolist()]
+        if rows.sum() > SPIKE_LENGTH * max(edges.size / 2, 1) and 2 * sum(quiet) >= edges.size:
+            says = f"{name} jumps to {end:g} and stays in {rows.sum()} rows while no input moves"
+            return f"{says}: if that is a sensor's code, leave those cells empty"
+        edges = np.flatnonzero(np.diff((values == end).astype(int), prepend=0, append=0)).reshape(-1, 2)
+        start, stop = max(edges.tolist(), key=lambda run: run[1] - run[0])
+        moves_before = moves[max(start - SPIKE_WINDOW, 0) : max(start - 1, 0)]
+        # a reading that settles has stood still between its steps before; one with noise never stands still
+        if stop - start >= SPIKE_WINDOW and np.count_nonzero(moves_before) > SPIKE_WINDOW / 2:
+            says = f"{name} is held at {end:g} for {stop - start} rows, as where its sensor ends"
+            return f"{says}: leave those cells empty"
     row = int(np.nanargmax(moves))
     before, after = values[max(row - SPIKE_WINDOW, 0) : row + 1], values[row + 1 : row + 1 + SPIKE_WINDOW]
     stays = np.abs(np.nanmedian(after) - np.nanmedian(before)) > moves[row] / 2
     in_gap = time[row + 1] - time[row] > GAP_STEPS * np.median(np.diff(time))
-    driven = any(np.any(np.diff(u[max(row - SPIKE_LENGTH, 0) : row + 2])) for u in inputs)
-    if not stays or in_gap or driven or not _rows_beyond_jumps(values, np.arange(values.size) > row).any():
+    beyond_jump = _rows_beyond_jumps(values, np.arange(values.size) > row).any()
+    if not stays or in_gap or _any_moves(inputs, row) or not beyond_jump:
         return ""
     problem = f"{name} jumps from {values[row]:g} to {values[row + 1]:g} and stays there while no input moves"
     return f"{problem}: if its sensor was changed there, cut the log: LOG@{time[row + 1] - time[0]:g}:"
 
 
-def _doubt_codes(name: str, values: Floats, inputs: Sequence[Floats]) -> str:
-    """Return the doubt on the end of an output's range where it is held in runs like a sensor's code, entered
-    and left by jumps while no input moves; empty where there is none."""
-    for end in (np.nanmin(values), np.nanmax(values)):
-        rows = _rows_beyond_jumps(values, values == end)
-        edges = np.flatnonzero(np.diff(rows.astype(int)))
-        by_input = [
-            np.any(np.diff(u[max(edge - SPIKE_LENGTH, 0) : edge + 2])) for edge in edges for u in inputs
-        ]
-        if rows.sum() > SPIKE_LENGTH * max(edges.size / 2, 1) and 2 * sum(map(bool, by_input)) <= len(
-            by_input
-        ):
-            says = f"{name} jumps to {end:g} and stays in {rows.sum()} rows while no input moves"
-            return f"{says}: if that is a sensor's code, leave those cells empty"
-    return ""
+def _any_moves(inputs: Sequence[Floats], row: int) -> bool:
+    """Tell whether an input moves in the rows just before a row's end."""
+    return any(np.any(np.diff(u[max(row - SPIKE_LENGTH, 0) : row + 2])) for u in inputs)
 
 
 def _rows_beyond_jumps(values: Floats, rows: NDArray[np.bool_]) -> NDArray[np.bool_]:

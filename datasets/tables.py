@@ -196,14 +196,14 @@ def find_layout(text: str, file: str, *, named: bool = False) -> Layout:
     header, used = _names_above([line for _, line in head[:first]], n, separator)
     hollow = not header[-1] and all(row[-1] == "" for row in rows)  # every line ends with a separator
     nameless = [f"c{place}" for place, name in enumerate(header[: n - hollow], 1) if not name]
-    above = len(_split_cells(head[first - 1][1].lstrip("#%/ "), separator)) if first else 0
-    if 1 < above == n - 1 and any(header) and not (hollow or named):
+    above = _split_cells(head[first - 1][1].lstrip("#%/ "), separator) if first else []
+    if 1 < len(above) == n - 1 and _number_share(above, separator) < 0.5 and not (hollow or named):
         # commas may be decimals, or the first column be without a name: each name would be another column's
         hint = f"name all with --columns {','.join(['NAME'] * n)}, or write decimals with a point"
         raise UserError(f"has {n - 1} names above rows of {n} cells", file=file, hint=hint)
     notes = []
     if len(nameless) == n - hollow:
-        why = f"{above} names above rows of {n} cells" if above > n else "no header"
+        why = f"{len(above)} names above rows of {n} cells" if len(above) > n else "no header"
         notes = [f"{why}: {_NAMELESS.format(n - hollow)}"]
     elif nameless:
         notes = [f"without a name: {', '.join(nameless)}"]

@@ -832,6 +832,21 @@ def test_sensors_changed_over_are_asked_about(write, swapped):
     assert ("LOG@370:" in doubts) == swapped
 
 
+def test_rows_that_were_written_twice_are_read_once(write):
+    rows = "".join(2 * f"{2 * k},{k // 9},{20 + k / 8}\n" for k in range(40))
+    log = read_log(write("time_s,q,temp\n" + rows))
+    assert log["time"].values.tolist() == [*range(0, 80, 2)]
+    assert "40 rows dropped that repeat the one before and its time" in log.attrs["repairs"]
+
+
+def test_a_sensor_at_its_end_is_asked_about(write):
+    heater = np.repeat([20, 80, 50, 90, 30, 70], 100)
+    plate = np.convolve(heater, np.ones(60) / 60)[:600] + np.random.default_rng(0).standard_normal(600)
+    rows = "".join(f"{k},{u},{min(y, 60):.1f}\n" for k, (u, y) in enumerate(zip(heater, plate)))
+    doubts = read_log(write("time_s,heater,plate_degC\n" + rows)).attrs["role_doubts"]
+    assert "plate is held at 60 for " in doubts
+
+
 def test_a_server_s_readings_of_bad_quality_are_none(write):
     row = "{0},u,{1},Good\n{0},T,{2},Good\n"
     rows = "".join(row.format(k, k // 9, 9 + k % 3) for k in range(60)) + "60,u,0,Bad\n60,T,9,Good\n"

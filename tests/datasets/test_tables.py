@@ -148,6 +148,7 @@ LEFT = "row(s) with too few or too many cells left out"
         ('a,b\n1,2\n"3,4\n5,6\n', "", "row 3: has 1 cell(s), the header has 2; complete"),
         ("a,b\n1,1_0\n2,3\n", "", "'1_0' is not a number"),
         ("a,b\n1,2,5\n2,3,5\n", "", "2 names above rows of 3 cells; name all with --columns NAME,NAME"),
+        ('"t" "u"\n"1" 0 5\n"2" 1 5\n', "", "has 2 names above rows of 3 cells"),  # as R writes row names
         (rows(9, {4: "b,a\n"}), "", "row 6: the header stands again with other columns: 'b,a'; cut the file"),
         ('a {"T":1,"U":2}\nb {"T":1}\n' * 9, "", "lines of several kinds are none)"),
         ("a,b\n1," + "x" * 40 + "\n2,3\n", "", f"'{'x' * 40}' is not a number"),
