@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -42,7 +43,8 @@ def test_the_table_has_a_column_for_each_schedule(bench, monkeypatch):
     assert done.code == 0, done.err
     head = next(line for line in done.out.splitlines() if "parameter" in line)
     assert head.split() == ["parameter", "unit", "value", "now", "prbs", "multisine", "staircase", "optimal"]
-    assert "bits; after optimal" in done.out
+    assert re.findall(r"^(\w+): [\d.]+ bits", done.out, re.MULTILINE) == head.split()[4:]
+    assert done.out.count("bits; after optimal") == 3
     log = read_log("s.csv", inputs=["q1", "q2"], outputs=[])
     assert np.all(log["q2"].values == 0.0)
     assert np.abs(np.diff(log["q1"].values)).max() <= 20.0 + 1e-6
