@@ -3,20 +3,13 @@
 At a time t of the contact the classifier has probabilities p from the readings so far.  The contact ends
 early when the answer is **confident**, max p >= c.  The threshold comes from training grasps, each followed
 through growing windows: it is the least one at which the grasps that stop for it are wrong no more often than
-stated: with k of n wrong, (k + 1) / (n + 2) <= error, the posterior mean of a rate after k of n (Laplace's
-rule of succession), so that n grasps cannot show an error below 1 / (n + 2).  And the classifier itself must
-expect no more: the mean of 1 - max p over them is at most the error too, since training grasps, which
-calibrated the gripper, are wrong less often than fresh ones (``docs/records/classification.md``).  A rule is
-for the times at which it was learnt, close together at first: evaluating it more often stops earlier and errs
-more.
+stated, and the classifier itself must expect no more, since training grasps, which calibrated the gripper,
+are wrong less often than fresh ones (``docs/records/classification.md``).  A rule is for the times at which
+it was learnt, close together at first: evaluating it more often stops earlier and errs more.
 
 **Sample by sample.**  A :class:`Stream` holds what a robot loop needs during one contact.  Each sample costs
 milliseconds, since every candidate's mode starts from the one of the sample before; :meth:`Stream.result`
 gives the same answer as the batch call on the finished grasp.
-
-What a robot sends is not always a contact.  A reading that leaps by 10 K waits for the next three, which show
-whether it was a spike; a skin that does not move, or has just saturated, ends no contact; and once a skin
-has not moved for three seconds, 10 K from its object, the probabilities are NaN, as no material is there.
 """
 
 from __future__ import annotations
@@ -236,6 +229,7 @@ def learn_from_windows(
         ended = [(stops(rule, windows), true) for windows, true in parts]
         wrong = np.concatenate([(stopped.answer != true)[stopped.early] for stopped, true in ended])
         p_wrong = np.concatenate([stopped.p_wrong[stopped.early] for stopped, _ in ended])
+        # with k of n wrong (k + 1) / (n + 2), the posterior mean of a rate (Laplace's rule of succession)
         if 1 / (wrong.size + 2) > error:
             continue  # so few are that confident: even with none of them wrong they show nothing
         if (wrong.sum() + 1) / (wrong.size + 2) > error or p_wrong.mean() > error:
@@ -366,6 +360,9 @@ class Stream:
 
     def _evaluate(self) -> None:
         """Take what was read so far for what it is."""
+        # What a robot sends is not always a contact.  A reading that leaps by 10 K waits for the next three,
+        # which show whether it was a spike; a skin that does not move, or has just saturated, ends no
+        # contact; once it has not moved for three seconds, 10 K from its object, no material is there.
         grasp = self.grasps()
         quality = check_grasps(grasp)
         if quality.reason[0]:

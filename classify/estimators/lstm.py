@@ -10,24 +10,12 @@ As in Osawa et al. (arXiv 2111.15344): batches of 100, 2000 epochs, training gra
 shifts of the initial temperature up to a hundred series a material.  Hidden size (32), Adam and its rate are
 ours, the paper does not give them.
 
-What the network is fed matters more than its size.  ``"trace"`` is the plain reading of the paper: one mean
-and one scale for all temperatures.  Copper and iron, 0.4 K apart on a rise of 5 K, are then a few percent of
-the input's spread and take the network long to find.  ``"each_time"`` takes the mean training trace off and
-brings every sample time to spread 1, so that the network sees how grasps differ and not what they share.
-
-**When training ends.**  A network that has found what tells materials apart goes on to learn the grasps by
-heart.  So one of five groups of training grasps (sessions, else blocks) is held out first, and a network is
-trained on the others until the loss of the held-out ones has not fallen for ``patience`` epochs; a second
-one, on all grasps, is trained for as many epochs as the first needed, and is taken from the epoch of the
-least training loss, for losses leap.  ``patience=None`` is the paper's training: all epochs, and the last
-weights.
+It is fed the plain reading of the paper (``"trace"``) or, by default, how grasps differ at each time
+(``"each_time"``), and its training ends early.
 
 ``torch.nn.LSTM`` trains, with all series in memory on one thread or on a GPU; weights and batches are drawn
 by PyTorch's generator, so that a seed is the same training on the same machine.  PyTorch is the extra
 ``lstm``; prediction does not need it.
-
-**Augmentation.**  Each copy is one real trace plus white noise on every sample and one shift of the whole
-trace, which is what another initial temperature is to a network that sees temperatures.
 """
 
 from __future__ import annotations
@@ -79,6 +67,8 @@ def augment(
     rng = np.random.default_rng(seed)
     grasps_of = dict(zip(*np.unique(y, return_counts=True)))
     copies = [-(-series_per_class // int(grasps_of[label])) for label in y]
+    # white noise on every sample, and one shift of the whole trace, which is what another initial temperature
+    # is to a network that sees temperatures
     source = np.repeat(np.arange(y.size), copies)
     noise = noise_sd * rng.standard_normal((source.size, x.shape[1]))
     shift = shift_sd * rng.standard_normal((source.size, 1))
@@ -121,6 +111,9 @@ class LstmClassifier(JoinedClassifier):
         target = np.searchsorted(self.classes_, labels).astype(np.int64)
         epochs = self.epochs
         split = _early_stopping_rows(grasps, labels, seed=self.random_state)
+        # A network that has found what tells materials apart goes on to learn the grasps by heart.  So one of
+        # five groups (sessions, else blocks) is held out first, to see how many epochs are needed; then all
+        # grasps train for as many.
         if split is not None and self.patience is not None and self.epochs > self.patience:
             fitted, held_out = split
             self.mean_, self.sd_ = self._standard(real[fitted])
@@ -161,6 +154,9 @@ class LstmClassifier(JoinedClassifier):
 
     def _standard(self, real: Floats) -> tuple[Floats, Floats]:
         """Return what is taken off the traces and what they are divided by."""
+        # One mean and one scale for all temperatures: copper and iron, 0.4 K apart on a rise of 5 K, are then
+        # a few percent of the input's spread and take the network long to find.  Else the mean training trace
+        # is taken off and every sample time has spread 1: how grasps differ and not what they share.
         if (self.feed or self.own_feed) == "trace":
             return np.full(real.shape[1], real.mean()), np.full(real.shape[1], max(real.std(), _LEAST_SD))
         return real.mean(axis=0), np.maximum(real.std(axis=0), _LEAST_SD)
@@ -282,7 +278,7 @@ def _train(
                     continue
                 with torch.no_grad():
                     now = float(curve[-1] if held_out_tensors is None else loss_of(*held_out_tensors))
-                if now < least - _LEAST_GAIN:
+                if now < least - _LEAST_GAIN:  # the weights of the least loss: losses leap
                     least = now
                     best = epoch
                     weights = _weights_by_name(network, readout)

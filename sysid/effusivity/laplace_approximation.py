@@ -14,20 +14,6 @@ sum of (nu + 1) ln(1 + w^2 / nu) replaces its w^2, the density's own curvature i
 ratio of the two peaks.  b and T_obj enter f linearly, so for them Laplace's method is exact
 marginalisation; the others are nearly Gaussian given them.  A nuisance with sd 0 is known.  Every function
 works on a batch of (grasp, hypothesis) pairs.
-
-What a hypothesis expects before the data
------------------------------------------
-
-- A **material with training grasps**: its block's ln h and ln e as calibrated, with the spread from grasp to
-  grasp.
-- A **material of the library**: its effusivity on the gripper's scale, with the row's uncertainty, on a block
-  of unknown contact conductance.
-- A **free effusivity**: a point of ln e, unknown contact conductance, rho c_p of solids in general (3.2
-  MJ/m^3K for metals, 1.7 for insulators).
-
-What comes from the gripper and the nominal temperature (build-up time, onset, object temperature) is common
-to all of them.
-
 """
 
 from __future__ import annotations
@@ -232,6 +218,7 @@ def material_hypotheses(gripper: GripperModel, candidates: Sequence[str | Materi
 
 def free_hypotheses(gripper: GripperModel, ln_e: ArrayLike) -> Hypotheses:
     """Return one hypothesis for each effusivity ln e on the gripper's own scale, h_c unknown."""
+    # rho c_p of solids in general: 3.2 MJ/m3K for metals, 1.7 for insulators
     x = np.asarray(ln_e, dtype=float).ravel()
     metal = 1 / (1 + np.exp(-4 * (x - np.log(4500.0))))
     spread = np.full(x.size, gripper.spreads.ln_h_of_blocks)
@@ -245,6 +232,8 @@ def free_hypotheses(gripper: GripperModel, ln_e: ArrayLike) -> Hypotheses:
 
 def prior_of(gripper: GripperModel, data: Touches, hypotheses: Hypotheses) -> Prior:
     """Return the prior of each (touch, hypothesis) pair, row by row; both have n rows."""
+    # What comes from the gripper and the nominal temperature (build-up time, onset, object temperature) is
+    # common to all hypotheses.
     n = data.level.size
     mean, sd = np.empty((n, N_NUISANCE)), np.empty((n, N_NUISANCE))
     dof = np.full((n, N_NUISANCE), np.inf)
@@ -328,8 +317,9 @@ def second_modes(
         one = Hypotheses(*(field[some] for field in others))
         return _own_modes(second, read, row[some], one, second_prior.take(some), start, None)
 
-    beside = search(np.arange(row.size), begin)
-    return restarted(beside, row, ~beside.converged, search), second_prior
+    # a passive sensor of an object of unknown temperature has several modes, some 15 K apart
+    every = np.arange(row.size)
+    return restarted(search(every, begin), row, every >= 0, search), second_prior
 
 
 def _own_modes(
@@ -411,7 +401,6 @@ class Fitted(NamedTuple):
     """Modes of n touches under m candidates, (n m,) rows."""
 
     mode: Mode  # of the grade that counts most, with the evidence of all
-    prior: Prior
     row: NDArray[np.int64]  # (n m,), the touch of each
     plain: Mode  # as grasps like those of the training
     plain_prior: Prior
@@ -452,7 +441,6 @@ def fit_candidates(
     by_grade = logsumexp(by_grade_and_candidate, axis=2)
     return Fitted(
         mode.take(best_grade)._replace(log_evidence=logsumexp(by_grade_and_candidate, axis=1).ravel()),
-        prior.take(best_grade),
         np.repeat(np.arange(n), m),
         mode.take(first),
         prior.take(first),
@@ -555,6 +543,7 @@ def _trained(gripper: GripperModel, name: str) -> dict[str, float]:
 
 
 def _untrained(gripper: GripperModel, row: Material) -> dict[str, float]:
+    # its effusivity on the gripper's scale, with the row's uncertainty, on a block of unknown conductance
     ln_effusivity = float(gripper.found_effusivity(np.log([row.effusivity]))[0])
     scale_sd = gripper.effusivity_scale(np.array([ln_effusivity]))[1]
     scatter = gripper.spreads.ln_effusivity if row.effusivity < INSULATOR else 0.0

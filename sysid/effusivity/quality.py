@@ -299,18 +299,14 @@ def contact_faults(grasps: Grasps, quality: GraspQuality) -> list[str]:
     return faults
 
 
-def torn_groups(records: Sequence[Grasps]) -> list[str]:
-    """Return in words which blocks have touches in several records: no answer joins those."""
-    return torn_names((str(record.attrs["name"]), touched_groups(record)) for record in records)
-
-
 def touched_groups(record: Grasps) -> list[str]:
     """Return the names of the touch groups of a record."""
     return list(dict.fromkeys(filter(None, label_values(record, "touch_group").tolist())))
 
 
-def torn_names(touched: Iterable[tuple[str, Sequence[str]]]) -> list[str]:
-    """Return what :func:`torn_groups` does, of the name of each file and its groups."""
+def torn_groups(touched: Iterable[tuple[str, Sequence[str]]]) -> list[str]:
+    """Return in words which blocks, by the name of each file and its groups, have touches in several files:
+    no answer joins those."""
     files_of: dict[str, list[str]] = {}
     for file, groups in touched:
         for name in groups:

@@ -600,7 +600,7 @@ def answer_files(
     from thermogrip.datasets.file_names import file_stem
     from thermogrip.datasets.grasp_files import distinct_names, list_grasp_files
     from thermogrip.datasets.parallel import in_order
-    from thermogrip.sysid.effusivity.quality import torn_names
+    from thermogrip.sysid.effusivity.quality import torn_groups
 
     files = list_grasp_files(paths)
     todo = [(file.absolute(), name) for file, name in zip(files, distinct_names(files))]
@@ -615,7 +615,7 @@ def answer_files(
                 table = file_stem((name or file.name).replace("/", "_"))
                 write_table(each["rows"], out / f"{table}.csv", unknown)
             progress(len(answers) / len(todo), file.name)
-    for words in torn_names((each["name"], each["groups"]) for each in answers):
+    for words in torn_groups((each["name"], each["groups"]) for each in answers):
         console.warn(words)
     if not out.is_dir():
         write_table([row for each in answers for row in each["rows"]], out, unknown)

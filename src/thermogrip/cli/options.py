@@ -342,14 +342,14 @@ def warn_of_contacts(
 ) -> None:
     """Warn of what was repaired in records while they were read, and of contacts that are missing or late;
     ``qualities`` are those of the records where a caller has them."""
-    from thermogrip.sysid.effusivity.quality import check_grasps, contact_faults, torn_groups
+    from thermogrip.sysid.effusivity.quality import check_grasps, contact_faults, torn_groups, touched_groups
 
     for grasps, quality in zip(records, qualities or map(check_grasps, records)):
         repairs = [line for line in str(grasps.attrs.get("repairs", "")).splitlines() if line]
         more = [f"{len(repairs) - SHOWN_REPAIRS} more like these"] if len(repairs) > SHOWN_REPAIRS else []
         for words in [*repairs[:SHOWN_REPAIRS], *more, *contact_faults(grasps, quality)]:
             warn(f"{grasps.attrs['name']}: {words}")
-    for words in torn_groups(records):
+    for words in torn_groups((record.attrs["name"], touched_groups(record)) for record in records):
         warn(words)
 
 

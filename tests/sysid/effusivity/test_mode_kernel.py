@@ -119,7 +119,7 @@ def test_a_candidate_far_behind_is_left_and_changes_no_other():
     gripper, record = load_default_gripper(), load_example_grasps()["exp1A_obj43_grip23"]
     data = touches(record.isel(grasp=np.flatnonzero(record["material"].values == "copper")[:3]))
     names = ["copper", "iron", "wood"]
-    raced, _, row, *_ = fit_candidates(gripper, data, names)
+    raced, row, *_ = fit_candidates(gripper, data, names)
     one = material_hypotheses(gripper, names)
     alone = fit_pairs(gripper, data, row, type(one)(*(np.tile(column, 3) for column in one)))
     found = raced.log_evidence.reshape(3, 3)

@@ -11,7 +11,7 @@ from thermogrip.classify import Stream, classify_grasps, load_classifier, save_c
 from thermogrip.classify.estimators.posterior import PosteriorClassifier
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.examples import load_example_grasps
-from thermogrip.datasets.schema import Grasps, make_grasps
+from thermogrip.datasets.schema import make_grasps
 from thermogrip.sysid.contact.simulation import simulate_grasps
 from thermogrip.sysid.effusivity.data import touches
 from thermogrip.sysid.effusivity.gripper_model import load_default_gripper
@@ -25,6 +25,7 @@ from thermogrip.sysid.effusivity.quality import (
     find_contact,
     longest_contact,
     torn_groups,
+    touched_groups,
 )
 
 from .makers import drawn_from_the_prior
@@ -95,11 +96,9 @@ def test_spikes_are_reported():
 
 
 def test_a_block_whose_touches_stand_in_two_files_is_reported_with_how_many_are_like_it():
-    def record(name: str, groups: list[str]) -> Grasps:
-        ids = [f"{name}{k}" for k in range(len(groups))]
-        return make_grasps([-1.0, 1.0], [[23.0, 25.0]] * len(ids), ids, touch_group=groups, name=name)
-
-    one, two, three = record("a", ["p", "q", "", "r"]), record("b", ["q", "", "p"]), record("c", ["r", "s"])
+    ids, groups = ["a1", "a2", "a3", "a4"], ["p", "q", "", "r"]
+    record = make_grasps([-1.0, 1.0], [[23.0, 25.0]] * 4, ids, touch_group=groups, name="a")
+    one, two, three = ("a", touched_groups(record)), ("b", ["q", "p"]), ("c", ["r", "s"])
     [words] = torn_groups([one, two, three])
     assert words.startswith("touch_group 'p' (2 more like it) is in a and in b, and touches are joined")
     [words] = torn_groups([one, three])
