@@ -91,13 +91,12 @@ class ErrorModel(ErrorNumbers):
     def slow(self, n: int) -> list[Array]:
         """Return what each slow error adds to :meth:`covariance`."""
         weights, lag = band_weights(n), np.arange(n)
-        sizes = zip(self.tau, self._together())
-        return [(weights @ np.exp(-lag / tau))[:, None, None] * together for tau, together in sizes]
-
-    def _together(self) -> list[Array]:
-        """Return the covariance (n_y, n_y) of the outputs by slow error."""
-        one = np.eye(len(self.white), dtype=bool)
-        return [np.where(one, 1.0, r) * np.outer(a, a) for a, r in zip(self.sd, self.correlation)]
+        same = np.eye(len(self.white), dtype=bool)
+        out = []
+        for tau, sd, correlation in zip(self.tau, self.sd, self.correlation):
+            between_outputs = np.where(same, 1.0, correlation) * np.outer(sd, sd)
+            out.append((weights @ np.exp(-lag / tau))[:, None, None] * between_outputs)
+        return out
 
     def scale(self, kind: NDArray[np.int64]) -> Array:
         """Return the factor of each column: its kind's s, or 1."""
