@@ -401,12 +401,12 @@ def _repair(
     written_twice = (
         again.any() and alike[again].all() and 2 * np.count_nonzero(alike[~again]) < (~again).sum()
     )
-    kept = np.flatnonzero(np.append(True, ~again) if written_twice else np.ones(time.size, dtype=bool))
-    ordered = repair.order_rows(time[kept], table.lines[kept], table.file)
+    once = np.append(True, ~(again & written_twice))
+    ordered = repair.order_rows(time[once], table.lines[once], table.file)
     time, repairs = ordered.time, ordered.repairs
     if written_twice:
         repairs.append(f"{again.sum()} rows dropped that repeat the one before and its time")
-    columns = {name: values[kept][ordered.rows] for name, values in columns.items()}
+    columns = {name: values[once][ordered.rows] for name, values in columns.items()}
     if time.size < 2:
         raise UserError(f"{time.size} row(s) are not a log", file=table.file, hint="give at least two rows")
     time, findings = since_first_row(time)

@@ -217,9 +217,11 @@ def roles_of_data(
     for name in [name for name in columns if name not in fixed]:
         values = columns[name][np.isfinite(columns[name])]
         steps, rows = np.diff(values), max(values.size, 1)
+        usual = np.median(steps) if steps.size else 0.0
+        even = np.abs(steps - usual) < _ROLES.exact * np.abs(usual)
         if not steps.any():
             out[name] = "other", _NEVER_MOVES
-        elif rows >= _ROLES.fewest_rows and _mostly_even(steps):
+        elif rows >= _ROLES.fewest_rows and np.mean(even) >= _ROLES.counter_share:
             out[name] = "other", _COUNTS_ROWS
         elif _is_held(values):
             out[name] = "input", f"it is held between {np.count_nonzero(steps)} moves in {rows} rows"
@@ -396,11 +398,6 @@ def _is_moved(
 def _name_words(name: str) -> str:
     """Return a name in lower case with its words apart: ``BeerSet`` as ``beer_set``."""
     return re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", name).lower()
-
-
-def _mostly_even(steps: Floats) -> bool:
-    usual = np.median(steps)
-    return bool(np.mean(np.abs(steps - usual) < _ROLES.exact * np.abs(usual)) >= _ROLES.counter_share)
 
 
 def _is_held(values: Floats) -> bool:
