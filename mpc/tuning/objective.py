@@ -288,7 +288,7 @@ def trial(
     if case.load is not None:
         n = round(seconds / truth.dt) + 1
         load = signal_of(case.load, truth, controlled, case.target, spec.ambient_degC, n)
-        # All of the error is the load's: noise alone would make most of it. With noise filters that hardly
+        # All of the error is the load's: noise alone would make most of it. With noise filters that barely
         # move win, and on the truth of a sous-vide bath meet loads with five times the error.
         around = replace(around, load=load, noise=0.0, noises={}, quantum=0.0, quanta={}, offset={})
     about: dict[str, Any] = {
