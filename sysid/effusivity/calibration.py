@@ -646,8 +646,8 @@ def _with_discrepancy(problem: Problem, theta: Array) -> tuple[Problem, Array]:
     x = np.log1p((KNOTS + 1.5) / 0.5)
     correlation = np.exp(-0.5 * ((x[:, None] - x) / 0.4) ** 2) + 1e-4 * np.eye(KNOTS.size)
     # What all grasps have in common and what goes along with the difference between object and skin are
-    # separated by objects on both sides of the skin.  Else all of it goes along, as heat does: a part that did
-    # not would be what is left of an estimate's error, and at another difference a misfit.
+    # separated by objects on both sides of the skin.  Else all of it goes along, as heat does: a part that
+    # did not would be what is left of an estimate's error, and at another difference a misfit.
     differences = problem.data.t_object - problem.data.level
     both_sides = (differences < 0).any() and (differences > 0).any()
     always_sd = SETTINGS.always_sd_K if both_sides else SETTINGS.exact * SETTINGS.always_sd_K
