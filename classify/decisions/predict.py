@@ -8,12 +8,6 @@ answers it from all of them, of another the log probabilities are added, and eac
 touch, or where a stop rule would have ended the contact.  What of a grasp is usable is decided in
 :mod:`thermogrip.sysid.effusivity.quality`, and ``note`` explains what is not: a grasp without contact is
 none of the candidates for certain, and the row of a left-out touch has the answer of its block's others.
-
-**Why a grasp is out of distribution.**  Under a candidate every nuisance u_k has a value that fits best, and
-training grasps have given its mean m_k and standard deviation s_k.  A large ``p_unknown`` comes with large
-deviations (u_k - m_k) / s_k under every known material, or with whitened residuals r of n bins whose
-(|r|^2 - n) / sqrt(2 n) is large.  They show what to check: a block that was not at its nominal temperature,
-a contact that closed badly, or a trace that no such block gives.
 """
 
 from __future__ import annotations

@@ -271,6 +271,8 @@ def deviation_words(material: str, off: Floats, sd: Floats, misfit: float) -> st
     """Return in words which unusual values of nuisances (7,) a material requires, ``off`` by so much of a
     mean that is known to ``sd``, or which ``misfit`` [standard deviations]; empty where nothing is
     unusual."""
+    # they show what to check: a block that was not at its nominal temperature, a contact that closed badly,
+    # or a trace that no such block gives
     late = "late" if off[ONSET] > 0 else "early"
     words = {
         H: f"{np.exp(off[H]):.2f} times the usual contact conductance",
