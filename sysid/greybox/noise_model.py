@@ -91,22 +91,12 @@ class ErrorModel(ErrorNumbers):
     def slow(self, n: int) -> list[Array]:
         """Return what each slow error adds to :meth:`covariance`."""
         weights, lag = band_weights(n), np.arange(n)
-        sizes = zip(self.tau, self._together())
-        return [(weights @ np.exp(-lag / tau))[:, None, None] * together for tau, together in sizes]
-
-    def in_time(self, n: int) -> Array:
-        """Return the covariance (n, n_y, n, n_y) of n bins in a row."""
-        lags = np.abs(np.subtract.outer(np.arange(n), np.arange(n)))
-        terms = [(np.eye(n), np.diag(np.square(self.white)))]
-        terms += [(np.exp(-lags / tau), together) for tau, together in zip(self.tau, self._together())]
-        return np.asarray(
-            sum(np.einsum("st,jk->sjtk", in_time, between_outputs) for in_time, between_outputs in terms)
-        )
-
-    def _together(self) -> list[Array]:
-        """Return the covariance (n_y, n_y) of the outputs by slow error."""
-        one = np.eye(len(self.white), dtype=bool)
-        return [np.where(one, 1.0, r) * np.outer(a, a) for a, r in zip(self.sd, self.correlation)]
+        same = np.eye(len(self.white), dtype=bool)
+        out = []
+        for tau, sd, correlation in zip(self.tau, self.sd, self.correlation):
+            between_outputs = np.where(same, 1.0, correlation) * np.outer(sd, sd)
+            out.append((weights @ np.exp(-lag / tau))[:, None, None] * between_outputs)
+        return out
 
     def scale(self, kind: NDArray[np.int64]) -> Array:
         """Return the factor of each column: its kind's s, or 1."""

@@ -158,10 +158,6 @@ class Problem:
             self._starts.linearised = self.start(z)
         return self._starts.linearised
 
-    def warm_up(self, at: int) -> float:
-        """Return the seconds at the beginning of a log from which its start is estimated."""
-        return start_seconds(self.model, self.logs[at][0], self.plant.dt)
-
     @property
     def width(self) -> Array:
         """Prior sd of theta, (n_free,)."""

@@ -4,10 +4,9 @@
 rows, then the weighted residuals of each log), whose weights are no noise model.
 
 **The truth** z_0 has s(z_0) = z_0 + sum_l J_l' r_l(z_0): a draw from the prior, the contribution of noise,
-model error and random effects of the logs (of a start what its warm-up left unknown,
-:mod:`~thermogrip.sysid.greybox.random_effects`), and that of model discrepancy, the same in all logs. With
-the covariance C_l of the former and the sizes s of the latter, learnt by
-:mod:`~thermogrip.sysid.greybox.noise_model`,
+model error and random effects of the logs (:mod:`~thermogrip.sysid.greybox.random_effects`), and that of
+model discrepancy, the same in all logs. With the covariance C_l of the former and the sizes s of the latter,
+learnt by :mod:`~thermogrip.sysid.greybox.noise_model`,
 
     cov s(z_0) = Omega = 1 + sum_l V_l + U U',      V_l = J_l' C_l J_l,    U = sum_l J_l' F_l s,
 
@@ -43,7 +42,7 @@ from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.errors import UserError
 from thermogrip.sysid.greybox.noise_model import ErrorModel, LogData, learn_error_model
 from thermogrip.sysid.greybox.problem import Problem
-from thermogrip.sysid.greybox.random_effects import WarmUp, linearise_logs
+from thermogrip.sysid.greybox.random_effects import linearise_logs
 
 
 @dataclass(frozen=True)
@@ -98,9 +97,7 @@ def score_covariance(
         width += [PRIORS.effect_sd] * (len(data.kinds) - data.n_responses)
         numbers = learn_error_model(data.logs, z, width=width)
     merge = float(round(data.bin_s / problem.average))  # residuals in one mean
-    scores = [
-        _one_log(log, warm, merge, numbers, z.size, data.n_shared) for log, warm in zip(data.logs, data.warm)
-    ]
+    scores = [_one_log(log, merge, numbers, z.size, data.n_shared) for log in data.logs]
     whole = LogScores(*(np.array(column) for column in zip(*scores)))
     pull = whole.discrepancy.sum(axis=0)
     hessian = np.eye(z.size) + whole.hessian.sum(axis=0)
@@ -150,9 +147,7 @@ def common_factor(q: Array, n_log: int) -> float:
     return max(phi, (1 + freedom * phi) / n_log)
 
 
-def _one_log(
-    log: LogData, warm: WarmUp | None, merge: float, numbers: ErrorModel, n: int, n_shared: int
-) -> LogScores:
+def _one_log(log: LogData, merge: float, numbers: ErrorModel, n: int, n_shared: int) -> LogScores:
     """Return what one log adds; the score is of reading less model, so that it pulls upwards."""
     scale = np.append(numbers.scale(log.kind), 1.0)
     products, noise = np.zeros((scale.size, scale.size)), np.zeros((n, n))
@@ -160,13 +155,10 @@ def _one_log(
         products += merge * np.einsum("bjjac->ac", block.products)
         noise += merge**2 * np.tensordot(block.covariance(numbers), block.products[..., :n, :n], axes=3)
     products = products * scale * scale[:, None]
-    effects, effect_covariance = products[:n, n_shared:-1], np.eye(log.n_effects)
-    if warm is not None:
-        spread, place = scale[n_shared:-1][list(warm.effects)], np.ix_(warm.effects, warm.effects)
-        effect_covariance[place] = warm.error(numbers, spread) / np.outer(spread, spread)
+    effects = products[:n, n_shared:-1]
     return LogScores(
         hessian=products[:n, :n],
-        spread=noise + effects @ effect_covariance @ effects.T,
+        spread=noise + effects @ effects.T,
         score=products[:n, -1],
         discrepancy=products[:n, n:n_shared],
     )

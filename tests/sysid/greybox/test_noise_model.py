@@ -41,9 +41,7 @@ def test_correlation_times_and_noise_of_two_outputs_are_found_again():
     found = learn_error_model(logs, np.zeros(1), width=())
     want = ErrorModel((0.4, 0.3), (25.0,), ((2.0, 0.5),), (0.6,))
     # what counts is the covariance, however two memories share it
-    for lag in (0, 1, 5, 25):
-        ours, theirs = found.in_time(lag + 1)[0, :, lag], want.in_time(lag + 1)[0, :, lag]
-        np.testing.assert_allclose(ours, theirs, rtol=0.15, atol=0.02)
+    np.testing.assert_allclose(found.covariance(50), want.covariance(50), rtol=0.15, atol=0.02)
 
 
 def test_effects_of_logs_have_the_spread_that_made_them():
