@@ -24,9 +24,9 @@ from scipy.signal import lfilter
 
 from thermogrip.datasets.arrays import Array
 from thermogrip.sysid.greybox.noise_model import Block, LogData
-from thermogrip.sysid.greybox.problem import Problem
+from thermogrip.sysid.greybox.problem import Problem, start_seconds
 from thermogrip.sysid.models.model import Model
-from thermogrip.sysid.plant.simulation import Start, predict
+from thermogrip.sysid.plant.simulation import READING_EVERY, Start, predict
 
 Parts = list[list[list[Array]]]  # by log, stretch and output
 
@@ -158,10 +158,7 @@ def _log_effects(
 ) -> list[_Column]:
     """Return everything that is the log's own."""
     plant, (stretches, bins) = problem.plant, problem.logs[at]
-    # A log that began at rest has measured its sensors' offsets in its first seconds.  What the warm-up says
-    # of any other start is not counted: with it 90 per cent intervals of logs that begin warm covered 71
-    # (four logs) and 81 per cent (one) for 74 and 87 without (40 rigs of benchmarks/coverage, their first
-    # third cut).
+    # a log that began at rest has measured its sensors' offsets in its first seconds
     most = EFFECTS.measured_offset_sd if starts[0].level is not None else np.inf
     out = []
     for j, name in enumerate(plant.outputs):
@@ -204,6 +201,19 @@ def _of_start(problem: Problem, at: int, k: int, p: Array, start: Start) -> list
     d = stretches[k].d - start.d_offset
     y, _ = problem.model.rollout(x0, stretches[k].u[None], d[None], p, problem.plant.dt)
     change = 10.0 * (y[1:] - y[0])  # (n_x, N + 1, n_y)
+    if k == 0 and start.level is None:
+        # A start that was estimated from its first readings is as uncertain as these leave it, of which one
+        # in READING_EVERY counts and whose sensors may be off.  90 per cent intervals of logs that begin warm
+        # cover 75 (four logs) and 87 per cent (one); those of the model's own spread as much, but up to 15
+        # times as wide (40 rigs of benchmarks/coverage, their first third cut; a tank under a lamp).
+        seconds = start_seconds(problem.model, stretches, problem.plant.dt)
+        read = np.nan_to_num(change[:, : round(seconds / problem.plant.dt) + 1])
+        off = np.diag([problem.plant.nuisance.get(name, 0.0) for name in problem.plant.outputs])[:, None]
+        columns = np.concatenate([read, np.broadcast_to(off, (len(off), *read.shape[1:]))]) / problem.sd
+        counted = (1 + seconds / READING_EVERY) / read.shape[1]
+        known = np.eye(len(columns)) + counted * np.einsum("atj,btj->ab", columns, columns)
+        unknown = np.linalg.inv(known)[: len(read), : len(read)]
+        change = np.tensordot(np.linalg.cholesky(unknown).T, change, axes=1)
     scaled = [o @ change[:, :, j].T / problem.sd[j] for j, o in enumerate(bins[k].operators)]
     stacked = np.nan_to_num(np.vstack(scaled))
     modes = stacked @ np.linalg.eigh(stacked.T @ stacked)[1]

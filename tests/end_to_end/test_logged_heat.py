@@ -101,6 +101,14 @@ def test_the_gain_of_a_lamp_is_its_power_over_the_loss(plant: Plant) -> None:
     assert gains["heater"] == pytest.approx(HEATER_W / LOSS / 100, rel=0.03)
 
 
+def test_a_start_that_was_read_costs_the_powers_of_a_network_nothing(found: Identification) -> None:
+    # its readings tell the start to 0.02 K, though the network's own spread of a start is 1 K
+    if found.plant.free:
+        low, high = found.plant.intervals()["P_lamp"]
+        assert low < LAMP_W < high
+        assert high - low < 0.05 * LAMP_W  # 2.3 W where that spread alone counts
+
+
 def test_a_controller_drives_the_heater_alone_and_gives_it_less_under_the_lamp(plant: Plant) -> None:
     few = {"evaluations": 3, "search_draws": 1, "check_draws": 1}
     spec = Spec(ambient_degC=20.0, steps=[(22.0, 32.0)], hold_s=8000.0, **few)
