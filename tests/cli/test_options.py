@@ -131,6 +131,7 @@ def test_what_was_repaired_in_grasps_is_reported_five_times_and_then_counted(
 ) -> None:
     stand_in("thermogrip.sysid.effusivity.quality.check_grasps")
     stand_in("thermogrip.sysid.effusivity.quality.contact_faults", ["no contact?"])
+    stand_in("thermogrip.sysid.effusivity.quality.touched_groups", ["p"])
     torn = stand_in("thermogrip.sysid.effusivity.quality.torn_groups", ["a block in two files"])
     lines = [f"row {k} dropped" for k in range(repaired)]
     record: Any = SimpleNamespace(attrs={"name": "mine", "repairs": "\n\n".join(lines)})
@@ -140,7 +141,7 @@ def test_what_was_repaired_in_grasps_is_reported_five_times_and_then_counted(
     said = [f"mine: {words}" for words in (*lines[:5], *more, "no contact?")]
     said += ["clean: no contact?", "a block in two files"]
     assert capsys.readouterr().err.splitlines() == [f"thermogrip: warning: {words}" for words in said]
-    assert torn[0].args == ([record, clean],)
+    assert [*torn[0].args[0]] == [("mine", ["p"]), ("clean", ["p"])]
 
 
 def test_a_port_that_is_not_there_is_refused_with_those_that_are(
