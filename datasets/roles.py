@@ -283,7 +283,9 @@ def _doubts(
             problem = f"{name} is taken as input, and is computed from {', '.join(outputs)}"
             doubts.append(f"{problem}: a heat or a flow, or a drive under feedback")
     for name in moving if inputs else ():
-        helped = next((n for n in outputs if _helps_beside(columns, name, n, inputs)), None)
+        # what is held like a drive may be the drive, and the input with a name its reading
+        beside = [] if _is_held(columns[name]) else inputs
+        helped = next((n for n in outputs if _helps_beside(columns, name, n, beside)), None)
         if helped is not None:
             doubts.append(f"{name} is left out ({reasons.get(name, NO_CLUE)}), and helps to predict {helped}")
     return tuple(doubts)
@@ -375,7 +377,7 @@ def _unnamed_causes(
     moved = [n for n in outputs if n not in unmoved]
     for name in [n for n in unmoved if n in guesses and moved]:
         of_temperature = _TEMPERATURE.search(_name_words(name))  # it may follow what a drive moves
-        if name in unnamed or (of_temperature and not _is_moved(columns, name, moved)):
+        if name in unnamed or (of_temperature and not _is_moved(columns, name, moved, at_lags=all)):
             out[name] = "disturbance", f"it does not respond to {', '.join(drives)}"
     return out
 

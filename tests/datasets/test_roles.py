@@ -452,3 +452,12 @@ def test_what_readings_say_of_each_other_is_a_doubt():
     assert list(roles.of.values()) == ["input", "output", "output", "input", "disturbance"]
     assert "q is taken as input, and is computed from t_in, t_out" in roles.doubts[1]
     assert roles.doubts[0] == "t_hall is taken as disturbance: it does not respond to duty, q"
+
+
+def test_a_held_column_that_moves_as_the_input_does_is_a_doubt():
+    drive = np.repeat(np.random.default_rng(3).choice([0.0, 1.0, 2.0], 40), 25)
+    voltage = 2 * drive + 0.01 * np.random.default_rng(4).standard_normal(drive.size)
+    columns = {"kk": drive, "u_1": voltage, "t_cold": plant_of(drive)}
+    roles = assign_roles({"kk": "1", "u_1": "V", "t_cold": "degC"}, columns=columns)
+    assert roles.of["kk"] == "other"
+    assert "kk is left out" in roles.doubts[0]
