@@ -456,8 +456,9 @@ def test_what_readings_say_of_each_other_is_a_doubt():
 
 def test_a_held_column_that_moves_as_the_input_does_is_a_doubt():
     drive = np.repeat(np.random.default_rng(3).choice([0.0, 1.0, 2.0], 40), 25)
-    voltage = 2 * drive + 0.01 * np.random.default_rng(4).standard_normal(drive.size)
-    columns = {"kk": drive, "u_1": voltage, "t_cold": plant_of(drive)}
+    t_cold = plant_of(drive, gain=-7.0)
+    voltage = 2 * drive + 0.02 * t_cold + 0.001 * np.random.default_rng(4).standard_normal(drive.size)
+    columns = {"kk": drive, "u_1": voltage, "t_cold": t_cold}
     roles = assign_roles({"kk": "1", "u_1": "V", "t_cold": "degC"}, columns=columns)
     assert roles.of["kk"] == "other"
     assert "kk is left out" in roles.doubts[0]
