@@ -122,7 +122,7 @@ def test_classifiers_are_scored_on_test_grasps_and_trained_for_the_twins_on_trai
 
 
 @pytest.mark.slow
-@pytest.mark.filterwarnings("ignore:A worker was restarted:UserWarning")  # loky's: one that imported torch grew
+@pytest.mark.filterwarnings("ignore:A worker was restarted:UserWarning")  # it grew
 def test_the_whole_demo_leaves_a_page_whose_every_question_is_answered(tmp_path: Path) -> None:
     seen: list[tuple[float, str]] = []
     done = demo.run_demo(tmp_path, seed=SEED, workers=2, progress=lambda *step: seen.append(step))
