@@ -48,13 +48,7 @@ from thermogrip.sysid.data.signal_roles import (
     still_inputs,
     without_still,
 )
-from thermogrip.sysid.plant.fit_record import (
-    HELD_OUT_SHARE,
-    SEVERAL,
-    TAIL,
-    ExpectedError,
-    HeldOut,
-)
+from thermogrip.sysid.plant.fit_record import HELD_OUT_SHARE, SEVERAL, TAIL, ExpectedError, HeldOut
 from thermogrip.sysid.plant.innovations import innovation_noise
 from thermogrip.sysid.plant.log_grid import Grid, match_logs, misfit, moved_before, signals
 from thermogrip.sysid.plant.log_grid import rows_of as log_rows
@@ -649,12 +643,7 @@ def no_draws(model: str, what: str, error: Exception) -> str:
 
 
 def _judged(
-    kind: str,
-    plant: Plant,
-    boxes: _Boxes,
-    folds: Sequence[_Fold],
-    task: _Task,
-    without_draws: Sequence[str],
+    kind: str, plant: Plant, boxes: _Boxes, folds: Sequence[_Fold], task: _Task, without_draws: Sequence[str]
 ) -> Identification:
     """Return the plant with its scores and expected errors, and all that was found beside it."""
     # the last part of the kept black box is scored at the logs' own rows

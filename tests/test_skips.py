@@ -21,10 +21,7 @@ MODULES = {
 
 @pytest.mark.parametrize(
     ("skips", "counts", "shared"),
-    [
-        ("listed", "1 failed, 1 skipped, 1 xfailed, 2 errors", ["-n", "1"]),
-        ("", "4 skipped, 1 xfailed", []),
-    ],
+    [("listed", "1 failed, 1 skipped, 1 xfailed, 2 errors", ["-n", "1"]), ("", "4 skipped, 1 xfailed", [])],
     ids=["listed", "any"],
 )
 def test_a_skip_that_is_not_allowed_is_a_failure(

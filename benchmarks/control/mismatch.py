@@ -54,10 +54,7 @@ class Case:
 
 CASES = (
     Case("model is right", Truth()),
-    Case(
-        "every number off",
-        Truth(0.0465, 2.15, 0.60, 20.0, 1.85, 0.18, 0.2, 7.2, room=26.5, delay=2.1),
-    ),
+    Case("every number off", Truth(0.0465, 2.15, 0.60, 20.0, 1.85, 0.18, 0.2, 7.2, room=26.5, delay=2.1)),
     Case("gain -30 %", Truth(seebeck=0.035)),
     Case("gain +30 %", Truth(seebeck=0.065)),
     Case("delay -50 %", Truth(delay=1.0)),

@@ -245,11 +245,7 @@ def reactor() -> Plant:
         feed = 77.0 + (4.0 if c.disturbed else 0.0)
         cooled = (0.15 + 1.1 * u[0] / 100.0) / 60.0 * (temp - 15.0)
         lag = 6.0 if c.running else 0.2
-        return [
-            (1.0 - conc) / 60.0 - rate,
-            (feed - temp) / 60.0 + 60.0 * rate - cooled,
-            (temp - shown) / lag,
-        ]
+        return [(1.0 - conc) / 60.0 - rate, (feed - temp) / 60.0 + 60.0 * rate - cooled, (temp - shown) / lag]
 
     return Plant(rates, [0.5, 60.0, 60.0], [2], step=0.1)
 

@@ -66,10 +66,7 @@ def first_fit() -> list[Row]:
 
 
 INSIDE: dict[str, Callable[[], list[Row]]] = {"fit": fit, "first": first_fit}
-COMMANDS = {
-    "identify": ["--report", "report.html"],
-    "posterior": ["--models", "network", "--posterior"],
-}
+COMMANDS = {"identify": ["--report", "report.html"], "posterior": ["--models", "network", "--posterior"]}
 
 
 def measured(name: str, threads: int) -> list[Row]:

@@ -272,11 +272,7 @@ class Calls:
 
 
 def record_loop(
-    truth: Truth,
-    controlled: tuple[str, ...],
-    calls: Calls,
-    stops: list[int],
-    band: float,
+    truth: Truth, controlled: tuple[str, ...], calls: Calls, stops: list[int], band: float
 ) -> ClosedLoop:
     """Return the record of a run, a segment, which ends at one of the calls ``stops``, for each stop and
     controlled output; ``band`` is that of settling [degC]."""
@@ -292,13 +288,7 @@ def record_loop(
         for k, name in enumerate(controlled):
             output, goal = y[rows, model.outputs.index(name)], float(calls.target[first, k])
             segment = segment_of(
-                name,
-                fine[rows],
-                output,
-                goal,
-                scaled[calls_of_segment],
-                full[calls_of_segment],
-                band,
+                name, fine[rows], output, goal, scaled[calls_of_segment], full[calls_of_segment], band
             )
             segments.append(replace(segment, travel=float(jumps[calls_of_segment].sum())))
     return ClosedLoop(

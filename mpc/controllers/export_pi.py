@@ -125,11 +125,7 @@ def check_pi(
 
 
 def _differences_from_c(
-    library: ctypes.CDLL,
-    controller: PIController,
-    states: int,
-    seed: int,
-    progress: Progress | None,
+    library: ctypes.CDLL, controller: PIController, states: int, seed: int, progress: Progress | None
 ) -> Array:
     """Return by sample the largest difference of a drive in ranges, whether none is limited, and whether the
     status is the same (states, 3)."""

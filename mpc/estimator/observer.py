@@ -199,11 +199,7 @@ def detectability_margin(
 
 
 def choose_disturbances(
-    model: PredictionModel,
-    controlled: tuple[str, ...],
-    *,
-    ambient: float = 25.0,
-    least: float = 1e-3,
+    model: PredictionModel, controlled: tuple[str, ...], *, ambient: float = 25.0, least: float = 1e-3
 ) -> DisturbanceModel:
     """Return the first set of disturbance states, one an output, that is detectable at rest."""
     _, A, B, E = model.linearise(*model.at_rest(ambient))

@@ -20,17 +20,7 @@ _SHARED: dict[ModuleType, tuple[str, ...]] = {
     observer: ("LARGEST_BIAS",),
     qp: ("SHORT", "TOLERANCE"),
     reading_checks: (*("LEFT_OUT", "SHARE"),),
-    rti: (
-        "BARELY",
-        "BREAKS",
-        "BREAKS_FAR",
-        "FADING",
-        "LITTLE",
-        "LOOK_AROUND",
-        "SAFE",
-        "SHARES",
-        "SHORTEST",
-    ),
+    rti: ("BARELY", "BREAKS", "BREAKS_FAR", "FADING", "LITTLE", "LOOK_AROUND", "SAFE", "SHARES", "SHORTEST"),
 }
 
 

@@ -79,13 +79,7 @@ class CondensedQP:
     """A QP of fixed shape, solved again and again with new numbers."""
 
     def __init__(
-        self,
-        *,
-        soft: Any,
-        linear: Any,
-        quadratic: Any,
-        iteration_limit: int = 500,
-        time_limit_s: float = 0.0,
+        self, *, soft: Any, linear: Any, quadratic: Any, iteration_limit: int = 500, time_limit_s: float = 0.0
     ) -> None:
         self.soft = np.asarray(soft, dtype=bool)
         self.linear = np.asarray(linear, dtype=float)

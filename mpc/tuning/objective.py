@@ -269,14 +269,7 @@ def signal_of(
     return np.asarray(y[1] - y[0])
 
 
-def trial(
-    controller: Regulator,
-    plant: Plant,
-    spec: Spec,
-    case: Case,
-    *,
-    seed: int = 0,
-) -> ClosedLoop:
+def trial(controller: Regulator, plant: Plant, spec: Spec, case: Case, *, seed: int = 0) -> ClosedLoop:
     """Run a case, wholly in C where the controller is in C."""
     # drives have held the start for long, and the controller knows them, as a running loop knows its own
     seconds = spec.hold_s if case.seconds is None else case.seconds
@@ -306,12 +299,7 @@ def trial(
 
 
 def run_trials(
-    controller: Regulator,
-    plant: Plant,
-    spec: Spec,
-    cases: Iterable[Case],
-    *,
-    seed: int = 0,
+    controller: Regulator, plant: Plant, spec: Spec, cases: Iterable[Case], *, seed: int = 0
 ) -> list[StepResult]:
     """Return the result of each of these cases."""
     return [result_of(trial(controller, plant, spec, case, seed=seed), case) for case in cases]

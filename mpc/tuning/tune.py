@@ -394,12 +394,7 @@ class Bench:
                 for name in _SCORED_PARTS
             )
             cost = np.inf if any(worse) else cost
-        return Trial(
-            controller=kind,
-            parameters=dict(parameters),
-            score=float(cost),
-            results=tuple(results),
-        )
+        return Trial(controller=kind, parameters=dict(parameters), score=float(cost), results=tuple(results))
 
 
 def _search_designs(bench: Bench, tried: list[Trial], show: Progress) -> None:

@@ -41,11 +41,7 @@ class Board:
     """What is wired to the device."""
 
     drives: tuple[protocol.Channel, ...] = (protocol.Channel("drive", "1", -10_000, 10_000),)
-    sensors: tuple[Sensor, ...] = (
-        Sensor("t_tank"),
-        Sensor("t_surface"),
-        Sensor("t_ambient", guarded=False),
-    )
+    sensors: tuple[Sensor, ...] = (Sensor("t_tank"), Sensor("t_surface"), Sensor("t_ambient", guarded=False))
     pump: bool = True  # whether a pump must run before anything is driven
     tachometer: bool = True  # whether the pump reports that it turns
 

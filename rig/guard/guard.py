@@ -54,14 +54,7 @@ class RuleMonitor:
         self._since = dict(self._ranges)
         self._moved: dict[str, tuple[float, float]] = {}  # largest rise and fall since then [K]
 
-    def check(
-        self,
-        time: float,
-        drive: float,
-        accepted: Mapping[str, float],
-        *,
-        room: float,
-    ) -> Trip | None:
+    def check(self, time: float, drive: float, accepted: Mapping[str, float], *, room: float) -> Trip | None:
         """Return the trip, if any; ``drive`` is what was applied since the last call, -1...1 of its range,
         positive heats; temperatures are in degC."""
         passed = time - self._time if isfinite(self._time) else 0.0
@@ -172,11 +165,7 @@ class Guard:
     """
 
     def __init__(
-        self,
-        plant: Plant | None = None,
-        settings: GuardSettings | None = None,
-        *,
-        skin: str = "t_surface",
+        self, plant: Plant | None = None, settings: GuardSettings | None = None, *, skin: str = "t_surface"
     ) -> None:
         self.settings = GuardSettings.of(plant, skin) if settings is None else settings
         self.skin = skin

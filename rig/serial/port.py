@@ -43,11 +43,7 @@ class Port:
     """A serial port, pty or socket (``socket://127.0.0.1:5000``) that is opened, lost and found again."""
 
     def __init__(
-        self,
-        url: str,
-        *,
-        baudrate: int = BAUDRATE,
-        clock: Callable[[], float] = time.monotonic,
+        self, url: str, *, baudrate: int = BAUDRATE, clock: Callable[[], float] = time.monotonic
     ) -> None:
         self.url = url
         self.baudrate = baudrate

@@ -259,13 +259,7 @@ def _settle(run: Loop, timeout: float, band: float) -> bool:
 
 
 def _grasp_object(
-    run: Loop,
-    thing: Object,
-    *,
-    output: str,
-    seconds: float,
-    dt: float,
-    stop: Callable[[Grasps], bool] | None,
+    run: Loop, thing: Object, *, output: str, seconds: float, dt: float, stop: Callable[[Grasps], bool] | None
 ) -> Grasps:
     """Stop the pump, close the gripper, record and open it; return the one grasp."""
     first, n_lead = len(run.rows), max(1, round(LEAD_S / dt))

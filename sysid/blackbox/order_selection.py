@@ -169,13 +169,7 @@ def priors_of(grid: Grid) -> tuple[StartPrior, ...]:
 
 
 def free_run_errors(
-    model: Model,
-    runs: Sequence[Run],
-    *,
-    dt: float,
-    scale: Array,
-    warmup: int,
-    priors: Sequence[StartPrior],
+    model: Model, runs: Sequence[Run], *, dt: float, scale: Array, warmup: int, priors: Sequence[StartPrior]
 ) -> Array:
     """Return the free-run RMSE over the rows after the warm-up, for each prior of the start."""
     refused = np.full((len(priors), len(scale)), np.inf)
@@ -210,11 +204,7 @@ def free_run_misses(
 
 
 def choose(
-    grid: Grid,
-    family: Family,
-    *,
-    warmup: int,
-    progress: Callable[[float, str], None] | None = None,
+    grid: Grid, family: Family, *, warmup: int, progress: Callable[[float, str], None] | None = None
 ) -> Choice:
     """Fit every structure on every fold and choose by the one-standard-error rule."""
     cases = folds(grid)

@@ -137,12 +137,7 @@ def _width(sd: float, log: bool) -> str:
 
 
 def describe(
-    names: Sequence[str],
-    jacobian: Array,
-    covariance: Array,
-    on_bound: Mapping[str, str],
-    *,
-    shift: Array,
+    names: Sequence[str], jacobian: Array, covariance: Array, on_bound: Mapping[str, str], *, shift: Array
 ) -> Identifiability:
     """Return the identifiability report of a fit that lies ``shift`` prior sd off the prior's means."""
     size = np.linalg.norm(jacobian, axis=0)

@@ -200,15 +200,7 @@ def make_problem(model: GreyModel, logs: Sequence[Log], *, average: float, indep
     free = tuple(i for i, spec in enumerate(model.specs.values()) if not spec.fixed)
     sd = np.array([model.sensor_sd[name] for name in model.outputs])
     tau = np.full(len(sd), max(1.0, independent / (steps * plant.dt)))
-    return Problem(
-        plant,
-        tuple(prepared_logs),
-        tuple(map(log_name, logs)),
-        free,
-        steps * plant.dt,
-        sd,
-        tau,
-    )
+    return Problem(plant, tuple(prepared_logs), tuple(map(log_name, logs)), free, steps * plant.dt, sd, tau)
 
 
 def start_seconds(model: GreyModel, stretches: Sequence[Stretch], dt: float) -> float:

@@ -91,13 +91,7 @@ def expected_error(errors: Sequence[float], gain_effect: float) -> ExpectedError
 
 
 def free_run_band(
-    plant: Plant,
-    log: Log,
-    simulated: Log,
-    *,
-    level: float = 0.9,
-    draws: int = 30,
-    warmup: float = WARMUP,
+    plant: Plant, log: Log, simulated: Log, *, level: float = 0.9, draws: int = 30, warmup: float = WARMUP
 ) -> Band:
     """Return the band about the ``simulated`` free run of a plant over a log, of so many draws of its
     parameters (seeds 1 to ``draws``), whose state readings of ``warmup`` [s] have set."""

@@ -518,10 +518,7 @@ def test_a_fault_without_a_time_is_refused(text: str, capsys: pytest.CaptureFixt
 
 @pytest.mark.parametrize(
     ("options", "said"),
-    [
-        (["--pty", "--socket", "0"], "both given"),
-        (["--fault", "5:ghost"], "--fault 'ghost' is unknown"),
-    ],
+    [(["--pty", "--socket", "0"], "both given"), (["--fault", "5:ghost"], "--fault 'ghost' is unknown")],
 )
 def test_a_device_that_cannot_be_is_one_line(
     options: list[str], said: str, capsys: pytest.CaptureFixture[str]

@@ -12,13 +12,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from thermogrip.datasets import atomic_files
-from thermogrip.datasets.atomic_files import (
-    atomic_path,
-    read_bytes,
-    read_json,
-    write_atomic,
-    write_json,
-)
+from thermogrip.datasets.atomic_files import atomic_path, read_bytes, read_json, write_atomic, write_json
 from thermogrip.datasets.errors import UserError, os_fault
 from thermogrip.datasets.provenance import hash_file
 

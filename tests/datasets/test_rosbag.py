@@ -23,13 +23,7 @@ from rosbags.typesys import Stores, get_typestore
 from thermogrip.datasets import rosbag
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.log_files import read_log, write_log
-from thermogrip.datasets.rosbag import (
-    Column,
-    Message,
-    TopicMap,
-    read_rosbag_table,
-    read_topic_map,
-)
+from thermogrip.datasets.rosbag import Column, Message, TopicMap, read_rosbag_table, read_topic_map
 from thermogrip.datasets.schema import names
 
 SECOND = 1_000_000_000

@@ -8,13 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.units import (
-    UNITS,
-    join_header,
-    read_header,
-    split_header,
-    to_record_unit,
-)
+from thermogrip.datasets.units import UNITS, join_header, read_header, split_header, to_record_unit
 
 NAMES = st.from_regex(r"[a-z]{2,8}(_[0-9])?", fullmatch=True)
 

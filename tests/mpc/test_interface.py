@@ -38,10 +38,7 @@ def test_the_room_offers_what_it_lists_and_nothing_else():
 def test_a_controller_starts_from_the_drive_that_its_first_reading_has(tank, name: str):
     """Asked for less where 40 % holds 30 degC, each goes down from there by the slew of a sample."""
     design = default_design(tank, dt=2.0, slew_per_s={"drive": 0.05})
-    made = {
-        "mpc": lambda: Controller(tank, design),
-        "pi": lambda: PIController(tank, design),
-    }[name]()
+    made = {"mpc": lambda: Controller(tank, design), "pi": lambda: PIController(tank, design)}[name]()
     reading = {"t_tank": 30.2, "t_surface": 30.0, "t_ambient": 25.0}
     made.reset(reading | {"drive": 0.4})
     assert made.step(reading, 20.0).drive == pytest.approx(0.3)

@@ -162,10 +162,7 @@ def test_trials_run_amid_it_and_every_controller_settles_without_offset(case):
     assert truth.d.tolist() == [case.room, case.nominal]
     shown = truth.reading()[case.name]
     assert shown == pytest.approx(case.nominal, abs=0.03 * (case.logs[1] - case.logs[0]))
-    for regulator in (
-        Controller(plant, design),
-        PIController(plant, design),
-    ):
+    for regulator in (Controller(plant, design), PIController(plant, design)):
         run = trial(regulator, plant, spec, Trial(*case.steps[0], 0))
         (segment,) = run.segments
         assert segment.settle_s < 900.0

@@ -17,11 +17,7 @@ from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.datasets.schema import make_log
 from thermogrip.report import classification
 from thermogrip.report.charts import Chart
-from thermogrip.report.classification import (
-    comparison_sections,
-    effusivity_section,
-    touch_section,
-)
+from thermogrip.report.classification import comparison_sections, effusivity_section, touch_section
 from thermogrip.report.html import Picture, Section, Text
 from thermogrip.sysid.effusivity import EffusivityRow
 
@@ -112,10 +108,7 @@ def test_who_wins_has_the_least_log_loss_and_is_set_apart_only_where_n_can(p_val
         score | {"classifier": "a", "log_loss": 0.25, "accuracy": 0.9},
         score | {"classifier": "c", "log_loss": 0.1, "accuracy": 1.0, "condition": "other"},
     ]
-    pairs = [
-        {"first": "b", "second": "a", "p_value": p_value},
-        {"first": "b", "second": "c", "p_value": 0.9},
-    ]
+    pairs = [{"first": "b", "second": "a", "p_value": p_value}, {"first": "b", "second": "c", "p_value": 0.9}]
     found = SimpleNamespace(scores=lambda: scores, differences=lambda condition: pairs)
     assert classification._who_wins(found, "pooled") == (
         "a has the lowest log loss (0.25; chance 1.10) and 90 % right of n = 20 grasps (68 to 99 %).",

@@ -139,9 +139,7 @@ def test_the_page_of_a_pi_has_its_loops_and_no_weights() -> None:
     assert control.tuning_section(tuning).verdict == "The PI meets the spec on every draw."
 
 
-def test_a_tuning_has_a_section_for_each_step_and_load_of_its_controller(
-    drawn: dict[str, Any],
-) -> None:
+def test_a_tuning_has_a_section_for_each_step_and_load_of_its_controller(drawn: dict[str, Any]) -> None:
     tuning = tuning_of()
     titles = [section.title for section in control.tuning_sections(tuning)]
     assert titles == [

@@ -156,8 +156,7 @@ def test_parameters_stand_where_there_are_any(monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr(plant, "free_run_section", lambda *args, **options: (args, options))
     asked: list[tuple[object, ...]] = []
     monkeypatch.setattr(
-        "thermogrip.sysid.validation.free_run.free_run",
-        lambda *args: (asked.append(args), "a run")[1],
+        "thermogrip.sysid.validation.free_run.free_run", lambda *args: (asked.append(args), "a run")[1]
     )
     found = identified()
     found.runs = (SimpleNamespace(warmup=9.0),)

@@ -19,13 +19,7 @@ from thermogrip.classify.estimators.base import GraspClassifier
 from thermogrip.cli.main import main
 from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.datasets.parallel import Progress
-from thermogrip.studies.paper import (
-    CASES,
-    Case,
-    PaperResult,
-    _published,
-    repeat_paper,
-)
+from thermogrip.studies.paper import CASES, Case, PaperResult, _published, repeat_paper
 
 FEW = (CASES[0], CASES[4])  # 1-A of five materials, and 2-C of three
 

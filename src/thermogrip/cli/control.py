@@ -69,13 +69,7 @@ def tune(
 
 def _written(console: Console, found: Tuning, plant: str, out: Path, report: Path | None) -> dict[str, Any]:
     """Write and show what a search found; return the answer."""
-    from thermogrip.report.control import (
-        kind_of,
-        spec_answer,
-        tuning_caption,
-        tuning_sections,
-        tuning_table,
-    )
+    from thermogrip.report.control import kind_of, spec_answer, tuning_caption, tuning_sections, tuning_table
     from thermogrip.report.html import write_report
 
     found.save(out)

@@ -417,15 +417,7 @@ def record(
             raise UserError(error.problem, file=schedule, hint=error.hint) from error
         about = {"schedule": schedule, "port": port, "sample_s": dt, "seed": seed}
         with _recorded(out, about, bridge, watch) as (folder, recorder):
-            log, ended = play(
-                rig,
-                plan,
-                dt=dt,
-                guard=checks,
-                clock=clock,
-                recorder=recorder,
-                **watch.hooks,
-            )
+            log, ended = play(rig, plan, dt=dt, guard=checks, clock=clock, recorder=recorder, **watch.hooks)
             folder.played(ended)
             watch.ended("tripped" if ended else "played")
     finally:
@@ -466,13 +458,7 @@ def recover(
         rows = 0 if done.run.log is None else done.run.log.sizes["time"]
         verdict = done.run.about["verdict"]
         results.append(
-            {
-                "run": run,
-                "changed": done.changed,
-                "said": done.findings,
-                "rows": rows,
-                "verdict": verdict,
-            }
+            {"run": run, "changed": done.changed, "said": done.findings, "rows": rows, "verdict": verdict}
         )
     if out is not None:
         export_run(folders[0], out)
@@ -596,12 +582,7 @@ def _recorded(
     """Yield the run folder of a session that is watched, and what records into it."""
     from thermogrip.rig.records.run_folder import RunFolder
 
-    with (
-        _bridge(bridge) as through,
-        watch,
-        RunFolder(out, about) as folder,
-        through(folder) as recorder,
-    ):
+    with _bridge(bridge) as through, watch, RunFolder(out, about) as folder, through(folder) as recorder:
         yield folder, recorder
 
 

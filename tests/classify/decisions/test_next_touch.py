@@ -14,12 +14,7 @@ from scipy.stats import multivariate_normal, norm
 
 from thermogrip.classify import choose_next_touch, make_classifier
 from thermogrip.classify.decisions import next_touch
-from thermogrip.classify.decisions.next_touch import (
-    NextTouch,
-    advise_touches,
-    entropy,
-    expected_information,
-)
+from thermogrip.classify.decisions.next_touch import NextTouch, advise_touches, entropy, expected_information
 from thermogrip.classify.estimators.posterior import PosteriorClassifier
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.examples import load_example_grasps

@@ -12,12 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from thermogrip.classify import (
-    answer,
-    classify_grasps,
-    make_classifier,
-    write_predictions,
-)
+from thermogrip.classify import answer, classify_grasps, make_classifier, write_predictions
 from thermogrip.classify.decisions.next_touch import advise_touches
 from thermogrip.classify.decisions.predict import unexplained_effusivities
 from thermogrip.classify.estimators.base import GraspClassifier, pick

@@ -5,10 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from thermogrip.classify.estimators.features import (
-    feature_noise,
-    linear_features,
-)
+from thermogrip.classify.estimators.features import feature_noise, linear_features
 from thermogrip.datasets.schema import make_grasps
 
 T = np.arange(-2.0, 10.05, 0.1)

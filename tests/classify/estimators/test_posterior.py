@@ -19,10 +19,7 @@ from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.datasets.schema import Grasps
 from thermogrip.sysid.contact.simulation import simulate_grasps
 from thermogrip.sysid.effusivity.data import KNOTS, graded, touches, whiten
-from thermogrip.sysid.effusivity.gripper_model import (
-    Discrepancy,
-    load_default_gripper,
-)
+from thermogrip.sysid.effusivity.gripper_model import Discrepancy, load_default_gripper
 from thermogrip.sysid.effusivity.laplace_approximation import fit_candidates
 from thermogrip.sysid.effusivity.multi_touch import two_touch_fit
 from thermogrip.sysid.effusivity.posterior import effusivity_posterior, material_fit
@@ -168,10 +165,7 @@ def test_a_metal_is_unknown_to_one_who_knows_only_wood(fitted: PosteriorClassifi
 
 @pytest.mark.parametrize(
     ("params", "message"),
-    [
-        ({"prior_unknown": 0.0}, "prior_unknown is 0"),
-        ({"priors": {"wood": 0.0}}, "a prior is not positive"),
-    ],
+    [({"prior_unknown": 0.0}, "prior_unknown is 0"), ({"priors": {"wood": 0.0}}, "a prior is not positive")],
 )
 def test_a_wrong_parameter_is_refused(warm: Grasps, params: dict[str, object], message: str) -> None:
     with pytest.raises(UserError, match=message):

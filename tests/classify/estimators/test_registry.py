@@ -13,12 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from thermogrip.classify import (
-    CLASSIFIERS,
-    load_classifier,
-    make_classifier,
-    save_classifier,
-)
+from thermogrip.classify import CLASSIFIERS, load_classifier, make_classifier, save_classifier
 from thermogrip.classify.estimators.base import GraspClassifier
 from thermogrip.classify.estimators.lda import ArrayClassifier
 from thermogrip.classify.estimators.registry import can_be_saved

@@ -20,10 +20,7 @@ from thermogrip.classify.estimators.base import Answered, JoinedClassifier, pick
 from thermogrip.classify.estimators.bayes import BayesClassifier
 from thermogrip.classify.evaluation import harness
 from thermogrip.classify.evaluation.comparison import Comparison
-from thermogrip.classify.evaluation.harness import (
-    binomial_p,
-    untouched,
-)
+from thermogrip.classify.evaluation.harness import binomial_p, untouched
 from thermogrip.classify.evaluation.metrics import (
     calibration_bins,
     calibration_interval,

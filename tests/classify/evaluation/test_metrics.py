@@ -13,11 +13,7 @@ from sklearn.metrics import brier_score_loss, roc_auc_score
 from sklearn.metrics import log_loss as sklearn_log_loss
 
 from thermogrip.classify.evaluation import metrics as s
-from thermogrip.classify.evaluation.metrics import (
-    calibration_interval,
-    grasp_counts,
-    mean_intervals,
-)
+from thermogrip.classify.evaluation.metrics import calibration_interval, grasp_counts, mean_intervals
 
 
 @given(st.integers(1, 300).flatmap(lambda n: st.tuples(st.integers(0, n), st.just(n))))

@@ -45,10 +45,7 @@ def test_a_good_reading_gives_ok_and_no_advice(controller):
     assert controller.plan.shape == (sum(controller.design.blocks), 1)
 
 
-@pytest.mark.parametrize(
-    "bad",
-    [{**REST, "t_surface": None}, {**REST, "t_surface": "warm"}, {}],
-)
+@pytest.mark.parametrize("bad", [{**REST, "t_surface": None}, {**REST, "t_surface": "warm"}, {}])
 def test_a_lost_skin_reading_follows_the_plan_then_switches_off(controller, bad):
     before = controller.step(REST, 38.0).drive
     statuses = []

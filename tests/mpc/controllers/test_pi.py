@@ -16,10 +16,7 @@ from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.plant import Plant
 
 PLANT, NAN = crossed(), float("nan")
-LOOPS = (
-    PILoop("q2", "a", Kc=3.0, Ti=20.0),
-    PILoop("q1", "b", Kc=2.0, Ti=40.0),
-)
+LOOPS = (PILoop("q2", "a", Kc=3.0, Ti=20.0), PILoop("q1", "b", Kc=2.0, Ti=40.0))
 TARGET = {"a": 30.0, "b": 29.5}  # held by 40 % of q2 and 30 % of q1 in a room of 22 degC
 
 

@@ -35,10 +35,7 @@ RATES: dict[str, Callable[[], Iterator[float]]] = {
 
 def makers(plant: Any) -> dict[str, Callable[[], Any]]:
     design = default_design(plant, dt=DT, deadline_s=1e9)
-    made = {
-        "mpc": lambda: ReferenceController(plant, design),
-        "pi": lambda: PIController(plant, dt=DT),
-    }
+    made = {"mpc": lambda: ReferenceController(plant, design), "pi": lambda: PIController(plant, dt=DT)}
     return made | ({"c": lambda: Controller(plant, design)} if compiler() else {})
 
 

@@ -26,15 +26,7 @@ BELIEF = ModelSettings(
 def plant() -> Plant:
     """Two outputs of which the second is the reference, behind a drive in percent and a step of 2 s."""
     model = StateSpaceModel(
-        ("q",),
-        ("hall",),
-        ("a", "b"),
-        A=A,
-        B=B[:, None] / HALF,
-        E=np.zeros((2, 1)),
-        C=C,
-        dt=2.0,
-        y0=LEVEL,
+        ("q",), ("hall",), ("a", "b"), A=A, B=B[:, None] / HALF, E=np.zeros((2, 1)), C=C, dt=2.0, y0=LEVEL
     )
     units = {"q": "percent", "hall": "degC", "a": "degC", "b": "degC"}
     offsets = dict(zip("ab", OFFSET.tolist()))

@@ -34,14 +34,7 @@ from thermogrip.datasets.schema import names
 from thermogrip.rig.guard.trip import Trip
 from thermogrip.rig.interface import Event
 from thermogrip.rig.records import run_folder
-from thermogrip.rig.records.run_folder import (
-    RunFolder,
-    export_run,
-    mark_bad,
-    read_run,
-    recover,
-    sums_agree,
-)
+from thermogrip.rig.records.run_folder import RunFolder, export_run, mark_bad, read_run, recover, sums_agree
 from thermogrip.rig.session.session import Session, run_session
 from thermogrip.rig.simulation.twin import Twin
 from thermogrip.studies.demo import _fresh

@@ -26,14 +26,7 @@ from thermogrip.rig.interface import Event, Reading
 from thermogrip.rig.records.run_folder import RunFolder, read_run, recover
 from thermogrip.rig.serial.port import PortError
 from thermogrip.rig.session.loop import PHASES, hold_last_good
-from thermogrip.rig.session.session import (
-    Object,
-    Playback,
-    _session_of,
-    grasp_of_rows,
-    play,
-    run_session,
-)
+from thermogrip.rig.session.session import Object, Playback, _session_of, grasp_of_rows, play, run_session
 from thermogrip.rig.simulation.twin import Twin
 from thermogrip.sysid.contact.simulation import Grip
 from thermogrip.sysid.plant.plant import Plant

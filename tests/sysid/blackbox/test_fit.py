@@ -42,8 +42,7 @@ def fit_of(kind, log, **orders):
 @pytest.mark.slow
 @pytest.mark.parametrize("rows", [1200, 600])
 @pytest.mark.parametrize(
-    ("kind", "orders"),
-    [("oe", {"poles": 2, "delays": 2}), ("subspace", {"orders": 2, "rows": 15})],
+    ("kind", "orders"), [("oe", {"poles": 2, "delays": 2}), ("subspace", {"orders": 2, "rows": 15})]
 )
 def test_refits_spread_as_fits_to_new_logs_do(kind, orders, rows):
     fitted, spread = [], []

@@ -18,10 +18,7 @@ from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.datasets.materials import find_material
 from thermogrip.datasets.schema import make_grasps
 from thermogrip.sysid.effusivity import calibration
-from thermogrip.sysid.effusivity.calibration import (
-    calibrate_example_gripper,
-    calibrate_gripper,
-)
+from thermogrip.sysid.effusivity.calibration import calibrate_example_gripper, calibrate_gripper
 from thermogrip.sysid.effusivity.data import KNOTS, touches
 from thermogrip.sysid.effusivity.gripper_model import (
     INSULATOR,

@@ -357,8 +357,7 @@ def test_the_more_a_grasp_misfits_the_less_it_says():
 
 def test_the_second_sensor_is_asked_about_the_same_material(device):
     second = replace(
-        device,
-        blocks={k: replace(b, ln_h=b.ln_h - 1.0) for k, b in device.blocks.items() if k != "zinc"},
+        device, blocks={k: replace(b, ln_h=b.ln_h - 1.0) for k, b in device.blocks.items() if k != "zinc"}
     )
     first = material_hypotheses(device, ["copper", "zinc", "aluminium"])
     other = laplace.hypotheses_of_second(device, second, first)

@@ -28,11 +28,7 @@ from thermogrip.sysid.effusivity.laplace_approximation import (
     predict,
     prior_of,
 )
-from thermogrip.sysid.effusivity.posterior import (
-    _effusivity_row,
-    effusivity_posterior,
-    material_fit,
-)
+from thermogrip.sysid.effusivity.posterior import _effusivity_row, effusivity_posterior, material_fit
 from thermogrip.sysid.effusivity.posterior_grid import (
     LN_E_RANGE,
     GridPosterior,

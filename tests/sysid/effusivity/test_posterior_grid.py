@@ -9,10 +9,7 @@ from scipy.special import ndtr
 from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.sysid.effusivity import posterior_grid
 from thermogrip.sysid.effusivity.data import touches, whiten
-from thermogrip.sysid.effusivity.laplace_approximation import (
-    EFFUSIVITY,
-    fit_candidates,
-)
+from thermogrip.sysid.effusivity.laplace_approximation import EFFUSIVITY, fit_candidates
 from thermogrip.sysid.effusivity.posterior_grid import (
     LN_E_RANGE,
     free_evidence,

@@ -8,10 +8,7 @@ import numpy as np
 
 from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.sysid.effusivity.data import noise_covariance
-from thermogrip.sysid.effusivity.laplace_approximation import (
-    jacobian,
-    nodes_for,
-)
+from thermogrip.sysid.effusivity.laplace_approximation import jacobian, nodes_for
 from thermogrip.sysid.effusivity.multi_touch import next_touch_prior
 from thermogrip.sysid.effusivity.predictive import _coming, next_touch
 

@@ -540,10 +540,7 @@ def test_a_longer_contact_is_named_by_its_beginning_and_the_answer_reports_it(sh
         assert row == pytest.approx(wanted, rel=1e-6, abs=1e-9)
     assert {row["decided_at_s"] for row in rows} == {10.0}
     np.testing.assert_allclose(
-        short.predict_proba(long),
-        short.predict_proba(long.sel(time=slice(None, 10.0))),
-        rtol=1e-6,
-        atol=1e-9,
+        short.predict_proba(long), short.predict_proba(long.sel(time=slice(None, 10.0))), rtol=1e-6, atol=1e-9
     )
 
 

@@ -16,11 +16,7 @@ from thermogrip.cli.excite import optimal_for, schedule_for
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log, make_log
 from thermogrip.sysid.experiment import optimal
-from thermogrip.sysid.experiment.information import (
-    ExperimentForecast,
-    interval_widths,
-    plant_from_prior,
-)
+from thermogrip.sysid.experiment.information import ExperimentForecast, interval_widths, plant_from_prior
 from thermogrip.sysid.experiment.optimal import Expectation, expect, inputs_of, optimal_schedule
 from thermogrip.sysid.greybox.fit import fit_network
 from thermogrip.sysid.models.network import load_network

@@ -608,13 +608,7 @@ def bare(**units: str) -> Any:
 
 
 def test_what_was_converted_is_reported_once_and_columns_take_the_models_roles():
-    columns = {
-        "q": (T, "1"),
-        "p": (T / 2, "1"),
-        "room": (T, "K"),
-        "t": (0 * T, "1"),
-        "n": (T, "s"),
-    }
+    columns = {"q": (T, "1"), "p": (T / 2, "1"), "room": (T, "K"), "t": (0 * T, "1"), "n": (T, "s")}
     log = make_log(T, {name: (*item, "input") for name, item in columns.items()})
     log["t"].values[:] = np.nan
     model = bare(q="W", p="percent", t="degC")

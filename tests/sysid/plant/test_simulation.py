@@ -17,12 +17,7 @@ from thermogrip.sysid.models.network import load_network
 from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.log_grid import Stretch, cut_stretches
 from thermogrip.sysid.plant.plant import Plant
-from thermogrip.sysid.plant.simulation import (
-    _binned,
-    _first_reading,
-    find_starts,
-    predict,
-)
+from thermogrip.sysid.plant.simulation import _binned, _first_reading, find_starts, predict
 
 A = np.array([[0.97, 0.01], [0.05, 0.9]])
 B, E = np.array([0.3, 0.05]), np.array([0.02, 0.05])

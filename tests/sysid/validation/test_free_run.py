@@ -16,9 +16,7 @@ from thermogrip.sysid.plant.fit_record import fit_logs
 from thermogrip.sysid.plant.plant import Plant
 from thermogrip.sysid.validation import free_run as module
 from thermogrip.sysid.validation.free_run import free_run, no_input_baseline, score
-from thermogrip.sysid.validation.residual_tests import (
-    CorrelationTest,
-)
+from thermogrip.sysid.validation.residual_tests import CorrelationTest
 
 
 def lag_plant(pole: float = 0.95, gain: float = 0.5) -> Plant:
