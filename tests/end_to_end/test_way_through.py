@@ -86,7 +86,8 @@ def test_grasps_become_materials(bench: Bench) -> None:
     assert bench.run("classify", "m", "more.csv", "--out", "p.csv").code == 0
     with (bench.path / "p.csv").open() as file:
         rows = list(csv.DictReader(file))
-    assert list(rows[0]) == ["grasp_id", "material", "p_copper", "p_wood", "p_unknown", "decided_at_s"]
+    numbers = ["p_copper", "p_wood", "p_unknown", "decided_at_s", "misfit_sd"]
+    assert list(rows[0]) == ["grasp_id", "material", *numbers, "deviates", "note", "note_codes"]
     assert [row["material"] for row in rows] == ["copper", "wood"] * 6
     assert all(abs(float(row["p_copper"]) + float(row["p_wood"]) - 1) < 1e-5 for row in rows)
 

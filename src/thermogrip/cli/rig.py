@@ -254,7 +254,6 @@ def run(
     console, pace = Console(as_json), rig.pace(show)
     watch = show.watch("run", console, out, pace)
     loaded = load_controller(controller, rig.network)
-    of_grasp = grasps.of_session(watch, loaded, console.say if profile is None else None)
     regulator, path = RecordedController(loaded, LoopMonitor(loaded.plant, loaded.design)), None
     if profile is not None:
         path = read_profile(profile, loaded.controlled, preview_s=loaded.dt * sum(loaded.design.blocks))
@@ -268,6 +267,7 @@ def run(
     about |= {} if profile is None else {"profile": profile.name}
     about |= {"from_degC": rig.start, "hold_s": hold, "object_degC": obj, "material": material, "seed": seed}
     clock = rig.clock(pace)
+    of_grasp = grasps.of_session(watch, loaded, console.say if profile is None else None)
     if rig.port and (taken := spec_of(loaded, None)[0].surroundings_in_words(loaded.plant)):
         console.say(f"Where the rig does not read it, {taken}")
     opened = rig.open(clock, loaded, pace=pace, seed=seed, say=console.say)
