@@ -118,11 +118,11 @@ def review(
     noise = judged_seed(plant, seed if isinstance(seed, int) else 0)
     return [
         reachable(controller, spec, span, rooms),
-        as_asked(controller, spec, judged, noise, noted=noted),
+        meets_each_step(controller, spec, judged, noise, noted=noted),
         after_loads(controller, spec, judged[:3]),
         lacks_structure(controller, spec, judged[-1], noise, noted=noted),
         valid_range(controller, span),
-        called_good(controller),
+        plant_is_good(controller),
     ]
 
 
@@ -150,15 +150,17 @@ def settle_limit_s(controller: Reviewed) -> float:
     return 2 * (spec if noted else Spec.of(controller.plant)).settle_within_s
 
 
-def as_asked(controller: Reviewed, spec: Spec, draws: Sequence[int], seed: int, *, noted: bool) -> Check:
+def meets_each_step(
+    controller: Reviewed, spec: Spec, draws: Sequence[int], seed: int, *, noted: bool
+) -> Check:
     """Every step of the spec must be as asked on the plant and on draws; nothing fails that nobody asked
     for."""
     cases = steps_on(spec, draws)
-    results_of_all = run_trials(_again(controller), controller.plant, spec, cases, seed=seed)
+    results_of_all = run_trials(_fresh(controller), controller.plant, spec, cases, seed=seed)
     words, verdicts = [], []
     for step in spec.steps:
         results = [result for result in results_of_all if result.case.step == step]
-        of_step = [_stepped(result, spec, noted=noted) for result in results]
+        of_step = [_step_verdict(result, spec, noted=noted) for result in results]
         late = [float(np.nan_to_num(result.settle_s, nan=np.inf)) for result in results]
         worst_of = max(range(len(results)), key=lambda k: (_RANK[of_step[k][1]], late[k]))
         words.append(f"{step[0]:g} to {step[1]:g} degC: {of_step[worst_of][0]}")
@@ -175,7 +177,7 @@ def after_loads(controller: Reviewed, spec: Spec, draws: Sequence[int]) -> Check
     loads = loads_of(plant, spec, controller.design)
     seconds = 2 * load_seconds(controller.design)
     cases = [Case(target, target, draw, load=load, seconds=seconds) for load in loads for draw in draws]
-    results = run_trials(_again(controller), plant, spec, cases)
+    results = run_trials(_fresh(controller), plant, spec, cases)
     words = []
     for load in loads:
         of_load = [result for result in results if result.case.load == load]
@@ -187,7 +189,7 @@ def after_loads(controller: Reviewed, spec: Spec, draws: Sequence[int]) -> Check
     return _graded("comes back after a load", "; ".join(words), fail=(lost, fix))
 
 
-def _again(controller: Reviewed) -> Reviewed:
+def _fresh(controller: Reviewed) -> Reviewed:
     """Return the same controller for trials, which has not run."""
     kind = "PI" if isinstance(controller, PIController) else "MPC"
     return made_for_trials(kind, controller.plant, controller.design)
@@ -202,9 +204,9 @@ def lacks_structure(controller: Reviewed, spec: Spec, draw: int, seed: int, *, n
     start, target = spec.steps[0]
     cases = [Case(start, target, draw, structure) for structure in lacking(plant, doubted, controlled)]
     words, verdicts = [], []
-    for result in run_trials(_again(controller), plant, doubted, cases, seed=seed):
+    for result in run_trials(_fresh(controller), plant, doubted, cases, seed=seed):
         structure = result.case.lacks
-        ends, verdict = _stepped(result, spec, noted=noted and structure in stated)
+        ends, verdict = _step_verdict(result, spec, noted=noted and structure in stated)
         words.append(f"{structure}: {ends}")
         verdicts.append(verdict if structure in stated else min(verdict, "warn", key=_RANK.__getitem__))
     fix = "identify on a log of the closed loop and tune again; a design that moves less tolerates more"
@@ -213,7 +215,7 @@ def lacks_structure(controller: Reviewed, spec: Spec, draw: int, seed: int, *, n
     return _graded(name, finding, fail=("fail" in verdicts, fix), warn=(set(verdicts) != {"pass"}, fix))
 
 
-def _stepped(result: StepResult, spec: Spec, *, noted: bool = False) -> tuple[str, str]:
+def _step_verdict(result: StepResult, spec: Spec, *, noted: bool = False) -> tuple[str, str]:
     """Return what a step did, in words, and graded: by the spec itself where that was ``noted``."""
     settled = bool(np.isfinite(result.settle_s))
     late = noted and not result.settle_s <= spec.settle_within_s
@@ -289,7 +291,7 @@ def valid_range(controller: Reviewed, span: tuple[float, float]) -> Check:
     return Check(name, "pass", "; ".join(logged))
 
 
-def called_good(controller: Reviewed) -> Check:
+def plant_is_good(controller: Reviewed) -> Check:
     """What rests on a plant that its own logs contradict looks as sound as what rests on a good one."""
     name, verdict = "identify calls the plant good", controller.plant.verdict
     fix = "identify on longer logs, or on logs that excite it more, and tune again"

@@ -125,12 +125,12 @@ def pairs_asked(
     stack: Stack, nodes: TimeNodes, data: Touches, row: NDArray[np.int64], beyond: Array | None
 ) -> Any:
     """Return the pairs of some rows and a gripper as the search takes them."""
-    from thermogrip.sysid.effusivity.mode_kernel import Asked
+    from thermogrip.sysid.effusivity.mode_kernel import Pairs
 
     shape = (row.size, 2, data.y.shape[1])
     # a copy in C order: for other kinds of arrays kernels are compiled anew
     nothing = np.zeros(shape) if beyond is None else np.array(np.broadcast_to(beyond, shape), order="C")
-    return Asked(nodes, gripper_modes(stack), data, row, nothing)
+    return Pairs(nodes, gripper_modes(stack), data, row, nothing)
 
 
 def stack_slopes(theta: Array, data: Touches, u: Array, beyond: Array | None = None) -> Array:

@@ -58,7 +58,7 @@ EARLIEST_ONSET, LATEST_ONSET = -1.5, 1.5
 Nodes = tuple[Array, NDArray[np.int64], Array]
 
 
-class Asked(NamedTuple):
+class Pairs(NamedTuple):
     """``n`` pairs, each of a row of ``data`` and a hypothesis."""
 
     nodes: Nodes
@@ -68,34 +68,34 @@ class Asked(NamedTuple):
     # (n, 2, n_bin), the gripper's discrepancy: always [K], and per degree between object and skin
     beyond: Array
 
-    def take(self, index: Any) -> Asked:
+    def take(self, index: Any) -> Pairs:
         """Return some of the pairs, of one gripper."""
         return self._replace(row=self.row[index], beyond=self.beyond[index])
 
 
-def readings(asked: Asked, u: Array, vary: Mask) -> tuple[Array, Array]:
+def readings(pairs: Pairs, u: Array, vary: Mask) -> tuple[Array, Array]:
     """Return the bin means (n, n_bin) that ``u`` (n, 7) predicts, and their derivatives (n, 8, n_bin), zero
     where not ``vary`` (n, 7), with what is left of the data in the last row."""
-    data, row = asked.data, asked.row
+    data, row = pairs.data, pairs.row
     wanted = np.ones((row.size, RATE + 1), dtype=bool)
     wanted[:, 1:] = vary[:, _CURVES]
     onset = np.minimum(np.maximum(u[:, _ONSET], EARLIEST_ONSET), LATEST_ONSET)
     wanted[:, RATE] &= onset == u[:, _ONSET]  # past the range nothing moves
-    means = _bin_means(asked, u.take(_CONTACT, axis=1), onset, wanted)
+    means = _bin_means(pairs, u.take(_CONTACT, axis=1), onset, wanted)
     n_bin = data.y.shape[1]
     y, slopes = np.empty((row.size, n_bin)), np.empty((row.size, _LEFT + 1, n_bin))
     scratch = np.empty((16, n_bin))
     predicted(
-        means, wanted, row, data.count, data.t, data.ramp, data.y, data.t_ambient[row], asked.gripper.numbers,
-        asked.beyond, u, vary, scratch, y, slopes,
+        means, wanted, row, data.count, data.t, data.ramp, data.y, data.t_ambient[row], pairs.gripper.numbers,
+        pairs.beyond, u, vary, scratch, y, slopes,
     )  # fmt: skip
     return y, slopes
 
 
-def _bin_means(asked: Asked, numbers: Array, onset: Array, wanted: Mask) -> Array:
+def _bin_means(pairs: Pairs, numbers: Array, onset: Array, wanted: Mask) -> Array:
     """Return the bin means (n, 6, n_bin) of the ``wanted`` curves of contacts of logarithms ``numbers`` (n,
     4); before contact zero."""
-    nodes, gripper, data, row, _ = asked
+    nodes, gripper, data, row, _ = pairs
     out = np.empty((row.size, RATE + 1, data.y.shape[1]))
     stepped = wanted[:, :N_STEPPED].copy()  # for arrays of another layout kernels are compiled anew
     rise, slope, _ = contacts(nodes, gripper, np.exp(numbers), stepped)
@@ -109,7 +109,7 @@ def _bin_means(asked: Asked, numbers: Array, onset: Array, wanted: Mask) -> Arra
 @numba.njit(**COMPILED)  # type: ignore[untyped-decorator]
 def bin_means(
     nodes: Array, rise: Array, slope: Array, wanted: Mask, onset: Array, row: NDArray[np.int64],
-    times: Array, bins: NDArray[np.int64], count: Array, room: Array, means: Array,
+    times: Array, bins: NDArray[np.int64], count: Array, scratch: Array, means: Array,
 ) -> None:  # fmt: skip
     """Fill ``means`` (n, 6, n_bin) of the ``wanted`` curves, the last of them the slope of the first."""
     last = nodes.size - 1
@@ -121,10 +121,10 @@ def bin_means(
         begin = times.shape[1]
         means[p] = 0.0
         # the node before each sample, -1 before contact, and the weights of values and slopes there and at
-        # the next one, by cubic Hermite interpolation
+        # the next value, by cubic Hermite interpolation
         for j in range(times.shape[1]):
             since = times[i, j] - onset[p]
-            room[0, j] = -1.0
+            scratch[0, j] = -1.0
             if bins[i, j] >= 0 and since > 0.0:
                 begin = min(begin, j)
                 while k < last - 1 and nodes[k + 1] < since:
@@ -133,24 +133,24 @@ def bin_means(
                     k -= 1
                 dt = nodes[k + 1] - nodes[k]
                 s = min((since - nodes[k]) / dt, 1.0)
-                room[0, j], room[1, j] = k, s * s * (3.0 - 2.0 * s)
-                room[2, j], room[3, j] = s * (1.0 - s) * (1.0 - s) * dt, -s * s * (1.0 - s) * dt
-                room[4, j], room[5, j] = 6.0 * s * (1.0 - s) / dt, (1.0 - s) * (1.0 - 3.0 * s)
-                room[6, j] = s * (3.0 * s - 2.0)
+                scratch[0, j], scratch[1, j] = k, s * s * (3.0 - 2.0 * s)
+                scratch[2, j], scratch[3, j] = s * (1.0 - s) * (1.0 - s) * dt, -s * s * (1.0 - s) * dt
+                scratch[4, j], scratch[5, j] = 6.0 * s * (1.0 - s) / dt, (1.0 - s) * (1.0 - 3.0 * s)
+                scratch[6, j] = s * (3.0 * s - 2.0)
         for c in range(n_curve):
             if not wanted[p, c]:
                 continue
             rates, values = c == n_curve - 1, 0 if c == n_curve - 1 else c
             r, v = rise[p, values], slope[p, values]
             for j in range(begin, times.shape[1]):
-                if room[0, j] >= 0.0:
-                    k = int(room[0, j])
+                if scratch[0, j] >= 0.0:
+                    k = int(scratch[0, j])
                     high = r[k + 1] - r[k]
                     if rates:
-                        one = room[4, j] * high + room[5, j] * v[k] + room[6, j] * v[k + 1]
+                        value = scratch[4, j] * high + scratch[5, j] * v[k] + scratch[6, j] * v[k + 1]
                     else:
-                        one = r[k] + room[1, j] * high + room[2, j] * v[k] + room[3, j] * v[k + 1]
-                    means[p, c, bins[i, j]] += one
+                        value = r[k] + scratch[1, j] * high + scratch[2, j] * v[k] + scratch[3, j] * v[k + 1]
+                    means[p, c, bins[i, j]] += value
             for m in range(n_bin):
                 if count[i, m] > 0.0:
                     means[p, c, m] /= count[i, m]
@@ -159,37 +159,38 @@ def bin_means(
 @numba.njit(**COMPILED)  # type: ignore[untyped-decorator]
 def predicted(
     means: Array, wanted: Mask, row: NDArray[np.int64], count: Array, t: Array, ramp: Array, read: Array,
-    ambient: Array, numbers: Array, beyond: Array, u: Array, vary: Mask, room: Array, y: Array, slopes: Array,
+    ambient: Array, numbers: Array, beyond: Array, u: Array, vary: Mask, scratch: Array, y: Array,
+    slopes: Array,
 ) -> None:  # fmt: skip
     """Fill ``y`` (n, n_bin) and ``slopes`` (n, 8, n_bin) of :func:`readings` from the ``means`` (n, 6, n_bin)
     of ``wanted`` curves, the last of them the slope of the first; ``read`` are the touches' bin means.
 
     Where the ``ambient`` temperature is known the block goes to the room by its far face at ``rate`` [1/s],
-    ``way`` [K], which counts ``late`` [s] later: a curve's integral up to ``late`` before, and its value
-    there, by straight lines between the bins with a ``count``, zero before them."""
+    ``to_room`` [K], which counts ``delay`` [s] later: a curve's integral up to ``delay`` before, and its
+    value there, by straight lines between the bins with a ``count``, zero before them."""
     n_curve, n_bin = wanted.shape[1], t.shape[1]
     # bins on either side, -1 before the first, and integrals
-    before = room[0]
-    after = room[1]
-    whole = room[2]
-    delayed, shifted = room[4:10], room[10:16]
+    before = scratch[0]
+    after = scratch[1]
+    integral = scratch[2]
+    delayed, shifted = scratch[4:10], scratch[10:16]
     for p in range(row.size):
         i = row[p]
         curves = means[p]
         k = min(p, numbers.shape[0] - 1)
-        warmth = ambient[p]
+        room_temperature = ambient[p]
         rate = 0.0
-        way = 0.0
-        leak = 0.0
-        away = 0.0
-        if np.isfinite(warmth):
+        to_room = 0.0
+        sensor_leak = 0.0
+        sensor_loss = 0.0
+        if np.isfinite(room_temperature):
             rate = numbers[k, 5] * np.exp(-u[p, _C])
-            way = warmth - u[p, _T]
-            leak = numbers[k, 6]
-            away = leak * (warmth - u[p, _LEVEL])
-        late = np.exp(2.0 * (u[p, _C] - u[p, _E])) / 6.0 if rate > 0.0 else -1.0
+            to_room = room_temperature - u[p, _T]
+            sensor_leak = numbers[k, 6]
+            sensor_loss = sensor_leak * (room_temperature - u[p, _LEVEL])
+        delay = np.exp(2.0 * (u[p, _C] - u[p, _E])) / 6.0 if rate > 0.0 else -1.0
         delayed[:], shifted[:] = 0.0, 0.0
-        if late >= 0.0:
+        if delay >= 0.0:
             low = high = -1
             for m in range(n_bin):
                 before[m] = -1.0
@@ -197,7 +198,7 @@ def predicted(
                     continue
                 if high < 0:
                     high = m
-                while t[i, high] <= t[i, m] - late:
+                while t[i, high] <= t[i, m] - delay:
                     low = high
                     if high == m:
                         break
@@ -213,50 +214,52 @@ def predicted(
                     if count[i, m] > 0.0:
                         if k >= 0:
                             summed += 0.5 * (t[i, m] - t[i, k]) * (curves[c, m] + curves[c, k])
-                        whole[m], k = summed, m
+                        integral[m], k = summed, m
                 for m in range(n_bin):
                     if before[m] >= 0.0:
                         low, high = int(before[m]), int(after[m])
-                        ahead, bend = t[i, m] - late - t[i, low], 0.0
+                        ahead, bend = t[i, m] - delay - t[i, low], 0.0
                         if high != low:
                             bend = (curves[c, high] - curves[c, low]) / (t[i, high] - t[i, low])
-                        delayed[c, m] = whole[low] + ahead * (curves[c, low] + 0.5 * bend * ahead)
+                        delayed[c, m] = integral[low] + ahead * (curves[c, low] + 0.5 * bend * ahead)
                         shifted[c, m] = curves[c, low] + bend * ahead
         difference = u[p, _T] - u[p, _LEVEL]
         level = u[p, _LEVEL]
         derivatives = slopes[p]
         by_t, by_level = 1.0 if vary[p, _T] else 0.0, 1.0 if vary[p, _LEVEL] else 0.0
         for m in range(n_bin):
-            f, lost = curves[VALUE, m] + beyond[p, 1, m], rate * delayed[VALUE, m]
-            one = level + difference * f + way * lost + away * ramp[i, m] + beyond[p, 0, m]
-            y[p, m] = one
-            derivatives[_T, m] = by_t * (f - lost)
-            derivatives[_LEVEL, m] = by_level * (1.0 - f - leak * ramp[i, m])
-            derivatives[_LEFT, m] = read[i, m] - one
+            f, block_loss = curves[VALUE, m] + beyond[p, 1, m], rate * delayed[VALUE, m]
+            reading = (
+                level + difference * f + to_room * block_loss + sensor_loss * ramp[i, m] + beyond[p, 0, m]
+            )
+            y[p, m] = reading
+            derivatives[_T, m] = by_t * (f - block_loss)
+            derivatives[_LEVEL, m] = by_level * (1.0 - f - sensor_leak * ramp[i, m])
+            derivatives[_LEFT, m] = read[i, m] - reading
         for c in range(1, n_curve):
             nuisance, by_late = _CURVES[c - 1], 0.0
             if nuisance == _E:  # a denser or less conducting block passes the loss on later
-                by_late = 2.0 * late
+                by_late = 2.0 * delay
             elif nuisance == _C:
-                by_late = -2.0 * late
+                by_late = -2.0 * delay
             if not (vary[p, nuisance] and wanted[p, c]):
                 derivatives[nuisance] = 0.0
                 continue
             sign = -1.0 if nuisance == _ONSET else 1.0
             less = 1.0 if nuisance == _C else 0.0
-            scale, passed = sign * difference, sign * rate * way
+            scale, passed = sign * difference, sign * rate * to_room
             for m in range(n_bin):
                 extra = delayed[c, m] + by_late * shifted[VALUE, m] - less * delayed[VALUE, m]
                 derivatives[nuisance, m] = scale * curves[c, m] + passed * extra
 
 
-def products(asked: Asked, whitener: Array, u: Array, sd: Array) -> Array:
+def products(pairs: Pairs, whitener: Array, u: Array, sd: Array) -> Array:
     """Return J' J, and J' r and r' r in the last row and column, (n, 8, 8): J in units of ``sd`` (n, 7), r
     the readings less those that ``u`` predicts, both whitened."""
     blocks = []
     for begin in range(0, len(u), SEARCH.pairs_at_once):
         chunk = slice(begin, begin + SEARCH.pairs_at_once)
-        some = asked.take(chunk)
+        some = pairs.take(chunk)
         columns = readings(some, u[chunk], sd[chunk] > 0.0)[1]
         blocks.append(squares(whitener, some.row, columns))
     matrix = blocks[0] if len(blocks) == 1 else np.concatenate(blocks)
@@ -353,7 +356,7 @@ class Found(NamedTuple):
     settled: Mask
 
 
-def search(asked: Asked, whitener: Any, law: Law, sd: Array, u: Array, *, rivals: bool) -> Found:
+def search(pairs: Pairs, whitener: Any, law: Law, sd: Array, u: Array, *, rivals: bool) -> Found:
     """Return where damped Gauss-Newton steps from ``u`` (n, 7) end, under priors of a ``law`` and of ``sd``
     (n, 7): where the next step would gain less than 0.005 nat, which then counts as taken.
 
@@ -371,7 +374,7 @@ def search(asked: Asked, whitener: Any, law: Law, sd: Array, u: Array, *, rivals
         damping=np.full(n, 1e-2), part=none, slope_gain=none, bend=none, stale=ended.settled,
     )  # fmt: skip
     for step in range(SEARCH.most_steps + 1):
-        tried = products(asked.take(state.at), whitener, state.trial, state.sd)
+        tried = products(pairs.take(state.at), whitener, state.trial, state.sd)
         state = _search_moved(*_refitted(state, tried), step)
         rhs, curved = state.matrix[:, :m, m] - state.slope, state.matrix[:, :m, :m].copy()
         curved[:, diagonal, diagonal] += state.bound
@@ -383,7 +386,7 @@ def search(asked: Asked, whitener: Any, law: Law, sd: Array, u: Array, *, rivals
             settled[:], going_on[:] = False, False
         if rivals:
             ahead[state.at] = state.cost - decrease
-            going_on &= _hopeful(asked, step, ahead)[state.at]
+            going_on &= _hopeful(pairs, step, ahead)[state.at]
         if not going_on.all():
             done = ~going_on
             finished = state.at[done]
@@ -423,19 +426,19 @@ def search(asked: Asked, whitener: Any, law: Law, sd: Array, u: Array, *, rivals
     return ended
 
 
-def _hopeful(asked: Asked, step: int, ahead: Array) -> Mask:
+def _hopeful(pairs: Pairs, step: int, ahead: Array) -> Mask:
     """Return which pairs are worth another step beside the best of their touch."""
-    best = np.full(asked.data.level.size, np.inf)
-    np.minimum.at(best, asked.row, ahead)
-    stated = np.isfinite(asked.data.t_object)
+    best = np.full(pairs.data.level.size, np.inf)
+    np.minimum.at(best, pairs.row, ahead)
+    stated = np.isfinite(pairs.data.t_object)
     limit = np.where(stated, _HOPELESS_STATED[step], _HOPELESS_COST.get(step, np.inf))
-    return np.asarray(ahead < (best + limit + SEARCH.unexplained_times * np.maximum(best, 0.0))[asked.row])
+    return np.asarray(ahead < (best + limit + SEARCH.unexplained_times * np.maximum(best, 0.0))[pairs.row])
 
 
 def _refitted(here: _Search, there: Array) -> tuple[_Search, Array, Mask]:
     """Return the trials and their products with level and T_obj, in which readings are linear, at their best:
     these go along with a step in all else, which is larger without bending; and whether other slopes, which
-    go with the difference of object and skin, must be asked for anew."""
+    go with the difference of object and skin, must be pairs for anew."""
     law = here.law
     trial = here.trial.copy()
     lin = there[:, _LEVEL : _T + 1]

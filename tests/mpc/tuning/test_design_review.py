@@ -178,7 +178,7 @@ NEVER = "never settles, overshoot 0.10, offset"
     ],
 )
 def test_a_step_is_judged_by_overshoot_and_offset_too(changes: dict[str, float], said: str, verdict: str):
-    assert checks._stepped(replace(STEP, **changes), Spec()) == (said, verdict)
+    assert checks._step_verdict(replace(STEP, **changes), Spec()) == (said, verdict)
 
 
 @pytest.mark.parametrize(
@@ -198,7 +198,7 @@ def test_every_step_of_the_spec_must_settle_where_the_model_is_right(
     def asked_of(notes: dict[str, Any]) -> checks.Check:
         controller = Controller(tank, design, notes={"spec": notes})
         spec, noted = checks.spec_of(controller, None)
-        return checks.as_asked(controller, spec, [0, 1], 0, noted=noted)
+        return checks.meets_each_step(controller, spec, [0, 1], 0, noted=noted)
 
     last = replace(STEP, case=Case(43.0, 30.0, 0))
     # the worst draw of the last step counts
@@ -232,5 +232,5 @@ def test_a_pi_is_reviewed_by_its_loops_and_by_what_it_does(tank):
     ],
 )
 def test_a_plant_that_identify_does_not_call_good_is_warned_of(said: str, verdict: str, finding: str):
-    check = checks.called_good(SimpleNamespace(plant=SimpleNamespace(verdict=said, logs=("a", "b"))))
+    check = checks.plant_is_good(SimpleNamespace(plant=SimpleNamespace(verdict=said, logs=("a", "b"))))
     assert (check.verdict, check.finding, bool(check.fix)) == (verdict, finding, verdict == "warn")
