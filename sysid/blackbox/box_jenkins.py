@@ -3,16 +3,8 @@
     y = G(q) w + v,    D(q) v = e,    D(q) = 1 + d_1 q^-1 + ... + d_p q^-p,
 
 with the filter G of :mod:`thermogrip.sysid.blackbox.output_error` and white e.  The likeliest G minimises the
-sum of e^2, which is the output-error fit of D y to D w.  D follows from the residuals of such a fit
-by the Yule-Walker equations, its order by the Bayesian information criterion, so both are fitted in turn
-(generalised least squares, [1]_ chapter 7).  One D an output serves all structures: it is that of the largest
-one.
-
-The plant keeps G alone: noise is not simulated.
-
-References
-----------
-.. [1] T. Soederstroem and P. Stoica, System Identification (Prentice Hall, 1989).
+sum of e^2, which is the output-error fit of D y to D w.  One D an output serves all structures: it is that of
+the largest one.  The plant keeps G alone: noise is not simulated.
 """
 
 from __future__ import annotations
@@ -35,6 +27,8 @@ def with_noise(found: Filter, records: Records) -> Filter:
     """Return the filter fitted again with autoregressive noise; as it is where its errors are white."""
     nb, rows = found.b.shape[1], sum(int(is_read.sum()) for is_read in records.known)
     found, misses = fit_rest(found, records)
+    # generalised least squares, T. Soederstroem and P. Stoica, System Identification (Prentice Hall, 1989),
+    # chapter 7
     for _ in range(ROUNDS):
         D = autoregression(misses, records.known)
         if len(D) == 1 or min(map(len, records.y)) < 2 * len(D):
@@ -58,6 +52,7 @@ def autoregression(errors: Sequence[Array], known: Sequence[NDArray[np.bool_]]) 
     sums = [sum(float(e[: len(e) - lag] @ e[lag:]) for e in errors) for lag in lags]
     r, n = np.array(sums) / np.maximum(pairs, 1), pairs[0]
     best, D = 0.0, np.ones(1)
+    # D by the Yule-Walker equations, its order by the Bayesian information criterion
     for p in lags[1:] if r[0] > 0 else ():
         # a trace more variance: errors that are all alike have a singular matrix
         d = solve_toeplitz(np.append((1 + 1e-9) * r[0], r[1:p]), r[1 : p + 1])

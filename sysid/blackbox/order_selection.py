@@ -1,18 +1,15 @@
 """Order selection by free run on held-out parts.
 
-Every structure is fitted on part of the data and *simulated* over the rest (on a slow plant the last reading
-alone predicts the next one well). With three or more logs each log is held out in turn: a run from its start.
-Of one or two logs
-
-* each of four consecutive blocks is: the readings of a short warm-up set the state, the others are scored;
-* and the last 30 percent of each log, run from the start of the log.
+Every structure is fitted on part of the data and *simulated* over the rest. With three or more logs each log
+is held out in turn. Of one or two logs each of four consecutive blocks is, and the last 30 percent of each
+log, run from the start of the log.
 
 **The one-standard-error rule.** With e_sf the error of structure s on part f and b the best structure, the
 smallest structure is taken for which
 
     mean_f ln(e_sf / e_bf) <= min(se_f ln(e_sf / e_bf), ln 1.05),        ln 1.2 over whole logs,
 
-with the standard error of the paired differences. Models that are unstable or diverge on a part are refused.
+with the standard error of the paired differences.
 """
 
 from __future__ import annotations
@@ -47,7 +44,7 @@ _LINEAR_CORRELATION = (
     0.98  # correlation of an input with its square: a line leaves a fifth of the square's spread
 )
 
-_FADING_SHARE = 0.25  # of a held-out part: the memory of an offset that fades
+_FADING_SHARE = 0.25  # of a held-out part: the memory of an offset that fades; a longer one looks lasting
 
 
 class Model(PlantModel, Protocol):
@@ -138,6 +135,7 @@ def _cut_blocks(grid: Grid, blocks: int) -> list[Fold]:
         inside, outside = _split_segments(grid.segments, first, last)
         # the second half is run once more from a warm-up of its own
         halves = [segment.part(len(segment.time) // 2, len(segment.time)) for segment in inside]
+        # the readings of a short warm-up set the state, the others are scored
         runs = tuple(Run(segment) for segment in (*inside, *halves))
         parts.append(Fold(f"block {at + 1} of {blocks}", grid.having(outside), runs))
     return parts
@@ -159,8 +157,7 @@ def _last_parts(grid: Grid) -> Fold:
 
 
 def priors_of(grid: Grid) -> tuple[StartPrior, ...]:
-    """Return how a first error may be shared between state and sensor, and how long an offset lasts; offsets
-    that fade do in a quarter of a held-out part: a longer memory looks like one that lasts."""
+    """Return how a first error may be shared between state and sensor, and how long an offset lasts."""
     seconds = grid.dt * sum(len(segment.time) for segment in grid.segments)
     fading = _FADING_SHARE * seconds / (len(grid.logs) if len(grid.logs) >= 3 else _CUTS)
     none = [StartPrior(noise=r) for r in (0.03, 0.1, 0.3)]
@@ -179,7 +176,9 @@ def free_run_errors(
     for segment, scored_from in runs:
         first = max(warmup, scored_from)
         is_read = np.isfinite(segment.y[first:])
+        # simulated, since on a slow plant the last reading alone predicts the next one well
         miss = free_run_misses(model, segment, dt=dt, scale=scale, warmup=warmup, priors=priors)[:, first:]
+        # it diverged
         if not np.isfinite(miss[:, is_read]).all():
             return refused
         total += np.sum(np.where(is_read, miss, 0.0) ** 2, axis=1)

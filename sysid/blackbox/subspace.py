@@ -5,25 +5,9 @@ rows of the past,
 
     Y_f = Gamma X + H W_f + noise,        X spanned by Z_p = [W_p; Y_p],
 
-with Gamma = [C; CA; ...; CA^(f-1)].  The LQ factorisation of [W_f; Z_p; Y_f] takes the future inputs out,
-
-    [W_f]   [L11          ]
-    [Z_p] = [L21 L22      ] Q',        L32 = Gamma X projected,
-    [Y_f]   [L31 L32 L33  ]
-
-(of rows that depend on others, as with an input that moves once, what is new) and the left singular vectors
-of S L32 span Gamma: S = I is PO-MOESP (Verhaegen), and S = (L32 L32' + L33 L33')^(-1/2) is CVA (Larimore).  A
-follows from the shift of Gamma, C is its first block row; poles that it puts outside of the unit circle are
-moved inside (:func:`stabilised`).  B, E, the constant and one initial state per segment enter the *simulated*
-output linearly, so they are a least-squares fit of the free run, not of one step.
-
-**PARSIM-K** (Pannocchia and Calosi).  With the innovation e = y - C x and A_K = A - K C,  x+ = A_K x + B w
-+ K y, so a reading i rows ahead is linear in the past and in the drives and *readings* between,
-
-    Y_f = Gamma_K L Z_p + H_K W_f + G_K Y_f + E,        Gamma L = (I - G_K)^-1 Gamma_K L,
-
-H_K and G_K strictly lower triangular.  The e of a row depends on none of what it is regressed on, even where
-w was fed back from y; PO-MOESP and CVA are biased by feedback.
+with Gamma = [C; CA; ...; CA^(f-1)].  The LQ factorisation of [W_f; Z_p; Y_f] takes the future inputs out, and
+the left singular vectors of S L32 span Gamma.  PARSIM-K (Pannocchia and Calosi) regresses each future row on
+the past and on drives and *readings* between; PO-MOESP and CVA are biased by feedback.
 """
 
 from __future__ import annotations
@@ -62,9 +46,8 @@ def subspace_family(
     weightings: Sequence[str] = ("moesp", "cva"),
     triangles: Triangles | None = None,
 ) -> Mapping[Structure, StateSpaceModel]:
-    """Return a model for each order, number of block rows f and weighting that the data allow; where absent,
-    ``rows`` are 3, 5, 8, 15 and 30 (2 where the data allow none of these); ``triangles``, empty at first,
-    keep what segments add for later fits."""
+    """Return a model for each order, number of block rows f and weighting that the data allow; ``triangles``,
+    empty at first, keep what segments add for later fits."""
     triangles = WeakKeyDictionary() if triangles is None else triangles
     models: dict[Structure, StateSpaceModel] = {}
     longest = max(len(segment.time) for segment in grid.segments)
@@ -74,6 +57,7 @@ def subspace_family(
     few = 1.5 * n_columns > sum(max(len(s.time) - 5, 0) for s in grid.segments)
     sizes = rows or (2, 3, 5, 8, 15, 30)
     if rows is None and only is None:
+        # 2 where the data allow none of the others
         sizes = [f for f in sizes if 6 * f < longest and (few or f > 2)]
     for some in sets:
         products = f", with {', '.join(some)}" if some else ""
@@ -106,6 +90,7 @@ def _realised(
             else:
                 gamma = extended_observability(*_factorise(triangle, f, n_y), weighting=weighting)
             for n in (n for size, w, n in wanted if (size, w) == (f, weighting) and n < gamma.shape[1]):
+                # A follows from the shift of Gamma, C is its first block row
                 before, after = gamma[:-n_y, :n], gamma[n_y:, :n]
                 shift = np.asarray(np.linalg.lstsq(before, after, rcond=None)[0], dtype=float)
                 A = stabilised(shift, longest)
@@ -116,10 +101,12 @@ def _realised(
 def extended_observability(L32: Array, L33: Array, *, weighting: str) -> Array:
     """Return the columns that span Gamma, scaled by the roots of the singular values."""
     if weighting == "cva":
+        # S = (L32 L32' + L33 L33')^(-1/2) (Larimore)
         size, vectors = np.linalg.eigh(L32 @ L32.T + L33 @ L33.T)
         size = np.maximum(size, 1e-10 * size.max())
         weight, back = (vectors * size**-0.5) @ vectors.T, (vectors * size**0.5) @ vectors.T
     elif weighting == "moesp":
+        # S = 1, PO-MOESP (Verhaegen)
         weight = back = np.eye(L32.shape[0])
     else:
         raise ValueError(f"weighting must be 'moesp' or 'cva', got {weighting!r}")
@@ -139,6 +126,8 @@ def fit_inputs(grid: Grid, A: Array, C: Array, terms: tuple[str, ...] = ()) -> S
         is_read = np.isfinite(segment.y).T
         columns.append(_unit_responses(drive - centre, A, C / scale[:, None])[is_read].T)
         targets.append(((segment.y - y0) / scale).T[is_read])
+    # B, E, the constant and one initial state per segment enter the *simulated* output linearly: a fit of the
+    # free run, not of one step
     weights, starts = least_squares([X[-n:] for X in columns], [X[:-n] for X in columns], targets, DEPENDENT)
     W = weights.reshape(len(centre) + 1, n).T
     c = W[:, -1] - W[:, :-1] @ centre
@@ -164,8 +153,8 @@ def _unit_responses(drive: Array, A: Array, C: Array) -> Array:
 
 
 def stabilised(A: Array, rows: int) -> Array:
-    """Return A with poles beyond exp(-1 / rows) moved onto that circle, along their direction; a record of so
-    many rows cannot distinguish a slower pole, or a growing one, from one of its own length."""
+    """Return A with poles beyond exp(-1 / rows) moved onto that circle, along their direction."""
+    # a record of so many rows cannot distinguish a slower pole, or a growing one, from one of its own length
     poles, vectors = np.linalg.eig(A)
     beyond = np.abs(poles) > np.exp(-1 / rows)
     if not beyond.any():
@@ -226,9 +215,13 @@ def _by_column(of_signal: Array, n_w: int, f: int, *, constant: float) -> Array:
 
 def _factorise(triangle: Array, f: int, n_y: int) -> tuple[Array, Array]:
     """Return L32 and L33 of the LQ factorisation."""
+    # [W_f]   [L11          ]
+    # [Z_p] = [L21 L22      ] Q',        L32 = Gamma X projected
+    # [Y_f]   [L31 L32 L33  ]
     # the triangle has the same inner products; of an input that barely moves columns are dependent, and the
     # directions that a QR gives those are rounding
     window = _window_columns(triangle, f, n_y)
+    # of rows that depend on others, as with an input that moves once, what is new
     future_basis = _span(window.future)
     past = window.past - future_basis @ (future_basis.T @ window.past)
     ahead = window.ahead - future_basis @ (future_basis.T @ window.ahead)
@@ -255,6 +248,9 @@ def predictor_observability(triangle: Array, f: int, n_y: int) -> Array:
     by_past, by_readings = np.zeros((f * n_y, n_z)), np.eye(f * n_y)
     constant = window.future[:, -1:]
     for row in range(f):
+        # With the innovation e = y - C x and A_K = A - K C, x+ = A_K x + B w + K y, so that Y_f = Gamma_K L
+        # Z_p + H_K W_f + G_K Y_f + E, H_K and G_K strictly lower triangular. The e of a row depends on none
+        # of what it is regressed on, even where w was fed back from y.
         before = window.ahead[:, : row * n_y]
         regressors = np.hstack([window.past, before, window.future[:, : row * n_w], constant])
         row_outputs = slice(row * n_y, (row + 1) * n_y)
@@ -262,6 +258,7 @@ def predictor_observability(triangle: Array, f: int, n_y: int) -> Array:
         by_past[row_outputs] = weights[:, :n_z]
         by_readings[row_outputs, : row * n_y] = -weights[:, n_z : n_z + row * n_y]
     apart = window.past - constant @ (constant.T @ window.past) / (constant.T @ constant)
+    # Gamma L = (I - G_K)^-1 Gamma_K L
     left_vectors, values, _ = np.linalg.svd(
         np.linalg.solve(by_readings, by_past) @ apart.T, full_matrices=False
     )

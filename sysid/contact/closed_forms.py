@@ -2,10 +2,7 @@
 
 A negative time, a depth outside its body, or a property that is not positive is a ValueError everywhere.
 
-Half-spaces
------------
-
-Both bodies are semi-infinite solids, joined by a thermal contact conductance h_c:
+**Half-spaces.**  Both bodies are semi-infinite solids, joined by a thermal contact conductance h_c:
 
     skin (e_dev, T_dev0) | h_c | object (e_obj, T_obj0)
 
@@ -13,38 +10,11 @@ A flux q(t) into a half-space raises its surface by q(s) / (e sqrt(s)) in the La
 loop q = h_c (T_obj_surf - T_dev_surf) gives, with H = h_c (1/e_dev + 1/e_obj) and y = H sqrt(t),
 
     q(t) = h_c (T_obj0 - T_dev0) erfcx(y),
-    T_dev(0, t) = T_dev0 + (T_obj0 - T_dev0) / (1 + gamma) (1 - erfcx(y)),   gamma = e_dev / e_obj,
-    T_dev(x, t) = T_dev0 + (T_obj0 - T_dev0) / (1 + gamma) exp(-xi^2) (erfcx(xi) - erfcx(xi + y)),
+    T_dev(0, t) = T_dev0 + (T_obj0 - T_dev0) / (1 + gamma) (1 - erfcx(y)),   gamma = e_dev / e_obj.
 
-xi = x / (2 sqrt(alpha t)).  Perfect contact (h_c -> inf) is eq. (7) of Osawa et al. [1]_, who leave h_c out.
-
-erfcx(x) = exp(x^2) erfc(x) neither over- nor underflows.  The differences above cancel for short times and
-deep points; there they are taken as series or as integrals of positive terms, so that every result holds to
-about 1e-12 of itself.  A block of thickness L is a half-space until heat has felt its back, at about L^2/(4
-alpha): 0.9 s for 2 cm of copper, 18 min for 2 cm of wood.
-
-Bodies that end: slabs, layers, blocks
---------------------------------------
-
-A body of finite depth answers a flux by its impedance, the rise of its face per unit flux in the Laplace
-domain:
-
-    half-space   Z = 1 / (e sqrt(s))
-    slab         Z = coth(sqrt(s) z) / (e sqrt(s)),   insulated back, z = L / sqrt(alpha) = C / e
-    layer        Z = (1/e1) (Z2 e1 cosh + sinh / sqrt(s)) / (cosh + Z2 e1 sqrt(s) sinh), of sqrt(s) z1, on a
-    body Z2
-
-C = rho c_p L.  Two bodies meet through h_c, q(s) = dT/s / (1/h_c + Z_dev + Z_obj), and
-:func:`invert_laplace` gives fluxes and temperatures to 1e-11 of themselves for any effusivity ratio.  So it
-does where a surface or a fluid has a given temperature: in a slab, of times in units of L^2 / alpha, with
-q = sqrt(s),
-
-    rise(x) = cosh(q (1 - x)) / (s (cosh(q) + (q / Bi) sinh(q))),   Bi = h L / k, infinite at a held surface.
-
-References
-----------
-.. [1] Osawa, Kase, Domae, Furukawa, Kheddar, "Material Classification Using Active Temperature Controllable
-   Robotic Gripper", arXiv:2111.15344.
+**Slabs, layers, blocks.**  A body of finite depth answers a flux by its impedance, the rise of its face per
+unit flux in the Laplace domain, and :func:`invert_laplace` gives fluxes and temperatures to 1e-11 of
+themselves for any effusivity ratio, also where a surface or a fluid has a given temperature.
 """
 
 from __future__ import annotations
@@ -64,14 +34,15 @@ _LEGENDRE = np.polynomial.legendre.leggauss(40)
 
 
 def contact_temperature(*, T_dev0: float, T_obj0: float, gamma: float) -> float:
-    """Return the surface temperature at perfect contact [degC], eq. (7) of the paper.
-
-    ``gamma`` is e_dev / e_obj; with T_dev0 = T_obj0 + dT0 it reads T_dev0 - dT0 / (1 + gamma), eq. (10).
+    """Return the surface temperature at perfect contact [degC]; ``gamma`` is e_dev / e_obj.
 
     >>> round(contact_temperature(T_dev0=23.0, T_obj0=43.0, gamma=1.6e3 / 3.64e4), 2)
     42.16
     """
     _positive(gamma=gamma)
+    # eq. (7) of Osawa, Kase, Domae, Furukawa, Kheddar, "Material Classification Using Active Temperature
+    # Controllable Robotic Gripper", arXiv:2111.15344, who leave h_c out
+    # with T_dev0 = T_obj0 + dT0 it reads T_dev0 - dT0 / (1 + gamma), eq. (10)
     return (T_obj0 + gamma * T_dev0) / (1 + gamma)
 
 
@@ -149,6 +120,7 @@ def device_temperature(
     # a zero time has moved nothing, at whatever depth; xi = 1 only avoids a division by zero
     xi = np.where(started, depth / (2 * np.sqrt(alpha_dev * np.where(started, t, 1.0))), 1.0)
     share = e_obj / (e_dev + e_obj)
+    # exp(-xi^2) (erfcx(xi) - erfcx(xi + y)), xi = x / (2 sqrt(alpha t))
     rise = np.exp(-(xi**2)) * _erfcx_difference(xi, y)
     at_once = (depth == 0) & np.isinf(y)
     return np.asarray(
@@ -177,13 +149,12 @@ def contact_flux(
 ) -> Array:
     """Return the heat flux into the gripper [W/m^2]; parameters are those of :func:`skin_temperature`.
 
-    At perfect contact it is the paper's eq. (12) per unit area, infinite at t = 0.
-
     >>> contact_flux([0.0, 10.0], T_dev0=23.0, T_obj0=43.0, e_dev=1.6e3, e_obj=3.64e4, h_c=500.0).round(0)
     array([10000.,  4191.])
     """
     t, y = _time_and_root(t, e_dev, e_obj, h_c)
     if np.isinf(h_c):
+        # eq. (12) of Osawa et al. per unit area, infinite at t = 0
         with np.errstate(divide="ignore"):
             return np.asarray((T_obj0 - T_dev0) / (1 / e_dev + 1 / e_obj) / np.sqrt(np.pi * t))
     return np.asarray(h_c * (T_obj0 - T_dev0) * erfcx(y))
@@ -195,8 +166,6 @@ def contact_heat(
     """Return the heat that the gripper has taken up [J/m^2]; parameters are those of
     :func:`skin_temperature`.
 
-    The integral of the flux, h_c (T_obj0 - T_dev0) / H^2 (erfcx(y) - 1 + 2 y / sqrt(pi)).
-
     >>> contact_heat([1.0, 10.0], T_dev0=23.0, T_obj0=43.0, e_dev=1.6e3, e_obj=3.64e4, h_c=500.0).round(0)
     array([ 7990., 54795.])
     """
@@ -204,6 +173,7 @@ def contact_heat(
     series = 1 / (1 / e_dev + 1 / e_obj)
     if np.isinf(h_c):
         return np.asarray((T_obj0 - T_dev0) * series * 2 * np.sqrt(t / np.pi))
+    # the integral of the flux, h_c (T_obj0 - T_dev0) / H^2 (erfcx(y) - 1 + 2 y / sqrt(pi)):
     # erfcx(y) - 1 + 2 y / sqrt(pi) without cancellation
     excess = np.where(y < 0.5, _series(np.minimum(y, 0.5), 2), erfcx(y) - 1 + 2 * y / np.sqrt(np.pi))
     return np.asarray((T_obj0 - T_dev0) * series**2 / h_c * excess)
@@ -259,6 +229,8 @@ def half_space(effusivity: float) -> Impedance:
     (0.0003125+0j)
     """
     _positive(effusivity=effusivity)
+    # a block of thickness L is one until heat has felt its back, at about L^2 / (4 alpha): 0.9 s for 2 cm of
+    # copper, 18 min for 2 cm of wood
     return lambda s: np.asarray(1 / (effusivity * np.sqrt(s)), dtype=complex)
 
 
@@ -272,6 +244,7 @@ def slab(effusivity: float, capacity: float) -> Impedance:
 
     def impedance(s: Complex) -> Complex:
         root = np.sqrt(s)
+        # Z = coth(sqrt(s) z) / (e sqrt(s)) with z = L / sqrt(alpha) = C / e
         fade = np.exp(-2 * root * capacity / effusivity)
         return np.asarray((1 + fade) / ((1 - fade) * effusivity * root))
 
@@ -288,6 +261,8 @@ def layer_on(effusivity: float, capacity: float, base: Impedance) -> Impedance:
     _positive(effusivity=effusivity, capacity=capacity)
 
     def impedance(s: Complex) -> Complex:
+        # Z = (1/e) (Z2 e cosh + sinh / sqrt(s)) / (cosh + Z2 e sqrt(s) sinh), of sqrt(s) z, on a body Z2;
+        # cosh and sinh over exp(sqrt(s) z), which would overflow
         surface_impedance = 1 / (effusivity * np.sqrt(s))
         fade = np.exp(-2 * np.sqrt(s) * capacity / effusivity)
         below = base(s)
@@ -310,6 +285,7 @@ def two_body_flux(
     array([4191.])
     """
     _positive(h_c=h_c)
+    # the bodies meet through h_c: q(s) = dT/s / (1/h_c + Z_dev + Z_obj)
     return (T_obj0 - T_dev0) * invert_laplace(lambda s: 1 / (s * (1 / h_c + dev(s) + obj(s))), t)
 
 
@@ -462,11 +438,10 @@ def _series(y: Array, first: int) -> Array:
 
 
 def _erfcx_difference(xi: Array, y: Array) -> Array:
-    """Return erfcx(xi) - erfcx(xi + y) without cancellation, for xi, y >= 0.
-
-    erfcx(x) = (2/sqrt(pi)) int_0^inf exp(-u^2 - 2 x u) du, so the difference is the integral of the positive
-    exp(-u^2 - 2 xi u) (1 - exp(-2 y u)).
-    """
+    """Return erfcx(xi) - erfcx(xi + y) without cancellation, for xi, y >= 0."""
+    # erfcx(x) = exp(x^2) erfc(x) = (2/sqrt(pi)) int_0^inf exp(-u^2 - 2 x u) du neither over- nor underflows,
+    # but this difference cancels for short times and deep points: there it is the integral of the positive
+    # exp(-u^2 - 2 xi u) (1 - exp(-2 y u)), so that every result holds to about 1e-12 of itself
     plain = erfcx(xi) - erfcx(xi + y)
     close = y < 0.5 * (1 + xi)
     if not np.any(close):
@@ -504,6 +479,8 @@ def _slab_rise(fo: Array, x: Array, biot: float) -> Array:
     depth_share = x[..., None]
 
     def transform(s: Complex) -> Complex:
+        # cosh(q (1 - x)) / (s (cosh(q) + (q / Bi) sinh(q))), times in units of L^2 / alpha, q = sqrt(s);
+        # Bi = h L / k, infinite at a held surface
         q, fade = np.sqrt(s), np.exp(-2 * np.sqrt(s))
         shape = np.exp(-q * depth_share) + np.exp(-q * (2 - depth_share))
         return np.asarray(shape / (s * ((1 + fade) + q / biot * (1 - fade))))

@@ -5,22 +5,8 @@ Both bodies are sums of exponential modes, so one step of length ``dt`` with a f
     x(t + dt) = E x(t) + a q(t) + b q(t + dt),   E = exp(-lam dt),  b = w (dt - phi)/(lam dt),  a = w phi - b,
 
 with phi = (1 - E)/lam and w the mode's weight.  The contact closes the loop, q = h(t) (1 - device rise -
-block drop), which is linear in the one unknown q(t + dt).  The state is x less b q, so that a step is
-one pass over the modes,
-
-    x <- E x + (E b + a) q,     q = h (1 - sum x) / (1 + h Z),     Z = sum b + resistances.
-
-A mode that a step damps below rounding keeps no state: only a q is left of it.  Steps double from group to
-group, and with them m = 1 - E becomes m (2 - m), without another exponential.
-
-**Derivatives** are stepped along, as curves of their own.  One by ln h or ln tau_b obeys the same recursion;
-one by ln e or ln C, which move the block's modes, gains dE x + d(E b + a) q.  All are driven by
-
-    dq = [dh gap - h (d sum x + q dZ)] / (1 + h Z),     gap = (1 - sum x) / (1 + h Z).
-
-One function is compiled, in which it is all written out: a function that calls others is optimised whole with
-each of them, and what NumPy does for many contacts at once costs no compilation.  This file and those that
-build on it import numba, so nothing pays for the compiler before it is used.
+block drop), which is linear in the one unknown q(t + dt).  Derivatives by ln h, ln tau_b, ln e and ln C are
+stepped along, as curves of their own.
 """
 
 from __future__ import annotations
@@ -31,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thermogrip.datasets.arrays import Array, Mask
-from thermogrip.datasets.compiled import numba
+from thermogrip.datasets.compiled import numba  # as do those that build on it: imported where it is used
 
 # sums over modes may be reordered, so that they run in vector registers; infinities stay what they are
 _SUMS = {"reassoc", "contract", "arcp", "nsz"}
@@ -202,6 +188,8 @@ def step_contacts(
     the sensor's lag; ``moves`` are those of :func:`slab_modes`; ``series`` (n, 3) is the resistance, and its
     derivatives by ln e and ln C.
     """
+    # One function, in which it is all written out: one that calls others is optimised whole with each of
+    # them, and what NumPy does for many contacts at once costs no compilation.
     last = modes.shape[2] - 1
     # states; 1 - E, a, b, E and E b + a; their derivatives by ln e and ln C
     x = room[:5]
@@ -238,6 +226,7 @@ def step_contacts(
         for g in range(repeat.size):
             step = dt[g]
             high = last
+            # a mode that a step damps below rounding keeps no state: only a q is left of it
             while high > N_MODE and rate[high - 1] * step > FADED:
                 high -= 1
             while low < N_MODE and rate[low] * step > FADED:
@@ -276,6 +265,7 @@ def step_contacts(
                         moved[row + 2, j] = d_b
                         z[c] += d_b
                         late[c] += d_a if j < low else 0.0
+            # so that a step is one pass over the modes, x <- E x + (E b + a) q
             for c in range(5):  # the state is less b q
                 if wanted[p, c]:
                     for j in range(low, high):
@@ -290,6 +280,7 @@ def step_contacts(
                         total = 0.0
                         at_sensor = 0.0
                         if c > 2:
+                            # ln e and ln C move the block's modes: the recursion gains dE x + d(E b + a) q
                             row, q0 = 3 * (c - 3), q[0]
                             for j in range(low, N_MODE):
                                 v = (
@@ -312,6 +303,7 @@ def step_contacts(
                             at_sensor += sensor[j] * v
                         w[c], s[c] = total, at_sensor
                 h, q0 = grown[p, 0, i], q[0]
+                # q = h (1 - sum x) / (1 + h Z), Z = sum b + resistances
                 invert = 1.0 / (1.0 + h * z[0])
                 gap = (1.0 - w[0] - late[0] * q0) * invert
                 flux[p, i] = h * gap
@@ -319,6 +311,7 @@ def step_contacts(
                     if wanted[p, c]:
                         new = h * gap
                         if c > 0:
+                            # dq = [dh gap - h (d sum x + q dZ)] / (1 + h Z), gap = (1 - sum x) / (1 + h Z)
                             driven = h * gap if c == 1 else (grown[p, 1, i] * gap if c == 2 else 0.0)
                             new = (
                                 driven - h * (w[c] + late[0] * q[c] + late[c] * q0 + z[c] * h * gap)
@@ -336,4 +329,5 @@ def step_contacts(
                             x[c, j] += moved[3 * c - 7, j] * q[0]
             k += repeat[g]
             for j in range(last + 1):
+                # steps double from group to group, and with them 1 - E, without another exponential
                 m[j] = m[j] * (2.0 - m[j])

@@ -3,39 +3,17 @@
 Two touches must agree on the block: on its effusivity, heat capacity, what its contact conductance has in
 common, and its temperature, which moves from one touch to the next.  Under a candidate, or a free effusivity
 on a grid, each touch is a Gaussian factor of what it shares with the others, by both sensors where there are
-two.  The factors are expanded twice, the second time around what the other touches say of the block's
-temperature: a wide prior leaves wood's open by many degrees, too far for one expansion.
-
-A touch as a Gaussian factor
-----------------------------
-
-Under a candidate, Laplace's method gives the posterior of a touch's nuisances; dividing out its prior leaves
-the likelihood of x = (T_obj, ln h, ln e, ln C) alone,
+two: Laplace's method gives the posterior of its nuisances, and dividing out its prior leaves the likelihood
+of x = (T_obj, ln h, ln e, ln C) alone,
 
     L(x) = c exp(eta' d - d' Lambda d / 2),   d = x - x0,
 
-with everything that no other touch knows (onset, level, build-up) integrated.  A Gaussian prior N(mu, P) of
-the x of all touches of a block, stacked, then has its evidence in closed form, P singular or not: with g =
-eta - Lambda (mu - x0),
+with everything that no other touch knows (onset, level, build-up) integrated.
 
-    ln Z = sum ln c + (eta - Lambda (mu - x0) / 2)' (mu - x0) + g' (I + P Lambda)^-1 P g / 2
-           - ln det(I + P Lambda) / 2.
-
-What happens to a block between two touches
--------------------------------------------
-
-A touch takes heat from the block or gives it some.  The face that is touched again later finds, per degree of
-initial difference, the drop
-
-    rho = sum_j w_j int_0^t1 q(tau) exp(-lam_j (t1 + rest - tau)) d tau
-
-of the block's modes (lam_j, w_j) under the flux q of the first touch.  A share a of it is left to find.
-Meanwhile the block relaxes towards the room with time constant C / U, so
+Between two touches the block relaxes towards the room with time constant C / U, so with a share a of the drop
+rho of the face that the first touch leaves,
 
     T_2 = T_room + exp(-U rest / C) (T_1 - a rho (T_1 - T_grip) - T_room) + N(0, s^2 + (law way)^2).
-
-All of it is learnt from groups of known material by maximum likelihood (:func:`learn_coupling`); the defaults
-are those of the example rig.
 """
 
 from __future__ import annotations
@@ -119,6 +97,7 @@ BLOCK = BlockSettings()
 class Coupling:
     """How a block moves between two touches."""
 
+    # defaults are the example rig's; :func:`learn_coupling` learns them by maximum likelihood
     found: float = 0.75  # share a of the first touch's drop that the next one finds
     loss: float = 100.0  # U, to the room, per contact face [W m^-2 K^-1]
     sd: float = 0.36  # s, what the two leave open [K]
@@ -131,8 +110,9 @@ class Coupling:
 
     def touch_sd(self, distance: Array) -> Array:
         """Return the error of a temperature that a touch finds at a distance from the skin, beyond its noise
-        [K]: two touches show the sum of the block's own AR(1) drift, of variance s^2 / 2 here, and of their
-        errors, s^2 / 4 each, which are not identifiable apart."""
+        [K]."""
+        # two touches show the sum of the block's own AR(1) drift, of variance s^2 / 2 here, and of their
+        # errors, s^2 / 4 each, which are not identifiable apart
         far_sd = BLOCK.far_sd * np.sqrt(np.maximum(np.square(distance) - BLOCK.far_K**2, 0.0))
         return np.asarray(np.hypot(0.5 * self.sd, far_sd))
 
@@ -196,6 +176,8 @@ def traces_of(gripper: GripperModel, data: Touches, rest: Array, hypotheses: Hyp
     inside = nodes.t <= data.end
     t, q = nodes.t[inside], flux[:, inside]
     lam, weight, _ = slabs(effusivity, capacity, 0.0)
+    # the face that is touched again finds, per degree of initial difference and by the flux q of this touch,
+    # rho = sum_j w_j int_0^t1 q(tau) exp(-lam_j (t1 + rest - tau)) d tau of the block's modes (lam_j, w_j)
     history = np.exp(-lam[:, :, None] * (data.end - t)) * q[:, None, :]
     return Traces(
         moved=weight * np.trapezoid(history, t, axis=2),
@@ -295,13 +277,17 @@ def combine(factor: Factor, mean: Array, covariance: Array) -> Joint:
     for i in range(n):
         columns = slice(i * N_SHARED, (i + 1) * N_SHARED)
         lam[..., columns, columns] = factor.precision[..., i, :, :]
+    # a Gaussian prior N(mu, P) of all x, stacked, has its evidence in closed form, P singular or not:
     eta = factor.eta.reshape(*lead, k)
     away = mean - factor.centre.reshape(*lead, k)
     pulled = np.einsum("...ij,...j->...i", lam, away)
     matrix = np.eye(k) + covariance @ lam
     posterior = np.linalg.solve(matrix, np.broadcast_to(covariance, matrix.shape))
+    # g = eta - Lambda (mu - x0)
     g = eta - pulled
     move = np.einsum("...ij,...j->...i", posterior, g)
+    # ln Z = sum ln c + (eta - Lambda (mu - x0) / 2)' (mu - x0) + g' (I + P Lambda)^-1 P g / 2 - ln det(I + P
+    # Lambda) / 2
     evidence = factor.log_size.sum(axis=-1) + ((eta - 0.5 * pulled) * away).sum(axis=-1)
     evidence = evidence + 0.5 * (g * move).sum(axis=-1) - 0.5 * np.linalg.slogdet(matrix)[1]
     return Joint(np.asarray(evidence), mean + move, np.asarray(posterior, dtype=float))
@@ -575,8 +561,7 @@ def _prior(view: _View, at: Rows, coupling: Coupling, factor: Factor) -> tuple[A
 
 def _cavities(view: _View, groups: list[Rows], factors: list[Factor]) -> list[tuple[Array, Array]]:
     """Return mean and sd (m, n) of each touch's block temperature by the other touches alone, or the prior's
-    where that contradicts the touch itself: such a hypothesis is hopeless, and an expansion there would reach
-    too far."""
+    where that contradicts the touch itself."""
     cavities = []
     for group_rows, factor in zip(groups, factors):
         prior = _prior(view, group_rows, view.coupling, factor)
@@ -586,6 +571,7 @@ def _cavities(view: _View, groups: list[Rows], factors: list[Factor]) -> list[tu
             others = [j for j in range(group_rows.size) if j != k]
             own_mean, own_sd = _t_object(combine(_without(factor, others), *prior), k)
             apart = np.abs(mean[:, k] - own_mean) > BLOCK.contradiction_sd * np.hypot(sd[:, k], own_sd)
+            # such a hypothesis is hopeless, and an expansion there would reach too far
             mean[apart, k], sd[apart, k] = factor.centre[apart, k, 0], UNKNOWN_OBJECT_SD
         cavities.append((mean, sd))
     return cavities
@@ -606,17 +592,18 @@ def _t_object(joint: Joint, k: int) -> tuple[Array, Array]:
 
 def _fits(view: _View, groups: list[Rows]) -> list[Joint]:
     """Return what :func:`_by_loss` does of each group, factors expanded around what the other touches say."""
+    # expanded twice: a wide prior leaves wood's temperature open by many degrees, too far for one expansion
     factors = _group_factors(view, groups, _cavities(view, groups, _group_factors(view, groups)))
     return [_by_loss(view, group_rows, factor) for group_rows, factor in zip(groups, factors)]
 
 
 def _by_loss(view: _View, at: Rows, factor: Factor) -> Joint:
-    """Return evidence and posterior of one group at each loss, of leading shape (n_loss, m); what a block
-    loses during a touch is little beside what it loses between two, so that one factor serves all."""
+    """Return evidence and posterior of one group at each loss, of leading shape (n_loss, m)."""
     # blocks of another shape or in another place lose k times as much: k is a nuisance of the record
     fits = []
     for ln_loss in BLOCK.ln_loss:
         losing = replace(view.coupling, loss=view.coupling.loss * float(np.exp(ln_loss)))
+        # what it loses during a touch is little beside what it loses between two: one factor serves all
         fits.append(combine(factor, *_prior(view, at, losing, factor)))
     return Joint(*map(np.stack, zip(*fits)))
 

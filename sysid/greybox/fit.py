@@ -6,19 +6,6 @@
    are whiter than one reading a minute.
 3. Covariance (:mod:`thermogrip.sysid.greybox.sandwich`), and which parameters are practically identifiable
    (:mod:`thermogrip.sysid.greybox.identifiability`).
-
-**Levenberg-Marquardt with geodesic acceleration, in a box.** Combinations of parameters that the logs barely
-determine make the cost |r(z)|^2 a narrow curved valley, which straight steps leave at once. The step
-
-    v = -(J'J + lambda)^-1 J'r            is followed by half of
-    a = -(J'J + lambda)^-1 J' r_vv,       r_vv = (2 / h^2) (r(z + h v) - r(z) - h J v),
-
-which bends with the valley [1]_.
-
-References
-----------
-.. [1] M. K. Transtrum, J. P. Sethna, "Improvements to the Levenberg-Marquardt algorithm for nonlinear
-   least-squares minimization", arXiv 1201.5885 (2012).
 """
 
 from __future__ import annotations
@@ -109,6 +96,10 @@ def _best_trial(
     residuals: Callable[[Array], Array], z: Array, r: Array, J: Array, low: Array, high: Array, damping: float
 ) -> _Trial:
     """Return the best of several damped steps, straight and bent."""
+    # Combinations of parameters that the logs barely determine make |r(z)|^2 a narrow curved valley, which
+    # straight steps leave at once; half of the geodesic acceleration bends with it: M. K. Transtrum, J. P.
+    # Sethna, "Improvements to the Levenberg-Marquardt algorithm for nonlinear least-squares minimization",
+    # arXiv 1201.5885 (2012).
     # SciPy's trust region stops in such valleys: at 303 for 51 on a printer's heater block
     gradient, normal = J.T @ r, J.T @ J
     # a coordinate on its bound whose step would leave the box is held there
@@ -125,9 +116,12 @@ def _best_trial(
         out[:, free] = -(inverse * (right[:, free] @ axes)) @ axes.T
         return out
 
+    # v = -(J'J + lambda)^-1 J'r
     step = solve(gradient[None])
     probe = _finite_residuals(residuals(np.clip(z + _PROBE * step, low, high)))
+    # r_vv = (2 / h^2) (r(z + h v) - r(z) - h J v)
     curvature = 2.0 / _PROBE**2 * (probe - r - _PROBE * step @ J.T)
+    # a = -(J'J + lambda)^-1 J' r_vv
     bend = solve(curvature @ J)
     # a bend longer than the step: the expansion is not valid there
     longer = np.linalg.norm(bend, axis=1) > 1.5 * np.linalg.norm(step, axis=1)

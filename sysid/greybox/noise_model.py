@@ -6,19 +6,8 @@ The residuals of one stretch of log l, one row of bins per output, are linear ne
 
 z ~ N(0, 1) are the parameters in prior units, c ~ N(0, s^2) the model discrepancy, the same in every log,
 b_l ~ N(0, s^2) the random effects of the log. Columns of F and B come in kinds with one s each. e is white
-noise and two slow errors of the model with correlation times tau_m,
-
-    cov(e_j(t), e_k(t')) = w_j^2 [t = t'] [j = k] + sum_m R_m,jk a_mj a_mk exp(-|t - t'| / tau_m).
-
-**Cosine coordinates.** Such a covariance is nearly diagonal after a discrete cosine transform [1]_, its
-diagonal sum_k W_fk c(k) with the autocovariance c and weights W of the number of bins.
-
-**Learning.** The numbers maximise the likelihood with z, c and all b_l integrated out (restricted maximum
-likelihood), under weak log-normal priors.
-
-References
-----------
-.. [1] N. Ahmed, T. Natarajan, K. R. Rao, "Discrete cosine transform", IEEE Trans. Computers C-23 (1974).
+noise and two slow errors of the model with correlation times tau_m.  The numbers maximise the likelihood with
+z, c and all b_l integrated out (restricted maximum likelihood), under weak log-normal priors.
 """
 
 from __future__ import annotations
@@ -53,6 +42,8 @@ class Block:
     @classmethod
     def of(cls, columns: Array, outputs: Sequence[int]) -> Block:
         """Take the columns (n, n_y, q) of a stretch by time; the last is reading less model."""
+        # such a covariance is nearly diagonal in cosine coordinates: N. Ahmed, T. Natarajan, K. R. Rao,
+        # "Discrete cosine transform", IEEE Trans. Computers C-23 (1974)
         waves = dct(columns, axis=0, norm="ortho")
         edges = _frequency_bands(len(columns))
         band_products = [
@@ -86,6 +77,7 @@ class ErrorModel(ErrorNumbers):
 
     def covariance(self, n: int) -> Array:
         """Return the covariance (n_band, n_y, n_y) of a stretch of n bins."""
+        # cov(e_j(t), e_k(t')) = w_j^2 [t = t'] [j = k] + sum_m R_m,jk a_mj a_mk exp(-|t - t'| / tau_m)
         return np.diag(np.square(self.white)) + sum(self.slow(n))
 
     def slow(self, n: int) -> list[Array]:
@@ -188,6 +180,7 @@ def _log_terms(numbers: ErrorModel, log: LogData, ref: Array) -> _OneLog:
     products = take.T @ products @ take
     value -= 0.5 * float(products[-1, -1])
     effect_products, right = products[n:-1, n:-1], products[:-1, -1]
+    # the random effects integrated out, as the Schur complement of 1 + B'B
     local = np.eye(log.n_effects) + effect_products
     inner, mixed = np.asarray(np.linalg.inv(local)), products[n:-1, :n]
     mean = np.asarray(inner @ right[n:])
@@ -263,6 +256,7 @@ def _frequency_bands(n: int) -> tuple[int, ...]:
 @lru_cache(maxsize=64)
 def band_weights(n: int) -> Array:
     """Return what takes an autocovariance to the variances in cosine coordinates."""
+    # the diagonal sum_k W_fk c(k) of the autocovariance c
     basis = dct(np.eye(n), axis=0, norm="ortho")  # row f: the f-th cosine
     weights = irfft(np.abs(rfft(basis, 2 * n, axis=1)) ** 2, 2 * n, axis=1)[:, :n]
     weights[:, 1:] *= 2  # lags of either sign

@@ -7,37 +7,16 @@ together:
 
     ln p(z) = -1/2 |z - z_fit|^2 - 1/2 |K^(1/2) Q'd(z)|^2 - 1/(2 T) |d(z) - Q Q'd(z)|^2.
 
-Q spans the slopes J = Q S R' of the fit; directions that move no run (S below 1e-9 of its largest) are left
-to the first term. With A = J'J, V the learnt covariance of the score
-(:mod:`~thermogrip.sysid.greybox.sandwich`; without model discrepancy, which the parameters have absorbed
-and a plant that is to predict readings keeps) and K = S R' V^-1 R S, the second term is A V^-1 A near the
-fit. The third, 0 where the plant is linear, excludes runs that the slopes do not predict; T = tr(P^-1 V) /
-tr(P^-1 A) [1]_.
+Q spans the slopes J = Q S R' of the fit. With A = J'J, V the learnt covariance of the score
+(:mod:`~thermogrip.sysid.greybox.sandwich`) and K = S R' V^-1 R S, the second term is A V^-1 A near the fit.
+The third, 0 where the plant is linear, excludes runs that the slopes do not predict.
 
-**Draws.** Each is a fit of its own, to perturbed readings from a perturbed prior [2]_:
-
-    minimise  |z - z_fit - xi|^2 + |K^(1/2) Q'd(z) - e|^2 + |d(z) - Q Q'd(z)|^2 / T,      xi, e ~ N(0, 1),
-
-a draw from p where the model is linear.  Draws of the normal approximation move runs 4 to 40 times as far as
-these (the rig's logs), for they leave the valley that the logs see.
+**Draws.** Each is a fit of its own, to perturbed readings from a perturbed prior, a draw from p where the
+model is linear.
 
 **Sampling.** emcee moves the few parameters z_s that the data determine best relative to the prior; the
-others are integrated out to second order about one Gauss-Newton step from their conditional mean, with the
-slopes J_o of the fit and H = 1 + A V^-1 A,
-
-    z_o = z_fit - H_oo^-1 H_os (z_s - z_fit) - H_oo^-1 g_o,     g = z - z_fit + J'Q K Q'd,
-    ln p(z_s) = ln p(z_s, z_o) + g_o' H_oo^-1 g_o / 2,
-
-and drawn afterwards, each as a fit of its own. **Converged** means that the chain is longer than 50
-integrated autocorrelation times of every parameter [3]_.
-
-References
-----------
-.. [1] J. W. Miller, D. B. Dunson, "Robust Bayesian inference via coarsening", JASA 114 (2019).
-.. [2] J. M. Bardsley, A. Solonen, H. Haario, M. Laine, "Randomize-then-optimize", SIAM J. Sci. Comput. 36
-   (2014).
-.. [3] Foreman-Mackey, Hogg, Lang, Goodman, "emcee: The MCMC Hammer", PASP 125 (2013) 306, and the package's
-   documentation on autocorrelation.
+others are integrated out to second order about one Gauss-Newton step from their conditional mean, and drawn
+afterwards, each as a fit of its own.
 """
 
 from __future__ import annotations
@@ -95,11 +74,14 @@ class RandomizedMap:
         by_log = problem.by_log(self.z, central=True)
         self._fitted = np.concatenate([r for r, _ in by_log])
         span, size, turn = np.linalg.svd(np.vstack([J for _, J in by_log]), full_matrices=False)
+        # directions that move no run are left to the prior's term
         moves_runs = size > DRAW.unseen_slope * size.max(initial=0.0)
         self._span = span[:, moves_runs]
         size = size[moves_runs]
         turn = turn[moves_runs]
         along = turn / size[:, None]
+        # without model discrepancy, which the parameters have absorbed and a plant that is to predict
+        # readings keeps
         error = along @ uncertainty.spread @ along.T  # S^-1 R V R' S^-1, about the error's covariance along Q
         value, axes = np.linalg.eigh((error + error.T) / 2)
         root = axes.T / np.sqrt(np.maximum(value, 0.0) + DRAW.least_error)[:, None]
@@ -107,6 +89,8 @@ class RandomizedMap:
         self._root *= np.where(np.diag(self._root) < 0, -1.0, 1.0)[:, None]
         self._pull = turn.T * size @ self._root.T  # J'Q K^(1/2)'
         self.information = self._pull @ self._pull.T
+        # T = tr(P^-1 V) / tr(P^-1 A): J. W. Miller, D. B. Dunson, "Robust Bayesian inference via coarsening",
+        # JASA 114 (2019)
         self._loose = 1.0 / np.sqrt(uncertainty.coarsening)
 
     @property
@@ -128,14 +112,17 @@ class RandomizedMap:
         if not others.size:
             out[inside] = -self._gradient(points)[1]
             return out
+        # H = 1 + A V^-1 A
         H = np.eye(self.z.size) + self.information
         factor = cho_factor(H[np.ix_(others, others)], lower=True)
+        # z_o = z_fit - H_oo^-1 H_os (z_s - z_fit) - H_oo^-1 g_o
         tied = H[others][:, list(columns)] @ (points - self.z)[:, list(columns)].T
         points[:, others] = points[:, others] - cho_solve(factor, tied).T
         points = np.clip(points, self.low, self.high)
         step = cho_solve(factor, self._gradient(points)[0][:, others].T).T
         points[:, others] = np.clip(points[:, others] - step, self.low[others], self.high[others])
         gradient, cost = self._gradient(points)
+        # ln p(z_s) = ln p(z_s, z_o) + g_o' H_oo^-1 g_o / 2
         other_gradient = gradient[:, others]
         out[inside] = -cost + 0.5 * np.einsum("ki,ik->k", other_gradient, cho_solve(factor, other_gradient.T))
         return out
@@ -151,6 +138,8 @@ class RandomizedMap:
         progress: Callable[[float, str], None] | None = None,
     ) -> Array:
         """Return draws (n, n_free) of z, in prior units, inside the bounds."""
+        # draws of the normal approximation move runs 4 to 40 times as far as these (the rig's logs), for they
+        # leave the valley that the logs see
         rng = np.random.default_rng(seed)
         z = np.tile(self.z, (n, 1))
         xi, noise = rng.standard_normal(z.shape), rng.standard_normal((n, len(self._root)))
@@ -166,6 +155,9 @@ class RandomizedMap:
     def _draw(self, z: Array, xi: Array, noise: Array, moving: NDArray[np.int_], iterations: int) -> Array:
         """Return the parameters ``moving`` of the least objective, the others at z (n_free,)."""
 
+        # minimise |z - z_fit - xi|^2 + |K^(1/2) Q'd(z) - e|^2 + |d(z) - Q Q'd(z)|^2 / T, xi, e ~ N(0, 1): J.
+        # M. Bardsley, A. Solonen, H. Haario, M. Laine, "Randomize-then-optimize", SIAM J. Sci. Comput. 36
+        # (2014)
         def residuals(points: Array) -> Array:
             whole = np.tile(z, (len(points), 1))
             whole[:, moving] = points
@@ -201,6 +193,7 @@ class RandomizedMap:
         """Return g (n, n_free), with the slopes of the fit, and -ln p (n,); what blew up has no pull."""
         along, off_span = self._moved(z)
         with np.errstate(over="ignore", invalid="ignore"):
+            # g = z - z_fit + J'Q K Q'd
             gradient = z - self.z + along @ self._pull.T
             cost = 0.5 * (
                 ((z - self.z) ** 2).sum(axis=1) + (along**2).sum(axis=1) + (off_span**2).sum(axis=1)
@@ -209,6 +202,8 @@ class RandomizedMap:
         return np.where(finite[:, None], gradient, 0.0), np.where(finite, cost, np.inf)
 
 
+# Foreman-Mackey, Hogg, Lang, Goodman, "emcee: The MCMC Hammer", PASP 125 (2013) 306, and the package's
+# documentation on autocorrelation
 LENGTH = 50  # autocorrelation times that make a chain long enough
 
 

@@ -1,21 +1,10 @@
 """A model's equations, compiled and run over a log for many parameter sets at once.
 
 The equations come as functions on lists of numbers (:class:`Equations`). Each is called once, with
-:class:`Vector` for numbers, and leaves its instructions in one function,
-
-    c = prepare(p)
-    for t in 0 .. N-1:
-        if a switch has moved:  kept = renew(u_t, c, h)
-        m times:                x = advance(x, u_t, d_t, c, kept, h)
-        y_(t+1) = read(x, c)
-
-which moves eight members of a batch through a log, without the interpreter's lock, so that blocks of eight
-run on all cores as threads.  A member's numbers do not depend on who its neighbours are.
-
-A :class:`Vector` represents eight numbers in a register, one for each parameter set.  It has no value; each
-``+ - * /`` on it appends one instruction of LLVM, so that indices are looked up, loops unrolled and products
-with a constant 0 or 1 gone.  No branch may depend on a value: ``if vector > 0`` raises.  A choice is
-``np.where(vector > 0, a, b)``; this, ``np.interp`` and NumPy's elementary functions work on vectors.
+:class:`Vector` for numbers, and leaves its instructions in one function, which moves eight members of a batch
+through a log, so that blocks of eight run on all cores as threads.  No branch may depend on a value: ``if
+vector > 0`` raises.  A choice is ``np.where(vector > 0, a, b)``; this, ``np.interp`` and NumPy's elementary
+functions work on vectors.
 """
 
 from __future__ import annotations
@@ -124,6 +113,7 @@ class Vector:
         return _elementary(function, "__call__", inputs, options)
 
     def _two(self, instruction: str, a: Any, b: Any, flags: Sequence[str]) -> Any:
+        # one instruction of LLVM: indices are looked up, loops unrolled, products with a constant 0 or 1 gone
         result = getattr(self.builder, instruction)(register(a), register(b), flags=flags)
         return Vector(self.builder, result)
 
@@ -355,6 +345,7 @@ class Kernel:
             for call in calls:
                 self._rollout(*call)
         else:
+            # without the interpreter's lock
             list(_threads().map(lambda call: self._rollout(*call), calls))
         return y.transpose(2, 1, 0)[:batch], x_end.T[:batch]
 
@@ -362,8 +353,9 @@ class Kernel:
 @lru_cache(maxsize=256)
 def _entries(batch: int, own: tuple[int, ...]) -> NDArray[np.int64]:
     """Return by block which entry of each array a member begins at, where members have so many of their own
-    there; places beyond the last member repeat it."""
+    there."""
     blocks = -(-batch // WIDTH)
+    # places beyond the last member repeat it: a member's numbers do not depend on who its neighbours are
     member = np.minimum(np.arange(blocks * WIDTH), batch - 1).reshape(blocks, 1, WIDTH)
     return np.ascontiguousarray(member * np.array(own)[:, None])
 
@@ -411,6 +403,7 @@ class _Writer:
         head, renew, step, done = (
             self.function.append_basic_block(name) for name in ("head", "renew", "step", "done")
         )
+        # c = prepare(p), and y_0
         c = steps.prepare(self._row(3, n_p))
         first = self._row(0, n_x)
         rows = builder.add(self.n, INTEGER(1))
@@ -423,6 +416,7 @@ class _Writer:
         builder.cbranch(builder.icmp_signed("<", begin, self.n), renew, done)
 
         builder.position_at_end(renew)
+        # if a switch has moved: kept = renew(u_t, c, h)
         switched = steps.renew(self._row(1, n_u, begin), c, self.h)
         builder.branch(step)
 
@@ -431,6 +425,7 @@ class _Writer:
         piece = builder.phi(INTEGER)
         x = [builder.phi(VECTOR) for _ in first]
         u, d = self._row(1, n_u, t), self._row(2, n_d, t)
+        # m times x = advance(x, u_t, d_t, c, kept, h), then y_(t+1) = read(x, c)
         later = steps.advance([Vector(builder, item) for item in x], u, d, c, switched, self.h)
         after, count = builder.add(t, INTEGER(1)), builder.add(piece, INTEGER(1))
         self._put(steps.read(later, c), self.y, after, rows)  # the last piece has the last word

@@ -4,16 +4,8 @@ With x the state, u the inputs, d the measured disturbances and y the outputs, o
 
     x+ = A x + B u + E d + F phi(u, d) + sum_s u_s A_s x + c,        y = C x + y0.
 
-There is no direct term: an input that is applied at a row cannot have moved the reading of that row.
 Transport delays are states (a shift register).  ``phi`` are products of inputs, their magnitudes and
 disturbances (``"drive*|drive|"``); with ``A_s`` a switch such as the pump changes how the states couple.
-
-**State at rest.**  A plant at rest whose outputs read y was held there by *some* constant input v,
-
-    min |x - A x - B v - E d - c|^2 + eps |v - u|^2     subject to     C x + y0 = y,
-
-and ``start`` improves on it with the readings of a warm-up: with x0 = x_rest + s, s ~ N(0, P), the readings
-are linear in s and the estimate is a ridge regression; P (``spread``) is the state's covariance in the fit.
 """
 
 from __future__ import annotations
@@ -122,10 +114,11 @@ class StateSpaceModel(BlackBox):
 
     def output(self, x: Values, p: Values) -> list[Any]:
         """Return the outputs y = C x + y0 as a list of length n_y, in plain arithmetic."""
+        # no direct term: an input that is applied at a row cannot have moved the reading of that row
         return [_dot(self.C[i], x) + self.y0[i] for i in range(len(self.outputs))]
 
     def rest(self, y: ArrayLike, u: ArrayLike, d: ArrayLike, p: ArrayLike) -> Array:
-        """Return the state (n_x,) of a plant at rest whose outputs read y (see the module's theory)."""
+        """Return the state (n_x,) of a plant at rest whose outputs read y."""
         u, d, y = (np.asarray(value, dtype=float) for value in (u, d, y))
         switched = (u[self.inputs.index(name)] * matrix for name, matrix in self.A_switch.items())
         A, push = self.A + sum(switched, 0.0 * self.A), self.push(u, d)
@@ -133,6 +126,8 @@ class StateSpaceModel(BlackBox):
         gain = (self.B + self._term_slopes(u, d))[:, move]
         n_v = gain.shape[1]
         scale = np.sqrt(np.maximum(np.trace(self.spread) / self.n_x, 1e-12))
+        # held there by *some* constant input v: min |x - A x - B v - E d - c|^2 + eps |v - u|^2 subject to C
+        # x + y0 = y
         rows = np.block(
             [
                 [(np.eye(self.n_x) - A) / scale, -gain / scale],
@@ -181,6 +176,8 @@ class StateSpaceModel(BlackBox):
         if noise is None:
             noise = 0.1 * np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", self.C, self.spread, self.C), 1e-12))
         rows = [np.asarray(value, dtype=float) for value in (y, u, d)]
+        # x0 = x_rest + s, s ~ N(0, P): the readings are linear in s and the estimate is a ridge regression; P
+        # is the state's covariance in the fit
         prior = [StartPrior(noise=1.0, nuisance=0.0)]
         sd = np.asarray(noise, dtype=float)
         return np.asarray(estimate_starts(self, *rows, dt=self.dt, scale=sd, priors=prior)[0][0])

@@ -4,16 +4,7 @@ A Kalman filter of the plant with a bias w for each graded input,
 
     x+ = f(x, u + w, d) + noise of sd q s_x,    w+ = w + noise of sd b s_u,    y = C x + noise of sd r,
 
-in a second, where s_x s_x' is the covariance of the states in the data of the fit over that of the outputs,
-and s_u an input's range in the logs, makes innovations e of covariance S.  Of q and b on a grid, beside
-sensors as noisy as the fit found them, and the scale of all three that is best for each in closed form, those
-are kept whose likelihood is greatest,
-
-    -2 log L = sum_k log det S + e_k' S^-1 e_k   [1]_.
-
-References
-----------
-.. [1] K. J. Astrom, "Maximum likelihood and prediction error methods", Automatica 16(5), 1980.
+in a second, makes innovations e of covariance S; those q and b are kept whose likelihood is greatest.
 """
 
 from __future__ import annotations
@@ -136,8 +127,10 @@ def _filter_of(plant: PlantData, stretches: Sequence[Stretch], graded: list[int]
     offset = np.array([plant.offsets.get(name, 0.0) for name in plant.outputs])
     C, level = output_matrix(plant)
     spread = np.atleast_2d(model.spread)
+    # s_x s_x', the covariance of the states in the data of the fit over that of the outputs
     covariance = spread / np.einsum("ij,jk,ik->i", C, spread, C).max()
     u, d, y = (np.concatenate([getattr(stretch, key) for stretch in stretches]) for key in "udy")
+    # s_u
     size = np.ptp(u, axis=0)[graded]
     middle = np.nanmean(y, axis=0)
     u0 = u.mean(axis=0)
@@ -170,7 +163,11 @@ def _most_likely(
     squares, count = filtered.squares(stretches, gains, spreads)
     if count <= _SETTLES:
         return None
+    # of q and b on a grid, beside sensors as noisy as the fit found them, the scale of all three that is best
+    # for each in closed form
     scale = squares / (count * len(sd))
+    # -2 log L = sum_k log det S + e_k' S^-1 e_k: K. J. Astrom, "Maximum likelihood and prediction error
+    # methods", Automatica 16(5), 1980
     cost = len(sd) * np.log(scale) + np.linalg.slogdet(spreads)[1]
     if not np.isfinite(cost).any():
         return None

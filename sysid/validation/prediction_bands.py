@@ -1,29 +1,22 @@
 """How far a free run may be off: the error of another run, bands, and the disagreement of an ensemble.
 
 **The error of another run** is one number for each output, the rms error of a free run over another run like
-those of the fit (:func:`expected_error`); bands and `validate` are made of it.  It has two parts.
+those of the fit (:func:`expected_error`); bands and `validate` are made of it.  The stated error has the
+median of two parts, its ends the 5 and 95 % quantiles of their sum.
 
 *Parts held out.*  Each of n parts (blocks of a log and its last part, or whole logs) has an error e_f.  The
-error of one part more lies about them as they do about each other: ln e^2 is Student's t about their mean,
-with the scale s sqrt(1 + 1/n).  A few numbers barely show a spread, so s^2 is taken with a prior of
-:data:`PRIOR_PARTS` parts that differ by :data:`PRIOR_SPREAD`.  The median is the geometric mean of the e_f.
+error of one part more lies about them as they do about each other.
 
 *What differs between runs* (supply voltage, air about the plant, a sensor that was glued anew) is in the
-errors of whole logs that were held out. A plant of one or two logs cannot show it. Then the gain of the
-inputs varies from run to run by g ~ N(0, :data:`~thermogrip.sysid.plant.fit_record.RUN_GAIN_SD`^2), so that
-one adds
-
-    (v(u) - v(u - g (u - u_0)))^2,        u_0 the value nearest to 0 in the logs of the fit:
-
-for what an input that never was 0 does from 0 on is part of the operating point.  The stated error has the
-median of both parts, its ends the 5 and 95 % quantiles of their sum.
+errors of whole logs that were held out. A plant of one or two logs cannot show it: the gain of its inputs
+varies from run to run by g ~ N(0, :data:`~thermogrip.sysid.plant.fit_record.RUN_GAIN_SD`^2).
 
 **Bands.** With v the free run, a reading is expected within
 
     v +- z sqrt(var_k v_k + s^2 + (median g)^2 (effect^2 + mean effect^2)/2 + unlike^2),   z = 1.645 for 90 %,
 
 with v_k the free runs of draws of the parameters, each with a start of its own, and s^2 what these do not
-explain of the error of parts held out.  A plant that was not compared has the error of its fit.
+explain of the error of parts held out.
 """
 
 from __future__ import annotations
@@ -77,14 +70,17 @@ def expected_error(errors: Sequence[float], gain_effect: float) -> ExpectedError
     (0.1, 0.048, 0.208)
     """
     # one part unlike all others (a tank that overflows once) would make an rms three times too wide
+    # ln e^2 of one part more is Student's t about their mean, with the scale s sqrt(1 + 1/n)
     logs, n = 2 * np.log(np.maximum(errors, 1e-12)), len(errors)
     middle, freedom = float(logs.mean()), PRIOR_PARTS + n - 1
+    # a few numbers barely show a spread: s^2 is taken with a prior
     squares = PRIOR_PARTS * (2 * PRIOR_SPREAD) ** 2 + float(np.sum((logs - middle) ** 2))
     scale = float(np.sqrt(squares / freedom * (1 + 1 / n)))
     ranks = (np.arange(_RANKS) + 0.5) / _RANKS
     part_squares = np.exp(middle + scale * stdtrit(freedom, ranks))
     gains = (gain_effect * ndtri(0.5 + ranks / 2)) ** 2
     low, high = np.sqrt(np.quantile(part_squares[:, None] + gains, (0.05, 0.95))).tolist()
+    # the median is the geometric mean of the e_f
     of_parts = float(np.exp(middle / 2))
     rmse = float(np.hypot(of_parts, MEDIAN * gain_effect))
     return ExpectedError(rmse, low, high, of_parts if gain_effect else None)
@@ -196,6 +192,8 @@ def effect_of_inputs(plant: Plant, logs: Sequence[Log], gain: float) -> dict[str
         log = log.copy()
         for name in moving:
             u = column(log, name)
+            # g (u - u_0), u_0 the value nearest to 0 in the logs of the fit: what an input that never was 0
+            # does from 0 on is part of the operating point
             log[name] = log[name].copy(data=u - gain * (u - nearest[name]))
         changes.append(change - columns(plant.simulate(log), plant.outputs))
     return dict(zip(plant.outputs, np.concatenate(changes).T))
@@ -220,8 +218,8 @@ class InputEffect:
 
 def effect_of_run(plant: Plant, error: Array, log: Log) -> InputEffect | None:
     """Return what inputs did more in a run than in the fit, at once or later, by least squares on the errors
-    (n, n_y) of the free run, NaN where it is not scored, in the spread of each output; None where that is
-    within two standard deviations of what differs from run to run, or leaves half of the squared error."""
+    (n, n_y) of the free run, NaN where it is not scored, in the spread of each output; None where
+    that is too little."""
     effects = effect_of_inputs(plant, [log], _INPUT_CHANGE)
     at_once = np.array([effects[name] for name in plant.outputs]).T / _INPUT_CHANGE
     spread = np.array([np.nanstd(column(log, name)) for name in plant.outputs])
@@ -244,6 +242,7 @@ def effect_of_run(plant: Plant, error: Array, log: Log) -> InputEffect | None:
             best = squares, gain, lag_s, np.where(is_finite, error - gain * effect, np.nan)
     assert best is not None
     squares, gain, lag_s, remaining = best
+    # within two standard deviations of what differs from run to run, or half of the squared error remains
     if abs(gain) <= 2 * RUN_GAIN_SD or squares > 0.5 * np.sum(scaled_error**2):
         return None
     rms = np.sqrt(np.nanmean(remaining**2, axis=0))

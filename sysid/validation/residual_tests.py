@@ -6,17 +6,11 @@ The residual of an output, in means over blocks, is modelled as
 
 N b is what a right model may leave: an offset of the sensor, of any size; the state in which each stretch
 begins, one prior sd in each direction; and the change by draws of the plant's parameters. x are first-order
-lags of 1, 4, 16 and 64 blocks of the input (a delay, time constant or heat flow that the model lacks is
-nearly a mixture of them), or of the squared output about its mean (a loss that curves). With V the covariance
-of N b + w and beta = 0,
+lags of the input, or of the squared output about its mean. With V the covariance of N b + w and beta = 0,
 
     g = x' V^-1 e,      cov g = x' V^-1 x = H,      g' H^-1 g ~ chi-square, rank(H) degrees of freedom,
 
-gives the probability p of at least this much. Of all pairs of an output and a signal those are significant
-whose p is too small by Holm's rule at :data:`LEVEL`: at most one right model in a hundred has any, whatever
-the correlation time of its errors and the number of pairs.
-
-w is the sum of white noise and slow errors (:func:`learn_noise`).  What it rarely finds is in
+gives the probability p of at least this much.  What the test rarely finds is in
 ``docs/explanation/validation.md``.
 """
 
@@ -139,8 +133,7 @@ def _residual(read: Array, run: Array, scored: Mask) -> Array | None:
 
 
 def _blocks_of_rows(plant: Plant, stretches: Sequence[Stretch]) -> tuple[NDArray[np.int_], float]:
-    """Return the number of each row's block, and the blocks' width [s]; stretches are so many numbers apart
-    that their errors are barely correlated."""
+    """Return the number of each row's block, and the blocks' width [s]."""
     steps = [float(np.median(np.diff(s.time))) for s in stretches if s.time.size > 1]
     step = max(plant.dt, *steps, 1e-9)
     seconds = sum(float(stretch.time[-1]) for stretch in stretches)
@@ -148,6 +141,7 @@ def _blocks_of_rows(plant: Plant, stretches: Sequence[Stretch]) -> tuple[NDArray
     block, first = [], 0
     for stretch in stretches:
         block.append(first + np.floor(stretch.time / width + 1e-9).astype(int))
+        # stretches are so many numbers apart that their errors are barely correlated
         first = int(block[-1][-1]) + _SCORE_TEST.most_blocks
     return np.concatenate(block), width
 
@@ -206,10 +200,12 @@ def _signals(plant: Plant, stretches: Sequence[Stretch], run: Array, width: floa
         if any(np.ptp(stretch.u[:, k]) > 0 for stretch in stretches)
     }
     for j, name in enumerate(plant.outputs):
+        # a loss that curves
         squares = (run[:, j] - run[:, j].mean()) ** 2
         signals[name + SQUARED] = [
             np.interp(plant.dt * np.arange(len(s.u)), s.time, squares[s.rows]) for s in stretches
         ]
+    # a delay, time constant or heat flow that the model lacks is nearly a mixture of these lags
     keeps = [np.exp(-plant.dt / (lag * width)) for lag in _SCORE_TEST.input_lags]
     out = {}
     for name, values in signals.items():
@@ -263,8 +259,8 @@ class _Null:
 
 
 def learn_noise(block: NDArray[np.int_], residual: Array, columns: Array) -> Array:
-    """Return the covariance of w over blocks (n,) that a residual with columns N supports best: variances of
-    the likeliest sum of white noise and slow errors with beta = 0, under wide log-normal priors."""
+    """Return the covariance of w over blocks (n,) that a residual with columns N supports best."""
+    # w is the likeliest sum of white noise and slow errors with beta = 0, under wide log-normal priors
     # Slow errors are Ornstein-Uhlenbeck processes with correlation times tau on a grid, averaged over blocks
     # as readings are: with the block as the unit of time and s = 1/tau,
     #     c(0) = 2 (s - 1 + exp(-s)) / s^2,       c(k) = (2 sinh(s/2) / s)^2 exp(-k s)    for k > 0.
@@ -305,6 +301,8 @@ def marked_by_holm(
     """Return the same tests, marked as significant by Holm's rule."""
     pairs = sorted((one.p, name, after) for name, row in found.items() for after, one in row.items())
     names: set[tuple[str, str]] = set()
+    # at most one right model in a hundred has any, whatever the correlation time of its errors and the number
+    # of pairs
     for k, (p, name, after) in enumerate(pairs):
         if not p < LEVEL / (len(pairs) - k):
             break

@@ -1,27 +1,14 @@
 """Whether a plant may be called good, and what a free run says of it, by the size of errors.
 
 **Good** (`identify`).  Over all parts held out, and over the logs of the fit, each output errs by less than
-half of the error without input; a part in which nothing moves weighs nothing.  On another run like these it
-errs by X (:func:`thermogrip.sysid.validation.prediction_bands.expected_error`), and X is below half of the
-error without input over whole logs.  Where two or more parts have moves, it errs less than no input on
-another part in 19 cases of 20: with e_f and b_f the errors on part f and those without input, ln (e_f / b_f)
-is Student's t about its mean, weighted by b_f^2, with the prior of the error of another run for its spread.
+half of the error without input.  On another run like these it errs by X
+(:func:`thermogrip.sysid.validation.prediction_bands.expected_error`), below half of the error without input
+over whole logs, and where two or more parts have moves, less than no input on another part in 19 cases of 20.
 
 **A free run** (`validate`) is judged by size (``docs/explanation/validation.md``). A plant states for this
-run the rms error X of each output, and the ends that 9 of 10 runs lie within
-(:mod:`thermogrip.sysid.validation.prediction_bands`). With e the error and b that of the best decay without
-input, both of the same readings,
-
-    better          e below the low end, every output
-    as stated       e within the ends
-    worse           e above the high end of any output, or above X and no better than without input
-                    (e > 0.8 b), or above X and most of it what inputs do
-    another plant   worse, without one cause, and no better than without input; or the run diverged
-    no test         the rows are those of the fit; or no right plant could have done better than without
-                    input, X > 0.8 b, and this one did not do clearly worse than that (e > b / 0.8)
-
-What is worse is so by its *gain*, an effect of the inputs that comes *slowly*, an *offset* or its *start*
-where one of them is most of the squared error of the worst output, else by its *dynamics*.
+run the rms error X of each output, and the ends that 9 of 10 runs lie within. With e the error and b that of
+the best decay without input, both of the same readings, it is better, as stated, worse, of another plant or
+no test.
 """
 
 from __future__ import annotations
@@ -114,9 +101,12 @@ def judge(
     start and of an offset the share of its squared error. ``seen``: its rows were in the fit."""
     stated = {name: size for name, size in band.expected.items() if size > 0}
     over = {name: error / stated[name] if name in stated else float("nan") for name, error in errors.items()}
+    # X > 0.8 b: no right plant could have done better than without input
     hopeless = {name for name, size in stated.items() if size > NO_BETTER * no_input[name]}
     most = {name: no_input[name] * (1 / NO_BETTER if name in hopeless else NO_BETTER) for name in stated}
+    # e > 0.8 b, and where that is hopeless clearly worse than b, e > b / 0.8
     lost = {name for name in stated if not errors[name] <= most[name]}
+    # e above the high end, or above X and no better than without input, or most of it what inputs do
     worse = [
         name
         for name in stated
@@ -125,21 +115,25 @@ def judge(
     ]
     if worse:
         worst = max(worse, key=lambda name: over[name])
+        # the run diverged
         if not np.isfinite(errors[worst]):
             return Verdict("another plant", over, "dynamics")
         if by_inputs is not None and by_inputs.lag_s == 0:
             return Verdict("worse", over, "gain", by_inputs.gain)
         if by_inputs is not None:
             return Verdict("worse", over, "slow")
+        # an offset or its start where one of them is most of the squared error, else its dynamics
         shares = causes.get(worst, {})
         cause = max(shares, key=lambda each: shares[each], default=None)
         if cause is not None and shares[cause] > MOST:
             return Verdict("worse", over, cause)
+        # without one cause, and no better than without input
         return Verdict("another plant" if worst in lost else "worse", over, "dynamics")
     if seen:
         return Verdict("no test", over, "seen")
     if stated and len(hopeless) == len(stated):
         return Verdict("no test", over, "too little input")
+    # e below the low end, every output
     better = bool(stated) and all(errors[name] < band.likely[name][0] for name in stated)
     return Verdict("better" if better else "as stated", over)
 
@@ -208,10 +202,12 @@ def _ratio_on_another_part(rows: Sequence[Row]) -> float:
         return 0.0
     errors = np.array([row.rmse for row in rows if row.no_input_rmse > 0])
     logs = np.log(np.maximum(errors, 1e-12) / no_input)
+    # a part in which nothing moves weighs nothing
     weights = no_input**2 / np.sum(no_input**2)
     n, middle = float(1 / np.sum(weights**2)), float(weights @ logs)
     if n < 2:
         return 0.0
+    # ln (e_f / b_f) is Student's t about its mean, with the prior of the error of another run for its spread
     freedom = PRIOR_PARTS + n - 1
     squares = PRIOR_PARTS * PRIOR_SPREAD**2 + n * float(weights @ (logs - middle) ** 2)
     scale = np.sqrt(squares / freedom * (1 + 1 / n))
