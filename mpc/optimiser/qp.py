@@ -85,6 +85,7 @@ class CondensedQP:
         self.linear = np.asarray(linear, dtype=float)
         self.quadratic = np.asarray(quadratic, dtype=float)
         self.iteration_limit, self.time_limit_s = iteration_limit, time_limit_s
+        self._sense = np.where(self.soft, _SOFT, 0).astype(np.int32)
         self._hard, self._priced = ~self.soft, np.where(self.soft, self.linear, 0.0)
         self._given: tuple[Array, Array] | None = None  # the newest H and A, of a linear plant the same ones
         self._scaled: tuple[Array, ...] = ()
@@ -141,8 +142,7 @@ class CondensedQP:
             "primal_tol": TOLERANCE,
         }
         model.settings = settings
-        sense = np.where(self.soft, _SOFT, 0).astype(np.int32)
-        flag, _ = model.setup(np.eye(f.size), f, A, upper, lower, sense)
+        flag, _ = model.setup(np.eye(f.size), f, A, upper, lower, self._sense.copy())
         if flag < 0:  # it has seen that there is no answer
             return ScaledAnswer(np.full(f.size, np.nan), np.zeros(lower.size), int(flag), 0)
         model.settings = settings

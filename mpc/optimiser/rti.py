@@ -84,6 +84,8 @@ class Weights:
     drive: Array  # (n,) of a squared drive
     energy: Array  # (n,) of a drive
     dear: Array  # (n_limited,) price of a unit beyond each limit
+    differences: Array  # (n, n): each block less the one before it
+    own: Array  # (n, n) of the Hessian, what moves and drives cost
 
     @classmethod
     def of(cls, model: PredictionModel, design: Design) -> Weights:
@@ -93,13 +95,17 @@ class Weights:
         sample[-1] += design.terminal
         energy = np.array([design.energy_price.get(name, 0.0) for name in model.drives])
         dear = [_DEAR if name in design.hard else 1.0 for name in design.limits]
+        n_b, drive = len(design.blocks), design.drive * np.repeat(lengths, model.n_u)
+        differences = np.kron(np.eye(n_b) - np.eye(n_b, k=-1), np.eye(model.n_u))
         return cls(
             output=np.array([design.weights.get(name, 1.0) for name in design.controlled]),
             sample=sample,
             zone=np.array([design.zones.get(name, 0.0) for name in design.controlled]),
-            drive=design.drive * np.repeat(lengths, model.n_u),
+            drive=drive,
             energy=np.outer(lengths, energy).ravel(),
             dear=design.price * np.array(dear),
+            differences=differences,
+            own=2 * (design.move * (differences.T @ differences) + np.diag(drive)),
         )
 
 
@@ -130,7 +136,7 @@ class RestGains:
 def _strongest_response(G: Array, rows: NDArray[np.int_]) -> Array:
     """Return the responses (n_b, n_u), summed over time, of each drive's output in ``rows`` (n_u,), of
     G (N, n_y, n_b, n_u)."""
-    return np.stack([G[:, row, :, j].sum(axis=0) for j, row in enumerate(rows)], axis=1)
+    return np.array([G[:, row, :, j].sum(axis=0) for j, row in enumerate(rows)]).T
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,7 +186,6 @@ class Optimiser:
         middles = np.cumsum(design.blocks) - 0.5 * np.array(design.blocks) + 0.5
         self._gaps = np.concatenate([[1.0], np.diff(middles)])
         self.reach = np.cumsum(self._gaps)  # samples of slew (n_b,) from now to the middle of each block
-        self._differences = np.kron(np.eye(self.n_b) - np.eye(self.n_b, k=-1), np.eye(model.n_u))
         # beyond a soft row by this, 0.2 of a price of 25, the distance costs as much as its square: at 1 the
         # noise of a reading, which moves all of a prediction, was answered with full drive near the band
         self._first = max(design.price, SHORTEST) ** -0.5
@@ -195,7 +200,7 @@ class Optimiser:
         """Return the program: ranges and slews, then of each controlled and limited output its samples."""
         design = self.design
         weights = self.weights
-        n = self._differences.shape[0]
+        n = weights.drive.size
         zoned, by_zone = weights.zone[:, None] > 0, weights.output[:, None] * weights.sample
         limited = np.repeat(weights.dear, self.N)
         # a row that is exceeded by s costs its price times (first s + s^2); that of a zone, which replaces
@@ -288,7 +293,7 @@ class Optimiser:
         """Return the QP's plan, or one that the nonlinear simulation finds better, with its outputs."""
         self._solves += 1
         y = predicted(plan[None])
-        at_guess, cost = self._merit(np.stack([guess, plan]), np.stack([y_guess, y[0]]), problem)
+        at_guess, cost = self._merit(np.array([guess, plan]), np.array([y_guess, y[0]]), problem)
         others = np.zeros((0, *plan.shape))
         if cost > at_guess:
             others = guess + np.array(SHARES)[:, None, None] * (plan - guess)
@@ -377,15 +382,13 @@ class Optimiser:
         linear = np.stack(weighted, axis=2)
         before = np.zeros((H.shape[0], n_u))
         before[:n_u] = np.diag(1 / self.model.span)
-        last = 2 * self.design.move * self._differences.T @ before
+        last = 2 * self.design.move * self.weights.differences.T @ before
         on_free = -span[:, None] * np.linalg.solve(H, linear.reshape(H.shape[0], -1))
         return LinearGains(H, on_free, span[:, None] * np.linalg.solve(H, last))
 
     def _hessian(self, G: Array, outputs: Sequence[int]) -> tuple[Array, list[Array]]:
         """Return H, and by controlled output the response (n, N) of each sample times twice its weight."""
-        moves = self.design.move * (self._differences.T @ self._differences)
-        H = 2 * (moves + np.diag(self.weights.drive))
-        weighted = []
+        H, weighted = self.weights.own.copy(), []
         for i in outputs:
             response = G[:, self._rows[i], :]
             weighted.append(response.T * (2 * self.weights.output[i] * self.weights.sample))
@@ -409,7 +412,7 @@ class Optimiser:
         soft = [*self._rows, *(row for row, _, _ in self._limits)]
         if self._A is None or self.model.affine is None:
             rows = G[:, soft].transpose(1, 0, 2).reshape(-1, n)
-            self._A = np.concatenate([np.eye(n), self._differences, rows])
+            self._A = np.concatenate([np.eye(n), self.weights.differences, rows])
         slew = (self._gaps[:, None] * self.drives.slew).ravel() / self._spans
         slew[:n_u] += problem.more * self.drives.slew / self.model.span
         before = np.zeros(n)
