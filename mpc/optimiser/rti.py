@@ -104,7 +104,7 @@ class Weights:
             drive=drive,
             energy=np.outer(lengths, energy).ravel(),
             dear=design.price * np.array(dear),
-            differences=differences,
+            differences=np.asarray(differences),
             own=2 * (design.move * (differences.T @ differences) + np.diag(drive)),
         )
 
