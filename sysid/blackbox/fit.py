@@ -1,17 +1,10 @@
 """Black-box fits: choose a structure, fit it to all logs, resample it to see how certain it is.
 
 The kinds (:data:`BLACK_BOXES`) differ in the family of models
-(:class:`thermogrip.sysid.blackbox.order_selection.Family`).
-
-**Uncertainty: dependent wild bootstrap** [1]_.  A black box has no parameters whose prior and likelihood
-could be written down, and its errors are not white.  So the chosen structure is fitted anew to readings that
-might have been: the free run of the fit plus its error times a random course w of mean 0, variance 1 and the
-correlation exp(-(t - s)^2 / l^2), l longer than the errors are correlated.  The spread of the refits
-estimates how the fit would differ had the same rig been logged again.
-
-References
-----------
-.. [1] X. Shao, "The dependent wild bootstrap", Journal of the American Statistical Association 105 (2010).
+(:class:`thermogrip.sysid.blackbox.order_selection.Family`).  A black box has no parameters whose prior and
+likelihood could be written down, and its errors are not white.  So the chosen structure is fitted anew to
+readings that might have been: the spread of the refits estimates how the fit would differ had the same rig
+been logged again.
 """
 
 from __future__ import annotations
@@ -275,6 +268,7 @@ def _resampled(
     from scipy.signal import oaconvolve  # half a second
 
     # a Gaussian filter of sd sigma leaves white noise the correlation exp(-(t - s)^2 / (4 sigma^2))
+    # X. Shao, "The dependent wild bootstrap", Journal of the American Statistical Association 105 (2010)
     sigma = memory / 2
     pad = int(4 * sigma)
     gaussian = np.exp(-0.5 * (np.arange(-pad, pad + 1) / sigma) ** 2)
@@ -283,6 +277,8 @@ def _resampled(
     for segment, miss in zip(segments, misses):
         noise = rng.standard_normal(len(segment.time) + 2 * pad)
         w = oaconvolve(noise, gaussian, mode="valid")
+        # the free run of the fit plus its error times a random course w of mean 0, variance 1 and the
+        # correlation exp(-(t - s)^2 / l^2), l longer than the errors are correlated
         out.append(replace(segment, y=segment.y + miss - miss * w[:, None]))
     return out
 
@@ -298,10 +294,11 @@ def _misses(fit: BlackBoxFit) -> list[Array]:
 
 
 def white_error(fit: BlackBoxFit) -> float:
-    """Return the part of the error over all logs that is white, which no model would predict: by the second
-    differences, whose variance is six times that of white noise; mean over the outputs, in their spreads."""
+    """Return the part of the error over all logs that is white, which no model would predict, as a mean over
+    the outputs in their spreads."""
     scale = np.maximum(fit.grid.output_spread(), 1e-9)
     differences = np.concatenate([np.diff(miss, n=2, axis=0) for miss in _misses(fit)])
+    # the variance of second differences is six times that of white noise
     return float(np.mean(np.sqrt(np.nanmean(differences**2, axis=0) / 6) / scale))
 
 

@@ -6,26 +6,13 @@ difference between object and skin:
     T(t) = T_dev(t) + (T_obj - T_dev(t0)) F(t - t0) + (T_room - T_obj) G(t - t0),
 
 G being what the room does by the block's far face (:func:`far_response`).  F depends on the block (effusivity
-e, heat capacity per face C = rho c_p L), on the contact conductance and on the gripper only:
-
-- **Block**: a slab whose far face loses U per degree, as modes
-  (:mod:`thermogrip.sysid.contact.time_stepping`), of which 37 serve copper (diffusion time C^2/e^2 of 4 s)
-  and wood (over an hour) alike.
-- **Gripper**: a stack of layers in the coordinate z = x / sqrt(alpha) [s^0.5], in which a layer is its
-  effusivity alone (a cell holds e dz and conducts e / dz).  An outer sheet, the sensor, an inner layer, a
-  conductance to what is behind; beside the sensor a store of heat, since the pipe that it is glued to holds
-  water on one side and foam on the other.  The sensor follows its node with a first-order lag.
-- **Contact**: h(t) = h [f0 + (1 - f0) (1 - exp(-t / tau_b))] [1 + c (1 - exp(-t / tau_c))], soft skin that
-  meets the block and then settles.
-
-With h constant and one layer this is the closed form of :mod:`thermogrip.sysid.contact.closed_forms`.
+e, heat capacity per face C = rho c_p L), on the contact conductance and on the gripper only.  With h constant
+and one layer this is the closed form of :mod:`thermogrip.sysid.contact.closed_forms`.
 
 **From grasp to grasp** five things differ and limit what one touch can identify: the contact conductance and
 its build-up time (log-normal factors), the moment of contact about the "closed" message, the object's true
 temperature about the nominal one, and for natural materials the effusivity itself.  :class:`Grip` holds these
-spreads and draws from them.  On its way to the contact the object relaxes by a small share of the way to the
-room's temperature.  The twin of the rig plays single touches; :func:`simulate_grasps` makes records of them,
-which show the accuracy that the spreads allow at all, and train classifiers.
+spreads and draws from them.
 """
 
 from __future__ import annotations
@@ -53,16 +40,20 @@ _N_OUTER, _N_INNER = 5, 26
 class Stack:
     """The gripper and the way it makes contact."""
 
+    # in z = x / sqrt(alpha) a layer is its effusivity alone: a cell holds e dz and conducts e / dz
     e_outer: float  # effusivity of the sheet over the sensor [W s^0.5 m^-2 K^-1]
     z_outer: float  # its thickness in diffusion time, x / sqrt(alpha) [s^0.5]
     e_inner: float  # of what lies behind the sensor
     z_inner: float
     g_back: float  # conductance from the back to the water [W m^-2 K^-1]
     lag: float  # time constant of the sensor [s]
+    # soft skin that meets the block and then settles:
+    # h(t) = h [f0 + (1 - f0) (1 - exp(-t / tau_b))] [1 + c (1 - exp(-t / tau_c))]
     first: float  # share of h at first touch
     build_up: float  # build-up time of the contact [s]
     creep: float  # relative growth of h while the skin settles
     leak: float = 0.0  # rate of the skin's drift to the room once the pump is off [1/s]
+    # the pipe that the sensor is glued to holds water on one side and foam on the other
     g_side: float = 0.0  # conductance to a store beside the sensor, such as water in the pipe [W m^-2 K^-1]
     c_side: float = 1e4  # heat capacity of that store [J m^-2 K^-1]
     settle: float = 2.5  # time constant of the creep [s]
@@ -276,6 +267,7 @@ class Grip:
             e, h_c, capacity = (np.asarray(column, dtype=float) for column in blocks)
         onset = self.onset + self.onset_sd * normal[1]
         away = t_object + self.bias + self.t_object_sd * normal[2]
+        # on its way to the contact the object relaxes by a small share of the way to the room's temperature
         true = away + self.transit_loss * (ambient - away)
         nodes = time_nodes(self.until)
         build_up = self.stack.build_up * np.exp(self.build_up_sd_ln * normal[4])

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thermogrip.datasets.arrays import Array, Mask
-from thermogrip.datasets.compiled import numba  # as do those that build on it: imported where it is used
+from thermogrip.datasets.compiled import numba  # this file is imported only where it is used
 
 # sums over modes may be reordered, so that they run in vector registers; infinities stay what they are
 _SUMS = {"reassoc", "contract", "arcp", "nsz"}
@@ -25,6 +25,7 @@ COMPILED: dict[str, Any] = {"cache": True, "fastmath": _SUMS, "error_model": "nu
 # a tenth of the compiler's time, for nothing here
 COMPILED |= {"no_rewrites": True, "no_cfunc_wrapper": True}
 _N_EXACT, _N_GROUPED = 12, 24
+# which serve copper (diffusion time C^2/e^2 of 4 s) and wood (over an hour) alike
 N_MODE = _N_EXACT + _N_GROUPED + 1
 FADED = 34.0  # lam dt past which exp(-lam dt) is nothing beside 1
 _FASTEST = 2e3  # 1/s: modes beyond it are a series resistance

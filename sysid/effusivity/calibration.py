@@ -3,21 +3,9 @@
 Every grasp has nuisances u = mean(theta) + s w, w ~ N(0, 1) (see
 :mod:`thermogrip.sysid.effusivity.laplace_approximation`); theta holds what all grasps share: the stack, the
 mean onset and build-up time, heat loss in transit, the depth, and ln h and ln e of each material.
-Gauss-Newton moves theta and all w at once.  The matrix is an arrow, a small block per grasp and a border for
-theta, so the w are eliminated grasp by grasp:
-
-    A_i = I + J_i' J_i,   S = P + sum_i K_i' K_i - K_i' J_i A_i^-1 J_i' K_i,   K_i = d(reading_i) / d theta.
-
-After each step a spread is renewed as s^2 = sum(posterior mean^2 + posterior variance) / dof, one step of EM
-for restricted likelihood: dof counts the grasps less the means fitted to them, and two for a first guess.
-The noise is then found by maximum likelihood of the residuals with the nuisances marginalised, and the fit is
-repeated.
-
-theta is laid out in the order of :data:`~thermogrip.sysid.effusivity.gripper_model.SHARED_NAMES`, then ln h
-and ln e of each block.  For a new gripper every prior is wide; only ln e leans on the library, and the depth
-on the block's length.  With an earlier calibration theta ~ N(its parameters, its covariance); blocks that it
-has but that are not touched now stay in theta, since what they have in common with the touched ones moves
-with them.  Its spreads from grasp to grasp count as ten grasps: another day is alike, not the same.
+Gauss-Newton moves theta and all w at once.  The noise is then found by maximum likelihood of the residuals
+with the nuisances marginalised, and the fit is repeated.  With an earlier calibration theta ~ N(its
+parameters, its covariance).
 """
 
 from __future__ import annotations
@@ -186,6 +174,7 @@ def anchors(
 def wide_prior(known: Sequence[Anchor]) -> ThetaPrior:
     """Return the prior of a gripper that nobody has seen, with blocks of these effusivities."""
     table = [*_WIDE.values(), *[_LN_H] * len(known)]
+    # only ln e leans on the library, and the depth on the block's length
     table += [(float(np.log(row.effusivity)), row.sd_ln) for row in known]
     mean, sd = np.array(table).T
     return ThetaPrior(mean, np.diag(sd**-2.0), dict(FIRST_SPREAD))
@@ -286,6 +275,7 @@ class Problem:
         """Return the degrees of freedom of a spread: grasps and guesses less the means fitted to them."""
         insulators = np.unique(self.which[self.insulating]).size
         means = {"ln_h": np.unique(self.which).size, "ln_effusivity": insulators, "t_object": 2}
+        # means are fitted to the same grasps; two more for a first guess of the spread
         guesses = self.prior.guesses
         return max(guesses, float(self.rows(spread).sum()) - means.get(spread, 1) + guesses)
 
@@ -396,6 +386,7 @@ def joint_step(
     lin = linearise(problem, theta, w, spread)
     residual = np.einsum("nij,nj->ni", whitener, problem.data.y - lin.y)
     j, k = whitener @ lin.by_w, whitener @ lin.by_theta
+    # an arrow, a small block A_i = I + J_i' J_i per grasp and a border for theta: the w are eliminated first
     matrix = np.eye(N_NUISANCE) + j.transpose(0, 2, 1) @ j
     inverse = np.linalg.inv(matrix)
     border = j.transpose(0, 2, 1) @ k
@@ -405,6 +396,7 @@ def joint_step(
     grad = np.einsum("nik,ni->k", k, residual) - prior.precision @ (theta - prior.mean)
     grad -= np.einsum("nka,na->k", eliminate, grad_w)
     flat = k.reshape(-1, theta.size)
+    # S = P + sum_i K_i' K_i - K_i' J_i A_i^-1 J_i' K_i, K_i = d(reading_i) / d theta
     precision = prior.precision + flat.T @ flat - (eliminate @ border).sum(axis=0)
     before = float((residual**2).sum() + (w**2).sum()) + prior.penalty(theta)
     new_theta, new_w = theta, w
@@ -429,18 +421,15 @@ def joint_step(
 
 
 def renew_spread(problem: Problem, spread: Spread, w: Array, variance: Array) -> tuple[Spread, Array]:
-    """Return the spreads after one (over-relaxed) step of EM, and w in their units.
-
-    The sum of squares is divided by the degrees of freedom, since means are fitted to the same grasps.
-    A spread that no grasp informs, such as that of insulators where all are metals, stays.
-    """
+    """Return the spreads after one (over-relaxed) step of EM, and w in their units."""
     new, scaled = dict(spread), w.copy()
     for name, column in _COLUMN.items():
         rows = problem.rows(name)
         if name == "t_object":
             rows = rows & ~np.isfinite(problem.data.t_object_sd)
-        if not rows.any():
+        if not rows.any():  # a spread that no grasp informs, such as that of insulators among metals, stays
             continue
+        # s^2 = sum(posterior mean^2 + posterior variance) / dof, one step of EM for restricted likelihood
         squares = float((w[rows, column] ** 2 + variance[rows, column]).sum())
         squares += problem.prior.guesses * (problem.prior.spread[name] / spread[name]) ** 2
         ratio = np.sqrt(squares / problem.dof(name)) ** 1.5
@@ -679,6 +668,8 @@ def _problem(
 ) -> Problem:
     touched = sorted(set(data.material.tolist()))
     library = {label: row for label in touched if (row := _library_row(label, materials)) is not None}
+    # blocks that are not touched now stay in theta: what they have in common with the touched ones moves with
+    # them
     labels = touched if prior is None else sorted({*touched, *prior.materials})
     anchor_of = dict(zip(labels, anchors(labels, library, prior)))
     theta = wide_prior([*anchor_of.values()])

@@ -8,26 +8,11 @@ The noise of the averages is a sum of three parts,
 
     C = sigma_w^2 / n  +  sigma_s^2 exp(-|dt| / l)  +  (m A)^2 g g' exp(-|du|),   u = ln(1 + t / 0.3 s),
 
-white noise (sensor and rounding), slow noise (drift, a drifting reference junction), and what the model
-itself gets wrong, proportional to the excursion A of the grasp; g = (1 + t / 10 s)^p lets that part grow
-with contact time, so that a longer record does not raise confidence faster than truth.
-
-Grasps unlike those of the training
------------------------------------
+white noise, slow noise, and what the model itself gets wrong, proportional to the excursion A of the grasp.
 
 A grasp may differ from all that the gripper was taught by: a slip, a film, paint, a sheet in place of a
-block, a slower sensor, a heater nearby.  There is no end of these, and what has no model is explained by a
-wrong material, which is then sure.  So the model is right but for
-
-- a discrepancy of its trace, a Gaussian process of sd s A (s is the ``share``) whose correlation is the mean
-  of exp(-|dt| / l) for l of 0.5, 2.5 and 10 s;
-- nuisances farther from where the training has them, by w in the logarithm of contact conductance, build-up
-  time and the block's heat capacity (a block of another thickness), by proportional amounts in onset and
-  object temperature (:func:`~thermogrip.sysid.effusivity.laplace_approximation.prior_of`).
-
-Nobody knows which it is of a grasp, so each is looked at under the :data:`GRADES`, and the evidence of
-whatever is asked (a material, an effusivity, a material of none of the blocks) is its sum over them, each
-times its prior probability.
+block, a slower sensor, a heater nearby.  The model is right but for a discrepancy of its trace and for
+nuisances farther from where the training has them, as much as each of the :data:`GRADES` says.
 """
 
 from __future__ import annotations
@@ -69,8 +54,8 @@ _BIN_EDGES = np.concatenate(
 class Noise:
     """Noise: ``white``, ``slow`` [K], ``correlation_time`` l [s], relative ``misfit`` m, its ``growth`` p."""
 
-    white: float = 0.045
-    slow: float = 0.018
+    white: float = 0.045  # sensor and rounding
+    slow: float = 0.018  # drift, a drifting reference junction
     correlation_time: float = 4.0
     misfit: float = 0.0015
     growth: float = 1.0
@@ -92,6 +77,9 @@ class Grade(NamedTuple):
     misstated_K: float = 0.0  # sd of the object's temperature about what was stated
 
 
+# There is no end of such differences, and what has no model is explained by a wrong material, which is then
+# sure. Nobody knows which it is of a grasp, so the evidence of whatever is asked (a material, an effusivity,
+# a material of none of the blocks) is its sum over the grades, each times its prior probability.
 # A slip, or a finger that closes again, leaves what came before it sound: then the discrepancy is anything
 # from a time of 1, 2 or 4 s on.  A larger share pays for itself by the determinant of its covariance: grasps
 # like those of the training are answered by the first grade as if there were no others, and what gross misfit
@@ -141,7 +129,9 @@ class Touches:
     t_ambient: Array  # (n,), of the room [degC]
     excursion: Array  # (n,) [K]
     share: Array  # (n,), s: sd of what the model leaves out of the trace, in units of the excursion
-    unlike: Array  # (n,), w: sd by which nuisances are farther from those of the training, in logarithms
+    # (n,), w: sd by which nuisances are farther from those of the training, in logarithms of contact
+    # conductance, build-up time and heat capacity, by proportional amounts in onset and object temperature
+    unlike: Array
     since: Array  # (n,), when the discrepancy of the trace begins [s]
     second: Touches | None = None  # what a second sensor of the finger read of the same grasps
 
@@ -295,11 +285,9 @@ def noise_covariance(data: Touches, noise: Noise) -> Array:
 
 
 def noise_fit(data: Touches, noise: Noise, extra: Array, left: Array) -> tuple[float, Array]:
-    """Return 1/2 r' C^-1 r + 1/2 ln det C of deviations r (n, n_bin) under a noise, and its slopes (5,).
-
-    ``extra`` (n, n_bin, n_bin) is what else C holds; slopes are by the logarithms of white, slow, correlation
-    time and misfit, and by growth: with C^-1 - C^-1 r r' C^-1 = G, 1/2 tr(G dC).
-    """
+    """Return 1/2 r' C^-1 r + 1/2 ln det C of deviations r (n, n_bin) under a noise, and its slopes, by
+    the logarithms of white, slow, correlation time and misfit, and by growth; C holds ``extra`` too."""
+    # with C^-1 - C^-1 r r' C^-1 = G the slopes are 1/2 tr(G dC)
     parts = _noise_parts(data, noise)
     chol = np.linalg.cholesky(parts.total() + extra)
     root = _inverse(chol)
@@ -355,9 +343,11 @@ def _noise_parts(data: Touches, noise: Noise) -> _NoiseParts:
     slow = noise.slow**2 * noise.correlation(apart / noise.correlation_time)
     u = np.log1p(np.maximum(axes, 0.0) / 0.3)
     alike = noise.correlation(np.abs(u[:, :, None] - u[:, None, :]))
+    # g = (1 + t / 10 s)^p: with contact time, so that a longer record raises confidence no faster than truth
     size = noise.misfit * data.excursion[:, None] * (1 + np.maximum(t, 0.0) / 10) ** noise.growth * (t > 0)
     misfit = alike[which] * (size * has_samples)[:, :, None] * (size * has_samples)[:, None, :]
     if data.share.any():
+        # a Gaussian process of sd s A whose correlation is the mean of exp(-|dt| / l)
         alike = np.mean([np.exp(-apart / scale) for scale in _DISCREPANCY_TIMES_S], axis=0)
         size = (data.share * data.excursion)[:, None] * has_samples * (t > data.since[:, None])
         misfit += alike[which] * size[:, :, None] * size[:, None, :]
@@ -375,11 +365,11 @@ def _axes(data: Touches) -> tuple[Array, NDArray[np.int64]]:
 
 
 def _inverse(chol: NDArray[np.floating[Any]]) -> Array:
-    """Return the inverses of lower triangular matrices (n, n_bin, n_bin), row after row of all at once: by L
-    L^-1 = 1 a row follows from those above it."""
+    """Return the inverses of lower triangular matrices (n, n_bin, n_bin), row after row of all at once."""
     out = np.zeros(chol.shape)
     for i, pivot in enumerate(np.moveaxis(np.diagonal(chol, axis1=1, axis2=2), 1, 0)):
         out[:, i, i] = 1.0 / pivot
+        # by L L^-1 = 1 a row follows from those above it
         out[:, i, :i] = -(chol[:, None, i, :i] @ out[:, :i, :i])[:, 0] / pivot[:, None]
     return out
 

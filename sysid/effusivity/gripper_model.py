@@ -8,17 +8,8 @@ Three parts are kept apart:
   effusivity of insulators): also from all;
 - the **blocks**: contact conductance and effusivity of each material, from the grasps of that material.
 
-An effusivity that the engine finds is on the gripper's own scale, since the data fix ratios such as e /
-e_inner better than e itself.  Blocks whose effusivity the library knows give the ``scale``, ln(found /
-library) against ln(found), which reported effusivities are divided by.
-
-A calibration ends with a posterior of theta, the parameters that all grasps share: the stack, mean build-up
-time and onset, heat loss in transit, bias of the nominal temperature, depth, and ln h and ln e of each block.
-A later calibration on a few known grasps leans on it.
-
-**Another gripper** of the same kind differs by how such fingers are made (:class:`GripperSpread`).  With
-conductivity k, heat capacity c and thickness d, ln e = (ln k + ln c) / 2 and ln z = ln d + (ln c - ln k) / 2,
-so the stack's own numbers are correlated.  The blocks stay the same.
+A calibration ends with a posterior of theta, the parameters that all grasps share; a later one on a few known
+grasps leans on it.
 """
 
 from __future__ import annotations
@@ -39,6 +30,7 @@ from thermogrip.datasets.materials import load_materials
 from thermogrip.sysid.contact.simulation import Grip, Stack
 from thermogrip.sysid.effusivity.data import GRADES, KNOTS, Grade, Noise, at_knots
 
+# the stack, mean build-up time and onset, heat loss in transit, bias of the nominal temperature, depth:
 # theta but for the blocks, in the order of the calibration
 SHARED_NAMES = (
     "ln_e_outer", "ln_z_outer", "ln_e_inner", "ln_z_inner", "ln_g_back", "ln_lag", "ln_first", "creep",
@@ -145,6 +137,8 @@ class GripperSpread:
         for where, layer in (("outer", "sheet"), ("inner", "layer")):
             e, z = f"ln_e_{where}", f"ln_z_{where}"
             out.append({z: getattr(self, f"{layer}_thickness")})
+            # of conductivity k, heat capacity c and thickness d: ln e = (ln k + ln c) / 2 and ln z = ln d +
+            # (ln c - ln k) / 2, so the stack's own numbers are correlated
             k, c = 0.5 * getattr(self, f"{layer}_conductivity"), 0.5 * getattr(self, f"{layer}_capacity")
             out += [{e: k, z: -k}, {e: c, z: c}]
         out += [{"ln_g_back": self.glue}, {"ln_g_side": self.glue}, {"ln_c_side": self.store}]
@@ -155,8 +149,8 @@ class GripperSpread:
 
 def another_gripper(gripper: GripperModel) -> GripperModel:
     """Return what one gripper's calibration leaves open about another one of its kind: the same numbers, less
-    well known, from which a calibration on a few known grasps of the other one starts.  Where its file keeps
-    no covariance its own numbers count as exact."""
+    well known, from which a calibration on a few known grasps of the other one starts."""
+    # where its file keeps no covariance its own numbers count as exact; the blocks stay the same
     covariance = gripper.uncertainty
     if covariance is None:
         names = (*SHARED_NAMES, *block_names(gripper.materials))
@@ -467,6 +461,8 @@ class GripperModel:
         correlation length 1.5 in ln e), so a found value far from every known block is reported with that
         prior's uncertainty.
         """
+        # the engine finds effusivities on the gripper's own scale: the data fix ratios such as e / e_inner
+        # better than e itself
         x = np.asarray(ln_effusivity, dtype=float)
         blocks = [*self.blocks.values()]
         anchors = np.array([b.ln_effusivity for b in blocks])
@@ -484,16 +480,11 @@ class GripperModel:
 
 
 def load_default_gripper() -> GripperModel:
-    """Return the bundled calibration of the example rig's gripper.
-
-    Its file was made, from the shipped training grasps of exp1 to exp4 alone, by::
-
-        python -c "from dataclasses import replace;
-        from thermogrip.sysid.effusivity.calibration import calibrate_example_gripper as calibrate;
-        replace(calibrate(), uncertainty=None).save('sysid/data/gripper_device.json')"
-
-    It keeps no covariance: its numbers count as exact.
-    """
+    """Return the bundled calibration of the example rig's gripper; its numbers count as exact."""
+    # made from the shipped training grasps of exp1 to exp4 alone, without a covariance, by
+    # python -c "from dataclasses import replace;
+    # from thermogrip.sysid.effusivity.calibration import calibrate_example_gripper as calibrate;
+    # replace(calibrate(), uncertainty=None).save('sysid/data/gripper_device.json')"
     path = resources.files("thermogrip.sysid.effusivity") / "data" / "gripper_device.json"
     with resources.as_file(path) as file:
         return GripperModel.load(file)

@@ -5,15 +5,8 @@ A hypothesis (a material, or an effusivity) fixes a Gaussian prior over the seve
     u = (ln h, ln tau_b, t0, b, T_obj, ln e, ln C),
 
 and predicts the bin means f(u).  With the whitener W of the noise and u = mean + sd w the objective is
-``|W (y - f)|^2 + |w|^2``, its Gauss-Newton matrix A = I + J' J, and
-
-    ln Z = -1/2 objective - 1/2 ln det A - 1/2 ln det(2 pi C).
-
-A nuisance whose spread was learnt from few grasps has Student's t as its prior instead of a normal one: the
-sum of (nu + 1) ln(1 + w^2 / nu) replaces its w^2, the density's own curvature its 1 in A, and ln Z gains the
-ratio of the two peaks.  b and T_obj enter f linearly, so for them Laplace's method is exact
-marginalisation; the others are nearly Gaussian given them.  A nuisance with sd 0 is known.  Every function
-works on a batch of (grasp, hypothesis) pairs.
+``|W (y - f)|^2 + |w|^2``, its Gauss-Newton matrix A = I + J' J.  A nuisance with sd 0 is known.  Every
+function works on a batch of (grasp, hypothesis) pairs.
 """
 
 from __future__ import annotations
@@ -176,11 +169,15 @@ def find_modes(
     ended = search(pairs, w_matrix, law, prior.sd, u, rivals=rivals)
     inverse, log_det_curvature = curvature(ended.matrix, law.penalty(ended.u).own)
     covariance = inverse * (prior.sd[:, :, None] * prior.sd[:, None, :])
+    # b and T_obj enter f linearly, so for them this is exact; the others are nearly Gaussian given them
     objective = ended.cost + log_det_curvature
+    # a nuisance whose spread was learnt from few grasps has Student's t as its prior: the sum of (nu + 1)
+    # ln(1 + w^2 / nu) replaces its w^2, the density's own curvature its 1 in A, and ln Z gains the ratio of
     # the peaks of Student's densities over the normal ones' of the same scale
     heavy = vary & np.isfinite(dof)
     nu = np.where(heavy, dof, 1.0)
     ratio = gammaln(0.5 * (nu + 1)) - gammaln(0.5 * nu) - 0.5 * np.log(0.5 * nu)
+    # ln Z = -1/2 objective - 1/2 ln det A - 1/2 ln det(2 pi C)
     evidence = -0.5 * (objective + log_det[row]) + np.where(heavy, ratio, 0.0).sum(axis=1)
     return Mode(ended.u, covariance, evidence, ended.settled, ended.matrix[:, -1, -1])
 

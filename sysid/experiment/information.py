@@ -1,19 +1,8 @@
 """Expected information of an experiment: temperatures that it may reach, intervals that it would leave.
 
-**Information.** A schedule u moves the outputs y(t). With the free parameters theta (logarithms where they
-are positive) of covariance P = R R' now, an experiment whose output j is read with standard deviation
-sigma_j, one independent reading every tau_j seconds, adds
-
-    F = sum_j 1 / (sigma_j^2 tau_j) integral (dy_j/dtheta) (dy_j/dtheta)' dt
-
-and leaves (P^-1 + F)^-1 = R (1 + R'F R)^-1 R': a gain of 1/2 log2 det(1 + R'F R) bits [1]_. All is linear
-about the plant's values.  Every experiment begins at rest in the room.
-
-sigma and tau are the weights of the fit, sd of the sensors and seconds of an independent reading.
-
-References
-----------
-.. [1] K. Chaloner, I. Verdinelli, "Bayesian experimental design: a review", Statistical Science 10(3), 1995.
+A schedule u moves the outputs y(t). With the free parameters theta (logarithms where they are positive) of
+covariance P = R R' now, an experiment adds information F and leaves (P^-1 + F)^-1 = R (1 + R'F R)^-1 R'. All
+is linear about the plant's values.  Every experiment begins at rest in the room.
 """
 
 from __future__ import annotations
@@ -83,6 +72,8 @@ class ExperimentForecast:
     def bits(self, u: Array) -> float:
         """Return the expected gain of information of an experiment u (N, n_u) [bits]."""
         gain = self._gain(self._run(u, *self._moved))
+        # 1/2 log2 det(1 + R'F R): K. Chaloner, I. Verdinelli, "Bayesian experimental design: a review",
+        # Statistical Science 10(3), 1995
         return float(0.5 * np.linalg.slogdet(gain)[1] / np.log(2.0))
 
     def covariance(self, u: Array) -> Array:
@@ -100,7 +91,9 @@ class ExperimentForecast:
         n = len(self.plant.free)
         slopes = np.nan_to_num(y[1:, 1:] - y[0, 1:]) / self._steps[:, None, None]
         rise = np.asarray(np.tensordot(self._root.T, slopes, axes=1), dtype=np.float64)
+        # the weights of the fit: sd of the sensors, seconds of an independent reading
         sd, seconds = reading_noise(self.plant)
+        # F = sum_j 1 / (sigma_j^2 tau_j) integral (dy_j/dtheta) (dy_j/dtheta)' dt
         flat = (rise * np.sqrt(self.dt / seconds) / sd).reshape(n, -1)
         return np.asarray(np.eye(n) + flat @ flat.T)
 

@@ -2,16 +2,7 @@
 
 Schedules are lists of cells of equal length, one level per input in each.  Starting from the best constant, a
 search exchanges one block of cells of random length after the other, for one level or for two in turn, and
-keeps what gains information (:mod:`thermogrip.sysid.experiment.information`) without leaving the limits:
-coordinate exchange of D-optimal design [1]_.
-
-Limits that are kept at the search's step are checked again at the plant's own; a schedule that violates them
-there is shrunk towards the start's level until it keeps them.
-
-References
-----------
-.. [1] R. K. Meyer, C. J. Nachtsheim, "The coordinate-exchange algorithm for constructing exact optimal
-   experimental designs", Technometrics 37(1), 1995.
+keeps what gains information (:mod:`thermogrip.sysid.experiment.information`) without leaving the limits.
 """
 
 from __future__ import annotations
@@ -119,6 +110,8 @@ def optimal_schedule(
     def bits(cells: Array) -> float:
         return fine.evaluate(frame.inputs(cells, coarse=False))
 
+    # limits kept at the search's step are checked at the plant's own: shrunk towards the start's level until
+    # they are
     within, _ = _shrunk(frame, bits, cells, SEARCH.halvings)
     best = frame.inputs(within, coarse=False)
     if not fine.stays(best):
@@ -189,6 +182,8 @@ def _search_cells(
     def evaluate(cells: Array) -> float:
         return forecast.evaluate(frame.inputs(cells, coarse=True), margin=SEARCH.margin)
 
+    # coordinate exchange of D-optimal design: R. K. Meyer, C. J. Nachtsheim, "The coordinate-exchange
+    # algorithm for constructing exact optimal experimental designs", Technometrics 37(1), 1995
     rng = np.random.default_rng(seed)
     best, gain = np.tile(frame.still, (frame.n_cell, 1)), -np.inf
     # square waves beside these gained 1 % of the bits of two plants, and nothing of two

@@ -1,15 +1,6 @@
 """Input schedules to identify a plant by: PRBS, multisine, staircase, inside the rig's limits.
 
 To excite time constants from tau_fast to tau_slow periods should span about pi tau_fast to 2 pi tau_slow.
-
-* **prbs**: a maximum-length shift register of two levels about the mean, held for tau_fast per bit; 2^n - 1
-  bits have a spectrum flat up to 0.44 / tau_fast and are balanced but for one bit.
-* **multisine**: log-spaced whole harmonics of the record, all of one amplitude, with the phases of least
-  crest factor among Schroeder's phi_k = -pi k (k - 1) / K (for consecutive harmonics) and 100 random
-  sets.
-* **staircase**: levels up and down over the whole range, each held for three tau_slow where time allows; it
-  shows the curvature that two-level signals cannot.
-
 The first 6 s rest at the middle, so that the start is known.
 """
 
@@ -83,10 +74,12 @@ def excite(
     rest_rows = int(np.ceil(REST / dt))
     n = time.size - rest_rows
     if kind == "prbs":
+        # 2^n - 1 bits of tau_fast have a spectrum flat up to 0.44 / tau_fast and are balanced but for one bit
         shape = prbs(n, hold=max(1, round(tau_fast / dt)), seed=seed)
     elif kind == "multisine":
         shape = multisine(n, slowest=2 * np.pi * tau_slow / dt, fastest=np.pi * tau_fast / dt, seed=seed)
     else:
+        # shows the curvature that two-level signals cannot
         shape = staircase(n, hold=3 * tau_slow / dt, seed=seed)
     drive = (low + high) / 2 + (high - low) / 2 * np.concatenate([np.zeros(rest_rows), shape])
     columns = {"drive": (drive, "1", "input"), "pump": (np.ones(time.size), "1", "input")}
@@ -110,9 +103,11 @@ def prbs(n: int, *, hold: int, seed: int = 0) -> Array:
 def multisine(n: int, *, slowest: float, fastest: float, seed: int = 0) -> Array:
     """Return n samples of a multisine within +-1."""
     first, last = max(1, int(np.ceil(n / slowest))), max(2, int(n / max(fastest, 4.0)))
+    # log-spaced whole harmonics of the record, all of one amplitude
     harmonics = np.unique(np.round(np.geomspace(first, max(first + 1, last), 25)).astype(int))
     k = np.arange(1, harmonics.size + 1)
     drawn = np.random.default_rng(seed).uniform(0, 2 * np.pi, (100, k.size))
+    # of least crest factor among Schroeder's (for consecutive harmonics) and 100 random sets
     phases = np.vstack([-np.pi * k * (k - 1) / k.size, drawn])
     spectrum = np.zeros((len(phases), n // 2 + 1), dtype=complex)
     spectrum[:, harmonics] = np.exp(1j * phases)

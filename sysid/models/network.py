@@ -3,31 +3,9 @@
 The network is declared in TOML (:mod:`thermogrip.sysid.models.network_spec`).  One arithmetic of a step runs
 on NumPy rows, CasADi symbols and SIMD vectors: no branch depends on a temperature, an input or a parameter.
 
-**Heat balance.**  Every state x_i is a temperature [degC] of a heat capacity C_i; z is x followed by the
-boundary temperatures (disturbances, then fixed ones).  Heat flows through
-
-    conductances   q_ij = G_ij (z_j - z_i) (1 + b |z_j - z_i| / 10 K),    taken from j, given to i
-    flows          q_ij = F (z_j - z_i),       given to i only: the water of i moved on with its heat
-    radiation      q_ij = k (T_j^4 - T_i^4),   T in kelvin
-    heaters        q_i  = P u,                 or P d of what is measured and not moved
-    Peltiers       face: a I T_face + R I^2 / 2,    sink: -a I T_sink + R I^2 / 2,    T in kelvin
-
-and C_i dx_i/dt = sum of q.  A sensor is a state too: its time constant is C, a unit flow from its
-node for q.  Conductances and flows may hang on a switch u_s (a pump): they have off + (1 - off) u_s of their
-value.
-
-**Time step.**  ROS2 of Verwer et al. [1]_, for dx/dt = f(x) over a step h with the input held:
-
-    (1 - g h A) k_1 = f(x),    (1 - g h A) k_2 = f(x + h k_1) - 2 k_1,    x+ = x + h (3 k_1 + k_2) / 2
-
-is of second order for *any* matrix A, and L-stable with g = 1 - 1/sqrt(2) where A is the Jacobian.  A holds
-the conductances and flows, the only stiff terms, so it changes with the switches alone and is factorised once
-per change.
-
-References
-----------
-.. [1] J. G. Verwer, E. J. Spee, J. G. Blom, W. Hundsdorfer, "A second-order Rosenbrock method applied to
-   photochemical dispersion problems", SIAM J. Sci. Comput. 20 (1999).
+Every state x_i is a temperature [degC] of a heat capacity C_i, and C_i dx_i/dt = sum of q, the heat that
+flows to it; z is x followed by the boundary temperatures (disturbances, then fixed ones).  A sensor is a
+state too: its time constant is C, a unit flow from its node for q.
 """
 
 from __future__ import annotations
@@ -56,6 +34,9 @@ from thermogrip.sysid.models.network_spec import (
 if TYPE_CHECKING:
     from thermogrip.sysid.models.jit_rollout import Kernel
 
+# ROS2 of J. G. Verwer, E. J. Spee, J. G. Blom, W. Hundsdorfer, "A second-order Rosenbrock method applied to
+# photochemical dispersion problems", SIAM J. Sci. Comput. 20 (1999): of second order for *any* matrix A, and
+# L-stable with this g where A is the Jacobian
 GAMMA = 0.2928932188134524  # 1 - 1/sqrt(2)
 KELVIN = 273.15
 DROOP_SPAN = 50.0  # K between face and sink to which the droop refers
@@ -165,6 +146,7 @@ class ThermalSteps:
     def renew(self, u: Values, c: _Values, h: Any) -> tuple[list[Any], list[_Pivot]]:
         """Return the conductances, and the factors of 1 - g h A."""
         g = self._conductances(u, c)
+        # A holds the conductances and flows, the only stiff terms: factorised once per change of the switches
         return g, self._factors(c, g, GAMMA * h)
 
     def advance(
@@ -174,8 +156,10 @@ class ThermalSteps:
         g, factors = kept
         outside = [*d, *c.fixed]
         q = self._flows([*x, *outside], u, c, g)
+        # (1 - g h A) k_1 = f(x)
         k = _solved(factors, [a / b for a, b in zip(q, c.capacity)])
         q = self._flows([*(a + h * b for a, b in zip(x, k)), *outside], u, c, g)
+        # (1 - g h A) k_2 = f(x + h k_1) - 2 k_1, x+ = x + h (3 k_1 + k_2) / 2
         k2 = _solved(factors, [a / b - 2.0 * e for a, b, e in zip(q, c.capacity, k)])
         return [a + h * (1.5 * e + 0.5 * b) for a, e, b in zip(x, k, k2)]
 
@@ -190,6 +174,7 @@ class ThermalSteps:
 
     def _conductances(self, u: Values, c: _Values) -> list[Any]:
         """Return the conductance [W/K] of every link at these switch positions."""
+        # conductances and flows may hang on a switch, such as a pump, that leaves a share of them when off
         return [
             value if link.switch < 0 else value * (off + (1.0 - off) * u[link.switch])
             for link, value, off in zip(self.links, c.link, c.off)
@@ -206,15 +191,19 @@ class ThermalSteps:
                 q[j] = q[j] - flow
 
         for link, conductance in zip(self.links, g):
+            # taken from j, given to i; of a flow given to i only, the water of i moved on with its heat
             move(link.to, link.source, conductance * (z[link.source] - z[link.to]), link.both)
         for link, conductance, bend in zip(self.links, g, c.bend):
             if bend is not None:
+                # q_ij = G_ij (z_j - z_i) (1 + b |z_j - z_i| / 10 K)
                 rise = z[link.source] - z[link.to]
                 move(link.to, link.source, conductance * bend / BEND_SPAN * rise * abs(rise), link.both)
         for link, factor in zip(self.radiation, c.radiation):
+            # q_ij = k (T_j^4 - T_i^4)
             a, b = z[link.to] + KELVIN, z[link.source] + KELVIN
             move(link.to, link.source, factor * (b * b * b * b - a * a * a * a))
         for (i, source, measured, _), power in zip(self.heaters, c.heater):
+            # P u, or P d of what is measured and not moved
             q[i] = q[i] + power * (z[source] if measured else u[source])
         for (face, sink, by, duty, _), element in zip(self.peltiers, c.peltier):
             at_face, at_sink = _peltier_heat(element, u[by], z[face], z[sink], duty)
@@ -277,6 +266,7 @@ def _peltier_heat(element: dict[str, Any], u: Any, t_face: Any, t_sink: Any, dut
     warm = 0.5 * (t_face + t_sink) - REFERENCE
     pumped = element["seebeck"] * (1.0 + element["seebeck_slope"] * warm) * current
     joule = 0.5 * element["resistance"] * (1.0 + element["resistance_slope"] * warm) * square
+    # a I T_face + R I^2 / 2 and -a I T_sink + R I^2 / 2, T in kelvin
     return pumped * (t_face + KELVIN) + joule, joule - pumped * (t_sink + KELVIN)
 
 
@@ -473,7 +463,7 @@ class NetworkModel(Described):
         return self.steps.read(x, ())
 
     def rest(self, y: ArrayLike, u: ArrayLike, d: ArrayLike, p: ArrayLike) -> Array:
-        """Return the state (n_x,) of a plant at rest whose sensors read y; see the module's theory."""
+        """Return the state (n_x,) of a plant at rest whose sensors read y."""
         return np.asarray(self.rest_of_each(y, u, d, np.asarray(p, dtype=float)[None])[0])
 
     def rest_of_each(self, y: ArrayLike, u: ArrayLike, d: ArrayLike, p: ArrayLike) -> Array:

@@ -14,10 +14,6 @@ The arguments are named tuples.  The same lines run on numbers, on rows of a bat
 (:mod:`thermogrip.sysid.models.jit_rollout`), and on CasADi symbols, so a choice between two values is
 ``np.where`` or ``np.maximum``, never ``if``, and comparisons are joined by ``np.logical_and``, not by ``&``;
 what vectors cannot say (sorting, a function of SciPy) NumPy runs on whole batches, more slowly.
-
-**In time.**  With dx/dt = f(x, u, d, p) and u, d held over a step, each step of the simulation is cut into n
-pieces, each a step of the classical Runge-Kutta rule of fourth order, after which a state with limits is put
-back inside them.  :meth:`OwnModel.prepared` doubles n until that changes the logs' simulations little.
 """
 
 from __future__ import annotations
@@ -207,11 +203,13 @@ class OwnCode:
 
     def advance(self, x: Values, u: Values, d: Values, c: Values, kept: Values, h: Any) -> list[Any]:
         """Return the state one Runge-Kutta step of ``h`` on."""
+        # the classical rule of fourth order for dx/dt = f(x, u, d, p), u and d held over a step
         k1 = self.rhs(x, u, d, c)
         k2 = self.rhs([a + h / 2 * k for a, k in zip(x, k1)], u, d, c)
         k3 = self.rhs([a + h / 2 * k for a, k in zip(x, k2)], u, d, c)
         k4 = self.rhs([a + h * k for a, k in zip(x, k3)], u, d, c)
         state = [a + h / 6 * (s + 2 * (q + r) + t) for a, s, q, r, t in zip(x, k1, k2, k3, k4)]
+        # a state with limits is put back inside them after each of the n pieces of a step
         for i, (low, high) in enumerate(self.limits):
             if np.isfinite(low):
                 state[i] = np.maximum(state[i], low)

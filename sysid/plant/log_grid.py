@@ -1,18 +1,9 @@
 """Logs as a model takes them: its signals in its units, on an even grid, cut where the input is unknown.
 
-After a gap of more than 10 s (and of five steps of a slow log) a stretch with a start of its own begins.
-
-**Inputs.**  With the grid t_k = t_0 + k dt of a stretch, an input is the exact mean of its held value over
-[t_k, t_k + dt).  A plant (:func:`cut_stretches`) has a grid of its own step: a command that its driver rounds
-is what the driver made of it, and a measured ambient is smoothed over 20 s, for its sensor is slow and
-coarse.  Readings stay at their own times, and the outputs of the model are interpolated to them.  Logs of a
-rig that says of an input what was applied up to the row (``ends``) are moved by one row.
-
-**Readings on the grid.**  For a black box (:func:`make_grid`) a reading is the mean of the line through the
-samples over [t_k - dt/2, t_k + dt/2], so that it is not shifted in time; where the grid is the log's own,
-the samples stand as they are.  A reading lost while the input is known stays NaN.
-
-**Roles and units** of a model at hand are used (:func:`match_logs`).
+With the grid t_k = t_0 + k dt of a stretch, an input is the exact mean of its held value over [t_k, t_k +
+dt).  A plant (:func:`cut_stretches`) has a grid of its own step; readings stay at their own times, and the
+outputs of the model are interpolated to them.  For a black box (:func:`make_grid`) a reading is the mean of
+the line through the samples over [t_k - dt/2, t_k + dt/2]; one lost while the input is known stays NaN.
 """
 
 from __future__ import annotations
@@ -40,7 +31,7 @@ if TYPE_CHECKING:
 
     Signals: TypeAlias = PlantData | GreyModel
 
-GAP = 10.0  # [s], beyond it the input is unknown
+GAP = 10.0  # [s], and five steps of a slow log: beyond it the input is unknown
 BRIDGED = 5  # rows
 MOVED = 0.01  # of an input's range: less is noise of its reading
 _LONGEST_GAP = 1_000_000  # steps, behind which a plant is long at rest; a damaged clock may have centuries
@@ -206,6 +197,7 @@ def cut_stretches(plant: PlantData, log: Log, *, gaps: str = "restart") -> list[
             raise UserError(f"would be simulated in {n} steps of {plant.dt:g} s", file=rows.log, hint=hint)
         return n
 
+    # logs of a rig that says of an input what was applied up to the row are moved by one row
     rows = rows.from_row_on() if plant.inputs_end_at_row else rows
     for name, step in plant.model.command_steps.items():
         # a driver drops what lies behind a multiple of its step; of averaged commands only the mean of the
@@ -401,6 +393,7 @@ def _segments(rows: Rows, step: float, native: float) -> list[Segment]:
         if is_native and np.ptp(np.diff(t)) < 0.02 * native:  # the samples stand as they are
             out.append(Segment(t, stretch.y, rows.u[stretch.rows], rows.d[stretch.rows], stretch.log))
         else:
+            # the mean about a row, so that it is not shifted in time
             grid = t[0] + step * np.arange(len(stretch.u))
             out.append(Segment(grid, _line_mean(t, stretch.y, grid, step), stretch.u, stretch.d, stretch.log))
     return out
