@@ -248,9 +248,9 @@ def predictor_observability(triangle: Array, f: int, n_y: int) -> Array:
     by_past, by_readings = np.zeros((f * n_y, n_z)), np.eye(f * n_y)
     constant = window.future[:, -1:]
     for row in range(f):
-        # With the innovation e = y - C x and A_K = A - K C, x+ = A_K x + B w + K y, so that Y_f = Gamma_K L
-        # Z_p + H_K W_f + G_K Y_f + E, H_K and G_K strictly lower triangular. The e of a row depends on none
-        # of what it is regressed on, even where w was fed back from y.
+        # With the innovation e = y - C x and A_K = A - K C, x+ = A_K x + B w + K y, so that
+        # Y_f = Gamma_K L Z_p + H_K W_f + G_K Y_f + E, H_K and G_K strictly lower triangular.
+        # The e of a row depends on none of what it is regressed on, even where w was fed back from y.
         before = window.ahead[:, : row * n_y]
         regressors = np.hstack([window.past, before, window.future[:, : row * n_w], constant])
         row_outputs = slice(row * n_y, (row + 1) * n_y)

@@ -137,8 +137,8 @@ class GripperSpread:
         for where, layer in (("outer", "sheet"), ("inner", "layer")):
             e, z = f"ln_e_{where}", f"ln_z_{where}"
             out.append({z: getattr(self, f"{layer}_thickness")})
-            # of conductivity k, heat capacity c and thickness d: ln e = (ln k + ln c) / 2 and ln z = ln d +
-            # (ln c - ln k) / 2, so the stack's own numbers are correlated
+            # of conductivity k, heat capacity c and thickness d: ln e = (ln k + ln c) / 2 and
+            # ln z = ln d + (ln c - ln k) / 2, so the stack's own numbers are correlated
             k, c = 0.5 * getattr(self, f"{layer}_conductivity"), 0.5 * getattr(self, f"{layer}_capacity")
             out += [{e: k, z: -k}, {e: c, z: c}]
         out += [{"ln_g_back": self.glue}, {"ln_g_side": self.glue}, {"ln_c_side": self.store}]

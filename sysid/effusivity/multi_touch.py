@@ -97,7 +97,7 @@ BLOCK = BlockSettings()
 class Coupling:
     """How a block moves between two touches."""
 
-    # defaults are the example rig's; :func:`learn_coupling` learns them by maximum likelihood
+    # the example rig's; those of another are learnt from groups of known material by maximum likelihood
     found: float = 0.75  # share a of the first touch's drop that the next one finds
     loss: float = 100.0  # U, to the room, per contact face [W m^-2 K^-1]
     sd: float = 0.36  # s, what the two leave open [K]
@@ -286,8 +286,8 @@ def combine(factor: Factor, mean: Array, covariance: Array) -> Joint:
     # g = eta - Lambda (mu - x0)
     g = eta - pulled
     move = np.einsum("...ij,...j->...i", posterior, g)
-    # ln Z = sum ln c + (eta - Lambda (mu - x0) / 2)' (mu - x0) + g' (I + P Lambda)^-1 P g / 2 - ln det(I + P
-    # Lambda) / 2
+    # ln Z = sum ln c + (eta - Lambda (mu - x0) / 2)' (mu - x0)
+    #        + g' (I + P Lambda)^-1 P g / 2 - ln det(I + P Lambda) / 2
     evidence = factor.log_size.sum(axis=-1) + ((eta - 0.5 * pulled) * away).sum(axis=-1)
     evidence = evidence + 0.5 * (g * move).sum(axis=-1) - 0.5 * np.linalg.slogdet(matrix)[1]
     return Joint(np.asarray(evidence), mean + move, np.asarray(posterior, dtype=float))

@@ -155,8 +155,8 @@ class RandomizedMap:
     def _draw(self, z: Array, xi: Array, noise: Array, moving: NDArray[np.int_], iterations: int) -> Array:
         """Return the parameters ``moving`` of the least objective, the others at z (n_free,)."""
 
-        # minimise |z - z_fit - xi|^2 + |K^(1/2) Q'd(z) - e|^2 + |d(z) - Q Q'd(z)|^2 / T, xi, e ~ N(0, 1): J.
-        # M. Bardsley, A. Solonen, H. Haario, M. Laine, "Randomize-then-optimize", SIAM J. Sci. Comput. 36
+        # |z - z_fit - xi|^2 + |K^(1/2) Q'd(z) - e|^2 + |d(z) - Q Q'd(z)|^2 / T is least, xi, e ~ N(0, 1):
+        # J. M. Bardsley, A. Solonen, H. Haario, M. Laine, "Randomize-then-optimize", SIAM J. Sci. Comput. 36
         # (2014)
         def residuals(points: Array) -> Array:
             whole = np.tile(z, (len(points), 1))

@@ -126,8 +126,8 @@ class StateSpaceModel(BlackBox):
         gain = (self.B + self._term_slopes(u, d))[:, move]
         n_v = gain.shape[1]
         scale = np.sqrt(np.maximum(np.trace(self.spread) / self.n_x, 1e-12))
-        # held there by *some* constant input v: min |x - A x - B v - E d - c|^2 + eps |v - u|^2 subject to C
-        # x + y0 = y
+        # held there by *some* constant input v:
+        # min |x - A x - B v - E d - c|^2 + eps |v - u|^2 subject to C x + y0 = y
         rows = np.block(
             [
                 [(np.eye(self.n_x) - A) / scale, -gain / scale],
