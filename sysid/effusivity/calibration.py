@@ -173,6 +173,7 @@ def anchors(
 
 def wide_prior(known: Sequence[Anchor]) -> ThetaPrior:
     """Return the prior of a gripper that nobody has seen, with blocks of these effusivities."""
+    # theta is laid out in the order of SHARED_NAMES, then ln h and ln e of each block
     table = [*_WIDE.values(), *[_LN_H] * len(known)]
     # only ln e leans on the library, and the depth on the block's length
     table += [(float(np.log(row.effusivity)), row.sd_ln) for row in known]

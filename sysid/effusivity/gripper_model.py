@@ -462,7 +462,7 @@ class GripperModel:
         prior's uncertainty.
         """
         # the engine finds effusivities on the gripper's own scale: the data fix ratios such as e / e_inner
-        # better than e itself
+        # better than e itself; those that are reported are divided by this one
         x = np.asarray(ln_effusivity, dtype=float)
         blocks = [*self.blocks.values()]
         anchors = np.array([b.ln_effusivity for b in blocks])

@@ -113,7 +113,8 @@ class Vector:
         return _elementary(function, "__call__", inputs, options)
 
     def _two(self, instruction: str, a: Any, b: Any, flags: Sequence[str]) -> Any:
-        # one instruction of LLVM: indices are looked up, loops unrolled, products with a constant 0 or 1 gone
+        # one instruction of LLVM for numbers that have no value yet: in what is compiled indices are looked
+        # up, loops unrolled and products with a constant 0 or 1 gone
         result = getattr(self.builder, instruction)(register(a), register(b), flags=flags)
         return Vector(self.builder, result)
 

@@ -78,6 +78,7 @@ def expected_error(errors: Sequence[float], gain_effect: float) -> ExpectedError
     scale = float(np.sqrt(squares / freedom * (1 + 1 / n)))
     ranks = (np.arange(_RANKS) + 0.5) / _RANKS
     part_squares = np.exp(middle + scale * stdtrit(freedom, ranks))
+    # what a gain that is off adds, (v(u) - v(u - g (u - u_0)))^2
     gains = (gain_effect * ndtri(0.5 + ranks / 2)) ** 2
     low, high = np.sqrt(np.quantile(part_squares[:, None] + gains, (0.05, 0.95))).tolist()
     # the median is the geometric mean of the e_f
