@@ -1,20 +1,7 @@
 """The time of each row of a log: which column is its clock, in what unit, and where it wraps or starts again.
 
 A clock is known by its name, else by its behaviour: it rises from row to row in steps that are nearly even.
-Its unit is that of its header.  A header without one leaves the numbers:
-
-* dates between the years 2000 and 2100 they may be, as programs count them (:data:`_DATES`): in s, ms, us or
-  ns since 1970, or in what Windows, .NET, spreadsheets and MATLAB count;
-* with decimals, or less than 20 apart, they are seconds, as logs are written;
-* whole numbers further apart are seconds where their steps are whole minutes, and milliseconds or, from
-  100 000 apart, microseconds of a board's counter where they are not.
-
-The last of these is a guess, as is a time that counts rows: it is reported as a doubt, with the option that
-settles it.
-
-A counter of 16 or 32 bits wraps: where the time runs back by 2^16 or 2^32 counts but for one step, it goes
-on.  A board that was reset begins again: where both parts rise on their own, the second one follows after a
-gap, for how long it was off is not known.
+Its unit is that of its header; of a header without one, the numbers show it.
 """
 
 from __future__ import annotations
@@ -179,6 +166,8 @@ def _what_counts_mean(name: str, counts: Floats, *, wrapped: bool) -> _Counts:
     usual = float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
     whole = bool(np.all(counts == np.rint(counts)))
     likely = (date for date in _DATES if not date.calendar or (not whole and usual <= _CLOCK.days_apart))
+    # dates between the years 2000 and 2100 they may be, as programs count them: in s, ms, us or ns since
+    # 1970, or in what Windows, .NET, spreadsheets and MATLAB count
     dates = next((date for date in likely if date.has(float(counts[0]))), None)
     of_board = whole and usual >= _CLOCK.counts_apart and not np.all(steps % 60 == 0)
     if word is not None and (dates is None or dates.seconds == 1.0):  # a board's counter may be as large
@@ -188,6 +177,8 @@ def _what_counts_mean(name: str, counts: Floats, *, wrapped: bool) -> _Counts:
         return replace(dates, doubt=f"{name} is taken as the time in days of {dates.calendar}, {apart}")
     if dates is not None and not (dates.seconds == 1.0 and of_board):
         return dates
+    # with decimals, or less than 20 apart, they are seconds, as logs are written; whole numbers further apart
+    # are seconds where their steps are whole minutes
     if not of_board:
         minutes = whole and usual >= _CLOCK.counts_apart
         guess = f"{name} has no unit: taken as seconds, so that rows are {usual:g} s apart" if minutes else ""
@@ -195,6 +186,7 @@ def _what_counts_mean(name: str, counts: Floats, *, wrapped: bool) -> _Counts:
     # 32 bits of microseconds last for 72 minutes, of milliseconds for 50 days
     fine = usual >= _CLOCK.microseconds_apart or (wrapped and counts[-1] > 2**32)
     scale, unit = (1e-6, "microseconds") if fine else (1e-3, "milliseconds")
+    # a guess, as is a time that counts rows: it is reported as a doubt, with the option that settles it
     doubt = f"{name} has no unit: taken as {unit}, so that rows are {usual * scale:g} s apart"
     return _Counts(scale, doubt=doubt)
 
@@ -209,6 +201,7 @@ def _unwrapped(counts: Floats, lines: NDArray[np.int64]) -> tuple[Floats, list[s
         for bits in (16, 32):
             for count in (1.0, 1e-3, 1e-6):  # the file may have it in s already
                 forward = float(steps[row]) + 2.0**bits * count
+                # where the time runs back by 2^16 or 2^32 counts but for one step, it goes on
                 if 0 < forward <= 2 * usual:
                     counts = counts + np.where(np.arange(counts.size) > row, 2.0**bits * count, 0.0)
                     notes.append(
@@ -228,6 +221,7 @@ def _in_pieces(seconds: Floats, lines: NDArray[np.int64]) -> tuple[Floats, list[
     whole = [piece.size >= _CLOCK.piece_rows and piece[1] - piece[0] <= GAP_STEPS * usual for piece in pieces]
     if not all(whole) or any(piece[0] > begins for piece in pieces):
         return seconds, []  # a stamp that is wrong begins no part that goes on as a clock does
+    # both parts rise on their own: a board was reset, and for how long it was off is not known
     gap = 1.0 + max(GAP_SECONDS, GAP_STEPS * usual)
     seconds = seconds.copy()
     for row in back:

@@ -1,26 +1,5 @@
 """What a reader may repair in a log; each function returns the values and one line a finding.
 
-A **spike** is a run of at most three samples of an output that leaves the running median of 21 samples and
-comes back.  With d the deviation from that median, a sample is a candidate where
-
-    |d| > max(floor, 6 s),   s = 1.4826 median |d| over the whole channel,
-
-floor is 0.6 K for a temperature and 2 % of the channel's 1-99 % range (at least five of its smallest
-increments) otherwise; and the run is a spike only if it is entered and left by jumps of opposite sign, each
-larger than the same threshold and than five times the 70 % quantile of the increments around it: a step is
-not left, the tip of a ramp is entered by increments like those around it.  In rows of a minute or more a
-plant moves and comes back by itself: there a spike is beyond all other samples by more than their range.
-
-What a sensor writes when it has no reading (:data:`SENSOR_CODES`) is lost, in whatever number of rows, where
-it is entered and left by jumps of more than five times what the other rows rarely move (their 99 %
-quantile): a kettle that passes 85 degC does not jump there.
-
-A reading that repeats itself bit by bit while the inputs move is **stuck**, and lost as well.  With M the
-moves of the inputs, in ranges, of the whole log, m those within the run that has most of them and k those
-within all other runs but for the first of each (a row's reading is from before its move), a sound reading
-stays through a move with a chance of about p = (k + 1) / (M - m + 2) (Laplace's rule); the run is stuck
-where p^(m - 1) is below 1e-3.
-
 An output is never filled.  A lost input is held from the last row, since that is what an actuator does; a
 lost disturbance is interpolated.
 """
@@ -49,13 +28,13 @@ SENSOR_CODES = {
     **dict.fromkeys((999.9, 999.0, 9999.0, -999.0, -9999.0), "a logger's mark of a lost value"),
     **dict.fromkeys((3276.7, -3276.8, 32767.0, -32768.0, 6553.5, 65535.0), "the end of a 16-bit number"),
 }
-_CODE_JUMP, _STUCK_CHANCE = 5.0, 1e-3  # see the module's text
-SPIKE_FLOOR_K = 0.6
-SPIKE_WINDOW = 21
-SPIKE_LENGTH = 3
+_CODE_JUMP, _STUCK_CHANCE = 5.0, 1e-3  # times what other rows rarely move; of a sound reading that stays
+SPIKE_FLOOR_K = 0.6  # the least deviation of a temperature that can be a spike
+SPIKE_WINDOW = 21  # samples of the running median
+SPIKE_LENGTH = 3  # samples at most of a spike
 _SLOW_ROWS = 60.0  # s
-GAP_SECONDS = 10.0
-GAP_STEPS = 5.0
+GAP_SECONDS = 10.0  # of the least gap
+GAP_STEPS = 5.0  # median steps of the rows, of the least gap
 _FEW, _MOST_MOVED = 0.05, 10  # share of rows whose time may be wrong; rows that one may be out of place
 
 
@@ -141,7 +120,7 @@ def describe_gaps(time: Floats, inputs: dict[str, Floats]) -> list[str]:
 
 
 def find_spikes(values: Floats, *, floor: float | None, step: float = 0.0) -> NDArray[np.bool_]:
-    """Return which samples (n,) of a channel are spikes, by the rule above; NaN is skipped.  ``floor`` is the
+    """Return which samples (n,) of a channel are spikes; NaN is skipped.  ``floor`` is the
     least deviation that can be one, None to derive it from the channel; ``step`` is that of the rows [s]."""
     spikes = np.zeros(values.shape, dtype=bool)
     finite_rows = np.flatnonzero(np.isfinite(values))
@@ -151,6 +130,7 @@ def find_spikes(values: Floats, *, floor: float | None, step: float = 0.0) -> ND
 
     good = values[finite_rows]
     deviation = good - median_filter(good, size=SPIKE_WINDOW, mode="nearest")
+    # |d| > max(floor, 6 s) with s = 1.4826 median |d| over the whole channel, d the deviation from the median
     threshold = max(
         _floor(good) if floor is None else floor, 6 * 1.4826 * float(np.median(np.abs(deviation)))
     )
@@ -159,6 +139,8 @@ def find_spikes(values: Floats, *, floor: float | None, step: float = 0.0) -> ND
     for start in np.flatnonzero(is_far & entered):
         length = _spike_length(good, is_far, int(start), threshold)
         spikes[finite_rows[start : start + length]] = True
+    # in rows of a minute or more a plant moves and comes back by itself: there a spike is beyond all other
+    # samples by more than their range
     if step >= _SLOW_ROWS and spikes.any():
         others = good[~spikes[finite_rows]]
         low, high = float(others.min()), float(others.max())
@@ -221,6 +203,7 @@ def _rows_beyond_jumps(values: Floats, rows: NDArray[np.bool_]) -> NDArray[np.bo
     if values.size < SPIKE_WINDOW or not rows.any() or rows.all() or not usual.any():
         return np.zeros(values.size, dtype=bool)
     # a column that rarely moves does so by its steps
+    # more than five times what the other rows rarely move: a kettle that passes 85 degC does not jump there;
     least = _CODE_JUMP * max(float(np.quantile(usual, 0.99)), float(usual[usual > 0].min()))
     between, beyond_jumps = rows[1:] ^ rows[:-1], rows.copy()
     edges = np.flatnonzero(np.diff(rows.astype(int), prepend=0, append=0))
@@ -242,7 +225,11 @@ def drop_stuck(name: str, values: Floats, inputs: Sequence[Floats]) -> tuple[Flo
     moved = travel[ends] - travel[starts]
     longest = int(np.argmax(moved))
     run, most = slice(int(starts[longest]), int(ends[longest]) + 1), float(moved[longest])
+    # but for the first row of each run: its reading is from before its move
     stayed = float(np.maximum(np.delete(moved, longest) - 1, 0).sum())
+    # With M the moves of the inputs, in ranges, of the whole log, m those within the run that has most of
+    # them and k those within all other runs, a sound reading stays through a move with a chance of about p =
+    # (k + 1) / (M - m + 2) (Laplace's rule); the run is stuck where p^(m - 1) is below 1e-3.
     chance = (stayed + 1) / (travel[-1] - most + 2)
     likely = most <= 2 or chance >= 1 or chance ** (most - 1) > _STUCK_CHANCE
     if values.size < SPIKE_WINDOW or likely or not np.isfinite(values[run]).all():
@@ -302,6 +289,7 @@ def _floor(values: Floats) -> float:
     low, high = np.percentile(values, [1, 99])
     moves = np.abs(np.diff(values))
     quantum = float(moves[moves > 0].min()) if np.any(moves > 0) else 0.0
+    # 2 % of the channel's 1-99 % range, and at least five of its smallest increments
     return max(0.02 * float(high - low), 5 * quantum, np.finfo(float).tiny)
 
 
@@ -323,6 +311,7 @@ def _leaves_and_returns(values: Floats, start: int, stop: int, threshold: float)
     before, after = values[max(0, start - half) : start], values[stop : stop + half]
     around = np.abs(np.concatenate([np.diff(before), np.diff(after)]))
     usual = float(np.quantile(around, 0.7)) if around.size else 0.0
+    # a step is not left, the tip of a ramp is entered by increments like those around it
     return bool(enter * leave < 0 and min(abs(enter), abs(leave)) > max(threshold, 5 * usual))
 
 

@@ -1,19 +1,6 @@
 """Roles of the columns of a log: input, disturbance, output or other, and what each guess rests on.
 
-Names come first, then units.  Where they show no input or no output, the data do (:func:`roles_of_data`): a
-column that is held between few large moves is an input, one whose next value another column's past helps to
-predict is an output.  With n lags and N rows the help of column i for column j is the gain in the Bayesian
-information criterion,
-
-    G_ij = N log(RSS_j / RSS_ij) - n log N,
-
-RSS_j of j on its own past, RSS_ij with that of i beside it (Granger 1969); beyond 10, with 2 lags and with 6
-(of a smooth input few leave what its output contains of it), it counts.
-
-A column is left out as a copy of another only where the two are one signal within their steps: each is a
-multiple of the other and a constant, over more than two levels.  Of two states every pair would be.  Two
-inputs that always move together cannot be told apart by any fit: one stays for both.
-
+Names come first, then units.  Where they show no input or no output, the data do (:func:`roles_of_data`).
 A guess that decides what a fit sees (a role that the course of a column alone shows, a column left out that
 helps to predict an output) is reported as a doubt.  Whoever states the roles has none.
 """
@@ -78,7 +65,7 @@ class RoleSettings:
     fewest_moves: int = 5  # of two columns that may be one signal: fewer moves agree by chance
     exact: float = 1e-6  # of a column's range: beyond the rounding of files
     rounding_share: float = 0.05  # of its standard deviation, that rounding takes at most
-    lags: tuple[int, ...] = (2, 6)  # rows; see the module's text
+    lags: tuple[int, ...] = (2, 6)  # rows; of a smooth input few leave what its output contains of it
     strong_gain: float = 10.0  # of the criterion: "very strong" evidence (Kass and Raftery 1995)
     most_rows: int = 20_000  # that are looked at, for time
 
@@ -223,6 +210,7 @@ def roles_of_data(
             out[name] = "other", _NEVER_MOVES
         elif rows >= _ROLES.fewest_rows and np.mean(even) >= _ROLES.counter_share:
             out[name] = "other", _COUNTS_ROWS
+        # held between few large moves
         elif _is_held(values):
             out[name] = "input", f"it is held between {np.count_nonzero(steps)} moves in {rows} rows"
     roles = {**fixed, **{name: role for name, (role, _) in out.items()}}
@@ -231,6 +219,7 @@ def roles_of_data(
     open_, net = [n for n in names if n not in roles], dict(zip(names, (gain - gain.T).sum(axis=1)))
     for name in open_:
         help_ = gain[:, names.index(name)]
+        # its next value is predicted by another column's past
         if help_.max() > _ROLES.strong_gain:
             out[name] = "output", f"{FOLLOWS} {names[int(help_.argmax())]}"
     roles |= {name: role for name, (role, _) in out.items()}
@@ -265,6 +254,7 @@ def _doubts(
     """Return the guesses that decide what a fit sees, a line each."""
     doubts = []
     for name, (role, why) in evidence.items():
+        # a role that the course of a column alone shows: whoever states the roles has no doubt
         if reasons.get(name) == why and (role != "other" or why.endswith(FOLLOWED)):
             doubts.append(f"{name} is {'left out' if role == 'other' else f'taken as {role}'}: {why}")
     for name, why in reasons.items():
@@ -439,15 +429,18 @@ def _copied_columns(
         if name not in guesses:
             continue
         (role, why), values = guesses[name], moving[name]
+        # one signal within their steps: each is a multiple of the other and a constant
         for other in [n for n in order[:place] if n not in out]:
             role_of_other = guesses.get(other, (role, ""))[0]
             if not _one_signal(values, moving[other]) or {role, role_of_other} == {"input", "output"}:
                 continue
+            # two inputs that always move together cannot be told apart by any fit: one stays for both
             drives = role == role_of_other == "input"
             drives |= guesses.get(other, ("", ""))[1] == NO_CLUE == why and _is_held(values)
             if drives and units[name] == units[other]:
                 says = f"it always moves with {other}, and their effects cannot be told apart"
                 out[name] = "other", f"{says}: {other} is kept for both"
+            # of two states every pair would be copies
             elif min(np.unique(v).size for v in (values, moving[other])) > 2:
                 out[name] = "other", f"it is {other} in another unit"
             break
@@ -484,7 +477,7 @@ def _explains(y: Floats, *some: Floats) -> bool:
 
 
 def _predictive_gain(columns: Sequence[Floats]) -> Floats:
-    """Return G (n, n) of the module's theory, the least over the lags; row i helps column j."""
+    """Return how much column i helps to predict column j, G (n, n), the least over the lags."""
     n, scaled = len(columns), _standardised(columns)
     gain = np.zeros((n, n))
     for j in range(n):
@@ -518,6 +511,8 @@ def _gain(y: Floats, x: Floats, beside: Sequence[Floats], lags: int) -> float:
         target = y[lags:]
         return float(np.sum((target - z @ np.linalg.lstsq(z, target, rcond=None)[0]) ** 2)) + 1e-12 * rows
 
+    # G = N log(RSS of y on its own past / RSS with that of x beside it) - n log N, of n lags and N rows
+    # (Granger 1969)
     pasts = [past(values) for values in (y, *beside)]
     gain = rows * np.log(left(pasts) / left([*pasts, past(x)])) - lags * np.log(rows)
     return max(0.0, float(gain))

@@ -12,10 +12,7 @@ readings y to come under each (:mod:`thermogrip.sysid.effusivity.predictive`), t
 
 .. math:: I = H(p) - \sum_m p_m E_{y|m} H(p(y)), \qquad A = \sum_m p_m E_{y|m} \max_k p_k(y)
 
-are the expected information [nat] and the expected accuracy of naming the likeliest candidate.  Both are
-averages over draws of y under each candidate.  Accuracy is never lost by reading on: with k* the candidate
-that is likeliest now, the gain is :math:`E[\max_k p_k(y) - p_{k*}(y)]`, which no draw makes negative and
-which is exactly zero where no reading could change the answer.
+are the expected information [nat] and the expected accuracy of naming the likeliest candidate.
 """
 
 from __future__ import annotations
@@ -72,17 +69,21 @@ def expected_information(forecast: PosteriorPredictive, *, draws: int = 48, seed
     half = rng.standard_normal((draws, width))
     z = np.concatenate([half, -half])
     later, gain = np.zeros(n), np.zeros(n)
+    # averages over draws of y under each candidate k
     for k in range(m):
         likely = np.flatnonzero(p[:, k] > _NEGLIGIBLE)
         if not likely.size:
             continue
         y = mean[likely, k, None, :] + z @ chol[likely, k].transpose(0, 2, 1)
         off = (y[:, None] - mean[likely][:, :, None, :]) @ white[likely].transpose(0, 1, 3, 2)
+        # p_m(y) ~ p_m N(y; m)
         after = log_p[likely][:, :, None] - 0.5 * ((off**2).sum(axis=3) + log_det[likely][:, :, None])
         after = (after - logsumexp(after, axis=1, keepdims=True)).transpose(0, 2, 1)
         q = np.exp(after)
         later[likely] += p[likely, k] * entropy(after).mean(axis=1)
         p_of_best = np.take_along_axis(q, best[likely][:, None, None], axis=2)[:, :, 0]
+        # Accuracy is never lost by reading on: with k* the candidate that is likeliest now, max_k p_k(y) -
+        # p_k*(y) is negative in no draw, and exactly zero where no reading could change the answer.
         gain[likely] += p[likely, k] * (q.max(axis=2) - p_of_best).mean(axis=1)
     return Expected(np.maximum(now - later, 0.0), p.max(axis=1) + gain, gain)
 
@@ -199,12 +200,7 @@ def advise_touches(
     price: float = 0.001,
     progress: Callable[[float, str], None] | None = None,
 ) -> list[dict[str, float | None]]:
-    """Return what another touch of each grasp's block would bring (:func:`choose_next_touch`), a row a grasp.
-
-    ``next_touch_degC`` is the gripper temperature of the touch that is worth most, None where none is worth
-    its time; ``next_touch_accuracy`` is the accuracy expected after a touch there, or without one.  Both are
-    None where no touch of the block is usable (no contact).
-    """
+    """Return, a row a grasp, what another touch of its block would bring (:func:`choose_next_touch`)."""
     units = unit_names(grasps)
     names = list(dict.fromkeys(units.tolist()))
     advice_of: dict[str, dict[str, float | None]] = {}
@@ -213,11 +209,13 @@ def advise_touches(
             progress(k / len(names), f"another touch of {name}")
         touched = pick(grasps, units == name)
         block = check_grasps(touched).usable_grasps(touched)
+        # no touch of the block has a contact
         if block is None:
             advice_of[name] = {"next_touch_degC": None, "next_touch_accuracy": None}
             continue
         choice = choose_next_touch(classifier, block, candidates=candidates, price=price)
         best, accuracy = None, choice.accuracy_now
+        # of the touch that is worth most, or without one
         if choice.worth_it:
             best, accuracy = choice.best, float(choice.accuracy[choice.t_gripper == choice.best][0])
         advice_of[name] = {"next_touch_degC": best, "next_touch_accuracy": accuracy}

@@ -3,9 +3,7 @@
 At a time t of the contact the classifier has probabilities p from the readings so far.  The contact ends
 early when the answer is **confident**, max p >= c.  The threshold comes from training grasps, each followed
 through growing windows: it is the least one at which the grasps that stop for it are wrong no more often than
-stated, and the classifier itself must expect no more, since training grasps, which calibrated the gripper,
-are wrong less often than fresh ones (``docs/records/classification.md``).  A rule is for the times at which
-it was learnt, close together at first: evaluating it more often stops earlier and errs more.
+stated.
 
 **Sample by sample.**  A :class:`Stream` holds what a robot loop needs during one contact.  Each sample costs
 milliseconds, since every candidate's mode starts from the one of the sample before; :meth:`Stream.result`
@@ -43,6 +41,8 @@ from thermogrip.sysid.effusivity.quality import GraspQuality, check_grasps
 if TYPE_CHECKING:
     from thermogrip.datasets.schema import Grasps
 
+# a rule is for the times at which it was learnt, close together at first: evaluating it more often stops
+# earlier and errs more
 TIMES = (0.3, 0.5, 0.7, 1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 9.0)
 RULE_FILE = "stop_rule.json"  # beside classifier.json
 _CONTACT_END_S = 0.25  # s: readings until then may be of before contact
@@ -232,6 +232,8 @@ def learn_from_windows(
         # with k of n wrong (k + 1) / (n + 2), the posterior mean of a rate (Laplace's rule of succession)
         if 1 / (wrong.size + 2) > error:
             continue  # so few are that confident: even with none of them wrong they show nothing
+        # the classifier itself must expect no more errors: training grasps, which calibrated the gripper, are
+        # wrong less often than fresh ones (``docs/records/classification.md``)
         if (wrong.sum() + 1) / (wrong.size + 2) > error or p_wrong.mean() > error:
             break
         best = rule

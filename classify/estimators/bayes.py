@@ -15,29 +15,9 @@ needs no division: a grasp at :math:`\Delta T` near 0 weighs little and spoils n
 
 .. math:: \Sigma \sim IW(\nu_0, (\nu_0 - d - 1) I), \qquad \mu_m | \Sigma \sim N(0, \Sigma / \kappa_0)
 
-on features scaled by their within-class spread, :math:`\mu_m` has a Gaussian posterior with mean
-:math:`\hat\mu_m` and covariance :math:`V_m`, and expectation maximisation over :math:`x` and :math:`\delta`
-of each grasp finds :math:`\Sigma` and :math:`\sigma_T`. A new grasp is Student-t distributed with
-:math:`\nu_n - d + 1` degrees of freedom, mean :math:`\Delta T \hat\mu_m` and scale :math:`\Delta T^2 (\Sigma
-+ V_m) + \sigma_T^2 \hat\mu_m \hat\mu_m^T + N`: the uncertainty of a mean of five grasps and of a covariance
-of twenty is in the answer. Where :math:`N` and :math:`\sigma_T` vanish and :math:`\Delta T = 1` all of it is
-the textbook normal-inverse-Wishart algebra with one scatter matrix for several means,
-
-.. math:: S_n = S_0 + W + \sum_m \frac{\kappa_0 n_m}{\kappa_0 + n_m} \bar x_m \bar x_m^T, \qquad
-          V_m = \Sigma / (\kappa_0 + n_m), \qquad \Sigma = S_n / (\nu_n - d + 1),
-
-(:math:`W` the within-class scatter). So features in kelvin are treated where no training grasp has a known
-difference of 1 K. The two shrinkages, :math:`\nu_0` of the covariance and :math:`\kappa_0` of the means
-(large where the materials do not differ), maximise the evidence of the normalised features,
-
-.. math:: \ln p(X) = \tfrac{\nu_0}{2} \ln|S_0| - \tfrac{\nu_n}{2} \ln|S_n| + \ln\Gamma_d(\nu_n / 2)
-          - \ln\Gamma_d(\nu_0 / 2) + \tfrac{d}{2} \sum_m \ln \frac{\kappa_0}{\kappa_0 + n_m} + const,
-
-in which a grasp counts for :math:`\Delta T^2 / (\Delta T^2 + 4\,\mathrm{K}^2)`. A feature that a grasp does
-not have (a response at 40 s in one of 10 s) is marginalised, in training and after.
-
-The mean density of the candidates beside that of a material that was not trained gives the probability that a
-grasp is of none of them.
+on features scaled by their within-class spread, expectation maximisation finds the posterior of the means,
+:math:`\Sigma` and :math:`\sigma_T`, and a new grasp is Student-t distributed: the uncertainty of a mean of
+five grasps and of a covariance of twenty is in the answer.
 """
 
 from __future__ import annotations
@@ -183,6 +163,9 @@ class FeatureReader:
         y = np.asarray(table.values, dtype=float)
         n = y.shape[0]
         if not self.normalise:
+            # in kelvin N and sigma_T vanish, and all is the textbook normal-inverse-Wishart algebra with V_m
+            # = Sigma / (kappa_0 + n_m), Sigma = S_n / (nu_n - d + 1) and, W being the within-class scatter,
+            # S_n = S_0 + W + sum_m kappa_0 n_m / (kappa_0 + n_m) mean_m mean_m^T
             noise, unknown = np.zeros((*y.shape, y.shape[1])), np.full(n, np.nan)
             return Readings(y, np.ones_like(y), noise, unknown, unknown)
         difference = features.object_difference(grasps)
@@ -263,7 +246,7 @@ class BayesClassifier(GraspClassifier):
             for m in range(k):
                 g = at == m
                 weighted = gain[g, :, None] * precision[g]
-                spread[m] = np.linalg.inv(prior + np.sum(weighted * gain[g, None, :], axis=0))
+                spread[m] = np.linalg.inv(prior + np.sum(weighted * gain[g, None, :], axis=0))  # V_m
                 means[m] = spread[m] @ np.einsum("gij,gj->i", weighted, y[g])
             pull = np.einsum("gij,gj->gi", precision, y - gain * means[at])
             scatter_mean = (gain * pull) @ covariance  # what each grasp is off its material, expected ...
@@ -302,6 +285,7 @@ class BayesClassifier(GraspClassifier):
         tried = [
             (_log_evidence_of_feature(within, means, counts, s, k), s, k) for s in grid for k in _MEAN_GRID
         ]
+        # kappa_0 is large where the materials do not differ
         _, shrinkage, mean_shrinkage = max(tried)
         return float(shrinkage), float(mean_shrinkage)
 
@@ -315,6 +299,7 @@ class BayesClassifier(GraspClassifier):
 
     def _answered(self, grasps: Grasps, names: list[str]) -> Answered:
         columns, log_p = [self.asked().index(name) for name in names], self._log_density(grasps)
+        # the mean density of the candidates beside that of a material that was not trained
         odds = logsumexp(log_p[:, columns], axis=1) - np.log(len(columns)) - log_p[:, -1]
         answered = Answered.nothing(len(log_p), len(names))
         unknown = np.asarray(expit(logit(self.prior_unknown) - odds))
@@ -367,6 +352,7 @@ class BayesClassifier(GraspClassifier):
             (mean, covariance, self.dof_) for mean, covariance in zip(self.means_, self.mean_covariance_)
         ]
         out = np.zeros((y.shape[0], k + 1))
+        # a feature that a grasp does not have (a response at 40 s in one of 10 s) is marginalised
         for has in np.unique(np.isfinite(y), axis=0):
             rows = (np.isfinite(y) == has).all(axis=1)
             gain, y_has = read.gain[np.ix_(rows, has)], y[np.ix_(rows, has)]
@@ -374,6 +360,7 @@ class BayesClassifier(GraspClassifier):
             for m, (mean, mean_covariance, dof) in enumerate([*kinds, (middle, strange, k - 1.0)]):
                 ray = (mean + zero)[has] * (gain != 1)
                 block = (self.covariance_ + mean_covariance)[np.ix_(has, has)]
+                # gain^2 (Sigma + V_m) + sd^2 mu_m mu_m^T + N
                 scale = gain[:, :, None] * block * gain[:, None, :] + noise_known
                 scale += sd[rows, None, None] ** 2 * _outer(ray)
                 out[rows, m] = _log_t(y_has - gain * mean[has], scale, dof)
@@ -474,6 +461,8 @@ def _log_evidence_of_feature(
     prior = d + 1 + extra
     scatter = within + np.einsum("m,mi,mj->ij", kappa * counts / (kappa + counts), means, means)
     total = np.linalg.slogdet(extra * np.eye(d) + scatter)[1]
+    # nu_0 / 2 ln|S_0| - nu_n / 2 ln|S_n| + ln Gamma_d(nu_n / 2) - ln Gamma_d(nu_0 / 2) + d / 2 sum_m ln
+    # kappa_0 / (kappa_0 + n_m)
     return float(
         0.5 * prior * d * np.log(extra)
         - 0.5 * (prior + n) * total

@@ -7,11 +7,6 @@ equations are linear, so the trace is
 
 and :math:`F` depends on the object's material but not on the temperatures: features of a grasp divided by its
 own :math:`T_{obj} - b` are those of the material.
-
-A **change** is the rise at a fixed time t after the message, on the line through the samples within 0.3 s, or
-t / 5, of it; the **late slope** is that of the samples from 5 s on.  Both are sums of samples, so that the
-noise of the sensor becomes noise of the features (:func:`feature_noise`), and need no onset: how late a
-contact was is a part of their scatter.
 """
 
 from __future__ import annotations
@@ -25,10 +20,11 @@ import xarray as xr
 from thermogrip.classify.estimators.base import Floats, level
 from thermogrip.datasets.schema import Grasps
 
-RESPONSE_TIMES = (0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 40.0)
+# fixed times, and no onset: how late a contact was is a part of the features' scatter
+RESPONSE_TIMES = (0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 40.0)  # s after the message
 KINDS = ("change_", "late_slope")
 _ONSET_WINDOW_S, _SHARE = 0.3, 0.2  # s, and of the time
-FIT_END = 10.0
+FIT_END = 10.0  # s, until which the late slope is read
 LEAST_DIFFERENCE = 1.0  # K
 _LEAST_NOISE = 0.01  # K; a sensor that rests on one step of its converter shows less than it has
 
@@ -73,6 +69,7 @@ def _linear_weights(time: tuple[float, ...], names: tuple[str, ...], last: float
         nominal_time = FIT_END if slope else float(name[len("change_") : -1])
         read_time = min(nominal_time, last)
         used = (
+            # a change is read on the line through the samples within 0.3 s, or t / 5, of its time
             (t >= 5.0) if slope else np.abs(t - read_time) <= max(_ONSET_WINDOW_S, _SHARE * read_time) + 1e-6
         )
         used &= t <= (read_time + 1e-6 if slope else last)
@@ -93,6 +90,7 @@ def feature_noise(grasps: Grasps, names: Sequence[str]) -> Floats:
     middle = np.full(second.shape[0], 0.0)
     middle[has_difference] = np.nanmedian(second[has_difference], axis=1)
     sample_sd = np.maximum(middle / (0.6745 * np.sqrt(6.0)), _LEAST_NOISE)
+    # features are sums of samples, so that the noise of the sensor becomes theirs
     return np.asarray(sample_sd[:, None, None] ** 2 * _noise_shape(time, tuple(names)))
 
 

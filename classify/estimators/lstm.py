@@ -6,16 +6,8 @@ With :math:`\sigma` the logistic function and :math:`x_t` the standardised tempe
    i, f, o = \sigma(W x_t + U h_{t-1} + b), \quad g = \tanh(\cdot), \quad
    c_t = f c_{t-1} + i g, \quad h_t = o \tanh c_t, \quad p = \mathrm{softmax}(V h_T + v).
 
-As in Osawa et al. (arXiv 2111.15344): batches of 100, 2000 epochs, training grasps copied with noise and
-shifts of the initial temperature up to a hundred series a material.  Hidden size (32), Adam and its rate are
-ours, the paper does not give them.
-
-It is fed the plain reading of the paper (``"trace"``) or, by default, how grasps differ at each time
-(``"each_time"``), and its training ends early.
-
-``torch.nn.LSTM`` trains, with all series in memory on one thread or on a GPU; weights and batches are drawn
-by PyTorch's generator, so that a seed is the same training on the same machine.  PyTorch is the extra
-``lstm``; prediction does not need it.
+As in Osawa et al. (arXiv 2111.15344), but for what the paper does not give.  PyTorch trains; prediction does
+not need it.
 """
 
 from __future__ import annotations
@@ -75,9 +67,11 @@ def augment(
     return Augmented(x[source] + noise + shift, y[source], source)
 
 
+# Osawa et al.: batches of 100, 2000 epochs, training grasps copied with noise and shifts of the initial
+# temperature up to a hundred series a material
 PAPER_EPOCHS = 2000
 QUICK_EPOCHS = 200
-FEEDS = ("each_time", "trace")
+FEEDS = ("each_time", "trace")  # how grasps differ at each time; the plain reading, as in the paper
 _LEAST_SD = 0.05  # degC; before contact a smaller spread is noise, not to be blown up
 _LEAST_GAIN = 1e-3  # nats: a loss of nearly nothing falls for thousands of epochs and names no grasp better
 
@@ -91,6 +85,7 @@ class LstmClassifier(JoinedClassifier):
     needs: ClassVar[tuple[str, str] | None] = ("torch", "lstm")
     own_feed: ClassVar[str] = "each_time"
 
+    # hidden size, Adam and its rate are ours, the paper does not give them
     hidden: int = 32  # size of the state
     epochs: int = PAPER_EPOCHS  # over the augmented training set, at most; 200 is quick and undertrained
     patience: int | None = 200  # epochs without a lower loss of held-out grasps; None: all epochs
@@ -248,6 +243,7 @@ def _train(
     torch.set_num_threads(1)  # products of 100 x 32 numbers are too small to share
     try:
         with torch.random.fork_rng(devices=[]):
+            # weights and batches are drawn by PyTorch's generator: a seed is one training on one machine
             torch.manual_seed(model.random_state)
             network = torch.nn.LSTM(x.shape[2], model.hidden, batch_first=True).to(device)
             readout = torch.nn.Linear(model.hidden, model.classes_.size).to(device)

@@ -6,18 +6,8 @@ candidate m.  With prior odds :math:`\pi_m` (equal by default)
 
 .. math:: p(m | \text{trace}) = \frac{\pi_m Z_m}{\sum_k \pi_k Z_k}.
 
-Fitting calibrates the gripper, which is one and the same in every condition: training grasps at all
-temperatures describe it together, also those of materials that are no candidates.  Beside the known materials
-is a free effusivity; its Bayes factor gives the probability that the grasp is of none of them.
-
-Touches of one block (``touch_group``) are one question: their evidence is joint, since they share the block's
-temperature (:mod:`thermogrip.sysid.effusivity.multi_touch`), and each of their rows has the common
-answer.
-
-A calibration is of one gripper and its blocks.  What other blocks of the same materials, or another gripper
-of its kind, read beyond it is one of the ways in which a grasp may be unlike those of the training
-(:mod:`thermogrip.sysid.effusivity.data`): such grasps are answered less surely.  A few grasps of known blocks
-teach another gripper (:meth:`PosteriorClassifier.for_another_gripper`).
+Beside the known materials is a free effusivity; its Bayes factor gives the probability that the grasp is of
+none of them.
 """
 
 from __future__ import annotations
@@ -114,6 +104,8 @@ class PosteriorClassifier(GraspClassifier):
         where = "+".join(str(record.attrs.get("name")) for record in records)
         self.classes_ = two_or_more(np.concatenate(labels), where)
         records = [record.assign(material=("grasp", materials)) for record, materials in zip(records, labels)]
+        # the gripper is one and the same in every condition: training grasps at all temperatures describe it
+        # together, also those of materials that are no candidates
         device = calibrate_gripper(records, start=self.device, seed=self.random_state, progress=progress)
         self.notes_ = [f"{m}: not in the materials table, learnt from its grasps" for m in device.unlisted]
         self.longest_ = longest_contact(records)
@@ -136,6 +128,8 @@ class PosteriorClassifier(GraspClassifier):
         from thermogrip.sysid.effusivity.calibration import calibrate_gripper
 
         self._check_fitted()
+        # what other blocks of the same materials, or another gripper of its kind, read beyond a calibration
+        # is one of the ways in which a grasp may be unlike those of the training, and answered less surely
         prior = another_gripper(self.device_)
         other = copy(self)
         other.device_ = calibrate_gripper(record_list(known), prior=prior, seed=self.random_state)
@@ -177,6 +171,7 @@ class PosteriorClassifier(GraspClassifier):
                 free = free_evidence(self.device_, data, fitted.mode.u[best], noise)
                 odds[single] = logsumexp(evidence[single], axis=1) - np.log(len(names)) - free
                 self._explain(answered, single, data, names, fitted, best)
+        # touches of one block are one question: they share its temperature
         if single.size < group.size:
             self._touched(answered, grasps, names, evidence, odds, unknown=unknown)
         if unknown:

@@ -4,19 +4,7 @@ Rules that it keeps:
 
 - splits are those of :mod:`thermogrip.classify.evaluation.splits`, and whatever a classifier does with its
   training grasps, augmentation included, happens inside ``fit``;
-- each record is one condition, and its candidates are the materials of its training grasps;
-- what describes the gripper, and is the same in all conditions, may be learnt from the training grasps of all
-  of them (``learns_from_all_conditions``); never from a test grasp; a classifier that does not join touches
-  learns a condition that is scored apart, or has a material that only other temperatures could show, alone;
-- what cannot be scored is noted, not dropped in silence: a classifier that cannot learn from the training
-  grasps of a condition, or answer there, is left out of it, and the others are scored.
-
-**Leak probe.**  Everything after -0.5 s is replaced by the trace's own level before contact, with noise of
-the size seen there.  Such a record contains no touch, so a classifier trained and tested on it must be at
-chance; one that is not has found the label elsewhere: in the gripper's temperature on that day, in the
-order of the grasps, in a column of the record.  On public touch data such a probe reached 0.83 where chance
-is 0.17.  Its test is one-sided binomial: how likely are k or more right of n grasps, at the share of the
-commonest material.
+- each record is one condition, and its candidates are the materials of its training grasps.
 """
 
 from __future__ import annotations
@@ -75,6 +63,7 @@ def untouched(grasps: Grasps, *, seed: int = 0) -> Grasps:
         still_trace = base[:, None] + np.maximum(spread, PROBE.least_noise_K)[:, None] * rng.standard_normal(
             values.shape
         )
+        # the trace's own level before contact goes on, with noise of the size seen there
         after = (time > LAST_UNTOUCHED)[None, :] & np.isfinite(values)
         out[key] = (("grasp", "time"), np.where(after, still_trace, values), grasps[key].attrs)
     return out
@@ -95,6 +84,7 @@ def probe_clone(classifier: GraspClassifier) -> GraspClassifier:
 
 def binomial_p(right: float, n: int, by_chance: float) -> float:
     """Return the probability of so many or more right of n by chance."""
+    # one-sided: how likely are k or more right of n grasps, at the share of the commonest material?
     return float(binom.sf(np.ceil(right - 1e-9) - 1, n, by_chance))
 
 
@@ -173,6 +163,7 @@ def evaluate(
     real = [r for r in results if not r.probe and r.fault is None]
     if faults and not real:
         raise faults[0].fault  # type: ignore[misc]
+    # what cannot be scored is noted, not dropped in silence, and the other classifiers are scored
     unable = dict.fromkeys(
         f"{r.classifier} left out of {plan.folds[r.order].condition}: {r.fault}" for r in faults
     )
@@ -295,17 +286,23 @@ def _jobs(named: Mapping[str, GraspClassifier], plan: Plan, probe: bool) -> list
 
 def _taught_together(classifier: GraspClassifier, fold: Fold, training: Sequence[Grasps]) -> bool:
     """Return whether the training grasps of all conditions serve one of them."""
+    # what describes the gripper, the same in all conditions, may be learnt from the training grasps of all
     if classifier.joins_touches:
         return True
     labels_far = [
         grasp_labels(record)[np.abs(object_difference(record)) >= LEAST_DIFFERENCE] for record in training
     ]
+    # a classifier that does not join touches learns a condition that is scored apart, or has a material that
+    # only other temperatures could show, alone
     return not fold.apart and set(fold.candidates) <= set(np.concatenate(labels_far))
 
 
 def _run_job(job: _Job) -> list[_FoldResult]:
     classifier: GraspClassifier = clone(job.classifier)
     only = job.probe == "only"
+    # without a touch a classifier must be at chance; one that is not has found the label elsewhere: in the
+    # gripper's temperature on that day, in the order of the grasps, in a column of the record (on public
+    # touch data such a probe reached 0.83 where chance is 0.17)
     training = [untouched(g, seed=1) for g in job.training] if only else list(job.training)
     start = perf_counter()
     try:

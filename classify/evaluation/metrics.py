@@ -1,10 +1,5 @@
 r"""Scores of predictions, each with the interval that its sample size allows.
 
-- **Accuracy** k/n: Clopper-Pearson, the interval that covers at least the stated share whatever the truth.
-- **Repeated random splits** test the same few grasps again and again.  With :math:`c_i` the share of its test
-  rounds in which grasp i was right, the mean :math:`\hat p` of m grasps has variance
-  :math:`\mathrm{var}(c_i)/m \le \hat p (1 - \hat p) / m`: Clopper-Pearson with n = m distinct grasps (and k =
-  m p, which need not be whole) is conservative, and does not collapse to a point where all were right.
 - **Log loss** :math:`-\ln p_{true}` and **Brier** :math:`\sum_k (p_k - y_k)^2` score probabilities.
 - **Calibration**: confidence beside accuracy in bins; their mean absolute gap, weighted by bin, is the ECE;
   beside it what a perfectly calibrated forecaster of the same confidences would show.
@@ -24,7 +19,7 @@ from scipy.stats import binom, norm, rankdata
 
 Floats = NDArray[np.float64]
 
-_LEAST_PROBABILITY = 1e-15
+_LEAST_PROBABILITY = 1e-15  # a class that was never expected costs 35 nats, and no mean is infinite
 
 
 class Bin(NamedTuple):
@@ -50,6 +45,10 @@ def clopper_pearson(k: float, n: int, *, level: float = 0.95) -> tuple[float, fl
     a fractional k."""
     if n < 1 or not -1e-9 <= k <= n + 1e-9:
         raise ValueError(f"need 0 <= k <= n and n >= 1, got {k=}, {n=}")
+    # The interval covers at least the stated share whatever the truth.  Repeated random splits test the same
+    # few grasps again and again: with c_i the share of its test rounds in which grasp i was right, the mean p
+    # of m grasps has variance var(c_i) / m <= p (1 - p) / m, so that n = m distinct grasps and k = m p, which
+    # need not be whole, are conservative, and do not collapse to a point where all were right.
     k = min(max(k, 0.0), float(n))
     tail = (1 - level) / 2
     low = 0.0 if k == 0 else float(betaincinv(k, n - k + 1, tail))
@@ -118,8 +117,8 @@ def auroc(negative: ArrayLike, positive: ArrayLike) -> float:
     return float((ranks.sum() - high.size * (high.size + 1) / 2) / (low.size * high.size))
 
 
-_DRAWS = 2000
-_FORECASTERS = 1000
+_DRAWS = 2000  # of whole grasps, for an interval
+_FORECASTERS = 1000  # perfectly calibrated ones, whose ECE is compared
 _N_BINS = 10  # of confidence
 _CALIBRATION_EDGES = np.linspace(0, 1, _N_BINS + 1)
 

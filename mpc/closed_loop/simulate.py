@@ -5,14 +5,6 @@ the posterior) in a room and behind sensors that the controller does not know: n
 as thermocouple amplifiers have it, an offset on any sensor.  What counts is the temperature that the sensor
 would read without noise and quantum: an offset of a sensor is not something that a controller could see.
 
-For each target of the schedule:
-
-* **settling**: the time after which the controlled output stays within the band to the end of the segment;
-* **overshoot**: the largest excursion beyond the target, on the far side from where the segment began;
-* **bias**: the mean error of the last 120 s (or the last fifth of a shorter segment);
-* **energy**: the integral of the squared drive, in seconds at full drive;  **travel**: the sum of its
-  changes, that to the first drive included.
-
 Of a session on hardware :class:`RecordedController` keeps what its log lacks: status, advice and step times.
 """
 
@@ -77,11 +69,11 @@ class Segment:
     begin_s: float  # of the segment [s]
     end_s: float
     settle_s: float  # time until it stays inside the band [s]; NaN where it never does
-    overshoot: float  # [degC], see the module's text; ``sd`` is of the same last seconds as the bias
-    bias: float
-    sd: float
+    overshoot: float  # largest excursion beyond the target, on the far side from where it began [degC]
+    bias: float  # mean error of the last 120 s, or the last fifth of a shorter segment
+    sd: float  # of the same last seconds
     energy_s: float  # of all drives together, in fractions of full drive
-    travel: float
+    travel: float  # sum of the drives' changes, that to the first one included
     full_share: float  # share of the time until settling at the limit of the drive, 0 to 1
 
 

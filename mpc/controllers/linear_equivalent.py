@@ -2,15 +2,9 @@ r"""The controller as a linear system: what it is while no limit is near.
 
 Without limits the first move of the QP is linear in the free response of the estimate, and the observer with
 its settled gain L is linear too.  About rest in the design's room, with r the target, d the measured
-disturbances and u^- the move of the sample before,
-
-    z = z^ + L (y - H z^),                    estimate of state and disturbances with this reading,
-    u = K_z z + K_r r + K_d d + K_u u^-,      the first move,
-    z^+ = F z + B u + E d,
-
-so in (z^, u^-) the controller is one state space from (y, r, d) to u: what loop shaping and margins are made
-of.  The overshoot band and the limits of outputs are rows of the QP, and not in it; nor are zones and prices:
-what is reviewed tracks the middle of a zone.
+disturbances and u^- the move of the sample before, it is in (z^, u^-) one state space from (y, r, d) to u:
+what loop shaping and margins are made of.  The overshoot band and the limits of outputs are rows of the QP,
+and not in it; nor are zones and prices: what is reviewed tracks the middle of a zone.
 """
 
 from __future__ import annotations
@@ -77,11 +71,14 @@ def linear_law(controller: ControllerParts) -> LinearLaw:
         by_held_d.append(H[rows] @ held_d)
     move = linear_move(controller)
     on_free = move.on_free[:n_u]
+    # the first move is u = K_z z + K_r r + K_d d + K_u u^-
     K_z, K_d = on_free @ np.vstack(by_z), on_free @ np.vstack(by_held_d)
     K_r = -on_free @ np.tile(np.eye(len(rows)), (len(by_z), 1))
+    # z = z^ + L (y - H z^), the estimate of state and disturbances with this reading
     uncorrected = np.eye(n_z) - L @ H
     to_drive = np.hstack([K_z @ uncorrected, move.on_last[:n_u]])
     straight = np.hstack([K_z @ L, K_r, K_d])
+    # z^+ = F z + B u + E d
     after = np.hstack([F @ uncorrected, np.zeros((n_z, model.n_u))])
     into_z = np.hstack([F @ L, np.zeros((n_z, len(rows))), E])
     targets = tuple(f"target_{name}" for name in controller.design.controlled)

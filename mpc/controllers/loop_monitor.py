@@ -3,17 +3,6 @@ r"""What somebody beside a loop may say of it: it swings, a sensor has stopped, 
 A monitor is fed what was read, asked and moved, outside of the step and its deadline, whatever the law, and
 has a filter of its own.  Its words name a load where one would look the same, and are taken back when their
 evidence goes.
-
-**Settling.**  Of the first-order plant with gain K, lag T and apparent delay L that its step response is, the
-loop of a PI has the poles of
-
-    T s^2 + (1 + K Kc) s + K Kc / Ti = 0,
-
-and with the slowest of them, 1 / t, it is there in L + 4 t (2 % are left); a predictive controller is held to
-the PI by Skogestad's rule.
-
-**Reach.**  At a new target, and while an output stays off its own, the drives are sought that hold all
-targets within the limits, with the biases that the filter has found: a dead heater is a bias of its range.
 """
 
 from __future__ import annotations
@@ -47,6 +36,8 @@ def settling_time(gain: float, delay: float, lag: float, Kc: float, Ti: float) -
     >>> round(settling_time(gain=2.0, delay=5.0, lag=100.0, Kc=5.0, Ti=40.0), 1)
     129.7
     """
+    # the poles T s^2 + (1 + K Kc) s + K Kc / Ti = 0 of a first-order plant with gain K, lag T and apparent
+    # delay L under a PI; with the slowest of them, 1 / t, the loop is there in L + 4 t
     slowest = float(np.max(np.roots([lag, 1.0 + gain * Kc, gain * Kc / Ti]).real))
     return delay - _CONSTANTS / slowest if slowest < 0 else np.inf
 
@@ -83,6 +74,7 @@ class LoopMonitor:
         answers = [step_response(plant, p.drive, p.output) for p in self.loops]
         delays = [max(a.delay, model.dt) for a in answers]
         spans = model.span[self._drives].tolist()
+        # a predictive controller is held to the PI by Skogestad's rule
         self._promised = np.array(
             [
                 settling_time(a.gain / span, delay, a.lag, p.Kc, p.Ti)
@@ -213,6 +205,7 @@ class LoopMonitor:
         d = d + observer.disturbance_bias
         if not np.isfinite(asked).all():
             return ""
+        # the biases that the filter has found are in it: a dead heater is a bias of its range
         held = holding_drive(self.model, self.names, asked, d, within=(low, high))
         shown = held.y + bias
         miss = np.abs(shown[rows] - target) - self._zone

@@ -5,11 +5,7 @@ One loop for each controlled output, on the drive that moves it most:
     v = Kc (b r + (1 - b) r_0 - y) + I,      u = v inside range and slew,
     I+ = I + dt Kc/Ti (r - y),  but I where u is limited and this would take v further out.
 
-So the integrator stands while the drive is limited, which is most of the time after a step of the target
-(taken to the limit by back-calculation, it overshoots).  r_0 is where the loop began, and b below 1 answers a
-new target less than a reading, against overshoot.  Where readings have a time, dt is what really passed, for
-the integrator and for the slew alike, and a call before a move is due
-(:mod:`thermogrip.mpc.estimator.call_times`) holds the last one.
+where r_0 is the output at which the loop began.
 """
 
 from __future__ import annotations
@@ -139,6 +135,7 @@ class PIController(SampledController):
     def propose(self, y: Array, target: Array, *, seconds: float | None = None) -> Array:
         """Return the limited drives (n_u,) after so many seconds, and integrate; readings y (n_controlled,)
         are NaN where lost."""
+        # where readings have a time, dt is what really passed, for the integrator and for the slew alike
         seconds = self.dt if seconds is None else seconds
         error = target - y
         self._begun = np.where(np.isfinite(self._begun), self._begun, y)
@@ -152,6 +149,8 @@ class PIController(SampledController):
         u = self.drives.follow(v, self._u, seconds / self.dt)
         for k, (loop, (j, i), _) in enumerate(loops):
             if np.isfinite(error[i]):
+                # the integrator stands while the drive is limited, which is most of the time after a step of
+                # the target; taken to the limit by back-calculation, it overshoots
                 inward = (u[j] - v[j]) * loop.Kc * error[i] > 0
                 if inward or abs(u[j] - v[j]) <= UNCUT * self.model.span[j]:
                     self.integral[k] += seconds * loop.Kc / loop.Ti * error[i]
@@ -159,6 +158,7 @@ class PIController(SampledController):
 
     def left_out(self, target: Array) -> Array:
         """Return of each loop the part of its error that its setpoint weight leaves out."""
+        # (1 - b) (r - r_0): b below 1 answers a new target less than a reading, against overshoot
         weights = np.array([loop.setpoint for loop in self.loops])
         return np.asarray((1 - weights) * (target - self._begun)[[i for _, i in self.ends]])
 

@@ -2,20 +2,9 @@ r"""The model-predictive controller's step in Python, written to be read: what t
 
 Each sample: advance the estimate under the drive that was applied, correct it with the reading, improve
 the plan (:mod:`thermogrip.mpc.optimiser.rti`), answer with its first move.  A loop must never be left without
-an answer, so every failure has a next best one, and the status says which:
-
-* ``ok``: the optimiser's move;
-* ``late``: the deadline passed, so the last plan goes on (the PI, where there is none);
-* ``infeasible``: a target that is no number, a limit that must break, an applied drive out
-  of range; the move is the nearest that can be;
-* ``fallback_plan``: no usable reading, or the solver failed; the last plan goes on, for ``patience_s``.  Of
-  several controlled outputs one may be lost: the optimiser goes on, for ``patience_s`` with the model in
-  place of the reading, then without that output, and the drive that is there for it goes to rest;
-* ``fallback_pi``: the plan has run out; PI on the reading, taken over without a bump;
-* ``off``: no reading to act on, or the pump is off; the drive goes to zero.
+an answer, so every failure has a next best one, and the status says which.
 
 Whatever the status, a drive is finite, inside its range, and within the slew limit of the one before.
-
 It may be called at any rate (:mod:`thermogrip.mpc.estimator.call_times`): before a move is due the last one
 is held; called more seldom, it answers with the mean of the plan until the next call is likely.
 """
@@ -117,6 +106,7 @@ class ReferenceController(SampledController):
             return self._pause(y, d, target, started)
         applied = self._applied(reading, self._u)
         self._pass(self.times.seconds, applied)
+        # it may be called at any rate: before a move is due the last one is held
         if not self.times.due:
             self._refine(y)
             return self._held_move(started)
@@ -136,6 +126,7 @@ class ReferenceController(SampledController):
         if status == "ok":  # what happened in this sample, before what has been so for long
             lasting = event or lasting
         if wrong and status == "ok":
+            # of a target that is no number the move is the nearest that can be
             status = "infeasible"
         self._u = self._within(choice.u)
         return self._answer(status, wrong or lasting or event, started)
@@ -227,6 +218,7 @@ class ReferenceController(SampledController):
 
     def _first_of(self, plan: Array) -> Array:
         """Return what of a plan (N, n_u) to apply until the next call."""
+        # of a loop that is called more seldom, the mean of the plan until the next call is likely
         return opening(plan, self.times.slew_s / self.dt)
 
     def _decide(self, wanted: Array, ahead: Array | None, started: float) -> _Choice:
@@ -235,11 +227,13 @@ class ReferenceController(SampledController):
             return _Choice(self.drives.safe, "off", advice.no_target(safe=bool(self.design.safe_drive)))
         if (self._unread_s > 0).all():
             if not self._lost.all():
+                # no usable reading: the last plan goes on, for ``patience_s``
                 plan = self._young_plan()
                 return _Choice(self._u if plan is None else self._first_of(plan), "fallback_plan", "")
             self._follows.plan = None
             return _Choice(self.drives.safe, "off", advice.blind(self._unread_s.min()))
         if self.clock() - started >= self.design.deadline_s:
+            # the deadline passed: the last plan goes on, or the PI, where there is none
             return self._fall_back("late", advice.TOO_LATE)
         low, high = self.drives.lowest - 1e-9, self.drives.highest + 1e-9
         outside = bool(np.any((self._u < low) | (self._u > high)))
@@ -256,6 +250,7 @@ class ReferenceController(SampledController):
         self._follows.plan = np.repeat(outcome.plan, self.design.blocks, axis=0)
         self._follows.age_s, self._follows.on_pi = 0.0, False
         if outside:
+            # an applied drive out of range: the move is the nearest that can be
             return _Choice(self._first_of(self._follows.plan), "infeasible", advice.OUT_OF_RANGE)
         return _Choice(self._first_of(self._follows.plan), *self._judge(outcome, started))
 
@@ -270,6 +265,8 @@ class ReferenceController(SampledController):
             return "late", advice.TOO_LATE
         if (self._unread_s > 0).any():
             return "fallback_plan", self.say_unseen(self._unread_s)
+        # Of several controlled outputs one may be lost: the optimiser goes on, for ``patience_s`` with the
+        # model in place of the reading, then without that output, while the drive for it goes to rest.
         return "ok", ""
 
     def say_unseen(self, unread_s: Array) -> str:
@@ -332,6 +329,7 @@ class ReferenceController(SampledController):
         if not self.pi.loops or not np.isfinite(y).all():
             return _Choice(self.drives.safe, "off", why)
         if not self._follows.on_pi:
+            # taken over without a bump
             self.pi.follow(self._u, y, self._target)
         self._follows.on_pi = True
         self.pi.hold(self.drives.cut(self._u))

@@ -9,14 +9,7 @@ Temperatures count in degC, so ``move = 1`` means: one whole range in one sample
 for one sample.  ``default_design`` takes everything from the plant: sample time and horizon from its delay
 and lag, blocks that double from one sample on, and one move weight that the tuner then improves.
 
-**PI loops** follow Skogestad's rule (SIMC), with gain k, delay L and lag T of the step response:
-
-    Kc = T / (k (tau_c + L)),   Ti = min(T, 4 (tau_c + L)),   tau_c = L   [1]_.
-
-References
-----------
-.. [1] S. Skogestad, "Simple analytic rules for model reduction and PID controller tuning", Journal of Process
-   Control 13(4), 2003.
+**PI loops** follow Skogestad's rule (:func:`simc`).
 """
 
 from __future__ import annotations
@@ -87,6 +80,8 @@ def simc(plant: Plant, drive: str, output: str, *, tau_c: float | None = None) -
     delay = max(answer.delay, plant.dt)
     closed = max(delay, 2 * plant.dt) if tau_c is None else tau_c
     low, high = drive_range(plant, drive)
+    # Kc = T / (k (tau_c + L)) and Ti = min(T, 4 (tau_c + L)), tau_c = L: S. Skogestad, "Simple analytic rules
+    # for model reduction and PID controller tuning", Journal of Process Control 13(4), 2003
     Kc = (high - low) * answer.lag / (answer.gain * (closed + delay))
     Ti = min(answer.lag, 4 * (closed + delay))
     return PILoop(drive, output, Kc, Ti)

@@ -2,23 +2,8 @@ r"""A drive that does another share than before, and a sensor that has stopped.
 
 Both compare what a plant was driven with and what was read, and neither asks for a posterior.
 
-**Gain.**  After a new target a drive moves for the target and not for a load.  With e the innovation of the
-loop's filter, and e' that of a second one, which is given a tenth less of the drive, the slope of the
-innovation is psi = (e' - e) / 0.1, and of a drive whose gain is 1 + g times the model's e = g psi + noise, so
-
-    g = sum(psi e / R) / sum(psi^2 / R),     sd^2 = sum((psi e / R)^2) / sum(psi^2 / R)^2,
-
-over the samples from a new target on until the loop has settled.  A model's own gain may be wrong (of a kiln
-by 30 %) and no fault, so what is compared is 1 + g of the last four targets and of all before.
-
 What this cannot tell: anything before five changes of target; a drive that did another share of its model
 from the start; a loss of less than a fifth; and a load that comes with each of several targets from a loss.
-
-**Stuck.**  While a reading stays the very same number, the model is run twice from where the filter was when
-it last changed: under the drives that were sent, and under that of then.  Where the first moves by more than
-a third of a jump, and by as much otherwise than the second, the reading should have moved.  At rest both stay
-together, however far a bias that is a little off leads them in hours; where a drive stops an output that was
-on its way, the first stays.
 """
 
 from __future__ import annotations
@@ -81,12 +66,17 @@ class GainMonitor:
             less[j] *= 1.0 - _LESS
             observer.advance(seconds, less, d)
             observer.look(d)
+            # With e the innovation of the loop's filter, and e' that of this one, which is given a tenth less
+            # of the drive, psi = (e' - e) / 0.1, and a drive whose gain is 1 + g times the model's has
+            # e = g psi + noise.
             slopes.append((observer.update(y) - innovation) / _LESS)
         if new and not self._was_new:  # along a profile every target is new: that is one window
             self._end_window()
         self._since_s, self._was_new = 0.0 if new else self._since_s + seconds, new
+        # after a new target a drive moves for the target and not for a load
         if self._since_s <= self._settling_s:
             psi, effect = np.nan_to_num(slopes), np.nan_to_num(slopes) @ (np.nan_to_num(innovation) / R)
+            # g = sum(psi e / R) / sum(psi^2 / R), sd^2 = sum((psi e / R)^2) / sum(psi^2 / R)^2
             self._window = self._window + np.array([psi**2 @ (1.0 / R), effect, effect**2])
 
     def _end_window(self) -> None:
@@ -102,6 +92,7 @@ class GainMonitor:
             variance = self._before[2] / self._before[0] ** 2  # loads are in it, without a model of them
             # shrunk by the share of the prior in prior and variance: few windows before say little
             known = self._before[1] / self._before[0] * _PRIOR_SD**2 / (_PRIOR_SD**2 + variance)
+            # a model's own gain may be wrong (of a kiln by 30 %) and no fault: 1 + g of now and of before
             self.share = (1.0 + effect / power) / (1.0 + known)
         self._reported = changed & self._changed()  # at two new targets in a row
 
@@ -146,11 +137,14 @@ class StuckMonitor:
                 continue
             begin, x, still, held_drive, w = run
             on_drive, on_d = disturbance.on_drive @ w * model.span, disturbance.on_disturbance @ w
+            # under the drives that were sent, and under that of when the reading last changed
             x = model.next_state(x, u + on_drive, d + on_d)
             still = model.next_state(still, held_drive + on_drive, d + on_d)
             self._runs[i] = begin, x, still, held_drive, w
             moved = float(model.output(x)[i]) - begin
             by_drive = float((model.output(x) - model.output(still))[i])
+            # at rest both stay together, however far a bias that is a little off leads them in hours; where a
+            # drive stops an output that was on its way, the first stays
             if min(abs(moved), abs(by_drive)) > SHARE * float(model.spike[i]):
                 self.message = f"{name} is stuck at {y[i]:.4g}: by its drives the model moves by {moved:+.2g}"
         self._y = np.where(np.isfinite(y), y, self._y)

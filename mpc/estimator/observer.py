@@ -6,37 +6,8 @@ the target:
 
     x+ = f(x, u + W_u w, d + W_d w),     w+ = w + noise,     y = C x + y0 + W_y w + noise.
 
-With as many disturbances as measured outputs, and the augmented model detectable, the estimate can only
-stand still where predicted and measured outputs agree, so the output that the controller sees as settled is
-settled [1]_. Detectability of the augmented model is the rank condition
-
-    rank [ A - I    B W_u + E W_d ]
-         [ C        W_y           ]  =  n_x + n_w,
-
-together with detectability of (A, C) itself.  ``choose_disturbances`` tests it and takes the first set
-that passes, in this order: a bias on each drive (a heat flow that is wrong by a few watts), a bias on the
-controlled outputs (a thermocouple that sits elsewhere), on the other outputs, on the measured disturbances.
-
 The filter uses the Jacobian of the whole sample, delays included, at the current estimate.  It starts from a
-plant at rest whose sensors are off: where an output has an offset among the disturbance states, that is where
-the start finds it, and it may drift; of the other outputs the start keeps a constant offset.
-
-**At rest** the state stays where it is under some past drive v, but for a small rate r, and each reading is
-off by an offset b of its own,
-
-    x = f(x, v, d) + r,     v ~ N(rest, span^2),     r ~ N(0, rate^2),     b ~ N(0, offset^2),
-
-so that one Kalman update with the readings is the weighted least-squares answer for state, offsets and past
-drive together.
-
-**Between samples** x stays on a grid of samples, each predicted under the mean of the drives that were
-applied in it, for a model whose delays are shift registers can be advanced by whole samples alone.  Every
-reading counts, also one that comes before a move is due.
-
-References
-----------
-.. [1] U. Maeder, F. Borrelli, M. Morari, "Linear offset-free model predictive control", Automatica 45(10),
-   2009.
+plant at rest whose sensors are off (:func:`resting_state`), and looks at readings between samples too.
 """
 
 from __future__ import annotations
@@ -102,6 +73,8 @@ def _resting_state(model: PredictionModel, *at: tuple[float, ...]) -> RestingSta
     push = after - A @ x + B @ (model.neutral - v)
     # linearised, (I - A) x = push + B (v - rest) + r with S = B span^2 B' + diag(rate^2), and so
     # P^-1 = (I - A)' S^-1 (I - A): a state that would leave its place by units within a sample is not
+    # At rest the state stays where it is under some past drive v, but for a small rate r, and each reading is
+    # off by an offset b of its own: v ~ N(rest, span^2), r ~ N(0, rate^2), b ~ N(0, offset^2).
     # accepted, whatever the sensors read, and what is left open the next readings decide
     scaled = B * model.span
     S = scaled @ scaled.T + np.diag((_RATE * unit) ** 2)
@@ -178,6 +151,9 @@ def detectability_margin(
 ) -> float:
     """Return how detectable disturbances in units of ``scale`` (n_w,) are: 0 where the rank test fails."""
     n_x, n_w = A.shape[0], into_state.shape[1]
+    # With as many disturbances as measured outputs, and the augmented model detectable, the estimate can only
+    # stand still where predicted and measured outputs agree: what the controller sees as settled is settled
+    # (U. Maeder, F. Borrelli, M. Morari, "Linear offset-free model predictive control", Automatica 45, 2009).
     if n_w > C.shape[0]:
         return 0.0
     scale = np.ones(n_w) if scale is None else scale
@@ -189,6 +165,7 @@ def detectability_margin(
     # An integrator has no steady effects: the rank test itself decides.  A pole beyond 1, as a nonlinear
     # model may have at one point, is none: its equilibrium moves by as much as any other's.
     if np.any(np.abs(poles - 1) < 1e-9):
+        # rank [A - I, B W_u + E W_d; C, W_y] = n_x + n_w, beside detectability of (A, C) itself
         whole = np.block([[A - np.eye(n_x), into_state * scale], [C, into_output * scale]])
         values = np.linalg.svd(whole, compute_uv=False)
         return float(values[-1] / values[0]) if values[-1] > 1e-9 * values[0] else 0.0
@@ -207,6 +184,8 @@ def choose_disturbances(
     margin = float("inf")
     first = [i for i, name in enumerate(model.outputs) if name in controlled]
     uncontrolled = [i for i in range(model.n_y) if i not in first]
+    # a bias on each drive (a heat flow that is wrong by a few watts), on the controlled outputs (a
+    # thermocouple that sits elsewhere), on the other outputs, on the measured disturbances
     order = [("input", j) for j in range(model.n_u)]
     order += [("output", i) for i in first + uncontrolled]
     order += [("disturbance", k) for k in range(model.n_d)]
@@ -290,6 +269,7 @@ class Observer:
         # what each sensor was found to read too much at the start or after a jump that stayed
         self.found_offset = np.zeros(model.n_y)
         self.P0 = np.where(self.is_drive, 0.03, OFFSET * bias_unit) ** 2
+        # the start finds an offset where it is among the disturbance states, and it may drift;
         # a sensor without an offset among the disturbance states is read as loosely, once
         self.fixed: Mask = np.asarray(~disturbance.on_output.any(axis=1))
         self.R_start = self.R + np.where(self.fixed, (OFFSET * model.unit) ** 2, 0.0)
@@ -305,7 +285,7 @@ class Observer:
         self._held[self.model.n_x : self._n] = (self.disturbance.on_drive * weak[:, None]).any(axis=0)
 
     def reset(self, y: Array, d: Array) -> None:
-        """Start at rest at reading y (n_y,), NaN where a sensor is lost; see the module's theory."""
+        """Start at rest at reading y (n_y,), NaN where a sensor is lost."""
         model, level = self.model, self._level(y, d)
         levels = np.where(np.isfinite(y), y - self.offset, model.usual(self.ambient))
         rests = np.where(model.warm, level, levels)
@@ -351,6 +331,7 @@ class Observer:
         whole[:n_x, :n_x] = P
         whole[n_x:, n_x:] = np.diag(self.P0)
         self._P = whole
+        # one Kalman update is the weighted least-squares answer for state, offsets and past drive together
         self._correct(y, self.R_start)
         self.set_offsets(y, np.asarray(self.fixed))
 
@@ -454,6 +435,8 @@ class Observer:
         share = self._into / self.model.dt
         if share <= SAME:
             return
+        # x stays on a grid of samples, each predicted under the mean of the drives that were applied in it: a
+        # model whose delays are shift registers can be advanced by whole samples alone
         after, step = self._sample(self._dose / self._into, d)
         P = self._P + self._noise(share - self._noised)  # the states' noise grows with the seconds
         self._P = P

@@ -5,23 +5,8 @@ error
 
     IAE = a T / pi,
 
-and the mean error 2 a / pi.  After Haegglund [1]_ a half swing counts whose IAE exceeds that of the least
-amplitude at the shortest period: 6 samples.  The least amplitude is what the output may overshoot, or
-three standard deviations of its readings' noise.  Besides, the mean error must be that of this amplitude,
-for a slow stray has IAE enough, and a half swing of more than 2.5 ultimate periods is none: a loop swings
-with one of these by its delay, and with some by its integral, and what takes longer is a load.  The ultimate
-period of a loop with an apparent delay L (2 samples at least) is 4 L.  A loop swings where six half swings,
-side by turns, follow each other with less than a period of quiet between, of which the last two have 57 % of
-the IAE of the first two at least: the damping ratio is below 0.044.
-
-* One load, or a step, rings out sooner: the approach to a new target does not count.
-* White noise of standard deviation s exceeds 18 s / pi in a sum of n <= 3 readings with mean 6 s / pi, all
-  on one side, with a probability of 5e-4 at most; six times by turns, with 1e-20.
-* Slow disturbances by turns beyond what is allowed are swings too.
-
-References
-----------
-.. [1] T. Haegglund, "A control-loop performance monitor", Control Engineering Practice 3(11), 1995.
+and the mean error 2 a / pi (T. Haegglund, "A control-loop performance monitor", Control Engineering Practice
+3(11), 1995).  A loop swings where half swings, side by turns, follow each other.
 """
 
 from __future__ import annotations
@@ -31,9 +16,13 @@ from math import isfinite, pi
 from typing import NamedTuple
 
 NOISE_SD = 3.0  # standard deviations of a reading that are no swing
+# White noise of standard deviation s exceeds 18 s / pi in a sum of n <= 3 readings with mean 6 s / pi, all on
+# one side, with a probability of 5e-4 at most; six times by turns, with 1e-20.
 _SWINGS = 6  # half swings in a row
+# the damping ratio is below 0.044
 _LAST_TWO = 0.57  # of the IAE of the first two, that the last two must have
 _SHORTEST_PERIOD = 6.0  # samples, of a period
+# a loop swings with one ultimate period by its delay, and some by its integral; what is slower is a load
 _LONGEST_HALF_SWING = 2.5  # ultimate periods, of a half swing
 
 
@@ -49,6 +38,7 @@ class Oscillation:
 
     def __init__(self, dt: float, delay: float, least: float) -> None:
         self._shortest = _SHORTEST_PERIOD * dt
+        # the ultimate period of a loop with an apparent delay L, 2 samples at least, is 4 L
         self._longest = _LONGEST_HALF_SWING * 4.0 * max(delay, 2.0 * dt)
         self.least = least
         self.restart()
@@ -83,11 +73,13 @@ class Oscillation:
                         before = self._halves.pop()
                         half = half._replace(iae=before.iae + half.iae, begin=before.begin)
                     self._halves.append(half)
+                # one load, or a step, rings out sooner: the approach to a new target does not count
                 self._arrived = self._arrived or half.side != 0.0
                 self._open = _Half(side, 0.0, before_s, before_s)
             iae = self._open.iae + abs(error) * seconds
             self._open = self._open._replace(iae=iae, end=self._now_s)
             last = self._halves[-1] if self._halves else self._open
+            # less than a period of quiet lies between two half swings
             if self._now_s - last.end > 2.0 * (last.end - last.begin) and not self._counts(self._open):
                 self._halves.clear()
         if len(self._halves) < _SWINGS:
@@ -97,5 +89,7 @@ class Oscillation:
 
     def _counts(self, half: _Half) -> bool:
         seconds = half.end - half.begin
+        # the IAE of the least amplitude at the shortest period; a slow stray has IAE enough, so that its mean
+        # error must be that of this amplitude as well.  Slow disturbances by turns are swings too.
         large = half.iae >= max(self.least * self._shortest / pi, 2.0 / pi * self.least * seconds)
         return self._arrived and large and seconds <= self._longest

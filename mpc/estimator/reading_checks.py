@@ -1,19 +1,7 @@
 r"""Readings that cannot be, and plants that do not follow: found by what the model expects.
 
-**A jump.**  A reading more than 6 degC (of a wide range: a tenth of it) off the prediction is a loose plug:
-it is left out, for three samples.  If it is still there at the fourth it counts: where most sensors have
-stayed with the model, it is taken for an offset of the sensor that jumped; else the world has changed, and
-the estimate starts again.
-
-**A sensor that is stuck.**  A frozen reading is as finite and as near as any other, and a controller that
-accepts it heats for ever.  The model reveals it: while the reading stays the very same number,
-the changes that the model expects of it sum up,
-
-    m+ = m + |C (f(x, u, d) - x)|  with its sign,      m = 0 whenever the reading changes.
-
-Beyond 2 degC (of a wide range: a thirtieth of it, for readings in coarse steps stay where they are while a
-model is a little off) it is taken for lost until it moves.  (The estimate follows the frozen reading
-meanwhile, so that only what each sample adds is summed, not where the model would have gone by itself.)
+A jump is a loose plug until it stays; a frozen reading is as finite and as near as any other, and a
+controller that accepts it heats for ever.
 """
 
 from __future__ import annotations
@@ -33,6 +21,7 @@ if TYPE_CHECKING:
 LEFT_OUT = 3  # samples in a row, at most, that a jump is left out for
 #: Of a jump (6 degC, or a tenth of a wide range): what the model expects of a reading that has not moved at
 #: all, and a bias of an output that is no small error of the model.
+# a thirtieth of a wide range, for readings in coarse steps stay where they are while a model is a little off
 SHARE = 1 / 3
 FOLLOWS_DRIVE = 0.3  # of its range: a larger bias of a drive is a pump that is off, or another plant
 
@@ -51,6 +40,8 @@ class ReadingMonitor:
 
     def expect(self, change: Array) -> None:
         """Note by how much the model moves the outputs (n_y,) in a sample [degC]."""
+        # m+ = m + C (f(x, u, d) - x), and 0 whenever the reading changes: the estimate follows the frozen
+        # reading meanwhile, so that only what each sample adds is summed, not where the model would have gone
         self._moved = self._moved + change
 
     @property
@@ -63,6 +54,8 @@ class ReadingMonitor:
         jumped and stay there; ``expected`` (n_y,) is the prediction."""
         y, jumped = self._found(y, expected)
         self._spikes = np.where(jumped, self._spikes + 1, np.where(np.isfinite(y), 0, self._spikes))
+        # at the fourth it counts: where most sensors have stayed with the model, as an offset of the one that
+        # jumped; else the world has changed, and the estimate starts again
         stays = self._spikes > LEFT_OUT
         self._spikes[stays] = 0
         return np.where(jumped & ~stays, np.nan, y), stays

@@ -6,16 +6,8 @@ it needs, the parameters, the drives, the state, or the direction of a tangent:
     prepare(p -> k),    hold(u, k -> h),    step(x, u, d, k, h -> x+),
     partials(x, u, d, k, h -> x+, m),    tangent(m, k, h, sx -> sx+)
 
-and the last with a direction of the drives, su, and of the disturbances, sd, too.  ``hold`` does as much of
-it as ``step`` reads, ``hold_slopes`` all; ``next`` is hold and step.  Both run over the drives of n blocks,
-at most four, entry i of block c at [4 i + c], and ``tangent`` over n groups of four directions, entry i of
-direction c at [c / 4][i][c % 4]: a compiler takes four at once.
-
-A dense Jacobian of an implicit step takes ten times the work of the step for every sample; a dozen tangents
-that share their partial derivatives take two or three.
-
-A quotient by something known earlier becomes a product with its reciprocal.  The code needs ``math.h`` and
-nothing else.
+and the last with a direction of the drives, su, and of the disturbances, sd, too.  ``next`` is hold and step.
+The code needs ``math.h`` and nothing else.
 """
 
 from __future__ import annotations
@@ -168,6 +160,7 @@ def write_model(model: Model, drives: Sequence[int], h: float) -> ModelCode:
     bodies = {
         "prepare": _body(line, _PARAMETERS, k, into["k"]),
         "hold": _over_drives(_body(line, _DRIVES, read, into["h"][: len(read)]), line.n_u),
+        # hold does as much of it as a step reads, hold_slopes all
         "hold_slopes": _over_drives(_body(line, _DRIVES, held, into["h"]), line.n_u),
         "step": _body(line, _STATE, roots[0], into["xn"]),
         "next": [
@@ -212,6 +205,8 @@ def _graph(model: Model, drives: Sequence[int], h: float) -> Any:
     lists = [ca.vertsplit(item) if item.numel() else [] for item in (x, d, p)]
     after = ca.vertcat(*model.step(lists[0], full, lists[1], lists[2], h))
     along = (sx, su, sd)
+    # a dense Jacobian of an implicit step takes ten times the work of the step for every sample; a dozen
+    # tangents that share their partial derivatives take two or three
     tangents = [ca.jtimes(after, ca.vertcat(*(x, u, d)[:n]), ca.vertcat(*along[:n])) for n in range(1, 4)]
     results = ca.cse([ca.densify(item) for item in (after, *tangents)])
     return ca.Function("model", [p, x, u, d, *along], results)
@@ -252,6 +247,7 @@ def _operation(line: _Line, what: str, uses: tuple[int, ...]) -> _Value:
     if what not in _OPERATIONS:
         raise NotImplementedError(f"the model uses {what}, which has no C here")
     divisor = line.values[uses[-1]]
+    # a quotient by something known earlier becomes a product with its reciprocal
     if what == "OP_DIV" and divisor.what == "OP_CONST" and divisor.number and stage:
         constant = 1.0 / divisor.number
         line.values.append(_Value("OP_CONST", f"({constant!r})", (), 0, constant))
@@ -276,12 +272,14 @@ def _over_drives(lines: Sequence[str], n_u: int) -> list[str]:
     """Return statements for the drives of one block, repeated over n of them."""
     if not lines:
         return ["    (void)n;"]
+    # entry i of block c is at [4 i + c], of four blocks at most
     return [f"    for (; n > 0; n--, u += {n_u}, h++) {{", *("    " + item for item in lines), "    }"]
 
 
 def _over_groups(lines: Sequence[str], moving: Sequence[str], sizes: Mapping[str, int]) -> list[str]:
     """Return statements for one direction, repeated over groups of four."""
     steps = ", ".join(["g++", *(f"{item} += {4 * sizes[item]}" for item in moving if sizes[item])])
+    # entry i of direction c is at [c / 4][i][c % 4]: a compiler takes four at once
     inner = ["        for (int c = 0; c < 4; c++) {", *("        " + item for item in lines), "        }"]
     return [f"    for (int g = 0; g < n; {steps}) {{", *(inner if lines else []), "    }"]
 

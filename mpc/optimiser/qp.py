@@ -5,20 +5,7 @@ With the states eliminated (condensed), the unknowns are the block values of the
     minimise    1/2 x'Hx + f'x + sum_i ( w_i (s_i^- + s_i^+) + 1/2 q_i (s_i^-^2 + s_i^+^2) )
     subject to  lower_i - s_i^- <= (A x)_i <= upper_i + s_i^+ ,   s >= 0,   s_i = 0 on hard rows.
 
-The linear penalty ``w`` makes a soft row exact (it is broken only if keeping it costs more than w per degC),
-the quadratic one ``q`` spreads what must be broken.
-
-The solver is DAQP, a dual active-set method [1]_, started anew each time: from the active set of the last
-sample it takes a fifth less time, but its answer was now and then off by 2e-4 of a range while it called it
-solved (``tests/mpc/controllers/test_compiled.py``).  It is given a least-distance program, x = L^-T z with
-H = L L': the factor and A L^-T are LAPACK's and BLAS', which take less time for them.  Each row is divided by
-its length r_i in units in which H has a diagonal of 1, so that tolerances are of the row; a slack becomes
-s/r, and its penalties w r and q r^2.
-
-References
-----------
-.. [1] D. Arnstrom, A. Bemporad, D. Axehill, "A dual active-set solver for embedded quadratic programming
-   using recursive LDL' updates", IEEE Transactions on Automatic Control 67(8), 2022.
+It is handed to DAQP as a least-distance program (:meth:`CondensedQP.solve`).
 """
 
 from __future__ import annotations
@@ -105,10 +92,12 @@ class CondensedQP:
         if (H.diagonal() <= 0).any():
             return self._failed("not convex", f.size)
         if not is_same:
+            # x = L^-T z with H = L L': the factor and A L^-T are LAPACK's and BLAS', which take less time
             factor, failed = dpotrf(H.T, lower=1, clean=1)
             if failed:
                 return self._failed("not convex", f.size)
             back = dtrtri(factor, lower=1)[0].T  # L^-T
+            # each row is divided by its length in units in which H has a diagonal of 1
             length = np.maximum(np.sqrt((A * A) @ (1.0 / H.diagonal())), 1e-12)
             rows = A @ back
             rows /= length[:, None]
@@ -135,6 +124,11 @@ class CondensedQP:
         """Hand the scaled problem to DAQP."""
         from daqp import Model
 
+        # D. Arnstrom, A. Bemporad, D. Axehill, "A dual active-set solver for embedded quadratic programming
+        # using recursive LDL' updates", IEEE Transactions on Automatic Control 67(8), 2022.  It is started
+        # anew each time: from the active set of the last sample it takes a fifth less time, but its answer
+        # was now and then off by 2e-4 of a range while it called it solved
+        # (``tests/mpc/controllers/test_compiled.py``).
         model = Model()
         settings = {
             "iter_limit": self.iteration_limit,
@@ -147,6 +141,8 @@ class CondensedQP:
             return ScaledAnswer(np.full(f.size, np.nan), np.zeros(lower.size), int(flag), 0)
         model.settings = settings
         # penalties in scaled units; of the quadratic one it takes the reciprocal
+        # a slack becomes s/r, and its penalties w r and q r^2: the linear one makes a soft row exact (it is
+        # broken only if keeping it costs more than w per degC), the quadratic one spreads it;
         reciprocal = 1.0 / np.maximum(self.quadratic * length**2, LEAST_QUADRATIC)
         linear = self._priced * length
         model.soft_weights(reciprocal, reciprocal, linear, linear)

@@ -1,19 +1,10 @@
 r"""One sample's optimisation: linearise along the last plan, condense, solve one QP, say how it went.
 
-This is a real-time iteration: the plan of the last sample, shifted, is where the prediction is linearised,
-and one QP a sample improves it.  Unknowns are the block values of the drives in fractions of their range,
-z = v/span. With y(v) ~ y0 + G (v - v0) over the horizon and Delta the difference along the blocks,
+A real-time iteration: the plan of the last sample, shifted, is where the prediction is linearised, and one QP
+a sample improves it.  Unknowns are the block values of the drives in fractions of their range, z = v/span.
+With y(v) ~ y0 + G (v - v0) over the horizon, Delta the difference along the blocks and e the drive now,
 
-    H = 2 ( G'QG + move Delta'Delta + drive L ),    f = 2 ( G'Q (y0 - G v0 - r) - move Delta' e ),
-
-where e has the drive that is applied now.  Rows: range and slew of each block (hard), the overshoot
-band of the controlled outputs and the limits of any output at every sample (soft).
-
-Near the optimum of a Peltier element the linearisation predicts cooling that a whole step does not give, and
-beyond it more current heats. Three guards stand there: a block's range ends where its gain will have faded, a
-plan that costs more than the guess in the nonlinear simulation is taken only part of the way, and ramps that
-take the drive back are looked at. A drive that serves a limit and no loop is not held so, nor is any where a
-plan is improved until it stays, and a linear plant has none of the guards.
+    H = 2 ( G'QG + move Delta'Delta + drive L ),    f = 2 ( G'Q (y0 - G v0 - r) - move Delta' e ).
 """
 
 from __future__ import annotations
@@ -295,6 +286,9 @@ class Optimiser:
         y = predicted(plan[None])
         at_guess, cost = self._merit(np.array([guess, plan]), np.array([y_guess, y[0]]), problem)
         others = np.zeros((0, *plan.shape))
+        # three guards stand near the optimum of a Peltier element, where the linearisation predicts cooling
+        # that a whole step does not give: here a plan that costs more than the guess in the nonlinear
+        # simulation is taken only part of the way
         if cost > at_guess:
             others = guess + np.array(SHARES)[:, None, None] * (plan - guess)
         # the far side is a trap: there, heating seems to ask for still more cooling current.  Nor does a
@@ -310,6 +304,7 @@ class Optimiser:
 
     def _authority(self, G: Array) -> Array:
         """Return each block's response over that at rest, (n_b, n_u); 1 where the horizon hides it."""
+        # a linear plant has none of the guards
         if self.model.affine is not None:
             return np.ones((self.n_b, self.model.n_u))
         G = G.reshape(self.N, self.model.n_y, self.n_b, self.model.n_u)
@@ -411,6 +406,7 @@ class Optimiser:
         n, n_u = len(self._spans), self.model.n_u
         soft = [*self._rows, *(row for row, _, _ in self._limits)]
         if self._A is None or self.model.affine is None:
+            # range and slew of each block are hard, the overshoot band and the limits at every sample soft
             rows = G[:, soft].transpose(1, 0, 2).reshape(-1, n)
             self._A = np.concatenate([np.eye(n), self.weights.differences, rows])
         slew = (self._gaps[:, None] * self.drives.slew).ravel() / self._spans

@@ -5,22 +5,9 @@ held, so one sample is f composed n times, or fewer times at a longer step where
 by less than a hundredth of an output's unit (:func:`unit_of`).  Delay is in the model's states.
 
 With the plan held over blocks, u_k = v_b for k in block b, the outputs are linearised **along the predicted
-trajectory** [1]_:
+trajectory**:
 
     y(v) ~ y(v0) + G (v - v0),    G = dy/dv at v0, by stages y_k = h(x_k), x_k+1 = f(x_k, u_k).
-
-Linearising there, not at the current state, is what keeps a Peltier drive safe: past the optimum current
-more current heats, dT/du changes sign along the plan, and a controller that froze the sign drives into the
-wrong side.
-
-The derivatives are CasADi's, exact: its instructions for the step and its tangent become machine code that
-runs a direction for each block and drive in one batch. A step with instructions that have no such code (a
-branch) is linearised sample by sample, S+ = A S + B, by CasADi itself. Of a linear step they are made once.
-
-References
-----------
-.. [1] M. Diehl, H. G. Bock, J. P. Schloeder, "A real-time iteration scheme for nonlinear optimization in
-   optimal feedback control", SIAM Journal on Control and Optimization 43(5), 2005.
 """
 
 from __future__ import annotations
@@ -142,6 +129,8 @@ class PredictionModel:
         self.least_d = np.where(self.rooms, self.coldest, low - width_allowed)
         self.most_d = np.where(self.rooms, self.hottest, high + width_allowed)
         wanted = sample_time(plant) if dt is None else float(dt)
+        # a sample is n native steps with u held; where fewer, longer ones change the prediction by less than
+        # a hundredth of an output's unit, it is cut into these
         self.sub = max(1, round(wanted / plant.dt))
         self.dt = self.sub * plant.dt
         self._responses: dict[tuple[int, ...], Response] = {}
@@ -257,6 +246,8 @@ class PredictionModel:
         """The compiled step with its derivative in one direction; None where it is more than arithmetic."""
         from thermogrip.sysid.models.jit_rollout import Kernel
 
+        # a step and its tangent become machine code that runs a direction for each block and drive in one
+        # batch; a step with instructions that have no such code (a branch) is linearised by CasADi itself
         steps = _TangentSteps(self)
         return Kernel(steps) if steps.are_arithmetic else None
 
@@ -305,6 +296,10 @@ class PredictionModel:
             return y + self.output(np.zeros(self.n_x)), G
         if self._kernel is None:
             return self._trajectory_by_casadi(x, plan, d, blocks)
+        # Linearised along the plan, as M. Diehl, H. G. Bock, J. P. Schloeder, "A real-time iteration scheme
+        # for nonlinear optimization in optimal feedback control", SIAM Journal on Control and Optimization
+        # 43(5), 2005: past the optimum current of a Peltier drive more current heats, dT/du changes sign
+        # along the plan, and a controller that froze the sign drives into the wrong side.
         of_steps = np.repeat(plan, np.multiply(blocks, self.sub), axis=0)
         y, _ = self._along(self._kernel, self._plan_directions(tuple(blocks)), x, of_steps, d)
         y = y[:, self.sub :: self.sub]

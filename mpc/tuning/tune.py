@@ -1,13 +1,9 @@
 r"""Find the best controller of all kinds for what is wanted, and say whether weights were the limit.
 
 An MPC is varied by five factors of its default design, a PI by three of SIMC's settings, each by its
-logarithm, by NLopt's simplex search [1]_, and scored in closed loop on draws of the plant's posterior
+logarithm, by NLopt's simplex search, and scored in closed loop on draws of the plant's posterior
 (:mod:`thermogrip.mpc.tuning.objective`).  The default design, the best MPC and the best PI are then compared
 on draws that the search has not seen; the one of the least score is what is saved, whatever its kind.
-
-References
-----------
-.. [1] J. A. Nelder, R. Mead, "A simplex method for function minimization", Computer Journal 7(4), 1965.
 """
 
 from __future__ import annotations
@@ -436,6 +432,7 @@ def minimise(
 
     if most < 1:
         return
+    # J. A. Nelder, R. Mead, "A simplex method for function minimization", Computer Journal 7(4), 1965
     search = nlopt.opt(nlopt.LN_NELDERMEAD, len(names))
     search.set_min_objective(cost)
     search.set_lower_bounds(low)

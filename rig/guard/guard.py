@@ -11,11 +11,6 @@ It asks, in this order:
 
 and of a move, before it goes out: is it finite, and does it pump heat into standing water?  (drive,
 interlock)
-
-A suspect reading never reaches the controller; the last good one takes its place, for two looks.
-
-Without a model stands the rule of 3-D printers (Klipper's ``verify_heater``, Marlin's ``WATCH_TEMP``), with a
-sign, because a Peltier drive does both, and by energy, because what heats slowly burns as well.
 """
 
 from __future__ import annotations
@@ -80,6 +75,8 @@ class RuleMonitor:
         self._moved = {}
 
     def _no_answer(self, time: float, outputs: Mapping[str, float], room: float) -> Trip | None:
+        # the rule of 3-D printers (Klipper's ``verify_heater``, Marlin's ``WATCH_TEMP``), with a sign,
+        # because a Peltier drive does both, and by energy, because what heats slowly burns as well:
         # the drive has come to ``full_drive_s`` without a change of sign: an output must have moved by
         # ``least_K`` with it, or one must stand where such a drive holds it, on its side of the room,
         #     |T - T_room| >= far_K min(1, 2 |mean drive|) - least_K
@@ -309,6 +306,7 @@ class Guard:
         if trip is not None:
             self.trips.append(trip)
         fresh = bool(accepted) and self.rooms(reading.values).issuperset(suspect)
+        # a suspect reading never reaches the controller: the last good one takes its place, for two looks
         values = {**reading.values, **self.sensors.last_good(), **accepted}
         self._last = Findings(values, suspect, fresh, trip)
         return self._last

@@ -29,9 +29,9 @@ LARGEST_DRIVE_BIAS = 0.5  # a driver that gives half, or half more, is at fault 
 class StartSettings:
     """Standard deviations at a start from rest."""
 
-    state_K: float = 0.5
-    drive: float = 0.03
-    output_K: float = 0.3
+    state_K: float = 0.5  # of the state that moves most
+    drive: float = 0.03  # of a drive's bias, in half its range
+    output_K: float = 0.3  # of an output's bias
     not_at_rest: float = 100.0  # times the variance of the states: 5 K, as a heatsink may be off the water
 
 

@@ -10,14 +10,6 @@ firmware.  The host asks and the device answers once, with the number of the que
 Every answer but that of hello is the whole state, so one exchange a sample both drives and reads.
 A question that got no answer is asked again with the same number; the device repeats its answer and does
 nothing twice.  An answer to anything but the question that is open is reported and never used.
-
-**What the check detects.**  A line ends in its length, the CRC-16 of what is before it, and that of the same
-bytes backwards: a check of 31 bits, since the two codes share only the factor x + 1.  The length is there for
-the usual damage of a serial line, an overrun that drops bytes so that the head of one line meets the tail of
-the next, and the grammar (single spaces, printable words, whole numbers in one spelling) finds most of the
-rest.
-
-Empty lines mean nothing: a host sends one to end what the other side has received by half.
 """
 
 from __future__ import annotations
@@ -64,6 +56,8 @@ def encode_line(seq: int, *words: str) -> bytes:
     whole = _BODY.fullmatch(body) and body.count(b" ") == len(words)
     if seq > 0xFFFF or not whole or len(body) > MAX_BODY:
         raise ValueError(f"these words make no line: {body!r}")
+    # The CRC-16 of what is before it, and that of the same bytes backwards, are a check of 31 bits: the two
+    # codes share only the factor x + 1.
     checked = body + b"*%02X" % len(body)
     return checked + b"%04X%04X\n" % (crc16(checked), crc16(checked[::-1]))
 
@@ -75,11 +69,13 @@ def decode_line(data: bytes) -> Line | Damaged:
     body, trailer = data[:-_CHECK], _TRAILER.fullmatch(data[-_CHECK:])
     if trailer is None:
         return Damaged("check", data)
+    # the usual damage, an overrun, drops bytes: the head of one line meets the tail of another
     if int(trailer[1], 16) != len(body):
         return Damaged("length", data)
     checked = data[:-8]
     if int(trailer[2], 16) != crc16(checked) or int(trailer[3], 16) != crc16(checked[::-1]):
         return Damaged("crc", data)
+    # single spaces, printable words, whole numbers in one spelling: what is left of the damage shows here
     if not _BODY.fullmatch(body):
         return Damaged("grammar", data)
     number, *words = body.decode("ascii").split(" ")
@@ -98,6 +94,7 @@ class LineParser:
         *ended, unended = data.split(b"\n")
         for piece in ended:
             self._add(piece)
+            # an empty line means nothing: a host sends one to end what the other side has received by half
             events += [decode_line(bytes(self._pending))] if self._pending else []
             self.reset()
         self._add(unended)

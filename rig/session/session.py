@@ -9,7 +9,6 @@
               ``stop`` ends it; then it opens
 
 Whatever ends it (done, time-out, a trip, an exception, Ctrl-C, ``kill``), drive and pump are off afterwards.
-A session that does not settle is an answer (a verdict), not an error, and so is one that the guard ended.
 """
 
 from __future__ import annotations
@@ -221,6 +220,7 @@ def run_session(
     if thing is not None and isinstance(thing.t_object, str) and thing.t_object not in run.reading.values:
         hint = known_names(thing.t_object, run.reading.values, "use one of {}, or a number")
         raise UserError(f"the rig has no sensor {thing.t_object!r}", hint=hint)
+    # not to settle is an answer and not an error, and so is an end by the guard
     verdict, touched = "not settled", None
     with run.powered():
         run.start(target if isinstance(target, Mapping) else {output: float(target)})

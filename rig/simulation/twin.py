@@ -1,14 +1,9 @@
 """The twin: an identified plant behind the rig's interface, with sensors and a hand to grasp with.
 
-The plant is integrated with its own native step dt; the inputs of a step are the time averages of what was
-applied during it (what the fit did to its logs), a switch takes the value that it had for longer.  Between
-two steps the outputs are interpolated towards a provisional step, so the twin can be read at any time.
+The plant is integrated with its own native step dt.  Between two steps the outputs are interpolated towards a
+provisional step, so the twin can be read at any time.
 
-A reading is  truth + offset + slow noise + white noise, rounded to the quantum;  slow noise is an
-Ornstein-Uhlenbeck process (standard deviation ``slow_noise``, memory ``SLOW_S``).
-
-On release what an object adds to the skin dies out with the time constant ``RECOVERY_S``; it is the heat that
-soaks into the finger and the water, which the plant's states do not know.
+A reading is  truth + offset + slow noise + white noise, rounded to the quantum.
 """
 
 from __future__ import annotations
@@ -46,6 +41,7 @@ class _Contact:
     def addition(self, time: float, alone: float) -> float:
         """Return what the object adds to the skin's reading [K], which alone would be at ``alone``."""
         if time > self.opened:
+            # the heat that soaks into the finger and the water, which the plant's states do not know
             return self.left * float(np.exp((self.opened - time) / RECOVERY_S))
         # heat conduction is linear: with the plant's skin y(t), the true time of contact t_c, the step
         # response F of sysid.contact.simulation and G, what the room does by the far face of the block,
@@ -284,6 +280,7 @@ class Twin:
     def _mean_input(self) -> Array:
         """Return the inputs averaged over the native step so far; switches on or off."""
         mean = self._applied / self._elapsed if self._elapsed > 0 else self._input_vector()
+        # what the fit did to its logs; a switch takes the value that it had for longer
         switch = np.array([name in self.plant.model.switches for name in self.plant.inputs])
         return np.where(switch, np.round(mean), mean)
 
@@ -309,6 +306,7 @@ class Twin:
 
     def _sensor(self, name: str, true: float) -> float:
         if name == self.plant.outputs[0]:  # the slow noise of all sensors moves on once a sample
+            # an Ornstein-Uhlenbeck process of standard deviation ``slow_noise``
             keep = float(np.exp(-(self.time - self._slow_at) / SLOW_S))
             for sensor in self._slow:
                 fresh = self.slow_noise * np.sqrt(1 - keep**2) * self._noise_rng.standard_normal()

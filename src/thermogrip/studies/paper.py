@@ -6,8 +6,7 @@ with an LSTM that is trained on noisy copies.  Here the same cases are repeated
 
 - on the bundled grasps: five a material to train, three to test;
 - on grasps of the simulated gripper, thirty a material to test, so that n is large enough to distinguish
-  cases.  The simulated gripper is of the family of models that the posterior classifier assumes, which
-  favours it there.
+  cases.
 
 A third table shows what the published numbers can rest on: the paper's LSTM is trained on copies of one grasp
 a material, and tested on further copies and on other grasps.
@@ -248,6 +247,7 @@ def _simulated(case: Case, seed: int) -> Grasps:
     from thermogrip.sysid.contact.simulation import simulate_grasps
     from thermogrip.sysid.effusivity.gripper_model import load_default_gripper
 
+    # of the family of models that the posterior classifier assumes, which favours it there
     return simulate_grasps(
         load_default_gripper().grip(),
         case.materials,
