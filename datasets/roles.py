@@ -290,10 +290,7 @@ def _helps_beside(columns: Mapping[str, Floats], name: str, output: str, inputs:
 def _heated_rooms(
     columns: Mapping[str, Floats], guesses: Mapping[str, tuple[str, str]], stated: Mapping[str, str]
 ) -> dict[str, tuple[str, str]]:
-    """Return the rooms that are outputs, because a drive heats them; weather is heated by nobody.
-
-    A rig warms the room around it too: beside another output only what is called a room is one.
-    """
+    """Return the rooms that are outputs, because a drive heats them; weather is heated by nobody."""
     roles = {name: role for name, (role, _) in guesses.items()} | dict(stated)
     drives = [n for n, role in roles.items() if role == "input" and n in columns]
     alone = "output" not in roles.values()
@@ -302,6 +299,7 @@ def _heated_rooms(
         words = _name_words(name)
         if role != "disturbance" or _OUTDOORS.search(words) or not _ROOM.search(words) or not drives:
             continue
+        # a rig warms the room around it too: beside another output only what is called a room is one
         if not (alone or re.search(r"(^|_)room(_|$)", words)):
             continue
         gain = _predictive_gain([columns[name], *(columns[drive] for drive in drives)])
@@ -417,13 +415,10 @@ def _unlike_inputs(
 def _copied_columns(
     columns: Mapping[str, Floats], guesses: Mapping[str, tuple[str, str]], units: Mapping[str, str]
 ) -> dict[str, tuple[str, str]]:
-    """Return the columns that are one signal with another, or a set point less a reading, and of what.
-
-    Of two copies the one with a clue, else the first, stays.  What is read is no copy of what is driven:
-    under a proportional controller the two are multiples of each other.
-    """
+    """Return the columns that are one signal with another, or a set point less a reading, and of what."""
     moving = {n: v[: _ROLES.most_rows] for n, v in columns.items() if np.ptp(v) > 0}  # of lost values none
     out: dict[str, tuple[str, str]] = {}
+    # of two copies the one with a clue, else the first, stays
     order = sorted(moving, key=lambda n: (n in guesses) + (guesses.get(n, ("", ""))[1] == NO_CLUE))
     for place, name in enumerate(order):
         if name not in guesses:
@@ -432,6 +427,7 @@ def _copied_columns(
         # one signal within their steps: each is a multiple of the other and a constant
         for other in [n for n in order[:place] if n not in out]:
             role_of_other = guesses.get(other, (role, ""))[0]
+            # what is read is no copy of what is driven, a multiple of it under a proportional controller
             if not _one_signal(values, moving[other]) or {role, role_of_other} == {"input", "output"}:
                 continue
             # two inputs that always move together cannot be told apart by any fit: one stays for both

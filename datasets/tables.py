@@ -332,16 +332,14 @@ def _first_line_as_names(text: str, file: str) -> Layout:
 
 
 def _without_labels(text: str) -> tuple[str, tuple[str, ...]]:
-    """Return the lines of a log that have readings beside their names, as a table with a header.
-
-    So write serial plotters (``T1:23.5,T2:24.0``), printer hosts (``T:22.1 /200.0 @:127``, a target behind
-    its reading) and Klipper (``extruder: target=200 temp=22.1 pwm=0.9``); lines without them are passed over.
-    """
+    """Return the lines of a log that have readings beside their names, as a table with a header."""
     head = list(islice(_head_lines(text), 5 * _HEAD_LINES))
     if any(map(_ESPHOME.match, head)):
         matches = map(_ESPHOME.match, _iterate_lines(text))
         readings = (match.expand(r"\1,\2,\3") if match else "" for match in matches)
         return "\n".join(["time,name,state", *readings]), ("lines of an ESPHome log",)
+    # so write serial plotters (T1:23.5,T2:24.0), printer hosts (T:22.1 /200.0 @:127, a target behind its
+    # reading) and Klipper (extruder: target=200 temp=22.1 pwm=0.9); lines without them are passed over
     labels = Counter(tuple(_labelled_cells(line)) for line in head)
     del labels[()]
     names, lines_of_names = max(labels.items(), key=lambda item: (item[1], len(item[0])), default=((), 0))

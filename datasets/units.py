@@ -80,12 +80,10 @@ class Header(NamedTuple):
 
 
 def read_header(header: str, others: Sequence[str] = ()) -> Header:
-    """Return name, unit and the factor to that unit of a column header as any program writes it.
-
-    A word that is no unit stays a part of the name; so does a letter that others of ``others`` continue
-    (``zone_a``, ``zone_b``, ``zone_c``).  The name is empty where the header has none.
-    """
+    """Return name, unit and the factor to that unit of a column header as any program writes it; a word
+    that is no unit stays a part of the name, which is empty where the header has none."""
     header = header.strip()
+    # a letter that others continue is no unit: zone_a, zone_b, zone_c
     series = any(f"{header[:-1]}{letter}" in others for letter in "abdeABDE" if letter != header[-1:])
     for unit in UNITS:
         if header.endswith(f"_{unit}") and not (series and len(unit) == 1):

@@ -29,11 +29,7 @@ class ScaledClock:
 
 
 class Metronome:
-    """The ends of consecutive waits, on a grid whatever the work between them takes.
-
-    Work of less than the wait itself (and than half a second) is taken off the next wait; after more the grid
-    starts anew, and nothing is caught up.
-    """
+    """The ends of consecutive waits, on a grid whatever the work between them takes."""
 
     def __init__(self, clock: Callable[[], float], sleep: Callable[[float], None]) -> None:
         self._clock, self._sleep = clock, sleep
@@ -48,6 +44,8 @@ class Metronome:
     def next(self, seconds: float) -> float:
         """Return when a wait of so many seconds that begins now is to end."""
         now = self._clock()
+        # work of less than the wait itself (and than half a second) is taken off the next wait; after more
+        # the grid starts anew, and nothing is caught up
         begin = self._last if 0 <= now - self._last < min(seconds, _LATE_S) else now
         self._last = round(begin + seconds, 9)
         return self._last

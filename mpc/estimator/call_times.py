@@ -5,9 +5,7 @@ is due at the call that is nearest to a sample time after the last one,
 
     since >= dt - interval / 2,
 
-where ``interval`` is that of the last call.  A reading whose time has not moved on is stale: the call is
-taken to be as far from the last as calls usually are.  A clock that went back by more than 30 s and goes on
-from there has begun anew.
+where ``interval`` is that of the last call.
 """
 
 from __future__ import annotations
@@ -53,11 +51,13 @@ class CallTimes:
         elif now > before:
             self.seconds, self._time = now - before, now
         elif before - now > RESTART_S and now > self._back:  # never where there is no time gone back to
+            # a clock that went back by so much and goes on from there has begun anew
             self.seconds, self._time = now - self._back + self._interval, now
         else:
             self.stale = True
         self._back = now if self.stale else math.nan
         if self.stale:
+            # its time has not moved on: it is taken to be as far from the last as calls usually are
             self._repeats += 1
             self._assumed += self._interval
         else:
