@@ -107,7 +107,7 @@ class LstmClassifier(JoinedClassifier):
         epochs = self.epochs
         split = _early_stopping_rows(grasps, labels, seed=self.random_state)
         # A network that has found what tells materials apart goes on to learn the grasps by heart.  So one of
-        # five groups (sessions, else blocks) is held out first, to see how many epochs are needed; then all
+        # five groups (sessions, else blocks) is held out first, to see for how long to train; then all
         # grasps train for as many.
         if split is not None and self.patience is not None and self.epochs > self.patience:
             fitted, held_out = split
