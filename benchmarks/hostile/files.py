@@ -3,7 +3,8 @@
     python benchmarks/hostile/files.py [--only WORD]
 
 Prints for every file its size, the exit code, the seconds of CPU (and how many more than for a file of one
-zero byte), the peak memory and the line on stderr.  Each is to end with code 2 within 2 s of CPU and 500 MB.
+zero byte), the peak memory and the line on stderr.  Each is to end with code 2 within 2 s of CPU and 500 MB;
+a packed table may take what it may unpack to besides, once, and the seconds of that.
 The files are written into a temporary folder; the large Parquet takes half a minute to write.
 """
 
@@ -25,7 +26,10 @@ from typing import Any
 
 import numpy as np
 
+from thermogrip.datasets.limits import most_unpacked
+
 SECONDS, MEGABYTES = 2.0, 500.0
+UNPACKED_MB_PER_S = 300.0  # of CPU; gzip: 359 of zeros, 542 of rows
 ROWS = "time_s,drive,pump,t_tank_degC,t_surface_degC,t_ambient_degC\n" + "".join(
     f"{k},{0.5 * (k % 40 > 20)},1,{25 + 0.01 * k:.2f},{25 + 0.008 * k:.3f},25.0\n" for k in range(120)
 )
@@ -317,7 +321,11 @@ def main() -> int:
                 starts[words[0]] = min(measure(asked, folder)[1] for _ in range(2))
             code, seconds, peak, line = measure([str(path) if w == "FILE" else w for w in words], folder)
             shutil.rmtree(path) if path.is_dir() else path.unlink()
-            wrong = code != 2 or seconds > SECONDS or peak > MEGABYTES
+            # a reader holds what a file may unpack to before it can tell that there is more
+            unpacked = most_unpacked(size) / 1e6 if path.suffix in {".gz", ".xz"} else 0.0
+            wrong = (
+                code != 2 or seconds > SECONDS + unpacked / UNPACKED_MB_PER_S or peak > MEGABYTES + unpacked
+            )
             beyond += wrong
             shown = line.replace(f"{folder}/", "").replace("thermogrip: ", "")[:150]
             mark = " (!)" if wrong else ""

@@ -29,6 +29,7 @@ from thermogrip.sysid.blackbox.order_selection import (
     Run,
     choose,
     excess_within_noise,
+    folds,
     free_run_errors,
     free_run_misses,
 )
@@ -214,6 +215,8 @@ def _with_convention(
     if grid.dt > 1.5 * grid.native or kind in _AVERAGED:
         return grid, choice
     moved = replace(grid.of(logs, ends=True), why=grid.why)
+    if [fold.label for fold in folds(moved)] != [fold.label for fold in choice.folds]:
+        return grid, choice  # moved by a row, an input loses a move in its first: errors do not pair
     # the same structure first: one fit a fold
     for tried in (partial(family, only=(choice.structure,)), family):
         try:

@@ -63,6 +63,13 @@ def test_a_later_move_of_any_log_tells_the_gain_of_all():
     assert ([log.sizes["time"] for log in longer], len(said)) == ([N + 50, N + 50, N], 2)
 
 
+@pytest.mark.parametrize("kind", ["arx", "subspace"])
+def test_a_log_that_climbs_before_its_only_move_is_fitted(kind):
+    log = step_test(at=100).isel(time=slice(99, 189))
+    climbs = log.assign(t=log.t.copy(data=log.t.values + 15 * (1 - np.exp(-np.arange(90) / 20))))
+    assert identify(climbs, models=[kind], draws=0).plant.model.inputs == ("q",)
+
+
 def test_a_step_test_recorded_from_its_step_on_gives_the_gain_and_runs_a_step_of_twice_the_size():
     found = identify(step_test(noise=0.05, quantum=0.32), models=["arx", "oe", "subspace"], draws=8)
     assert any("begins with the only move of an input" in note for note in found.notes)
