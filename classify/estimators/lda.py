@@ -24,7 +24,7 @@ from sklearn.decomposition import PCA
 from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
 from sklearn.linear_model import RidgeClassifierCV
 from sklearn.pipeline import make_pipeline
-from sklearn.preprocessing import StandardScaler
+from sklearn.preprocessing import FunctionTransformer, StandardScaler
 from sklearn.svm import SVC
 
 from thermogrip.classify.estimators.base import (
@@ -292,9 +292,11 @@ class RocketClassifier(ArrayClassifier):
         from aeon.transformations.collection.convolution_based import MiniRocket
 
         transform = MiniRocket(random_state=self.random_state)
+        # sums of 10 000 features in single precision differ by 1e-6 with the number of grasps
+        double = FunctionTransformer(np.asarray, kw_args={"dtype": np.float64})
         alphas = np.logspace(-1, 5, 7)  # of a penalty on some 10 000 features of spread 1
         return _with_probabilities(
-            make_pipeline(transform, StandardScaler(), RidgeClassifierCV(alphas)), labels
+            make_pipeline(transform, double, StandardScaler(), RidgeClassifierCV(alphas)), labels
         )
 
 
