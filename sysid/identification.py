@@ -40,7 +40,7 @@ from thermogrip.sysid.blackbox.order_selection import (
     excess_within_noise,
 )
 from thermogrip.sysid.data.data_quality import DataCheck, Evidence, check_data, evidence
-from thermogrip.sysid.data.rest_before import with_rest
+from thermogrip.sysid.data.rest_before import doubt_of_gains, with_rest
 from thermogrip.sysid.data.signal_roles import (
     SignalRole,
     role_doubts,
@@ -270,7 +270,7 @@ def _read_logs(
     _ask_for_excitation(checked, u, logs[0])
     roles, unused = signal_roles(logs, ([*u, *still], d, y), named, model, still)
     all_named = named["inputs"] is not None and named["outputs"] is not None
-    doubts = role_doubts(logs, named_all=all_named)
+    doubts = (*role_doubts(logs, named_all=all_named), *doubt_of_gains(logs, u))
     return _Task(
         logs, model, u, y, d, checked, roles, doubts, (*matched.converted, *rested, *unused), options
     )

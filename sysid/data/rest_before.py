@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.schema import Log, columns, log_name
@@ -37,13 +38,8 @@ def with_rest(
     >>> rested[0].sizes["time"], float(rested[0].time[0]), float(rested[0].t[0]), len(said)
     (350, -50.0, 21.0, 1)
     """
-    u = [columns(log, inputs) for log in logs]
-    least = MOVED * np.ptp(np.concatenate(u), axis=0)
-    moved = [
-        np.flatnonzero(np.any(np.abs(np.diff(inputs_of_log, axis=0)) > least, axis=1)) + 1
-        for inputs_of_log in u
-    ]
-    if not any(map(len, moved)) or any(rows[-1] > _EARLY for rows in moved if len(rows)):
+    moved = _moved_rows(logs, inputs)
+    if not _moved_early_alone(moved):
         return list(logs), []
     out, notes = [], []
     for log, rows in zip(logs, moved):
@@ -56,6 +52,29 @@ def with_rest(
             f"readings before ({_ADDED} rows of that are in the fit): record a minute of rest to make sure"
         )
     return out, notes
+
+
+def doubt_of_gains(logs: Sequence[Log], inputs: Sequence[str]) -> list[str]:
+    """Return a line where the inputs of all logs, with the rest that was added, move in first rows alone."""
+    if not _moved_early_alone(_moved_rows(logs, inputs)):
+        return []
+    name = inputs[0] if len(inputs) == 1 else "each input"
+    return [
+        f"{name} moves in the first rows alone, where the plant was not at rest: no gain follows from that "
+        "(record a minute of rest before the move, or move it again)"
+    ]
+
+
+def _moved_rows(logs: Sequence[Log], inputs: Sequence[str]) -> list[NDArray[np.int64]]:
+    """Return for each log the rows at which an input is another than before."""
+    u = [columns(log, inputs) for log in logs]
+    least = MOVED * np.ptp(np.concatenate(u), axis=0)
+    changes = [np.any(np.abs(np.diff(inputs_of_log, axis=0)) > least, axis=1) for inputs_of_log in u]
+    return [np.flatnonzero(change) + 1 for change in changes]
+
+
+def _moved_early_alone(moved: Sequence[NDArray[np.int64]]) -> bool:
+    return any(map(len, moved)) and all(rows[-1] <= _EARLY for rows in moved if len(rows))
 
 
 def _first_readings(log: Log, outputs: Sequence[str], n: int) -> dict[str, float]:

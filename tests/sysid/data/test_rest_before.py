@@ -64,10 +64,12 @@ def test_a_later_move_of_any_log_tells_the_gain_of_all():
 
 
 @pytest.mark.parametrize("kind", ["arx", "subspace"])
-def test_a_log_that_climbs_before_its_only_move_is_fitted(kind):
+def test_a_log_that_climbs_before_its_only_move_is_fitted_and_its_gain_in_doubt(kind):
     log = step_test(at=100).isel(time=slice(99, 189))
     climbs = log.assign(t=log.t.copy(data=log.t.values + 15 * (1 - np.exp(-np.arange(90) / 20))))
-    assert identify(climbs, models=[kind], draws=0).plant.model.inputs == ("q",)
+    found = identify(climbs, models=[kind], draws=0)
+    assert (found.plant.model.inputs, found.good) == (("q",), False)
+    assert "q moves in the first rows alone, where the plant was not at rest" in found.doubts[0]
 
 
 def test_a_step_test_recorded_from_its_step_on_gives_the_gain_and_runs_a_step_of_twice_the_size():
