@@ -126,7 +126,7 @@ def _effusivity_row(gripper: GripperModel, name: str, found: GridPosterior) -> E
     low, middle, high = np.exp(mixture_quantiles(found.mass, ln_e, sd, _QUANTILES)).tolist()
     variance = found.mass @ ((ln_e - found.mass @ ln_e) ** 2 + sd**2)
     t = np.array(mixture_quantiles(found.weight, found.t_object, found.t_object_sd, _QUANTILES))
-    if gripper.discrepancy is not None:  # it has no scale of its own: that of the temperatures it was told
+    if gripper.discrepancy is not None:  # it has no scale of its own: that of the stated temperatures
         t = t - gripper.bias
     return EffusivityRow(
         grasp_id=name, effusivity=middle, effusivity_p05=low, effusivity_p95=high, t_object=float(t[1]),

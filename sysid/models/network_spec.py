@@ -63,16 +63,9 @@ class _Table(BaseModel):
 _DriveUnit = Literal["1", "percent", "0_255", "A", "V", "W"]
 
 
-class Input(_Table):
-    """What is moved, seen by elements as a share of ``full_scale``; ``switch`` marks a pump or valve.
+class _Scaled(_Table):
+    """A signal that heaters see as a share of ``full_scale``."""
 
-    A driver with a coarse register drops what lies behind a multiple of ``step``.
-    """
-
-    unit: _DriveUnit
-    range: tuple[Number, Number]
-    switch: bool = False
-    step: Positive | None = None
     full_scale: Positive = 0.0  # 0 until the validator has set it
 
     @model_validator(mode="before")
@@ -89,7 +82,19 @@ class Input(_Table):
         return {**content, "full_scale": full or 1.0}
 
 
-class Disturbance(_Table):
+class Input(_Scaled):
+    """What is moved, seen by elements as a share of ``full_scale``; ``switch`` marks a pump or valve.
+
+    A driver with a coarse register drops what lies behind a multiple of ``step``.
+    """
+
+    unit: _DriveUnit
+    range: tuple[Number, Number]
+    switch: bool = False
+    step: Positive | None = None
+
+
+class Disturbance(_Scaled):
     """What is measured and not moved: a temperature, or of another unit what brings heat, such as a lamp.
 
     ``log_sd`` is how far its sensor is off, from log to log; heaters see a share of ``full_scale``, which is
@@ -98,14 +103,6 @@ class Disturbance(_Table):
 
     unit: Literal["degC"] | _DriveUnit = "degC"
     log_sd: NotNegative = 0.0
-    full_scale: Positive = 0.0  # 0 until the validator has set it
-
-    @model_validator(mode="before")
-    @classmethod
-    def _full_scale(cls, content: Any) -> Any:
-        if not isinstance(content, Mapping) or "full_scale" in content:
-            return content
-        return {**content, "full_scale": _SHARES.get(str(content.get("unit")), 1.0)}
 
 
 class Output(_Table):
