@@ -15,8 +15,8 @@ from typing import Any
 
 REFERENCE = Path(__file__).parents[1] / "docs" / "reference"
 ROOMS = {
-    "datasets": "Files of logs and grasps, materials, example data",
-    "sysid": "Identification, plants, effusivity",
+    "datasets": "Files of logs and grasps, example data",
+    "sysid": "Identification, plants, effusivity, materials",
     "mpc": "Controllers, closed loops, tuning",
     "rig": "Devices, sessions, guard, records",
     "classify": "Classifiers, their comparison, decisions",

@@ -1,4 +1,4 @@
-"""The records every stage exchanges (Log, Grasps), their files, materials, examples and splits."""
+"""The records every stage exchanges (Log, Grasps), their files and examples."""
 
 from thermogrip import lazy_exports
 

@@ -8,7 +8,6 @@ from thermogrip.datasets.grasp_files import read_grasps as read_grasps
 from thermogrip.datasets.grasp_files import write_grasps as write_grasps
 from thermogrip.datasets.log_files import read_log as read_log
 from thermogrip.datasets.log_files import write_log as write_log
-from thermogrip.datasets.materials import find_material as find_material
 from thermogrip.datasets.public_sets import read_hold as read_hold
 from thermogrip.datasets.public_sets import read_toh as read_toh
 from thermogrip.datasets.resample import cut as cut
@@ -20,6 +19,4 @@ from thermogrip.datasets.schema import make_log as make_log
 if typing.TYPE_CHECKING:  # doors of 0.1.0, which are found and not listed
     from thermogrip.datasets.examples import copy_examples as copy_examples
     from thermogrip.datasets.grasp_files import read_grasp_files as read_grasp_files
-    from thermogrip.datasets.materials import Material as Material
-    from thermogrip.datasets.materials import load_materials as load_materials
     from thermogrip.datasets.resample import gaps as gaps

@@ -62,8 +62,7 @@ def copy_examples(folder: str | Path) -> list[Path]:
     for original in sorted(_FOLDER.glob("*.csv.xz")):
         is_log = original.name.removesuffix(".csv.xz") in EXAMPLE_LOGS
         content[(folder if is_log else folder / "grasps") / original.name] = original.read_bytes()
-    about = (_FOLDER / "README.md").read_text(encoding="utf-8")
-    content[folder / "EXAMPLES.md"] = about.split("## materials.csv")[0].rstrip().encode() + b"\n"
+    content[folder / "EXAMPLES.md"] = (_FOLDER / "README.md").read_bytes()
     for path, data in content.items():
         if path.exists() and path.read_bytes() != data:
             raise UserError("another file of this name is here", file=path, hint="choose another folder")

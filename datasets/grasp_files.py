@@ -223,19 +223,6 @@ def distinct_names(files: Sequence[Path]) -> list[str | None]:
     return names
 
 
-def check_apart(out: str | Path, paths: Sequence[str | Path]) -> None:
-    """Refuse an output that is among the files that are read, or would be the next time."""
-    place, hint = Path(os.path.realpath(out)), "choose another name or folder for --out"
-    for pattern in paths:
-        paths_meant = [Path(name).resolve() for name in matching_files(pattern)]
-        if any(place.parent == path for path in paths_meant if path.is_dir()):
-            raise UserError("is in a folder that is read", file=out, hint=hint)
-        of_csv = [_meta_path(path) for path in paths_meant if path.is_file() and file_format(path) == "csv"]
-        matches = place.match(os.path.realpath(pattern)) and not os.path.isdir(pattern)
-        if matches or place in (*paths_meant, *of_csv):
-            raise UserError("is to be read and written", file=out, hint=hint)
-
-
 def _is_text(header: str) -> bool:
     """Tell whether a column of grasps is left as text: its name is that of no number."""
     return not header.startswith(_SAMPLE_COLUMNS) and _name_of_fact(header)[0] not in GRASP_NUMBERS

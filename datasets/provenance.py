@@ -1,4 +1,4 @@
-"""Where a result comes from: version, date, command, repository, seed, and the SHA-256 of what was read.
+"""Where a result comes from: version, date, command, seed, and the SHA-256 of what was read.
 
 Every JSON file has it under the key ``provenance``, every page in its foot.  Two runs of one command with one
 seed differ in this alone; ``SOURCE_DATE_EPOCH`` sets the date.
@@ -10,8 +10,6 @@ import hashlib
 import os
 import re
 import shlex
-import shutil
-import subprocess
 import sys
 import time
 from collections.abc import Iterator, Sequence
@@ -28,7 +26,6 @@ _ROOMS = tuple(
     str(Path(__file__).resolve().parent.parent / room) + os.sep
     for room in ("datasets", "sysid", "mpc", "rig", "classify")
 )  # what they bring belongs to the version
-_GIT_S = 5  # it takes milliseconds; a disk of the network may hang
 _EPOCH = re.compile("[0-9]{1,11}")
 
 
@@ -99,7 +96,6 @@ def provenance() -> dict[str, Any]:
         "thermogrip": __version__,
         "written": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(seconds)),
         "command": shlex.join(now.words),
-        "git": _commit_of(folder) if folder else None,
         "seed": now.seed,
         "inputs": {name.removeprefix(below): digest for name, digest in now.read.items()},
     }
@@ -109,18 +105,3 @@ def hash_file(path: str | Path) -> str:
     """Return the SHA-256 of a file as 64 hexadecimal digits."""
     with os_faults(path), open(path, "rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
-
-
-def _commit_of(folder: str) -> str | None:
-    """Return the commit that is checked out in the repository around a folder, None where there is none."""
-    # rev-parse reads names and their commits alone (https://git-scm.com/docs/git-rev-parse): it starts none
-    # of the programs that a repository's configuration, which an unpacked archive may bring, can name
-    git = shutil.which("git")
-    if git is None or Path(git).parent == Path(folder):  # on Windows the working folder is searched first
-        return None
-    command = [git, "-C", folder, "rev-parse", "--verify", "--quiet", "HEAD"]
-    alone: dict[str, Any] = {"stdin": subprocess.DEVNULL, "env": os.environ | {"GIT_NO_LAZY_FETCH": "1"}}
-    with suppress(OSError, subprocess.SubprocessError):
-        ran = subprocess.run(command, capture_output=True, text=True, check=True, timeout=_GIT_S, **alone)
-        return str(ran.stdout).strip()
-    return None

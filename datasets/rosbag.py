@@ -52,11 +52,10 @@ class Column:
 
 @dataclass(frozen=True)
 class TopicMap:
-    """Columns by name, which of them is the clock ("" to choose), and which time counts."""
+    """Columns by name, and which of them is the clock ("" to choose)."""
 
     columns: Mapping[str, Column]
     clock: str = ""
-    stamp: str = "log"
 
 
 @dataclass(frozen=True)
@@ -79,12 +78,13 @@ def read_topic_map(path: str | Path) -> TopicMap:
         fault = f"has the unknown key {unknown[0]!r}" if unknown else "is no topic map"
         raise UserError(fault, file=path, hint="write a fresh one with `thermogrip init topics`")
     columns = {name: _column(name, entry, path) for name, entry in content["columns"].items()}
-    clock, stamp = str(content.get("clock", "")), str(content.get("stamp", "log"))
+    clock = str(content.get("clock", ""))
     if clock and clock not in columns:
         raise UserError(f"clock {clock!r} is no column", file=path, hint=known_names(clock, columns))
-    if stamp not in ("log", "header"):
-        raise UserError(f"stamp {stamp!r} is unknown", file=path, hint="use log or header")
-    return TopicMap(columns, clock, stamp)
+    if (stamp := content.get("stamp", "log")) != "log":  # which version 0.2 had beside "header"
+        hint = "remove the line: a message counts from when it was recorded"
+        raise UserError(f"stamp {stamp!r} is not read", file=path, hint=hint)
+    return TopicMap(columns, clock)
 
 
 def _column(name: str, entry: Any, path: str | Path) -> Column:
@@ -117,7 +117,7 @@ def read_rosbag_table(path: str | Path, topics: TopicMap | None = None) -> Table
         for name, column in columns.items():
             if column.topic == message.topic:
                 times, values = series.setdefault(name, ([], []))
-                times.append(_stamped(message, topic_map.stamp, file))
+                times.append(message.time)
                 values.append(_message_number(message, column, name, file))
     _check_found(columns, series, type_of_topic, file)
     return _bag_table(file, columns, series, topic_map.clock, notes)
@@ -232,18 +232,6 @@ def _message_number(message: Message, column: Column, name: str, file: Path) -> 
     except _NO_NUMBER as error:
         problem = f"{message.topic} ({message.type}) has no number {column.field!r}"
         raise UserError(problem, file=file, column=name, hint="correct the field in the topic map") from error
-
-
-def _stamped(message: Message, stamp: str, file: Path) -> float:
-    if stamp == "log":
-        return message.time
-    try:
-        of_header = _field(message.content, "header.stamp")
-        fields = ("sec", "nanosec") if _has(of_header, "sec") else ("secs", "nsecs")  # ROS 2, ROS 1
-        return float(_field(of_header, fields[0])) + 1e-9 * float(_field(of_header, fields[1]))
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        problem = f"{message.topic} ({message.type}) has no header.stamp"
-        raise UserError(problem, file=file, hint='set stamp = "log" in the topic map') from error
 
 
 def _check_found(

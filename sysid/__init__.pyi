@@ -1,4 +1,5 @@
 from thermogrip.datasets.log_files import read_log as read_log
+from thermogrip.sysid.contact.materials import find_material as find_material
 from thermogrip.sysid.data.data_quality import check_data as check_data
 from thermogrip.sysid.effusivity.calibration import calibrate_gripper as calibrate_gripper
 from thermogrip.sysid.effusivity.gripper_model import GripperModel as GripperModel

@@ -29,8 +29,8 @@ from numpy.typing import NDArray
 from thermogrip.classify import answer, classify_grasps
 from thermogrip.classify.estimators.posterior import PosteriorClassifier
 from thermogrip.datasets.examples import load_example_grasps
-from thermogrip.datasets.materials import find_material
 from thermogrip.datasets.schema import Grasps
+from thermogrip.sysid.contact.materials import find_material
 from thermogrip.sysid.contact.simulation import step_response, time_nodes
 from thermogrip.sysid.effusivity.gripper_model import GripperModel, load_default_gripper
 from thermogrip.sysid.effusivity.posterior import effusivity_posterior

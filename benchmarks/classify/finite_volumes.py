@@ -19,8 +19,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from thermogrip.datasets.materials import find_material
 from thermogrip.datasets.schema import Grasps, make_grasps
+from thermogrip.sysid.contact.materials import find_material
 
 Array = NDArray[np.float64]
 

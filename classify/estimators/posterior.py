@@ -35,8 +35,8 @@ from thermogrip.classify.estimators.base import (
     two_or_more,
 )
 from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.materials import load_materials
 from thermogrip.datasets.schema import has_touch_groups, label_values
+from thermogrip.sysid.contact.materials import load_materials
 from thermogrip.sysid.effusivity.data import Touches, graded, touches, whiten
 from thermogrip.sysid.effusivity.gripper_model import GripperModel, another_gripper
 from thermogrip.sysid.effusivity.laplace_approximation import (

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thermogrip.datasets.arrays import Array
-from thermogrip.datasets.code_cache import code_cache, only_ours
+from thermogrip.mpc.native.code_cache import code_cache, only_ours
 from thermogrip.mpc.native.codegen import ModelCode, write_model
 from thermogrip.mpc.native.design_struct import Sizes, as_structure, config_header, numbers_of, sizes_of
 

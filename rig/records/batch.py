@@ -21,7 +21,6 @@ import numpy as np
 from thermogrip.datasets.atomic_files import make_folder, read_json, write_json
 from thermogrip.datasets.errors import UserError, known_names, reading
 from thermogrip.datasets.grasp_files import read_grasps, write_grasps
-from thermogrip.datasets.materials import find_material
 from thermogrip.datasets.schema import GRASP_LABELS, GRASP_NUMBERS, Grasps, make_grasps
 from thermogrip.datasets.tables import read_csv_table
 from thermogrip.mpc.interface import Controller
@@ -32,6 +31,7 @@ from thermogrip.rig.records.run_folder import RunFolder, mark_bad, read_run
 from thermogrip.rig.session.loop import Recorder
 from thermogrip.rig.session.session import Object, Session, run_session
 from thermogrip.rig.session.snapshot import Operator
+from thermogrip.sysid.contact.materials import find_material
 
 SCHEMA, VERSION = "thermogrip.batch", 1
 #: Trips after which a trial may simply be done again: what they say is over once the rig answers.

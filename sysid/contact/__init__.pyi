@@ -18,6 +18,8 @@ from thermogrip.sysid.contact.closed_forms import slab_temperature as slab_tempe
 from thermogrip.sysid.contact.closed_forms import slab_temperature_convective as slab_temperature_convective
 from thermogrip.sysid.contact.closed_forms import two_body_flux as two_body_flux
 from thermogrip.sysid.contact.closed_forms import two_body_temperatures as two_body_temperatures
+from thermogrip.sysid.contact.materials import find_material as find_material
+from thermogrip.sysid.contact.materials import load_materials as load_materials
 from thermogrip.sysid.contact.simulation import Grip as Grip
 from thermogrip.sysid.contact.simulation import Stack as Stack
 from thermogrip.sysid.contact.simulation import simulate_grasps as simulate_grasps

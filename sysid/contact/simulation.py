@@ -26,8 +26,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from thermogrip.datasets.arrays import Array
-from thermogrip.datasets.materials import find_material
 from thermogrip.datasets.schema import make_grasps
+from thermogrip.sysid.contact.materials import find_material
 
 if TYPE_CHECKING:
     from thermogrip.datasets.schema import Grasps

@@ -24,9 +24,9 @@ from scipy.optimize import minimize
 from thermogrip.datasets.arrays import Array, Mask
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.grasp_files import Records, as_grasps
-from thermogrip.datasets.materials import Material, find_material, load_materials
 from thermogrip.datasets.parallel import Progress
 from thermogrip.datasets.schema import log_name
+from thermogrip.sysid.contact.materials import Material, find_material, load_materials
 from thermogrip.sysid.contact.simulation import TimeNodes
 from thermogrip.sysid.effusivity.data import (
     KNOTS,

@@ -26,7 +26,7 @@ from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.atomic_files import read_json, write_json
 from thermogrip.datasets.errors import reading
 from thermogrip.datasets.limits import number_within
-from thermogrip.datasets.materials import load_materials
+from thermogrip.sysid.contact.materials import load_materials
 from thermogrip.sysid.contact.simulation import Grip, Stack
 from thermogrip.sysid.effusivity.data import GRADES, KNOTS, Grade, Noise, at_knots
 

@@ -21,7 +21,7 @@ from scipy.special import gammaln, logsumexp
 
 from thermogrip.datasets.arrays import Array, Mask
 from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.materials import Material, find_material
+from thermogrip.sysid.contact.materials import Material, find_material
 from thermogrip.sysid.contact.simulation import Stack, TimeNodes, gripper_modes, time_nodes
 from thermogrip.sysid.effusivity.data import UNKNOWN_OBJECT_SD, Touches, Whitened, graded, whiten
 from thermogrip.sysid.effusivity.gripper_model import (

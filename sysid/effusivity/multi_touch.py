@@ -33,8 +33,8 @@ from thermogrip.datasets.arrays import Array, Mask
 from thermogrip.datasets.atomic_files import read_json, write_json
 from thermogrip.datasets.errors import UserError, reading
 from thermogrip.datasets.limits import number_within
-from thermogrip.datasets.materials import Material
 from thermogrip.datasets.schema import label_values, log_name
+from thermogrip.sysid.contact.materials import Material
 from thermogrip.sysid.contact.simulation import step_response, time_nodes
 from thermogrip.sysid.effusivity import posterior_grid
 from thermogrip.sysid.effusivity.data import UNKNOWN_OBJECT_SD, Touches, touches, whiten

@@ -18,8 +18,8 @@ from scipy.special import softmax
 
 from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.grasp_files import Records, as_grasps
-from thermogrip.datasets.materials import Material
 from thermogrip.datasets.schema import has_touch_groups
+from thermogrip.sysid.contact.materials import Material
 from thermogrip.sysid.effusivity.data import touches
 from thermogrip.sysid.effusivity.gripper_model import INSULATOR, GripperModel
 from thermogrip.sysid.effusivity.laplace_approximation import T_OBJECT, fit_candidates

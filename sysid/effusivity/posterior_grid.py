@@ -20,7 +20,7 @@ import numpy as np
 from scipy.special import logsumexp
 
 from thermogrip.datasets.arrays import Array
-from thermogrip.datasets.materials import load_materials
+from thermogrip.sysid.contact.materials import load_materials
 from thermogrip.sysid.effusivity.data import Touches, Whitened, graded, whiten
 from thermogrip.sysid.effusivity.gripper_model import GripperModel
 from thermogrip.sysid.effusivity.laplace_approximation import (

@@ -25,7 +25,7 @@ from numpy.typing import ArrayLike
 from scipy.special import logsumexp
 
 from thermogrip.datasets.arrays import Array
-from thermogrip.datasets.materials import Material
+from thermogrip.sysid.contact.materials import Material
 from thermogrip.sysid.contact.simulation import PUMP_OFF
 from thermogrip.sysid.effusivity.data import Touches, noise_covariance
 from thermogrip.sysid.effusivity.gripper_model import GripperModel

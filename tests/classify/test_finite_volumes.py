@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from scipy.special import erfcx
 
-from thermogrip.datasets.materials import find_material
+from thermogrip.sysid.contact.materials import find_material
 
 
 @pytest.fixture(scope="module")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from dataclasses import asdict, replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -17,11 +18,12 @@ import pytest
 from tests.cli.conftest import Bench, StandIn, shares, words_of
 from thermogrip.classify.decisions.predict import Answer, Note
 from thermogrip.cli import classify as verb
-from thermogrip.cli.classify import SHOWN, say_names, touched_part, training_part
+from thermogrip.cli.classify import SHOWN, check_place, say_names, touched_part, training_part
 from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.materials import load_materials
+from thermogrip.datasets.grasp_files import write_grasps
 from thermogrip.datasets.schema import Grasps, make_grasps
 from thermogrip.report.console import Console, short
+from thermogrip.sysid.contact.materials import load_materials
 from thermogrip.sysid.effusivity.posterior import EffusivityRow
 
 QUALITY = "thermogrip.sysid.effusivity.quality"
@@ -475,3 +477,21 @@ def test_materials_are_listed_by_their_effusivity(bench: Bench) -> None:
     assert json.loads(bench.run("materials", "copper", "--json").out) == {
         "materials": [asdict(copper) | {"aliases": list(copper.aliases)}]
     }
+
+
+@pytest.mark.parametrize(
+    ("out", "given", "problem"),
+    [
+        ("a.csv", ["a.csv"], "is to be read and written"),
+        ("a_meta.csv", ["b.csv", "a.csv"], "is to be read and written"),
+        ("new.csv", ["."], "is in a folder that is read"),
+        ("new.csv", ["*.csv"], "is to be read and written"),
+        ("more/new.csv", [".", "*.csv"], ""),
+    ],
+)
+def test_an_output_is_no_file_that_is_read(out: str, given: list[str], problem: str, tmp_path: Path) -> None:
+    (tmp_path / "more").mkdir()
+    for name in "ab":
+        write_grasps(record_of([name]), tmp_path / f"{name}.csv")
+    with pytest.raises(UserError, match=problem) if problem else nullcontext():
+        check_place(tmp_path / out, [str(tmp_path / name) for name in given])

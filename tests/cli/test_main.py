@@ -255,7 +255,7 @@ def test_ctrl_c_is_code_130(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Capt
     def interrupted() -> dict[str, object]:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("thermogrip.datasets.materials.load_materials", interrupted)
+    monkeypatch.setattr("thermogrip.sysid.contact.materials.load_materials", interrupted)
     assert main(["materials"]) == 130
     assert capsys.readouterr().err == "thermogrip: stopped by Ctrl-C\n"
 
@@ -280,7 +280,7 @@ def test_every_error_has_its_code_and_one_line(
     def broken() -> None:
         raise error
 
-    monkeypatch.setattr("thermogrip.datasets.materials.load_materials", broken)
+    monkeypatch.setattr("thermogrip.sysid.contact.materials.load_materials", broken)
     for words in (["materials"], ["materials", "--debug"]):
         assert main(words) == code
         out, err = capsys.readouterr()

@@ -21,8 +21,8 @@ from thermogrip.datasets.examples import (
     load_example_logs,
 )
 from thermogrip.datasets.log_files import read_log
-from thermogrip.datasets.materials import find_material
 from thermogrip.datasets.schema import column
+from thermogrip.sysid.contact.materials import find_material
 
 
 def test_the_logs_hold_what_their_description_says():

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import lzma
-from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
@@ -14,13 +13,7 @@ from hypothesis import strategies as st
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.examples import example_path
-from thermogrip.datasets.grasp_files import (
-    check_apart,
-    distinct_names,
-    read_grasp_files,
-    read_grasps,
-    write_grasps,
-)
+from thermogrip.datasets.grasp_files import distinct_names, read_grasp_files, read_grasps, write_grasps
 from thermogrip.datasets.schema import make_grasps
 
 META = "grasp_id,material,t_object_nominal_degC,t_gripper_set_degC\n"
@@ -396,24 +389,6 @@ def test_a_folder_of_folders_says_the_pattern_for_it(tmp_path, small_grasps):
     (tmp_path / "may").mkdir()
     with pytest.raises(UserError, match=r"holds no grasp files.*or a pattern in quotes: '.*/\*/\*.parquet'"):
         read_grasp_files([tmp_path])
-
-
-@pytest.mark.parametrize(
-    ("out", "given", "problem"),
-    [
-        ("a.csv", ["a.csv"], "is to be read and written"),
-        ("a_meta.csv", ["b.csv", "a.csv"], "is to be read and written"),
-        ("new.csv", ["."], "is in a folder that is read"),
-        ("new.csv", ["*.csv"], "is to be read and written"),
-        ("more/new.csv", [".", "*.csv"], ""),
-    ],
-)
-def test_an_output_is_no_file_that_is_read(out: str, given: list[str], problem: str, tmp_path: Path) -> None:
-    (tmp_path / "more").mkdir()
-    for name in "ab":
-        write_grasps(make_grasps([-1.0, 0.0, 1.0], [[23.0, 23.0, 24.0]], [name]), tmp_path / f"{name}.csv")
-    with pytest.raises(UserError, match=problem) if problem else nullcontext():
-        check_apart(tmp_path / out, [str(tmp_path / name) for name in given])
 
 
 def test_files_of_one_name_in_several_folders_are_told_apart_by_these(tmp_path: Path) -> None:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
-import subprocess
 import sys
 from hashlib import sha256
 from pathlib import Path
@@ -12,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from thermogrip.datasets.atomic_files import read_json, write_json
-from thermogrip.datasets.materials import find_material
 from thermogrip.datasets.provenance import KEY, note_seed, provenance, work
+from thermogrip.sysid.contact.materials import find_material
 
 
 @pytest.fixture(autouse=True)
@@ -41,10 +39,8 @@ def test_a_json_says_who_wrote_it_from_what_and_is_read_with_and_without_that(he
         assert content == {"schema": "thing", "version": 1, "a": a}
         assert found.pop("written").endswith("Z")
         assert found.pop("thermogrip")
-        assert found == {
-            "command": "thermogrip identify 'a b.csv'", "git": None, "seed": 7,
-            "inputs": {"old.json": digest, str(outside): digest},
-        }  # fmt: skip
+        inputs = {"old.json": digest, str(outside): digest}
+        assert found == {"command": "thermogrip identify 'a b.csv'", "seed": 7, "inputs": inputs}
 
 
 def test_what_the_package_brings_is_no_input() -> None:
@@ -75,41 +71,6 @@ def test_the_date_is_that_of_the_environment(epoch: str, date: str, monkeypatch:
 def test_a_date_that_is_none_is_left_alone(epoch: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("SOURCE_DATE_EPOCH", epoch)
     assert provenance()["written"] > "2024"
-
-
-@pytest.mark.skipif(shutil.which("git") is None, reason="git is not installed")
-def test_the_commit_is_told_and_the_repository_s_configuration_starts_no_program(
-    here: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def git(*words: str) -> str:
-        command = ["git", "-c", "user.name=a", "-c", "user.email=a@b", *words]
-        return subprocess.run(command, cwd=here, check=True, capture_output=True, text=True).stdout.strip()
-
-    git("init")
-    assert provenance()["git"] is None  # no commit yet
-    (here / ".gitattributes").write_text("* filter=trap\n")
-    git("add", ".")
-    git("commit", "-m", "first")
-    commit = git("rev-parse", "HEAD")
-    trap = here / ".git" / "trap.sh"
-    trap.write_text(f"#!/bin/sh\ntouch {here}/ran\n")
-    trap.chmod(0o755)
-    settings = ("core.fsmonitor", "filter.trap.clean", "core.pager", "core.sshCommand", "core.editor",
-                "remote.origin.uploadpack", "alias.rev-parse")  # fmt: skip
-    for name in settings:
-        git("config", name, f"!{trap}" if name.startswith("alias") else str(trap))
-    for name, value in (("remote.origin.url", str(here)), ("remote.origin.promisor", "true")):
-        git("config", name, value)
-    git("config", "core.repositoryFormatVersion", "1")
-    git("config", "extensions.partialClone", "origin")
-    (here / ".gitattributes").write_text("* filter=trap # changed\n")
-    (here / ".git" / "objects" / commit[:2] / commit[2:]).unlink()  # which a remote would be asked for
-    (here / "below").mkdir()
-    monkeypatch.chdir(here / "below")
-    assert provenance()["git"] == commit
-    (here / ".git" / "HEAD").write_text("the first line of a file\n")
-    assert provenance()["git"] is None
-    assert not (here / "ran").exists()
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="needs POSIX: a folder in use cannot be removed")

@@ -246,13 +246,12 @@ def test_a_damaged_chunk_is_never_read_as_numbers(tmp_path: Path) -> None:
         (('topic = "/skin"', 'topic = "/nose"'), "topic /nose has no message; it has /cmd"),
         (('field = "data"', 'field = "date"'), "has no number 'date'"),
         (('field = "data"', 'field = "__class__"'), "has no number '__class__'"),
-        (("version = 1", 'version = 1\nstamp = "header"'), "/cmd (std_msgs/msg/Float64) has no header.stamp"),
         (('unit = "K"', 'unit = "Kelvin"'), "unit 'Kelvin' is unknown"),
         (("thermogrip.topics", "thermogrip.topic"), "is no topic map"),
         (('role = "input"', 'role = "in"'), "role 'in' is unknown"),
         (("version = 1", 'version = 1\nclock = "t3"'), "clock 't3' is no column; use t_tank"),
         (("version = 1", 'version = 1\nclocks = "t3"'), "has the unknown key 'clocks'; write a fresh one"),
-        (("version = 1", 'version = 1\nstamp = "now"'), "stamp 'now' is unknown; use log or header"),
+        (("version = 1", 'version = 1\nstamp = "header"'), "stamp 'header' is not read; remove the line"),
         (('topic = "/cmd"', ""), "column drive: needs topic, field, unit, role; name its topic"),
         (('role = "input"', 'rôle = "input"'.replace("ô", "u")), "column drive: needs topic, field"),
         ((MAP[MAP.index("[columns.t_tank]") :], "[columns]\nx = 1"), "column x: needs topic, field"),
@@ -268,13 +267,6 @@ def test_a_wrong_map_is_one_line_that_says_what_repairs_it(
         read_log(file)
     assert said in str(caught.value)
     assert "\n" not in str(caught.value)
-
-
-def test_the_header_stamp_may_be_the_time(tmp_path: Path) -> None:
-    file = write_bag(tmp_path, "bag")
-    text = MAP.split("[columns.drive]")[0].replace("version = 1", 'version = 1\nstamp = "header"')
-    (tmp_path / "topics.toml").write_text(text)
-    np.testing.assert_allclose(read_log(file)["time"].values, 0.5 * np.arange(60), atol=1e-6)
 
 
 def said(topic: str, at: float, content: Any, **attrs: str) -> Message:
@@ -351,10 +343,10 @@ def test_topics_that_make_no_table_are_one_line(
 def test_the_template_is_a_topic_map(tmp_path: Path) -> None:
     found = read_topic_map(Path(rosbag.__file__).with_name("data") / "topics.toml")
     assert set(found.columns) == {"t_surface", "t_tank", "drive", "pump"}
-    assert (found.clock, found.stamp) == ("t_surface", "log")
+    assert found.clock == "t_surface"
     assert found.columns["drive"] == Column("/peltier/command", "data", "1", "input")
     (tmp_path / "topics.toml").write_text('schema = "thermogrip.topics"\n[columns.a]\ntopic = "/b"\n')
-    assert read_topic_map(tmp_path / "topics.toml") == TopicMap({"a": Column("/b", "data", "1")}, "", "log")
+    assert read_topic_map(tmp_path / "topics.toml") == TopicMap({"a": Column("/b", "data", "1")})
 
 
 @pytest.mark.parametrize("name", ["run.bag", "run.db3", "run.mcap"])

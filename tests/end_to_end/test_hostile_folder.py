@@ -11,10 +11,10 @@ from pathlib import Path
 import pytest
 
 from tests.end_to_end.conftest import Bench
-from thermogrip.datasets.code_cache import code_cache
 from thermogrip.datasets.errors import UserError
 from thermogrip.mpc.controllers.export import check_export, export_controller
 from thermogrip.mpc.controllers.mpc import Controller
+from thermogrip.mpc.native.code_cache import code_cache
 from thermogrip.mpc.native.runtime import build_library, compiler
 from thermogrip.sysid.plant.plant import Plant
 

@@ -328,7 +328,7 @@ def classify(
     if out is not None:
         check_place(out, [*(paths or ()), *(known or ())])
     pool = cli.workers_of(workers, cluster)
-    from thermogrip.datasets.materials import load_materials
+    from thermogrip.sysid.contact.materials import load_materials
 
     unlisted = [name for name in cli.comma(candidates) or () if name not in load_materials()]
     cli.choices("--materials", unlisted, model_dir / "classifier.json", "classes")
@@ -519,7 +519,7 @@ def materials(
     name: Annotated[str | None, cli.arg("[NAME]", "One material.")] = None, as_json: cli.AsJson = False
 ) -> int:
     """List the materials table, or show one row of it."""
-    from thermogrip.datasets.materials import find_material, load_materials
+    from thermogrip.sysid.contact.materials import find_material, load_materials
 
     rows = (
         [find_material(name)]
@@ -577,13 +577,21 @@ def _with_gripper(model: GraspClassifier) -> PosteriorClassifier:
 
 def check_place(out: Path, given: Sequence[str]) -> None:
     """Refuse a place for answers that cannot be written, or is among the files that are read."""
-    from thermogrip.datasets.grasp_files import check_apart
+    from thermogrip.datasets.file_names import file_stem, matching_files
 
     if as_folder := out.is_dir() or not out.suffix:
         cli.new_folder(out)
     else:
         cli.new_file(out, (".csv", ".parquet"))
-    check_apart(out / "answers.csv" if as_folder else out, given)
+    file, hint = out / "answers.csv" if as_folder else out, "choose another name or folder for --out"
+    place = file.resolve()
+    for pattern in given:
+        read = [Path(name).resolve() for name in matching_files(pattern)]
+        if place.parent in (path for path in read if path.is_dir()):
+            raise UserError("is in a folder that is read", file=file, hint=hint)
+        read += [path.with_name(f"{file_stem(path)}_meta.csv") for path in read]
+        if place in read or (place.match(str(Path(pattern).resolve())) and not Path(pattern).is_dir()):
+            raise UserError("is to be read and written", file=file, hint=hint)
 
 
 def answer_files(

@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 from thermogrip.cli import options as cli
 from thermogrip.cli.control import ControllerFile, load_controller
 from thermogrip.datasets.errors import UserError, as_user_error
-from thermogrip.datasets.materials import find_material
 from thermogrip.report.console import Console
 from thermogrip.rig.session.signals import check_stopped, stop_signals
 from thermogrip.rig.simulation.faults import FAULTS
+from thermogrip.sysid.contact.materials import find_material
 
 if TYPE_CHECKING:
     from thermogrip.datasets.schema import Grasps

@@ -198,7 +198,7 @@ def effusivity_section(rows: Sequence[tuple[Mapping[str, Any], str]], of: int) -
     import math
 
     from thermogrip.classify.figures import effusivity_figure
-    from thermogrip.datasets.materials import find_material
+    from thermogrip.sysid.contact.materials import find_material
     from thermogrip.sysid.effusivity import EffusivityRow
 
     head = ("grasp", "effusivity", "5 %", "95 %", "object [degC]", "5 %", "95 %", "h_c [W m^-2 K^-1]", "note")

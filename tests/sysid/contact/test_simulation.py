@@ -10,7 +10,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from thermogrip.datasets.materials import load_materials
 from thermogrip.sysid.contact.closed_forms import (
     half_space,
     layer_on,
@@ -18,6 +17,7 @@ from thermogrip.sysid.contact.closed_forms import (
     slab,
     two_body_flux,
 )
+from thermogrip.sysid.contact.materials import load_materials
 from thermogrip.sysid.contact.simulation import (
     SOFT_FINGER,
     Blocks,

@@ -15,8 +15,8 @@ from thermogrip.classify import answer
 from thermogrip.classify.estimators.posterior import PosteriorClassifier
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.examples import load_example_grasps
-from thermogrip.datasets.materials import find_material
 from thermogrip.datasets.schema import make_grasps
+from thermogrip.sysid.contact.materials import find_material
 from thermogrip.sysid.effusivity import calibration
 from thermogrip.sysid.effusivity.calibration import calibrate_example_gripper, calibrate_gripper
 from thermogrip.sysid.effusivity.data import KNOTS, touches

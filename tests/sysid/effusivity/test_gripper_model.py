@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.materials import load_materials
+from thermogrip.sysid.contact.materials import load_materials
 from thermogrip.sysid.contact.simulation import Stack
 from thermogrip.sysid.effusivity.data import Noise
 from thermogrip.sysid.effusivity.gripper_model import (

@@ -11,8 +11,8 @@ from scipy.optimize import minimize
 from scipy.special import gammaln
 
 from thermogrip.datasets.examples import load_example_grasps
-from thermogrip.datasets.materials import find_material
 from thermogrip.datasets.schema import make_grasps
+from thermogrip.sysid.contact.materials import find_material
 from thermogrip.sysid.contact.simulation import far_response, step_response
 from thermogrip.sysid.effusivity import laplace_approximation as laplace
 from thermogrip.sysid.effusivity import mode_kernel

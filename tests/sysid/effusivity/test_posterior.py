@@ -16,7 +16,7 @@ from scipy.stats import binom, multivariate_t, norm
 from scipy.stats import t as student_t
 
 from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.materials import find_material, load_materials
+from thermogrip.sysid.contact.materials import find_material, load_materials
 from thermogrip.sysid.effusivity.data import KNOTS, touches, whiten
 from thermogrip.sysid.effusivity.gripper_model import Discrepancy, ParameterCovariance, another_gripper
 from thermogrip.sysid.effusivity.laplace_approximation import (

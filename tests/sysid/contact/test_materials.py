@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.materials import find_material, load_materials
+from thermogrip.sysid.contact.materials import find_material, load_materials
 
 HEAD = "name,kind,k,rho,c_p,effusivity,effusivity_sd_percent,aliases,source\n"
 
@@ -105,7 +105,7 @@ RANGES = {
 
 def test_no_row_has_lost_a_decimal_point():
     """Published tables have: each number is in the range of its kind, and e is that of the other three."""
-    text = (files("thermogrip.datasets") / "data" / "materials.csv").read_text(encoding="utf-8")
+    text = (files("thermogrip.sysid.contact") / "data" / "materials.csv").read_text(encoding="utf-8")
     stated = {row["name"]: float(row["effusivity"]) for row in csv.DictReader(io.StringIO(text))}
     table = load_materials()
     assert {m.kind for m in table.values()} == set(RANGES)

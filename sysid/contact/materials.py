@@ -45,7 +45,7 @@ class Material:
 @cache
 def _bundled() -> dict[str, Material]:
     materials = {}
-    text = (files("thermogrip.datasets") / "data" / "materials.csv").read_text(encoding="utf-8")
+    text = (files("thermogrip.sysid.contact") / "data" / "materials.csv").read_text(encoding="utf-8")
     for row in csv.DictReader(io.StringIO(text)):
         k, rho, c_p = (float(row[key]) for key in ("k", "rho", "c_p"))
         materials[row["name"]] = Material(
