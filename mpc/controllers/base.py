@@ -93,13 +93,20 @@ class SampledController:
             wrong = advice.bad_target(controlled[int(np.argmax(lost)) :])
         return np.where(lost, self._target, wanted), wrong
 
+    def _moves(self, target: Trajectory, wanted: Array) -> bool:
+        """Return whether this call moves the drives: where it is due, or these targets are other ones."""
+        # where the samples ahead are known a new target is none
+        is_new = not has_preview(target) and not np.array_equal(wanted, self._target, equal_nan=True)
+        return self.times.moves(new_target=is_new)
+
     def _within(self, u: Array) -> Array:
         """Return drives (n_u,) that are finite, in range, and within the slew limit since the last ones."""
         return self.drives.follow(u, self._u, self.times.slew_s / self.dt)
 
-    def _answer(self, status: str, why: str, started: float) -> Move:
-        """Return the move of the drives in force; without any, the pump may rest."""
-        self.times.moved()
+    def _answer(self, u: Array, status: str, why: str, started: float) -> Move:
+        """Return the move to drives (n_u,), from now on in force; without any, the pump may rest."""
+        self.times.moved(self.dt * float(np.max(np.abs(u - self._u) / self.drives.slew)))
+        self._u = u
         pump = 0 if status == "off" and not np.any(self._u) else 1
         drive = as_drive(self.model.drives, self._u)
         self._move = Move(drive, pump, status, why, self.clock() - started)
@@ -112,12 +119,17 @@ class SampledController:
         )
 
 
+def has_preview(target: Trajectory) -> bool:
+    """Return whether targets of the samples ahead are known."""
+    return isinstance(target, Mapping) and any(isinstance(value, Sequence) for value in target.values())
+
+
 def targets_ahead(
     target: Trajectory, controlled: Sequence[str], now: Array, at: NDArray[np.int_], low: float, high: float
 ) -> Array | None:
     """Return the targets (len(at), n_controlled) of samples ``at`` from now, of which the last stays; None
     where targets do.  What is not from low to high is the target now (n_controlled,)."""
-    if not isinstance(target, Mapping) or not any(isinstance(v, Sequence) for v in target.values()):
+    if not isinstance(target, Mapping) or not has_preview(target):
         return None
     lines = [np.atleast_1d(target.get(name, target_now)) for name, target_now in zip(controlled, now)]
     ahead = np.column_stack([line[np.minimum(at, len(line) - 1)] for line in lines]).astype(float)

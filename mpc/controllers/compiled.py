@@ -16,7 +16,7 @@ import numpy as np
 
 from thermogrip.datasets.arrays import Array
 from thermogrip.mpc.controllers import advice
-from thermogrip.mpc.controllers.base import as_drive, targets_ahead
+from thermogrip.mpc.controllers.base import as_drive, has_preview, targets_ahead
 from thermogrip.mpc.controllers.reference import ReferenceController
 from thermogrip.mpc.estimator.reading_checks import is_off
 from thermogrip.mpc.interface import STATUSES, Move, Readings, Trajectory, number
@@ -93,8 +93,8 @@ class CompiledStep:
         c.step(bool(self._switches) and is_off(self._switches, reading))
         if ahead is not None:
             c.library.tg_host_goals(c.state, None)
-        *drive, over, pump, status, code, which, _, due = c.answer[:]
-        if not due:
+        *drive, over, pump, status, code, which, _, moved = c.answer[:]
+        if not moved:
             again = self._move.advice or advice.TOO_EARLY
             return replace(self._move, advice=again, seconds=self.clock() - started)
         words, state = "", STATUSES[int(status)]
@@ -109,7 +109,7 @@ class CompiledStep:
 
     def _ahead(self, target: Trajectory) -> Array | None:
         """Return the targets of the samples ahead (N, n_controlled), None where they stay."""
-        if not isinstance(target, Mapping) or not any(isinstance(v, Sequence) for v in target.values()):
+        if not isinstance(target, Mapping) or not has_preview(target):
             return None
         model = self.reference.model
         controlled = self.reference.controlled

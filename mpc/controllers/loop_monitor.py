@@ -120,13 +120,15 @@ class LoopMonitor:
         """Note a reading, the move that answered it, and the target; return what is to be said."""
         now = number(reading, "time_s")
         seconds = now - self._time_s if np.isfinite(now - self._time_s) else self.model.dt
-        if self._u is not None and seconds < self.model.dt * (1 - SAME):
-            return self.message
-        self._time_s = now
         y = np.array([number(reading, name) for name in self.model.outputs])
         d = np.array([number(reading, name) for name in self.model.disturbances])
         d = np.where(np.isfinite(d), d, self.model.undisturbed(self.observer.ambient))
         u = np.array(move.drives(self.model.drives), dtype=float)
+        between = self._u is not None and seconds < self.model.dt * (1 - SAME)
+        # between two samples only a move counts: until then another drive was applied
+        if between and (seconds <= 0 or np.array_equal(u, self._u)):
+            return self.message
+        self._time_s = now
         applied = u if self._u is None else self._u
         read_drives = np.array([number(reading, name) for name in self.model.drives])
         applied = np.where(np.isfinite(read_drives), read_drives, applied)

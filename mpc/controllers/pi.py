@@ -23,6 +23,7 @@ from thermogrip.mpc.controllers.advice import STALE
 from thermogrip.mpc.controllers.base import SampledController
 from thermogrip.mpc.controllers.controller_file import Parts
 from thermogrip.mpc.design.design import Design, check_design, default_design
+from thermogrip.mpc.estimator.call_times import CallTimes
 from thermogrip.mpc.interface import Move, Readings, Trajectory
 from thermogrip.mpc.native.shared_constants import UNCUT
 from thermogrip.mpc.optimiser.drive_limits import DriveLimits
@@ -111,9 +112,9 @@ class PIController(SampledController):
         then it goes to rest, and the others go on."""
         started = self.clock()
         self.times.call(reading)
-        if not self.times.due:
-            return self._held_move(started)
         wanted, wrong = self._wanted(target)
+        if not self._moves(target, wanted):
+            return self._held_move(started)
         self._target = wanted
         y = self._read(reading)[0][self._rows]
         if self.times.stale:  # a stale reading is none
@@ -121,22 +122,24 @@ class PIController(SampledController):
         usable = np.isfinite(y) & np.isfinite(wanted).all()
         self._unread_s = np.where(usable, 0.0, self._unread_s + self.times.waited_s)
         status, advice = "fallback_plan", wrong or "reading lost: the drive is held"
+        u = self._u
         if usable.any():
-            self._u = self.propose(y, wanted, seconds=self.times.slew_s)
+            u = self.propose(y, wanted, self.times)
             lost = [name for name, is_usable in zip(self.controlled, usable) if not is_usable]
             status, advice = "ok", wrong
             if lost:
                 status, advice = "fallback_plan", f"{', '.join(lost)}: no usable reading, the others go on"
         elif self._lost.all():
-            self._u = self._within(self.drives.safe)
+            u = self._within(self.drives.safe)
             status, advice = "off", wrong or "reading lost: drive to zero"
-        return self._answer(status, advice, started)
+        return self._answer(u, status, advice, started)
 
-    def propose(self, y: Array, target: Array, *, seconds: float | None = None) -> Array:
-        """Return the limited drives (n_u,) after so many seconds, and integrate; readings y (n_controlled,)
-        are NaN where lost."""
-        # where readings have a time, dt is what really passed, for the integrator and for the slew alike
-        seconds = self.dt if seconds is None else seconds
+    def propose(self, y: Array, target: Array, times: CallTimes | None = None) -> Array:
+        """Return the limited drives (n_u,) after the seconds of these calls, by default a sample, and
+        integrate; readings y (n_controlled,) are NaN where lost."""
+        # where readings have a time, dt is what really passed; a slew limit may count more
+        slew_s = self.dt if times is None else times.slew_s
+        seconds = slew_s if times is None else min(times.waited_s, slew_s)
         error = target - y
         self._begun = np.where(np.isfinite(self._begun), self._begun, y)
         v = np.zeros(self.model.n_u)
@@ -146,7 +149,7 @@ class PIController(SampledController):
                 v[j] = loop.Kc * (error[i] - left_out) + self.integral[k]
             else:
                 v[j] = self.drives.safe[j] if self._lost[i] else self._u[j]
-        u = self.drives.follow(v, self._u, seconds / self.dt)
+        u = self.drives.follow(v, self._u, slew_s / self.dt)
         for k, (loop, (j, i), _) in enumerate(loops):
             if np.isfinite(error[i]):
                 # the integrator stands while the drive is limited, which is most of the time after a step of

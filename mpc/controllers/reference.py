@@ -106,13 +106,13 @@ class ReferenceController(SampledController):
             return self._pause(y, d, target, started)
         applied = self._applied(reading, self._u)
         self._pass(self.times.seconds, applied)
+        wanted, wrong = self._wanted(target)
         # it may be called at any rate: before a move is due the last one is held
-        if not self.times.due:
+        if not self._moves(target, wanted):
             self._refine(y)
             return self._held_move(started)
         event = self._absorb(y, d, applied) or (advice.STALE if self.times.stale else "")
-        wanted, wrong = self._wanted(target)
-        if not np.array_equal(wanted, self._target):
+        if not np.array_equal(wanted, self._target, equal_nan=True):
             self._follows.side = self._sides(wanted)
         self._target = wanted
         samples = np.arange(1, self.optimiser.N + 1)
@@ -128,8 +128,7 @@ class ReferenceController(SampledController):
         if wrong and status == "ok":
             # of a target that is no number the move is the nearest that can be
             status = "infeasible"
-        self._u = self._within(choice.u)
-        return self._answer(status, wrong or lasting or event, started)
+        return self._answer(self._within(choice.u), status, wrong or lasting or event, started)
 
     def _start(self, y: Array, d: Array, begin: Callable[[Array, Array], None]) -> None:
         """Forget the past at readings y, disturbances d; the estimate is begun by one of the observer's two
@@ -206,14 +205,14 @@ class ReferenceController(SampledController):
 
     def _pause(self, y: Array, d: Array, target: Trajectory, started: float) -> Move:
         """Take the drive back while no water moves its heat; the estimate starts again afterwards."""
-        u = self._within(self.drives.neutral)
+        u, before = self._within(self.drives.neutral), self._u
         wanted, _ = self._wanted(target)
         self._start(y, np.where(np.isfinite(d), d, self._past.d), self.observer.reset_in_room)
-        self._u = u
+        self._u = before
         self._target, self._follows.side = wanted, self._sides(wanted)
         stands = advice.pump_off(self.model.model.switches)
         # without a pump that is asked for nobody would switch it on again
-        self._move = replace(self._answer("off", stands, started), pump=1)
+        self._move = replace(self._answer(u, "off", stands, started), pump=1)
         return self._move
 
     def _first_of(self, plan: Array) -> Array:
@@ -333,5 +332,5 @@ class ReferenceController(SampledController):
             self.pi.follow(self._u, y, self._target)
         self._follows.on_pi = True
         self.pi.hold(self.drives.cut(self._u))
-        u = self.pi.propose(y, self._target, seconds=self.times.slew_s)
+        u = self.pi.propose(y, self._target, self.times)
         return _Choice(u, "fallback_pi" if status == "fallback_plan" else status, why)

@@ -5,7 +5,7 @@ is due at the call that is nearest to a sample time after the last one,
 
     since >= dt - interval / 2,
 
-where ``interval`` is that of the last call.
+where ``interval`` is that of the last call, and at once where a target is another one after a sample or more.
 """
 
 from __future__ import annotations
@@ -26,7 +26,8 @@ SAME = 1e-6
 
 class CallTimes:
     """The times of the calls of a controller of sample time ``dt`` [s]: ``seconds`` since the last call (0
-    where the reading is ``stale``), ``since`` the last move that a fresh reading led to."""
+    where the reading is ``stale``), ``since`` the last move that a fresh reading led to, ``stood`` since one
+    that had other targets than the one before."""
 
     def __init__(self, dt: float) -> None:
         self.dt = dt
@@ -37,13 +38,15 @@ class CallTimes:
         self._time = self._back = math.nan
         self._interval = self.dt
         self._repeats = 0
-        self.seconds = self.since = self._assumed = self._spent = 0.0
-        self.stale = False
+        self.seconds = self.since = self.stood = self._assumed = self._spent = 0.0
+        self._before = 0.0  # seconds of the sample that had passed at a move between two samples
+        self._unspent = 0.0  # seconds of its slew limit that the last move left
+        self.stale = self.early = False
 
     def call(self, reading: Mapping[str, float]) -> None:
         """Note a call with this reading."""
         now, before = number(reading, "time_s"), self._time
-        self.seconds, self.stale = 0.0, False
+        self.seconds, self.stale, self.early = 0.0, False, False
         if not math.isfinite(now):
             self.seconds, self._time = self.dt, before + self.dt
         elif not math.isfinite(before):
@@ -63,11 +66,22 @@ class CallTimes:
         else:
             self._interval, self._repeats = self.seconds / (1 + self._repeats), 0
             self.since += self.seconds
+            self.stood += self.seconds
+
+    def moves(self, *, new_target: bool) -> bool:
+        """Return whether this call is to move the drives, where the target is another one or not."""
+        # a target that changes at every call is followed at the sample time: it never stood for a sample
+        stood = self.stood >= self.dt * (1 - SAME)
+        self.early = new_target and stood and not self.stale and not self.due
+        moves = self.due or self.early
+        if moves and new_target:
+            self.stood = 0.0
+        return moves
 
     @property
     def due(self) -> bool:
-        """Whether this call is to move the drives."""
-        passed = self.since + self._assumed - self._spent if self.stale else self.since
+        """Whether a sample time is over."""
+        passed = self.since + (self._assumed - self._spent if self.stale else self._before)
         return passed >= self.dt * (1 - SAME) - 0.5 * self._interval
 
     @property
@@ -80,11 +94,17 @@ class CallTimes:
     @property
     def slew_s(self) -> float:
         """Seconds for which the slew limit counts: no more than a sample where they are not known."""
+        if self.early:  # what the last move left counts: over any T seconds a drive changes by slew (T + dt)
+            return min(self.waited_s + self._unspent, self.dt)
         unknown = self.stale or self.seconds > RESTART_S + self.dt
         return min(self.waited_s, self.dt) if unknown else self.waited_s
 
-    def moved(self) -> None:
-        """Note that the drives were moved."""
+    def moved(self, used_s: float) -> None:
+        """Note that the drives were moved by what the slew limit allows in so many seconds."""
+        self._unspent = max(self.slew_s - used_s, 0.0)
+        # after a move between two samples the next is due where it was before: there the estimate is on its
+        # grid, where no state is interpolated
+        self._before = 0.0 if self.stale or self.due else self._before + self.since
         if self.stale:
             self._spent = self.since + self._assumed
         else:

@@ -33,6 +33,7 @@ static void forget_calls(tg_controller *c)
     c->interval_s = c->design->dt;
     c->repeats = c->stale = 0;
     c->passed_s = c->since_s = c->assumed_s = c->spent_s = c->waited_s = c->slew_s = 0.0;
+    c->stood_s = c->before_s = c->unspent_s = 0.0;
 }
 
 static void start(tg_controller *c, const double *y, const double *d)
@@ -106,7 +107,8 @@ static void note_call(tg_controller *c, tg_time now)
         c->interval_s = c->passed_s / (1 + c->repeats);
         c->repeats = 0;
         c->since_s += c->passed_s;
-        passed = c->since_s;
+        c->stood_s += c->passed_s;
+        passed = c->since_s + c->before_s;
         c->waited_s = fmax(c->since_s - c->spent_s, fmin(c->since_s, dt));
     }
     c->slew_s = c->waited_s;
@@ -115,8 +117,16 @@ static void note_call(tg_controller *c, tg_time now)
     c->due = passed >= dt * (1.0 - TG_SAME) - 0.5 * c->interval_s;
 }
 
-static void note_move(tg_controller *c)
+/* Note a move to these drives.  After one between two samples the next is due where it was before: there the
+ * estimate stands on its grid. */
+static void note_move(tg_controller *c, const double *drive)
 {
+    double used = 0.0; /* samples of slew */
+    for (int j = 0; j < TG_NU; j++)
+        used = fmax(used, fabs(drive[j] - c->u[j]) / c->design->slew[j]);
+    c->unspent_s = fmax(c->slew_s - used * c->design->dt, 0.0);
+    memcpy(c->u, drive, sizeof c->u);
+    c->before_s = c->stale || c->due ? 0.0 : c->before_s + c->since_s;
     if (c->stale)
         c->spent_s = c->since_s + c->assumed_s;
     else
@@ -262,19 +272,35 @@ static int absorb(tg_controller *c, double *y, const double *d, const double *ap
     return lost ? (stuck ? TG_STUCK : TG_LOST_READING) : TG_ALL_WELL;
 }
 
+/* Whether a target is another one than at the last move. */
+static int is_new(const tg_controller *c, const double *target)
+{
+    for (int r = 0; r < c->design->n_c; r++)
+        if (isfinite(clean(c->design, target[r])) && target[r] != c->target[r])
+            return 1;
+    return 0;
+}
+
+/* Whether this call moves the drives: a sample time is over, or a target that stood for one is another now.
+ * One that changes at every call, or whose samples ahead are known, is followed at the sample time. */
+static int moves(tg_controller *c, const double *target)
+{
+    int other = !c->goals && is_new(c, target);
+    int at_once = other && !c->stale && c->stood_s >= c->design->dt * (1.0 - TG_SAME);
+    if (other && (c->due || at_once))
+        c->stood_s = 0.0;
+    if (at_once && !c->due) /* what the last move left of its slew counts */
+        c->slew_s = fmin(c->waited_s + c->unspent_s, c->design->dt);
+    return c->due || at_once;
+}
+
 static int set_target(tg_controller *c, const double *target)
 {
     const tg_design *s = c->design;
     double mean[TG_NY], wanted;
-    int wrong = 0, moved = 0;
-    for (int r = 0; r < s->n_c; r++) {
-        wanted = clean(s, target[r]);
-        wrong = wrong || !isfinite(wanted);
-        if (isfinite(wanted) && wanted != c->target[r])
-            moved = 1;
-        if (!isfinite(wanted) && !isfinite(c->target[r]))
-            moved = 1;
-    }
+    int wrong = 0, moved = is_new(c, target);
+    for (int r = 0; r < s->n_c; r++)
+        wrong = wrong || !isfinite(clean(s, target[r]));
     tg_expected(c, mean);
     for (int r = 0; r < s->n_c; r++) {
         wanted = isfinite(clean(s, target[r])) ? target[r] : c->target[r];
@@ -440,7 +466,7 @@ static void go_on_pi(tg_controller *c, double *drive)
         int j = s->loop_drive[l];
         double change = s->Kc[l] * error_of(c, l, 1.0), cut = drive[j] - wanted[j];
         if (cut * change > 0.0 || fabs(cut) <= TG_UNCUT * (s->highest[j] - s->lowest[j]))
-            c->integral[l] += c->slew_s / s->Ti[l] * change;
+            c->integral[l] += fmin(c->waited_s, c->slew_s) / s->Ti[l] * change;
     }
 }
 
@@ -618,7 +644,8 @@ tg_move tg_step(tg_controller *c, tg_time time_s, const double *y, const double 
     int said, wrong;
     receive(c, time_s, y, d, applied, clean_y, clean_d, did);
     pass(c, did);
-    if (!c->due)
+    c->moves = moves(c, target);
+    if (!c->moves)
         return hold(c, clean_y);
     memset(&move, 0, sizeof move);
     said = absorb(c, clean_y, clean_d, did, &silent);
@@ -638,11 +665,10 @@ tg_move tg_step(tg_controller *c, tg_time time_s, const double *y, const double 
     if (move.advice == TG_RESTARTED)
         move.over = silent;
     keep_within(c, move.drive);
-    memcpy(c->u, move.drive, sizeof c->u);
+    note_move(c, move.drive);
     set_pump(&move);
     c->status = move.status;
     c->advice = move.advice;
-    note_move(c);
     return move;
 }
 
@@ -654,6 +680,7 @@ tg_move tg_pause(tg_controller *c, tg_time time_s, const double *y, const double
     receive(c, time_s, y, d, NULL, clean_y, clean_d, did);
     memcpy(move.drive, c->design->neutral, sizeof move.drive);
     keep_within(c, move.drive);
+    note_move(c, move.drive);
     for (int i = 0; i < TG_ND; i++)
         clean_d[i] = isfinite(clean_d[i]) ? clean_d[i] : c->d[i];
     for (int r = 0; r < TG_NC; r++) /* the last good one stays */
@@ -664,7 +691,6 @@ tg_move tg_pause(tg_controller *c, tg_time time_s, const double *y, const double
     move.pump = 1; /* nobody would switch it on again */
     move.status = c->status = TG_OFF;
     move.advice = c->advice = TG_PUMP_OFF;
-    note_move(c);
     return move;
 }
 

@@ -5,7 +5,7 @@
  *     every dt seconds:  move = tg_step(&controller, time_s, y, d, NULL, target);
  *
  * With the time of each reading it may be called at any rate: estimate, plan and slew count the seconds that
- * passed, and before its sample time is over the last move is held.
+ * passed, and before its sample time is over the last move is held, but for a new target.
  *
  * y, d and target hold temperatures [degC]; NAN where a reading is lost.  No malloc, no file, no clock; one
  * struct a controller.  Whatever the status, a drive is finite, inside its range and within its slew limit.
@@ -74,7 +74,9 @@ typedef struct {
     /* when it was called */
     tg_time time_s, back_s;
     double interval_s, passed_s, since_s, assumed_s, spent_s, waited_s, slew_s;
-    int repeats, stale, due;
+    double stood_s, before_s; /* since a move to other targets; of the sample, at a move between two samples */
+    double unspent_s;         /* of its slew limit, that the last move left */
+    int repeats, stale, due, moves; /* whether a sample time is over, and whether this call moves the drives */
     /* loop */
     double d[TG_SOME(TG_ND)], y[TG_NY], u[TG_NU], target[TG_NC], side[TG_NC];
     double plan[TG_NH * TG_NU], unread_s[TG_NC], age_s, silent_s;
@@ -110,7 +112,8 @@ void tg_reset(tg_controller *c, const tg_design *design, const double *y, const 
 /* Return the move for this sample.
  * time_s: of the reading, or NAN; then one sample time has passed.  applied: what the drives really did since
  * the last step, or NULL.  Called more often than its sample time it holds its move until the call that is
- * nearest to it; called more seldom it moves each time. */
+ * nearest to it, or until a target that has stood for a sample is another one; called more seldom it moves each
+ * time. */
 tg_move tg_step(tg_controller *c, tg_time time_s, const double *y, const double *d, const double *applied,
                 const double *target);
 

@@ -62,7 +62,7 @@ void tg_host_reset(tg_controller *c, const double *given)
 }
 
 /* given: y, d, applied as at a reset, then time and targets; answer: drives, over, pump, status, advice, which,
- * iterations, and whether a move was due. */
+ * iterations, and whether the drives were moved. */
 void tg_host_step(tg_controller *c, const double *given, int paused, double seconds, double *answer)
 {
     const double *applied = given + TG_NY + TG_ND, *target = applied + TG_NU + 1;
@@ -79,7 +79,7 @@ void tg_host_step(tg_controller *c, const double *given, int paused, double seco
     answer[3] = move.advice;
     answer[4] = move.which;
     answer[5] = move.iterations;
-    answer[6] = paused || c->due;
+    answer[6] = paused || c->moves;
 }
 
 /* The plan from now on, N rows of drives; whether there is one. */

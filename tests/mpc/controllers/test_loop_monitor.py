@@ -176,3 +176,14 @@ def test_calls_between_samples_and_lost_readings_are_no_news():
         reading = {"time_s": 1.0 * k, "t1": 25.0 if k % 7 else float("nan"), "t2": 25.0}
         assert monitor.note(reading, move, {"t1": 25.0, "t2": 25.0}) == ""
     assert monitor._time_s == 36.0
+
+
+def test_a_drive_that_moves_between_two_samples_is_no_load():
+    monitor = LoopMonitor(KIT, default_design(KIT, dt=4.0))
+    truth, biases = Truth(KIT, 1.0, Surroundings(noise=0.0, quantum=0.0), None, 0), []
+    for k in range(240):  # it moves a second after each eighth sample, up by 40 % and back
+        move = Move({"q1": 40.0 * ((k - 1) // 32 % 2), "q2": 0.0})
+        monitor.note(truth.reading(), move, {"t1": 40.0, "t2": 25.0})
+        biases.append(monitor.observer.drive_bias[0])
+        truth.apply(move)
+    assert np.ptp(biases) < 1.0  # per cent of full drive; 4 where the drive before the move is forgotten

@@ -106,14 +106,14 @@ def test_at_random_times_c_answers_what_python_answers(tank):
     reading = {"time_s": 0.0, "t_tank": 25.0, "t_surface": 25.0, "t_ambient": 25.0}
     for controller in (python, c):
         controller.reset(reading)
-    now = 0.0
+    now, target, targets = 0.0, 35.0, np.random.default_rng(6)
     for k in range(150):
         odd = rng.choice(
             [0.0, -0.3, -50.0, NAN], p=[0.85, 0.05, 0.05, 0.05]
         )  # out of order, begun anew, none
         reading = {"time_s": now + odd, "t_tank": 25 + 0.05 * now + 0.1 * rng.normal(), "t_ambient": 25.0}
         reading["t_surface"] = NAN if rng.random() < 0.05 else 25 + 0.04 * now + 0.1 * rng.normal()
-        target = 35.0 if k < 80 else 30.0
+        target = 65.0 - target if targets.random() < 0.2 else target
         one, two = python.step(reading, target), c.step(reading, target)
         assert (two.status, two.pump, two.advice) == (one.status, one.pump, one.advice), k
         assert two.drive == pytest.approx(one.drive, abs=1e-8), k
@@ -150,7 +150,7 @@ def test_the_seconds_of_all_calls_are_the_time_that_passed(gaps):
     times, now = CallTimes(DT), 100.0
     times.call({"time_s": now})
     begin = times.seconds
-    times.moved()
+    times.moved(DT)
     passed, moved = 0.0, 0.0
     for gap in gaps:
         if np.isnan(gap):  # a reading without a time is a sample later
@@ -163,7 +163,7 @@ def test_the_seconds_of_all_calls_are_the_time_that_passed(gaps):
         passed += times.seconds
         if times.due and not times.stale:
             moved += times.since
-            times.moved()
+            times.moved(DT)
     assert begin == DT
     assert passed == pytest.approx(now - 100.0, abs=1e-9)
     assert moved + times.since == pytest.approx(passed, abs=1e-9)
@@ -175,7 +175,7 @@ def called(*readings: float | None) -> CallTimes:
     for at, now in enumerate(readings):
         times.call({} if now is None else {"time_s": now})
         if times.due and at < len(readings) - 1:
-            times.moved()
+            times.moved(DT)
     return times
 
 
@@ -318,6 +318,44 @@ def test_the_slew_limit_counts_real_seconds_and_a_lost_reading_changes_nothing_o
             if move.drive != u:
                 assert abs(move.drive - u) <= SLEW * max(now - last, DT) + 1e-9
                 u, last = move.drive, now
+
+
+GRID = [0.0, 2.0, 4.0, 6.0, 8.0]
+#: A target at each time, and when the loop moves; it is read every 0.25 s.
+NEW_TARGETS: dict[str, tuple[Callable[[float], Any], list[float]]] = {
+    "none": (lambda now: 35.0, GRID),
+    "one": (lambda now: 35.0 if now < 4.75 else 20.0, sorted([*GRID, 4.75])),
+    "of one output by name": (lambda now: {"t_surface": 35.0 + (now >= 6.5)}, sorted([*GRID, 6.5])),
+    "another within a sample": (lambda now: 35.0 if now < 4.75 else 32.0 + (now >= 5.25), sorted([*GRID, 4.75])),
+    "within a sample of the start": (lambda now: 35.0 if now < 1.0 else 32.0, GRID),
+    "after a move that took all of its slew": (lambda now: 35.0 if now < 2.25 else 20.0, sorted([*GRID, 2.25])),
+    "one at every reading": (lambda now: 30.0 + now, GRID),
+    "known ahead": (lambda now: {"t_surface": [35.0 if now < 4.75 else 32.0, 32.0]}, GRID),
+    "with a reading that has not moved on": (lambda now: 35.0 if now < 7.0 else 32.0, sorted([*GRID, 7.25])),
+}
+
+
+@pytest.mark.parametrize("case", NEW_TARGETS)
+@pytest.mark.parametrize("name", ["mpc", "pi", "c"])
+def test_a_new_target_is_answered_at_the_next_reading_and_the_grid_of_moves_stays(tank, name, case):
+    if name not in (made := makers(tank)):
+        pytest.skip("no gcc here")
+    (target, expected), controller = NEW_TARGETS[case], made[name]()
+    rest = {"t_tank": 25.0, "t_surface": 25.0, "t_ambient": 25.0}
+    controller.reset(rest)
+    moved_at, drives = [], [0.0]
+    for now in np.arange(0.0, 9.5, 0.25):
+        read_at = 6.75 if case.startswith("with a reading") and now == 7.0 else now
+        move = controller.step({**rest, "time_s": read_at}, target(now))
+        if not move.advice.startswith("called before its sample time"):
+            moved_at.append(now)
+            drives.append(move.drive)
+    assert moved_at == expected
+    for k in range(len(moved_at)):  # over any T seconds as on the grid: by the slew of T and a sample more
+        windows = moved_at[-1 - k] - np.array(moved_at[: len(moved_at) - k])
+        assert np.all(np.abs(drives[-1 - k] - np.array(drives[: len(moved_at) - k])) <= SLEW * (windows + DT) + 1e-9)
+    if case == "one":  # by all that a sample allows, of which the move before needed nothing
+        assert drives[4] == pytest.approx(drives[3] - SLEW * DT)
 
 
 def test_a_move_that_is_held_goes_on_reporting_what_is_wrong(tank):
