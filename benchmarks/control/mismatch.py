@@ -35,6 +35,7 @@ from thermogrip.mpc.controllers.mpc import Controller
 from thermogrip.mpc.design.design import default_design
 from thermogrip.mpc.interface import Move
 from thermogrip.sysid.models.jit_rollout import Kernel
+from thermogrip.sysid.models.model import Sizes
 from thermogrip.sysid.plant.plant import Plant as Model
 
 TARGETS, SECONDS = (38.0, 23.0, 45.0, 20.0), 300.0
@@ -89,27 +90,9 @@ class InRoom(ReferenceModel):
     def rollout(self, x0, u, d, p, dt):  # type: ignore[no-untyped-def]
         """Simulate a batch in machine code."""
         if not hasattr(self, "_kernel"):
-            self._kernel = Kernel(_Steps(self, dt))
+            sizes = Sizes(self.n_x, 1, 1, len(self.parameters))
+            self._kernel = Kernel(self.step, self.output, sizes)
         return self._kernel.rollout(*(np.ascontiguousarray(v, dtype=float) for v in (x0, u, d, p)), dt)
-
-
-class _Steps:
-    """The model's step as the kernel takes equations."""
-
-    def __init__(self, model: InRoom, h: float) -> None:
-        self.model, self.h, self.sizes = model, h, (model.n_x, 1, 1, len(model.parameters))
-
-    def prepare(self, p):  # type: ignore[no-untyped-def]
-        return list(p)
-
-    def renew(self, u, c, h):  # type: ignore[no-untyped-def]
-        return []
-
-    def advance(self, x, u, d, c, kept, h):  # type: ignore[no-untyped-def]
-        return self.model.step(x, u, d, c, self.h)
-
-    def read(self, x, c):  # type: ignore[no-untyped-def]
-        return self.model.output(x, c)
 
 
 @dataclass(frozen=True)

@@ -149,35 +149,16 @@ class ReferenceModel:
     ) -> tuple[Array, Array]:
         """Simulate a batch in machine code."""
         from thermogrip.sysid.models.jit_rollout import Kernel
+        from thermogrip.sysid.models.model import Sizes
 
         if not hasattr(self, "_kernel"):
-            self._kernel = Kernel(_Steps(self, dt))
+            self._kernel = Kernel(self.step, self.output, Sizes(self.n_x, 1, len(self.disturbances), 0))
         batch = [np.ascontiguousarray(v, dtype=float) for v in (x0, u, d)]
         return self._kernel.rollout(*batch, np.zeros((1, 0)), dt)
 
     def to_dict(self) -> dict[str, Any]:
         """Return what makes it."""
         return {"kind": self.kind, "numbers": self.numbers, "dt": self.dt}
-
-
-class _Steps:
-    """The model's step as the kernel takes equations."""
-
-    def __init__(self, model: ReferenceModel, h: float) -> None:
-        self.model, self.h = model, h
-        self.sizes = model.n_x, 1, len(model.disturbances), 0
-
-    def prepare(self, p: Any) -> list[Any]:
-        return []
-
-    def renew(self, u: Any, c: Any, h: Any) -> list[Any]:
-        return []
-
-    def advance(self, x: Any, u: Any, d: Any, c: Any, kept: Any, h: Any) -> list[Any]:
-        return self.model.step(x, u, d, (), self.h)
-
-    def read(self, x: Any, c: Any) -> list[Any]:
-        return self.model.output(x, ())
 
 
 def plant_of(numbers: Mapping[str, float], *, dt: float = DT, current: float = 5.0) -> Plant:

@@ -12,8 +12,7 @@ trajectory**:
 
 from __future__ import annotations
 
-import operator
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -218,9 +217,7 @@ class PredictionModel:
         """Return one sample's next state (n_x,), and its derivatives A, B, E by x, u (n_x, n_u) and d."""
         if self.affine is not None:
             return self.affine._replace(after=self.next_state(x, u, d))
-        if self._kernel is None:
-            return self._by_casadi(x, u, d)
-        _, ends = self._along(self._kernel, self._sample_directions, x, u, d)
+        _, ends = self._along(self._sample_directions, x, u, d)
         after, by = ends[0, : self.n_x], ends[:, self.n_x :].T
         n_xu = self.n_x + self.n_u
         return LinearStep(after, by[:, : self.n_x], by[:, self.n_x : n_xu], by[:, n_xu:])
@@ -235,21 +232,17 @@ class PredictionModel:
         if any(ca.which_depends(after, ca.vertcat(*symbols), 2, True)):
             return None
         # CasADi's own: once, which is not worth a compiled step
-        return self._by_casadi(*(np.zeros(n) for n in (self.n_x, self.n_u, self.n_d)))
-
-    def _by_casadi(self, x: Array, u: Array, d: Array) -> LinearStep:
-        after, *derivatives = (np.asarray(value.full()) for value in self._casadi(x, u, d))
-        return LinearStep(after.ravel(), *derivatives)
+        for _ in range(1, self.sub):
+            after = ca.vertcat(*_symbolic_step(self, [after, *symbols[1:]]))
+        blocks = [after, *(ca.densify(ca.jacobian(after, of)) for of in symbols)]
+        from_zero = ca.Function("sample", symbols, blocks)(*(np.zeros(of.numel()) for of in symbols))
+        at_zero, *derivatives = (np.asarray(value.full()) for value in from_zero)
+        return LinearStep(at_zero.ravel(), *derivatives)
 
     @cached_property
-    def _kernel(self) -> Kernel | None:
-        """The compiled step with its derivative in one direction; None where it is more than arithmetic."""
-        from thermogrip.sysid.models.jit_rollout import Kernel
-
-        # a step and its tangent become machine code that runs a direction for each block and drive in one
-        # batch; a step with instructions that have no such code (a branch) is linearised by CasADi itself
-        steps = _TangentSteps(self)
-        return Kernel(steps) if steps.are_arithmetic else None
+    def _kernel(self) -> Kernel:
+        """The compiled step with its derivative in one direction."""
+        return _tangent_kernel(self)
 
     @cached_property
     def _sample_directions(self) -> list[Array]:
@@ -268,16 +261,14 @@ class PredictionModel:
             self._directions[blocks] = [by_x, np.concatenate([0 * by_u, by_u], axis=2), by_d]
         return self._directions[blocks]
 
-    def _along(
-        self, kernel: Kernel, directions: list[Array], x: Array, u: Array, d: Array
-    ) -> tuple[Array, Array]:
+    def _along(self, directions: list[Array], x: Array, u: Array, d: Array) -> tuple[Array, Array]:
         """Return outputs (B, n + 1, 2 n_y) and last states (B, 2 n_x) of a run from x under u (n, n_u) or
         (n_u,) and d, each followed by its derivatives in the directions behind."""
         start, drives, disturbances = (room.copy() for room in directions)  # threads share a model
         start[:, : self.n_x] = x
         drives[..., : self.n_u] = u
         disturbances[..., : self.n_d] = d
-        return kernel.rollout(start, drives, disturbances, np.zeros((1, 0)), self.dt / self.sub)
+        return self._kernel.rollout(start, drives, disturbances, np.zeros((1, 0)), self.dt / self.sub)
 
     @cached_property
     def C(self) -> Array:
@@ -294,14 +285,12 @@ class PredictionModel:
             by_x, by_rest, G = self.response(tuple(blocks))
             y = by_x @ x + by_rest @ (from_zero.E @ d + from_zero.after) + np.tensordot(G, plan, axes=2)
             return y + self.output(np.zeros(self.n_x)), G
-        if self._kernel is None:
-            return self._trajectory_by_casadi(x, plan, d, blocks)
         # Linearised along the plan, as M. Diehl, H. G. Bock, J. P. Schloeder, "A real-time iteration scheme
         # for nonlinear optimization in optimal feedback control", SIAM Journal on Control and Optimization
         # 43(5), 2005: past the optimum current of a Peltier drive more current heats, dT/du changes sign
         # along the plan, and a controller that froze the sign drives into the wrong side.
         of_steps = np.repeat(plan, np.multiply(blocks, self.sub), axis=0)
-        y, _ = self._along(self._kernel, self._plan_directions(tuple(blocks)), x, of_steps, d)
+        y, _ = self._along(self._plan_directions(tuple(blocks)), x, of_steps, d)
         y = y[:, self.sub :: self.sub]
         return y[0, :, : self.n_y], y[:, :, self.n_y :].transpose(1, 2, 0).reshape(-1, self.n_y, *plan.shape)
 
@@ -331,35 +320,6 @@ class PredictionModel:
             first += length
         self._responses[blocks] = Response(np.stack(by_x), np.stack(by_rest), G)
         return self._responses[blocks]
-
-    def _trajectory_by_casadi(
-        self, x: Array, plan: Array, d: Array, blocks: Sequence[int]
-    ) -> tuple[Array, Array]:
-        """Return what :meth:`trajectory` returns, from CasADi forward sensitivities."""
-        n_b, n_u = plan.shape
-        sensitivity: Array = np.zeros((self.n_x, n_b, n_u))
-        outputs, gains = list[Array](), list[Array]()
-        for block, length in enumerate(blocks):
-            for _ in range(length):
-                x, A, B, _ = self._by_casadi(x, plan[block], d)
-                sensitivity = np.asarray(np.tensordot(A, sensitivity, axes=1), dtype=np.float64)
-                sensitivity[:, block, :] += B
-                outputs.append(self.output(x))
-                gains.append(np.asarray(np.tensordot(self.C, sensitivity, axes=1), dtype=np.float64))
-        return np.stack(outputs), np.stack(gains)
-
-    @cached_property
-    def _casadi(self) -> Any:
-        """The CasADi function (x, u, d) -> (x_next, A, B, E) of one sample."""
-        import casadi as ca
-
-        symbols = _symbols(self)
-        state = ca.vertsplit(symbols[0])
-        for _ in range(self.sub):
-            state = _symbolic_step(self, [ca.vertcat(*state), *symbols[1:]])
-        after = ca.vertcat(*state)
-        blocks = [after, *(ca.densify(ca.jacobian(after, of)) for of in symbols)]
-        return ca.Function("sample", symbols, blocks)
 
     def steady_state(self, u: ArrayLike, d: ArrayLike) -> Array:
         """Return the state (n_x,) in which the plant stays under drives u (Newton); NaN: there is none."""
@@ -407,83 +367,28 @@ def _symbolic_step(model: PredictionModel, symbols: list[Any]) -> list[Any]:
     return list(model.model.step(x, full, d, model.p.tolist(), model.dt / model.sub))
 
 
-class _TangentSteps:
-    """A step and its derivative in one direction for a compiled kernel: x, u, d, each and its direction."""
+def _tangent_kernel(model: PredictionModel) -> Kernel:
+    """Return a step and its derivative in one direction, compiled: of x, u, d, each with its direction."""
+    import casadi as ca
 
-    def __init__(self, model: PredictionModel) -> None:
-        import casadi as ca
+    from thermogrip.sysid.models.jit_rollout import Kernel
 
-        symbols, along = _symbols(model), _symbols(model, "s")
-        after = ca.vertcat(*_symbolic_step(model, symbols))
-        slope = ca.jtimes(after, ca.vertcat(*symbols), ca.vertcat(*along))
-        results = ca.cse([ca.densify(after), ca.densify(slope)])
-        self._function = ca.Function("step", [*symbols, *along], results)
-        self._names = {getattr(ca, key): key for key in dir(ca) if key.startswith("OP_")}
-        self.sizes = Sizes(2 * model.n_x, 2 * model.n_u, 2 * model.n_d, 0)
-        self._C, self._level = model.C.tolist(), model.output(np.zeros(model.n_x)).tolist()
+    C, level = model.C, model.output(np.zeros(model.n_x))
 
-    @property
-    def are_arithmetic(self) -> bool:
-        """Whether each instruction is one that :meth:`advance` writes."""
-        of = self._function
-        used = {self._names[of.instruction_id(k)] for k in range(of.n_instructions())}
-        return used <= {"OP_INPUT", "OP_OUTPUT", "OP_CONST", *_ARITHMETIC}
+    def step(x: Values, u: Values, d: Values, p: Values, h: Any) -> list[Any]:
+        point, along = zip(
+            *((ca.vertcat(*v[: len(v) // 2]), ca.vertcat(*v[len(v) // 2 :])) for v in (x, u, d))
+        )
+        after = ca.vertcat(*_symbolic_step(model, list(point)))
+        slope = ca.jtimes(after, ca.vertcat(*point), ca.vertcat(*along))
+        return [*ca.vertsplit(after), *ca.vertsplit(slope)]
 
-    def prepare(self, p: Values) -> list[Any]:
-        """Return nothing: parameters are numbers in the step."""
-        return []
+    def output(x: Values, p: Values) -> list[Any]:
+        point, along = ca.vertcat(*x[: model.n_x]), ca.vertcat(*x[model.n_x :])
+        return [*ca.vertsplit(C @ point + level), *ca.vertsplit(C @ along)]
 
-    def renew(self, u: Values, c: Values, h: Any) -> list[Any]:
-        """Return nothing: switches stay on."""
-        return []
-
-    def advance(self, x: Values, u: Values, d: Values, c: Values, kept: Values, h: Any) -> list[Any]:
-        """Return the state after the step, then its direction, by CasADi's instructions one by one."""
-        halves = [(values[: len(values) // 2], values[len(values) // 2 :]) for values in (x, u, d)]
-        inputs = [half[0] for half in halves] + [half[1] for half in halves]
-        function, work = self._function, dict[int, Any]()
-        results: list[list[Any]] = [[0.0] * len(halves[0][0]) for _ in range(2)]
-        for k in range(function.n_instructions()):
-            name = self._names[function.instruction_id(k)]
-            into, out_of = function.instruction_output(k), function.instruction_input(k)
-            if name == "OP_OUTPUT":
-                results[into[0]][into[1]] = work[out_of[0]]
-            elif name == "OP_INPUT":
-                work[into[0]] = inputs[out_of[0]][out_of[1]]
-            elif name == "OP_CONST":
-                work[into[0]] = float(function.instruction_constant(k))
-            else:
-                work[into[0]] = _ARITHMETIC[name](*(work[place] for place in out_of))
-        return [*results[0], *results[1]]
-
-    def read(self, x: Values, c: Values) -> list[Any]:
-        """Return the outputs, then their direction."""
-        half = len(x) // 2
-        rows = [(level, x[:half]) for level in self._level], [(0.0, x[half:]) for _ in self._level]
-        return [
-            level + sum(gain * value for gain, value in zip(row, states, strict=True) if gain)
-            for part_rows in rows
-            for row, (level, states) in zip(self._C, part_rows, strict=True)
-        ]
-
-
-#: CasADi's operations on numbers or on SIMD vectors of them.
-_ARITHMETIC: dict[str, Callable[..., Any]] = {
-    "OP_ASSIGN": lambda a: a,
-    "OP_ADD": operator.add,
-    "OP_SUB": operator.sub,
-    "OP_MUL": operator.mul,
-    "OP_DIV": operator.truediv,
-    "OP_NEG": operator.neg,
-    "OP_SQ": lambda a: a * a,
-    "OP_TWICE": lambda a: 2.0 * a,
-    "OP_INV": lambda a: 1.0 / a,
-    "OP_POW": operator.pow,
-    "OP_CONSTPOW": operator.pow,
-    "OP_FABS": abs,
-    "OP_SIGN": lambda a: a / (abs(a) + 1e-300),  # 0 at 0, without a branch
-    **{f"OP_{name.upper()}": getattr(np, name) for name in ("sqrt", "exp", "log", "sin", "cos", "tanh")},
-}
+    # parameters are numbers in the step, switches stay on
+    return Kernel(step, output, Sizes(2 * model.n_x, 2 * model.n_u, 2 * model.n_d, 0))
 
 
 @lru_cache(maxsize=64)

@@ -21,7 +21,7 @@ from typing import Any, ClassVar, NamedTuple, Protocol, Self, runtime_checkable
 import numpy as np
 from numpy.typing import ArrayLike
 
-from thermogrip.datasets.arrays import Array, Mask, Run, Values
+from thermogrip.datasets.arrays import Array, Run, Values
 from thermogrip.datasets.errors import reading
 from thermogrip.datasets.limits import STEP_RANGE, array_within, number_within
 from thermogrip.sysid.models.network_spec import Parameter
@@ -36,30 +36,9 @@ class Sizes(NamedTuple):
     n_p: int  # parameters
 
 
-class Equations(Protocol):
-    """A model's step in three parts, on lists of numbers, of NumPy rows or of vectors."""
-
-    @property
-    def sizes(self) -> Sizes:
-        """Numbers of states, inputs, disturbances and parameters."""
-        ...
-
-    def prepare(self, p: Values) -> Any:
-        """Return what depends on the parameters alone, c."""
-        ...
-
-    def renew(self, u: Values, c: Any, h: Any) -> Any:
-        """Return what depends on the switches among the inputs besides, and on the step h [s]."""
-        ...
-
-    def advance(self, x: Values, u: Values, d: Values, c: Any, kept: Any, h: Any) -> list[Any]:
-        """Return the state after h seconds."""
-        ...
-
-    def read(self, x: Values, c: Any) -> list[Any]:
-        """Return the outputs."""
-        ...
-
+# (x, u, d, p, h [s]) -> state after h seconds; (x, p) -> outputs: lists of numbers, NumPy rows or symbols
+Step = Callable[[Values, Values, Values, Values, Any], list[Any]]
+Output = Callable[[Values, Values], list[Any]]
 
 SMOOTH = 20.0  # [s] mean of a measured ambient, for its sensor is slow and coarse
 
@@ -211,27 +190,16 @@ class Described:
 
 
 def roll_rows(
-    steps: Equations,
-    x0: Array,
-    u: Array,
-    d: Array,
-    p: Array,
-    h: float,
-    renew: Mask | None = None,
-    pieces: int = 1,
+    step: Step, output: Output, x0: Array, u: Array, d: Array, p: Array, h: float, pieces: int = 1
 ) -> Run:
     """Do without a compiler what a compiled kernel does: the same lines on rows with one entry a member."""
-    n_batch, n = len(x0), u.shape[1]
-    c = steps.prepare(list(p.T))
-    x = list(x0.T.copy())
-    switched: Any = None
-    u_rows, d_rows = list(u.transpose(1, 2, 0)), list(d.transpose(1, 2, 0))
+    x, parameters = list(x0.T.copy()), list(p.T)
     with np.errstate(all="ignore"):  # what is not finite is found afterwards
-        outputs = [*steps.read(x, c)]
-        for t in range(n):
-            switched = steps.renew(u_rows[t], c, h) if renew is None or renew[t] else switched
+        outputs = [*output(x, parameters)]
+        for u_row, d_row in zip(u.transpose(1, 2, 0), d.transpose(1, 2, 0)):
             for _ in range(pieces):
-                x = steps.advance(x, u_rows[t], d_rows[t], c, switched, h)
-            outputs += steps.read(x, c)
-    y, last = ([np.broadcast_to(value, n_batch) for value in values] for values in (outputs, x))
-    return np.array(y, dtype=float).reshape(n + 1, -1, n_batch).transpose(2, 0, 1), np.array(last).T
+                x = step(x, list(u_row), list(d_row), parameters, h)
+            outputs += output(x, parameters)
+    y, last = ([np.broadcast_to(value, len(x0)) for value in values] for values in (outputs, x))
+    rows = u.shape[1] + 1
+    return np.array(y, dtype=float).reshape(rows, -1, len(x0)).transpose(2, 0, 1), np.array(last).T

@@ -94,19 +94,6 @@ class _Peltier(NamedTuple):
     values: tuple[Coefficient, ...]  # in the order of PELTIER
 
 
-class _Values(NamedTuple):
-    """What depends on the parameters alone: by element, in the order of :class:`ThermalSteps`."""
-
-    capacity: list[Any]
-    fixed: list[Any]
-    link: list[Any]
-    off: list[Any]
-    bend: list[Any]
-    radiation: list[Any]
-    heater: list[Any]
-    peltier: list[dict[str, Any]]
-
-
 class _Pivot(NamedTuple):
     """One step of an elimination."""
 
@@ -118,71 +105,54 @@ class _Pivot(NamedTuple):
 
 @dataclass(frozen=True)
 class ThermalSteps:
-    """The three parts of a step; see :class:`thermogrip.sysid.models.model.Equations`.  Places are numbers
-    and no parameter has a value, so that networks of one structure share what is compiled."""
+    """The equations of a network.  Places are numbers and no parameter has a value, so that networks of one
+    structure share what is compiled."""
 
     sizes: Sizes
+    switches: tuple[int, ...]  # inputs that are on or off
     capacities: tuple[Coefficient, ...]  # by state
     fixed: tuple[Coefficient, ...]  # temperatures of the boundaries
     links: tuple[_Link, ...]
     radiation: tuple[_Link, ...]
     heaters: tuple[_Heater, ...]
     peltiers: tuple[_Peltier, ...]
-    output: tuple[int, ...]  # (n_y,) state that each output reads
+    outputs: tuple[int, ...]  # (n_y,) state that each output reads
 
-    def prepare(self, p: Values) -> _Values:
-        """Return the coefficients."""
-        return _Values(
-            capacity=[item.of(p) for item in self.capacities],
-            fixed=[item.of(p) for item in self.fixed],
-            link=[link.value.of(p) for link in self.links],
-            off=[link.off.of(p) for link in self.links],
-            bend=[None if link.bend is None else link.bend.of(p) for link in self.links],
-            radiation=[item.value.of(p) for item in self.radiation],
-            heater=[item.power.of(p) for item in self.heaters],
-            peltier=[dict(zip(PELTIER, (v.of(p) for v in item.values))) for item in self.peltiers],
-        )
-
-    def renew(self, u: Values, c: _Values, h: Any) -> tuple[list[Any], list[_Pivot]]:
-        """Return the conductances, and the factors of 1 - g h A."""
-        g = self._conductances(u, c)
-        # A holds the conductances and flows, the only stiff terms: factorised once per change of the switches
-        return g, self._factors(c, g, GAMMA * h)
-
-    def advance(
-        self, x: Values, u: Values, d: Values, c: _Values, kept: tuple[list[Any], list[_Pivot]], h: Any
-    ) -> list[Any]:
-        """Return the state one step of ``h`` [s] on."""
-        g, factors = kept
-        outside = [*d, *c.fixed]
-        q = self._flows([*x, *outside], u, c, g)
+    def step(self, x: Values, u: Values, d: Values, p: Values, h: Any) -> list[Any]:
+        """Return the state ``h`` [s] later."""
+        capacity = self.capacity(p)
+        # A holds the conductances and flows, the only stiff terms
+        factors = self._factors(capacity, self._conductances(u, p), GAMMA * h)
         # (1 - g h A) k_1 = f(x)
-        k = _solved(factors, [a / b for a, b in zip(q, c.capacity)])
-        q = self._flows([*(a + h * b for a, b in zip(x, k)), *outside], u, c, g)
+        k = _solved(factors, [a / b for a, b in zip(self.heat(x, u, d, p), capacity)])
+        q = self.heat([a + h * b for a, b in zip(x, k)], u, d, p)
         # (1 - g h A) k_2 = f(x + h k_1) - 2 k_1, x+ = x + h (3 k_1 + k_2) / 2
-        k2 = _solved(factors, [a / b - 2.0 * e for a, b, e in zip(q, c.capacity, k)])
+        k2 = _solved(factors, [a / b - 2.0 * e for a, b, e in zip(q, capacity, k)])
         return [a + h * (1.5 * e + 0.5 * b) for a, e, b in zip(x, k, k2)]
 
-    def read(self, x: Values, c: Any) -> list[Any]:
+    def output(self, x: Values, p: Values) -> list[Any]:
         """Return what the sensors read [degC]."""
-        return [x[i] for i in self.output]
+        return [x[i] for i in self.outputs]
+
+    def capacity(self, p: Values) -> list[Any]:
+        """Return the heat capacity of each state [J/K] (sensors: time constant [s])."""
+        return [item.of(p) for item in self.capacities]
+
+    def _conductances(self, u: Values, p: Values) -> list[Any]:
+        """Return the conductance [W/K] of every link at these switch positions."""
+        # conductances and flows may hang on a switch, such as a pump, that leaves a share of them when off
+        values = []
+        for link in self.links:
+            value = link.value.of(p)
+            if link.switch >= 0:
+                off = link.off.of(p)
+                value = value * (off + (1.0 - off) * u[link.switch])
+            values.append(value)
+        return values
 
     def heat(self, x: Values, u: Values, d: Values, p: Values) -> list[Any]:
         """Return the heat that each state receives [W] (sensors: [K])."""
-        c = self.prepare(p)
-        return self._flows([*x, *d, *c.fixed], u, c, self._conductances(u, c))
-
-    def _conductances(self, u: Values, c: _Values) -> list[Any]:
-        """Return the conductance [W/K] of every link at these switch positions."""
-        # conductances and flows may hang on a switch, such as a pump, that leaves a share of them when off
-        return [
-            value if link.switch < 0 else value * (off + (1.0 - off) * u[link.switch])
-            for link, value, off in zip(self.links, c.link, c.off)
-        ]
-
-    def _flows(self, z: Values, u: Values, c: _Values, g: Values) -> list[Any]:
-        """Return the heat that each state receives [W], at temperatures z [degC]."""
-        n = self.sizes.n_x
+        z, n = [*x, *d, *(item.of(p) for item in self.fixed)], self.sizes.n_x
         q = [0.0 * z[i] for i in range(n)]
 
         def move(i: int, j: int, flow: Any, both: bool = True) -> None:
@@ -190,28 +160,29 @@ class ThermalSteps:
             if both and j < n:
                 q[j] = q[j] - flow
 
-        for link, conductance in zip(self.links, g):
+        for link, conductance in zip(self.links, self._conductances(u, p)):
             # taken from j, given to i; of a flow given to i only, the water of i moved on with its heat
-            move(link.to, link.source, conductance * (z[link.source] - z[link.to]), link.both)
-        for link, conductance, bend in zip(self.links, g, c.bend):
-            if bend is not None:
+            rise = z[link.source] - z[link.to]
+            move(link.to, link.source, conductance * rise, link.both)
+            if link.bend is not None:
                 # q_ij = G_ij (z_j - z_i) (1 + b |z_j - z_i| / 10 K)
-                rise = z[link.source] - z[link.to]
-                move(link.to, link.source, conductance * bend / BEND_SPAN * rise * abs(rise), link.both)
-        for link, factor in zip(self.radiation, c.radiation):
+                bent = conductance * link.bend.of(p) / BEND_SPAN * rise * abs(rise)
+                move(link.to, link.source, bent, link.both)
+        for link in self.radiation:
             # q_ij = k (T_j^4 - T_i^4)
             a, b = z[link.to] + KELVIN, z[link.source] + KELVIN
-            move(link.to, link.source, factor * (b * b * b * b - a * a * a * a))
-        for (i, source, measured, _), power in zip(self.heaters, c.heater):
+            move(link.to, link.source, link.value.of(p) * (b * b * b * b - a * a * a * a))
+        for heater in self.heaters:
             # P u, or P d of what is measured and not moved
-            q[i] = q[i] + power * (z[source] if measured else u[source])
-        for (face, sink, by, duty, _), element in zip(self.peltiers, c.peltier):
-            at_face, at_sink = _peltier_heat(element, u[by], z[face], z[sink], duty)
-            q[face] = q[face] + at_face
-            q[sink] = q[sink] + at_sink
+            drive = (z if heater.measured else u)[heater.source]
+            q[heater.state] = q[heater.state] + heater.power.of(p) * drive
+        for element in self.peltiers:
+            at_face, at_sink = _peltier_heat(element, u[element.input], z[element.face], z[element.sink], p)
+            q[element.face] = q[element.face] + at_face
+            q[element.sink] = q[element.sink] + at_sink
         return q
 
-    def _factors(self, c: _Values, g: Values, gh: Any) -> list[_Pivot]:
+    def _factors(self, capacity: Values, g: Values, gh: Any) -> list[_Pivot]:
         """Return the LU factors of 1 - gh A, by rows of what is not 0."""
         rows: list[dict[int, Any]] = [{i: 1.0} for i in range(self.sizes.n_x)]
 
@@ -220,12 +191,12 @@ class ThermalSteps:
 
         for link, conductance in zip(self.links, g):
             i, j = link.to, link.source
-            share = gh * conductance / c.capacity[i]
+            share = gh * conductance / capacity[i]
             add(i, i, share)
             if j < len(rows):
                 add(i, j, -share)
                 if link.both:
-                    share = gh * conductance / c.capacity[j]
+                    share = gh * conductance / capacity[j]
                     add(j, j, share)
                     add(j, i, -share)
         # 1 - gh A is diagonally dominant by columns and needs no pivots for its size
@@ -245,8 +216,9 @@ class ThermalSteps:
         return factors
 
 
-def _peltier_heat(element: dict[str, Any], u: Any, t_face: Any, t_sink: Any, duty: bool) -> tuple[Any, Any]:
+def _peltier_heat(peltier: _Peltier, u: Any, t_face: Any, t_sink: Any, p: Values) -> tuple[Any, Any]:
     """Return the heat that face and sink of an element receive [W]."""
+    element = {name: item.of(p) for name, item in zip(PELTIER, peltier.values)}
     v, dead = u / element["full"] + element["offset"], element["dead_zone"]
     # beyond a dead zone v_d, v - v_d replaces the command v
     v = v - 0.5 * (abs(v + dead) - abs(v - dead))
@@ -255,7 +227,7 @@ def _peltier_heat(element: dict[str, Any], u: Any, t_face: Any, t_sink: Any, dut
     size = abs(v)
     up, down = element["heating_gain"] * 0.5 * (v + size), element["cooling_gain"] * 0.5 * (v - size)
     droop = element["droop"] / DROOP_SPAN * (t_face - t_sink)
-    if duty:
+    if peltier.duty:
         # pulses of I_max (1 - r dT / 50) for the share v of the time: Joule heat goes with v, not its square
         on = element["current"] * (1.0 - droop)
         current, square = up * on, up * on * on
@@ -328,6 +300,7 @@ def thermal_steps(network: Network) -> ThermalSteps:
     at = _Places(network)
     return ThermalSteps(
         sizes=Sizes(at.n_x, len(network.inputs), len(network.disturbances), len(network.parameters)),
+        switches=tuple(k for k, item in enumerate(network.inputs.values()) if item.switch),
         capacities=tuple(_capacities(network, at)),
         fixed=tuple(at.coefficient(item.temperature) for item in network.boundaries.values()),
         links=tuple(_links(network, at)),
@@ -337,7 +310,7 @@ def thermal_steps(network: Network) -> ThermalSteps:
         ),
         heaters=tuple(_heater(network, heater, at) for heater in network.heaters.values()),
         peltiers=tuple(_peltier(network, element, at) for element in network.peltiers.values()),
-        output=tuple(
+        outputs=tuple(
             at.z[o.node if o.lag is None else f"{name}.sensor"] for name, o in network.outputs.items()
         ),
     )
@@ -454,13 +427,11 @@ class NetworkModel(Described):
 
     def step(self, x: Values, u: Values, d: Values, p: Values, dt: float) -> list[Any]:
         """Return the state after ``dt`` seconds; numbers, NumPy rows or CasADi symbols alike."""
-        steps = self.steps
-        c = steps.prepare(p)
-        return steps.advance(x, u, d, c, steps.renew(u, c, dt), dt)
+        return self.steps.step(x, u, d, p, dt)
 
     def output(self, x: Values, p: Values) -> list[Any]:
         """Return what the sensors read at state x [degC], a list of length n_y."""
-        return self.steps.read(x, ())
+        return self.steps.output(x, p)
 
     def rest(self, y: ArrayLike, u: ArrayLike, d: ArrayLike, p: ArrayLike) -> Array:
         """Return the state (n_x,) of a plant at rest whose sensors read y."""
@@ -520,10 +491,7 @@ class NetworkModel(Described):
     def rollout(self, x0: ArrayLike, u: ArrayLike, d: ArrayLike, p: ArrayLike, dt: float) -> Run:
         """Simulate a batch."""
         x0, u, d, p = (np.ascontiguousarray(value, dtype=float) for value in (x0, u, d, p))
-        switched = [self.inputs.index(name) for name in self.switches]
-        renew = np.ones(u.shape[1], dtype=bool)
-        renew[1:] = np.any(u[:, 1:, switched] != u[:, :-1, switched], axis=(0, 2)) if switched else False
-        return _kernel(self.steps).rollout(x0, u, d, p, float(dt), renew)
+        return _kernel(self.steps).rollout(x0, u, d, p, float(dt))
 
     def to_dict(self) -> dict[str, Any]:
         """Return the whole network as plain JSON."""
@@ -605,4 +573,4 @@ def _kernel(steps: ThermalSteps) -> Kernel:
     """Return the compiled steps."""
     from thermogrip.sysid.models.jit_rollout import Kernel  # pulls in llvmlite
 
-    return Kernel(steps)
+    return Kernel(steps.step, steps.output, steps.sizes, steps.switches)

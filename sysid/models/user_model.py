@@ -10,10 +10,10 @@
         def rhs(self, x, u, d, p):
             return [p.inflow * u.pump - p.outflow * np.sqrt(np.maximum(x.level, 0.0))]
 
-The arguments are named tuples.  The same lines run on numbers, on rows of a batch, compiled
-(:mod:`thermogrip.sysid.models.jit_rollout`), and on CasADi symbols, so a choice between two values is
-``np.where`` or ``np.maximum``, never ``if``, and comparisons are joined by ``np.logical_and``, not by ``&``;
-what vectors cannot say (sorting, a function of SciPy) NumPy runs on whole batches, more slowly.
+The arguments are named tuples.  The same lines run on numbers, on rows of a batch and on CasADi symbols, so a
+choice between two values is ``np.where`` or ``np.maximum``, never ``if``, and comparisons are joined by
+``np.logical_and``, not by ``&``; what symbols cannot say (sorting, a function of SciPy) NumPy runs on whole
+batches, more slowly than the machine code that is made of symbols.
 """
 
 from __future__ import annotations
@@ -141,8 +141,7 @@ class _Attributes(_Table):
 
 
 class OwnCode:
-    """A user's class, its tables checked and its functions guarded: the steps of a model
-    (:class:`thermogrip.sysid.models.model.Equations`)."""
+    """A user's class, its tables checked and its functions guarded."""
 
     def __init__(self, made: Any) -> None:
         self.made, self.name = made, type(made).__name__
@@ -193,21 +192,14 @@ class OwnCode:
         """Numbers of states, inputs, disturbances and parameters."""
         return Sizes(len(self.states), len(self.inputs), len(self.disturbances), len(self.parameters))
 
-    def prepare(self, p: Values) -> list[Any]:
-        """Return the parameters."""
-        return list(p)
-
-    def renew(self, u: Values, c: Values, h: Any) -> list[Any]:
-        """Return nothing: no part of a class is known to hang on switches alone."""
-        return []
-
-    def advance(self, x: Values, u: Values, d: Values, c: Values, kept: Values, h: Any) -> list[Any]:
-        """Return the state one Runge-Kutta step of ``h`` on."""
+    def step(self, x: Values, u: Values, d: Values, p: Values, h: Any) -> list[Any]:
+        """Return the state one Runge-Kutta step of ``h`` on; CasADi's symbols too."""
+        x, u, d, p = (_for_numpy(values) for values in (x, u, d, p))
         # the classical rule of fourth order for dx/dt = f(x, u, d, p), u and d held over a step
-        k1 = self.rhs(x, u, d, c)
-        k2 = self.rhs([a + h / 2 * k for a, k in zip(x, k1)], u, d, c)
-        k3 = self.rhs([a + h / 2 * k for a, k in zip(x, k2)], u, d, c)
-        k4 = self.rhs([a + h * k for a, k in zip(x, k3)], u, d, c)
+        k1 = self.rhs(x, u, d, p)
+        k2 = self.rhs([a + h / 2 * k for a, k in zip(x, k1)], u, d, p)
+        k3 = self.rhs([a + h / 2 * k for a, k in zip(x, k2)], u, d, p)
+        k4 = self.rhs([a + h * k for a, k in zip(x, k3)], u, d, p)
         state = [a + h / 6 * (s + 2 * (q + r) + t) for a, s, q, r, t in zip(x, k1, k2, k3, k4)]
         # a state with limits is put back inside them after each of the n pieces of a step
         for i, (low, high) in enumerate(self.limits):
@@ -215,14 +207,14 @@ class OwnCode:
                 state[i] = np.maximum(state[i], low)
             if np.isfinite(high):
                 state[i] = np.minimum(state[i], high)
-        return state
+        return _plain(state)
 
-    def read(self, x: Values, c: Values) -> list[Any]:
+    def output(self, x: Values, p: Values) -> list[Any]:
         """Return what the outputs read, a list of length n_y."""
         if not hasattr(self.made, "output"):
             named = dict(zip(self.states, x))
             return [named[name] for name in self.outputs]
-        return self._call("output", self.outputs, (self.X(*x), self.P(*c)))
+        return _plain(self._call("output", self.outputs, (self.X(*_for_numpy(x)), self.P(*_for_numpy(p)))))
 
     def rhs(self, x: Values, u: Values, d: Values, p: Values) -> list[Any]:
         """Return dx/dt, a list of length n_x."""
@@ -248,7 +240,7 @@ class OwnCode:
             if fields is not None:  # of a named tuple of the arguments
                 hint = f"the {type(error.obj).__name__} are {', '.join(fields) or 'none'}"  # type: ignore[attr-defined]
             elif "ArrayInterface" in str(error):
-                hint = "what is controlled or exported joins comparisons with np.logical_and, not with &"
+                hint = "join comparisons with np.logical_and, not with &"
             elif "truth value" in str(error):
                 hint = "an if about many values at once: choose with np.where or np.maximum"
             problem = f"fails in {what}: {type(error).__name__}: {error}"
@@ -326,7 +318,7 @@ def compile_steps(code: OwnCode) -> tuple[Kernel | None, str]:
     from thermogrip.sysid.models.jit_rollout import Kernel  # pulls in llvmlite
 
     try:
-        return Kernel(code, in_pieces=True), ""
+        return Kernel(code.step, code.output, code.sizes), ""
     except UserError as error:
         return None, error.problem
 
@@ -348,7 +340,7 @@ def still(code: OwnCode, y: Array, u: Array, d: Array, p: Array, *, sd: Array, s
         """Return the residuals (n_r,) at states, then inputs, in units of their scale."""
         x, v = z[:n_x] * scale, np.where(moved, z[n_x:] * wide, u)
         flow = seconds * np.array(code.rhs(list(x), list(v), list(d), list(p)), dtype=float)
-        read = np.array(code.read(list(x), list(p)), dtype=float)
+        read = np.array(code.output(list(x), list(p)), dtype=float)
         miss = (OWN.sensor_weight * (read - y) / sd)[is_read]
         return np.concatenate([flow / scale, miss, OWN.input_weight * (z[n_x:] - u / wide)])
 
@@ -394,15 +386,14 @@ class OwnModel(Described):
 
     def step(self, x: Values, u: Values, d: Values, p: Values, dt: float) -> list[Any]:
         """Return the state after ``dt`` seconds; numbers, NumPy rows or CasADi symbols alike."""
-        n = self._pieces(dt)
-        state, u, d, p = (_for_numpy(values) for values in (x, u, d, p))
+        n, state = self._pieces(dt), list(x)
         for _ in range(n):
-            state = self.code.advance(state, u, d, p, (), dt / n)
-        return _plain(state)
+            state = self.code.step(state, u, d, p, dt / n)
+        return state
 
     def output(self, x: Values, p: Values) -> list[Any]:
         """Return what the outputs read at state x, a list of length n_y."""
-        return _plain(self.code.read(_for_numpy(x), _for_numpy(p)))
+        return self.code.output(x, p)
 
     def rest(self, y: ArrayLike, u: ArrayLike, d: ArrayLike, p: ArrayLike) -> Array:
         """Return the state (n_x,) of a plant at rest whose outputs read y: the class's own or a found one."""
@@ -430,7 +421,7 @@ class OwnModel(Described):
         n = self._pieces(dt)
         kernel = compile_steps(self.code)[0]
         if kernel is None:
-            return roll_rows(self.code, x0, u, d, p, dt / n, pieces=n)
+            return roll_rows(self.code.step, self.code.output, x0, u, d, p, dt / n, pieces=n)
         return kernel.rollout(x0, u, d, p, dt / n, pieces=n)
 
     def prepared(self, free_runs: FreeRuns, spread: Mapping[str, float], p: Array | None = None) -> OwnModel:
@@ -567,6 +558,6 @@ def own_model(kind: Any) -> OwnModel:
     x, u, d = ([np.ones(2)] * n for n in (model.n_x, len(model.inputs), len(model.disturbances)))
     with np.errstate(all="ignore"):
         code.rhs(x, u, d, two)
-        code.read(x, two)
+        code.output(x, two)
         code.rest([1.0] * len(model.outputs), [1.0] * len(u), [1.0] * len(d), model.prior.tolist())
     return model

@@ -279,7 +279,7 @@ def _rate(plant: PlantData) -> Callable[[Array, Array, Array], Array] | None:
     model: Any = plant.model
     p = plant.p.tolist()
     if plant.model.kind == "network":
-        capacities = model.steps.prepare(p).capacity
+        capacities = model.steps.capacity(p)
 
         def heated(x: Array, u: Array, d: Array) -> Array:
             flows = model.steps.heat(list(x.T), list(u.T), list(d.T), p)

@@ -10,11 +10,8 @@ import pytest
 
 from tests.mpc.design.test_design import block
 from tests.mpc.makers import kit, network_plant
-from tests.mpc.native.test_codegen import PAIRS, meant
 from thermogrip.mpc.design.design import make_blocks
-from thermogrip.mpc.native.codegen import _OPERATIONS
 from thermogrip.mpc.plant.prediction import (
-    _ARITHMETIC,
     PredictionModel,
     held_start,
     holding_drive,
@@ -81,11 +78,6 @@ def test_derivatives_along_a_plan_are_those_that_casadi_finds(tank, gripper, nam
         )
 
 
-@pytest.mark.parametrize("name", ["gripper", "peltier_chamber", "tclab"])
-def test_steps_of_networks_are_machine_code(name):
-    assert PredictionModel(network_plant(name))._kernel is not None
-
-
 def test_a_step_that_is_more_than_arithmetic_is_linearised_too(tank):
     class Bent(type(tank.model)):
         """The tank, its drive through an arc tangent."""
@@ -116,7 +108,6 @@ def test_a_step_that_is_more_than_arithmetic_is_linearised_too(tank):
     bent = Bent(**{name: getattr(tank.model, name) for name in names})
     model = PredictionModel(replace(tank, model=bent), dt=2.0)
     x = model.rest(np.array([25.0, 25.0]), ROOM)
-    assert model._kernel is None
     _, _, B, _ = model.linearise(x, np.array([0.5]), ROOM)
     _, _, straight, _ = PredictionModel(tank, dt=2.0).linearise(x, np.array([0.5]), ROOM)
     np.testing.assert_allclose(B, straight / (1 + 0.5**2), rtol=1e-9)
@@ -240,16 +231,6 @@ def test_a_reading_may_be_as_far_from_the_logs_as_they_are_wide(valid, ends, spi
     model = PredictionModel(replace(block(10, 50.0), valid={"q": (0.0, 100.0)} | valid))
     assert (model.coldest, model.hottest) == ends
     assert model.spike.tolist() == [spike]
-
-
-def test_each_operation_of_a_compiled_step_does_what_casadi_does():
-    for name, done in _ARITHMETIC.items():
-        places = sum(part in _OPERATIONS[name][0] for part in ("{0}", "{1}"))
-        for pair in PAIRS:
-            want = meant(name[3:], pair)
-            if np.isfinite(want):
-                given = (pair[0], 2.5 if name == "OP_CONSTPOW" else pair[1])[:places]
-                assert done(*given) == pytest.approx(want, rel=1e-14), (name, pair)
 
 
 def test_a_steady_state_is_one_that_stays_or_none(tank):

@@ -173,7 +173,7 @@ def test_compiled_rows_and_symbols_run_the_same_equations(name: str):
     x0 = rng.uniform(15.0, 45.0, (batch, model.n_x))
     p = model.prior * rng.uniform(0.8, 1.2, (batch, model.prior.size))
     y, end = model.rollout(x0, u, d, p, model.dt)
-    y_rows, end_rows = roll_rows(model.steps, x0, u, d, p, model.dt, np.ones(n, dtype=bool))
+    y_rows, end_rows = roll_rows(model.step, model.output, x0, u, d, p, model.dt)
     np.testing.assert_allclose(y_rows, y, rtol=0, atol=1e-10)
     np.testing.assert_allclose(end_rows, end, rtol=0, atol=1e-10)
     parts = [
@@ -333,7 +333,7 @@ def test_what_a_network_says_of_its_signals_is_what_its_file_says():
     assert (model.switches, model.average, model.dt) == (("pump",), 7.0, 0.5)
     assert (model.independent, model.warmup, model.smooth) == (60.0, 60.0, 20.0)
     np.testing.assert_allclose(np.sqrt(np.diag(model.spread)), [1.0, 3.0, 1.0] + [0.5] * 6)
-    assert [float(c) for c in model.steps.prepare(model.prior.tolist()).capacity] == pytest.approx(
+    assert [float(c) for c in model.steps.capacity(model.prior.tolist())] == pytest.approx(
         [500.0, 200.0, 80.0, 48.0, 15.0, 48.0, 15.0, 96.0, 3.0]
     )
     plain = model_of(everything())

@@ -157,7 +157,8 @@ def test_compiled_rows_and_symbols_agree():
     x0, pump = rng.uniform(0.0, 12.0, (5, 2)), rng.uniform(0, 9, (1, 200, 1))
     p = fast.prior * rng.uniform(0.5, 2.0, (5, 3))
     run = x0, pump, np.zeros((1, 200, 0)), p
-    ends = [roll_rows(fast.code, *run, 4.0 / 3, pieces=3), fast.rollout(*run, 4.0)]
+    code = fast.code
+    ends = [roll_rows(code.step, code.output, *run, 4.0 / 3, pieces=3), fast.rollout(*run, 4.0)]
     assert fast.slow_because == ""
     np.testing.assert_allclose(ends[0][0], ends[1][0], atol=1e-10)
     np.testing.assert_allclose(ends[0][1], ends[1][1], atol=1e-10)
@@ -182,7 +183,8 @@ def test_a_limit_holds_the_level_and_lets_it_go_at_once():
 
     pump = np.repeat([1.0, -1.0], [10, 2])[None, :, None]
     run = np.zeros((1, 1)), pump, np.zeros((1, 12, 0)), np.ones((1, 1)), 1.0
-    for y, _ in (own_model(Bucket).rollout(*run), roll_rows(own_model(Bucket).code, *run)):
+    model = own_model(Bucket)
+    for y, _ in (model.rollout(*run), roll_rows(model.step, model.output, *run)):
         np.testing.assert_allclose(y[0, :, 0], [0, 1, 2, 3, 3, 3, 3, 3, 3, 3, 3, 2, 1], atol=1e-12)
 
 
