@@ -12,10 +12,8 @@ import atexit
 import os
 import signal
 import threading
-from collections.abc import Callable, Generator, Iterable, Iterator
-from concurrent.futures import Future, as_completed
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import closing
 from importlib.util import find_spec
 from typing import Any, TypeAlias, TypeVar
 from warnings import catch_warnings, simplefilter
@@ -55,16 +53,10 @@ def in_order(
     the fraction done and ``what``.
     """
     todo = list(items)
-    waiting: dict[int, _Result] = {}
-    following = 0
-    with closing(_done(function, todo, workers)) as done:
-        for count, (place, result) in enumerate(done, start=1):
-            waiting[place] = result
-            if progress is not None:
-                progress(count / len(todo), what)
-            while following in waiting:
-                yield waiting.pop(following)
-                following += 1
+    for count, result in enumerate(_results(function, todo, check_workers(workers)), start=1):
+        if progress is not None:
+            progress(count / len(todo), what)
+        yield result
 
 
 def check_workers(workers: Workers) -> Workers:
@@ -93,46 +85,26 @@ def sub_progress(progress: Progress | None, start: float, stop: float, name: str
     return show
 
 
-def _done(
-    function: Callable[[_Item], _Result], todo: list[_Item], workers: Workers
-) -> Generator[tuple[int, _Result], None, None]:
-    """Yield the place of each item and its result, in the order of finishing."""
-    check_workers(workers)
-    if isinstance(workers, str):
-        if todo:
-            from distributed import KilledWorker
+def _results(function: Callable[[_Item], _Result], todo: list[_Item], workers: Workers) -> Iterator[_Result]:
+    """Yield the result of each item; what has not begun is cancelled where the rest is not asked for."""
+    if isinstance(workers, str) and todo:
+        from distributed import KilledWorker
 
-            problem = f"workers of {workers} are killed again and again"
-            with as_user_error(KilledWorker, problem, hint="give them more memory"):
-                yield from _in_pool(_client_of(workers).get_executor(), function, todo)
+        problem = f"workers of {workers} are killed again and again"
+        with as_user_error(KilledWorker, problem, hint="give them more memory"):
+            yield from _client_of(workers).get_executor(pure=False).map(function, todo)
         return
-    n = min(workers, os.cpu_count() or 1)
+    n = min(workers, os.cpu_count() or 1) if isinstance(workers, int) else 1
     if n == 1 or len(todo) < 2:
-        yield from enumerate(map(function, todo))
+        yield from map(function, todo)
         return
     pool, hint = _processes(n), "lower --workers; memory may be short"
     try:
         with as_user_error(BrokenProcessPool, "a worker process was killed", hint=hint):
-            yield from _in_pool(pool, function, todo)
+            yield from pool.map(function, todo)
     except KeyboardInterrupt:
         pool.shutdown(wait=True, kill_workers=True)
         raise
-
-
-def _in_pool(
-    pool: Any, function: Callable[[_Item], _Result], todo: list[_Item]
-) -> Generator[tuple[int, _Result], None, None]:
-    places: dict[Future[_Result], int] = {}
-    try:
-        places |= {pool.submit(function, item): place for place, item in enumerate(todo)}
-        for future in as_completed([*places]):
-            result = future.result()
-            place = places.pop(future)  # it holds the result, of which only the caller may need many
-            del future
-            yield place, result
-    finally:
-        for future in places:
-            future.cancel()  # what has not begun
 
 
 def _processes(n: int) -> Any:
