@@ -11,8 +11,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -37,7 +36,7 @@ from thermogrip.datasets.units import rename_hint, split_header, to_record_unit
 
 if TYPE_CHECKING:
     import xarray as xr
-    from pandas import DataFrame
+    from pandas import DataFrame, Index, Series
 
     from thermogrip.datasets.schema import Grasps
 
@@ -50,17 +49,8 @@ _FROM_META = {"t_object_nominal": "t_object", "t_gripper_set": "t_gripper"}
 #: Names in the meta file of what a record calls otherwise.
 META_NAMES = {ours: theirs for theirs, ours in _FROM_META.items()}
 _ENDINGS = (".csv", ".csv.gz", ".csv.xz")
-_SAMPLE_COLUMNS = ("time", "t_surface")  # how the columns of a sample begin that are numbers
-
-
-@dataclass(frozen=True)
-class _Samples:
-    """The rows of a table of samples, in its units of records."""
-
-    grasp_ids: list[str]  # (n_row,)
-    time: Floats  # (n_row,) [s]
-    channels: dict[str, Floats]  # (n_row,) [degC]
-    repairs: list[str]
+_SAMPLES = {"time": "s", "t_surface": "degC", "t_surface_2": "degC"}  # what a sample has, and its unit
+_SAMPLE_PREFIXES = ("grasp_id", "time", "t_surface")
 
 
 def read_grasps(path: str | Path, *, name: str | None = None) -> Grasps:
@@ -102,21 +92,6 @@ def read_grasps(path: str | Path, *, name: str | None = None) -> Grasps:
         raise UserError("grasps are CSV, NetCDF or Parquet", file=path, hint="use one of them")
     samples = read_csv_table(path, text=_is_text)
     return _of_tables(samples, read_csv_table(_meta_path(path), text=_is_text), name or file_stem(path))
-
-
-def _with_level_before(grasps: Grasps, path: str | Path) -> Grasps:
-    """Return grasps with their level before contact; UserError where one has no sample on either side."""
-    grasps = with_lead_in(grasps)
-    time, finite = grasps["time"].values, np.isfinite(grasps["t_surface"].values)
-    for side, has, hint in (
-        ("before", finite[:, time < 0].any(axis=1), "record from 2 s before, or give t_gripper_set_degC"),
-        ("after", finite[:, time > 0].any(axis=1), "is this a grasp? remove it or record the contact"),
-    ):
-        if not has.all():
-            grasp = str(grasps["grasp"].values[int(np.argmin(has))])
-            problem = f"grasp {grasp!r} has no sample {side} the closed message at 0 s"
-            raise UserError(problem, file=path, hint=hint)
-    return grasps
 
 
 def as_grasps(grasps: Records) -> list[Grasps]:
@@ -198,14 +173,13 @@ def list_grasp_files(paths: Sequence[str | Path]) -> list[Path]:
             continue
         with os_faults(path):
             inside = sorted(path.iterdir())
-        shown = (file for file in inside if not file.name.startswith("."))
         endings = (*_ENDINGS, ".nc", ".parquet", ".pq")
-        of_grasps = [file for file in shown if file.name.lower().endswith(endings)]
-        files += [file for file in of_grasps if not file_stem(file).endswith("_meta")]
-        if not of_grasps:
-            hint = "give a folder with .csv, .nc or .parquet in it"
-            if any(file.is_dir() for file in inside):
-                hint += f", or a pattern in quotes: '{path}/*/*.parquet'"
+        tables = [file for file in inside if file.name.lower().endswith(endings) and file.name[0] != "."]
+        files += [file for file in tables if not file_stem(file).endswith("_meta")]
+        if not tables:
+            has_folders = any(file.is_dir() for file in inside)
+            deeper = f", or a pattern in quotes: '{path}/*/*.parquet'" if has_folders else ""
+            hint = f"give a folder with .csv, .nc or .parquet in it{deeper}"
             raise UserError("holds no grasp files", file=path, hint=hint)
     return files
 
@@ -225,68 +199,91 @@ def distinct_names(files: Sequence[Path]) -> list[str | None]:
 
 def _is_text(header: str) -> bool:
     """Tell whether a column of grasps is left as text: its name is that of no number."""
-    return not header.startswith(_SAMPLE_COLUMNS) and _name_of_fact(header)[0] not in GRASP_NUMBERS
+    return not header.startswith(("time", "t_surface")) and _name_and_unit(header)[0] not in GRASP_NUMBERS
 
 
-def _samples_of(table: Table) -> _Samples:
-    """Return the samples of a table, in which the facts of a grasp may stand too."""
-    file = table.file
+def _name_and_unit(header: str, file: str | None = None) -> tuple[str, str]:
+    """Return what a record calls a column, and its unit; no name where it means nothing."""
+    prefixes = (*_SAMPLE_PREFIXES, *GRASP_LABELS, *GRASP_NUMBERS)
+    if not re.fullmatch(r"\S+", header) or not header.lower().startswith(prefixes):
+        return "", ""
+    name, unit = split_header(header, file=file)
+    return name.lower() if name.lower() in GRASP_LABELS else _FROM_META.get(name, name), unit  # "Material"
+
+
+def _columns(table: Table, wanted: Collection[str]) -> tuple[dict[str, Any], list[str]]:
+    """Return the columns of these names in a record, in its units, and what was converted."""
+    columns: dict[str, Any] = {}
+    converted = []
+    for header in (*table.text, *table.numbers):
+        name, unit = _name_and_unit(header, table.file)
+        if name in columns:
+            raise UserError(f"gives {name} a second time", file=table.file, column=header, hint="keep one")
+        if name in GRASP_LABELS and name in wanted:
+            columns[name] = np.asarray(table.text[header])
+        elif name in wanted:
+            columns[name], unit_after = to_record_unit(table.numbers[header], unit)
+            wanted_unit = (_SAMPLES | GRASP_NUMBERS)[name]
+            if unit_after != wanted_unit:
+                problem = "has no unit" if unit == "1" else f"unit {unit!r} does not fit"
+                hint = f"it is in {wanted_unit}: write {name}_{wanted_unit}"
+                raise UserError(problem, file=table.file, column=header, hint=hint)
+            if unit_after != unit:
+                converted.append(f"{name}: converted from {unit} to {unit_after}")
+    return columns, converted
+
+
+def _grasp_ids(table: Table, hint: str) -> NDArray[np.str_]:
     if "grasp_id" not in table.text:
-        hint = "a grasp file has grasp_id,time_s,t_surface_degC"
-        raise UserError("no column grasp_id", file=file, hint=hint)
-    channels, repairs = {}, list(table.notes)
-    for header in [header for header in table.numbers if header.startswith(_SAMPLE_COLUMNS)]:
-        name, unit = split_header(header, file=file)
-        channels[name], unit_after = to_record_unit(table.numbers[header], unit)
-        if name.startswith("t_surface") and unit_after != "degC":
-            raise UserError("is not a temperature", file=file, column=header, hint=f"write {name}_degC")
-        if name == "time" and unit_after != "s":
-            raise UserError("is not a time", file=file, column=header, hint="write time_s or time_ms")
-        if unit_after != unit:
-            repairs.append(f"{name}: converted from {unit} to {unit_after}")
-    for need, wanted in (("time", "time_s"), ("t_surface", "t_surface_degC")):
-        if need not in channels:
-            hint = rename_hint(need, [*table.text, *table.numbers])
-            raise UserError(f"no column {wanted}", file=file, hint=hint)
-    time, ids = channels["time"], table.text["grasp_id"]
-    if not np.isfinite(time).all():
-        row = int(table.lines[np.argmin(np.isfinite(time))])
-        raise UserError("has no time", file=file, row=row, hint="remove the row")
-    if "" in ids:
-        row = int(table.lines[ids.index("")])
-        raise UserError("is empty", file=file, row=row, column="grasp_id", hint="name the grasp")
-    skin = {name: values for name, values in channels.items() if name in ("t_surface", "t_surface_2")}
-    return _Samples(ids, np.round(time, 6), skin, repairs)
+        raise UserError("no column grasp_id", file=table.file, hint=hint)
+    return np.asarray(table.text["grasp_id"])
 
 
-def _onto_one_axis(samples: _Samples, order: Sequence[str], file: str) -> tuple[Floats, dict[str, Floats]]:
-    """Return the common time axis (n_time,) and the channels (n_grasp, n_time); what is repaired is added to
-    the samples' repairs."""
+def _samples_of(table: Table) -> tuple[DataFrame, list[str]]:
+    """Return the samples of a table, in which the facts of a grasp may stand too, and what was repaired:
+    columns ``grasp_id``, ``time`` [s] and those of the sensors [degC]."""
     import pandas as pd
 
-    time, rows_of = samples.time, []
-    rows_by_grasp = pd.Series(samples.grasp_ids).groupby(samples.grasp_ids).indices
-    for grasp in order:
-        rows = rows_by_grasp[grasp]
-        steps = np.diff(time[rows])
-        if (back := np.flatnonzero(steps < 0)).size:
-            begin, end = time[rows[back[0] : back[0] + 2]]
-            problem = f"grasp {grasp!r}: time runs back from {begin:g} s to {end:g} s"
-            raise UserError(problem, file=file, hint="sort its rows, or give each grasp its own grasp_id")
-        if repeated := int((steps == 0).sum()):
-            samples.repairs.append(f"grasp {grasp}: {repeated} repeated time stamp(s) dropped")
-        rows_of.append(rows[np.append(True, steps > 0)])
-    step = _common_step([time[rows] for rows in rows_of], order, file)
+    file = table.file
+    ids = _grasp_ids(table, "a grasp file has grasp_id,time_s,t_surface_degC")
+    columns, converted = _columns(table, _SAMPLES)
+    for need, header in (("time", "time_s"), ("t_surface", "t_surface_degC")):
+        if need not in columns:
+            hint = rename_hint(need, [*table.text, *table.numbers])
+            raise UserError(f"no column {header}", file=file, hint=hint)
+    if (lost := ~np.isfinite(columns["time"])).any():
+        raise UserError("has no time", file=file, row=int(table.lines[lost.argmax()]), hint="remove the row")
+    if (empty := ids == "").any():
+        row = int(table.lines[empty.argmax()])
+        raise UserError("is empty", file=file, row=row, column="grasp_id", hint="name the grasp")
+    columns["time"] = np.round(columns["time"], 6)
+    return pd.DataFrame({"grasp_id": ids} | columns), [*table.notes, *converted]
+
+
+def _onto_one_axis(samples: DataFrame, file: str, repairs: list[str]) -> tuple[Floats, dict[str, Floats]]:
+    """Return the common time axis (n_time,) and the channels (n_grasp, n_time), grasps in order of their
+    first rows; what is repaired is added to the repairs."""
+    steps = samples.groupby("grasp_id", sort=False)["time"].diff()
+    if (back := np.flatnonzero(steps < 0)).size:
+        grasp, end = samples[["grasp_id", "time"]].iloc[back[0]]
+        problem = f"grasp {grasp!r}: time runs back from {end - steps.iloc[back[0]]:g} s to {end:g} s"
+        raise UserError(problem, file=file, hint="sort its rows, or give each grasp its own grasp_id")
+    repeated = samples["grasp_id"][steps == 0].value_counts(sort=False)
+    repairs += [f"grasp {grasp}: {n} repeated time stamp(s) dropped" for grasp, n in repeated.items()]
+    samples = samples[steps != 0]
+    by_grasp = samples.groupby("grasp_id", sort=False)
+    step = _common_step(by_grasp["time"].agg(_mean_step), file)
+    time = samples["time"].to_numpy()
     axis = np.unique(time)
     # where stamps jitter each grasp is interpolated linearly onto the common step, and left NaN where the
     # nearest samples are more than 1.5 steps apart
     if not _is_even(axis, step):
         first, last = np.ceil(time.min() / step - 1e-6), np.floor(time.max() / step + 1e-6)
         axis = np.round(step * np.arange(first, last + 1), 9)
-        samples.repairs.append(f"time stamps jitter: interpolated onto a step of {step:g} s")
+        repairs.append(f"time stamps jitter: interpolated onto a step of {step:g} s")
     return axis, {
-        name: np.stack([_on_axis(axis, time[rows], values[rows], step) for rows in rows_of])
-        for name, values in samples.channels.items()
+        name: np.stack([_on_axis(axis, rows["time"], rows[name], step) for _, rows in by_grasp])
+        for name in samples.columns.drop(["grasp_id", "time"])
     }
 
 
@@ -300,31 +297,32 @@ def _is_even(axis: Floats, step: float) -> bool:
     return bool(np.abs(axis - axis[0] - exact * count).max() <= 0.02 * step)
 
 
-def _common_step(times: Sequence[Floats], order: Sequence[str], file: str) -> float:
-    """Return the median over grasps of the mean step, in which a hole counts as the steps that it is long."""
-    steps = np.full(len(times), np.nan)
-    for grasp, time in enumerate(times):
-        if time.size > 1:
-            moves = np.diff(time)
-            steps[grasp] = np.ptp(time) / np.maximum(np.round(moves / np.median(moves)), 1).sum()
-    if np.isnan(steps).all():
+def _mean_step(time: Series[float]) -> float:
+    """Return the mean step of a grasp, in which a hole counts as the steps that it is long; NaN of one
+    sample."""
+    moves = np.diff(time)
+    return np.ptp(time) / np.maximum(np.round(moves / np.median(moves)), 1).sum() if moves.size else np.nan
+
+
+def _common_step(steps: Series[float], file: str) -> float:
+    """Return the median of the grasps' steps [s]."""
+    if steps.isna().all():
         raise UserError("no grasp has two samples", file=file, hint="give the whole recording of each grasp")
-    step = float(np.nanmedian(steps))
-    odd = np.abs(steps / step - 1) > 0.2  # NaN compares false
-    if odd.any():
-        grasp = int(odd.argmax())
-        problem = f"grasp {order[grasp]!r} has a step of {steps[grasp]:g} s, the others {step:g} s"
+    step = float(steps.median())
+    odd = steps[(steps / step - 1).abs() > 0.2]  # NaN compares false
+    for grasp, its_step in odd[:1].items():
+        problem = f"grasp {grasp!r} has a step of {its_step:g} s, the others {step:g} s"
         raise UserError(problem, file=file, hint="give grasps of another rate a file of their own")
     plain = float(f"{step:.2g}")
     return plain if abs(plain / step - 1) < 0.01 else float(f"{step:.4g}")
 
 
-def _on_axis(axis: Floats, time: Floats, values: Floats, step: float) -> Floats:
+def _on_axis(axis: Floats, time: Series[float], values: Series[float], step: float) -> Floats:
     """Return a grasp on the axis: as it is where it has a sample, NaN where none is near."""
     finite = np.isfinite(values)
     if not finite.any():
         return np.full(axis.size, np.nan)
-    t = time[finite]
+    t = time[finite].to_numpy()
     after = np.clip(np.searchsorted(t, axis), 0, t.size - 1)
     before = np.clip(np.searchsorted(t, axis, side="right") - 1, 0, t.size - 1)
     inside = (axis >= t[0] - 0.5 * step) & (axis <= t[-1] + 0.5 * step)
@@ -342,98 +340,64 @@ def _meta_path(path: str | Path) -> Path:
     return meta_path
 
 
-def _name_of_fact(header: str, file: str | None = None) -> tuple[str, str]:
-    """Return what a record calls a column of the meta file, and its unit; no name where it means nothing."""
-    prefixes = ("grasp_id", *GRASP_LABELS, *GRASP_NUMBERS)
-    if not re.fullmatch(r"\S+", header) or not header.lower().startswith(prefixes):
-        return "", ""
-    name, unit = split_header(header, file=file)
-    return name.lower() if name.lower() in GRASP_LABELS else _FROM_META.get(name, name), unit  # "Material"
-
-
-def _facts_of(table: Table, rows: Sequence[int]) -> dict[str, Any]:
-    """Return what is known of each grasp, from a row of each."""
-    facts: dict[str, Any] = {}
-    for header in (*table.text, *table.numbers):
-        name, unit = _name_of_fact(header, table.file)
-        if name in facts:
-            raise UserError(f"gives {name} a second time", file=table.file, column=header, hint="keep one")
-        if name in GRASP_NUMBERS:
-            numbers, unit = to_record_unit(table.numbers[header], unit)
-            if unit != GRASP_NUMBERS[name]:
-                hint = f"it is in {GRASP_NUMBERS[name]}: write {name}_{GRASP_NUMBERS[name]}"
-                raise UserError(f"unit {unit!r} does not fit", file=table.file, column=header, hint=hint)
-            facts[name] = numbers[[*rows]]
-        elif name in GRASP_LABELS:
-            facts[name] = [table.text[header][row] for row in rows]
-    return facts
-
-
-def _unused(table: Table, known: Sequence[str]) -> list[str]:
+def _unused(table: Table, known: Collection[str]) -> list[str]:
     """Return a line about the columns of a table that are none of the known ones, if there are any."""
-    used = ("grasp_id", "pump", *_SAMPLE_COLUMNS)
+    used = ("pump", *_SAMPLE_PREFIXES)
     columns = [header for header in (*table.text, *table.numbers) if not header.startswith(used)]
-    unused = [header for header in columns if _name_of_fact(header)[0] not in known]
+    unused = [header for header in columns if _name_and_unit(header)[0] not in known]
     numbers = (f"{META_NAMES.get(name, name)}_{unit}" for name, unit in GRASP_NUMBERS.items())
     hint = f"known are {', '.join([*numbers, *GRASP_LABELS])}"
     return [f"{Path(table.file).name}: not used: {', '.join(unused)}; {hint}"] if unused else []
 
 
-def _rows_of_meta(table: Table, order: Sequence[str], file: str) -> list[int]:
+def _rows_of_meta(meta: Table, order: Index[str], file: str) -> NDArray[np.intp]:
     """Return for each grasp its row in the meta file; both files must name the same grasps, each once."""
-    if "grasp_id" not in table.text:
-        hint = "give each grasp's name as in the sample file"
-        raise UserError("no column grasp_id", file=table.file, hint=hint)
-    rows: dict[str, int] = {}
-    for row_of_table, grasp in enumerate(table.text["grasp_id"]):
-        line = int(table.lines[row_of_table])
-        if grasp in rows:
-            problem = f"grasp_id {grasp!r} occurs twice"
-            raise UserError(problem, file=table.file, row=line, hint="give each its own")
-        if grasp not in order:
-            problem = f"grasp {grasp!r} has no samples in {Path(file).name}"
-            raise UserError(problem, file=table.file, row=line, hint="remove the row or add the samples")
-        rows[grasp] = row_of_table
-    for grasp in order:
-        if grasp not in rows:
-            problem = f"no row for grasp {grasp!r} of {Path(file).name}"
-            raise UserError(problem, file=table.file, hint="add it")
-    return [rows[grasp] for grasp in order]
-
-
-def _first_rows(table: Table) -> list[int]:
-    """Return the first row of each grasp in a table that repeats its facts; UserError where they differ."""
     import pandas as pd
 
-    grasps, order = pd.factorize(np.asarray(table.text["grasp_id"], dtype=object))
-    first_rows = np.unique(grasps, return_index=True)[1]
+    ids = pd.Index(_grasp_ids(meta, "give each grasp's name as in the sample file"))
+    without = f"grasp {{!r}} has no samples in {Path(file).name}"
+    for wrong, problem, hint in (
+        (ids.duplicated(), "grasp_id {!r} occurs twice", "give each its own"),
+        (~ids.isin(order), without, "remove the row or add the samples"),
+    ):
+        for row in np.flatnonzero(wrong)[:1]:
+            raise UserError(problem.format(ids[row]), file=meta.file, row=int(meta.lines[row]), hint=hint)
+    for grasp in order[~order.isin(ids)][:1]:
+        raise UserError(f"no row for grasp {grasp!r} of {Path(file).name}", file=meta.file, hint="add it")
+    return ids.get_indexer(order)
+
+
+def _first_rows(table: Table) -> NDArray[np.intp]:
+    """Return the first row of each grasp in a table that repeats its facts; UserError where they differ."""
+    ids = np.asarray(table.text["grasp_id"])
+    _, first_rows, grasps = np.unique(ids, return_index=True, return_inverse=True)
     for header, column in {**table.text, **table.numbers}.items():
-        if _name_of_fact(header)[0] not in (*GRASP_LABELS, *GRASP_NUMBERS):
+        if _name_and_unit(header)[0] not in (*GRASP_LABELS, *GRASP_NUMBERS):
             continue
         cells = np.asarray(column)
         first = cells[first_rows][grasps]
         differs = (cells != first) & ~((cells != cells) & (first != first))  # NaN is as good as NaN
-        if differs.any():
-            row = int(differs.argmax())
+        for row in np.flatnonzero(differs)[:1]:
             earlier = f"was {first[row]!s} in row {table.lines[first_rows[grasps[row]]]}"
-            problem = f"{cells[row]!s} of grasp {order[grasps[row]]!r} {earlier}"
+            problem = f"{cells[row]!s} of grasp {str(ids[row])!r} {earlier}"
             hint, line = "repeat in each row what is known of its grasp", int(table.lines[row])
             raise UserError(problem, file=table.file, row=line, column=header, hint=hint)
-    return [int(row) for row in first_rows]
+    return np.sort(first_rows)
 
 
 def _of_tables(table: Table, meta: Table | None, name: str) -> Grasps:
     """Return the grasps of a table with a row a sample, and of one with a row a grasp, if there is one."""
-    samples = _samples_of(table)
-    order = list(dict.fromkeys(samples.grasp_ids))
+    import pandas as pd
+
+    samples, repairs = _samples_of(table)
+    order = pd.Index(samples["grasp_id"].unique())
     rows = _first_rows(table) if meta is None else _rows_of_meta(meta, order, table.file)
-    axis, channels = _onto_one_axis(samples, order, table.file)
-    facts = _facts_of(meta or table, rows)
-    of_grasps = (*GRASP_NUMBERS, *GRASP_LABELS)
-    unused = _unused(table, of_grasps) if meta is None else [*_unused(table, ()), *_unused(meta, of_grasps)]
-    repairs = [*samples.repairs, *unused]
-    attrs = {"name": name, "repairs": "\n".join(repairs)}
-    return _record(table.file, name, order, axis, channels | facts, attrs)
+    axis, channels = _onto_one_axis(samples, table.file, repairs)
+    known = (*GRASP_NUMBERS, *GRASP_LABELS)
+    facts = {name: column[rows] for name, column in _columns(meta or table, known)[0].items()}
+    unused = _unused(table, known) if meta is None else [*_unused(table, ()), *_unused(meta, known)]
+    attrs = {"name": name, "repairs": "\n".join([*repairs, *unused])}
+    return _record(table.file, name, order.tolist(), axis, channels | facts, attrs)
 
 
 def _of_dataset(data: xr.Dataset, path: str | Path, called: str | None = None) -> Grasps:
@@ -467,7 +431,8 @@ def _record(
     variables: dict[str, Any],
     attrs: dict[Any, Any],
 ) -> Grasps:
-    """Return the grasps of a file, each with the session and the block that it has where none is stated."""
+    """Return the grasps of a file, each with the session and the block that it has where none is stated;
+    UserError where one has no sample before or after contact."""
     unstated = np.full(len(ids), "")
     material = variables.get("material", unstated)
     for label, default in (("material", ""), ("session", stem), ("block", material)):
@@ -475,4 +440,13 @@ def _record(
         variables[label] = np.where(stated == "", default, stated)
     grasps = make_grasps(axis, grasp_id=ids, name=str(file), **variables)  # whose faults name the file
     grasps.attrs |= attrs
-    return _with_level_before(grasps, file)
+    grasps = with_lead_in(grasps)
+    time, finite = grasps["time"].values, np.isfinite(grasps["t_surface"].values)
+    for side, inside, hint in (
+        ("before", time < 0, "record from 2 s before, or give t_gripper_set_degC"),
+        ("after", time > 0, "is this a grasp? remove it or record the contact"),
+    ):
+        for grasp in grasps["grasp"].values[~finite[:, inside].any(axis=1)][:1]:
+            problem = f"grasp {str(grasp)!r} has no sample {side} the closed message at 0 s"
+            raise UserError(problem, file=file, hint=hint)
+    return grasps
