@@ -5,8 +5,6 @@ An input is applied from its row until the next; outputs are samples.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from itertools import pairwise
 from typing import TypeAlias
 
 import numpy as np
@@ -17,7 +15,6 @@ from thermogrip.datasets.repair import gap_rows
 from thermogrip.datasets.schema import Log, log_name
 
 Floats: TypeAlias = NDArray[np.float64]
-_Blocks: TypeAlias = tuple[Floats, Floats]
 
 
 def cut(log: Log, start: float = -np.inf, stop: float = np.inf) -> Log:
@@ -57,44 +54,25 @@ def gaps(log: Log, longer_than: float = 10.0) -> list[tuple[int, float, float]]:
     return [(int(row), float(time[row]), float(time[row + 1])) for row in gap_rows(time, longer_than)]
 
 
-def block_means(
-    time: Floats, values: Floats, held: NDArray[np.bool_], *, seconds: float, after: Sequence[int], log: str
-) -> list[_Blocks]:
-    """Return starts (n_block,) and means (n_block, n) of blocks of so many seconds, of each part of a log.
+def block_means(log: Log, values: Floats, seconds: float) -> tuple[Floats, Floats]:
+    """Return starts (n_block,) and means (n_block, n) of what is there of values (n_time, n) in blocks of so
+    many seconds, which begin anew after each gap."""
+    import pandas as pd
 
-    ``held`` (n,) says which of the values (n_time, n) are inputs and disturbances, averaged as held; others
-    are means of the samples that are there (NaN where none is).  ``after`` are the rows that begin anew after
-    a gap: no block mixes what was before with what came after.
-    """
+    time = log["time"].values
     step = float(np.median(np.diff(time)))
     if not seconds >= step * (1 - 1e-9):
         problem = f"cannot average over {seconds:g} s: the rows are {step:g} s apart"
-        raise UserError(problem, file=log, hint="choose a longer block")
-    segments = [
-        _filled_blocks(time[a:b], values[a:b], held, seconds=seconds, step=step)
-        for a, b in pairwise([0, *after, time.size])
-    ]
-    if (n := sum(begins.size for begins, _ in segments)) < 2:
-        problem = f"{n} block of {seconds:g} s is not a log"
-        raise UserError(problem, file=log, hint="choose a shorter block")
-    return segments
-
-
-def _filled_blocks(
-    time: Floats, values: Floats, is_held: NDArray[np.bool_], *, seconds: float, step: float
-) -> _Blocks:
-    """Return the starts (n_block,) and means (n_block, n_variables) of the filled blocks of one stretch."""
-    import pandas as pd
-
+        raise UserError(problem, file=log_name(log), hint="choose a longer block")
+    segment = np.searchsorted([row for row, _, _ in gaps(log)], np.arange(time.size))
+    begin = pd.Series(time).groupby(segment).transform("first").to_numpy()
     # rows a rounding error before an edge belong behind it: 3 * 0.1 > 0.3
-    block = np.floor((time - time[0]) / seconds + 1e-9).astype(np.int64)
-    filled, where = np.unique(block, return_inverse=True)
-    edges = time[0] + seconds * np.arange(int(block[-1]) + 2)
-    edges[-1] = min(edges[-1], time[-1] + step)  # the last row is held for one step, not for the whole block
-    means = np.empty((filled.size, values.shape[1]))
-    means[:, is_held] = held_means(time, values[:, is_held], edges)[filled]
-    means[:, ~is_held] = pd.DataFrame(values[:, ~is_held]).groupby(where).mean()
-    return edges[filled], means
+    starts = begin + seconds * np.floor((time - begin) / seconds + 1e-9)
+    means = pd.DataFrame(values).groupby(starts).mean()
+    if len(means) < 2:
+        problem = f"{len(means)} block of {seconds:g} s is not a log"
+        raise UserError(problem, file=log_name(log), hint="choose a shorter block")
+    return means.index.to_numpy(dtype=float), means.to_numpy(dtype=float)
 
 
 def held_means(time: Floats, values: Floats, edges: Floats) -> Floats:

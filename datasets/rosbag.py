@@ -373,7 +373,7 @@ def _mcap_messages(file: Path, notes: list[str]) -> Iterator[Message]:
     data, count = read_bytes(file), 0
     schemas: dict[int, Any] = {}
     channels: dict[int, Any] = {}
-    decoders = _Decoders(file)
+    decoders: dict[int, Callable[[bytes], Any]] = {}  # by channel
     try:
         for record in _mcap_records(data, file):
             if isinstance(record, records.Schema):
@@ -383,7 +383,9 @@ def _mcap_messages(file: Path, notes: list[str]) -> Iterator[Message]:
             elif isinstance(record, records.Message):
                 channel = channels[record.channel_id]
                 schema = schemas.get(channel.schema_id)
-                content = decoders.decode(schema, channel, record.data)
+                if channel.id not in decoders:
+                    decoders[channel.id] = _decoder(schema, channel, file)
+                content = decoders[channel.id](record.data)
                 kind = channel.message_encoding if schema is None else schema.name
                 count += 1
                 yield Message(channel.topic, kind, 1e-9 * record.log_time, content, channel.metadata)
@@ -401,38 +403,23 @@ def _mcap_messages(file: Path, notes: list[str]) -> Iterator[Message]:
         notes.append(f"has no end: its writer died; {count} whole messages were read, the rest is lost")
 
 
-class _Decoders:
-    """From bytes to numbers, by what the file says of its messages."""
+def _decoder(schema: Any, channel: Any, file: Path) -> Callable[[bytes], Any]:
+    """Return what makes numbers of a channel's bytes, by what the file says of them."""
+    encoding = channel.message_encoding
+    if encoding == "json":
+        return json.loads
+    if encoding not in ("cdr", "ros1") or schema is None:
+        problem = f"{channel.topic} is encoded as {encoding!r}, which is not read"
+        raise UserError(problem, file=file, hint="export it as CDR, ROS 1 or JSON")
+    _need("rosbags", file)
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-    def __init__(self, file: Path) -> None:
-        self._file = file
-        self._store: Any = None
-        self._types: dict[str, str] = {}  # by the name of a schema
-
-    def decode(self, schema: Any, channel: Any, data: bytes) -> Any:
-        encoding = channel.message_encoding
-        if encoding == "json":
-            return json.loads(data)
-        if encoding not in ("cdr", "ros1") or schema is None:
-            problem = f"{channel.topic} is encoded as {encoding!r}, which is not read"
-            raise UserError(problem, file=self._file, hint="export it as CDR, ROS 1 or JSON")
-        kind = self._types.get(schema.name) or self._registered(schema)
-        deserialize = self._store.deserialize_cdr if encoding == "cdr" else self._store.deserialize_ros1
-        return deserialize(data, kind)
-
-    def _registered(self, schema: Any) -> str:
-        """Return the type of messages that the definition in the file is of."""
-        _need("rosbags", self._file)
-        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-
-        self._store = self._store or get_typestore(Stores.EMPTY)
-        kind = schema.name if "/msg/" in schema.name else schema.name.replace("/", "/msg/", 1)
-        problem = f"the definition of {schema.name} cannot be read"
-        with reading(problem, file=self._file, hint="write the file again"):
-            definitions = get_types_from_msg(schema.data.decode(), kind)
-            self._store.register({k: v for k, v in definitions.items() if k not in self._store.fielddefs})
-        self._types[schema.name] = kind
-        return str(kind)
+    store = get_typestore(Stores.EMPTY)
+    kind = schema.name if "/msg/" in schema.name else schema.name.replace("/", "/msg/", 1)
+    problem = f"the definition of {schema.name} cannot be read"
+    with reading(problem, file=file, hint="write the file again"):
+        store.register(get_types_from_msg(schema.data.decode(), kind))
+    return partial(store.deserialize_cdr if encoding == "cdr" else store.deserialize_ros1, typename=kind)
 
 
 def _need(package: str, file: Path) -> None:

@@ -283,12 +283,8 @@ def _beside(plant: Plant, log: Log, simulated: Log, average: float | None = None
         raise UserError(problem, file=log_name(log), hint=hint)
     read, run = (np.where(scored[:, None], columns(each, plant.outputs), np.nan) for each in (log, simulated))
     if average is not None:
-        values, n_y = np.hstack([read, run]), len(plant.outputs)
-        is_held = np.zeros(2 * n_y, dtype=bool)
-        after = [row + 1 for row, _, _ in gaps(log)]
-        blocks = block_means(time, values, is_held, seconds=average, after=after, log=log_name(log))
-        time, values = (np.concatenate(segments) for segments in zip(*blocks))
-        read, run = np.split(values, 2, axis=1)
+        time, means = block_means(log, np.hstack([read, run]), average)
+        read, run = np.split(means, 2, axis=1)
     return _Pairs(time, dict(zip(plant.outputs, zip(read.T, run.T))))
 
 
