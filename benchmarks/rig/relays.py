@@ -26,8 +26,9 @@ import numpy as np
 
 from thermogrip.datasets.schema import make_log
 from thermogrip.mpc import Controller, PIController
+from thermogrip.mpc.design.relays import Relay
 from thermogrip.mpc.interface import Move
-from thermogrip.rig.drivers.relays import Relay, RelayRig
+from thermogrip.rig.drivers.relays import RelayRig
 from thermogrip.rig.guard.guard import Guard
 from thermogrip.rig.guard.settings import GuardSettings, RuleSettings, SensorSettings
 from thermogrip.rig.interface import Reading

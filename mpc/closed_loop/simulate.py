@@ -19,8 +19,9 @@ import numpy as np
 from thermogrip.datasets.arrays import Array, Mask
 from thermogrip.datasets.media import Shown
 from thermogrip.datasets.schema import Log, column, names
+from thermogrip.mpc.design.relays import Relay, Switches
 from thermogrip.mpc.interface import Controller, Move, Readings, Regulator, Target
-from thermogrip.mpc.plant.prediction import held_start, prediction_model
+from thermogrip.mpc.plant.prediction import drive_range, held_start, prediction_model
 
 if TYPE_CHECKING:
     from thermogrip.mpc.controllers.loop_monitor import LoopMonitor
@@ -47,6 +48,7 @@ class Surroundings:
     held: tuple[str, ...] = ()
     # measured disturbances by name; where absent, what the plant has where nobody reads them
     disturbances: dict[str, float] = field(default_factory=dict)
+    relays: dict[str, Relay] = field(default_factory=dict)  # of drives that are switched
     # what a load adds to the outputs (n, n_y), at the plant's own steps from the start on; its last row stays
     load: Array | None = field(default=None, compare=False)
 
@@ -201,6 +203,9 @@ class Truth:
         self.before = native.neutral if holding_drive is None else holding_drive
         offsets = [plant.offsets.get(name, 0.0) + around.offset.get(name, 0.0) for name in native.outputs]
         self.offset = np.array(offsets, dtype=float)
+        self.switches = Switches(around.relays, {name: drive_range(plant, name) for name in around.relays})
+        for switch in self.switches.each:
+            switch.since_s = np.inf  # it has rested, as all has
         self.rng = np.random.default_rng(seed)
         self.late = round(around.move_delay_s / native.dt)
         self.sees = native.dt / (native.dt + around.sensor_lag_s)  # share of a change that is shown at once
@@ -242,6 +247,8 @@ class Truth:
         self.moves.append(np.array(move.drives(self.model.drives), dtype=float))
         moves_in_force = np.arange(first, first + self.sub) // self.sub
         u = np.stack([self.moves[k] if k >= 0 else drive_before for k in moves_in_force])
+        for row in u if self.switches.each else ():
+            row[:] = list(self.switches.mean(dict(zip(self.model.drives, row)), self.model.dt).values())
         y, x = self.model.run(
             self.x[None, :], (drive_before + self.around.drive_share * (u - drive_before))[None], self.d
         )

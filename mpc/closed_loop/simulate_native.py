@@ -24,7 +24,7 @@ from thermogrip.mpc.closed_loop.simulate import (
 from thermogrip.mpc.controllers.mpc import Controller
 from thermogrip.mpc.controllers.pi import PIController
 from thermogrip.mpc.interface import STATUSES
-from thermogrip.mpc.native.runtime import CompiledController, CompiledTruth, address
+from thermogrip.mpc.native.runtime import CompiledController, CompiledTruth, address, relay_rows
 from thermogrip.mpc.native.shared_constants import UNCUT
 
 if TYPE_CHECKING:
@@ -67,10 +67,17 @@ def compiled_loop(
 
 class _Around(ctypes.Structure):
     _fields_ = [
-        *((name, ctypes.c_int) for name in ("per_sample", "late")),
-        *((name, ctypes.c_double) for name in ("sees", "acts")),
+        *((name, ctypes.c_int) for name in ("per_sample", "late", "n_relays")),
+        *((name, ctypes.c_double) for name in ("sees", "acts", "step_s")),
         *((name, ctypes.c_void_p) for name in ("before", "d", "noise", "quanta", "d_offset")),
+        *((name, ctypes.c_void_p) for name in ("relays", "switches")),
     ]
+
+
+#: ``tg_relay`` and ``tg_switch`` of ``tg_switches.h``.
+_NUMBERS = ("full", "on_s", "off_s", "dead_s")
+_RELAY = np.dtype([("drive", "i4"), ("opposite", "i4"), *((name, "f8") for name in _NUMBERS)], align=True)
+_SWITCH = np.dtype([("on", "i4"), ("owed_s", "f8"), ("since_s", "f8")], align=True)
 
 
 class _Run:
@@ -86,6 +93,9 @@ class _Run:
         self.y = np.zeros((n * truth.sub + 1, model.n_y))
         self.reading, self.drive = np.zeros((n, model.n_y + model.n_d)), np.zeros((n, model.n_u))
         self.status = np.full(n, STATUSES.index("ok"), dtype=np.int32)
+        switches = truth.switches
+        relays = np.array(relay_rows(switches, model.drives), dtype=_RELAY)
+        states = np.array([(one.on, one.owed_s, one.since_s) for one in switches.each], dtype=_SWITCH)
         self.plant, arrays_of_plant = CompiledTruth(model).at(truth.x, truth.offset)
         self._held = (
             arrays_of_plant,
@@ -94,9 +104,12 @@ class _Run:
             noise,
             quanta,
             offset,
+            relays,
+            states,
         )  # they live as long as this
         places = [address(values) for values in self._held[1:]]
-        self.around = _Around(truth.sub, truth.late, truth.sees, around.drive_share, *places)
+        numbers = truth.sub, truth.late, len(relays), truth.sees, around.drive_share, model.dt
+        self.around = _Around(*numbers, *places)
 
 
 def _run_mpc(

@@ -28,11 +28,14 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.media import markdown
 from thermogrip.datasets.parallel import Progress
 from thermogrip.mpc.controllers.mpc import Controller
+from thermogrip.mpc.controllers.pi import PIController
 from thermogrip.mpc.controllers.reference import ReferenceController
+from thermogrip.mpc.design.relays import Switches
 from thermogrip.mpc.interface import STATUSES
 from thermogrip.mpc.native import design_struct
 from thermogrip.mpc.native.codegen import write_model
-from thermogrip.mpc.native.runtime import SOURCES, c_source, compiler
+from thermogrip.mpc.native.runtime import SOURCES, SWITCHES, c_source, compiler, relays_header
+from thermogrip.mpc.plant.prediction import drive_range
 
 _COPIED = (*SOURCES, "tg_design.h", "Makefile", "example.c", "check.c")
 # of a drive's range; where dozens of soft rows are broken, a plan is a small difference of large multipliers,
@@ -87,13 +90,25 @@ def export_controller(controller: Controller, folder: str | Path, *, arduino: bo
         + design_struct.initialiser(sizes, numbers)
         + "\n};\n",
     }
-    files["README.md"] = _readme(controller, sizes)
+    relays, section = relay_files(controller)
+    files |= {"README.md": _readme(controller, sizes) + section} | relays
     if arduino:
         files = _as_library(controller, files)
     for name, content in files.items():
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         write_atomic(folder / name, content)
     return Export(folder, tuple(sorted(files)))
+
+
+def relay_files(controller: Controller | PIController) -> tuple[dict[str, str], str]:
+    """Return the C of a controller's relays, and its section of the README; nothing where it has none."""
+    relays, drives = controller.design.relays, controller.model.drives
+    if not relays:
+        return {}, ""
+    switches = Switches(relays, {name: drive_range(controller.plant, name) for name in relays})
+    files = {name: c_source(name) for name in SWITCHES} | {"tg_relays.h": relays_header(switches, drives)}
+    names = ", ".join(f"{k} is {markdown(one.channel)}" for k, one in enumerate(switches.each))
+    return files, c_source("README_relays.md.in").format(names=names)
 
 
 def _as_library(controller: Controller, files: dict[str, str]) -> dict[str, str]:

@@ -17,7 +17,7 @@ from thermogrip.datasets.atomic_files import write_atomic
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.media import markdown
 from thermogrip.datasets.parallel import Progress
-from thermogrip.mpc.controllers.export import Agreement, Export, footprint, run_build
+from thermogrip.mpc.controllers.export import Agreement, Export, footprint, relay_files, run_build
 from thermogrip.mpc.controllers.pi import PIController
 from thermogrip.mpc.estimator.call_times import SAME
 from thermogrip.mpc.interface import STATUSES
@@ -37,7 +37,8 @@ def export_pi(controller: PIController, folder: str | Path) -> Export:
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     files = {name: c_source(name) for name in ("tg_pi.h", "tg_pi.c")}
-    files |= {"tg_pi_config.h": _config(controller), "README.md": _pi_readme(controller)}
+    relays, section = relay_files(controller)
+    files |= {"tg_pi_config.h": _config(controller), "README.md": _pi_readme(controller) + section} | relays
     for name, content in files.items():
         write_atomic(folder / name, content)
     return Export(folder, tuple(sorted(files)))

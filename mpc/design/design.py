@@ -25,6 +25,7 @@ from pydantic import AfterValidator, ConfigDict, Field, Strict, TypeAdapter, Val
 
 from thermogrip.datasets.errors import UserError, known_names
 from thermogrip.datasets.limits import LARGEST
+from thermogrip.mpc.design.relays import Relay, two_signed
 from thermogrip.mpc.estimator.observer import (
     DRIFT,
     NOISE,
@@ -168,6 +169,7 @@ def _check_names(design: Design, plant: Plant) -> None:
         "slew_per_s": (drives, no_drive),
         "energy_price": (drives, no_drive),
         "safe_drive": (drives, no_drive),
+        "relays": (drives, no_drive),
         "weights": (design.controlled, not_regulated),
         "zones": (design.controlled, not_regulated),
         "ramp_per_s": (design.controlled, not_regulated),
@@ -178,6 +180,7 @@ def _check_names(design: Design, plant: Plant) -> None:
             _refuse(name not in names, f"{key}: {problem.format(name)}")
     for name in design.controlled:
         _refuse(design.controlled.count(name) > 1, f"controlled names {name} twice")
+    _check_relays(design, plant)
     for name in drives:
         missing = name not in design.drive_range or name not in design.slew_per_s
         _refuse(missing, f"drive_range, slew_per_s: nothing for drive {name}")
@@ -187,6 +190,23 @@ def _check_names(design: Design, plant: Plant) -> None:
         _refuse(no_pair, f"{pair} no pair of a regulated output and a drive")
         twice = any(loop.drive == other.drive or loop.output == other.output for other in design.loops[:k])
         _refuse(twice, f"{pair} there twice")
+
+
+def _check_relays(design: Design, plant: Plant) -> None:
+    """Refuse relays that cannot be those of their drives."""
+    relays, signed = design.relays, two_signed(design.relays)
+    for name, relay in relays.items():
+        low, _ = design.drive_range[name]
+        wrong = f"relays: {name} is from {low:g} up: a drive has a cooler where it goes below 0"
+        _refuse((low < 0) != (name in signed), wrong)
+        _refuse(relay.dead_s and not relay.cooler, f"relays: dead_s of {name} is between it and a cooler")
+        if relay.cooler and name not in signed:
+            pair, coolers = (name, relay.cooler), [other.cooler for other in relays.values()]
+            gains = [[step_response(plant, drive, y).gain for drive in pair] for y in design.controlled]
+            opposed = any(heats * cools < 0 for heats, cools in gains)
+            alone = coolers.count(relay.cooler) == 1 and not relays[relay.cooler].cooler
+            _refuse(not opposed, f"relays: {name} and {relay.cooler} move no output in opposite directions")
+            _refuse(not alone, f"relays: {relay.cooler} is in two pairs of a heater and a cooler")
 
 
 def _validated(content: Mapping[str, Any]) -> Design:
@@ -254,6 +274,7 @@ class Design:
     energy_price: dict[str, NotNegative] = field(default_factory=dict)
     ramp_per_s: dict[str, Positive] = field(default_factory=dict)  # fastest change of a target [units per s]
     safe_drive: dict[str, Finite] = field(default_factory=dict)  # where a failing loop goes; 0 where absent
+    relays: dict[str, Relay] = field(default_factory=dict)  # of drives that are switched
     # programs a sample: above 1 until the plan stays
     iterations: Annotated[int, Strict(), Field(ge=1, le=50)] = 1
     price: NotNegative = 25.0  # weight of the square of what exceeds a soft limit [degC^-2]

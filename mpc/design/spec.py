@@ -31,6 +31,7 @@ from thermogrip.mpc.design.design import (
     default_design,
     problem_of,
 )
+from thermogrip.mpc.design.relays import Relay
 from thermogrip.mpc.plant.prediction import drive_names, drive_range, step_response
 
 if TYPE_CHECKING:
@@ -106,6 +107,7 @@ class Spec(BaseModel):
     ramp_per_s: Positive | dict[str, Positive] | None = None  # fastest change of a target [degC per s]
     safe_drive: Finite | dict[str, Finite] | None = None  # where a drive goes without its loop, in its units
     iterations: Annotated[int, Field(ge=1, le=50)] = 1  # programs a sample, until the plan stays
+    relays: dict[str, Relay] | None = None  # of drives that are switched, with their least times
 
     @model_validator(mode="after")
     def _agree(self) -> Spec:
@@ -117,6 +119,12 @@ class Spec(BaseModel):
         if "settle_within_s" in self.model_fields_set and self.settle_within_s > self.hold_s:
             too_long = f"longer than each step is simulated (hold_s, {self.hold_s:g} s)"
             raise ValueError(f"settle_within_s: {self.settle_within_s:g} s is {too_long}")
+        for name, relay in (self.relays or {}).items():
+            least = relay.on_s + relay.off_s + relay.dead_s
+            if least > self.settle_within_s:
+                raise ValueError(
+                    f"relays: {name} goes on and off in {least:g} s, longer than settle_within_s"
+                )
         return self
 
     @classmethod
@@ -213,7 +221,7 @@ class Spec(BaseModel):
         counted = {name: weights.get(name, 1.0) * design.weights.get(name, 1.0) for name in design.controlled}
         values["weights"] = {name: weight for name, weight in counted.items() if weight != 1.0}
         values |= {"zones": dict(self.zones or {}), "hard": tuple(self.hard or ())}
-        values["iterations"] = self.iterations
+        values |= {"iterations": self.iterations, "relays": dict(self.relays or {})}
         values["energy_price"] = _by_drive("energy_price", self.energy_price, drives)
         values["safe_drive"] = _by_drive("safe_drive", self.safe_drive, drives)
         ramp = self.ramp_per_s or {}

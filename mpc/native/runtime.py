@@ -14,7 +14,7 @@ import os
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 from importlib import resources
 from pathlib import Path
@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thermogrip.datasets.arrays import Array
+from thermogrip.mpc.design.relays import NOW_S, SHORTEST_S, Switches
 from thermogrip.mpc.native.code_cache import code_cache, only_ours
 from thermogrip.mpc.native.codegen import ModelCode, write_model
 from thermogrip.mpc.native.design_struct import Sizes, as_structure, config_header, numbers_of, sizes_of
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
 
 #: The C files that every export shares.
 _CODE = ("tg_qp", "tg_controller", "tg_observer", "tg_optimiser")
+SWITCHES = ("tg_switches.h", "tg_switches.c")  # where drives are switched
 SOURCES = ("tg_qp.h", "tg_controller.h", *(f"{name}.c" for name in _CODE))
 
 # sums may be done in any order and pairs of operations at once; NaN keeps its meaning
@@ -66,6 +68,22 @@ def wanted() -> bool:
 def c_source(name: str) -> str:
     """Return a C file of the package."""
     return (resources.files("thermogrip.mpc.native") / "csource" / name).read_text(encoding="utf-8")
+
+
+def relay_rows(switches: Switches, drives: Sequence[str]) -> list[tuple[float, ...]]:
+    """Return the numbers of ``tg_relay`` of each switch: drive, opposite, full and least times."""
+    place = {switch: number for number, switch in enumerate(switches.each)} | {None: -1}
+    return [
+        (drives.index(one.drive), place[one.opposite], one.full, one.on_s, one.off_s, one.dead_s)
+        for one in switches.each
+    ]
+
+
+def relays_header(switches: Switches, drives: Sequence[str]) -> str:
+    """Return ``tg_relays.h``: the numbers of relays, and those that all share."""
+    rows = ",\n".join(f"    {{{', '.join(map(repr, row))}}}" for row in relay_rows(switches, drives))
+    numbers = {"count": len(switches.each), "now": NOW_S, "shortest": SHORTEST_S}
+    return c_source("tg_relays.h.in").format(rows=rows, **numbers)
 
 
 def build_library(files: dict[str, str]) -> Path:
@@ -157,7 +175,8 @@ class CompiledController:
         model = controller.model
         code = _code_of(model)
         self.sizes: Sizes = sizes_of(controller, code, room=True)
-        files = {name: c_source(name) for name in (*SOURCES, "tg_host.c")} | code.files
+        files = {name: c_source(name) for name in (*SOURCES, *SWITCHES, "tg_host.c")} | code.files
+        files["tg_relays.h"] = relays_header(Switches({}, {}), ())
         self.library = _loaded_library(build_library(files | {"tg_config.h": config_header(self.sizes)}))
         k = np.zeros(max(1, code.n_k))
         self.library.tg_host_prepare(address(np.ascontiguousarray(model.p)), address(k))

@@ -135,7 +135,7 @@ def spec_of(controller: Reviewed, wanted: tuple[float, float] | None) -> tuple[S
         known = Spec.model_fields.keys() - ({"settle_within_s"} if long else set())
         return spec_from_dict({key: value for key, value in notes.items() if key in known}), True
     low, high = wanted or controller.plant.valid.get(controller.controlled[0], (20.0, 40.0))
-    return Spec(steps=[(low, max(low + 1.0, high))]), False
+    return Spec(steps=[(low, max(low + 1.0, high))], relays=controller.design.relays or None), False
 
 
 def passes(checks: Iterable[Check]) -> bool:

@@ -240,6 +240,7 @@ def surroundings_of(
         quanta=dict.fromkeys([*reading_sd, *others], 0.0),
         offset=offset,
         held=tuple(controlled),
+        relays=spec.relays or {},
     )
     if not filtered_s:
         return usual

@@ -34,6 +34,7 @@ from thermogrip.rig.session.step_test import StepTest
 
 if TYPE_CHECKING:
     from thermogrip.datasets.parallel import Progress, Workers
+    from thermogrip.mpc.design.relays import Relay
     from thermogrip.mpc.design.spec import Spec
     from thermogrip.mpc.interface import Move
     from thermogrip.mpc.tuning.tune import Tuning
@@ -77,6 +78,7 @@ class Autotune:
     make_guard: Callable[[Plant | None], Guard]
     minutes: float = 30.0  # of step test and loops together, at most
     spec: Spec | None = None
+    relays: Mapping[str, Relay] = field(default_factory=dict)  # of the rig's drives
     about: Mapping[str, Any] = field(default_factory=dict)
     clock: Callable[[], float] | None = None
     progress: Progress | None = None
@@ -285,6 +287,8 @@ class Autotune:
             step = float(np.mean(begin)), float(np.mean(list(targets.values())))
             wanted = Spec.of(plant).model_dump(exclude_unset=True)
             spec = Spec(**(wanted | {"steps": [step], "output": list(targets)}))
+        switched = {name: relay for name, relay in self.relays.items() if name in plant.inputs}
+        spec = spec.model_copy(update={"relays": switched or None})
         self.tuning = tune(plant, spec, progress=self._part(0.5, 0.9), seed=self.seed)
         self.tuning.save(self.folder / "controller.json")
         if self.tuning.interrupted:

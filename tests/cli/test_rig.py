@@ -18,6 +18,8 @@ from thermogrip.cli.main import main
 from thermogrip.cli.rig import RigOptions, ShowOptions
 from thermogrip.datasets.errors import UserError
 from thermogrip.mpc.controllers.mpc import Controller
+from thermogrip.mpc.design.design import default_design
+from thermogrip.mpc.design.relays import Relay
 from thermogrip.rig import Session
 from thermogrip.rig.guard.trip import Trip
 from thermogrip.rig.records.batch import Batch, Trial
@@ -96,7 +98,7 @@ def test_a_rig_on_a_port_drives_what_the_controller_moves(stand_in: StandIn) -> 
     clock, options = SimpleNamespace(sleep="its sleep"), RigOptions(port="COM3", protocol="tclab")
 
     def of(*inputs: str) -> Any:
-        return SimpleNamespace(plant=SimpleNamespace(inputs=inputs))
+        return SimpleNamespace(plant=SimpleNamespace(inputs=inputs), design=SimpleNamespace(relays={}))
 
     assert options.open(clock, of("q1", "pump"), pace=None, seed=3) is board
     assert (opened[0].args, opened[0].sleep) == (("COM3", "tclab"), "its sleep")
@@ -126,7 +128,7 @@ def test_a_twin_is_a_draw_of_its_plant_within_the_controller_s_ranges(own: bool,
     again = stand_in("thermogrip.cli.options.load_plant", plant)
     twins = stand_in("thermogrip.rig.simulation.twin.Twin", "a twin")
     ranges = dict.fromkeys("abcde", (0.0, 100.0)) | {"d": (0.0, 5.0)}  # d has no unit: 1
-    controller = SimpleNamespace(design=SimpleNamespace(drive_range=ranges))
+    controller = SimpleNamespace(design=SimpleNamespace(drive_range=ranges, relays={}))
     options = RigOptions(twin=Path("p.json"), draw=4, start=28.0, network="own.py:Own")
     assert options.open("clock", controller, pace=None, seed=3) == "a twin"
     [twin] = twins
@@ -217,11 +219,13 @@ def test_a_run_on_a_slow_twin_says_its_world_and_waits_as_long_as_its_spec(bench
     )  # fmt: skip
     valid = {"q": (0.0, 1.0), "lamp": (0.0, 1.0), "room": (17.5, 22.9), "t": (20.0, 35.0)}
     plant = Plant(model, {}, dt=20.0, units={"lamp": "1"}, valid=valid, nominal={"lamp": 1.0})
-    Controller(plant).save(bench.path / "c.json")
+    relays = {"q": Relay(on_s=40.0, off_s=60.0)}
+    Controller(plant, default_design(plant, relays=relays)).save(bench.path / "c.json")
     plant.save(bench.path / "plant.json")
     words = ["run", "c.json", "--twin", "plant.json", "--from", "24", "--target", "30", "--out", "r"]
     done = bench.run(*words)
-    limit, world, *_ = done.out.splitlines()
+    limit, switched, world, *_ = done.out.splitlines()
+    assert switched == "Switched, at least: q (40 s on, 60 s off)"
     assert limit == "Gives up settling after 24000 s, twice what the spec allows a step"
     assert world == "The twin's world, from the middle of its plant's logs: lamp 1, room 20.2"
     assert done.code == 0, done

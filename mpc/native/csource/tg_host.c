@@ -3,6 +3,7 @@
 #define _POSIX_C_SOURCE 199309L /* for the clock */
 #include "tg_controller.h"
 #include "tg_model.h"
+#include "tg_relays.h"
 
 #include <math.h>
 #include <string.h>
@@ -152,11 +153,14 @@ static void look(const tg_truth *plant, double *y)
 /* Surroundings of a closed loop: per_sample: the plant's steps in a sample; late: steps after which a drive
  * acts, acts: the share of it that does, both counted from the drives before; sees: share of a change that
  * sensors show at once; d: disturbances; noise: TG_NY readings' errors a sample; quanta: of each of the
- * TG_NY + TG_ND readings, 0 none; d_offset: what a sensor of a disturbance shows too much. */
+ * TG_NY + TG_ND readings, 0 none; d_offset: what a sensor of a disturbance shows too much; n_relays: of drives
+ * that are switched, within the plant's steps of step_s. */
 typedef struct {
-    int per_sample, late;
-    double sees, acts;
+    int per_sample, late, n_relays;
+    double sees, acts, step_s;
     const double *before, *d, *noise, *quanta, *d_offset;
+    const tg_relay *relays;
+    tg_switch *switches;
 } tg_around;
 
 /* What sensors show in sample t of outputs row. */
@@ -171,13 +175,30 @@ static void read_sensors(const tg_around *a, int t, const double *row, double *s
             shown[i] = rint(shown[i] / a->quanta[i]) * a->quanta[i];
 }
 
+/* The drives as relays give them on average in a step of the plant in which these are requested. */
+static void switch_drives(const tg_around *a, const double *requested, double *given)
+{
+    double remaining_s = a->step_s;
+    memcpy(given, requested, TG_NU * sizeof(double));
+    for (int i = 0; i < a->n_relays; i++)
+        given[a->relays[i].drive] = 0.0;
+    while (a->n_relays && remaining_s > TG_NOW_S) {
+        double due_s = tg_switches_turn(a->relays, a->switches, a->n_relays, requested, 1);
+        double step = fmin(remaining_s, fmax(due_s, TG_SHORTEST_S));
+        for (int i = 0; i < a->n_relays; i++)
+            given[a->relays[i].drive] += a->switches[i].on * a->relays[i].full * step / a->step_s;
+        tg_switches_pass(a->relays, a->switches, a->n_relays, requested, step);
+        remaining_s -= step;
+    }
+}
+
 /* Let sample t pass under the drives given so far, TG_NU a sample; outputs go behind row. */
 static void pass(const tg_around *a, tg_truth *plant, int t, const double *drive, double *row)
 {
     for (int part = 0; part < a->per_sample; part++) {
-        double *swap = plant->x, u[TG_NU];
+        double *swap = plant->x, u[TG_NU], given[TG_NU];
         const int since = t * a->per_sample + part - a->late;
-        const double *given = since < 0 ? a->before : drive + since / a->per_sample * TG_NU;
+        switch_drives(a, since < 0 ? a->before : drive + since / a->per_sample * TG_NU, given);
         for (int j = 0; j < TG_NU; j++)
             u[j] = a->acts == 1.0 ? given[j] : a->before[j] + a->acts * (given[j] - a->before[j]);
         plant->next(plant->x, u, a->d, plant->k, plant->after);

@@ -50,14 +50,17 @@ def autotune(
     from thermogrip.rig.records.autotune import Autotune, Tripped
 
     console, pace = Console(as_json), rig.pace(show)
+    requested = None if spec is None else read_spec(spec)
+    relays = rig.switched(None if requested is None else requested.relays)
     clock, watch = rig.clock(pace), show.watch("autotune", console, out, pace)
     work = Autotune(
         cli.new_folder(out),
         wanted,
-        lambda: rig.open(clock, None, pace=pace, seed=seed),
+        lambda: rig.open(clock, None, pace=pace, seed=seed, relays=relays),
         lambda plant: rig.guard(guard, plant, limit=limit),
         minutes=minutes,
-        spec=None if spec is None else read_spec(spec),
+        spec=requested,
+        relays=relays,
         about={"limit": limit, "twin": rig.about().get("twin")},  # a port may be called otherwise
         clock=None if rig.port is None else clock,
         progress=watch.progress,

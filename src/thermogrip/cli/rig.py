@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
 from math import isfinite
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from thermogrip.live.watch import Watch
     from thermogrip.mpc.controllers.mpc import Controller
     from thermogrip.mpc.controllers.pi import PIController
+    from thermogrip.mpc.design.relays import Relay
     from thermogrip.rig.clock import ScaledClock
     from thermogrip.rig.guard.guard import Guard
     from thermogrip.rig.guard.trip import Trip
@@ -120,6 +121,12 @@ class RigOptions:
         """Return its guard."""
         return guard_of(path, plant, speed=self.speed or 1.0, limit=limit)
 
+    def switched(self, otherwise: Mapping[str, Relay] | None) -> Mapping[str, Relay]:
+        """Return the relays of the file, else these."""
+        from thermogrip.rig.drivers.relays import read_relays
+
+        return (otherwise or {}) if self.relays is None else read_relays(self.relays)
+
     def open(
         self,
         clock: ScaledClock,
@@ -127,21 +134,28 @@ class RigOptions:
         *,
         pace: float | None,
         seed: int,
+        relays: Mapping[str, Relay] | None = None,
         say: Callable[[str], None] | None = None,
     ) -> Rig:
-        """Return the rig on a port, or the simulated one at a pace, with the relays of a file; ``say`` what
-        is round the simulated one."""
+        """Return the rig on a port, or the simulated one at a pace, with the relays of a file, else of the
+        controller, else these; ``say`` what is switched, and what is round the simulated one."""
         from thermogrip.rig.clock import Metronome
         from thermogrip.rig.drivers.connect import open_rig
-        from thermogrip.rig.drivers.relays import RelayRig, read_relays
+        from thermogrip.rig.drivers.relays import RelayRig, of_inputs
 
-        switched = {} if self.relays is None else read_relays(self.relays)
+        switched = self.switched(relays if controller is None else controller.design.relays)
+        if say is not None and switched:
+            times = (
+                f"{name} ({relay.on_s:g} s on, {relay.off_s:g} s off)" for name, relay in switched.items()
+            )
+            say(f"Switched, at least: {', '.join(times)}")
         if self.twin is not None:
             wait = None if pace is None else Metronome(clock, clock.sleep).wait
             simulated = self._twin(self.twin, controller, seed=seed, wait=wait)
             if say is not None and simulated.disturbances:
                 values = (f"{name} {value:.4g}" for name, value in simulated.disturbances.items())
                 say(f"The twin's world, from the middle of its plant's logs: {', '.join(values)}")
+            switched = of_inputs(switched, simulated)
             return RelayRig(simulated, switched, lambda: simulated.time) if switched else simulated
         rig: Rig = open_rig(str(self.port), self.protocol, clock=clock, sleep=clock.sleep)
         try:

@@ -96,7 +96,7 @@ def test_an_integrator_holds_any_target_with_no_drive_wherever_a_step_starts():
 def stub(**design) -> Any:
     """Return as much of a controller as a check asks for: two drives, one output."""
     usual = {"controlled": ("t",), "dt": 2.0, "blocks": (1, 3), "slew_per_s": {"q": 0.1}}
-    usual |= {"drive_range": {"q": (-1.0, 3.0)}, "limits": {}, "ambient": 22.0}
+    usual |= {"drive_range": {"q": (-1.0, 3.0)}, "limits": {}, "ambient": 22.0, "relays": {}}
     model = SimpleNamespace(drives=("p", "q"), n_u=2, n_d=1, outputs=("t",), span=np.array([1.0, 4.0]))
     model.disturbances, model.rooms = ("t_room",), np.array([True])
     model.undisturbed = lambda ambient: np.array([ambient])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -12,7 +13,8 @@ import pytest
 from tests.rig.makers import STILL, Constant, make_lab
 from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.errors import UserError
-from thermogrip.rig.drivers.relays import Relay, RelayRig, read_relays
+from thermogrip.mpc.design.relays import Relay
+from thermogrip.rig.drivers.relays import RelayRig, read_relays
 from thermogrip.rig.guard.guard import Guard
 from thermogrip.rig.interface import Reading, Rig
 from thermogrip.rig.session.session import run_session
@@ -123,6 +125,25 @@ def test_heater_and_cooler_never_meet(same: bool, seed: int) -> None:
             assert at - ended[-state] >= 6.0 - 1e-4
 
 
+def test_two_drives_that_are_a_pair_never_meet_whatever_is_asked_of_both() -> None:
+    board = Board(heat="percent", cool="1")
+    relays = {"heat": Relay("heat", "cool", 8.0, 12.0, 6.0), "cool": Relay(on_s=5.0, off_s=9.0)}
+    rig = RelayRig(board, relays, lambda: board.now)  # type: ignore[arg-type]
+    for heat, cool in zip(restless(1, -0.5).clip(0), restless(2, -0.5).clip(0)):
+        rig.apply({"heat": 100 * heat, "cool": cool}, 1)
+        rig.wait(0.5)
+    ended, states = {"heat": -np.inf, "cool": -np.inf}, []
+    for (_, before), (at, now) in pairwise(board.set):
+        states.append(tuple(value > 0 for value in now.values()))
+        ended |= {name: at for name in ended if before[name]}
+        assert not (now["heat"] and not before["heat"] and at - ended["cool"] < 6.0 - 1e-4)
+        assert not (now["cool"] and not before["cool"] and at - ended["heat"] < 6.0 - 1e-4)
+    assert set(states) == {(False, False), (True, False), (False, True)}
+    for name, on_s, off_s in (("heat", 8.0, 12.0), ("cool", 5.0, 9.0)):
+        assert min(length for value, length in board.spells(name)[1:] if value) >= on_s - 1e-4
+        assert min(length for value, length in board.spells(name)[1:] if not value) >= off_s - 1e-4
+
+
 def test_a_drive_of_one_sign_gets_its_mean_from_its_own_relay() -> None:
     board = Board(heat="1", cool="1")
     played(board, Relay("heat", "cool", 5.0, 5.0, 10.0), np.full(4000, -0.3))
@@ -138,6 +159,38 @@ def test_an_end_switches_off_at_once_whatever_the_least_time() -> None:
     assert (board.drive, board.pump) == ({"drive": 0.0}, 0)
     rig.wait(100.0)
     assert board.drive == {"drive": 0.0}
+
+
+def test_least_off_is_kept_from_the_start_and_after_a_stop() -> None:
+    board = Board(drive="1")
+    rig = played(board, Relay("drive", on_s=60.0, off_s=30.0), np.full(100, 1.0))
+    assert board.spells("drive")[0] == (0.0, pytest.approx(30.0))  # nobody knows since when it was off
+    rig.apply({"drive": 0.0}, 0)  # on for 20 s
+    stopped_s = board.now
+    for _ in range(80):
+        rig.apply({"drive": 1.0}, 1)
+        rig.wait(0.5)
+    on_again_s = next(at for at, drive in board.set if at > stopped_s and drive["drive"])
+    assert on_again_s - stopped_s == pytest.approx(30.0, abs=0.5)
+
+
+def test_a_lost_sensor_switches_off_at_once() -> None:
+    lab = make_lab()
+    twin = Twin(lab, **STILL, skin="t1")
+    rig = RelayRig(twin, {"q1": Relay(on_s=100.0)}, lambda: twin.time)
+    read = rig.read
+
+    def read_until_lost() -> Reading:
+        reading = read()
+        return reading if twin.time < 90 else replace(reading, values={**reading.values, "t1": np.nan})
+
+    rig.read = read_until_lost  # type: ignore[method-assign]
+    session = run_session(
+        rig, Constant({"q1": 90.0, "q2": 0.0}), {"t1": 50.0}, output="t1", guard=Guard(lab, skin="t1")
+    )
+    assert session.trip is not None
+    assert max(row["q1"] for row in twin.history) == 100.0
+    assert (twin.read().drive, twin.time < 150) == ({"q1": 0.0, "q2": 0.0}, True)
 
 
 def test_a_reading_has_the_request_while_the_device_does_what_it_was_told() -> None:

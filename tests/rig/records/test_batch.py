@@ -17,7 +17,8 @@ import pytest
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.grasp_files import read_grasps
 from thermogrip.datasets.schema import Grasps, make_grasps
-from thermogrip.rig.drivers.relays import Relay, RelayRig
+from thermogrip.mpc.design.relays import Relay
+from thermogrip.rig.drivers.relays import RelayRig
 from thermogrip.rig.guard.guard import Guard
 from thermogrip.rig.guard.trip import Trip
 from thermogrip.rig.interface import DeviceRefusedError
