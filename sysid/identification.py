@@ -34,11 +34,7 @@ from thermogrip.sysid.blackbox.fit import (
     white_error,
     with_refits,
 )
-from thermogrip.sysid.blackbox.order_selection import (
-    SIMPLER_MARGIN,
-    SIMPLER_MARGIN_OF_LOGS,
-    excess_within_noise,
-)
+from thermogrip.sysid.blackbox.order_selection import BARELY_MORE, excess_within_noise
 from thermogrip.sysid.data.data_quality import DataCheck, Evidence, check_data, evidence
 from thermogrip.sysid.data.rest_before import doubt_of_gains, with_rest
 from thermogrip.sysid.data.signal_roles import (
@@ -48,7 +44,7 @@ from thermogrip.sysid.data.signal_roles import (
     still_inputs,
     without_still,
 )
-from thermogrip.sysid.plant.fit_record import HELD_OUT_SHARE, SEVERAL, TAIL, ExpectedError, HeldOut
+from thermogrip.sysid.plant.fit_record import HELD_OUT_SHARE, TAIL, ExpectedError, HeldOut
 from thermogrip.sysid.plant.innovations import innovation_noise
 from thermogrip.sysid.plant.log_grid import Grid, match_logs, misfit, moved_before, signals
 from thermogrip.sysid.plant.log_grid import rows_of as log_rows
@@ -70,8 +66,7 @@ MODELS = (*BLACK_BOXES, "network")
 # public logs and four of a gripper none keeps sindy
 ON_REQUEST = ("armax", "bj", "parsim", "sindy")
 USUAL_MODELS = tuple(model for model in MODELS if model not in ON_REQUEST)
-LINEAR = ("arx", "oe", "armax", "bj", "subspace", "parsim")  # kept where another kind errs barely less
-WITHIN_NOISE = 1.1  # of the best error: then the network is preferred, and a linear kind to neural models
+LINEAR = ("arx", "oe", "armax", "bj", "subspace", "parsim")
 NO_DRAWS = (UserError, np.linalg.LinAlgError)  # what draws of a fit may fail with; the fit itself is sound
 
 Progress = Callable[[float, str], None]
@@ -123,8 +118,6 @@ def identify(
     *,
     models: Sequence[str] = USUAL_MODELS,
     average: float | None = None,
-    order: int | None = None,
-    delay: int | None = None,
     leave_one_out: bool = False,
     draws: int = 24,
     seed: int = 0,
@@ -146,9 +139,6 @@ def identify(
         Candidates, of :data:`MODELS`; those of :data:`ON_REQUEST` where they are asked for.
     average : float, optional
         Averaging step of the black boxes [s]; chosen where absent.
-    order, delay : int, optional
-        Poles of each output (states, of ``subspace``) and steps of delay of the black boxes that have them;
-        the others are left out then. Searched where absent.
     leave_one_out : bool, optional
         Score each log by a fit to the others (at least two logs).
     draws : int, optional
@@ -190,7 +180,8 @@ def identify(
         as_logs(logs, inputs, outputs, disturbances),
         network if "network" in models else None,
         {"inputs": inputs, "outputs": outputs, "disturbances": disturbances},
-        _Options(average, order, delay, leave_one_out, draws, seed),
+        average,
+        leave_one_out=leave_one_out,
     )
     kinds = _candidate_kinds(models, task.network)
     cases = cases_of(task.logs, leave_one_out)
@@ -205,28 +196,16 @@ def identify(
         noisy = [finding.says for finding in task.checked.of("noise") if finding.verdict != "ok"]
         hint = "; ".join([*noisy, *task.doubts]) or None
         raise UserError(f"no model could be fitted ({refused[0]})", hint=hint)
-    plant, without_draws = _refit(kind, boxes.kept, task, steps)
+    plant, without_draws = _refit(kind, boxes.kept, task, steps, draws, seed)
     return _judged(kind, plant, boxes, folds, task, without_draws)
 
 
 # read
 
 
-@dataclass(frozen=True)
-class _Options:
-    """What was asked for beside the data."""
-
-    average: float | None
-    order: int | None
-    delay: int | None
-    leave_one_out: bool
-    draws: int
-    seed: int
-
-
 @dataclass(frozen=True, eq=False)
 class _Task:
-    """The logs as all candidates see them, and what was asked for."""
+    """The logs as all candidates see them."""
 
     logs: list[Log]
     network: GreyModel | None
@@ -237,7 +216,8 @@ class _Task:
     signals: tuple[SignalRole, ...]
     doubts: tuple[str, ...]
     notes: tuple[str, ...]  # what was converted, taken for rest, or left out
-    options: _Options
+    average: float | None
+    leave_one_out: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -253,7 +233,9 @@ def _read_logs(
     logs: list[Log],
     network: GreyModel | str | Path | None,
     named: Mapping[str, Sequence[str] | None],
-    options: _Options,
+    average: float | None,
+    *,
+    leave_one_out: bool,
 ) -> _Task:
     """Return the logs in the roles and units of all candidates, checked; each is matched once."""
     matched = _for_network(network, logs)
@@ -264,16 +246,15 @@ def _read_logs(
     still = still_inputs(model, logs, u)
     u = tuple(name for name in u if name not in still)
     logs, rested = with_rest(logs, u, y)
-    if options.leave_one_out and len(logs) < 2:
+    if leave_one_out and len(logs) < 2:
         raise UserError("leaving one log out needs at least two logs", hint="give another log")
-    checked = check_data(logs, inputs=u, outputs=y, disturbances=d, average=options.average)
+    checked = check_data(logs, inputs=u, outputs=y, disturbances=d, average=average)
     _ask_for_excitation(checked, u, logs[0])
     roles, unused = signal_roles(logs, ([*u, *still], d, y), named, model, still)
     all_named = named["inputs"] is not None and named["outputs"] is not None
     doubts = (*role_doubts(logs, named_all=all_named), *doubt_of_gains(logs, u))
-    return _Task(
-        logs, model, u, y, d, checked, roles, doubts, (*matched.converted, *rested, *unused), options
-    )
+    notes = (*matched.converted, *rested, *unused)
+    return _Task(logs, model, u, y, d, checked, roles, doubts, notes, average, leave_one_out)
 
 
 def _ask_for_excitation(checked: DataCheck, inputs: Sequence[str], log: Log) -> None:
@@ -344,7 +325,7 @@ def _fit_black_boxes(
     kinds: Sequence[str], task: _Task, steps: _Steps, early: Callable[[Identification], None] | None
 ) -> _Boxes:
     """Fit each black box to all logs: subspace, whose step the others take, first, neural ones last."""
-    boxes = [] if task.options.leave_one_out else [kind for kind in kinds if kind != "network"]
+    boxes = [] if task.leave_one_out else [kind for kind in kinds if kind != "network"]
     fits: dict[str, BlackBoxFit] = {}
     refused: dict[str, str] = {}
     grid = None
@@ -379,9 +360,7 @@ def _fit_box(
         inputs=task.inputs,
         outputs=task.outputs,
         disturbances=task.disturbances,
-        average=task.options.average,
-        order=task.options.order,
-        delay=task.options.delay,
+        average=task.average,
         grid=grid,
         progress=report,
     )
@@ -497,7 +476,7 @@ def _hold_out(
 
     pairs = [(kind, case) for case in cases for kind in kinds]
     portable = task.network is None or isinstance(task.network, NetworkModel)
-    if task.options.leave_one_out and workers != 1 and portable:
+    if task.leave_one_out and workers != 1 and portable:
         items: list[_FoldItem] = [(kind, case, kept, task, None) for kind, case in pairs]
         report = steps.start("left out", of=len(items))
         return list(in_order(_fold_of, items, workers, report, what="fitting"))
@@ -560,17 +539,16 @@ def _fitted(
 
 
 def choose_black_box(fits: Sequence[BlackBoxFit], logs: Sequence[Log]) -> BlackBoxFit:
-    """Return the fit of the least error on the parts, a linear one where another kind errs barely less."""
+    """Return the fit of the least error on the parts, a linear one within one standard error of another."""
     # on another run the gain differs besides, which the errors of one or two logs do not show
     run = _run_error(fits, logs)
-    most = SIMPLER_MARGIN if len(fits[0].grid.logs) < SEVERAL else SIMPLER_MARGIN_OF_LOGS
     errors = [np.log(np.hypot(fit.choice.errors[fit.choice.structure], run)) for fit in fits]
     by_error = sorted(range(len(fits)), key=lambda k: float(errors[k].mean()))
     best = by_error[0]
     # the smaller of two linear kinds that tie was no better on 14 public logs, nor the one of the less error
     # over the whole log of its fit (1.69 times the best structure of all in the geometric mean, for 1.34)
     linear = next((k for k in by_error if fits[k].kind in LINEAR), best)
-    return fits[linear if excess_within_noise(errors[linear] - errors[best], most) else best]
+    return fits[linear if excess_within_noise(errors[linear] - errors[best]) else best]
 
 
 def beyond_reach(fits: Sequence[BlackBoxFit], logs: Sequence[Log]) -> bool:
@@ -579,7 +557,7 @@ def beyond_reach(fits: Sequence[BlackBoxFit], logs: Sequence[Log]) -> bool:
     if not linear:
         return False
     best, run = min(linear, key=lambda fit: fit.choice.error), _run_error(linear, logs)
-    return float(np.hypot(best.choice.error, run)) <= WITHIN_NOISE * float(np.hypot(white_error(best), run))
+    return float(np.hypot(best.choice.error, run)) <= BARELY_MORE * float(np.hypot(white_error(best), run))
 
 
 def _run_error(fits: Sequence[BlackBoxFit], logs: Sequence[Log]) -> float:
@@ -608,28 +586,28 @@ def choose_model(rows: Sequence[Row], complete: int) -> str | None:
         return None
     best = min(mean, key=lambda model: mean[model])
     # within 10 percent of the best the network is kept, for its parameters mean something
-    return "network" if mean.get("network", np.nan) <= WITHIN_NOISE * mean[best] else best
+    return "network" if mean.get("network", np.nan) <= BARELY_MORE * mean[best] else best
 
 
 # refit: the chosen one on all logs, with what its uncertainty is drawn from
 
 
-def _refit(kind: str, kept: BlackBoxFit | None, task: _Task, steps: _Steps) -> tuple[Plant, list[str]]:
+def _refit(
+    kind: str, kept: BlackBoxFit | None, task: _Task, steps: _Steps, draws: int, seed: int
+) -> tuple[Plant, list[str]]:
     """Return the plant of a kind fitted to all logs with its draws, and in words why it has none."""
     report = steps.start(f"{kind} on all logs")
     box = None if kind == "network" else kept or _fit_box(kind, task.logs, task, report)
     plant = box.plant if box is not None else _fitted(kind, task.logs, None, task, report)
-    if not task.options.draws or (box is not None and kind not in RESAMPLED):
+    if not draws or (box is not None and kind not in RESAMPLED):
         return plant, []
-    n = task.options.draws
-    seed = task.options.seed
     report = steps.start("draws")
     try:
         if box is not None:
-            return with_refits(box, n, seed=seed, progress=report), []
+            return with_refits(box, draws, seed=seed, progress=report), []
         from thermogrip.sysid.greybox.posterior import fit_problem, with_draws
 
-        return with_draws(plant, fit_problem(plant, task.logs), n, seed=seed, progress=report), []
+        return with_draws(plant, fit_problem(plant, task.logs), draws, seed=seed, progress=report), []
     except NO_DRAWS as error:
         return plant, [no_draws(kind, "draws", error)]
 
@@ -651,7 +629,7 @@ def _judged(
     part_rows = [row for row in part_rows if not (boxes.kept_as(row.model) and row.log.startswith(TAIL))]
     rows = [*part_rows, *_held_out_rows(folds)]
     # the same warm-up as on what was held out, or errors of the start would stand beside ones without
-    starts = [0.0 if task.options.leave_one_out else warm_up_of(log["time"].values) for log in task.logs]
+    starts = [0.0 if task.leave_one_out else warm_up_of(log["time"].values) for log in task.logs]
     whole = [Held(log, log_name(log), start) for log, start in zip(task.logs, starts)]
     runs = tuple(run_held_out(plant, whole_log) for whole_log in whole)
     for whole_log, run in zip(whole, runs):

@@ -74,7 +74,7 @@ def arx_family(
             own_and_driven = (n_y if coupled else 1) + n_drive + len(products)
             label = f"na {n}, nb {n}, delay {delay}" + (", coupled" if coupled and n_y > 1 else "")
             label += f", with {', '.join(products)}" if products else ""
-            structure = Structure(label, n_y * (n * own_and_driven + 1))
+            structure = Structure(label, n_y * (n * own_and_driven + 1), products)
             if only is not None and structure not in only:
                 continue
             model = _solve(grid, products, regression, _Orders(n, delay, coupled))

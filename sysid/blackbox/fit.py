@@ -56,11 +56,6 @@ _SEARCHED, _FACTORISED = ("oe", "armax", "bj"), ("subspace", "parsim")
 # a refit of a neural model takes as long as its fit
 RESAMPLED = ("arx", "oe", "armax", "bj", "subspace", "parsim", "sindy")
 
-# what a kind calls its order or delay
-_FIXED = {(kind, "order"): "poles" for kind in ("arx", "oe", "armax", "bj")}
-_FIXED |= {(kind, "delay"): "delays" for kind, _ in _FIXED}
-_FIXED |= {(kind, "order"): "orders" for kind in ("subspace", "parsim")}
-_MOST_FIXED = 20  # more poles, or steps of delay, than any record determines
 _AVERAGED = ("sindy", "neural")  # fitted at the averaged rate alone
 _FEWEST_ROWS = 160  # of means over five rows: eight blocks' worth of the shortest that is held out
 _MEMORIES, _MEMORY_ROWS = 32, 20  # l of the bootstrap: this part of the logs, and so many rows at least
@@ -94,18 +89,14 @@ def fit_black_box(
     outputs: Sequence[str] | None = None,
     disturbances: Sequence[str] | None = None,
     average: float | None = None,
-    order: int | None = None,
-    delay: int | None = None,
     grid: Grid | None = None,
     progress: Callable[[float, str], None] | None = None,
 ) -> BlackBoxFit:
     """Fit one kind of :data:`BLACK_BOXES` to one or several logs.
 
-    Where absent, signals are known by role, two steps ``average`` [s] are tried (the chosen one and the logs'
-    own, or means over five rows), ``order`` (poles of each output; states, of ``subspace`` and ``parsim``)
-    and ``delay`` (steps from an input to its effect, of ``arx``, ``oe``, ``armax`` and ``bj``) are searched.
-    ``grid`` has the logs at a step that is known already. A UserError where there is no such kind, order or
-    delay, the data are too short, or no structure survives the held-out free run.
+    Where absent, signals are known by role and two steps ``average`` [s] are tried (the chosen one and the
+    logs' own, or means over five rows). ``grid`` has the logs at a step that is known already. A UserError
+    where there is no such kind, the data are too short, or no structure survives the held-out free run.
 
     >>> from scipy.signal import lfilter
     >>> from thermogrip.datasets.schema import make_log
@@ -127,7 +118,7 @@ def fit_black_box(
         grids = _grids(kind, logs, inputs, outputs, disturbances, average)
     # of few rows a search of its own for each part takes little, and may find another optimum
     many = sum(len(segment.time) for segment in grids[0].segments) > MANY_ROWS
-    family = _remembering(kind, order, delay, searches=many)
+    family = _remembering(kind, searches=many)
     for at, tried in enumerate(grids):
 
         def report(done: float, what: str, at: int = at) -> None:
@@ -188,19 +179,9 @@ def _within_steps(grid: Grid, grids: Sequence[Grid]) -> float:
     return float(np.mean(missed / np.maximum(finest.output_spread(), 1e-9)))
 
 
-def _remembering(
-    kind: str, order: int | None = None, delay: int | None = None, *, searches: bool = True
-) -> Family:
-    """Return the family with order and delay as asked for; a kind that has none to fix is refused."""
+def _remembering(kind: str, *, searches: bool = True) -> Family:
+    """Return the family with what its fits leave to the next ones."""
     settings: dict[str, Any] = {}
-    for what, value in (("order", order), ("delay", delay)):
-        if value is None:
-            continue
-        if (kind, what) not in _FIXED:
-            raise UserError(f"a {kind} model has no {what} to fix", hint=f"leave the {what} away, or {kind}")
-        if not 1 <= value <= _MOST_FIXED:
-            raise UserError(f"{what} {value} is not between 1 and {_MOST_FIXED}", hint="give another")
-        settings[_FIXED[kind, what]] = (value,)
     if kind in _SEARCHED and searches:
         settings["searches"] = []
     if kind in _FACTORISED:

@@ -9,7 +9,9 @@ smallest structure is taken for which
 
     mean_f ln(e_sf / e_bf) <= min(se_f ln(e_sf / e_bf), ln 1.05),        ln 1.2 over whole logs,
 
-with the standard error of the paired differences.
+with the standard error of the paired differences. A richer class of models (with products of inputs, of a
+nonlinear kind, with inputs applied up to their rows) is taken only where the best of it wins by more than the
+standard error, or ln 1.1.
 """
 
 from __future__ import annotations
@@ -17,7 +19,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise, product
-from typing import Any, NamedTuple, Protocol, TypeVar
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
@@ -29,10 +31,9 @@ from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.fit_record import HELD_OUT_SHARE, SEVERAL, TAIL
 from thermogrip.sysid.plant.log_grid import MOVED, Grid, Segment
 
-Item = TypeVar("Item")
-
-SIMPLER_MARGIN = float(np.log(1.05))  # of log errors
-SIMPLER_MARGIN_OF_LOGS = float(np.log(1.2))  # the same over whole logs, of which there are few
+# of log errors, to which a standard error of few parts is limited; over whole logs, of which there are fewer
+ORDER_MARGIN, ORDER_MARGIN_OF_LOGS = float(np.log(1.05)), float(np.log(1.2))
+BARELY_MORE = 1.1  # times the error: then a richer class of models, or one without physics, is not taken
 # Times the error on the worst part: a fit to all data, which it has seen, errs on them no more than that;
 # where none does (one structure was asked for, say) no more than twice that.
 _ERROR_ON_ALL_RATIOS = (1.0, 2.0)
@@ -61,6 +62,7 @@ class Structure(NamedTuple):
 
     label: str
     size: int
+    products: tuple[str, ...] = ()  # of inputs, beside these
 
 
 class Family(Protocol):
@@ -208,32 +210,41 @@ def choose(
     """Fit every structure on every fold and choose by the one-standard-error rule."""
     cases = folds(grid)
     scored = _score(grid, family, cases, warmup, progress)
-    structure, fitted = _first_sound(grid, family, scored, warmup)
-    errors = scored[structure]
-    table = {structure_of_table: item.mean for structure_of_table, item in scored.items()}
-    return Choice(structure, errors.prior, table, tuple(cases), errors.rmse, warmup, fitted)
+    table = {structure: errors.mean for structure, errors in scored.items()}
+    sound = _first_sound(grid, family, scored, warmup)
+    if sound is None:
+        raise UserError(
+            "no structure gives a stable model on every held-out part",
+            hint="give a longer log, more excitation, or average more",
+        )
+    structure, fitted = sound
+    if structure.products:
+        plain = {each: errors for each, errors in scored.items() if not each.products}
+        without = _first_sound(grid, family, plain, warmup)
+        if without is not None and excess_within_noise(np.log(table[without[0]] / table[structure])):
+            structure, fitted = without
+    chosen = scored[structure]
+    return Choice(structure, chosen.prior, table, tuple(cases), chosen.rmse, warmup, fitted)
 
 
 def _first_sound(
     grid: Grid, family: Family, scored: Mapping[Structure, _Errors], warmup: int
-) -> tuple[Structure, Model]:
-    """Return the best structure whose fit to all data errs on them no more than it may, and that fit."""
-    most = SIMPLER_MARGIN if len(grid.logs) < SEVERAL else SIMPLER_MARGIN_OF_LOGS
+) -> tuple[Structure, Model] | None:
+    """Return the best structure whose fit to all data errs on them no more than it may, and that fit; None
+    where there is none."""
+    most = ORDER_MARGIN if len(grid.logs) < SEVERAL else ORDER_MARGIN_OF_LOGS
     on_all: dict[Structure, tuple[Model, float] | None] = {}
     for times in _ERROR_ON_ALL_RATIOS:
         remaining = {structure: errors.mean for structure, errors in scored.items()}
         while any(np.isfinite(errors).all() for errors in remaining.values()):
-            structure = smallest_near_the_best(remaining, most, size=lambda s: s.size)
+            structure = smallest_near_the_best(remaining, most)
             if structure not in on_all:
                 on_all[structure] = _fit_to_all(grid, family, structure, scored[structure], warmup)
             fit = on_all[structure]
             if fit is not None and fit[1] <= times * float(np.max(scored[structure].mean)):
                 return structure, fit[0]
             del remaining[structure]
-    raise UserError(
-        "no structure gives a stable model on every held-out part",
-        hint="give a longer log, more excitation, or average more",
-    )
+    return None
 
 
 class _Errors(NamedTuple):
@@ -376,21 +387,18 @@ def first_readings(segment: Segment) -> Array:
     return np.asarray(segment.y[np.argmax(np.isfinite(segment.y), axis=0), np.arange(segment.y.shape[1])])
 
 
-def excess_within_noise(excess: Array, most: float = SIMPLER_MARGIN) -> bool:
-    """Return whether paired differences of log errors are zero to within one standard error and ``most``."""
+def excess_within_noise(excess: Array, most: float = float(np.log(BARELY_MORE))) -> bool:
+    """Return whether paired differences of log errors are zero to within one standard error, and ``most``."""
     return bool(excess.mean() <= min(excess.std(ddof=1) / np.sqrt(excess.size), most))
 
 
-def smallest_near_the_best(
-    table: Mapping[Item, Array], most: float, *, size: Callable[[Item], float]
-) -> Item:
-    """Return by the one-standard-error rule the smallest of items that were scored on the same parts."""
-    usable = {item: error for item, error in table.items() if np.isfinite(error).all()}
+def smallest_near_the_best(table: Mapping[Structure, Array], most: float) -> Structure:
+    """Return by the one-standard-error rule the smallest of structures that were scored on the same parts."""
     # a part whose input lies outside of what the rest has seen is bad for all alike: it must not outweigh
-    logs = {item: np.log(np.maximum(error, 1e-12)) for item, error in usable.items()}
-    best = min(logs, key=lambda item: float(logs[item].mean()))
-    near_best = [item for item in logs if item == best or excess_within_noise(logs[item] - logs[best], most)]
-    return min(near_best, key=lambda item: (size(item), float(logs[item].mean())))
+    logs = {s: np.log(np.maximum(error, 1e-12)) for s, error in table.items() if np.isfinite(error).all()}
+    best = min(logs, key=lambda s: float(logs[s].mean()))
+    near_best = [s for s in logs if s == best or excess_within_noise(logs[s] - logs[best], most)]
+    return min(near_best, key=lambda s: (s.size, float(logs[s].mean())))
 
 
 def _moves_all(fold: Fold, *, least: Array) -> bool:

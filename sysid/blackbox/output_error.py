@@ -304,7 +304,7 @@ def oe_family(
         for na, nb, nk in product(poles, zeros, delays):
             label = f"na {na}, nb {nb}, delay {nk}" + (f", with {', '.join(products)}" if products else "")
             size = (na + w[0].shape[1] * nb + kind.numbers(na)) * len(grid.outputs)
-            structure = order_selection.Structure(label, size)
+            structure = order_selection.Structure(label, size, products)
             if only is not None and structure not in only:
                 continue
             fitted = [search_one(record, na, nb, nk) for search_one, record in zip(searches, records)]

@@ -63,7 +63,7 @@ def subspace_family(
         products = f", with {', '.join(some)}" if some else ""
         names = {
             (f, w, n): Structure(
-                f"order {n}, {f} block rows, {w}{products}", n * (n_drive + len(some) + n_y + 1)
+                f"order {n}, {f} block rows, {w}{products}", n * (n_drive + len(some) + n_y + 1), some
             )
             for f, w, n in product(sizes, weightings, orders)
             if n < f or (f == 2 and n <= n_y)

@@ -31,12 +31,7 @@ from thermogrip.datasets.resample import block_means, gaps
 from thermogrip.datasets.schema import Log, column, columns, log_name
 from thermogrip.sysid.plant.fit_record import SEVERAL, fit_logs, said_of_fit
 from thermogrip.sysid.plant.log_grid import cut_stretches, match_logs
-from thermogrip.sysid.validation.residual_tests import (
-    SQUARED,
-    CorrelationTest,
-    ResidualCorrelations,
-    residual_correlations,
-)
+from thermogrip.sysid.validation.residual_tests import SQUARED, ResidualCorrelations, residual_correlations
 from thermogrip.sysid.validation.verdict import NO_BETTER, Cause, Verdict, judge
 
 if TYPE_CHECKING:
@@ -186,7 +181,8 @@ def usual_warmup(plant: Plant, log: Log) -> float:
         return max(5.0, plant.dt)
     # one of one or two logs was scored from the steady start of a part, fifty rows, and its slowest state
     # needs a tenth of its time constant to show; no run spends more than a tenth of its log on that
-    return max(5.0, plant.dt, warm_up_of_fit(plant, log), start_seconds(plant, log))
+    of_fit = warm_up_of(log["time"].values) if 0 < len(plant.logs) < SEVERAL else 0.0
+    return max(5.0, plant.dt, of_fit, start_seconds(plant, log))
 
 
 def start_seconds(plant: Plant, log: Log) -> float:
@@ -202,12 +198,6 @@ def start_seconds(plant: Plant, log: Log) -> float:
 def warm_up_of(time: Array) -> float:
     """Return the warm-up [s] of a log that may begin warm: fifty rows, a minute at most."""
     return min(50.0 * float(np.median(np.diff(time))), 60.0)
-
-
-def warm_up_of_fit(plant: Plant, log: Log) -> float:
-    """Return the warm-up [s] that scored a black box of one or two logs; 0 for other plants."""
-    black_box = bool(plant.scores.held_out_by_part)
-    return warm_up_of(log["time"].values) if black_box and 0 < len(plant.logs) < SEVERAL else 0.0
 
 
 def _judged(run: FreeRun, error: Array, by_inputs: InputEffect | None) -> FreeRun:
@@ -341,7 +331,8 @@ def _notes(run: FreeRun, by_inputs: InputEffect | None) -> list[str]:
     outside = _outside(plant, {name: column(log, name) for name in plant.valid if name in log})
     unseen = [name for name in outside if name not in plant.outputs]
     units = {name: _unit(log, name) for name in plant.outputs}
-    notes += _residual_notes(run.residual, units, run.warmup, unseen, verdict)
+    small = verdict is not None and verdict.standing not in ("worse", "another plant")
+    notes += _residual_notes(run, units, unseen, small=small)
     if by_inputs is not None:
         remaining = ", ".join(f"{name} {rms:.2g} {units[name]}" for name, rms in by_inputs.remaining.items())
         notes.append(f"most of the error is {by_inputs.words()}, which would leave {remaining}")
@@ -352,47 +343,35 @@ def _notes(run: FreeRun, by_inputs: InputEffect | None) -> list[str]:
     return notes if verdict is None else [*notes, str(verdict)]
 
 
-def _residual_notes(
-    residual: ResidualCorrelations,
-    units: Mapping[str, str],
-    warmup: float,
-    unseen: list[str],
-    verdict: Verdict | None = None,
-) -> list[str]:
-    """Return notes on the residuals of each output."""
+def _residual_notes(run: FreeRun, units: Mapping[str, str], unseen: list[str], *, small: bool) -> list[str]:
+    """Return with what each residual correlates, by how much, and what that may mean; ``small``: of an error
+    that is no larger than was stated."""
     notes = []
-    small = verdict is not None and verdict.standing not in ("worse", "another plant")
-    for name, tests in residual.tests.items():
+    for name, tests in run.residual.tests.items():
         significant = {signal: found for signal, found in tests.items() if found.significant}
-        notes += [
-            _correlation_note(name, *item, units[name], unseen, small=small) for item in significant.items()
-        ]
-        share = residual.start.get(name, 0.0)
+        for signal, found in significant.items():
+            what, lacks = signal, "a delay, lag or term"
+            if signal.endswith(SQUARED):
+                what = f"the square of {name}"
+                losses = "a loss that curves (radiation, free convection)"
+                lacks = losses if units[name] == "degC" else "a term that curves"
+            why = f"{lacks} is missing, or the plant is not what it was in the fit"
+            if small:
+                why = f"{lacks} is missing, within the error that was stated"
+            if unseen:
+                seldom = f"the fit has not seen {', '.join(unseen)} as here"
+                why = f"{seldom}, so this need not be a term that is missing"
+            size = f"{found.size:.2g} {units[name]}".removesuffix(" 1")
+            notes.append(
+                f"{name}: the residual correlates with {what} (rms {size}, p = {found.p:.1g}): {why}"
+            )
+        share = run.residual.start.get(name, 0.0)
         if share > START and not significant:
             notes.append(
-                f"{name}: {100 * share:.0f} % of the squared error is the start, which {warmup:g} s of "
+                f"{name}: {100 * share:.0f} % of the squared error is the start, which {run.warmup:g} s of "
                 "readings do not determine; give a longer warm-up"
             )
     return notes
-
-
-def _correlation_note(
-    name: str, signal: str, found: CorrelationTest, unit: str, unseen: list[str], *, small: bool = False
-) -> str:
-    """Return with what the residual of an output correlates, by how much, and what that may mean; ``small``:
-    of an error that is no larger than was stated."""
-    if signal.endswith(SQUARED):
-        curved = "a loss that curves (radiation, free convection)" if unit == "degC" else "a term that curves"
-        what, lacks = f"the square of {name}", curved
-    else:
-        what, lacks = signal, "a delay, lag or term"
-    size = f"{found.size:.2g} {unit}".removesuffix(" 1")
-    why = f"{lacks} is missing, or the plant is not what it was in the fit"
-    if small:
-        why = f"{lacks} is missing, within the error that was stated"
-    if unseen:
-        why = f"the fit has not seen {', '.join(unseen)} as here, so this need not be a term that is missing"
-    return f"{name}: the residual correlates with {what} (rms {size}, p = {found.p:.1g}): {why}"
 
 
 def _outside(plant: Plant, signals: Mapping[str, Array]) -> dict[str, float]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
-from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -16,11 +15,10 @@ from scipy.io import loadmat
 
 from tests.cli.conftest import Bench, StandIn, shares, words_of
 from tests.end_to_end.conftest import small_plant
-from thermogrip.cli.identify import _starts
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.log_files import read_log
 from thermogrip.datasets.schema import make_log
-from thermogrip.report.console import Console, short
+from thermogrip.report.console import short
 from thermogrip.report.plant import band_words
 from thermogrip.sysid.data.data_quality import Finding
 from thermogrip.sysid.data.signal_roles import SignalRole
@@ -33,7 +31,7 @@ from thermogrip.sysid.plant.fit_record import ExpectedError, PlantScores
 from thermogrip.sysid.plant.linearise import linearise_plant
 from thermogrip.sysid.plant.log_grid import roles_of
 from thermogrip.sysid.plant.plant import Plant
-from thermogrip.sysid.validation.free_run import free_run
+from thermogrip.sysid.validation.free_run import free_run, usual_warmup
 from thermogrip.sysid.validation.verdict import Row, Standing, Verdict
 
 BOARD = plant_from_prior(load_network("tclab"))
@@ -130,7 +128,7 @@ def test_the_network_is_the_one_asked_for_or_a_shipped_one_whose_columns_the_log
 
 def test_words_reach_the_fit_by_their_meaning(room: SimpleNamespace) -> None:
     words = "good.csv two.csv --network tclab --inputs q1,q2 --outputs T1_degC --disturbances room"
-    words += " --models arx,network --average 2.5 --order 2 --delay 3 --leave-one-out"
+    words += " --models arx,network --average 2.5 --leave-one-out"
     words += " --seed 7 --report r.html --workers 3"
     done = room.bench.run("identify", *words.split(), "--out", "p.json")
     assert done.code == 0, done
@@ -140,7 +138,6 @@ def test_words_reach_the_fit_by_their_meaning(room: SimpleNamespace) -> None:
     [fit] = room.fits
     assert (len(fit.args[0]), fit.args[2:]) == (2, roles)
     assert (fit.models, fit.average, fit.leave_one_out) == (("arx", "network"), 2.5, True)
-    assert (fit.order, fit.delay) == (2, 3)
     assert (fit.draws, fit.seed, fit.workers) == (24, 7, 3)
     [page] = room.pages
     assert page.args == (Path("r.html"), "Identification", "From log a, log a.", ["a section"])
@@ -405,18 +402,6 @@ def test_a_plant_that_is_not_good_is_identified_anew_whatever_a_run_says(
     assert done.err.endswith(f"next: thermogrip {then}\n")
 
 
-def test_a_warm_up_shorter_than_that_of_the_fit_is_told(
-    bench: Bench, stand_in: StandIn, runs_stand_in: Callable[[Any], None]
-) -> None:
-    stand_in("thermogrip.sysid.validation.free_run.warm_up_of_fit", 50.0)
-    runs_stand_in(SimpleNamespace(notes=(), band=lambda: None, verdict=None))
-    done = bench.run("validate", "plant.json", "good.csv", "--warmup", "8", "--score-from", "9")
-    assert "good: 8 s of readings set the state, the fit was scored with 50 s" in words_of(done.err)
-    assert "--warmup 50 --score-from 50" in words_of(done.err)
-    done = bench.run("validate", "plant.json", "good.csv", "--warmup", "50", "--score-from", "50")
-    assert "set the state" not in done.err
-
-
 def test_a_plant_is_linearised_where_it_is_asked_for(bench: Bench) -> None:
     (bench.path / "board.json").write_text(json.dumps(replace(BOARD, samples=None).to_dict()))
     words = ("linearise", "board.json", "--at", "q1=30, q2=20", "--dt", "4", "--out", "l.json", "--seed", 3)
@@ -478,9 +463,6 @@ def test_a_black_box_begins_from_as_many_readings_as_its_slowest_time_constant_a
     model = StateSpaceModel(("q",), (), ("t",), A=[[np.exp(-5 / 500)]], B=[[1.0]], C=[[1.0]], dt=5.0)
     box = Plant(model, {}, dt=5.0, logs=("a", "b", "c"), valid={"q": (0.0, 1.0), "t": (0.0, 50.0)})
     scores = PlantScores(held_out_by_part={"t": [0.1]})
-    console = Console(as_json=True)
-    starts = partial(_starts, console)
-    assert starts(replace(box, scores=scores), [log], None, None) == [(50.0, 50.0)]
-    assert starts(replace(box, scores=scores), [log.isel(time=slice(80))], None, None) == [(40.0, 40.0)]
-    assert starts(replace(box, scores=scores), [log], 7.0, 9.0) == [(7.0, 9.0)]
-    assert starts(box, [log], None, None) == [(5.0, 5.0)]
+    assert usual_warmup(replace(box, scores=scores), log) == 50.0
+    assert usual_warmup(replace(box, scores=scores), log.isel(time=slice(80))) == 40.0
+    assert usual_warmup(box, log) == 5.0

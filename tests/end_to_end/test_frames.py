@@ -36,7 +36,7 @@ LOGS: list[Any] = [
     lambda plant, log: [free_run(plant, log).scores["t_tank"].rmse, free_run(plant, log).band().level],
     lambda plant, log: [len(check_data(log, outputs=["t_tank"]).findings)],
     pytest.param(
-        lambda plant, log: identify(log, models=["arx"], draws=2, order=1).plant.model.A.ravel(),
+        lambda plant, log: identify(log, models=["arx"], draws=2).plant.model.A.ravel(),
         marks=pytest.mark.slow,
     ),
 ]

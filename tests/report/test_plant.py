@@ -106,8 +106,7 @@ def test_signals_are_shown_with_their_roles_and_guesses_are_marked() -> None:
 
 @pytest.fixture
 def no_figures(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(plant.plots, "models_figure", lambda *_, **__: Figure())
-    monkeypatch.setattr("thermogrip.report.plots.corner_figure", lambda *_, **__: Figure())
+    monkeypatch.setattr(plant, "corner_figure", lambda *_, **__: Figure())
     monkeypatch.setattr(
         "thermogrip.sysid.greybox.identifiability.identifiability_report", lambda _: ["U is known"]
     )

@@ -20,19 +20,11 @@ from thermogrip.datasets.schema import make_grasps, make_log
 from thermogrip.mpc import PIController, simulate_closed_loop
 from thermogrip.report import plot
 from thermogrip.report.charts import draw_chart
-from thermogrip.report.plots import (
-    bode_chart,
-    corner_figure,
-    free_run_chart,
-    grasps_chart,
-    loops_chart,
-    models_figure,
-    steps_chart,
-)
+from thermogrip.report.plant import bode_chart, corner_figure, free_run_chart
+from thermogrip.report.plots import grasps_chart, loops_chart, steps_chart
 from thermogrip.sysid import free_run, identify
 from thermogrip.sysid.export.dynamics import Estimate
 from thermogrip.sysid.validation.prediction_bands import Band
-from thermogrip.sysid.validation.verdict import Row
 
 
 def waves(n: int, shift: float = 0.0) -> Any:
@@ -58,17 +50,6 @@ def free_run_of(n: int) -> Figure:
     band = Band(0.9, {name: np.full(n, 0.5) for name in ("t1", "level")}, {"t1": 0.9, "level": 0.8}, 3)
     run = SimpleNamespace(measured=waves(n), log=waves(n, 0.25), scores=dict.fromkeys(("t1", "level")))
     return draw_chart(free_run_chart(run, ("t1", "level"), band))
-
-
-def models_of() -> Figure:
-    rows = [
-        Row(model, "order 1", log, output, rmse, 90.0, {"t1": "degC"}.get(output, "V"), 10, 1.0, log != "own")
-        for model, log, output, rmse in (
-            ("arx", "one", "t1", 0.1), ("arx", "two", "t1", 0.2), ("oe", "one", "t1", 0.4),
-            ("oe", "two", "level", 30.0), ("oe", "own", "level", 9.0),
-        )
-    ]  # fmt: skip
-    return models_figure(rows)
 
 
 def corner_of() -> Figure:
@@ -111,7 +92,6 @@ def grasps_of(*labels: str) -> Any:
 FIGURES = {
     "free run": lambda: free_run_of(12),
     "free run of many rows": lambda: free_run_of(3001),
-    "models": models_of,
     "corner": corner_of,
     "loops": loops_of,
     "steps": steps_of,
@@ -170,7 +150,7 @@ def test_a_result_is_drawn_as_its_page_shows_it(tmp_path: Path) -> None:
     run = simulate_closed_loop(PIController(plant), plant, [(26.0, 20.0)])
     identified = identify([log], models=["arx"])
     drawn = {
-        "free-run RMSE": plot(identified), "t_tank": plot(free_run(plant, log)), "t_surface": plot(plant),
+        "free run": plot(identified), "t_tank": plot(free_run(plant, log)), "t_surface": plot(plant),
         "magnitude": plot(plant, bode=True), "drive": plot(run),
     }  # fmt: skip
     for words, figure in drawn.items():

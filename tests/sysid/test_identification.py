@@ -25,7 +25,7 @@ from thermogrip.sysid.models.network import load_network
 from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.fit_record import ExpectedError, HeldOut, fit_logs
 from thermogrip.sysid.validation import verdict
-from thermogrip.sysid.validation.free_run import free_run, warm_up_of_fit
+from thermogrip.sysid.validation.free_run import free_run, usual_warmup
 from thermogrip.sysid.validation.prediction_bands import between_runs, expected_error
 
 REAL = Path(os.environ.get("THERMOGRIP_REAL_DATA", Path(__file__).parents[3] / "shared" / "data" / "real"))
@@ -118,7 +118,9 @@ def test_every_part_held_out_of_every_candidate_is_in_the_table():
 @pytest.mark.parametrize(
     ("errors", "run", "chosen"),
     [
-        ({"neural": [0.10, 0.10, 0.10, 0.10], "oe": [0.10, 0.11, 0.10, 0.10]}, 0, "oe"),  # within 5 percent
+        ({"neural": [0.10, 0.10, 0.10, 0.10], "oe": [0.10, 0.11, 0.10, 0.10]}, 0, "oe"),
+        # 10 percent more, the standard error is 14
+        ({"neural": [0.10, 0.10, 0.10, 0.10], "oe": [0.08, 0.15, 0.10, 0.12]}, 0, "oe"),
         ({"neural": [0.10, 0.10, 0.10, 0.10], "oe": [0.12, 0.11, 0.12, 0.12]}, 0, "neural"),
         ({"subspace": [0.10, 0.10, 0.10, 0.10], "oe": [0.10, 0.11, 0.10, 0.10]}, 0, "subspace"),
         ({"subspace": [0.10, 0.10, 0.10, 0.10], "oe": [0.13, 0.13, 0.13, 0.13]}, 0, "subspace"),
@@ -182,13 +184,6 @@ def test_neural_models_are_left_out_where_linear_ones_err_by_white_noise():
     assert "little more than noise" in note
 
 
-def test_a_fixed_order_leaves_kinds_without_one_out():
-    found = identify(plant_log(), models=["oe", "sindy"], average=2.0, order=1, draws=0)
-    assert found.model == "oe"
-    assert any("a sindy model has no order to fix" in note for note in found.notes)
-    assert "na 1," in found.plant.scores.structure
-
-
 def test_inputs_of_the_row_are_said_and_the_warm_up_of_a_fit_is_that_of_its_logs():
     rng = np.random.default_rng(3)
     q = rng.random(600)
@@ -197,11 +192,11 @@ def test_inputs_of_the_row_are_said_and_the_warm_up_of_a_fit_is_that_of_its_logs
     found = identify(log, models=["arx"], average=1.0, draws=0)
     assert found.plant.inputs_end_at_row
     assert any("an input moves its own row's reading" in note for note in found.notes)
-    assert warm_up_of_fit(found.plant, log) == 50.0
-    assert warm_up_of_fit(found.plant, log.isel(time=slice(0, None, 2))) == 60.0  # of rows of 2 s
-    assert warm_up_of_fit(replace(found.plant, logs=("a", "b", "c")), log) == 0.0
+    assert usual_warmup(found.plant, log) == 50.0
+    assert usual_warmup(found.plant, log.isel(time=slice(0, None, 2))) == 60.0  # of rows of 2 s
+    assert usual_warmup(replace(found.plant, logs=("a", "b", "c")), log) == 5.0
     network = Plant(found.plant.model, {}, dt=1.0, logs=("a",))  # no errors of folds
-    assert warm_up_of_fit(network, log) == 0.0
+    assert usual_warmup(network, log) == 5.0
 
 
 def test_one_error_is_stated_of_another_run_everywhere():

@@ -88,14 +88,6 @@ def identify(
         ),
     ] = USUAL_MODELS,
     average: Average = None,
-    order: Annotated[
-        int | None,
-        cli.opt("--order", "N", "Poles of ARX, OE, ARMAX and BJ, states of subspace models.", min=1, max=20),
-    ] = None,
-    delay: Annotated[
-        int | None,
-        cli.opt("--delay", "N", "Delay of ARX, OE, ARMAX and BJ, in steps of the model.", min=1, max=20),
-    ] = None,
     leave_one_out: Annotated[
         bool, cli.flag("--leave-one-out", "Score each log by a fit to the others.")
     ] = False,
@@ -143,8 +135,6 @@ def identify(
             *roles,
             models=wanted,
             average=average,
-            order=order,
-            delay=delay,
             leave_one_out=leave_one_out,
             draws=0 if posterior else 24,
             seed=seed,
@@ -289,7 +279,6 @@ def _show_identified(
         signal_table,
         time_constant_words,
     )
-    from thermogrip.sysid.greybox.identifiability import identifiability_report
 
     console.table("Columns of the logs", *signal_table(found))
     console.table("Free runs (RMSE)", *held_out_table(found.rows))
@@ -298,7 +287,7 @@ def _show_identified(
     if dynamics is not None:
         console.table("Gains at rest", *gain_table(dynamics))
         console.say(time_constant_words(dynamics))
-    for sentence in identifiability_report(plant):
+    for sentence in _identifiability(plant):
         console.say(sentence)
     for finding in found.data_check.findings:
         if finding.verdict != "ok":
@@ -309,10 +298,16 @@ def _show_identified(
     console.say(found.verdict)
 
 
-def _identified(found: Identification, plant: Plant, record: Posterior | None, out: Path) -> dict[str, Any]:
-    """Return the JSON answer of ``identify``."""
+def _identifiability(plant: Plant) -> list[str]:
+    if not plant.free:  # a black box
+        return []
     from thermogrip.sysid.greybox.identifiability import identifiability_report
 
+    return identifiability_report(plant)
+
+
+def _identified(found: Identification, plant: Plant, record: Posterior | None, out: Path) -> dict[str, Any]:
+    """Return the JSON answer of ``identify``."""
     sampled = None
     if record is not None:
         sampled = {
@@ -333,7 +328,7 @@ def _identified(found: Identification, plant: Plant, record: Posterior | None, o
             name: {"value": plant.values[name], "unit": plant.units.get(name, "1")} for name in plant.free
         },
         "intervals_90": plant.intervals(0.9),
-        "identifiability": identifiability_report(plant),
+        "identifiability": _identifiability(plant),
         "posterior": sampled,
         "notes": found.notes,
         "out": out,
@@ -379,7 +374,6 @@ def validate(
     from thermogrip.sysid.validation.free_run import free_run
 
     repairs = _repaired(console, logs)
-    starts = _starts(console, loaded, logs, warmup, score_from)
     for log in logs:
         for name in moved_beside(loaded, log):
             console.warn(f"{log.attrs['name']}: {name} moves in this log, and the plant has no such input")
@@ -387,12 +381,12 @@ def validate(
     with console.progress("validate") as progress:
         for k, log in enumerate(logs):
             progress(k / len(logs), log.attrs["name"])
-            seconds, first = starts[k]
-            runs.append(free_run(loaded, log, warmup=seconds, score_from=first, average=average))
+            runs.append(free_run(loaded, log, warmup=warmup, score_from=score_from, average=average))
     bands = [run.band() for run in runs]
     if report is not None:
         sections = [free_run_section(*pair) for pair in zip(runs, bands)]
-        since = ", ".join(dict.fromkeys(f"{first:g} s" for _, first in starts))
+        firsts = [run.warmup if score_from is None else score_from for run in runs]
+        since = ", ".join(dict.fromkeys(f"{first:g} s" for first in firsts))
         lead = f"Inputs in, outputs out, nothing fed back; scored from {since} on."
         write_report(report, f"Free runs of {plant.name}", lead, sections)
     console.table(f"Free run of {plant.name}", *run_table(runs))
@@ -418,25 +412,6 @@ def validate(
     more = ["--warmup", f"{seconds:g}", "--score-from", f"{seconds:g}"]
     command = shlex.join(["validate", str(plant), *map(str, paths), *more])
     return cli.Done(most_urgent, code, printable(command))
-
-
-def _starts(
-    console: Console, plant: Plant, logs: Sequence[Log], warmup: float | None, score_from: float | None
-) -> list[tuple[float, float]]:
-    """Return by log the warm-up and from when it is scored [s], and warn of one shorter than the fit's."""
-    from thermogrip.sysid.validation.free_run import usual_warmup, warm_up_of_fit
-
-    out = []
-    for log in logs:
-        needed, name = warm_up_of_fit(plant, log), log.attrs["name"]
-        seconds = usual_warmup(plant, log) if warmup is None else warmup
-        if seconds < needed:
-            console.warn(
-                f"{name}: {seconds:g} s of readings set the state, the fit was scored with {needed:g} s; "
-                f"write --warmup {needed:g} --score-from {needed:g}"
-            )
-        out.append((seconds, seconds if score_from is None else score_from))
-    return out
 
 
 def _urgency(verdict: Verdict) -> str:

@@ -22,8 +22,8 @@ def plot(result: Identification | FreeRun | Plant | ClosedLoop | Comparison, *, 
     Parameters
     ----------
     result : Identification, FreeRun, Plant, ClosedLoop or Comparison
-        Held-out errors of the candidates; measured and simulated outputs; step responses about the middle of
-        the logs; outputs and drives; accuracies with their intervals.
+        Measured and simulated outputs, over what was held out where a model was identified; step responses
+        about the middle of the logs; outputs and drives; accuracies with their intervals.
     bode : bool, optional
         Of a plant: frequency responses in place of the step responses.
 
@@ -48,22 +48,23 @@ def plot(result: Identification | FreeRun | Plant | ClosedLoop | Comparison, *, 
     from thermogrip.classify.evaluation.comparison import Comparison
     from thermogrip.classify.figures import accuracy_figure
     from thermogrip.mpc.closed_loop.simulate import ClosedLoop
-    from thermogrip.report import plots
     from thermogrip.report.charts import draw_chart
+    from thermogrip.report.plant import bode_chart, free_run_chart, step_response_chart
+    from thermogrip.report.plots import closed_loop_chart
     from thermogrip.sysid.export.dynamics import plant_dynamics
     from thermogrip.sysid.identification import Identification
     from thermogrip.sysid.plant.plant import Plant
     from thermogrip.sysid.validation.free_run import FreeRun
 
     if isinstance(result, Identification):
-        return plots.models_figure(result.rows)
+        result = next(iter(result.held_out_runs.values()), result.runs[0])
     if isinstance(result, FreeRun):
-        return draw_chart(plots.free_run_chart(result, tuple(result.scores)))
+        return draw_chart(free_run_chart(result, tuple(result.scores)))
     if isinstance(result, Plant):
         dynamics = plant_dynamics(result)
-        return draw_chart(plots.bode_chart(dynamics) if bode else plots.step_response_chart(dynamics))
+        return draw_chart(bode_chart(dynamics) if bode else step_response_chart(dynamics))
     if isinstance(result, ClosedLoop):
-        return draw_chart(plots.closed_loop_chart(result))
+        return draw_chart(closed_loop_chart(result))
     if isinstance(result, Comparison):
         return accuracy_figure(result)
     raise TypeError(f"there is no picture of a {type(result).__name__}")

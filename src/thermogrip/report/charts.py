@@ -164,3 +164,13 @@ def _draw(axis: Axes, panel: Panel) -> None:
     axis.set_ylabel(panel.label)
     if panel.title:
         axis.set_title(panel.title, fontsize=9)
+
+
+def with_unit(name: str, unit: str) -> str:
+    """Return the variable with its unit, where it has one."""
+    return name if unit == "1" else f"{name} [{unit}]"
+
+
+def difference_unit(unit: str) -> str:
+    """Return the unit of a difference: kelvin of temperatures."""
+    return "K" if unit == "degC" else unit

@@ -1,4 +1,4 @@
-"""Sections of the page of a plant: the models compared, its parameters, posterior, free runs.
+"""Sections and charts of the page of a plant: the models compared, its parameters, posterior, free runs.
 
 As in :mod:`thermogrip.report.classification`, each function returns sections whose verdict is a sentence.
 """
@@ -6,20 +6,34 @@ As in :mod:`thermogrip.report.classification`, each function returns sections wh
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from thermogrip.datasets.schema import log_name
-from thermogrip.report import plots
+from thermogrip.datasets.arrays import Array
+from thermogrip.datasets.errors import UserError, known_names
+from thermogrip.datasets.schema import column, log_name, names
+from thermogrip.report.charts import (
+    DASHES,
+    PALETTE,
+    Chart,
+    Curve,
+    Panel,
+    difference_unit,
+    stretches,
+    with_unit,
+)
 from thermogrip.report.console import Cells, significant
 from thermogrip.report.html import Picture, Plot, Section, Table, Text
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from matplotlib.figure import Figure
+
     from thermogrip.datasets.schema import Log
-    from thermogrip.sysid.export.dynamics import Dynamics
+    from thermogrip.sysid.export.dynamics import Dynamics, Estimate
     from thermogrip.sysid.greybox import Posterior
     from thermogrip.sysid.identification import Identification
     from thermogrip.sysid.plant.plant import Plant
@@ -31,7 +45,89 @@ _BASELINES = (
     "reading (RMSE)"
 )
 _HELD_OUT = "Free-run RMSE on rows that were not fitted (blocks: of means over a step of the model)"
+MEASURED, PREDICTED = "#9dabb9", PALETTE[1]  # a broad line, and a thin one of dashes over it
 _TIME_CONSTANTS = 6  # the slowest, in a sentence
+
+
+def free_run_chart(run: FreeRun, outputs: Sequence[str], band: Band | None = None) -> Chart:
+    """Return outputs measured and in free run, their difference and the inputs, a column an output; rows
+    whose ``scored`` is 0 stand on grey, and where a band is given readings are expected in the shade."""
+    log, simulated = run.measured, run.log
+    t = np.asarray(log["time"].values, dtype=float)
+    shaded = stretches(t, column(simulated, "scored") == 0) if "scored" in simulated else ()
+    inputs = tuple(
+        Curve(with_unit(u, log[u].attrs["units"]), t, column(log, u), PALETTE[(2 + k) % 8], step=True)
+        for k, u in enumerate(names(log, "input"))
+    )
+    columns = []
+    for name in outputs:
+        measured, model = column(log, name), column(simulated, name)
+        unit = log[name].attrs["units"]
+        read = Curve("measured", t, measured, MEASURED, width=5.0)
+        freely = Curve("free run", t, model, PREDICTED, width=1.6, dash="--")
+        error = Curve("measured - free run", t, measured - model, width=0.9)
+        above: tuple[Curve, ...] = (read, freely)
+        below: tuple[Curve, ...] = (error,)
+        if band is not None:
+            half = band.half[name]
+            above = (read, replace(freely, low=model - half, high=model + half))
+            below = (Curve("expected", t, 0 * half, PREDICTED, 1.0, "--", low=-half, high=half), error)
+        columns.append(
+            (
+                Panel(with_unit(name, unit), above, name, 2.4, shaded=shaded),
+                Panel(f"error [{difference_unit(unit)}]", below, height=1.3, shaded=shaded),
+                Panel("inputs", inputs),
+            )
+        )
+    return Chart(tuple(columns))
+
+
+def step_response_chart(found: Dynamics) -> Chart:
+    """Return the response of each output, a panel each, to a unit step of each input, a column each."""
+    outputs, inputs = found.linear.outputs, found.linear.inputs
+    time, step = found.step_response()
+    units = {name: found.units.get(name, "1") for name in (*outputs, *inputs)}
+
+    def panel(i: int, j: int) -> Panel:
+        value, low, high = (np.asarray(values)[:, i, j] for values in step)
+        ends = (low, high) if np.isfinite(low).all() else (None, None)
+        curve = Curve(outputs[i], time, value, PALETTE[i % 8], low=ends[0], high=ends[1])
+        by = units[inputs[j]]
+        title = f"{inputs[j]} + 1{'' if by == '1' else ' ' + difference_unit(by)}"
+        label = with_unit(outputs[i], difference_unit(units[outputs[i]]))
+        return Panel(label, (curve,), title if i == 0 else "", 1.3)
+
+    rows = range(len(outputs))
+    columns = tuple(tuple(panel(i, j) for i in rows) for j in range(len(inputs)))
+    return Chart(columns, wide=max(3.2, 6.4 / len(inputs)))
+
+
+def bode_chart(found: Dynamics) -> Chart:
+    """Return magnitude and phase from each input, a column each, to every output, a line each."""
+    outputs, inputs = found.linear.outputs, found.linear.inputs
+    omega, magnitude, phase = found.frequency_response()
+    least = 1e-4 * magnitude.value.max(axis=(0, 1))  # of each input: the scale has no zero
+    turned = type(phase)(*(np.where(magnitude.value < least, np.nan, part) for part in phase))
+
+    def curve(part: Estimate, i: int, j: int, floor: float) -> Curve:
+        value, low, high = (ends[:, i, j] for ends in part)
+        line = Curve(
+            outputs[i], omega, np.where(value < floor, np.nan, value), PALETTE[i % 8], dash=DASHES[i % 4]
+        )
+        if not np.isfinite(high).any():
+            return line
+        visible = high >= floor
+        low, high = np.where(visible, np.maximum(low, floor), np.nan), np.where(visible, high, np.nan)
+        return replace(line, low=low, high=high)
+
+    rows = range(len(outputs))
+    columns = []
+    for j, name in enumerate(inputs):
+        sizes = tuple(curve(magnitude, i, j, float(least[j])) for i in rows)
+        turns = tuple(curve(turned, i, j, -np.inf) for i in rows)
+        above = Panel("magnitude", sizes, name, 1.5, log=True)
+        columns.append((above, Panel("phase [deg]", turns, height=1.3)))
+    return Chart(tuple(columns), "frequency [rad/s]", log=True, wide=max(3.2, 6.4 / len(inputs)))
 
 
 def run_table(runs: Sequence[FreeRun]) -> Cells:
@@ -78,10 +174,6 @@ def identification_section(found: Identification) -> Section:
         (f.verdict, f.check, f.log, f.channel, f.says) for f in found.data_check.findings if f.verdict != "ok"
     ]
     evidence: list[Any] = [
-        Picture(
-            plots.models_figure(found.rows),
-            "Free-run error of every model on rows that it was not fitted to.",
-        ),
         Table(*held_out_table([row for row in found.rows if row.held_out]), _HELD_OUT),
         Table(*signal_table(found), "Columns of the logs"),
         Table(
@@ -134,7 +226,7 @@ def held_out_section(found: Identification) -> Section:
     # without a band: of a fit that has not seen what it is to predict, draws may lie anywhere
     evidence = tuple(
         Plot(
-            plots.free_run_chart(run, tuple(run.scores)[k : k + 2]),
+            free_run_chart(run, tuple(run.scores)[k : k + 2]),
             f"{name}: {found.model} fitted without it, simulated from the inputs alone (dashed), over what "
             f"was measured. Readings of the first {run.warmup:.3g} s set the state. On grey: not scored.",
         )
@@ -176,11 +268,11 @@ def dynamics_section(found: Dynamics) -> Section:
     """Return the section of gains, step and frequency responses."""
     evidence = (
         Plot(
-            plots.step_response_chart(found),
+            step_response_chart(found),
             "Response of each output to a step of one unit of each input; shaded: the interval.",
         ),
         Table(*gain_table(found), "Gains in steady state, with intervals"),
-        Plot(plots.bode_chart(found), "Frequency response from each input; shaded: the interval."),
+        Plot(bode_chart(found), "Frequency response from each input; shaded: the interval."),
     )
     words = time_constant_words(found)
     return Section("How does the plant respond?", evidence, _sentence(words[0].upper() + words[1:]))
@@ -192,7 +284,6 @@ def _spaced(unit: str) -> str:
 
 def parameters_section(plant: Plant, record: Posterior | None = None) -> Section:
     """Return the section of the free parameters: how well each is known, and the posterior of ``record``."""
-    from thermogrip.report.plots import corner_figure
     from thermogrip.sysid.greybox.identifiability import identifiability_report
 
     evidence: list[Any] = [Table(*parameter_table(plant, record), "Free parameters", dense=True)]
@@ -293,7 +384,7 @@ def free_run_section(
     evidence: list[Any] = [
         *(
             Plot(
-                plots.free_run_chart(run, outputs[k : k + 2], band),
+                free_run_chart(run, outputs[k : k + 2], band),
                 f"{name}: measured, simulated from the inputs alone (dashed), and their difference. Readings "
                 f"of the first {run.warmup:.3g} s set the state; nothing is fed back after that. Shaded: "
                 f"{band_words(band)}. On grey: not scored.",
@@ -327,3 +418,49 @@ def band_words(band: Band) -> str:
 
 def _sentence(text: str) -> str:
     return text + ("" if text.endswith(".") else ".")
+
+
+def corner_figure(posterior: Posterior, names: Sequence[str] | None = None) -> Figure:
+    """Draw the samples of each pair of parameters, with marginals and the fitted values; UserError if a name
+    is not a free parameter."""
+    from matplotlib.figure import Figure
+
+    names = posterior.sampled if names is None else tuple(names)
+    for name in names:
+        if name not in posterior.free:
+            raise UserError(f"{name!r} was not sampled", hint=known_names(name, posterior.free))
+    columns = posterior.samples[:, [posterior.free.index(name) for name in names]]
+    n = len(names)
+    # without pyplot: no window system is asked for, and nothing global is left behind
+    figure = Figure(figsize=(1.7 * n + 0.6, 1.7 * n + 0.6), layout="constrained")
+    axes = figure.subplots(n, n, squeeze=False)
+    for i in range(n):
+        for j in range(n):
+            _corner_panel(axes[i, j], columns, names, posterior, i, j)
+    return figure
+
+
+def _corner_panel(
+    ax: Any, columns: Array, names: Sequence[str], posterior: Posterior, i: int, j: int
+) -> None:
+    """Draw row i, column j of the corner figure."""
+    if j > i:
+        ax.set_axis_off()
+        return
+    ax.tick_params(labelsize=6)
+    ax.locator_params(axis="x", nbins=3)
+    ax.axvline(posterior.fitted[names[j]], color="0.6", lw=0.8)
+    if i == j:
+        ax.hist(columns[:, i], bins=25, color="tab:blue", alpha=0.6)
+        for edge in (posterior.quantiles[names[i]][0], posterior.quantiles[names[i]][2]):
+            ax.axvline(edge, color="tab:blue", lw=0.8, ls="--")
+        ax.set_yticks([])
+    else:
+        # a ridge where two parameters trade off: neither is known well, a combination is
+        ax.plot(columns[:, j], columns[:, i], ".", ms=1.5, alpha=0.4, rasterized=True)  # of thousands
+        ax.axhline(posterior.fitted[names[i]], color="0.6", lw=0.8)
+        ax.tick_params(labelleft=j == 0)  # a row shares its scale
+    if i == len(names) - 1:
+        ax.set_xlabel(f"{names[j]} [{posterior.units.get(names[j], '1')}]", fontsize=7)
+    if j == 0 and i > 0:
+        ax.set_ylabel(f"{names[i]} [{posterior.units.get(names[i], '1')}]", fontsize=7)

@@ -326,9 +326,15 @@ NEW_TARGETS: dict[str, tuple[Callable[[float], Any], list[float]]] = {
     "none": (lambda now: 35.0, GRID),
     "one": (lambda now: 35.0 if now < 4.75 else 20.0, sorted([*GRID, 4.75])),
     "of one output by name": (lambda now: {"t_surface": 35.0 + (now >= 6.5)}, sorted([*GRID, 6.5])),
-    "another within a sample": (lambda now: 35.0 if now < 4.75 else 32.0 + (now >= 5.25), sorted([*GRID, 4.75])),
+    "another within a sample": (
+        lambda now: 35.0 if now < 4.75 else 32.0 + (now >= 5.25),
+        sorted([*GRID, 4.75]),
+    ),
     "within a sample of the start": (lambda now: 35.0 if now < 1.0 else 32.0, GRID),
-    "after a move that took all of its slew": (lambda now: 35.0 if now < 2.25 else 20.0, sorted([*GRID, 2.25])),
+    "after a move that took all of its slew": (
+        lambda now: 35.0 if now < 2.25 else 20.0,
+        sorted([*GRID, 2.25]),
+    ),
     "one at every reading": (lambda now: 30.0 + now, GRID),
     "known ahead": (lambda now: {"t_surface": [35.0 if now < 4.75 else 32.0, 32.0]}, GRID),
     "with a reading that has not moved on": (lambda now: 35.0 if now < 7.0 else 32.0, sorted([*GRID, 7.25])),
@@ -353,7 +359,9 @@ def test_a_new_target_is_answered_at_the_next_reading_and_the_grid_of_moves_stay
     assert moved_at == expected
     for k in range(len(moved_at)):  # over any T seconds as on the grid: by the slew of T and a sample more
         windows = moved_at[-1 - k] - np.array(moved_at[: len(moved_at) - k])
-        assert np.all(np.abs(drives[-1 - k] - np.array(drives[: len(moved_at) - k])) <= SLEW * (windows + DT) + 1e-9)
+        assert np.all(
+            np.abs(drives[-1 - k] - np.array(drives[: len(moved_at) - k])) <= SLEW * (windows + DT) + 1e-9
+        )
     if case == "one":  # by all that a sample allows, of which the move before needed nothing
         assert drives[4] == pytest.approx(drives[3] - SLEW * DT)
 

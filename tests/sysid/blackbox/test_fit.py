@@ -115,48 +115,14 @@ def test_inputs_that_were_logged_behind_their_reading_are_found_out(kind, tmp_pa
         return make_log(np.arange(700.0), {"q": (q, "1", "input"), "t": (y, "degC", "output")})
 
     kept, behind = log_with(q), log_with(np.append(q[:1], q[:-1]))  # of each row the input of the row before
-    assert not fit_black_box(kind, [kept], average=1.0, order=1).plant.inputs_end_at_row
-    plant = fit_black_box(kind, [behind], average=1.0, order=1).plant
+    assert not fit_black_box(kind, [kept], average=1.0).plant.inputs_end_at_row
+    plant = fit_black_box(kind, [behind], average=1.0).plant
     assert plant.inputs_end_at_row
     loaded = Plant.load(plant.save(tmp_path / "plant.json"))
     assert loaded.inputs_end_at_row
     for some in (plant, loaded):
         miss = some.simulate(behind, warmup=20.0)["t"].values - y
         assert np.std(miss[20:]) < 0.025  # of 2 K that the input moves it
-
-
-@pytest.mark.parametrize(
-    ("kind", "fixed"),
-    [
-        ("arx", {"order": 2, "delay": 3}),
-        ("oe", {"delay": 2}),
-        ("oe", {"order": 1, "delay": 1}),
-        ("subspace", {"order": 3}),
-    ],
-)
-def test_order_and_delay_are_those_asked_for(kind, fixed):
-    fit = fit_black_box(kind, [lagged_log(4, 700)], average=1.0, **fixed)
-    tried = {part for structure in fit.choice.errors for part in structure.label.split(", ")}
-    names = {"order": "order " if kind == "subspace" else "na ", "delay": "delay "}
-    for what, value in fixed.items():
-        assert {part for part in tried if part.startswith(names[what])} == {f"{names[what]}{value}"}
-
-
-@pytest.mark.parametrize(
-    ("kind", "fixed", "says"),
-    [
-        ("subspace", {"delay": 2}, "a subspace model has no delay to fix"),
-        ("neural", {"order": 2}, "a neural model has no order to fix"),
-        ("sindy", {"order": 2}, "a sindy model has no order to fix"),
-        ("arx", {"order": 0}, "order 0 is not between 1 and 20"),
-        ("oe", {"delay": 21}, "delay 21 is not between 1 and 20"),
-    ],
-)
-def test_an_order_or_delay_that_a_kind_cannot_have_is_refused(kind, fixed, says):
-    with pytest.raises(UserError, match=says):
-        fit_black_box(kind, [lagged_log(4, 200)], **fixed)
-    kept = fit_black_box("arx", [lagged_log(4, 200)], order=20, delay=1).choice.structure
-    assert kept == ("na 20, nb 20, delay 1", 41)
 
 
 def test_short_logs_are_not_resampled_and_that_is_reported():

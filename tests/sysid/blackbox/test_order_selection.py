@@ -221,7 +221,7 @@ def test_of_many_rows_a_structure_that_a_smaller_one_beats_on_two_parts_is_not_f
     ],
 )
 def test_an_excess_is_noise_within_a_standard_error_and_five_percent(excess, within):
-    assert selection.excess_within_noise(np.array(excess)) is within
+    assert selection.excess_within_noise(np.array(excess), selection.ORDER_MARGIN) is within
 
 
 @pytest.mark.parametrize(
@@ -236,7 +236,7 @@ def test_an_excess_is_noise_within_a_standard_error_and_five_percent(excess, wit
 )
 def test_the_smallest_of_the_good_ones_is_taken(table, chosen):
     errors = {structure: np.array(each) for structure, each in table.items()}
-    found = selection.smallest_near_the_best(errors, selection.SIMPLER_MARGIN, size=lambda s: s.size)
+    found = selection.smallest_near_the_best(errors, selection.ORDER_MARGIN)
     assert found.label == chosen
 
 
@@ -246,14 +246,25 @@ def test_the_error_of_a_choice_is_a_geometric_mean(errors, mean):
     assert choice.error == pytest.approx(mean)
 
 
-@pytest.mark.parametrize(("logs", "chosen"), [("a", LARGE), ("abc", SMALL)])
-def test_over_whole_logs_a_fifth_more_is_within_noise(monkeypatch, logs, chosen):
-    errors = {SMALL: [0.1, 0.15, 0.16], LARGE: [0.15, 0.1, 0.12]}  # 10 percent apart
-    scored = {s: selection._Errors(StartPrior(), np.array(e), np.ones((3, 1))) for s, e in errors.items()}
+@pytest.mark.parametrize(
+    ("logs", "products", "errors", "chosen"),
+    [
+        ("a", (), (0.1, 0.15, 0.155), "large"),  # 9 percent more, the standard error is 28
+        ("abc", (), (0.1, 0.15, 0.155), "small"),
+        ("a", ("q*q",), (0.1, 0.15, 0.155), "small"),
+        ("a", ("q*q",), (0.1, 0.3, 0.16), "large"),  # 39 percent, the standard error 54
+        ("a", ("q*q",), (0.16, 0.11, 0.13), "large"),  # 8 percent, the standard error 1
+    ],
+)
+def test_over_whole_logs_a_fifth_more_is_within_noise_and_a_tenth_without_products(
+    monkeypatch, logs, products, errors, chosen
+):
+    table = {SMALL: errors, LARGE._replace(products=products): (0.15, 0.1, 0.12)}
+    scored = {s: selection._Errors(StartPrior(), np.array(e), np.ones((3, 1))) for s, e in table.items()}
     monkeypatch.setattr(selection, "_score", lambda *_: scored)
     monkeypatch.setattr(selection, "_fit_to_all", lambda grid, family, structure, *_: (structure, 0.1))
     grid = grid_of(*(rows(80, log) for log in logs))
-    assert selection.choose(grid, lambda *_, **__: {}, warmup=2).structure == chosen
+    assert selection.choose(grid, lambda *_, **__: {}, warmup=2).structure.label == chosen
 
 
 def test_drives_are_inputs_disturbances_and_products_of_which_still_ones_are_none():

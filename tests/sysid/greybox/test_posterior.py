@@ -17,7 +17,7 @@ from scipy.stats import binom
 from tests.sysid.greybox.makers import TRUE, TwoGains, a_fit, a_log
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log
-from thermogrip.report.plots import corner_figure
+from thermogrip.report.plant import corner_figure
 from thermogrip.sysid.greybox import posterior
 from thermogrip.sysid.greybox.fit import fit_network
 from thermogrip.sysid.greybox.posterior import (

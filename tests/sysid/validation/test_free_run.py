@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from thermogrip.sysid.plant.fit_record import fit_logs
 from thermogrip.sysid.plant.plant import Plant
 from thermogrip.sysid.validation import free_run as module
 from thermogrip.sysid.validation.free_run import free_run, no_input_baseline, score
-from thermogrip.sysid.validation.residual_tests import CorrelationTest
+from thermogrip.sysid.validation.residual_tests import CorrelationTest, ResidualCorrelations
 
 
 def lag_plant(pole: float = 0.95, gain: float = 0.5) -> Plant:
@@ -246,5 +247,7 @@ def test_more_than_one_row_in_a_hundred_beyond_a_twentieth_of_the_range_is_outsi
       "be a term that is missing")],
 )  # fmt: skip
 def test_a_correlation_is_stated_with_its_signal_size_and_meaning(signal, unit, unseen, says):
-    note = module._correlation_note("t", signal, CorrelationTest(1e-5, 0.5, True), unit, unseen)
+    found = ResidualCorrelations({"t": {signal: CorrelationTest(1e-5, 0.5, True)}}, {})
+    run = SimpleNamespace(residual=found, warmup=5.0)
+    (note,) = module._residual_notes(run, {"t": unit}, unseen, small=False)
     assert note == f"t: the residual correlates with {says}"

@@ -138,7 +138,7 @@ def test_a_black_box_begins_from_the_readings_that_its_fit_began_from():
         u = rng.standard_normal(1000)
         y = lfilter([0, 1.0], a, u)[200:] + 0.01 * rng.standard_normal(800)
         logs.append(make_log(np.arange(800.0), {"u": (u[200:], "V", "input"), "y": (y, "m", "output")}))
-    plant = fit_black_box("arx", [logs[0]], order=8).plant
+    plant = fit_black_box("arx", [logs[0]]).plant
     run = free_run(plant, logs[1])
     assert run.warmup == 50.0
     assert not run.no_better
