@@ -57,7 +57,7 @@ def compiled_loop(
     if isinstance(controller, Controller):
         _run_mpc(controller.c, controller, run, target, drives_known=truth.known)
     # PI loops, which go to one target in C, run in Python where a reading is absurd
-    elif len(schedule) > 1 or not _run_pi(controller.c, controller, run, target[0]):
+    elif np.ptp(target) > 0 or not _run_pi(controller.c, controller, run, target[0]):
         return simulate_closed_loop(controller, plant, schedule, **about)
     truth.y = list(run.y)
     status = tuple(STATUSES[code] for code in run.status)
