@@ -93,11 +93,9 @@ class SampledController:
             wrong = advice.bad_target(controlled[int(np.argmax(lost)) :])
         return np.where(lost, self._target, wanted), wrong
 
-    def _moves(self, target: Trajectory, wanted: Array) -> bool:
-        """Return whether this call moves the drives: where it is due, or these targets are other ones."""
-        # where the samples ahead are known a new target is none
-        is_new = not has_preview(target) and not np.array_equal(wanted, self._target, equal_nan=True)
-        return self.times.moves(new_target=is_new)
+    def _is_new(self, wanted: Array) -> bool:
+        """Return whether a target (n_controlled,) is another one than at the last move."""
+        return bool((np.isfinite(wanted) & (wanted != self._target)).any())
 
     def _within(self, u: Array) -> Array:
         """Return drives (n_u,) that are finite, in range, and within the slew limit since the last ones."""

@@ -20,7 +20,7 @@ import numpy as np
 
 from thermogrip.datasets.arrays import Array
 from thermogrip.mpc.controllers.advice import STALE
-from thermogrip.mpc.controllers.base import SampledController
+from thermogrip.mpc.controllers.base import SampledController, has_preview
 from thermogrip.mpc.controllers.controller_file import Parts
 from thermogrip.mpc.design.design import Design, check_design, default_design
 from thermogrip.mpc.estimator.call_times import CallTimes
@@ -113,7 +113,7 @@ class PIController(SampledController):
         started = self.clock()
         self.times.call(reading)
         wanted, wrong = self._wanted(target)
-        if not self._moves(target, wanted):
+        if not self.times.moves(new_target=self._is_new(wanted) and not has_preview(target)):
             return self._held_move(started)
         self._target = wanted
         y = self._read(reading)[0][self._rows]

@@ -20,7 +20,7 @@ import numpy as np
 
 from thermogrip.datasets.arrays import Array, Mask
 from thermogrip.mpc.controllers import advice
-from thermogrip.mpc.controllers.base import SampledController, targets_ahead
+from thermogrip.mpc.controllers.base import SampledController, has_preview, targets_ahead
 from thermogrip.mpc.controllers.pi import PIController
 from thermogrip.mpc.design.design import Design
 from thermogrip.mpc.estimator.call_times import RESTART_S, opening, shifted
@@ -107,12 +107,14 @@ class ReferenceController(SampledController):
         applied = self._applied(reading, self._u)
         self._pass(self.times.seconds, applied)
         wanted, wrong = self._wanted(target)
-        # it may be called at any rate: before a move is due the last one is held
-        if not self._moves(target, wanted):
+        is_new = self._is_new(wanted)
+        # it may be called at any rate: before a move is due the last one is held; where the samples ahead are
+        # known a new target is none
+        if not self.times.moves(new_target=is_new and not has_preview(target)):
             self._refine(y)
             return self._held_move(started)
         event = self._absorb(y, d, applied) or (advice.STALE if self.times.stale else "")
-        if not np.array_equal(wanted, self._target, equal_nan=True):
+        if is_new:
             self._follows.side = self._sides(wanted)
         self._target = wanted
         samples = np.arange(1, self.optimiser.N + 1)

@@ -115,7 +115,8 @@ def shifted(plan: Array, samples: float) -> Array:
     """Return what is ahead of a plan (N, n_u) after so many samples, its last row staying; between two
     samples a row is the mean of the drives that were planned for those seconds."""
     whole, rows = math.floor(samples + SAME), np.arange(len(plan))
-    samples = samples if samples - whole > SAME else whole
+    if samples - whole <= SAME:
+        return plan[np.minimum(rows + whole, len(plan) - 1)]
     return np.column_stack([np.interp(rows + samples, rows, drive) for drive in plan.T])
 
 

@@ -256,6 +256,7 @@ class Observer:
         self.unit = np.sqrt(np.maximum(np.diag(covariance), 1e-24))  # of each state by itself
         self._step_unit = self.unit * model.unit.max()  # what counts as a unit of each state at rest
         self.is_drive = disturbance.on_drive.any(axis=0)
+        self._largest = np.where(self.is_drive, LARGEST_BIAS, np.inf)
         drives = np.array([self.noise.drive.get(name, DRIFT) for name in model.drives])
         # the unit of an output's bias is the output's, that of a measured disturbance's its own
         bias_unit = np.where(disturbance.on_output.any(axis=0), disturbance.on_output.T @ model.unit, 1.0)
@@ -276,6 +277,7 @@ class Observer:
         self._n = model.n_x + disturbance.n_w
         self._P = np.zeros((self._n, self._n))
         self._held = np.zeros(self._n, dtype=bool)
+        self._one = np.eye(self._n)
         self._on_sample()
 
     def hold_drives(self, weak: Mask) -> None:
@@ -399,11 +401,11 @@ class Observer:
             S = H @ PH + np.diag(R[read])
             gain = np.linalg.solve(S, PH.T).T
             gain[np.asarray(self._held, dtype=bool)] = 0.0  # C holds whole numbers
-            uncorrected = np.eye(self._P.shape[0]) - gain @ H  # Joseph's form: right for any gain
+            uncorrected = self._one - gain @ H  # Joseph's form: right for any gain
             self._P = uncorrected @ self._P @ uncorrected.T + (gain * R[read]) @ gain.T
             change, n_x = gain @ innovation[read], self.model.n_x
             w = self.w + change[n_x:]
-            w = np.where(self.is_drive, np.clip(w, -LARGEST_BIAS, LARGEST_BIAS), w)
+            w = np.minimum(np.maximum(w, -self._largest), self._largest)
             if self._share:
                 change[n_x:] = w - self.w
                 self._ahead = self._ahead + (self._way @ change)[:n_x]
@@ -446,7 +448,7 @@ class Observer:
         # register between two samples holds the mean of its neighbours, and since x itself is never
         # interpolated nothing is smeared from sample to sample
         self._ahead = (1 - share) * self.x + share * after
-        self._way = (1 - share) * np.eye(len(P)) + share * step
+        self._way = (1 - share) * self._one + share * step
         # a straight line between two samples is not the path of an output that moves
         self._bent = 4 * share * (1 - share) * (self.model.C @ (after - self.x))
 
@@ -454,7 +456,7 @@ class Observer:
         """Return the state a sample later, and the Jacobian of the filter's states."""
         n_x, disturbance = self.model.n_x, self.disturbance
         after, A, B, E = self.model.linearise(self.x, u + self.drive_bias, d + self.disturbance_bias)
-        step = np.eye(self._n)
+        step = self._one.copy()
         step[:n_x, :n_x] = A
         step[:n_x, n_x:] = (
             B @ (disturbance.on_drive * self.model.span[:, None]) + E @ disturbance.on_disturbance

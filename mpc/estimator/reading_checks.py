@@ -71,7 +71,7 @@ class ReadingMonitor:
         self._last = np.where(np.isfinite(y), y, self._last)
         self._moved = np.where(fresh, 0.0, self._moved)
         y = np.where(self.stuck, np.nan, y)
-        return y, np.asarray(np.abs(np.nan_to_num(y - expected)) > self._spike)
+        return y, np.asarray(np.abs(y - expected) > self._spike)
 
 
 def follows(observer: Observer, controlled: tuple[str, ...]) -> str:

@@ -45,4 +45,4 @@ class DriveLimits:
         those before; range wins over slew."""
         before, slew = self.cut(before), self.slew * samples
         wanted = np.where(np.isfinite(u), u, self.safe)
-        return self.cut(np.clip(wanted, before - slew, before + slew))
+        return self.cut(np.minimum(np.maximum(wanted, before - slew), before + slew))

@@ -45,7 +45,6 @@ class QPAnswer:
     iterations: int  # active-set changes
     # (m,) of the rows, positive at the upper bound, negative at the lower one: H x + f + A' multipliers = 0
     multipliers: Array
-    slack: Array  # (m,) by how much each row is broken, in the row's own units, 0 where it holds
 
     @property
     def solved(self) -> bool:
@@ -76,6 +75,7 @@ class CondensedQP:
         self._hard, self._priced = ~self.soft, np.where(self.soft, self.linear, 0.0)
         self._given: tuple[Array, Array] | None = None  # the newest H and A, of a linear plant the same ones
         self._scaled: tuple[Array, ...] = ()
+        self._model: Any = None  # DAQP's, None before the first program and after one without an answer
 
     def solve(self, H: Array, f: Array, A: Array, lower: Array, upper: Array) -> QPAnswer:
         """Return the minimiser for H (n, n), positive definite, f (n,) and rows A (m, n) between bounds that
@@ -85,12 +85,11 @@ class CondensedQP:
         room = upper - lower
         is_same = self._given is not None and H is self._given[0] and A is self._given[1]
         is_finite = _is_finite(f) and (is_same or (_is_finite(H) and _is_finite(A)))
-        if not is_finite or np.isnan(room).any():
+        crossed = ~(room >= 0)
+        if not is_finite or (crossed.any() and np.isnan(room).any()):
             return self._failed("not finite", f.size)
-        if ((room < 0) & self._hard).any():
+        if (crossed & self._hard).any():
             return self._failed("infeasible", f.size)
-        if (H.diagonal() <= 0).any():
-            return self._failed("not convex", f.size)
         if not is_same:
             # x = L^-T z with H = L L': the factor and A L^-T are LAPACK's and BLAS', which take less time
             factor, failed = dpotrf(H.T, lower=1, clean=1)
@@ -114,11 +113,7 @@ class CondensedQP:
             return self._failed(status, f.size, scaled.iterations)
         if not np.isfinite(scaled.z).all():
             return self._failed("not finite", f.size, scaled.iterations)
-        x = back @ scaled.z
-        value = A @ x
-        slack = np.maximum(0.0, np.maximum(value - upper, lower - value))
-        slack = np.where(self.soft, slack, 0.0)
-        return QPAnswer(x, "solved", scaled.iterations, scaled.multipliers / length, slack)
+        return QPAnswer(back @ scaled.z, "solved", scaled.iterations, scaled.multipliers / length)
 
     def _run(self, f: Array, A: Array, lower: Array, upper: Array, length: Array) -> ScaledAnswer:
         """Hand the scaled problem to DAQP."""
@@ -129,17 +124,20 @@ class CondensedQP:
         # anew each time: from the active set of the last sample it takes a fifth less time, but its answer
         # was now and then off by 2e-4 of a range while it called it solved
         # (``tests/mpc/controllers/test_compiled.py``).
-        model = Model()
-        settings = {
-            "iter_limit": self.iteration_limit,
-            "time_limit": self.time_limit_s,
-            "primal_tol": TOLERANCE,
-        }
-        model.settings = settings
-        flag, _ = model.setup(np.eye(f.size), f, A, upper, lower, self._sense.copy())
+        if self._model is None:
+            self._model = Model()
+            self._model.settings = {
+                "iter_limit": self.iteration_limit,
+                "time_limit": self.time_limit_s,
+                "primal_tol": TOLERANCE,
+            }
+            flag, _ = self._model.setup(np.eye(f.size), f, A, upper, lower, self._sense.copy())
+        else:  # in the same memory
+            flag = self._model.update(f=f, A=A, bupper=upper, blower=lower, sense=self._sense.copy())
+        model = self._model
         if flag < 0:  # it has seen that there is no answer
+            self._model = None
             return ScaledAnswer(np.full(f.size, np.nan), np.zeros(lower.size), int(flag), 0)
-        model.settings = settings
         # penalties in scaled units; of the quadratic one it takes the reciprocal
         # a slack becomes s/r, and its penalties w r and q r^2: the linear one makes a soft row exact (it is
         # broken only if keeping it costs more than w per degC), the quadratic one spreads it;
@@ -147,11 +145,12 @@ class CondensedQP:
         linear = self._priced * length
         model.soft_weights(reciprocal, reciprocal, linear, linear)
         z, _, flag, info = model.solve()
+        if flag <= 0:
+            self._model = None
         return ScaledAnswer(np.asarray(z), np.asarray(info["lam"]), int(flag), int(info["iterations"]))
 
     def _failed(self, status: str, n: int, iterations: int = 0) -> QPAnswer:
-        zero = np.zeros(self.soft.size)
-        return QPAnswer(np.full(n, np.nan), status, iterations, zero, zero)
+        return QPAnswer(np.full(n, np.nan), status, iterations, np.zeros(self.soft.size))
 
 
 def _is_finite(values: Array) -> bool:

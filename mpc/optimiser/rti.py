@@ -105,6 +105,7 @@ class RestGains:
     """How the controlled outputs answer to drives at rest, in the drives' ranges."""
 
     strongest: NDArray[np.int_]  # (n_u,) which controlled output each drive moves most
+    rows: NDArray[np.int_]  # (n_u,) its place among all outputs
     response: Array  # (n_b, n_u) of that output to each block, summed over time
     # (n_b, n_u) whether the horizon shows the response of a drive whose gain may fade or turn over
     seen: Mask
@@ -121,7 +122,7 @@ class RestGains:
         # of a drive that is no loop's and serves a limit, what it does to a target may fade or turn over
         paired = {loop.drive for loop in design.loops}
         is_seen &= np.array([name in paired or not (paired and design.limits) for name in model.drives])
-        return cls(strongest, response, is_seen)
+        return cls(strongest, rows[strongest], response, is_seen)
 
 
 def _strongest_response(G: Array, rows: NDArray[np.int_]) -> Array:
@@ -175,8 +176,10 @@ class Optimiser:
         self._spans = np.tile(model.span, self.n_b)  # of each unknown
         # a later block may differ by what the slew allows between the middles of the two
         middles = np.cumsum(design.blocks) - 0.5 * np.array(design.blocks) + 0.5
-        self._gaps = np.concatenate([[1.0], np.diff(middles)])
-        self.reach = np.cumsum(self._gaps)  # samples of slew (n_b,) from now to the middle of each block
+        gaps = np.concatenate([[1.0], np.diff(middles)])
+        self._slews = (gaps[:, None] * self.drives.slew).ravel() / self._spans
+        self._hard = np.concatenate([np.eye(self._spans.size), self.weights.differences])
+        self.reach = np.cumsum(gaps)  # samples of slew (n_b,) from now to the middle of each block
         # beyond a soft row by this, 0.2 of a price of 25, the distance costs as much as its square: at 1 the
         # noise of a reading, which moves all of a prediction, was answered with full drive near the band
         self._first = max(design.price, SHORTEST) ** -0.5
@@ -308,7 +311,7 @@ class Optimiser:
         if self.model.affine is not None:
             return np.ones((self.n_b, self.model.n_u))
         G = G.reshape(self.N, self.model.n_y, self.n_b, self.model.n_u)
-        response = _strongest_response(G, np.array(self._rows)[self.at_rest.strongest])
+        response = _strongest_response(G, self.at_rest.rows)
         share = np.ones(response.shape)
         return np.divide(response, self.at_rest.response, out=share, where=self.at_rest.seen)
 
@@ -316,20 +319,20 @@ class Optimiser:
         self, guess: Array, drive_bias: Array, authority: Array, problem: Problem
     ) -> tuple[Array, Array]:
         """Return the range (n_b, n_u) of each block: no further than where its gain will have faded."""
-        drives = self.drives
-        away, last_away = guess - drives.neutral, problem.last - drives.neutral
-        reach = (self.reach[:, None] + problem.more) * drives.slew
-        least = np.where(away * last_away > 0, np.abs(last_away) - reach, 0.0)  # what the slew allows
-        # a Peltier's gain fades in proportion to its drive, to nothing at the optimum: what is left of it
-        # along the guess says where that is.  The bias counts where the gain is evaluated, not in the share
-        # of the way there: it is a heat flow, and heat moves no optimum
-        fades = authority < 1 - FADING
-        best = np.abs(away + drive_bias) / np.maximum(1 - authority, FADING)  # where the gain is nothing
-        end = np.abs(np.where(away < 0, drives.lowest, drives.highest) - drives.neutral)
-        room = np.maximum(best * allowed_share(end, best, self.model.span), least)
-        low = np.where(fades & (away < 0), drives.neutral - room, drives.lowest)
-        high = np.where(fades & (away > 0), drives.neutral + room, drives.highest)
-        low, high = drives.cut(low), drives.cut(high)
+        drives, fades = self.drives, authority < 1 - FADING
+        low, high = (np.broadcast_to(end, guess.shape) for end in (drives.lowest, drives.highest))
+        if fades.any():
+            away, last_away = guess - drives.neutral, problem.last - drives.neutral
+            reach = (self.reach[:, None] + problem.more) * drives.slew
+            least = np.where(away * last_away > 0, np.abs(last_away) - reach, 0.0)  # what the slew allows
+            # a Peltier's gain fades in proportion to its drive, to nothing at the optimum: what is left of it
+            # along the guess says where that is.  The bias counts where the gain is evaluated, not in the
+            # share of the way there: it is a heat flow, and heat moves no optimum
+            best = np.abs(away + drive_bias) / np.maximum(1 - authority, FADING)  # where the gain is nothing
+            end = np.abs(np.where(away < 0, drives.lowest, drives.highest) - drives.neutral)
+            room = np.maximum(best * allowed_share(end, best, self.model.span), least)
+            low = drives.cut(np.where(fades & (away < 0), drives.neutral - room, drives.lowest))
+            high = drives.cut(np.where(fades & (away > 0), drives.neutral + room, drives.highest))
         if not problem.parked:
             return low, high
         little = np.zeros(self.model.n_u)
@@ -408,8 +411,8 @@ class Optimiser:
         if self._A is None or self.model.affine is None:
             # range and slew of each block are hard, the overshoot band and the limits at every sample soft
             rows = G[:, soft].transpose(1, 0, 2).reshape(-1, n)
-            self._A = np.concatenate([np.eye(n), self.weights.differences, rows])
-        slew = (self._gaps[:, None] * self.drives.slew).ravel() / self._spans
+            self._A = np.concatenate([self._hard, rows])
+        slew, none = self._slews.copy(), np.full(self.N, np.inf)
         slew[:n_u] += problem.more * self.drives.slew / self.model.span
         before = np.zeros(n)
         before[:n_u] = problem.last / self.model.span
@@ -419,7 +422,6 @@ class Optimiser:
             error, zone = problem.target[:, i] - free[:, row], self.weights.zone[i]
             allowed = zone or self.design.overshoot
             counts = i in problem.counted
-            none = np.full(self.N, np.inf)
             lower.append(error - allowed if (counts if zone else problem.side[i] < 0) else -none)
             upper.append(error + allowed if (counts if zone else problem.side[i] > 0) else none)
         for row, low, high in self._limits:

@@ -51,8 +51,9 @@ def test_the_answer_fulfils_the_optimality_conditions(seed):
         )
         assert np.all(lam[value > upper + tolerance] > -1e-9)
         assert np.all(lam[value < lower - tolerance] < 1e-9)
-        broken = soft & (answer.slack > 10 * tolerance)
-        penalty = w + np.maximum(q, LEAST_QUADRATIC / length**2) * answer.slack
+        slack = np.maximum(value - upper, lower - value)
+        broken = soft & (slack > 10 * tolerance)
+        penalty = w + np.maximum(q, LEAST_QUADRATIC / length**2) * slack
         np.testing.assert_allclose(np.abs(lam)[broken], penalty[broken], rtol=1e-3, atol=1e-4)
 
 
@@ -117,7 +118,7 @@ def test_the_iteration_limit_is_a_status():
     assert answer.status == "iteration limit"
 
 
-def test_what_is_broken_is_said_at_either_end_and_of_soft_rows_only():
+def test_soft_rows_are_broken_at_either_end_at_their_price_and_a_hard_one_is_kept():
     """Nearest to (3, -3) with x1 <= 1 and x2 >= -1 at a penalty of half a unit, and x1 + x2 = 0 hard."""
     A = np.array([[1.0, 0.0], [0.0, 1.0], [1.0, 1.0]])
     solver = CondensedQP(soft=[True, True, False], linear=[0.5, 0.5, 0.0], quadratic=[0.0, 0.0, 0.0])
@@ -125,17 +126,7 @@ def test_what_is_broken_is_said_at_either_end_and_of_soft_rows_only():
         np.eye(2), np.array([-3.0, 3.0]), A, np.array([-np.inf, -1.0, 0.0]), np.array([1.0, np.inf, 0.0])
     )
     np.testing.assert_allclose(answer.x, [2.5, -2.5], atol=1e-6)
-    np.testing.assert_allclose(answer.slack[:2], [1.5, 1.5], atol=1e-6)
     np.testing.assert_allclose(answer.multipliers[:2], [0.5, -0.5], atol=1e-6)
-    rng = np.random.default_rng(0)
-    for _ in range(20):
-        n, m = 4, 6
-        soft = np.arange(m) % 2 == 0
-        solver = CondensedQP(soft=soft, linear=np.ones(m), quadratic=np.ones(m))
-        bound = rng.random(m)
-        answer = solver.solve(np.eye(n), 5 * rng.normal(size=n), rng.normal(size=(m, n)), -bound, bound)
-        assert answer.solved
-        assert (answer.slack[~soft] == 0.0).all()
 
 
 @pytest.mark.parametrize("soft", [True, False])
@@ -156,7 +147,7 @@ def test_ends_that_cross_by_a_rounding_are_infeasible_where_the_row_is_hard(soft
     answer = solver.solve(np.eye(1), np.array([-3.0]), np.ones((1, 1)), *ends)
     assert answer.status == status
     if soft:  # 0.5 (x - 3)^2 + s + 0.5 s^2 with s = x - 1
-        np.testing.assert_allclose([*answer.x, *answer.slack], [1.5, 0.5], atol=1e-9)
+        np.testing.assert_allclose(answer.x, [1.5], atol=1e-9)
 
 
 def test_a_hard_row_of_nothing_is_not_overlooked():
@@ -167,7 +158,6 @@ def test_a_hard_row_of_nothing_is_not_overlooked():
         answer = solver.solve(H, f, A, np.array([1.0]), np.array([np.inf]))
         assert answer.status == status
     np.testing.assert_allclose(answer.x, [1.0, 0.0], atol=1e-9)
-    assert answer.slack.tolist() == [1.0]
 
 
 FLAGS = {
@@ -186,9 +176,7 @@ def test_a_flag_of_the_solver_is_a_status_and_no_number_is_no_solution(monkeypat
     assert found.status == ("not finite" if flag > 0 and not solved else status)
     assert (found.solved, found.iterations) == (solved, 7)
     # x = z / 2; a row of length 3 / 2
-    np.testing.assert_equal(
-        [found.x, found.multipliers, found.slack], [[0.25], [4], [0]] if solved else [[np.nan], [0], [0]]
-    )
+    np.testing.assert_equal([found.x, found.multipliers], [[0.25], [4]] if solved else [[np.nan], [0]])
 
 
 def test_rows_of_another_shape_are_refused():
@@ -205,5 +193,5 @@ def test_what_breaking_a_row_costs_is_in_its_own_units(side):
     lower, upper = (-far, np.array([2.0])) if side > 0 else (np.array([-2.0]), far)
     found = solver.solve(np.array([[4.0]]), np.array([-12.0 * side]), np.array([[2.0]]), lower, upper)
     np.testing.assert_allclose(found.x, [1.375 * side], rtol=1e-8)
-    np.testing.assert_allclose([*found.slack, *found.multipliers], [0.75, 3.25 * side], rtol=1e-7)
+    np.testing.assert_allclose(found.multipliers, [3.25 * side], rtol=1e-7)
     assert found.iterations > 0

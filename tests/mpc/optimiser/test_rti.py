@@ -233,7 +233,7 @@ def test_a_solve_predicts_what_its_plan_does_and_parks_what_is_lost(optimiser):
     np.testing.assert_allclose(lost.plan[:, 0], [32.0, 20.0, 0.0])
     assert abs(lost.y[-1, 0] - 26.5) < 0.5  # while a goes on to its target
     optimiser.qp = SimpleNamespace(
-        solve=lambda *given: QPAnswer(np.full(6, np.nan), "cycling", 4, None, None)
+        solve=lambda *given: QPAnswer(np.full(6, np.nan), "cycling", 4, np.zeros(0))
     )
     failed = optimiser.solve(Sample(START, LAST, guess, room, **ask))
     assert (failed.status, failed.broken) == ("cycling", {})
