@@ -103,15 +103,9 @@ def read_json(path: str | Path, schema: str, version: int) -> dict[str, Any]:
     """Return the JSON object in ``path``, which must have this schema and no newer version."""
     raw = read_bytes(path, share=JSON_SHARE)
     place: dict[str, Any] = {"file": path, "hint": f"it must be a JSON file of schema {schema!r}"}
-    try:
+    too_deep = as_user_error(RecursionError, "is nested too deeply", **place)
+    with too_deep, as_user_error(ValueError, "is not JSON ({error})", **place):  # or no text
         content: dict[str, Any] = parse_json(raw.decode("utf-8"))
-    except json.JSONDecodeError as error:
-        problem = f"is not JSON ({error.msg}, column {error.colno})"
-        raise UserError(problem, **place, row=error.lineno) from error
-    except RecursionError as error:
-        raise UserError("is nested too deeply", **place) from error
-    except ValueError as error:  # no text, or half a character
-        raise UserError(f"is not JSON ({error})", **place) from error
     check_json(content, schema, version, file=path)
     check_content(content, file=path)
     return content

@@ -89,13 +89,6 @@ def reading(problem: str, *, file: str | Path | None = None, hint: str) -> Itera
     For parsers of other people's formats and for documents of ours: on damaged content they raise whatever
     they stumble over, so no list of exceptions is complete.  Nothing but reading belongs in the block.  A
     UserError keeps its words, and gets the file where it names none.
-
-    >>> try:
-    ...     with reading("is no log", file="a.bag", hint="copy it again"):
-    ...         b""[3]
-    ... except UserError as error:
-    ...     print(error)
-    a.bag: is no log (IndexError: index out of range); copy it again
     """
     try:
         yield

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import os
 import re
-from glob import glob
 from pathlib import Path
 from typing import NamedTuple
 
@@ -63,10 +62,3 @@ def split_cut(path: str | Path) -> CutFile:
     if not start < stop:
         raise UserError(f"the cut {start:g}:{stop:g} is empty", file=str(path), hint="write the start first")
     return CutFile(Path(match["path"]), start, stop)
-
-
-def matching_files(path: str | Path) -> list[str]:
-    """Return what a pattern with *, ? or [] that a shell left names, in order, without meta files of grasps;
-    else the path itself."""
-    matches = [] if os.path.exists(path) else sorted(glob(str(path), recursive=True))
-    return [name for name in matches if not file_stem(name).endswith("_meta")] or [str(path)]

@@ -9,7 +9,6 @@ The grasps of one file share one time axis.
 
 from __future__ import annotations
 
-import os
 import re
 from collections.abc import Collection, Sequence
 from pathlib import Path
@@ -19,18 +18,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thermogrip.datasets.atomic_files import write_atomic
-from thermogrip.datasets.errors import UserError, os_faults, reading
-from thermogrip.datasets.file_names import file_format, file_stem, matching_files
+from thermogrip.datasets.errors import UserError, reading
+from thermogrip.datasets.file_names import file_format, file_stem
 from thermogrip.datasets.media import csv_cell
 from thermogrip.datasets.netcdf import open_netcdf, record_unit, write_netcdf
-from thermogrip.datasets.schema import (
-    GRASP_LABELS,
-    GRASP_NUMBERS,
-    check_grasps,
-    log_name,
-    make_grasps,
-    with_lead_in,
-)
+from thermogrip.datasets.schema import GRASP_LABELS, GRASP_NUMBERS, check_grasps, make_grasps, with_lead_in
 from thermogrip.datasets.tables import Table, frame_table, read_csv_table, read_parquet_table
 from thermogrip.datasets.units import rename_hint, split_header, to_record_unit
 
@@ -91,7 +83,7 @@ def read_grasps(path: str | Path, *, name: str | None = None) -> Grasps:
     if kind != "csv":
         raise UserError("grasps are CSV, NetCDF or Parquet", file=path, hint="use one of them")
     samples = read_csv_table(path, text=_is_text)
-    return _of_tables(samples, read_csv_table(_meta_path(path), text=_is_text), name or file_stem(path))
+    return _of_tables(samples, read_csv_table(meta_path(path), text=_is_text), name or file_stem(path))
 
 
 def as_grasps(grasps: Records) -> list[Grasps]:
@@ -149,52 +141,6 @@ def write_grasps(grasps: Grasps, path: str | Path) -> Path:
     samples["grasp"] = samples["grasp"].map(csv_cell)
     header = ["grasp_id", "time_s", *(f"{name}_degC" for name in channels)]
     return write_atomic(path, samples.to_csv(index=False, header=header, lineterminator="\n"))
-
-
-def read_grasp_files(paths: Sequence[str | Path]) -> list[Grasps]:
-    """Return the records of several files as of :func:`read_grasps`; a folder is all its grasp files, in
-    order of name, and no file may be given twice."""
-    records: dict[str, Grasps] = {}
-    files = list_grasp_files(paths)
-    for file, name in zip(files, distinct_names(files)):
-        grasps = read_grasps(file, name=name)
-        if log_name(grasps) in records:  # two NetCDF files may call themselves alike
-            grasps.attrs["name"] = str(file)
-        records[log_name(grasps)] = grasps
-    return list(records.values())
-
-
-def list_grasp_files(paths: Sequence[str | Path]) -> list[Path]:
-    """Return the grasp files in paths and folders, as of :func:`read_grasp_files`, unread."""
-    files: list[Path] = []
-    for path in (Path(name) for pattern in paths for name in matching_files(pattern)):
-        if not path.is_dir():
-            files.append(path)
-            continue
-        with os_faults(path):
-            inside = sorted(path.iterdir())
-        endings = (*_ENDINGS, ".nc", ".parquet", ".pq")
-        tables = [file for file in inside if file.name.lower().endswith(endings) and file.name[0] != "."]
-        files += [file for file in tables if not file_stem(file).endswith("_meta")]
-        if not tables:
-            has_folders = any(file.is_dir() for file in inside)
-            deeper = f", or a pattern in quotes: '{path}/*/*.parquet'" if has_folders else ""
-            hint = f"give a folder with .csv, .nc or .parquet in it{deeper}"
-            raise UserError("holds no grasp files", file=path, hint=hint)
-    return files
-
-
-def distinct_names(files: Sequence[Path]) -> list[str | None]:
-    """Return for each file None, or where another one has its stem its path below the folder that all of this
-    stem have in common; UserError where a file is given twice."""
-    places = [os.path.abspath(file) for file in files]
-    names: list[str | None] = []
-    for file, place in zip(files, places):
-        if places.count(place) > 1:
-            raise UserError("is given twice", file=file, hint="give each file once")
-        alike = [other for other in places if file_stem(other) == file_stem(file)]
-        names.append(os.path.relpath(place, os.path.commonpath(alike)) if len(alike) > 1 else None)
-    return names
 
 
 def _is_text(header: str) -> bool:
@@ -330,7 +276,8 @@ def _on_axis(axis: Floats, time: Series[float], values: Series[float], step: flo
     return np.where(has_neighbours, np.interp(axis, t, values[finite]), np.nan)
 
 
-def _meta_path(path: str | Path) -> Path:
+def meta_path(path: str | Path) -> Path:
+    """Return the meta file of a CSV file; UserError where there is none."""
     stem = file_stem(path)
     choices = [Path(path).with_name(f"{stem}_meta{ending}") for ending in _ENDINGS]
     meta_path = next((p for p in choices if p.exists()), None)

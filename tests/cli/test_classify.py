@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import json
 from collections.abc import Callable, Sequence
-from contextlib import nullcontext
 from dataclasses import asdict, replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -18,9 +17,8 @@ import pytest
 from tests.cli.conftest import Bench, StandIn, shares, words_of
 from thermogrip.classify.decisions.predict import Answer, Note
 from thermogrip.cli import classify as verb
-from thermogrip.cli.classify import SHOWN, check_place, say_names, touched_part, training_part
+from thermogrip.cli.classify import SHOWN, say_names, touched_part, training_part
 from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.grasp_files import write_grasps
 from thermogrip.datasets.schema import Grasps, make_grasps
 from thermogrip.report.console import Console, short
 from thermogrip.sysid.contact.materials import load_materials
@@ -45,7 +43,7 @@ def of_files(stand_in: StandIn, records: Callable[[], list[Grasps]]) -> None:
     def read(path: Path, *, name: str | None) -> Grasps:
         return records()[files.index(Path(path.name))]
 
-    stand_in("thermogrip.datasets.grasp_files.list_grasp_files", lambda paths: files[: len(records())])
+    stand_in("thermogrip.cli.grasp_arguments.list_grasp_files", lambda paths: files[: len(records())])
     stand_in("thermogrip.datasets.grasp_files.read_grasps", read)
 
 
@@ -225,7 +223,7 @@ def test_a_gripper_is_the_bundled_one_or_calibrated_on_what_touched(
         return mine
 
     records = [record_of(["a"]), record_of(["b"], touch_group=["p"]), record_of(["c"], touch_group=["q"])]
-    read = stand_in("thermogrip.datasets.grasp_files.read_grasp_files", records)
+    read = stand_in("thermogrip.cli.grasp_arguments.read_grasp_files", records)
     warned = stand_in("thermogrip.cli.options.warn_of_contacts")
     touched = stand_in("thermogrip.cli.classify.touched_part", lambda console, given: given)
     asked = stand_in("thermogrip.sysid.effusivity.calibration.calibrate_gripper", calibrate)
@@ -295,7 +293,7 @@ def school(bench: Bench, stand_in: StandIn, monkeypatch: pytest.MonkeyPatch) -> 
     made = SimpleNamespace(bench=bench, model=model, fitted=[], saved=[])
     model.fit = made.fitted.append
     made.record = record_of(["a", "b", "c"], split=["train", "train", "test"])
-    made.read = stand_in("thermogrip.datasets.grasp_files.read_grasp_files", lambda paths: [made.record])
+    made.read = stand_in("thermogrip.cli.grasp_arguments.read_grasp_files", lambda paths: [made.record])
     made.warned = stand_in("thermogrip.cli.options.warn_of_contacts")
     stand_in("thermogrip.cli.classify.touched_part", lambda console, records: records)
     made.asked = stand_in("thermogrip.classify.estimators.registry.make_classifier", model)
@@ -341,7 +339,7 @@ def test_a_stop_rule_is_learnt_from_grasps_of_known_temperature(
     asked = stand_in("thermogrip.classify.decisions.stopping_rule.learn_stop_rule", learn)
     stand_in("thermogrip.classify.evaluation.splits.scored_apart", lambda record: record is apart)
     known, apart = records = [record_of(["a"]), record_of(["b"])]
-    stand_in("thermogrip.datasets.grasp_files.read_grasp_files", lambda paths: records)
+    stand_in("thermogrip.cli.grasp_arguments.read_grasp_files", lambda paths: records)
     words = ["train", "grasps.csv", "--classifier", "bayes", "--split", "all", "--stop-error", "0.1"]
     done = school.bench.run(*words, "--out", "m")
     ((model, (learnt_from,)),) = [call.args for call in asked]
@@ -372,7 +370,7 @@ def named(bench: Bench, stand_in: StandIn) -> SimpleNamespace:
     (bench.path / "m").mkdir()
     verb._answerer.cache_clear()
     of_files(stand_in, lambda: [made.record])
-    stand_in("thermogrip.datasets.grasp_files.read_grasp_files", lambda paths: [made.record])
+    stand_in("thermogrip.cli.grasp_arguments.read_grasp_files", lambda paths: [made.record])
     made.warned = stand_in("thermogrip.cli.options.warn_of_contacts")
     made.ranged = stand_in("thermogrip.sysid.effusivity.data.with_object_range", lambda *_: "ranged")
     made.loaded = stand_in("thermogrip.classify.estimators.registry.load_classifier", lambda _: made.model)
@@ -477,21 +475,3 @@ def test_materials_are_listed_by_their_effusivity(bench: Bench) -> None:
     assert json.loads(bench.run("materials", "copper", "--json").out) == {
         "materials": [asdict(copper) | {"aliases": list(copper.aliases)}]
     }
-
-
-@pytest.mark.parametrize(
-    ("out", "given", "problem"),
-    [
-        ("a.csv", ["a.csv"], "is to be read and written"),
-        ("a_meta.csv", ["b.csv", "a.csv"], "is to be read and written"),
-        ("new.csv", ["."], "is in a folder that is read"),
-        ("new.csv", ["*.csv"], "is to be read and written"),
-        ("more/new.csv", [".", "*.csv"], ""),
-    ],
-)
-def test_an_output_is_no_file_that_is_read(out: str, given: list[str], problem: str, tmp_path: Path) -> None:
-    (tmp_path / "more").mkdir()
-    for name in "ab":
-        write_grasps(record_of([name]), tmp_path / f"{name}.csv")
-    with pytest.raises(UserError, match=problem) if problem else nullcontext():
-        check_place(tmp_path / out, [str(tmp_path / name) for name in given])

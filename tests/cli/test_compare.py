@@ -61,7 +61,7 @@ def scored(bench: Bench, stand_in: StandIn) -> SimpleNamespace:
 
     made = SimpleNamespace(bench=bench, read={"grasps.csv": MARKED, "more.csv": PLAIN}, of={}, missing=())
     stand_in(
-        "thermogrip.datasets.grasp_files.read_grasp_files", lambda paths: [made.read[path] for path in paths]
+        "thermogrip.cli.grasp_arguments.read_grasp_files", lambda paths: [made.read[path] for path in paths]
     )
     made.warned = stand_in("thermogrip.cli.options.warn_of_contacts")
     made.touched = stand_in("thermogrip.cli.compare.touched_part", lambda console, records: records)

@@ -149,7 +149,7 @@ def test_json_has_no_nan(tmp_path):
     [
         (b"", "is not JSON"),
         (b"{", "is not JSON"),
-        (b'{"schema": "thermogrip.test",\n "version": 1,\n oops}', "row 3"),
+        (b'{"schema": "thermogrip.test",\n "version": 1,\n oops}', "line 3 column 2"),
         (b'{"schema": "thermogrip.test", "version": 1, "x": NaN}', "x is nan, not a finite number"),
         (b'{"schema": "thermogrip.test", "version": 1, "x": "\\ud800"}', "surrogates not allowed"),
         (b"\x80\x04\x95", "is not JSON ('utf-8'"),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import lzma
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,7 +12,7 @@ from hypothesis import strategies as st
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.examples import example_path
-from thermogrip.datasets.grasp_files import distinct_names, read_grasp_files, read_grasps, write_grasps
+from thermogrip.datasets.grasp_files import read_grasps, write_grasps
 from thermogrip.datasets.schema import make_grasps
 
 META = "grasp_id,material,t_object_nominal_degC,t_gripper_set_degC\n"
@@ -246,17 +245,6 @@ def test_a_log_is_no_grasps(tmp_path, small_log):
     assert "no column grasp_id" in refused(write_log(small_log, tmp_path / "x.parquet"))
 
 
-def test_a_folder_is_its_grasp_files(tmp_path, small_grasps):
-    write_grasps(small_grasps, tmp_path / "b.csv")
-    write_grasps(small_grasps, tmp_path / "a.nc")
-    assert [r.attrs["name"] for r in read_grasp_files([tmp_path])] == ["small", "b"]
-    (tmp_path / "empty").mkdir()
-    with pytest.raises(UserError, match="holds no grasp files"):
-        read_grasp_files([tmp_path / "empty"])
-    with pytest.raises(UserError, match="is given twice"):
-        read_grasp_files([tmp_path / "b.csv", tmp_path / "b.csv"])
-
-
 def test_columns_that_nobody_asked_for_are_left_out_and_reported(pair):
     plain = samples("a")
     head, *rows = plain.splitlines()
@@ -322,7 +310,7 @@ def test_parquet_with_a_row_a_sample_is_the_csv(tmp_path):
     samples, meta = pd.read_csv(tmp_path / "warm.csv"), pd.read_csv(tmp_path / "warm_meta.csv")
     (tmp_path / "parquet").mkdir()
     samples.merge(meta, on="grasp_id").to_parquet(tmp_path / "parquet" / "warm.parquet")
-    [found] = read_grasp_files([tmp_path / "parquet"])
+    found = read_grasps(tmp_path / "parquet" / "warm.parquet")
     assert found.identical(csv)
 
 
@@ -367,32 +355,7 @@ def test_a_fault_in_parquet_names_its_file_row_and_column(
     assert "identify" not in line
 
 
-def test_parquet_of_either_ending_is_found_in_a_folder(frame, tmp_path):
-    for name in ("a.parquet", "b.pq"):
-        frame.to_parquet(tmp_path / name)
-    assert [record.attrs["name"] for record in read_grasp_files([tmp_path])] == ["a", "b"]
-
-
 def test_what_the_rows_of_a_grasp_may_differ_in_is_left_out_and_reported(frame, tmp_path):
     path = tmp_path / "part.parquet"
     frame.assign(force_N=range(6)).to_parquet(path)
     assert read_grasps(path).attrs["repairs"].startswith("part.parquet: not used: force_N; known are")
-
-
-def test_two_files_that_call_themselves_alike_are_both_read(tmp_path, small_grasps):
-    for k in range(2):
-        write_grasps(small_grasps.assign_coords(grasp=[f"{k}{n}" for n in range(6)]), tmp_path / f"{k}.nc")
-    assert [r.attrs["name"] for r in read_grasp_files([tmp_path])] == ["small", str(tmp_path / "1.nc")]
-
-
-def test_a_folder_of_folders_says_the_pattern_for_it(tmp_path, small_grasps):
-    (tmp_path / "may").mkdir()
-    with pytest.raises(UserError, match=r"holds no grasp files.*or a pattern in quotes: '.*/\*/\*.parquet'"):
-        read_grasp_files([tmp_path])
-
-
-def test_files_of_one_name_in_several_folders_are_told_apart_by_these(tmp_path: Path) -> None:
-    files = [tmp_path / "may" / "a.csv", tmp_path / "june" / "a.csv", tmp_path / "b.csv"]
-    assert distinct_names(files) == ["may/a.csv", "june/a.csv", None]
-    with pytest.raises(UserError, match=r"b\.csv: is given twice"):
-        distinct_names([tmp_path / "b.csv", tmp_path / "may" / ".." / "b.csv"])

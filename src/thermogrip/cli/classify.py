@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, TypeAlias
 
 from thermogrip.classify.estimators import classifier_names
+from thermogrip.cli import grasp_arguments
 from thermogrip.cli import options as cli
 from thermogrip.datasets.errors import UserError
 from thermogrip.report.console import Console
@@ -49,13 +50,12 @@ def calibrated_device(console: Console, calibrate: Sequence[str], seed: int) -> 
             "the bundled gripper's calibration is used; give --calibrate with labelled grasps of yours"
         )
         return CalibratedDevice(load_default_gripper(), None, _BUNDLED)
-    from thermogrip.datasets.grasp_files import read_grasp_files
     from thermogrip.datasets.schema import has_touch_groups
     from thermogrip.sysid.effusivity import calibrate_gripper
     from thermogrip.sysid.effusivity.multi_touch import learn_coupling
     from thermogrip.sysid.effusivity.quality import longest_contact
 
-    labelled = read_grasp_files(calibrate)
+    labelled = grasp_arguments.read_grasp_files(calibrate)
     cli.warn_of_contacts(console.warn, labelled)
     labelled = touched_part(console, labelled)
     with console.progress("calibrate") as progress:
@@ -218,7 +218,6 @@ def train(
     """
     from thermogrip.classify.decisions.stopping_rule import RULE_FILE
     from thermogrip.classify.estimators.registry import can_be_saved, make_classifier, save_classifier
-    from thermogrip.datasets.grasp_files import read_grasp_files
 
     model = make_classifier(classifier, quick=quick, seed=seed)
     if not can_be_saved(model):
@@ -228,7 +227,7 @@ def train(
         )
     model.check_installed()
     console = Console(as_json)
-    records = training_part(console, read_grasp_files(grasps), split)
+    records = training_part(console, grasp_arguments.read_grasp_files(grasps), split)
     cli.warn_of_contacts(console.warn, records)
     records = touched_part(console, records)
     cli.new_folder(out)
@@ -434,13 +433,12 @@ class _Question:
         from thermogrip.classify.decisions.predict import answer_record
         from thermogrip.classify.decisions.stopping_rule import load_stop_rule
         from thermogrip.classify.estimators.registry import load_classifier
-        from thermogrip.datasets.grasp_files import read_grasp_files
         from thermogrip.sysid.effusivity.data import with_object_range
 
         model = load_classifier(self.model_dir)
         rule = load_stop_rule(self.model_dir) if self.early else None
         if self.known:
-            model = _with_gripper(model).for_another_gripper(read_grasp_files(self.known))
+            model = _with_gripper(model).for_another_gripper(grasp_arguments.read_grasp_files(self.known))
 
         def rows_of(record: Grasps) -> tuple[list[dict[str, Any]], GraspQuality]:
             answers, quality = answer_record(
@@ -577,7 +575,8 @@ def _with_gripper(model: GraspClassifier) -> PosteriorClassifier:
 
 def check_place(out: Path, given: Sequence[str]) -> None:
     """Refuse a place for answers that cannot be written, or is among the files that are read."""
-    from thermogrip.datasets.file_names import file_stem, matching_files
+    from thermogrip.datasets.file_names import file_format
+    from thermogrip.datasets.grasp_files import meta_path
 
     if as_folder := out.is_dir() or not out.suffix:
         cli.new_folder(out)
@@ -586,10 +585,10 @@ def check_place(out: Path, given: Sequence[str]) -> None:
     file, hint = out / "answers.csv" if as_folder else out, "choose another name or folder for --out"
     place = file.resolve()
     for pattern in given:
-        read = [Path(name).resolve() for name in matching_files(pattern)]
+        read = [Path(name).resolve() for name in grasp_arguments.matching_files(pattern)]
         if place.parent in (path for path in read if path.is_dir()):
             raise UserError("is in a folder that is read", file=file, hint=hint)
-        read += [path.with_name(f"{file_stem(path)}_meta.csv") for path in read]
+        read += [meta_path(path) for path in read if path.is_file() and file_format(path) == "csv"]
         if place in read or (place.match(str(Path(pattern).resolve())) and not Path(pattern).is_dir()):
             raise UserError("is to be read and written", file=file, hint=hint)
 
@@ -606,12 +605,11 @@ def answer_files(
     """Return the answers to files of grasps, read one by one, with the ``rows`` of their tables written; CSV
     has ``unknown`` for NaN."""
     from thermogrip.datasets.file_names import file_stem
-    from thermogrip.datasets.grasp_files import distinct_names, list_grasp_files
     from thermogrip.datasets.parallel import in_order
     from thermogrip.sysid.effusivity.quality import torn_groups
 
-    files = list_grasp_files(paths)
-    todo = [(file.absolute(), name) for file, name in zip(files, distinct_names(files))]
+    files = grasp_arguments.list_grasp_files(paths)
+    todo = [(file.absolute(), name) for file, name in zip(files, grasp_arguments.distinct_names(files))]
     answers: list[dict[str, Any]] = []
     with console.progress(verb) as progress:
         progress(0.0, "grasps")

@@ -77,7 +77,7 @@ def compare(
     pool = cli.workers_of(workers, cluster)
     from thermogrip.classify.estimators.registry import trainable
     from thermogrip.classify.evaluation.harness import evaluate
-    from thermogrip.datasets.grasp_files import read_grasp_files
+    from thermogrip.cli.grasp_arguments import read_grasp_files
 
     names = cli.comma(classifiers)
     models, missing = trainable(names or BY_DEFAULT, quick=quick, seed=seed)

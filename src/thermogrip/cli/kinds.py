@@ -15,8 +15,8 @@ from importlib import import_module, resources
 from pathlib import Path
 from typing import Any
 
+from thermogrip.cli.grasp_arguments import matching_files
 from thermogrip.datasets.errors import UserError, known_names
-from thermogrip.datasets.file_names import matching_files
 
 KINDS: dict[str, dict[str, Any]] = tomllib.loads(
     (resources.files("thermogrip.cli") / "kinds.toml").read_text(encoding="utf-8")
