@@ -93,20 +93,11 @@ class _Run:
         self.y = np.zeros((n * truth.sub + 1, model.n_y))
         self.reading, self.drive = np.zeros((n, model.n_y + model.n_d)), np.zeros((n, model.n_u))
         self.status = np.full(n, STATUSES.index("ok"), dtype=np.int32)
-        switches = truth.switches
-        relays = np.array(relay_rows(switches, model.drives), dtype=_RELAY)
-        states = np.array([(one.on, one.owed_s, one.since_s) for one in switches.each], dtype=_SWITCH)
+        relays = np.array(relay_rows(truth.switches, model.drives), dtype=_RELAY)
+        states = np.array([(0, 0.0, np.inf)] * len(relays), dtype=_SWITCH)  # as truth has them
         self.plant, arrays_of_plant = CompiledTruth(model).at(truth.x, truth.offset)
-        self._held = (
-            arrays_of_plant,
-            truth.before,
-            truth.d,
-            noise,
-            quanta,
-            offset,
-            relays,
-            states,
-        )  # they live as long as this
+        # they live as long as this
+        self._held = (arrays_of_plant, truth.before, truth.d, noise, quanta, offset, relays, states)
         places = [address(values) for values in self._held[1:]]
         numbers = truth.sub, truth.late, len(relays), truth.sees, around.drive_share, model.dt
         self.around = _Around(*numbers, *places)

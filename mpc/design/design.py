@@ -25,7 +25,7 @@ from pydantic import AfterValidator, ConfigDict, Field, Strict, TypeAdapter, Val
 
 from thermogrip.datasets.errors import UserError, known_names
 from thermogrip.datasets.limits import LARGEST
-from thermogrip.mpc.design.relays import Relay, two_signed
+from thermogrip.mpc.design.relays import Relay, pairs_of_drives, two_signed
 from thermogrip.mpc.estimator.observer import (
     DRIFT,
     NOISE,
@@ -200,13 +200,13 @@ def _check_relays(design: Design, plant: Plant) -> None:
         wrong = f"relays: {name} is from {low:g} up: a drive has a cooler where it goes below 0"
         _refuse((low < 0) != (name in signed), wrong)
         _refuse(relay.dead_s and not relay.cooler, f"relays: dead_s of {name} is between it and a cooler")
-        if relay.cooler and name not in signed:
-            pair, coolers = (name, relay.cooler), [other.cooler for other in relays.values()]
-            gains = [[step_response(plant, drive, y).gain for drive in pair] for y in design.controlled]
-            opposed = any(heats * cools < 0 for heats, cools in gains)
-            alone = coolers.count(relay.cooler) == 1 and not relays[relay.cooler].cooler
-            _refuse(not opposed, f"relays: {name} and {relay.cooler} move no output in opposite directions")
-            _refuse(not alone, f"relays: {relay.cooler} is in two pairs of a heater and a cooler")
+    pairs = pairs_of_drives(relays)
+    for pair in pairs.items():
+        gains = [[step_response(plant, drive, y).gain for drive in pair] for y in design.controlled]
+        opposed = any(heats * cools < 0 for heats, cools in gains)
+        _refuse(not opposed, f"relays: {' and '.join(pair)} move no output in opposite directions")
+        others = [*pairs, *pairs.values()]
+        _refuse(others.count(pair[1]) > 1, f"relays: {pair[1]} is in two pairs of a heater and a cooler")
 
 
 def _validated(content: Mapping[str, Any]) -> Design:

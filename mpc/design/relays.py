@@ -41,9 +41,14 @@ class Relay:
     dead_s: Seconds = 0.0  # least time between heater and cooler
 
 
+def pairs_of_drives(relays: Mapping[str, Relay]) -> dict[str, str]:
+    """Return the cooler of each heater where both are drives of their own."""
+    return {name: of.cooler for name, of in relays.items() if of.cooler in relays.keys() - {name}}
+
+
 def two_signed(relays: Mapping[str, Relay]) -> set[str]:
     """Return the drives that go both ways, whose coolers are no drives of their own."""
-    return {name for name, of in relays.items() if of.cooler and of.cooler not in relays.keys() - {name}}
+    return {name for name, of in relays.items() if of.cooler} - pairs_of_drives(relays).keys()
 
 
 @dataclass(eq=False)

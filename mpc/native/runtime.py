@@ -39,20 +39,10 @@ _CODE = ("tg_qp", "tg_controller", "tg_observer", "tg_optimiser")
 SWITCHES = ("tg_switches.h", "tg_switches.c")  # where drives are switched
 SOURCES = ("tg_qp.h", "tg_controller.h", *(f"{name}.c" for name in _CODE))
 
+_BUILD = ("-std=c99", "-O2", "-march=native", "-fvect-cost-model=dynamic", "-fPIC", "-shared")
 # sums may be done in any order and pairs of operations at once; NaN keeps its meaning
-_GCC_FLAGS = (
-    *(
-        "-std=c99",
-        "-O2",
-        "-fvect-cost-model=dynamic",
-        "-fno-inline-functions-called-once",
-        "-march=native",
-        "-fno-math-errno",
-        "-fno-trapping-math",
-        "-fno-signed-zeros",
-    ),
-    *("-fassociative-math", "-ffp-contract=fast", "-fPIC", "-shared"),
-)
+_ARITHMETIC = ("-fno-math-errno", "-fno-trapping-math", "-fno-signed-zeros", "-fassociative-math")
+_GCC_FLAGS = (*_BUILD, *_ARITHMETIC, "-ffp-contract=fast", "-fno-inline-functions-called-once")
 
 
 def compiler() -> str | None:

@@ -23,6 +23,7 @@ from thermogrip.mpc.controllers.controller_file import KEPT_DRAWS
 from thermogrip.mpc.controllers.mpc import Controller
 from thermogrip.mpc.controllers.pi import PIController
 from thermogrip.mpc.design.design import Design
+from thermogrip.mpc.design.relays import pairs_of_drives
 from thermogrip.mpc.design.spec import Spec
 from thermogrip.mpc.tuning.design_review import Check, passes, review
 from thermogrip.mpc.tuning.objective import (
@@ -556,6 +557,7 @@ def unknown_to_pi(spec: Spec) -> list[str]:
         "energy prices": spec.energy_price,
         "limits of outputs": spec.limits,
         "ramps": spec.ramp_per_s,
+        "a heater and a cooler": pairs_of_drives(spec.relays or {}),
     }
     return [wish for wish, value in wishes.items() if value]
 

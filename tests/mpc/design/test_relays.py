@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import subprocess
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from thermogrip.mpc.design.design import default_design
 from thermogrip.mpc.design.relays import Relay, Switches
 from thermogrip.mpc.design.spec import Spec, spec_from_dict
 from thermogrip.mpc.native.runtime import compiler
+from thermogrip.mpc.tuning.tune import unknown_to_pi
 from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.plant import Plant
 
@@ -121,7 +123,16 @@ def test_relays_that_make_no_sense_are_refused(relays, says):
 
 def test_a_pair_has_one_heater_and_one_cooler():
     spec = spec_from_dict({"relays": {name: vars(relay) for name, relay in PAIR.items()}})
-    assert spec.design(chamber()).relays == PAIR
+    design = spec.design(chamber())
+    assert (design.relays, design.drive) == (PAIR, pytest.approx(0.5 * spec.bias_degC * 40, rel=0.01))
+    # otherwise both are on at once, which holds nothing, and the relays wait for each other
+    errors = []
+    for drive in (0.0, design.drive):
+        controller, around = Controller(chamber(), replace(design, drive=drive)), Surroundings(relays=PAIR)
+        run = simulate_closed_loop(controller, chamber(), [(24.0, 6000.0)], start=22.0, surroundings=around)
+        errors.append(float(np.sqrt(np.mean((run.outputs["t"][600:] - 24.0) ** 2))))
+    assert errors[1] < 0.25 < 0.5 < errors[0]
+    assert unknown_to_pi(spec) == ["a heater and a cooler"]
     both = {"hot": Relay(cooler="cold"), "cold": Relay(cooler="hot")}
     with pytest.raises(UserError, match="cold is in two pairs"):
         default_design(chamber(), relays=both)
