@@ -56,7 +56,10 @@ def _open_dataset(path: Path) -> xr.Dataset:
     check_netcdf(path)
     options: dict[str, Any] = {"engine": "h5netcdf", "decode_times": False, "decode_timedelta": False}
     with _not_damaged(path), xr.open_dataset(path, **options) as opened:
-        data = _text_as_str(opened.load())
+        data = opened.load()
+    # text of variable length is read as arrays of objects
+    texts = [key for key, variable in data.variables.items() if variable.dtype.kind in "OS"]
+    data = data.assign({key: data[key].astype(str) for key in texts})
     if "grasp_id" in data.variables and data["grasp_id"].dims == ("grasp",) and "grasp" not in data.variables:
         # version 0.2 had the names of grasps there
         data = data.assign_coords(grasp=data["grasp_id"].astype(str).values).drop_vars("grasp_id")
@@ -144,9 +147,3 @@ def convention_unit(unit: str, name: str, file: str) -> str:
         hint = f"use one of {' '.join(UNITS)} 1"
         raise UserError(f"unit {unit!r} is unknown", file=file, column=name, hint=hint)
     return known_unit
-
-
-def _text_as_str(data: xr.Dataset) -> xr.Dataset:
-    """Turn the object arrays that variable-length text is read as into arrays of str."""
-    texts = [key for key, variable in data.variables.items() if variable.dtype.kind in "OS"]
-    return data.assign({key: data[key].astype(str) for key in texts})

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thermogrip.datasets.atomic_files import read_bytes
-from thermogrip.datasets.errors import UserError, as_user_error
+from thermogrip.datasets.errors import UserError, as_user_error, reading
 from thermogrip.datasets.schema import Grasps, make_grasps, with_lead_in
 
 _HOLD = re.compile(r"(?P<object>.+)_(?P<number>\d+)_(?P<trial>\d+)_HOLD\.mat")
@@ -28,13 +28,6 @@ _KINDS = {"M": "aluminium", "W": "wood", "CW": "wood_cold"}
 _ARRAY = re.compile(
     rb"\(I(\d+)\nI(\d+)\ntcnumpy\ndtype\n.*?\(S'f8'\n.*?tbI0([01])\n(S['\"].*['\"])\ntb", re.DOTALL
 )
-# counts, and the maker's divider and thermistor: with x the share of full scale
-# T = 4025 K / ln((155183 - 46555 x) / x) - 273.15 degC
-_FULL_SCALE = 4095.0
-_DIVIDER = (155183.0, 46555.0)
-_BETA = 4025.0
-_KELVIN = 273.15
-_STEP, _AVERAGED = 0.01, 10  # s; samples
 
 
 def read_hold(folder: str | Path) -> Grasps:
@@ -66,22 +59,21 @@ def read_hold(folder: str | Path) -> Grasps:
     """
     from scipy.io import loadmat
 
-    traces, files = [], _named_files(Path(folder), "*_HOLD.mat", _HOLD)
+    shares, files = [], _named_files(Path(folder), "*_HOLD.mat", _HOLD)
     for file, _ in files:
-        wrong = (KeyError, IndexError, TypeError, ValueError, OSError, NotImplementedError)
-        with as_user_error(wrong, "has no F0tdc", file=file, hint="give the files as published"):
-            # of finger 0's core at 100 Hz
-            share = loadmat(file)["F0tdc"][0].astype(float) / _FULL_SCALE
-        with np.errstate(divide="ignore", invalid="ignore"):
-            traces.append(_BETA / np.log((_DIVIDER[0] - _DIVIDER[1] * share) / share) - _KELVIN)
-    n = min(map(len, traces)) // _AVERAGED
-    rows = np.stack([t[: n * _AVERAGED].reshape(n, _AVERAGED).mean(axis=1) for t in traces])
+        with reading("has no F0tdc", file=file, hint="give the files as published"):
+            shares.append(loadmat(file)["F0tdc"][0] / 4095)  # finger 0's core at 100 Hz, in 12 bits
+    n = min(map(len, shares)) // 10
+    x = np.stack([share[: 10 * n] for share in shares])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        core = 4025 / np.log((155183 - 46555 * x) / x) - 273.15  # the maker's divider and thermistor
+    rows = core.reshape(len(files), n, 10).mean(axis=2)
     names = [name.groupdict() for _, name in files]
     # the files begin with the hold, and fluid and skin delay what the core feels: its first tenth of a second
     # counts as the level before contact
     return with_lead_in(
         make_grasps(
-            _AVERAGED * _STEP * (np.arange(n) + 0.5),
+            0.1 * (np.arange(n) + 0.5),
             rows,
             [f"{name['object']}_{name['trial']}" for name in names],
             material=[name["object"].replace("_", " ") for name in names],

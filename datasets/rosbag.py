@@ -119,7 +119,14 @@ def read_rosbag_table(path: str | Path, topics: TopicMap | None = None) -> Table
                 times, values = series.setdefault(name, ([], []))
                 times.append(message.time)
                 values.append(_message_number(message, column, name, file))
-    _check_found(columns, series, type_of_topic, file)
+    have = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(type_of_topic.items())) or "none"
+    for name, column in columns.items():
+        if name not in series:
+            problem = f"topic {column.topic} has no message"
+            raise UserError(problem, file=file, column=name, hint=f"it has {have}")
+    if not columns:
+        problem = f"has no topic with a single number (topics: {have})"
+        raise UserError(problem, file=file, hint="write a topic map (`thermogrip init topics`)")
     return _bag_table(file, columns, series, topic_map.clock, notes)
 
 
@@ -232,19 +239,6 @@ def _message_number(message: Message, column: Column, name: str, file: Path) -> 
     except _NO_NUMBER as error:
         problem = f"{message.topic} ({message.type}) has no number {column.field!r}"
         raise UserError(problem, file=file, column=name, hint="correct the field in the topic map") from error
-
-
-def _check_found(
-    columns: Mapping[str, Column], series: Mapping[str, Any], seen: Mapping[str, str], file: Path
-) -> None:
-    have = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(seen.items())) or "none"
-    for name, column in columns.items():
-        if name not in series:
-            hint = f"it has {have}"
-            raise UserError(f"topic {column.topic} has no message", file=file, column=name, hint=hint)
-    if not columns:
-        problem = f"has no topic with a single number (topics: {have})"
-        raise UserError(problem, file=file, hint="write a topic map (`thermogrip init topics`)")
 
 
 def _bag_table(

@@ -96,10 +96,11 @@ def test_what_an_array_takes_in_memory_is_what_it_declares(
             assert netcdf._in_memory(file["words"]) == found
 
 
-def test_text_of_any_kind_is_text_and_units_are_those_of_the_conventions() -> None:
-    data = xr.Dataset({"a": (("x", "y"), np.array([[b"p", b"qq"]])), "b": ("x", np.array([1.5], object))})
-    found = netcdf._text_as_str(data)
-    assert (found["a"].values.tolist(), found["b"].values.tolist()) == ([["p", "qq"]], ["1.5"])
+def test_text_of_any_kind_is_text_and_units_are_those_of_the_conventions(tmp_path: Path) -> None:
+    data = xr.Dataset({"a": (("x", "y"), np.array([[b"p", b"qq"]])), "b": ("x", np.array(["r"], object))})
+    data.to_netcdf(tmp_path / "a.nc", engine="h5netcdf")
+    found = netcdf.open_netcdf(tmp_path / "a.nc")
+    assert [(v.dtype.kind, v.values.tolist()) for v in found.values()] == [("U", [["p", "qq"]]), ("U", ["r"])]
     ours = [netcdf.convention_unit(unit, "a", "f") for unit in ("degrees_C", "%", "", repr(1 / 255), "V")]
     assert ours == ["degC", "percent", "1", "0_255", "V"]
     values, unit = netcdf.record_unit(xr.DataArray([300, 301], attrs={"units": "kelvin"}), "a", "f")
