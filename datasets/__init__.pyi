@@ -17,5 +17,4 @@ from thermogrip.datasets.schema import make_grasps as make_grasps
 from thermogrip.datasets.schema import make_log as make_log
 
 if typing.TYPE_CHECKING:  # doors of 0.1.0, which are found and not listed
-    from thermogrip.datasets.examples import copy_examples as copy_examples
     from thermogrip.datasets.resample import gaps as gaps

@@ -13,7 +13,6 @@ from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from thermogrip.datasets.atomic_files import write_atomic
 from thermogrip.datasets.errors import UserError, known_names
 from thermogrip.datasets.grasp_files import read_grasps
 from thermogrip.datasets.log_files import read_log
@@ -53,24 +52,6 @@ def example_path(name: str) -> Path:
         hint = known_names(name, [*EXAMPLE_LOGS, *example_grasps()], "there are {}")
         raise UserError(f"no example {name!r}", hint=hint)
     return path
-
-
-def copy_examples(folder: str | Path) -> list[Path]:
-    """Write the bundled logs into a folder, the grasps into ``grasps`` in it and what each file is into
-    ``EXAMPLES.md``, and return their paths; UserError before any is written where another file is there."""
-    folder, content = Path(folder), {}
-    for original in sorted(_FOLDER.glob("*.csv.xz")):
-        is_log = original.name.removesuffix(".csv.xz") in EXAMPLE_LOGS
-        content[(folder if is_log else folder / "grasps") / original.name] = original.read_bytes()
-    content[folder / "EXAMPLES.md"] = (_FOLDER / "README.md").read_bytes()
-    for path, data in content.items():
-        if path.exists() and path.read_bytes() != data:
-            raise UserError("another file of this name is here", file=path, hint="choose another folder")
-    for path, data in content.items():
-        path.parent.mkdir(parents=True, exist_ok=True)
-        if not path.exists():
-            write_atomic(path, data)
-    return list(content)
 
 
 def load_example_logs() -> dict[str, Log]:

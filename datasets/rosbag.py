@@ -14,6 +14,7 @@ import io
 import json
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from importlib.util import find_spec
@@ -24,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thermogrip.datasets.atomic_files import read_bytes, read_toml
-from thermogrip.datasets.errors import UserError, known_names, os_fault, os_faults, reading
+from thermogrip.datasets.errors import UserError, known_names, os_faults, reading
 from thermogrip.datasets.file_names import file_stem
 from thermogrip.datasets.limits import Unpacker, check_size, check_source
 from thermogrip.datasets.roles import guess_role
@@ -199,11 +200,11 @@ def _guess_column(message: Message, columns: dict[str, Column], file: Path) -> N
     """Add a column for a topic that is seen for the first time and has one number."""
     if any(column.topic == message.topic for column in columns.values()):
         return
-    number_field = next((f for f in _SINGLE_FIELDS if _has(message.content, f)), "")
-    field = "value" if message.attrs.get("units") else number_field
-    try:
-        float(_field(message.content, field))
-    except _NO_NUMBER:
+    for field in ("value",) if message.attrs.get("units") else _SINGLE_FIELDS:
+        with suppress(*_NO_NUMBER):
+            float(_field(message.content, field))
+            break
+    else:
         return
     name = message.topic.strip("/").replace("/", "_")
     unit = message.attrs.get("units") or _SINGLE_FIELDS.get(field, "")
@@ -213,10 +214,6 @@ def _guess_column(message: Message, columns: dict[str, Column], file: Path) -> N
         hint = "write a topic map (`thermogrip init topics`)"
         raise UserError(f"two topics would be {name}", file=file, hint=hint)
     columns[name] = Column(message.topic, field, unit, message.attrs.get("role", ""))
-
-
-def _has(content: Any, field: str) -> bool:
-    return field in content if isinstance(content, dict) else hasattr(content, field)
 
 
 def _field(content: Any, path: str) -> Any:
@@ -279,8 +276,8 @@ def _bag_table(
 
 
 def _messages(file: Path, notes: list[str]) -> Iterator[Message]:
-    if not file.exists():
-        raise os_fault(FileNotFoundError(2, "missing"), file)
+    with os_faults(file):
+        file.stat()
     bag_files = bag_parts(file) if os.path.isdir(file) else [file]
     if os.path.isdir(file) and not (file / "metadata.yaml").is_file():
         notes.append("has no metadata.yaml: its writer died; all of its files are read")

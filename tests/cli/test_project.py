@@ -11,6 +11,9 @@ import pytest
 
 from tests.cli.conftest import Bench, StandIn, shares
 from tests.mpc.makers import network_plant
+from thermogrip.cli.project import copy_examples
+from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.examples import example_grasps, example_path
 from thermogrip.mpc.design.spec import Spec, read_spec
 from thermogrip.report.html import Section
 from thermogrip.sysid.models.network import load_network
@@ -116,3 +119,24 @@ def test_warm_up_says_where_the_compiled_code_is_kept(bench: Bench) -> None:
     assert answer["kept_in"] == step_contacts.stats.cache_path
     assert list(Path(answer["kept_in"]).glob("time_stepping.step_contacts-*.nbc"))
     assert "kept in" in bench.run("warm-up").out
+
+
+def test_the_copied_examples_are_the_bundled_ones_byte_for_byte(tmp_path):
+    paths = copy_examples(tmp_path / "new" / "folder")
+    for path in paths[:-1]:
+        assert path.read_bytes() == (example_path("multisine").parent / path.name).read_bytes()
+    folders = {path.parent.relative_to(tmp_path / "new").as_posix() for path in paths}
+    assert folders == {"folder", "folder/grasps"}
+    assert len(paths) == 4 + 2 * len(example_grasps()) + 1
+    assert paths[-1].read_text(encoding="utf-8").count("`prbs_heating_cooling`") == 1
+
+
+def test_copied_examples_never_replace_a_file_of_the_user(tmp_path):
+    mine = tmp_path / "pump_on_off.csv.xz"
+    mine.write_text("mine", encoding="utf-8")
+    with pytest.raises(UserError, match="another file of this name"):
+        copy_examples(tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == [mine.name]
+    assert mine.read_text(encoding="utf-8") == "mine"
+    mine.unlink()
+    assert copy_examples(tmp_path) == copy_examples(tmp_path)

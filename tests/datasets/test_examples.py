@@ -14,7 +14,6 @@ import thermogrip.datasets
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.examples import (
     EXAMPLE_LOGS,
-    copy_examples,
     example_grasps,
     example_path,
     load_example_grasps,
@@ -62,27 +61,6 @@ def test_an_example_that_is_not_there_is_refused_with_the_list():
         example_path("none")
 
 
-def test_the_copied_examples_are_the_bundled_ones_byte_for_byte(tmp_path):
-    paths = copy_examples(tmp_path / "new" / "folder")
-    for path in paths[:-1]:
-        assert path.read_bytes() == (example_path("multisine").parent / path.name).read_bytes()
-    folders = {path.parent.relative_to(tmp_path / "new").as_posix() for path in paths}
-    assert folders == {"folder", "folder/grasps"}
-    assert len(paths) == 4 + 2 * len(example_grasps()) + 1
-    assert paths[-1].read_text(encoding="utf-8").count("`prbs_heating_cooling`") == 1
-
-
-def test_copied_examples_never_replace_a_file_of_the_user(tmp_path):
-    mine = tmp_path / "pump_on_off.csv.xz"
-    mine.write_text("mine", encoding="utf-8")
-    with pytest.raises(UserError, match="another file of this name"):
-        copy_examples(tmp_path)
-    assert [path.name for path in tmp_path.iterdir()] == [mine.name]
-    assert mine.read_text(encoding="utf-8") == "mine"
-    mine.unlink()
-    assert copy_examples(tmp_path) == copy_examples(tmp_path)
-
-
 def test_the_data_is_small_and_described():
     folder = example_path("multisine").parent
     assert sum(p.stat().st_size for p in folder.iterdir()) < 3_000_000
@@ -93,10 +71,10 @@ def test_the_data_is_small_and_described():
 
 
 def test_every_exported_name_is_there():
-    for name in (*thermogrip.datasets.__all__, "copy_examples"):
+    for name in (*thermogrip.datasets.__all__, "gaps"):
         assert getattr(thermogrip.datasets, name) is not None
     assert dir(thermogrip.datasets) == sorted(thermogrip.datasets.__all__)
-    assert "copy_examples" not in thermogrip.datasets.__all__
+    assert "gaps" not in thermogrip.datasets.__all__
     assert not hasattr(thermogrip.datasets, "nothing_such")
 
 

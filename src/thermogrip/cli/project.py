@@ -158,9 +158,30 @@ def warm_up(as_json: cli.AsJson = False) -> int:
     return 0
 
 
+def copy_examples(folder: Path) -> list[Path]:
+    """Write the bundled logs into a folder, the grasps into ``grasps`` in it and what each file is into
+    ``EXAMPLES.md``, and return their paths; UserError before any is written where another file is there."""
+    from thermogrip.datasets.atomic_files import write_atomic
+    from thermogrip.datasets.examples import EXAMPLE_LOGS, example_path
+
+    source, content = example_path(EXAMPLE_LOGS[0]).parent, {}
+    for original in sorted(source.glob("*.csv.xz")):
+        is_log = original.name.removesuffix(".csv.xz") in EXAMPLE_LOGS
+        content[(folder if is_log else folder / "grasps") / original.name] = original.read_bytes()
+    content[folder / "EXAMPLES.md"] = (source / "README.md").read_bytes()
+    for path, data in content.items():
+        if path.exists() and path.read_bytes() != data:
+            raise UserError("another file of this name is here", file=path, hint="choose another folder")
+    for path, data in content.items():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if not path.exists():
+            write_atomic(path, data)
+    return list(content)
+
+
 def _examples(console: Console, folder: Path) -> int:
     """Copy the example files and say what they are."""
-    from thermogrip.datasets.examples import EXAMPLE_LOGS, copy_examples, example_grasps
+    from thermogrip.datasets.examples import EXAMPLE_LOGS, example_grasps
 
     paths = copy_examples(cli.new_folder(folder))
     logs, grasps = len(EXAMPLE_LOGS), len(example_grasps())
