@@ -60,17 +60,11 @@ def arx_family(
     out = {}
     n_y, n_drive = len(grid.outputs), len(grid.inputs) + len(grid.disturbances)
     couplings = (False, True) if n_y > 1 else (True,)
-    # short logs with many signals do without the longest delays, then without the highest orders
-    fewer_delays = [(poles, delays[:n]) for n in range(len(delays), 0, -1)]
-    fewer_poles = [(poles[:n], delays[:1]) for n in range(len(poles) - 1, 0, -1)]
     for products in default_terms(grid) if terms is None else terms:
-        for kept_poles, kept_delays in (*fewer_delays, *fewer_poles):
-            regression = _regress(grid, products, max(kept_poles) + max(kept_delays) - 1)
-            if regression is not None:
-                break
-        else:
+        regression = _regress(grid, products, max(poles) + max(delays) - 1)
+        if regression is None:
             continue
-        for n, delay, coupled in product(kept_poles, kept_delays, couplings):
+        for n, delay, coupled in product(poles, delays, couplings):
             own_and_driven = (n_y if coupled else 1) + n_drive + len(products)
             label = f"na {n}, nb {n}, delay {delay}" + (", coupled" if coupled and n_y > 1 else "")
             label += f", with {', '.join(products)}" if products else ""
@@ -120,17 +114,15 @@ def _solve(
     first = regression.deep * n_y
     B = [lags[:, first + i * n_w : first + (i + 1) * n_w] for i in range(orders.delay + orders.poles - 1)]
     model = _arx_realisation(grid, terms, A, B, solution[-1])
-    return with_spread(model, grid, _at_rest(grid, terms, orders)) if model.stable else None
-
-
-def _at_rest(grid: Grid, terms: tuple[str, ...], orders: _Orders) -> list[Array]:
-    """Return the state in which each segment's first reading and first drives have always stood."""
-    out = []
+    if not model.stable:
+        return None
+    starts = []
     for segment, w in zip(grid.segments, drives(grid, terms)):
+        # its first reading and first drives have always stood
         middle = np.nan_to_num(first_readings(segment), nan=0.0)
         past_drives = np.tile(w[0], orders.delay + orders.poles - 2)
-        out.append(np.concatenate([np.tile(middle, orders.poles), past_drives]))
-    return out
+        starts.append(np.concatenate([np.tile(middle, orders.poles), past_drives]))
+    return with_spread(model, grid, starts)
 
 
 def _structure_columns(orders: _Orders, deep: int, n_y: int, n_w: int, output: int) -> list[int]:

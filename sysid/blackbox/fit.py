@@ -43,8 +43,8 @@ from thermogrip.sysid.plant.simulation import READING_EVERY
 _MODULES = {
     "arx": "arx",
     "oe": "output_error",
-    "armax": "armax",
-    "bj": "box_jenkins",
+    "armax": "noise_models",
+    "bj": "noise_models",
     "subspace": "subspace",
     "parsim": "subspace",
     "sindy": "sindy",
@@ -308,15 +308,12 @@ def _plant(grid: Grid, choice: Choice, logs: Sequence[Log]) -> Plant:
     log_rows = [rows_of(log, (), grid.outputs, ()) for log in logs]
     excess = reading_excess(log_rows, grid.outputs, grid.dt)
     by_part = np.hypot(choice.rmse, [excess[name] for name in grid.outputs])  # of readings, not of means
-    rmse = np.sqrt(np.mean(by_part**2, axis=0))
     scores = PlantScores(
         structure=choice.structure.label,
         average_s=grid.dt,
         average_why=grid.why,
         reading_excess=excess,
         reading_sd=reading_excess(log_rows, grid.outputs, np.inf),
-        folds=[fold.label for fold in choice.folds],
-        held_out_rmse={name: float(v) for name, v in zip(grid.outputs, rmse)},
         held_out_by_part={name: errors.tolist() for name, errors in zip(grid.outputs, by_part.T)},
     )
     plant = Plant(

@@ -53,12 +53,7 @@ def subspace_family(
     longest = max(len(segment.time) for segment in grid.segments)
     sets = default_terms(grid) if terms is None else terms
     n_drive, n_y = len(grid.inputs) + len(grid.disturbances), len(grid.outputs)
-    n_columns = 2 * 3 * (n_drive + n_y) + 1  # of windows of three block rows
-    few = 1.5 * n_columns > sum(max(len(s.time) - 5, 0) for s in grid.segments)
-    sizes = rows or (2, 3, 5, 8, 15, 30)
-    if rows is None and only is None:
-        # 2 where the data allow none of the others
-        sizes = [f for f in sizes if 6 * f < longest and (few or f > 2)]
+    sizes = rows or [f for f in (3, 5, 8, 15, 30) if only is not None or 6 * f < longest]
     for some in sets:
         products = f", with {', '.join(some)}" if some else ""
         names = {
@@ -66,7 +61,7 @@ def subspace_family(
                 f"order {n}, {f} block rows, {w}{products}", n * (n_drive + len(some) + n_y + 1), some
             )
             for f, w, n in product(sizes, weightings, orders)
-            if n < f or (f == 2 and n <= n_y)
+            if n < f
         }
         wanted = {of: name for of, name in names.items() if only is None or name in only}
         models |= {wanted[of]: model for of, model in _realised(grid, wanted, some, triangles).items()}

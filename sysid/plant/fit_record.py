@@ -119,8 +119,7 @@ class PlantScores:
     average_why: str = ""  # which rule set it
     reading_excess: dict[str, float] = field(default_factory=dict)  # one reading off its bin's mean, by noise
     reading_sd: dict[str, float] = field(default_factory=dict)  # of a black box: white noise of one reading
-    folds: list[str] = field(default_factory=list)  # of a black box: names of the parts held out in turn
-    held_out_rmse: dict[str, float] = field(default_factory=dict)  # by output, over all of them
+    # of a black box, by output: errors over the parts held out in turn
     held_out_by_part: dict[str, list[float]] = field(default_factory=dict)
     # between independent residuals, as the fit weighted them
     weight_s: dict[str, float] = field(default_factory=dict)

@@ -108,7 +108,7 @@ def free_run_band(
     likely = {}
     by_gain = 0.0  # share of the squared error, of the output where it is most
     other_run, unlike = between_runs(plant, [log]), unlike_fit(plant, log, simulated, warmup)
-    is_unlike, compared = False, bool(plant.scores.held_out or plant.scores.held_out_rmse)
+    is_unlike, compared = False, bool(plant.scores.held_out or plant.scores.held_out_by_part)
     for column_index, name in enumerate(plant.outputs):
         errors, variance = part_errors(plant, name), variances[:, column_index]
         error_of_parts = expected_error(errors, 0.0).rmse
@@ -152,7 +152,6 @@ def part_errors(plant: Plant, name: str) -> list[float]:
     if len(plant.logs) >= SEVERAL and whole:
         held_out = whole
     errors = [score.rmse for score in held_out] or scores.held_out_by_part.get(name, [])
-    errors = errors or [error for score, error in scores.held_out_rmse.items() if score == name]
     # a fit to means adds the white noise of one reading
     return errors or [float(np.hypot(plant.noise.get(name, 0.0), scores.reading_excess.get(name, 0.0)))]
 

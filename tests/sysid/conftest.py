@@ -13,7 +13,7 @@ from scipy.signal import lfilter
 from thermogrip.datasets.schema import Log, make_log
 from thermogrip.sysid.blackbox.fit import family_of
 from thermogrip.sysid.blackbox.order_selection import Model
-from thermogrip.sysid.plant.log_grid import Grid, make_grid
+from thermogrip.sysid.plant.log_grid import Grid
 
 POLE, GAIN, DELAY = 0.95, 0.5, 3  # y[k] = 0.95 y[k-1] + 0.5 u[k-3] about 25 degC: gain 10 K
 
@@ -97,15 +97,3 @@ def _fit_one(kind: str, grid: Grid, *, variant: str = "", **orders: Any) -> Mode
 def fit_one() -> Callable[..., Model]:
     """Return the function of (kind, grid, orders by the family's names, variant) to one model."""
     return _fit_one
-
-
-@pytest.fixture
-def many_signals() -> Grid:
-    """75 rows of five inputs and three outputs of the first order."""
-    rng = np.random.default_rng(0)
-    u = rng.standard_normal((75, 5))
-    y = lfilter([0.0, 1.0], [1.0, -0.8], u @ rng.standard_normal((5, 3)), axis=0)
-    y += 0.01 * rng.standard_normal(y.shape)
-    signals = {f"u{i}": (u[:, i], "1", "input") for i in range(5)}
-    signals |= {f"y{i}": (y[:, i], "1", "output") for i in range(3)}
-    return make_grid([make_log(np.arange(75.0), signals)], average=1.0)

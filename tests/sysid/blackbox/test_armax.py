@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from thermogrip.sysid.blackbox.armax import ArmaxSearch, armax_family, solve_armax
+from thermogrip.sysid.blackbox.noise_models import ArmaxSearch, armax_family, solve_armax
 from thermogrip.sysid.blackbox.output_error import Records, oe_family
 from thermogrip.sysid.plant.log_grid import Grid, Segment
 

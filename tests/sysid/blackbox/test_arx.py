@@ -70,11 +70,3 @@ def test_too_few_rows_give_no_model(first_order):
 )
 def test_a_structure_uses_its_lags_of_the_one_regression(orders, output, columns):
     assert _structure_columns(_Orders(*orders), 4, 2, 3, output) == columns
-
-
-def test_a_short_log_of_many_signals_is_fitted_with_what_its_rows_allow(many_signals):
-    models = arx_family(many_signals)
-    small = "na 1, nb 1, delay 1"
-    assert small in {structure.label for structure in models}
-    [chosen] = [structure for structure in models if structure.label == small]
-    assert list(arx_family(many_signals, only=[chosen])) == [chosen]

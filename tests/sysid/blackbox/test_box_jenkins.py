@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from thermogrip.sysid.blackbox.box_jenkins import autoregression, bj_family, with_noise
+from thermogrip.sysid.blackbox.noise_models import autoregression, bj_family, with_noise
 from thermogrip.sysid.blackbox.output_error import Filter, Records, Search, fit_rest, oe_family
 from thermogrip.sysid.plant.log_grid import Grid, Segment
 

@@ -187,11 +187,3 @@ def test_parsim_finds_the_markov_parameters_of_the_plant_without_feedback(couple
     (model,) = parsim_family(grid, orders=(2,), rows=(15,), terms=((),)).values()
     wanted = markov(coupled.A, coupled.B, coupled.C, 20)
     np.testing.assert_allclose(markov(model.A, model.B, model.C, 20), wanted, atol=2e-3)
-
-
-def test_a_short_log_of_many_signals_is_fitted_with_what_its_rows_allow(many_signals):
-    models = subspace_family(many_signals)
-    small = "order 3, 2 block rows, moesp"
-    assert small in {structure.label for structure in models}
-    [chosen] = [structure for structure in models if structure.label == small]
-    assert list(subspace_family(many_signals, only=[chosen])) == [chosen]

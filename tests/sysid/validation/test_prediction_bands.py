@@ -74,9 +74,9 @@ def test_what_the_draws_do_not_explain_of_the_held_out_errors_is_in_the_band(sch
         A, B = pole * np.eye(2), 0.01 * np.eye(2)
         return StateSpaceModel(("q1", "q2"), (), ("t1", "t2"), A=A, B=B, C=np.eye(2), dt=2.0)
 
-    errors = {"t1": 1.0, "t2": 0.001}
+    errors = {"t1": [1.0], "t2": [0.001]}
     noise = {"t1": 0.1, "t2": 0.1}
-    plant = Plant(block(0.9), {}, dt=2.0, noise=noise, scores=PlantScores(held_out_rmse=errors))
+    plant = Plant(block(0.9), {}, dt=2.0, noise=noise, scores=PlantScores(held_out_by_part=errors))
     run = plant.simulate(schedule)
     assert np.allclose(free_run_band(plant, schedule, run).half["t1"], 1.6449, rtol=1e-3)
     ensemble = replace(plant, refits=(block(0.905), block(0.895)))
@@ -153,7 +153,7 @@ def shown():
     plant = Plant(model, {}, dt=1.0, logs=("a",), units={"q": "percent"}, valid={"q": (0, 50), "t": (0, 50)})
     log = make_log(np.arange(400.0), {"q": (q, "percent", "input"), "t": (0.0 * q, "degC", "output")})
     log["t"] = log["t"].copy(data=plant.simulate(log)["t"].values)
-    scores = PlantScores(held_out_rmse={"t": 0.1}, held_out_by_part={"t": [0.1, 0.1]})
+    scores = PlantScores(held_out_by_part={"t": [0.1, 0.1]})
     return replace(plant, scores=scores), log
 
 
@@ -229,7 +229,7 @@ def test_the_error_of_a_plant_is_that_of_the_parts_held_out_and_of_whole_logs_wh
     assert part_errors(one, "t") == [0.2, 0.4]
     assert part_errors(replace(one, logs=("a", "b", "c")), "t") == [0.4]
     assert part_errors(first_order(), "t1") == [0.1]  # a fit alone
-    parts = PlantScores(held_out_rmse={"t1": 0.5}, held_out_by_part={"t1": [0.3, 0.6]})
+    parts = PlantScores(held_out_by_part={"t1": [0.3, 0.6]})
     assert part_errors(replace(first_order(), scores=parts), "t1") == [0.3, 0.6]
 
 
@@ -351,7 +351,7 @@ def test_a_band_counts_scored_readings_and_adds_draws_the_fit_and_single_reading
 
 
 def test_the_words_of_a_band_say_what_its_own_error_is_and_what_is_assumed():
-    plant, log, run = still(held_out_rmse={"t": 1.0}, held_out_by_part={"t": [2.0, 1.0, 0.5]})
+    plant, log, run = still(held_out_by_part={"t": [2.0, 1.0, 0.5]})
     band = free_run_band(plant, log, run)
     assert band.own_error == "the errors of free runs over parts held out of it"
     assert band.expected["t"] == pytest.approx(1.0)  # their geometric mean
