@@ -124,9 +124,9 @@ class LoopMonitor:
         d = np.array([number(reading, name) for name in self.model.disturbances])
         d = np.where(np.isfinite(d), d, self.model.undisturbed(self.observer.ambient))
         u = np.array(move.drives(self.model.drives), dtype=float)
-        between = self._u is not None and seconds < self.model.dt * (1 - SAME)
+        between = seconds < self.model.dt * (1 - SAME)
         # between two samples only a move counts: until then another drive was applied
-        if between and (seconds <= 0 or np.array_equal(u, self._u)):
+        if self._u is not None and between and (seconds <= 0 or np.array_equal(u, self._u)):
             return self.message
         self._time_s = now
         applied = u if self._u is None else self._u

@@ -116,7 +116,7 @@ def shifted(plan: Array, samples: float) -> Array:
     samples a row is the mean of the drives that were planned for those seconds."""
     whole, rows = math.floor(samples + SAME), np.arange(len(plan))
     if samples - whole <= SAME:
-        return plan[np.minimum(rows + whole, len(plan) - 1)]
+        return np.asarray(plan[np.minimum(rows + whole, len(plan) - 1)], dtype=float)
     return np.column_stack([np.interp(rows + samples, rows, drive) for drive in plan.T])
 
 
