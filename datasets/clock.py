@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,9 @@ from numpy.typing import NDArray
 from thermogrip.datasets.repair import GAP_SECONDS, GAP_STEPS, name_rows
 from thermogrip.datasets.tables import STAMP, Table
 from thermogrip.datasets.units import Header, to_record_unit
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 Floats = NDArray[np.float64]
 
@@ -27,6 +31,7 @@ _TIME_NAME = re.compile(
 )
 _STEP_NAME = re.compile(r"(?i)ts|dt|delta_?t|sampl(e|ing)_?(time|period|interval)")
 _COUNTER = re.compile(r"(?i)x|n|k|i|no|nr|id|index|idx|samples?|rows?|steps?|count(er)?|unnamed.*")
+_IN_SECONDS = re.compile(r"(?i)(.*_)?(s|secs?|seconds?|sekunden|x_value|uptime)")  # X_Value is LabVIEW's
 _TIME_WORDS = {"ms": 1e-3, "milli": 1e-3, "us": 1e-6, "micro": 1e-6, "minute": 60.0, "hour": 3600.0}
 EPOCH = (946684800.0, 4102444800.0)  # s since 1970 of the years 2000 and 2100
 
@@ -39,6 +44,7 @@ class ClockSettings:
     evenness: float = 0.2  # of their median, by which nearly even steps differ: loops of a board jitter so
     counts_apart: float = 20.0  # of a board's counter: 50 rows a second in ms, which no plant here needs
     microseconds_apart: float = 1e5  # 100 ms in us, or 100 s in ms
+    late: float = 0.03  # of its step, by which a loop is late at most
     piece_rows: int = 20  # of a part of a log that stands alone
     days_apart: float = 1 / 24  # rows of a plant are closer than an hour, seconds so late in a day are not
 
@@ -177,18 +183,30 @@ def _what_counts_mean(name: str, counts: Floats, *, wrapped: bool) -> _Counts:
         return replace(dates, doubt=f"{name} is taken as the time in days of {dates.calendar}, {apart}")
     if dates is not None and not (dates.seconds == 1.0 and of_board):
         return dates
-    # with decimals, or less than 20 apart, they are seconds, as logs are written; whole numbers further apart
-    # are seconds where their steps are whole minutes
+    # with decimals, or less than 20 apart, they are likely seconds; whole numbers further apart are where
+    # their steps are whole minutes
     if not of_board:
-        minutes = whole and usual >= _CLOCK.counts_apart
-        guess = f"{name} has no unit: taken as seconds, so that rows are {usual:g} s apart" if minutes else ""
-        return _Counts(1.0, doubt=guess)
+        known = _IN_SECONDS.fullmatch(name) or (dates is not None) or _of_loop(steps)
+        guess = f"{name} has no unit: taken as seconds, so that rows are {usual:g} s apart"
+        return _Counts(1.0, doubt="" if known else guess)
     # 32 bits of microseconds last for 72 minutes, of milliseconds for 50 days
     fine = usual >= _CLOCK.microseconds_apart or (wrapped and counts[-1] > 2**32)
     scale, unit = (1e-6, "microseconds") if fine else (1e-3, "milliseconds")
     # a guess, as is a time that counts rows: it is reported as a doubt, with the option that settles it
     doubt = f"{name} has no unit: taken as {unit}, so that rows are {usual * scale:g} s apart"
     return _Counts(scale, doubt=doubt)
+
+
+def _of_loop(steps: Floats) -> bool:
+    """Tell whether steps are those of a program's loop, which counts in seconds: they differ from row to row
+    by more than rounding, and are 0.1, 0.2, 0.5, 1, ... s long or not round in minutes or hours."""
+    usual = float(np.median(steps))
+    off = steps[np.abs(steps - usual) <= _CLOCK.evenness * usual] - usual
+    if usual < 0.095 or np.unique(np.round(off, 9)).size < 5 or off.std() < 5e-4 * usual:
+        return False
+    in_seconds, *in_others = (usual * 10.0 ** -np.floor(np.log10(usual * n)) * n for n in (1, 60, 3600))
+    is_round = [any(abs(step / one - 1) < _CLOCK.late for one in (1, 1.5, 2, 3, 5, 10)) for step in in_others]
+    return any(abs(in_seconds / one - 1) < _CLOCK.late for one in (1, 2, 5, 10)) or not any(is_round)
 
 
 def _unwrapped(counts: Floats, lines: NDArray[np.int64]) -> tuple[Floats, list[str]]:
@@ -271,7 +289,8 @@ def read_clock(cells: Sequence[str]) -> tuple[Floats, str] | None:
     if fields[1].isna().all():
         steps = np.diff(of_day, prepend=of_day[0])
         return of_day + 86400.0 * np.cumsum(np.nan_to_num(steps) < -43200), ""
-    fields[2] = fields[2].str.lower().map(_MONTHS).fillna(fields[2])
+    months = fields[2].str.lower().map(_MONTHS)
+    of_names, fields[2] = months.notna(), months.fillna(fields[2])
     triples = [numbers(key) for key in (1, 2, 3)]
     first, middle, _ = (float(np.nanmax(values)) for values in triples)
     order, note = ("day", "month", "year"), ""
@@ -280,12 +299,25 @@ def read_clock(cells: Sequence[str]) -> tuple[Floats, str] | None:
     elif middle > 12 or (first <= 12 and "/" in str(cells[0])):
         order = ("month", "day", "year")
         note = "" if middle > 12 else " (taken as month/day)"
-    date = dict(zip(order, triples))
-    year = np.where(date["year"] < 100, date["year"] + 2000, date["year"])
-    year[(year < 1900) | (year > 2200)] = np.nan  # beyond what pandas counts in nanoseconds
-    dates = pd.to_datetime(pd.DataFrame(date | {"year": year}), errors="coerce")
+
+    def dates_in(order: Sequence[str]) -> pd.Series:
+        date = dict(zip(order, triples))
+        year = np.where(date["year"] < 100, date["year"] + 2000, date["year"])
+        year[(year < 1900) | (year > 2200)] = np.nan  # beyond what pandas counts in nanoseconds
+        return pd.to_datetime(pd.DataFrame(date | {"year": year}), errors="coerce")
+
+    dates = dates_in(order)
+    for other in (("month", "day", "year"), ("day", "month", "year"), ("year", "month", "day")):
+        if first <= 31 and not of_names.any() and not _follow(dates) and _follow(likely := dates_in(other)):
+            dates, note = likely, f" (taken as {'/'.join(other)}, in which the days follow each other)"
     days = (dates - pd.Timestamp(0)) / pd.Timedelta(days=1)
     return np.asarray(days, dtype=float) * 86400.0 + of_day, note
+
+
+def _follow(dates: pd.Series) -> bool:
+    """Tell whether all cells are dates, and each day is the one after another."""
+    days = np.unique(np.asarray(dates, dtype="datetime64[D]"))
+    return bool(dates.notna().all() and np.all(np.diff(days) == np.timedelta64(1, "D")))
 
 
 def since_first_row(seconds: Floats) -> tuple[Floats, list[str]]:

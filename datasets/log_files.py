@@ -152,8 +152,10 @@ def read_log(
             roles = _without_half_lost(roles, repaired.time, repaired.columns)
         repairs = [*read.repairs, *repaired.repairs]
         log = _made(repaired.time, repaired.columns, repairs, read, roles, file)
-        log.attrs["clock_doubts"] = read.clock.doubt
-        log.attrs["role_doubts"] = "\n".join(roles.doubts)
+        of_clock = [line for line in repairs if isinstance(line, repair.ClockDoubt)]
+        others = [line for line in repairs if isinstance(line, repair.Doubt) and line not in of_clock]
+        log.attrs["clock_doubts"] = "\n".join(filter(None, [read.clock.doubt, *of_clock]))
+        log.attrs["role_doubts"] = "\n".join([*roles.doubts, *others])
     for header, name in read.names_of.items():
         if (words := table.attrs.get(header, {}).get("flag_meanings")) and name in log:
             log[name].attrs["flag_meanings"] = words

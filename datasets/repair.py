@@ -35,7 +35,16 @@ SPIKE_LENGTH = 3  # samples at most of a spike
 _SLOW_ROWS = 60.0  # s
 GAP_SECONDS = 10.0  # of the least gap
 GAP_STEPS = 5.0  # median steps of the rows, of the least gap
+_OTHER_STEP = 1.5  # times as long: no jitter, another step
 _FEW, _MOST_MOVED = 0.05, 10  # share of rows whose time may be wrong; rows that one may be out of place
+
+
+class Doubt(str):
+    """A finding that decides what a fit sees and that nothing else confirms."""
+
+
+class ClockDoubt(Doubt):
+    """One that a stated step (``--dt``) settles."""
 
 
 class OrderedRows(NamedTuple):
@@ -68,14 +77,20 @@ def order_rows(time: Floats, lines: NDArray[np.int64], file: str) -> OrderedRows
             hint = "cut the file there in two, sort its rows, or give the step of all rows with --dt"
             raise UserError(problem, file=file, row=int(lines[rows[at + 1]]), hint=hint)
         which = name_rows(lines[rows[back]])
-        repairs.append(f"{back.sum()} row{_s(int(back.sum()))} out of order sorted ({which})")
         rows = rows[order]
+        sorted_steps = np.diff(time[rows])
+        says = f"{back.sum()} row{_s(int(back.sum()))} out of order sorted ({which})"
+        between = sorted_steps.min() < np.median(sorted_steps) / 2  # where rows fall between others
+        repairs.append(ClockDoubt(f"{says}, between others: did the clock run twice?") if between else says)
     first = np.concatenate([[True], np.diff(time[rows]) > 0])
     starts, repeats = np.flatnonzero(first), int((~first).sum())
     if repeats > 0.25 * rows.size and starts.size > 1:  # a coarse clock
         stamps = time[rows[starts]]
         ends = np.append(starts, rows.size), np.append(stamps, stamps[-1] + np.median(np.diff(stamps)))
-        repairs.append(f"time has {starts.size} stamps for {rows.size} rows: rows spread evenly between them")
+        says = f"time has {starts.size} stamps for {rows.size} rows: rows spread evenly between them"
+        counts = np.diff(starts)[1:]
+        even = not counts.size or np.ptp(counts) <= 2
+        repairs.append(says if even else ClockDoubt(f"{says}, {counts.min()} to {counts.max()} each"))
         return OrderedRows(np.interp(np.arange(rows.size), *ends), rows, repairs)
     if repeats:
         which = name_rows(lines[rows[~first]])
@@ -91,9 +106,13 @@ def describe_steps(time: Floats) -> list[str]:
     low, high = float(usual.min()), float(usual.max())
     if high - low <= 0.02 * median:
         return []
-    return [
-        f"time stamps are uneven: median step {median:.4g} s, {low:.4g} to {high:.4g} s; kept as they are"
-    ]
+    says = f"time stamps are uneven: median step {median:.4g} s, {low:.4g} to {high:.4g} s"
+    first, last = (
+        float(np.median(part)) for part in (usual[: usual.size // 4 + 1], usual[-usual.size // 4 :])
+    )
+    if not 1 / _OTHER_STEP < last / first < _OTHER_STEP:
+        return [ClockDoubt(f"{says}, {first:.4g} s at first and {last:.4g} s at last: is the unit the same?")]
+    return [f"{says}; kept as they are"]
 
 
 def gap_rows(time: Floats, longer_than: float = GAP_SECONDS) -> NDArray[np.int64]:

@@ -8,16 +8,25 @@ helps to predict an output) is reported as a doubt.  Whoever states the roles ha
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
 from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.evidence import (
+    EVIDENCE,
+    comes_to,
+    explains,
+    helps_beside,
+    is_held,
+    is_moved,
+    one_signal,
+    predictive_gain,
+    role_doubts,
+)
 from thermogrip.datasets.limits import MOST_NUMBER
-from thermogrip.datasets.repair import drop_stuck
 from thermogrip.datasets.units import DRIVE, find_column
 
 Floats = NDArray[np.float64]
@@ -47,30 +56,14 @@ _BOOKKEEPING = re.compile(
 )
 _MODES = {"auto", "automatic", "manual", "mode", "status"}  # of a controller
 IS_SET_POINT = "its name is that of a set point"
+_IS_BOOKKEEPING = "its name is that of a number of the clock's or the controller's"
 NO_CLUE = "neither its name nor its unit shows what it is"
 _NEVER_MOVES, _COUNTS_ROWS = "it never moves", "it counts rows or time"
 BY_UNIT = "its unit is degC"
 FOLLOWS = "its course follows"
+_TOGETHER, _OF_CONTROLLER = "it always moves with", "beside a set point it is the controller's:"
+_ESTABLISHED = (_TOGETHER, _OF_CONTROLLER, "it is ", _NEVER_MOVES, _COUNTS_ROWS)  # by the course itself
 FOLLOWED = "settles at its levels, as at a set point"
-
-
-@dataclass(frozen=True)
-class RoleSettings:
-    """Limits of the rules; 38 of 40 kinds of logs are right and 2 asked with them (benchmarks/hostile)."""
-
-    held_share: float = 0.5  # of rows with a move at most, of a column that is held
-    held_size: float = 0.05  # of its range, that the median of its moves has at least: beyond noise
-    fewest_rows: int = 20  # of fewer, chance looks like a rule
-    counter_share: float = 0.9  # of the rows of a counter have the same step
-    fewest_moves: int = 5  # of two columns that may be one signal: fewer moves agree by chance
-    exact: float = 1e-6  # of a column's range: beyond the rounding of files
-    rounding_share: float = 0.05  # of its standard deviation, that rounding takes at most
-    lags: tuple[int, ...] = (2, 6)  # rows; of a smooth input few leave what its output contains of it
-    strong_gain: float = 10.0  # of the criterion: "very strong" evidence (Kass and Raftery 1995)
-    most_rows: int = 20_000  # that are looked at, for time
-
-
-_ROLES = RoleSettings()
 
 
 @dataclass(frozen=True)
@@ -99,8 +92,7 @@ def explain_role(name: str, unit: str) -> tuple[str, str]:
     set_drive = _SET_DRIVE.search(words) and unit in _OF_DRIVES
     rows = (
         (_SETPOINT.search(words) and not set_drive, "other", IS_SET_POINT),
-        (_BOOKKEEPING.match(words), "other",
-         "its name is that of a number of the clock's or the controller's"),
+        (_BOOKKEEPING.match(words), "other", _IS_BOOKKEEPING),
         (_OUTDOORS.search(words) or _ROOM.search(words), "disturbance",
          "its name is that of the surroundings"),
         (_INFLOW.search(words) and (celsius or "temp" in words), "disturbance",
@@ -144,7 +136,7 @@ def assign_roles(
     evidence: dict[str, tuple[str, str]] = {}  # of the data alone
     if columns is not None:  # what is beyond all use is no reading, and its squares are none either
         columns = {n: np.where(np.abs(v) <= MOST_NUMBER, v, np.nan) for n, v in columns.items()}
-        if all(len(values) >= _ROLES.fewest_rows for values in columns.values()):
+        if all(len(values) >= EVIDENCE.fewest_rows for values in columns.values()):
             guesses |= _copied_columns(columns, guesses, units)
             guesses |= _unlike_inputs(columns, guesses, [n for n, role in stated.items() if role == "input"])
         guesses |= _controllers(guesses, units, columns)
@@ -165,8 +157,22 @@ def assign_roles(
         roles[name] = chosen.get(name, "other" if lists.get(guess) is not None else guess)
         if why and roles[name] == guess:
             reasons[name] = why
-    doubts = () if columns is None else _doubts(columns, roles, reasons, evidence, lists)
-    return Roles(roles, reasons, doubts)
+    # a role that the course of a column alone shows: whoever states the roles has no doubt
+    doubts = [
+        f"{name} is {'left out' if role == 'other' else f'taken as {role}'}: {why}"
+        for name, (role, why) in evidence.items()
+        if reasons.get(name) == why and (role != "other" or why.endswith(FOLLOWED))
+    ]
+    doubts += [f"{name} is left out: {why}" for name, why in reasons.items() if why.startswith(_TOGETHER)]
+    if columns is not None and lists["input"] is None:  # what was not listed was not meant
+        named = {name: why for name, why in reasons.items() if name not in evidence}
+        goals = [name for name, why in named.items() if why == IS_SET_POINT]
+        words = {_name_words(name) for name in units}
+        sound = (*_ESTABLISHED, *([_IS_BOOKKEEPING] if goals else []))
+        for goal in [n for n in goals if _name_words(n).rpartition("_")[0] in words]:
+            del named[goal]  # its reading is called as it is
+        doubts += role_doubts(columns, roles, named, sound, goals)
+    return Roles(roles, reasons, tuple(doubts))
 
 
 def _controllers(
@@ -178,21 +184,20 @@ def _controllers(
     goals = {_name_words(name) for name in units if _SETPOINT.search(_name_words(name))}
     if not goals:
         return {}
-    of_controller = "beside a set point it is the controller's:"
     out: dict[str, tuple[str, str]] = {}
     reads, drives = by_name.keys() & {"input", "pv"}, by_name.keys() & {"output", "op", "out", "co"}
     if drives and (reads or any(role == "output" for role, _ in guesses.values())):
-        out |= {by_name[name]: ("output", f"{of_controller} what it reads") for name in reads}
-        out |= {by_name[name]: ("input", f"{of_controller} what it drives") for name in drives}
+        out |= {by_name[name]: ("output", f"{_OF_CONTROLLER} what it reads") for name in reads}
+        out |= {by_name[name]: ("input", f"{_OF_CONTROLLER} what it drives") for name in drives}
     without_clue = {_name_words(name): name for name, (_, why) in guesses.items() if why == NO_CLUE}
     moving = [name for name, (role, _) in guesses.items() if role == "input" and np.nanstd(columns[name]) > 0]
     for name in {_SETPOINT.sub("", goal) for goal in goals} & without_clue.keys():
-        if _is_moved(columns, without_clue[name], moving):
+        if is_moved(columns, without_clue[name], moving):
             out[without_clue[name]] = "output", "its set point stands beside it, and a drive moves it"
-    out |= {by_name[n]: ("other", f"{of_controller} its mode") for n in by_name.keys() & _MODES}
+    out |= {by_name[n]: ("other", f"{_OF_CONTROLLER} its mode") for n in by_name.keys() & _MODES}
     terms = by_name.keys() & {"p", "i", "d"}
     if len(terms) > 1:
-        out |= {by_name[name]: ("other", f"{of_controller} one of its terms") for name in terms}
+        out |= {by_name[name]: ("other", f"{_OF_CONTROLLER} one of its terms") for name in terms}
     return out
 
 
@@ -205,25 +210,25 @@ def roles_of_data(
         values = columns[name][np.isfinite(columns[name])]
         steps, rows = np.diff(values), max(values.size, 1)
         usual = np.median(steps) if steps.size else 0.0
-        even = np.abs(steps - usual) < _ROLES.exact * np.abs(usual)
+        even = np.abs(steps - usual) < EVIDENCE.exact * np.abs(usual)
         if not steps.any():
             out[name] = "other", _NEVER_MOVES
-        elif rows >= _ROLES.fewest_rows and np.mean(even) >= _ROLES.counter_share:
+        elif rows >= EVIDENCE.fewest_rows and np.mean(even) >= EVIDENCE.counter_share:
             out[name] = "other", _COUNTS_ROWS
         # held between few large moves
-        elif _is_held(values):
+        elif is_held(values):
             out[name] = "input", f"it is held between {np.count_nonzero(steps)} moves in {rows} rows"
     roles = {**fixed, **{name: role for name, (role, _) in out.items()}}
     names = [n for n in columns if roles.get(n) != "other" and np.nanmax(columns[n]) > np.nanmin(columns[n])]
-    gain = _predictive_gain([columns[name] for name in names])
+    gain = predictive_gain([columns[name] for name in names])
     open_, net = [n for n in names if n not in roles], dict(zip(names, (gain - gain.T).sum(axis=1)))
     for name in open_:
         help_ = gain[:, names.index(name)]
         # its next value is predicted by another column's past
-        if help_.max() > _ROLES.strong_gain:
+        if help_.max() > EVIDENCE.strong_gain:
             out[name] = "output", f"{FOLLOWS} {names[int(help_.argmax())]}"
     roles |= {name: role for name, (role, _) in out.items()}
-    has_held_input = any(roles.get(n) == "input" and _is_held(columns[n]) for n in names)
+    has_held_input = any(roles.get(n) == "input" and is_held(columns[n]) for n in names)
     for name in [n for n in open_ if n not in roles]:
         why = "no other column predicts its course"
         out[name] = ("disturbance" if has_held_input or units[name] == "degC" else "input"), why
@@ -244,49 +249,6 @@ def roles_of_data(
     return out
 
 
-def _doubts(
-    columns: Mapping[str, Floats],
-    roles: Mapping[str, str],
-    reasons: Mapping[str, str],
-    evidence: Mapping[str, tuple[str, str]],
-    lists: Mapping[str, Sequence[str] | None],
-) -> tuple[str, ...]:
-    """Return the guesses that decide what a fit sees, a line each."""
-    doubts = []
-    for name, (role, why) in evidence.items():
-        # a role that the course of a column alone shows: whoever states the roles has no doubt
-        if reasons.get(name) == why and (role != "other" or why.endswith(FOLLOWED)):
-            doubts.append(f"{name} is {'left out' if role == 'other' else f'taken as {role}'}: {why}")
-    for name, why in reasons.items():
-        if why.startswith("it always moves with"):
-            doubts.append(f"{name} is left out: {why}")
-    if lists["input"] is not None:  # what was not listed was not meant
-        return tuple(doubts)
-    inputs, outputs = ([n for n, r in roles.items() if r == role] for role in ("input", "output"))
-    unclear = [n for n in columns if roles[n] == "other" and reasons.get(n, NO_CLUE) == NO_CLUE]
-    unclear += [n for n, why in reasons.items() if roles[n] == "other" and why.startswith("it moves in most")]
-    moving = [n for n in unclear if np.ptp(columns[n][np.isfinite(columns[n])]) > 0]
-    read = [columns[n] for n in outputs]
-    for name in [n for n in inputs if n in reasons and len(read) > 1 and not _is_held(columns[n])]:
-        # under a proportional controller one reading is enough
-        if _explains(columns[name], *read) and not any(_explains(columns[name], one) for one in read):
-            problem = f"{name} is taken as input, and is computed from {', '.join(outputs)}"
-            doubts.append(f"{problem}: a heat or a flow, or a drive under feedback")
-    for name in moving if inputs else ():
-        # what is held like a drive may be the drive, and the input with a name its reading
-        beside = [] if _is_held(columns[name]) else inputs
-        helped = next((n for n in outputs if _helps_beside(columns, name, n, beside)), None)
-        if helped is not None:
-            doubts.append(f"{name} is left out ({reasons.get(name, NO_CLUE)}), and helps to predict {helped}")
-    return tuple(doubts)
-
-
-def _helps_beside(columns: Mapping[str, Floats], name: str, output: str, inputs: Sequence[str]) -> bool:
-    """Tell whether the past of a column helps to predict an output beside that of the inputs and its own."""
-    reading, *others = _standardised([columns[n] for n in (output, name, *inputs)])
-    return all(_gain(reading, others[0], others[1:], lags) > _ROLES.strong_gain for lags in _ROLES.lags)
-
-
 def _heated_rooms(
     columns: Mapping[str, Floats], guesses: Mapping[str, tuple[str, str]], stated: Mapping[str, str]
 ) -> dict[str, tuple[str, str]]:
@@ -302,8 +264,8 @@ def _heated_rooms(
         # a rig warms the room around it too: beside another output only what is called a room is one
         if not (alone or re.search(r"(^|_)room(_|$)", words)):
             continue
-        gain = _predictive_gain([columns[name], *(columns[drive] for drive in drives)])
-        if gain[1:, 0].max() > _ROLES.strong_gain:
+        gain = predictive_gain([columns[name], *(columns[drive] for drive in drives)])
+        if gain[1:, 0].max() > EVIDENCE.strong_gain:
             drive = drives[int(gain[1:, 0].argmax())]
             out[name] = "output", f"it follows the drive {drive}, as no surroundings do"
     return out
@@ -315,33 +277,22 @@ def _followed_levels(
     """Return the held columns whose levels a reading comes to while another column drives it, as set points,
     and the readings that no name shows, as outputs."""
     likely = [n for n in columns if guesses.get(n, ("", ""))[1] in (NO_CLUE, BY_UNIT)]
-    held_names = [n for n in likely if _is_held(columns[n])]
+    held_names = [n for n in likely if is_held(columns[n])]
     out: dict[str, tuple[str, str]] = {}
     for goal in held_names:
         moving = [n for n in columns if n not in held_names]
         read = [n for n in moving if guesses.get(n, ("output", ""))[0] in ("output", "other")]
-        reading = next((n for n in read if _comes_to(columns[n], columns[goal])), None)
+        reading = next((n for n in read if comes_to(columns[n], columns[goal])), None)
         if reading is None:
             continue
         drives = [n for n, (role, why) in guesses.items() if role == "input" or why == NO_CLUE]
         others = [columns[n] for n in drives if n not in (goal, reading)]
-        gains = _predictive_gain([columns[reading], *others])
-        if gains[1:, 0].max(initial=0.0) > _ROLES.strong_gain:
+        gains = predictive_gain([columns[reading], *others])
+        if gains[1:, 0].max(initial=0.0) > EVIDENCE.strong_gain:
             out[goal] = "other", f"{reading} {FOLLOWED}"
             if guesses.get(reading, ("", ""))[1] == NO_CLUE:
                 out[reading] = "output", f"it settles at the levels of {goal}"
     return out
-
-
-def _comes_to(reading: Floats, goal: Floats) -> bool:
-    """Tell whether most of the levels that a goal is held at, three at least, are those that a reading has in
-    the last half of each hold."""
-    bounds = [0, *(np.flatnonzero(np.diff(goal)) + 1), goal.size]
-    holds = [(goal[a], reading[(a + b) // 2 : b]) for a, b in pairwise(bounds) if b - a >= _ROLES.fewest_rows]
-    holds = [(level, second_half) for level, second_half in holds if np.isfinite(second_half).all()]
-    levels = np.array([level for level, _ in holds])
-    reached = [abs(level - np.median(half)) <= _ROLES.held_size * np.ptp(levels) for level, half in holds]
-    return np.unique(levels).size >= 3 and float(np.mean(reached)) > 0.5
 
 
 def _unnamed_causes(
@@ -354,48 +305,25 @@ def _unnamed_causes(
     if not drives or not outputs:
         return {}
     out = {}
-    for name in [n for n, (_, why) in guesses.items() if why == NO_CLUE and _is_held(columns[n])]:
-        helped = next((n for n in outputs if _helps_beside(columns, name, n, drives)), None)
+    for name in [n for n, (_, why) in guesses.items() if why == NO_CLUE and is_held(columns[n])]:
+        helped = next((n for n in outputs if helps_beside(columns, name, n, drives)), None)
         if helped is not None:
             out[name] = "input", f"it is held between its moves and helps to predict {helped}"
     drives += out
     unnamed = [n for n in outputs if guesses.get(n, ("", ""))[1].startswith((BY_UNIT, FOLLOWS))]
     # two lags leave some of a smooth weather to be explained by whatever moved meanwhile
-    unmoved = [n for n in outputs if not _is_moved(columns, n, drives, at_lags=all if n in unnamed else any)]
+    unmoved = [n for n in outputs if not is_moved(columns, n, drives, at_lags=all if n in unnamed else any)]
     moved = [n for n in outputs if n not in unmoved]
     for name in [n for n in unmoved if n in guesses and moved]:
         of_temperature = _TEMPERATURE.search(_name_words(name))  # it may follow what a drive moves
-        if name in unnamed or (of_temperature and not _is_moved(columns, name, moved, at_lags=all)):
+        if name in unnamed or (of_temperature and not is_moved(columns, name, moved, at_lags=all)):
             out[name] = "disturbance", f"it does not respond to {', '.join(drives)}"
     return out
-
-
-def _is_moved(
-    columns: Mapping[str, Floats],
-    name: str,
-    drives: Sequence[str],
-    at_lags: Callable[[Iterable[bool]], bool] = any,
-) -> bool:
-    """Tell whether the past of a drive helps to predict a column, as long as the column is not stuck."""
-    is_sound = np.isfinite(drop_stuck(name, columns[name], [columns[n] for n in drives])[0])
-    if is_sound.sum() < _ROLES.fewest_rows:
-        return True  # nothing of it speaks against
-    reading, *moves = _standardised([columns[n][is_sound] for n in (name, *drives)])
-    gains = ([_gain(reading, drive, (), lags) for lags in _ROLES.lags] for drive in moves)
-    return any(at_lags(gain > _ROLES.strong_gain for gain in by_lags) for by_lags in gains)
 
 
 def _name_words(name: str) -> str:
     """Return a name in lower case with its words apart: ``BeerSet`` as ``beer_set``."""
     return re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", name).lower()
-
-
-def _is_held(values: Floats) -> bool:
-    """Tell whether a column moves in few rows, and then far, as what a person or a relay sets does."""
-    finite = values[np.isfinite(values)]
-    moves = np.abs(np.diff(finite))
-    rarely_moves = 0 < np.count_nonzero(moves) <= _ROLES.held_share * finite.size
-    return bool(rarely_moves and np.median(moves[moves > 0]) >= _ROLES.held_size * np.ptp(finite))
 
 
 def _unlike_inputs(
@@ -405,9 +333,9 @@ def _unlike_inputs(
     ``stated`` is held; where none is, a controller moves them."""
     by_unit = [n for n, (role, why) in guesses.items() if role == "input" and why.startswith("its unit")]
     likely = [n for n, (role, why) in guesses.items() if role == "input" or why == NO_CLUE]
-    held_input = next((name for name in (*stated, *likely) if _is_held(columns[name])), None)
+    held_input = next((name for name in (*stated, *likely) if is_held(columns[name])), None)
     finite = {name: columns[name][np.isfinite(columns[name])] for name in by_unit}
-    moving = [n for n, v in finite.items() if np.count_nonzero(np.diff(v)) > _ROLES.held_share * len(v)]
+    moving = [n for n, v in finite.items() if np.count_nonzero(np.diff(v)) > EVIDENCE.held_share * len(v)]
     why = f"it moves in most rows, and {held_input} is held between its moves, as inputs are"
     return dict.fromkeys(moving if held_input else (), ("other", why))
 
@@ -416,7 +344,7 @@ def _copied_columns(
     columns: Mapping[str, Floats], guesses: Mapping[str, tuple[str, str]], units: Mapping[str, str]
 ) -> dict[str, tuple[str, str]]:
     """Return the columns that are one signal with another, or a set point less a reading, and of what."""
-    moving = {n: v[: _ROLES.most_rows] for n, v in columns.items() if np.ptp(v) > 0}  # of lost values none
+    moving = {n: v[: EVIDENCE.most_rows] for n, v in columns.items() if np.ptp(v) > 0}  # of lost values none
     out: dict[str, tuple[str, str]] = {}
     # of two copies the one with a clue, else the first, stays
     order = sorted(moving, key=lambda n: (n in guesses) + (guesses.get(n, ("", ""))[1] == NO_CLUE))
@@ -428,13 +356,13 @@ def _copied_columns(
         for other in [n for n in order[:place] if n not in out]:
             role_of_other = guesses.get(other, (role, ""))[0]
             # what is read is no copy of what is driven, a multiple of it under a proportional controller
-            if not _one_signal(values, moving[other]) or {role, role_of_other} == {"input", "output"}:
+            if not one_signal(values, moving[other]) or {role, role_of_other} == {"input", "output"}:
                 continue
             # two inputs that always move together cannot be told apart by any fit: one stays for both
             drives = role == role_of_other == "input"
-            drives |= guesses.get(other, ("", ""))[1] == NO_CLUE == why and _is_held(values)
+            drives |= guesses.get(other, ("", ""))[1] == NO_CLUE == why and is_held(values)
             if drives and units[name] == units[other]:
-                says = f"it always moves with {other}, and their effects cannot be told apart"
+                says = f"{_TOGETHER} {other}, and their effects cannot be told apart"
                 out[name] = "other", f"{says}: {other} is kept for both"
             # of two states every pair would be copies
             elif min(np.unique(v).size for v in (values, moving[other])) > 2:
@@ -442,73 +370,10 @@ def _copied_columns(
             break
         if name in out or why != NO_CLUE:
             continue
-        goals = [n for n in moving if n != name and (_SETPOINT.search(_name_words(n)) or _is_held(moving[n]))]
-        goals = [n for n in goals if not _one_signal(values, moving[n])]
+        goals = [n for n in moving if n != name and (_SETPOINT.search(_name_words(n)) or is_held(moving[n]))]
+        goals = [n for n in goals if not one_signal(values, moving[n])]
         pairs = ((g, n) for g in goals for n in order[:place] if n not in (*goals, *out))
-        both = next(((g, n) for g, n in pairs if _explains(values, moving[g], moving[n])), None)
+        both = next(((g, n) for g, n in pairs if explains(values, moving[g], moving[n])), None)
         if both is not None:
             out[name] = "other", f"it is computed from {both[0]} and {both[1]}"
     return out
-
-
-def _one_signal(one: Floats, other: Floats) -> bool:
-    """Tell whether two columns are multiples of each other and a constant, each within its own steps."""
-    return _explains(one, other) and _explains(other, one)
-
-
-def _explains(y: Floats, *some: Floats) -> bool:
-    """Tell whether a column is a sum of multiples of others but for rounding; of few moves nobody can."""
-    if min(np.count_nonzero(np.diff(v)) for v in (y, some[-1])) < _ROLES.fewest_moves:
-        return False
-    x = np.column_stack([np.ones(y.size), *some])
-    whole = np.isfinite(x).all(axis=1) & np.isfinite(y)
-    x, y = x[whole], y[whole]
-    moves = np.abs(np.diff(y))
-    least = max(_ROLES.exact * float(np.ptp(y)), float(moves[moves > 0].min(initial=np.inf)))
-    for rows in (slice(0, 200), slice(None)):
-        residual = y[rows] - x[rows] @ np.linalg.lstsq(x[rows], y[rows], rcond=None)[0]
-        if np.abs(residual).max() > least or residual.std() > _ROLES.rounding_share * y.std():
-            return False
-    return True
-
-
-def _predictive_gain(columns: Sequence[Floats]) -> Floats:
-    """Return how much column i helps to predict column j, G (n, n), the least over the lags."""
-    n, scaled = len(columns), _standardised(columns)
-    gain = np.zeros((n, n))
-    for j in range(n):
-        for i in (i for i in range(n) if i != j):
-            gain[i, j] = min(_gain(scaled[j], scaled[i], (), lags) for lags in _ROLES.lags)
-    return gain
-
-
-def _standardised(columns: Sequence[Floats]) -> list[Floats]:
-    """Return the first rows of columns, gaps filled, of mean 0 and standard deviation 1."""
-    scaled = []
-    for values in (column[: _ROLES.most_rows] for column in columns):
-        rows, finite = np.arange(values.size), np.isfinite(values)
-        filled = np.interp(rows, rows[finite], values[finite]) if finite.any() else np.zeros(values.size)
-        scaled.append((filled - filled.mean()) / (np.std(filled) or 1.0))
-    return scaled
-
-
-def _gain(y: Floats, x: Floats, beside: Sequence[Floats], lags: int) -> float:
-    """Return the gain in the information criterion of y, where the past of x stands beside its own and that
-    of others; 0 where it is negative, or rows are too few."""
-    rows = len(y) - lags
-    if rows < 5 * lags:
-        return 0.0
-
-    def past(values: Floats) -> Floats:
-        return np.stack([values[lags - k : len(values) - k] for k in range(1, lags + 1)], axis=1)
-
-    def left(regressors: Sequence[Floats]) -> float:
-        z = np.column_stack([np.ones(rows), *regressors])
-        target = y[lags:]
-        return float(np.sum((target - z @ np.linalg.lstsq(z, target, rcond=None)[0]) ** 2)) + 1e-12 * rows
-
-    # G = N log(RSS of y on its own past / RSS with that of x beside it) - n log N, of n lags and N rows
-    # (Granger 1969)
-    pasts = [past(values) for values in (y, *beside)]
-    gain = rows * np.log(left(pasts) / left([*pasts, past(x)])) - lags * np.log(rows)
-    return max(0.0, float(gain))

@@ -32,9 +32,10 @@ def jittered(step, first=0):
     ("header", "counts", "step", "doubt"),
     [
         ("time_s", 2 * np.arange(ROWS), 2.0, ""),
-        ("time", 2 * np.arange(ROWS), 2.0, ""),
-        ("t", 0.25 * np.arange(ROWS), 0.25, ""),
-        ("seconds", 300 * np.arange(ROWS), 300.0, "rows are 300 s apart"),
+        ("time", 2 * np.arange(ROWS), 2.0, "rows are 2 s apart"),
+        ("t", 0.25 * np.arange(ROWS), 0.25, "rows are 0.25 s apart"),
+        ("t", 2 * np.arange(ROWS) + 0.001 * RNG.integers(0, 9, ROWS), 2.0, ""),  # a program's loop
+        ("seconds", 300 * np.arange(ROWS), 300.0, ""),
         ("millis", jittered(500), 0.5, ""),
         ("time", jittered(500), 0.5, "taken as milliseconds"),
         ("timestamp", jittered(992, first=1_200_000_000), 0.992, "taken as milliseconds"),  # since it was on
@@ -43,7 +44,7 @@ def jittered(step, first=0):
         ("timestamp", jittered(500, first=1_700_000_000_000), 0.5, ""),
         ("uptime", jittered(1000), 1.0, "taken as milliseconds"),
         ("c1", jittered(500), 0.5, "taken as milliseconds"),
-        ("row", np.arange(ROWS), 1.0, "rows 1 s apart"),
+        ("row", np.arange(ROWS), 1.0, "rows are 1 s apart"),
     ],
 )
 def test_a_clock_is_known_by_its_name_or_its_behaviour_and_a_guess_is_a_doubt(

@@ -461,7 +461,9 @@ ISO = [f"1970-01-01 00:00:{k:02d}" for k in range(10)]
         (["1/2/1970", "12/3/1970"], [DAY, 336 * DAY], " (taken as month/day)"),
         (["1/2/1970", "13/2/1970"], [31 * DAY, 43 * DAY], ""),
         (["1/12/1970", "1/13/1970"], [11 * DAY, 12 * DAY], ""),
-        (["2/12/1970", "3/12/1970"], [42 * DAY, 70 * DAY], " (taken as month/day)"),
+        (["2/12/1970", "3/12/1970"], [335 * DAY, 336 * DAY],
+         " (taken as day/month/year, in which the days follow each other)"),
+        (["2/12/1970", "3/11/1970"], [42 * DAY, 69 * DAY], " (taken as month/day)"),
         (["1.2.1970 0:00", "31.2.1970 0:00"], [31 * DAY, np.nan], ""),
         (["2-Jan-1970", "03-feb-70"], [DAY, 36558 * DAY], ""),  # 2070: 100 years with 25 leap days
         (["32-1-2", "32-1-3"], [22646 * DAY, 22647 * DAY], ""),  # 2 January 2032, 62 years with 15 leap days
@@ -555,8 +557,8 @@ FOREIGN = [
     ("Zeit;q1;y\n13.01.26 10:00;1;2\n13.01.26 10:01;1;2\n", [0, 60], "q1 1 input 1|y 1 output 2", []),
     ("time,q1,y\n02-Jan-2026 10:00:00,1,2\n03-Feb-2026 10:00:00,1,2\n", [0, 32 * 86400],
      "q1 1 input 1|y 1 output 2", []),
-    ("time,q1,y\n3/4/2026 10:00,1,2\n4/4/2026 10:00,1,2\n", [0, 31 * 86400], "q1 1 input 1|y 1 output 2",
-     ["(taken as month/day)"]),
+    ("time,q1,y\n3/4/2026 10:00,1,2\n4/4/2026 10:00,1,2\n", [0, 86400], "q1 1 input 1|y 1 output 2",
+     ["(taken as day/month/year, in which the days follow each other)"]),
     ("time,q1,y\n13/4/2026,1,2\n14/4/2026,1,2\n", [0, 86400], "q1 1 input 1|y 1 output 2", []),
     ("t,pump_mA,T_C,zone_a,zone_b,zone_c,p (bar)\n0,500,20,1,2,3,4\n1,500,20,1,2,3,4\n", [0, 1],
      "pump A input .5|T degC output 20|zone_a 1 other 1|zone_b 1 other 2|zone_c 1 other 3|p_bar 1 other 4",

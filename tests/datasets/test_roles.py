@@ -184,7 +184,8 @@ def test_beside_a_set_point_input_and_output_are_the_controllers():
     roles = assign_roles(units, columns=columns).of
     assert roles == {"set": "other", "input": "output", "output": "input"}
     assert assign_roles(units, columns=columns, inputs=["input"]).of["input"] == "input"
-    named = {"automatic": 1.0 * (goal > 40), "temperature": columns["input"], "setpoint": goal, "output": pwm}
+    reading = {"temperature": columns["input"], "setpoint": goal}
+    named = {"automatic": 1.0 * (goal > 40), **reading, "output": HELD}
     found = assign_roles(dict.fromkeys(named, "1"), columns=named)
     assert [found.of[name] for name in named] == ["other", "output", "other", "input"]
     assert not found.doubts
@@ -450,7 +451,7 @@ def test_what_readings_say_of_each_other_is_a_doubt():
     }
     roles = assign_roles(dict.fromkeys(columns, "1"), columns=columns)
     assert list(roles.of.values()) == ["input", "output", "output", "input", "disturbance"]
-    assert "q is taken as input, and is computed from t_in, t_out" in roles.doubts[1]
+    assert "but is computed from t_in and t_out: a heat" in roles.doubts[1]
     assert roles.doubts[0] == "t_hall is taken as disturbance: it does not respond to duty, q"
 
 

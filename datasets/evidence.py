@@ -1,0 +1,276 @@
+"""What a reader may take for granted of a log: a decision has evidence, or it is a doubt.
+
+A name is half of the evidence of a role, the course of the column is the other half:
+
+* an output responds to an input, or to another output that does;
+* an input makes an output respond; it is no reading of another input, no total, not computed from readings;
+* a disturbance does not respond to an input;
+* what is left out never moves, counts, is one signal with another column or computed from some, is a set
+  point or of its controller, or neither responds nor makes an output respond.
+
+A role with one half alone is a doubt, and so is every other finding that is a :class:`Doubt`.  That a column
+x makes y respond is shown by prediction (Granger 1969): the past of x helps beside that of y.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations, pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thermogrip.datasets.repair import drop_stuck
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class EvidenceSettings:
+    """Limits of the rules; 38 of 40 kinds of logs are right and 2 asked with them (benchmarks/hostile)."""
+
+    held_share: float = 0.5  # of rows with a move at most, of a column that is held
+    held_size: float = 0.05  # of its range, that the median of its moves has at least: beyond noise
+    fewest_rows: int = 20  # of fewer, chance looks like a rule
+    counter_share: float = 0.9  # of the rows of a counter have the same step
+    fewest_moves: int = 5  # of two columns that may be one signal: fewer moves agree by chance
+    exact: float = 1e-6  # of a column's range: beyond the rounding of files
+    rounding_share: float = 0.05  # of its standard deviation, that rounding takes at most
+    lags: tuple[int, ...] = (2, 6)  # rows; of a smooth input few leave what its output contains of it
+    strong_gain: float = 10.0  # of the criterion: "very strong" evidence (Kass and Raftery 1995)
+    most_rows: int = 20_000  # that are looked at, for time
+    blocks: tuple[int, ...] = (1, 3, 10, 30)  # rows that are averaged: slow effects drown in noise at one
+    latest: int = 10  # rows by which a reading of an input is late
+    filters: tuple[int, ...] = (3, 10, 30)
+    telling_rows: int = 200  # of fewer, an effect may not be seen
+    follows: float = 0.9  # share of its variance that another input explains
+
+
+EVIDENCE = EvidenceSettings()
+
+
+def helps_beside(columns: Mapping[str, Floats], name: str, output: str, inputs: Sequence[str]) -> bool:
+    """Tell whether the past of a column helps to predict an output beside that of the inputs and its own."""
+    reading, *others = _standardised([columns[n] for n in (output, name, *inputs)])
+    return all(_gain(reading, others[0], others[1:], lags) > EVIDENCE.strong_gain for lags in EVIDENCE.lags)
+
+
+def is_moved(
+    columns: Mapping[str, Floats],
+    name: str,
+    drives: Sequence[str],
+    at_lags: Callable[[Iterable[bool]], bool] = any,
+) -> bool:
+    """Tell whether the past of a drive helps to predict a column, as long as the column is not stuck."""
+    is_sound = np.isfinite(drop_stuck(name, columns[name], [columns[n] for n in drives])[0])
+    if is_sound.sum() < EVIDENCE.fewest_rows:
+        return True  # nothing of it speaks against
+    reading, *moves = _standardised([columns[n][is_sound] for n in (name, *drives)])
+    gains = ([_gain(reading, drive, (), lags) for lags in EVIDENCE.lags] for drive in moves)
+    return any(at_lags(gain > EVIDENCE.strong_gain for gain in by_lags) for by_lags in gains)
+
+
+def is_held(values: Floats) -> bool:
+    """Tell whether a column moves in few rows, and then far, as what a person or a relay sets does."""
+    finite = values[np.isfinite(values)]
+    moves = np.abs(np.diff(finite))
+    rarely_moves = 0 < np.count_nonzero(moves) <= EVIDENCE.held_share * finite.size
+    return bool(rarely_moves and np.median(moves[moves > 0]) >= EVIDENCE.held_size * np.ptp(finite))
+
+
+def one_signal(one: Floats, other: Floats) -> bool:
+    """Tell whether two columns are multiples of each other and a constant, each within its own steps."""
+    return explains(one, other) and explains(other, one)
+
+
+def explains(y: Floats, *some: Floats) -> bool:
+    """Tell whether a column is a sum of multiples of others but for rounding; of few moves nobody can."""
+    if min(np.count_nonzero(np.diff(v)) for v in (y, some[-1])) < EVIDENCE.fewest_moves:
+        return False
+    x = np.column_stack([np.ones(y.size), *some])
+    whole = np.isfinite(x).all(axis=1) & np.isfinite(y)
+    x, y = x[whole], y[whole]
+    moves = np.abs(np.diff(y))
+    least = max(EVIDENCE.exact * float(np.ptp(y)), float(moves[moves > 0].min(initial=np.inf)))
+    for rows in (slice(0, 200), slice(None)):
+        residual = y[rows] - x[rows] @ np.linalg.lstsq(x[rows], y[rows], rcond=None)[0]
+        if np.abs(residual).max() > least or residual.std() > EVIDENCE.rounding_share * y.std():
+            return False
+    return True
+
+
+def predictive_gain(columns: Sequence[Floats]) -> Floats:
+    """Return how much column i helps to predict column j, G (n, n), the least over the lags."""
+    n, scaled = len(columns), _standardised(columns)
+    gain = np.zeros((n, n))
+    for j in range(n):
+        for i in (i for i in range(n) if i != j):
+            gain[i, j] = min(_gain(scaled[j], scaled[i], (), lags) for lags in EVIDENCE.lags)
+    return gain
+
+
+def _standardised(columns: Sequence[Floats]) -> list[Floats]:
+    """Return the first rows of columns, gaps filled, of mean 0 and standard deviation 1."""
+    scaled = []
+    for values in (column[: EVIDENCE.most_rows] for column in columns):
+        rows, finite = np.arange(values.size), np.isfinite(values)
+        filled = np.interp(rows, rows[finite], values[finite]) if finite.any() else np.zeros(values.size)
+        scaled.append((filled - filled.mean()) / (np.std(filled) or 1.0))
+    return scaled
+
+
+def _gain(y: Floats, x: Floats, beside: Sequence[Floats], lags: int) -> float:
+    return _gains(y, [x], beside, lags)[0]
+
+
+def _gains(y: Floats, causes: Sequence[Floats], beside: Sequence[Floats], lags: int) -> list[float]:
+    """Return the gain in the information criterion of y, where the past of each cause stands beside its own
+    and that of others; 0 where it is negative, or rows are too few."""
+    rows = len(y) - lags
+    if rows < 5 * lags:
+        return [0.0] * len(causes)
+
+    def past(values: Floats) -> Floats:
+        return np.stack([values[lags - k : len(values) - k] for k in range(1, lags + 1)], axis=1)
+
+    # what the pasts of y and of others explain is taken out of all once (Frisch and Waugh 1933)
+    known = np.column_stack([np.ones(rows), *map(past, (y, *beside))])
+    targets = np.column_stack([y[lags:], *map(past, causes)])
+    residuals = targets - known @ np.linalg.lstsq(known, targets, rcond=None)[0]
+    target = residuals[:, 0]
+    out = []
+    for k in range(len(causes)):
+        new = residuals[:, 1 + k * lags : 1 + (k + 1) * lags]
+        remaining = target - new @ np.linalg.lstsq(new, target, rcond=1e-9)[0]
+        squares = [float(np.sum(r**2)) + 1e-12 * rows for r in (target, remaining)]
+        # G = N log(RSS of y on its own past / RSS with that of x beside it) - n log N, of n lags and N rows
+        # (Granger 1969)
+        out.append(max(0.0, rows * float(np.log(squares[0] / squares[1])) - lags * np.log(rows)))
+    return out
+
+
+def comes_to(reading: Floats, goal: Floats) -> bool:
+    """Tell whether most of the levels that a goal is held at, three at least, are those that a reading has in
+    the last half of each hold."""
+    bounds = [0, *(np.flatnonzero(np.diff(goal)) + 1), goal.size]
+    spans = [(a, b) for a, b in pairwise(bounds) if b - a >= EVIDENCE.fewest_rows]
+    holds = [(goal[a], reading[(a + b) // 2 : b]) for a, b in spans]
+    holds = [(level, second_half) for level, second_half in holds if np.isfinite(second_half).all()]
+    levels = np.array([level for level, _ in holds])
+    reached = [abs(level - np.median(half)) <= EVIDENCE.held_size * np.ptp(levels) for level, half in holds]
+    return np.unique(levels).size >= 3 and float(np.mean(reached)) > 0.5
+
+
+def only_rises(values: Floats) -> bool:
+    """Tell whether a column never falls, or never rises, as totals and counters do."""
+    moves = np.diff(values[np.isfinite(values)])
+    rising = np.all(moves >= 0) or np.all(moves <= 0)
+    return bool(rising and np.unique(moves).size > 1 and np.count_nonzero(moves) > EVIDENCE.fewest_rows)
+
+
+def share_followed(values: Floats, other: Floats) -> float:
+    """Return the share of a column's variance that another one explains, at once, late or filtered."""
+    y, x = _standardised([values, other])
+    rows = y.size - EVIDENCE.latest
+    if rows < 20 * EVIDENCE.latest:  # of few rows the other's many terms explain any course
+        return float(np.mean(y * x)) ** 2
+    from scipy.signal import lfilter
+
+    filtered = [lfilter([1 / n], [1, 1 / n - 1], x) for n in EVIDENCE.filters]
+    late = [x[EVIDENCE.latest - k : x.size - k] for k in range(EVIDENCE.latest + 1)]
+    terms = np.column_stack([np.ones(rows), *late, *(f[EVIDENCE.latest :] for f in filtered)])
+    target = y[EVIDENCE.latest :]
+    residual = target - terms @ np.linalg.lstsq(terms, target, rcond=None)[0]
+    return 1 - float(np.var(residual) / (np.var(target) or 1.0))
+
+
+def role_doubts(
+    columns: Mapping[str, Floats],
+    roles: Mapping[str, str],
+    reasons: Mapping[str, str],
+    sound: Sequence[str],
+    goals: Sequence[str],
+) -> Iterator[str]:
+    """Yield a line for each guessed role of a column that its course does not confirm; the reasons of those
+    that need none begin with one of ``sound``."""
+    moving = [n for n, v in columns.items() if np.nanmax(v, initial=-np.inf) > np.nanmin(v, initial=np.inf)]
+    inputs, outputs, disturbances, others = (
+        [n for n in moving if roles[n] == role] for role in ("input", "output", "disturbance", "other")
+    )
+    if not inputs or not outputs:
+        return
+    guessed = [name for name in moving if name in reasons and not reasons[name].startswith(tuple(sound))]
+    moved = [name for name in outputs if is_moved(columns, name, inputs)]
+    while more := [n for n in outputs if n not in moved and is_moved(columns, n, moved)]:
+        moved += more
+    read = [*outputs, *disturbances]
+    for name in [name for name in inputs if name in guessed]:
+        what = _unlike_an_input(name, columns, [n for n in inputs if n != name], outputs, read)
+        if what:
+            yield f"{name} is taken as input ({reasons[name]}), but {what}"
+    for name in [name for name in outputs if name in guessed and name not in moved]:
+        if columns[name].size < EVIDENCE.telling_rows or any(_acts(columns, u, name, read) for u in inputs):
+            continue
+        yield f"{name} is taken as output ({reasons[name]}), but does not respond to {', '.join(inputs)}"
+    for name in [name for name in disturbances if name in guessed]:
+        if is_moved(columns, name, inputs, at_lags=all):
+            yield f"{name} is taken as disturbance ({reasons[name]}), but responds to {', '.join(inputs)}"
+    for name in [name for name in others if name in guessed and not only_rises(columns[name])]:
+        if name in goals and _is_goal(columns, name, inputs, outputs):
+            continue
+        # what is held like a drive may be the drive, and the input with a name its reading
+        beside = [] if is_held(columns[name]) else inputs
+        helped = next((n for n in outputs if helps_beside(columns, name, n, beside)), None)
+        if helped is not None:
+            yield f"{name} is left out ({reasons[name]}), and helps to predict {helped}"
+        elif is_moved(columns, name, inputs, at_lags=all):
+            says = f"responds to {', '.join(inputs)}: is it an output?"
+            yield f"{name} is left out ({reasons[name]}), but {says}"
+
+
+def _is_goal(columns: Mapping[str, Floats], name: str, inputs: Sequence[str], outputs: Sequence[str]) -> bool:
+    """Tell whether a column is held, and a drive responds to it or a reading comes to it."""
+    followed = any(comes_to(columns[n], columns[name]) for n in outputs)
+    return is_held(columns[name]) and (followed or any(is_moved(columns, n, [name]) for n in inputs))
+
+
+def _unlike_an_input(
+    name: str,
+    columns: Mapping[str, Floats],
+    other_inputs: Sequence[str],
+    outputs: Sequence[str],
+    read: Sequence[str],
+) -> str:
+    """Return what speaks against a column as an input, empty where nothing does."""
+    values = columns[name]
+    if only_rises(values):
+        return "only rises or falls, as a total does"
+    for pair in () if is_held(values) else combinations(read, 2):
+        # under a proportional controller one reading is enough
+        both = [columns[n] for n in pair]
+        if explains(values, *both) and not any(explains(values, one) for one in both):
+            return f"is computed from {' and '.join(pair)}: a heat or a flow, or a drive under feedback"
+    for other in other_inputs:
+        if share_followed(values, columns[other]) > EVIDENCE.follows:
+            return f"follows {other}: it may be a reading of it, and their effects cannot be told apart"
+    beside = [*other_inputs, *outputs]
+    if values.size >= EVIDENCE.telling_rows and not any(_acts(columns, name, y, beside) for y in outputs):
+        return f"no reading responds to it ({', '.join(outputs)})"
+    return ""
+
+
+def _acts(columns: Mapping[str, Floats], name: str, output: str, beside: Sequence[str]) -> bool:
+    """Tell whether a column helps to predict an output, alone or by switching what a reading does, at any
+    speed."""
+    others = [n for n in beside if n != output]
+    scaled = _standardised([columns[n] for n in (output, name, *others)])
+    for n in EVIDENCE.blocks:
+        y, x, *rest = (v[: v.size // n * n].reshape(-1, n).mean(axis=1) for v in scaled)
+        for lags in EVIDENCE.lags:
+            if any(
+                gain > EVIDENCE.strong_gain
+                for gain in _gains(y, [x, x * y, *(x * o for o in rest)], rest, lags)
+            ):
+                return True
+    return False
