@@ -474,7 +474,8 @@ def sample_time(plant: Plant) -> float:
     return max(1, round(nice / plant.dt)) * plant.dt
 
 
-_NEWTON_STEPS, _BALANCED = 20, 1e-7  # and by how much a state may move in a sample [degC]
+#: Newton's steps, how often one is halved, and by how much a state may move in a sample [degC].
+_NEWTON_STEPS, _HALVINGS, _BALANCED = 20, 9, 1e-7
 
 
 @dataclass(frozen=True)
@@ -523,9 +524,14 @@ def holding_drive(
     solution = least_squares(miss, begin, slope, bounds=(low, high), xtol=1e-10)
     u = solution.x * model.span
     x = model.steady_state(u, d)
-    if not np.isfinite(x).all():
-        # an integrator, which rests at any temperature or at none: what balances it may be out of range
-        x, u = _balance(model, rows, wanted, d)
+    if not np.max(np.abs(model.output(x)[rows] - wanted) / model.unit[rows]) < _STEP_ERROR:
+        # an integrator rests at any temperature or at none: what balances it may be out of range.  And where
+        # a bent plant runs away by itself, no search over drives finds what holds it: from the room such
+        # drives lead elsewhere
+        balanced, balance = _balance(model, rows, wanted, d)
+        in_range = np.all((low * model.span <= balance) & (balance <= high * model.span))
+        if not np.isfinite(x).all() or (in_range and np.isfinite(balanced).all()):
+            x, u = balanced, balance
     y = model.output(x)
     off = np.where(np.isfinite(y[rows]), y[rows] - wanted, 1e3)
     return Holding(u, x, y, float(np.max(np.abs(off))))
@@ -550,15 +556,25 @@ def held_start(
 
 
 def _balance(model: PredictionModel, rows: list[int], wanted: Array, d: Array) -> tuple[Array, Array]:
-    """Return a state that stays and has these outputs (NaN: there is none), and its drives, by Newton."""
-    x, u = model.rest(np.full(model.n_y, wanted.mean()), d), model.neutral
-    for _ in range(_NEWTON_STEPS):
+    """Return a state that stays and has these outputs (NaN: there is none), and its drives, by Newton, each
+    of whose steps is halved until it comes nearer."""
+
+    def off(x: Array, u: Array) -> tuple[LinearStep, Array]:
         step = model.linearise(x, u, d)
-        off = np.concatenate([step.after - x, model.output(x)[rows] - wanted])
-        if np.max(np.abs(off)) < _BALANCED:
+        return step, np.concatenate([step.after - x, model.output(x)[rows] - wanted])
+
+    x, u = model.rest(np.full(model.n_y, wanted.mean()), d), model.neutral
+    step, miss = off(x, u)
+    for _ in range(_NEWTON_STEPS):
+        if np.max(np.abs(miss)) < _BALANCED:
             return x, u
         outputs = np.hstack([model.C[rows], np.zeros((len(rows), model.n_u))])
         by = np.vstack([np.hstack([step.A - np.eye(model.n_x), step.B * model.span]), outputs])
-        move = np.linalg.lstsq(by, -off, rcond=None)[0]
-        x, u = x + move[: model.n_x], u + move[model.n_x :] * model.span
+        move, before = np.linalg.lstsq(by, -miss, rcond=None)[0], np.linalg.norm(miss)
+        for share in 0.5 ** np.arange(_HALVINGS):
+            nearer = x + share * move[: model.n_x], u + share * move[model.n_x :] * model.span
+            step, miss = off(*nearer)
+            if np.linalg.norm(miss) < before:
+                break
+        x, u = nearer
     return np.full(model.n_x, np.nan), u

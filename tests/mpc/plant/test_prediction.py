@@ -18,6 +18,7 @@ from thermogrip.mpc.plant.prediction import (
     sample_time,
     step_response,
 )
+from thermogrip.sysid.models.neural import NeuralModel
 from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.plant import Plant
 
@@ -376,6 +377,21 @@ def test_what_balances_an_integrator_may_lie_beyond_its_drive():
         assert held.miss == pytest.approx(0.0, abs=1e-6)
         at_rest, _ = held_start(prediction, ("t",), 40.0, (leak,))  # -8 asks for more than the drive has
         assert prediction.output(at_rest) == pytest.approx([40.0])
+
+
+@pytest.mark.parametrize("target", [54.0, 60.0, 63.0])
+def test_a_target_where_the_plant_runs_away_by_itself_can_be_held(target: float):
+    """Near 60 degC a sample of this network takes it further from where it is: x+ - x = 0.1 (tanh 2x - x) + w / 5."""
+    one = {"A": [[[0.9]]], "B": [[[0.2]]], "V": [[[0.1]]], "W": [[[2.0]]]}
+    none = {"c": [[0.0]], "U": [[[0.0]]], "b": [[0.0]]}
+    scales = {"y_middle": [60.0], "y_size": [20.0], "w_middle": [0.3], "w_size": [0.2], "reach": [10.0]}
+    rails = {"low": [-np.inf], "high": [np.inf]}
+    model = NeuralModel(("q",), (), ("t",), switches=(), dt=1.0, **one, **none, **scales, **rails)
+    plant = Plant(model, {}, dt=1.0, units={"q": "1"}, valid={"q": (-0.3, 0.6), "t": (5.0, 80.0)})
+    held = holding_drive(PredictionModel(plant, dt=1.0), ("t",), [target], [])
+    x = (target - 60.0) / 20.0
+    assert held.miss < 1e-5
+    assert held.u == pytest.approx([0.3 - 0.1 * (np.tanh(2 * x) - x)], abs=1e-6)
 
 
 def test_a_plant_that_was_held_stays_and_one_that_cannot_be_is_as_warm_all_over(tank):
