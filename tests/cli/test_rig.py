@@ -283,7 +283,7 @@ def test_a_batch_keeps_on_what_it_ran_and_fails_while_a_trial_is_left(
 
     def ran(opened: Any, *_: Any, progress: Any, **__: Any) -> Batch:
         progress(0.5, "trial 1")
-        rigs.append(opened())
+        rigs.extend([opened(), opened()])
         return Batch((bench.path,) * (2 - left), left, "stopped", "go on", 1)
 
     rigs: list[Any] = []
@@ -297,14 +297,15 @@ def test_a_batch_keeps_on_what_it_ran_and_fails_while_a_trial_is_left(
     (bench.path / "model").mkdir()
     words = ["batch", "c.json", "plan.csv", *where, "--grasp-time", "4", "--settle-timeout", "60"]
     done = bench.run(*words, "--guard", "g.toml", "--out", "out")
-    assert (done.code, rigs) == (code, ["a rig"]), done
+    assert (done.code, rigs) == (code, ["a rig"] * 2), done
     [call] = batches
     assert (call.about, call.output, call.guard) == (about, "t_surface", "a guard")
     assert (call.grasp_time, call.settle_timeout, call.stop) == (4.0, 60.0, None)
     assert [getattr(call, name) is not None for name in ("ready", "judge", "clock")] == [asks, asks, on_rig]
     assert (type(call.args[1]), len(call.args[2]), call.args[3]) == (Controller, 2, Path("out"))
     assert guards[0].args == (Path("g.toml"), call.args[1].plant)
-    [rig] = opened
+    rig, again = opened
+    assert rig.say is not None and again.say is None  # what is round a twin, once
     on_port = RigOptions(port="socket://rig", protocol="tclab", speed=3.0)
     assert rig.args[0] == (on_port if on_rig else RigOptions(twin=Path("plant.json"), draw=3))
     assert (rig.args[1].speed, rig.seed, rig.args[2]) == (
@@ -317,7 +318,7 @@ def test_a_batch_keeps_on_what_it_ran_and_fails_while_a_trial_is_left(
     assert (batches[1].ready, batches[1].judge, batches[1].stop) == (None, None, "stop")
     assert stops[0].args == (Path("model"),)
     bench.run("batch", "c.json", "plan.csv", "--twin", "plant.json", "--out", "out")
-    assert (batches[2].grasp_time, batches[2].settle_timeout, opened[2].args[0].draw) == (10.0, 900.0, 0)
+    assert (batches[2].grasp_time, batches[2].settle_timeout, opened[-1].args[0].draw) == (10.0, 900.0, 0)
 
 
 @pytest.fixture

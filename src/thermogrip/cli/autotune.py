@@ -53,10 +53,11 @@ def autotune(
     requested = None if spec is None else read_spec(spec)
     relays = rig.switched(None if requested is None else requested.relays)
     clock, watch = rig.clock(pace), show.watch("autotune", console, out, pace)
+    says = iter([console.say])  # at the first session
     work = Autotune(
         cli.new_folder(out),
         wanted,
-        lambda: rig.open(clock, None, pace=pace, seed=seed, relays=relays),
+        lambda: rig.open(clock, None, pace=pace, seed=seed, relays=relays, say=next(says, None)),
         lambda plant: rig.guard(guard, plant, limit=limit),
         minutes=minutes,
         spec=requested,

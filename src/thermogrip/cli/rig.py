@@ -367,9 +367,10 @@ def batch(
     clock, watch = rig.clock(pace), show.watch("batch", console, out, pace)
     checks = rig.guard(guard, loaded.plant)
     asks = ask and rig.port is not None and not as_json
+    says = iter([console.say])  # at the first trial
     with _bridge(bridge) as through, watch:
         done = run_batch(
-            lambda: rig.open(clock, loaded, pace=pace, seed=seed),
+            lambda: rig.open(clock, loaded, pace=pace, seed=seed, say=next(says, None)),
             loaded,
             trials,
             cli.new_folder(out),
