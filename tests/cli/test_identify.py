@@ -227,6 +227,10 @@ def test_a_guess_that_decides_is_a_warning_and_the_command_that_states_it_comes_
     assert "thermogrip: warning: in doubt: fan 2 is left out, and helps to predict t1" in done.err
     command = "thermogrip identify good.csv --inputs q1 --outputs t1 --out p.json"
     assert done.err.splitlines()[-1] == f"next: {command}"
+    typed = ["--outputs", "t1", "good.csv", "--models", "arx", "--report", "r.html", "--out", "p.json"]
+    last_line = room.bench.run("identify", *typed).err.splitlines()[-1]
+    typed.remove("good.csv")  # the rest of what was typed stays
+    assert last_line == f"next: thermogrip identify good.csv --inputs q1 {' '.join(typed)}"
     named = tuple(replace(signal, guessed=False) for signal in signals)  # no roles will mend the other doubts
     room.found = found_of(good=False, doubts=("U is far from its prior",), signals=named)
     done = room.bench.run("identify", "good.csv", "--out", "p.json")

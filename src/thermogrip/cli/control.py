@@ -50,9 +50,11 @@ def tune(
     wanted = Spec.of(loaded) if spec is None else read_spec(spec)
     console = Console(as_json)
     if spec is None:
+        regulated = " and ".join(wanted.design(loaded).controlled)
         steps = ", ".join(f"{start:g} to {target:g}" for start, target in wanted.steps)
         console.say(
-            f"No --spec: steps {steps}, each within {wanted.band_degC:g} after {wanted.settle_within_s:g} s; "
+            f"No --spec: {regulated} in steps {steps}, each within {wanted.band_degC:g} after "
+            f"{wanted.settle_within_s:g} s; "
             f"'thermogrip init spec --like {plant} --out spec.toml' writes what was taken, to edit"
         )
     if taken := wanted.surroundings_in_words(loaded):

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 import typer
 
 from thermogrip.cli import options as cli
+from thermogrip.cli.kinds import TYPED
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.media import printable
 from thermogrip.report.console import Console
@@ -57,6 +58,7 @@ Average = Annotated[
 
 
 def identify(
+    ctx: typer.Context,
     paths: cli.LogFiles,
     out: Annotated[
         Path | None,
@@ -174,21 +176,20 @@ def identify(
     if identified.good:
         return cli.Done("good")
     guessed = any(s.guessed for s in identified.signals) or any(log.attrs.get("clock_doubts") for log in logs)
-    stated = _stating(identified, paths, out, dt, logs) if identified.doubts and guessed else ""
+    stated = _stating(identified, paths, ctx.meta[TYPED], logs) if identified.doubts and guessed else ""
     return cli.Done("not good", cli.ANSWER_IS_NO, stated)
 
 
-def _stating(
-    found: Identification, paths: Sequence[str], out: Path, dt: float | None, logs: Sequence[Log]
-) -> str:
-    """Return the command that states what was guessed, to be corrected where the guess is wrong; an input
-    that nothing but its course shows may be one that nobody sets, such as a lamp."""
+def _stating(found: Identification, paths: Sequence[str], typed: Sequence[str], logs: Sequence[Log]) -> str:
+    """Return what was typed with what was guessed, to be corrected where the guess is wrong; an input that
+    nothing but its course shows may be one that nobody sets, such as a lamp."""
     named = {r: [s.name for s in found.signals if s.role == r] for r in ("input", "output", "disturbance")}
-    words = ["identify", *map(str, paths), *_stated_roles(named)]
-    if dt is None and any(log.attrs.get("clock_doubts") for log in logs):
+    unsaid = {role: names for role, names in named.items() if f"--{role}s" not in typed}
+    words = ["identify", *paths, *_stated_roles(unsaid)]
+    if "--dt" not in typed and any(log.attrs.get("clock_doubts") for log in logs):
         step = float(logs[0]["time"].diff("time").median())
         words += ["--dt", f"{step:g}"]
-    command = shlex.join([*words, "--out", str(out)])
+    command = shlex.join([*words, *(word for word in typed if word not in paths)])
     by_course = [s.name for s in found.signals if s.role == "input" and s.guessed and "name" not in s.why]
     driven = [name for name in named["input"] if name not in by_course]
     if driven and by_course:
