@@ -19,7 +19,7 @@ from thermogrip.mpc.controllers import advice
 from thermogrip.mpc.controllers.base import as_drive, has_preview, targets_ahead
 from thermogrip.mpc.controllers.reference import ReferenceController
 from thermogrip.mpc.estimator.reading_checks import is_off
-from thermogrip.mpc.interface import STATUSES, Move, Readings, Trajectory, number
+from thermogrip.mpc.interface import STATUSES, Move, Readings, Trajectory, number, target_now
 from thermogrip.mpc.native.runtime import QP_STATUS, CompiledController, address
 
 
@@ -79,14 +79,10 @@ class CompiledStep:
         names = self._names
         controlled = self.reference.controlled
         _put(c.given, reading, names)
-        unknown: list[str] = []
-        if not isinstance(target, Mapping):
-            for place in range(len(names), len(names) + len(controlled)):
-                c.given[place] = number({"": target}, "")
-        else:
-            now = {name: value[0] if isinstance(value, Sequence) else value for name, value in target.items()}
-            _put(c.given, now, controlled, len(names))
-            unknown = [name for name in now if name not in controlled]
+        now = target_now(target)
+        by_name = now if isinstance(now, Mapping) else dict.fromkeys(controlled, now)
+        _put(c.given, by_name, controlled, len(names))
+        unknown = [name for name in by_name if name not in controlled]
         ahead = self._ahead(target)
         if ahead is not None:
             c.library.tg_host_goals(c.state, address(ahead))

@@ -215,12 +215,8 @@ def choose_disturbances(
 
 def _disturbance_matrices(model: PredictionModel, entries: list[tuple[str, int]]) -> dict[str, Array]:
     """Return on what each disturbance state (n_w) acts, by the kind of row."""
-    n_w = len(entries)
-    matrices = {
-        "input": np.zeros((model.n_u, n_w)),
-        "disturbance": np.zeros((model.n_d, n_w)),
-        "output": np.zeros((model.n_y, n_w)),
-    }
+    sizes = {"input": model.n_u, "disturbance": model.n_d, "output": model.n_y}
+    matrices = {kind: np.zeros((size, len(entries))) for kind, size in sizes.items()}
     for column, (kind, row) in enumerate(entries):
         matrices[kind][row, column] = 1.0
     return matrices

@@ -11,7 +11,7 @@ It is handed to DAQP as a least-distance program (:meth:`CondensedQP.solve`).
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from scipy.linalg.lapack import dpotrf, dtrtri
@@ -50,15 +50,6 @@ class QPAnswer:
     def solved(self) -> bool:
         """Whether x is the minimiser."""
         return self.status == "solved"
-
-
-class ScaledAnswer(NamedTuple):
-    """What DAQP says of a scaled program."""
-
-    z: Array  # (n,), NaN where it has seen at once that there is none
-    multipliers: Array  # (m,)
-    flag: int
-    iterations: int
 
 
 class CondensedQP:
@@ -108,15 +99,12 @@ class CondensedQP:
         if idle.any():
             least[idle], most[idle] = -_NO_BOUND, _NO_BOUND
         scaled = self._run(f @ back, rows, least, most, length)
-        if scaled.flag <= 0:
-            status = _EXIT_FLAGS.get(scaled.flag, f"solver flag {scaled.flag}")
-            return self._failed(status, f.size, scaled.iterations)
-        if not np.isfinite(scaled.z).all():
-            return self._failed("not finite", f.size, scaled.iterations)
-        return QPAnswer(back @ scaled.z, "solved", scaled.iterations, scaled.multipliers / length)
+        if not scaled.solved:
+            return scaled
+        return QPAnswer(back @ scaled.x, "solved", scaled.iterations, scaled.multipliers / length)
 
-    def _run(self, f: Array, A: Array, lower: Array, upper: Array, length: Array) -> ScaledAnswer:
-        """Hand the scaled problem to DAQP."""
+    def _run(self, f: Array, A: Array, lower: Array, upper: Array, length: Array) -> QPAnswer:
+        """Return DAQP's answer to the scaled problem."""
         from daqp import Model
 
         # D. Arnstrom, A. Bemporad, D. Axehill, "A dual active-set solver for embedded quadratic programming
@@ -134,20 +122,22 @@ class CondensedQP:
             flag, _ = self._model.setup(np.eye(f.size), f, A, upper, lower, self._sense.copy())
         else:  # in the same memory
             flag = self._model.update(f=f, A=A, bupper=upper, blower=lower, sense=self._sense.copy())
-        model = self._model
         if flag < 0:  # it has seen that there is no answer
             self._model = None
-            return ScaledAnswer(np.full(f.size, np.nan), np.zeros(lower.size), int(flag), 0)
+            return self._failed(_EXIT_FLAGS.get(flag, f"solver flag {flag}"), f.size)
         # penalties in scaled units; of the quadratic one it takes the reciprocal
         # a slack becomes s/r, and its penalties w r and q r^2: the linear one makes a soft row exact (it is
         # broken only if keeping it costs more than w per degC), the quadratic one spreads it;
         reciprocal = 1.0 / np.maximum(self.quadratic * length**2, LEAST_QUADRATIC)
         linear = self._priced * length
-        model.soft_weights(reciprocal, reciprocal, linear, linear)
-        z, _, flag, info = model.solve()
+        self._model.soft_weights(reciprocal, reciprocal, linear, linear)
+        z, _, flag, info = self._model.solve()
         if flag <= 0:
             self._model = None
-        return ScaledAnswer(np.asarray(z), np.asarray(info["lam"]), int(flag), int(info["iterations"]))
+            return self._failed(_EXIT_FLAGS.get(flag, f"solver flag {flag}"), f.size, info["iterations"])
+        if not np.isfinite(z).all():
+            return self._failed("not finite", f.size, info["iterations"])
+        return QPAnswer(np.asarray(z), "solved", info["iterations"], np.asarray(info["lam"]))
 
     def _failed(self, status: str, n: int, iterations: int = 0) -> QPAnswer:
         return QPAnswer(np.full(n, np.nan), status, iterations, np.zeros(self.soft.size))

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.optimize import minimize
 
-from thermogrip.mpc.optimiser.qp import LEAST_QUADRATIC, CondensedQP, ScaledAnswer
+from thermogrip.mpc.optimiser.qp import LEAST_QUADRATIC, CondensedQP
 
 
 def random_problem(seed: int) -> tuple:
@@ -170,7 +172,9 @@ FLAGS = {
 @pytest.mark.parametrize("z", [0.5, np.nan])
 def test_a_flag_of_the_solver_is_a_status_and_no_number_is_no_solution(monkeypatch, flag, status, z):
     solver = CondensedQP(soft=[False], linear=[0.0], quadratic=[0.0])
-    monkeypatch.setattr(solver, "_run", lambda *given: ScaledAnswer(np.full(1, z), np.full(1, 6.0), flag, 7))
+    answer = np.full(1, z), 0.0, flag, {"lam": np.full(1, 6.0), "iterations": 7}
+    done = SimpleNamespace(setup=lambda *_: (1, 0.0), soft_weights=lambda *_: None, solve=lambda: answer)
+    monkeypatch.setattr("daqp.Model", lambda: done)
     found = solver.solve(np.array([[4.0]]), np.zeros(1), np.array([[3.0]]), -np.ones(1), np.ones(1))
     solved = flag > 0 and np.isfinite(z)
     assert found.status == ("not finite" if flag > 0 and not solved else status)

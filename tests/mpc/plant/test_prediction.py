@@ -381,7 +381,7 @@ def test_what_balances_an_integrator_may_lie_beyond_its_drive():
 
 @pytest.mark.parametrize("target", [54.0, 60.0, 63.0])
 def test_a_target_where_the_plant_runs_away_by_itself_can_be_held(target: float):
-    """Near 60 degC a sample of this network takes it further from where it is: x+ - x = 0.1 (tanh 2x - x) + w / 5."""
+    """Near 60 degC a sample of this network leads away: x+ - x = 0.1 (tanh 2x - x) + w / 5."""
     one = {"A": [[[0.9]]], "B": [[[0.2]]], "V": [[[0.1]]], "W": [[[2.0]]]}
     none = {"c": [[0.0]], "U": [[[0.0]]], "b": [[0.0]]}
     scales = {"y_middle": [60.0], "y_size": [20.0], "w_middle": [0.3], "w_size": [0.2], "reach": [10.0]}
