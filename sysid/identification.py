@@ -7,7 +7,7 @@ The candidates are ``arx``, ``oe``, ``subspace``, ``sindy``, ``neural`` (black b
 given (:mod:`thermogrip.sysid.blackbox.order_selection`); with ``leave_one_out`` a log that is left out has no
 part in that choice either.  The one that is kept, and the network, are scored besides on the last 30 percent
 of each log, fitted without them and run freely from the log's start, where its state is known.  When a plant
-is called good is in :mod:`thermogrip.sysid.validation.verdict`.
+is called good is in :mod:`thermogrip.sysid.validation.stated_errors`.
 """
 
 from __future__ import annotations
@@ -50,13 +50,16 @@ from thermogrip.sysid.plant.log_grid import Grid, match_logs, misfit, moved_befo
 from thermogrip.sysid.plant.log_grid import rows_of as log_rows
 from thermogrip.sysid.plant.plant import Plant
 from thermogrip.sysid.validation.free_run import FreeRun, free_run, no_input_baseline, warm_up_of
-from thermogrip.sysid.validation.prediction_bands import (
+from thermogrip.sysid.validation.stated_errors import (
+    Row,
     between_runs,
     check_ensemble,
+    doubts_of,
     expected_error,
+    network_name,
     part_errors,
+    verdict_of,
 )
-from thermogrip.sysid.validation.verdict import Row, doubts_of, network_name, verdict_of
 
 if TYPE_CHECKING:
     from thermogrip.sysid.models.model import GreyModel

@@ -27,7 +27,7 @@ from thermogrip.sysid.blackbox.fit import BLACK_BOXES, fit_black_box
 from thermogrip.sysid.identification import USUAL_MODELS
 from thermogrip.sysid.plant.plant import Plant
 from thermogrip.sysid.validation.free_run import FreeRun, free_run
-from thermogrip.sysid.validation.prediction_bands import between_runs
+from thermogrip.sysid.validation.stated_errors import between_runs
 
 
 def run_over(plant: Plant, some: ForeignSet) -> FreeRun:

@@ -13,7 +13,7 @@ Beside the free run stand
   hindsight. A model that does not beat it has learnt nothing from the input.
 
 The residual is tested (:mod:`thermogrip.sysid.validation.residual_tests`), the verdict goes by its size
-(:mod:`thermogrip.sysid.validation.verdict`).
+(:mod:`thermogrip.sysid.validation.stated_errors`).
 """
 
 from __future__ import annotations
@@ -32,7 +32,16 @@ from thermogrip.datasets.schema import Log, column, columns, log_name
 from thermogrip.sysid.plant.fit_record import SEVERAL, fit_logs, said_of_fit
 from thermogrip.sysid.plant.log_grid import cut_stretches, match_logs
 from thermogrip.sysid.validation.residual_tests import SQUARED, ResidualCorrelations, residual_correlations
-from thermogrip.sysid.validation.verdict import NO_BETTER, Cause, Verdict, judge
+from thermogrip.sysid.validation.stated_errors import (
+    NO_BETTER,
+    Band,
+    Cause,
+    InputEffect,
+    Verdict,
+    effect_of_run,
+    free_run_band,
+    judge,
+)
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -40,7 +49,6 @@ if TYPE_CHECKING:
     from pandas import DataFrame
 
     from thermogrip.sysid.plant.plant import Plant
-    from thermogrip.sysid.validation.prediction_bands import Band, InputEffect
 
 START = 0.1  # share of the squared error due to the start, from which that is reported
 
@@ -76,11 +84,9 @@ class FreeRun:
 
     def band(self, level: float = 0.9) -> Band:
         """Return the band about the run that a new run's readings should lie in, and the share that does;
-        see :func:`thermogrip.sysid.validation.prediction_bands.free_run_band`."""
+        see :func:`~thermogrip.sysid.validation.stated_errors.free_run_band`."""
         if self.stated is not None and level == self.stated.level:
             return self.stated
-        from thermogrip.sysid.validation.prediction_bands import free_run_band  # scipy.special
-
         return free_run_band(self.plant, self.measured, self.log, level=level, warmup=self.warmup)
 
 
@@ -165,8 +171,6 @@ def free_run(
     )
     by_inputs = None
     if tests:
-        from thermogrip.sysid.validation.prediction_bands import effect_of_run  # scipy.special
-
         is_scored = column(simulated, "scored")[:, None] > 0
         error = np.where(is_scored, columns(log, plant.outputs) - columns(simulated, plant.outputs), np.nan)
         by_inputs = effect_of_run(plant, error, log)
@@ -202,8 +206,6 @@ def warm_up_of(time: Array) -> float:
 
 def _judged(run: FreeRun, error: Array, by_inputs: InputEffect | None) -> FreeRun:
     """Return the run with tests of its error (n, n_y), NaN where not scored, and the verdict on the plant."""
-    from thermogrip.sysid.validation.prediction_bands import free_run_band  # scipy.special
-
     plant, log = run.plant, run.measured
     simulated, scored = columns(run.log, plant.outputs), column(run.log, "scored") > 0
     residual = residual_correlations(plant, cut_stretches(plant, log), simulated, scored, warmup=run.warmup)

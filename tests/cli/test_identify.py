@@ -32,7 +32,7 @@ from thermogrip.sysid.plant.linearise import linearise_plant
 from thermogrip.sysid.plant.log_grid import roles_of
 from thermogrip.sysid.plant.plant import Plant
 from thermogrip.sysid.validation.free_run import free_run, usual_warmup
-from thermogrip.sysid.validation.verdict import Row, Standing, Verdict
+from thermogrip.sysid.validation.stated_errors import Row, Standing, Verdict
 
 BOARD = plant_from_prior(load_network("tclab"))
 DYNAMICS = plant_dynamics(BOARD, inputs={"q1": 30.0, "q2": 10.0}, draws=9)

@@ -21,7 +21,7 @@ from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.fit_record import Identifiability
 from thermogrip.sysid.plant.plant import Plant
 from thermogrip.sysid.validation.free_run import FreeRun, free_run
-from thermogrip.sysid.validation.prediction_bands import Band
+from thermogrip.sysid.validation.stated_errors import Band
 
 
 @pytest.fixture(scope="module")

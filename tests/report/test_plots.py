@@ -24,7 +24,7 @@ from thermogrip.report.plant import bode_chart, corner_figure, free_run_chart
 from thermogrip.report.plots import grasps_chart, loops_chart, steps_chart
 from thermogrip.sysid import free_run, identify
 from thermogrip.sysid.export.dynamics import Estimate
-from thermogrip.sysid.validation.prediction_bands import Band
+from thermogrip.sysid.validation.stated_errors import Band
 
 
 def waves(n: int, shift: float = 0.0) -> Any:

@@ -24,9 +24,9 @@ from thermogrip.sysid.identification import Held, beyond_reach, choose_black_box
 from thermogrip.sysid.models.network import load_network
 from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.fit_record import ExpectedError, HeldOut, fit_logs
-from thermogrip.sysid.validation import verdict
+from thermogrip.sysid.validation import stated_errors
 from thermogrip.sysid.validation.free_run import free_run, usual_warmup
-from thermogrip.sysid.validation.prediction_bands import between_runs, expected_error
+from thermogrip.sysid.validation.stated_errors import between_runs, expected_error
 
 REAL = Path(os.environ.get("THERMOGRIP_REAL_DATA", Path(__file__).parents[3] / "shared" / "data" / "real"))
 needs_real = pytest.mark.skipif(
@@ -426,7 +426,7 @@ def test_an_input_that_never_moves_has_no_gain(kind):
     ("rmse", "high", "held", "own", "checked", "doubts", "said"),  # errors [K] beside 2 K without input
     [
         (0.99, 1.9, 0.9, 0.9, "ok", (), "Good for simulation"),
-        (1.01, 1.9, 0.9, 0.9, "ok", (), "Not good (arx): without input t errs by 2"),
+        (1.01, 1.9, 0.9, 0.9, "ok", (), "Not good (arx): on another run t errs by 1, without input by 2"),
         (0.5, 2.01, 0.9, 0.9, "ok", (), "Good for simulation"),  # one part of moves that no other has
         (0.5, 1.9, 1.01, 0.9, "ok", (), "Not good (arx): on parts held out t errs by 0.71"),
         (0.5, 1.9, 0.9, 1.01, "ok", (), "Not good (arx): on the logs of its own fit t errs by 1"),
@@ -444,34 +444,16 @@ def test_a_plant_is_good_where_it_errs_by_less_than_half_of_no_input_on_parts_in
     quality: Any = SimpleNamespace(findings=[SimpleNamespace(verdict=checked, says="q never moves")])
     scores = SimpleNamespace(expected={"t": ExpectedError(rmse, 0.1, high)})
     plant: Any = SimpleNamespace(scores=scores, units={"t": "K"}, logs=("a", "b", "c"), model=None)
-    found, words = verdict.verdict_of("arx", plant, rows, quality, doubts)
+    found, words = stated_errors.verdict_of("arx", plant, rows, quality, doubts)
     assert found == said.startswith("Good")
     assert words.startswith(said)
     assert words.endswith(f" Expected error of another run like these: t {rmse:.2g} K (0.1 to {high:.2g}).")
 
 
-def test_an_output_that_half_of_the_parts_hardly_excite_is_not_good():
-    """Over all parts it errs by .47 of no input, and by 2.6 times that on the other half of its log."""
-    shares = dict(zip("abcde", [0.79, 0.31, 0.33, 0.81, 0.47]))
-    rows = table({"arx": shares}) + table({"arx": {"own": 0.03}}, False)
-    idle = [0.214, 0.823, 0.84, 0.576, 1.254]
-    uneven = [
-        replace(row, rmse=row.rmse / 2 * size, no_input_rmse=size) for row, size in zip(rows, [*idle, 4.0])
-    ]
-    quality: Any = SimpleNamespace(findings=[])
-    scores = SimpleNamespace(expected={"t": ExpectedError(0.36, 0.17, 0.93)})
-    plant: Any = SimpleNamespace(scores=scores, units={"t": "K"}, logs=("a", "b", "c"), model=None)
-    good, words = verdict.verdict_of("arx", plant, uneven, quality)
-    assert not good
-    assert words.startswith("Not good (arx): on another part t may err 1.2 times as much as without input")
-    alike = [replace(row, rmse=0.35 * row.no_input_rmse) for row in uneven]
-    assert verdict.verdict_of("arx", plant, alike, quality)[0]
-
-
 def table(shares, held=True):
     """Rows by candidate and log, of an error of ``share`` times that of a model without input, 2 K."""
     return [
-        verdict.Row(model, "", log, "t", 2.0 * share, 90.0, "K", 100, 2.0, held)
+        stated_errors.Row(model, "", log, "t", 2.0 * share, 90.0, "K", 100, 2.0, held)
         for model, logs in shares.items()
         for log, share in logs.items()
     ]
@@ -513,7 +495,7 @@ def test_a_parameter_far_beyond_its_prior_is_a_doubt_that_names_the_network(off,
     name = plant.free[0]
     spec = plant.model.specs[name]
     end = spec.value * np.exp(1.645 * spec.sd_log * (1 if off > 1 else -1))
-    found = verdict._far_from_prior(replace(plant, values=plant.values | {name: end * off}))
+    found = stated_errors._far_from_prior(replace(plant, values=plant.values | {name: end * off}))
     assert [name in line and "network tclab" in line for line in found] == [True] * doubted
 
 
@@ -521,7 +503,7 @@ def test_a_parameter_far_beyond_its_prior_is_a_doubt_that_names_the_network(off,
 def test_a_heater_that_cools_is_a_doubt(gain, doubts):
     model = StateSpaceModel(("heater",), (), ("t",), A=[[0.9]], B=[[0.1 * gain]], C=[[1.0]], dt=1.0)
     plant = Plant(model, {}, dt=1.0, units={"heater": "percent", "t": "degC"}, valid={"heater": (0.0, 100.0)})
-    found = verdict._heaters_that_cool(plant)
+    found = stated_errors._heaters_that_cool(plant)
     assert len(found) == doubts
     assert all(f"heater lowers t (gain {gain:.2g}): recorded in closed loop" in line for line in found)
 

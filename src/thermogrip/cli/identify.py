@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from thermogrip.sysid.models.model import GreyModel
     from thermogrip.sysid.plant.plant import Plant
     from thermogrip.sysid.validation import Band, FreeRun
-    from thermogrip.sysid.validation.verdict import Verdict
+    from thermogrip.sysid.validation.stated_errors import Verdict
 
 MODELS = ("arx", "oe", "armax", "bj", "subspace", "parsim", "sindy", "neural", "network")
 USUAL_MODELS = ",".join(model for model in MODELS if model not in ("armax", "bj", "parsim", "sindy"))

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from thermogrip.sysid.identification import Identification
     from thermogrip.sysid.plant.plant import Plant
     from thermogrip.sysid.validation import Band, FreeRun
-    from thermogrip.sysid.validation.verdict import Row
+    from thermogrip.sysid.validation.stated_errors import Row
 
 _BASELINES = (
     "Beside the free run: the best decay without input, the log's mean, and one step from each last "

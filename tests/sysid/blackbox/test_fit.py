@@ -19,7 +19,7 @@ from thermogrip.sysid.blackbox.order_selection import Choice, Fold, Structure
 from thermogrip.sysid.models.lti import StartPrior
 from thermogrip.sysid.plant import log_grid
 from thermogrip.sysid.plant.log_grid import Grid, Segment, make_grid
-from thermogrip.sysid.validation.prediction_bands import free_run_band
+from thermogrip.sysid.validation.stated_errors import free_run_band
 
 
 def lagged_log(seed, n=1200, *, phi=0.9, noise=0.15):

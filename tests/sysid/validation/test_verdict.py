@@ -14,8 +14,7 @@ from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.fit_record import fit_logs
 from thermogrip.sysid.plant.plant import Plant
 from thermogrip.sysid.validation.free_run import free_run
-from thermogrip.sysid.validation.prediction_bands import Band, InputEffect
-from thermogrip.sysid.validation.verdict import NO_BETTER, judge
+from thermogrip.sysid.validation.stated_errors import NO_BETTER, Band, InputEffect, judge
 
 KEEP = 0.95
 

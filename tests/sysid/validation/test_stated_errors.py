@@ -19,7 +19,7 @@ from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.fit_record import HeldOut, PlantScores
 from thermogrip.sysid.plant.plant import Plant
 from thermogrip.sysid.validation.free_run import free_run
-from thermogrip.sysid.validation.prediction_bands import (
+from thermogrip.sysid.validation.stated_errors import (
     MOST_DISAGREEMENT,
     between_runs,
     check_ensemble,
