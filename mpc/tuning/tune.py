@@ -355,9 +355,7 @@ class Bench:
         """Return a controller whose trials run in C where there is one."""
         return made_for_trials(kind, self.plant, design, c=self._c)
 
-    def run(
-        self, kind: str, design: Design, draws: Sequence[int], seed: int, *, loads: bool = True
-    ) -> list[StepResult]:
+    def run(self, kind: str, design: Design, draws: Sequence[int], seed: int) -> list[StepResult]:
         """Return the results on these draws, what the plant lacks on the first alone."""
         cases = [
             replace(case, seconds=self.lengths[case.start, case.target])
@@ -365,7 +363,7 @@ class Bench:
         ]
         for words in self.lacking:  # which settle later
             cases += steps_on(self.spec, draws[:1], words)
-        cases += self.loads_on(draws) if loads else []
+        cases += self.loads_on(draws)
         return run_trials(self.made(kind, design), self.plant, self.spec, cases, seed=seed)
 
     def loads_on(self, draws: Sequence[int]) -> list[Case]:
@@ -381,7 +379,7 @@ class Bench:
         """Return the trial of a design on the search's draws."""
         design, results = self.design(kind, parameters), []
         for noise in range(COSTS.noises):
-            results += self.run(kind, design, self.draws, self.seed + noise, loads=not noise)
+            results += self.run(kind, design, self.draws, self.seed + noise)
         parts_of_score = score(results, self.spec, self.scales)
         cost = parts_of_score.total
         if kind == "MPC":

@@ -14,7 +14,7 @@ from thermogrip.mpc.controllers.mpc import Controller, load_controller
 from thermogrip.mpc.controllers.pi import PIController
 from thermogrip.mpc.design.spec import Spec
 from thermogrip.mpc.tuning.design_review import review
-from thermogrip.mpc.tuning.objective import Case, Load, Score, StepResult, meets_spec
+from thermogrip.mpc.tuning.objective import COSTS, Case, Load, Score, StepResult, meets_spec
 from thermogrip.mpc.tuning.tune import (
     Row,
     Trial,
@@ -66,6 +66,9 @@ def test_each_controller_is_compared_on_steps_and_on_loads_of_each_drive_and_out
         for load in ("", "drive by -0.2", "t_surface by -0.8")
     ]
     assert tuning.scores.keys() == {"baseline", "tuned", "PI"}
+    loads = [result for result in tuning.history[0].results if result.case.load]
+    of_first = [result.iae for result in loads if result.case == loads[0].case]
+    assert len(set(of_first)) == COSTS.noises  # as the steps, each in several noises
     assert list(tuning.runs) == [
         f"{title}, {kind}"
         for title in ("28 to 36", "drive by -0.2", "t_surface by -0.8")
