@@ -57,9 +57,9 @@ if TYPE_CHECKING:
 class SearchSettings:
     """How designs are searched and compared."""
 
-    # Relative fall of the score that counts. On unseen draws the score of 79 designs of seven plants, over the
-    # default's, is less than the mean of both errors over the default's on the truth by .06 in the logarithm
-    # and a standard deviation of .09 from plant to plant (eight_plants.py): their sum, as a fall.
+    # Relative fall of the score that counts. On unseen draws the score of 79 designs of seven plants, over
+    # their default's, is less than the mean of both errors over the default's on the truth by .06 in the
+    # logarithm and a standard deviation of .09 from plant to plant (eight_plants.py): their sum, as a fall.
     won: float = 0.14
     # relative rise of steps or of loads from which an MPC is not taken, whatever it wins on the other: trials
     # are the model's word, and on two of eight plants the truth denied it
