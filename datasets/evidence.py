@@ -43,6 +43,7 @@ class EvidenceSettings:
     blocks: tuple[int, ...] = (1, 3, 10, 30)  # rows that are averaged: slow effects drown in noise at one
     latest: int = 10  # rows by which a reading of an input is late
     filters: tuple[int, ...] = (3, 10, 30)
+    jump: float = 10.0  # times what a column rarely moves, is no move of it
     telling_rows: int = 200  # of fewer, an effect may not be seen
     follows: float = 0.9  # share of its variance that another input explains
 
@@ -116,6 +117,10 @@ def _standardised(columns: Sequence[Floats]) -> list[Floats]:
     for values in (column[: EVIDENCE.most_rows] for column in columns):
         rows, finite = np.arange(values.size), np.isfinite(values)
         filled = np.interp(rows, rows[finite], values[finite]) if finite.any() else np.zeros(values.size)
+        moves = np.diff(filled, prepend=filled[0])
+        usual = np.quantile(np.abs(moves[moves != 0]), 0.99) if moves.any() else 0.0
+        # where a sensor or its unit is changed, the course before and after it tells all the same
+        filled = filled[0] + np.cumsum(np.where(np.abs(moves) > EVIDENCE.jump * usual, 0.0, moves))
         scaled.append((filled - filled.mean()) / (np.std(filled) or 1.0))
     return scaled
 
@@ -246,6 +251,9 @@ def _unlike_an_input(
     values = columns[name]
     if only_rises(values):
         return "only rises or falls, as a total does"
+    others_held = any(is_held(columns[n]) for n in other_inputs)
+    if others_held and not is_held(values) and is_moved(columns, name, other_inputs, at_lags=all):
+        return f"responds to {', '.join(other_inputs)}: is it read?"
     for pair in () if is_held(values) else combinations(read, 2):
         # under a proportional controller one reading is enough
         both = [columns[n] for n in pair]

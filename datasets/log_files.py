@@ -411,6 +411,7 @@ def _repair(
     columns = {name: values[once][ordered.rows] for name, values in columns.items()}
     if time.size < 2:
         raise UserError(f"{time.size} row(s) are not a log", file=table.file, hint="give at least two rows")
+    repairs += repair.doubt_repeats([*columns.values()], table.lines[once][ordered.rows])
     time, findings = since_first_row(time)
     repairs += findings + repair.describe_steps(time)
     inputs, stuck = [values for name, values in columns.items() if roles[name] == "input"], False
@@ -446,7 +447,8 @@ def _reading_doubts(roles: Mapping[str, str], log: _Repaired) -> list[str]:
     """Return a line for each reading with runs like a sensor's code, or a jump that no input makes."""
     inputs = [values for name, values in log.columns.items() if roles[name] == "input"]
     readings = {name: v for name, v in log.columns.items() if roles[name] in ("output", "disturbance")}
-    doubts = (repair.doubt_readings(name, values, inputs, log.time) for name, values in readings.items())
+    doubts = [repair.doubt_readings(name, values, inputs, log.time) for name, values in readings.items()]
+    doubts += [repair.doubt_rows(name, v, inputs) for name, v in readings.items() if roles[name] == "output"]
     return [doubt for doubt in doubts if doubt]
 
 

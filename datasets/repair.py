@@ -35,6 +35,7 @@ SPIKE_LENGTH = 3  # samples at most of a spike
 _SLOW_ROWS = 60.0  # s
 GAP_SECONDS = 10.0  # of the least gap
 GAP_STEPS = 5.0  # median steps of the rows, of the least gap
+_REPEATED = 32  # rows with moves in most of them, that are not alike by chance
 _OTHER_STEP = 1.5  # times as long: no jitter, another step
 _FEW, _MOST_MOVED = 0.05, 10  # share of rows whose time may be wrong; rows that one may be out of place
 
@@ -180,10 +181,13 @@ def drop_codes(name: str, values: Floats) -> tuple[Floats, list[str]]:
 
 
 def doubt_readings(name: str, values: Floats, inputs: Sequence[Floats], time: Floats) -> str:
-    """Return the doubt on the ends of an output's range or on its largest jump, empty where there is none."""
+    """Return the doubt on a reading's ends of its range, largest jump or order, empty where there is none."""
     moves = np.abs(np.diff(values))
     if values.size < SPIKE_WINDOW or not np.isfinite(moves).any():
         return ""
+    least = float(np.min(moves[moves > 0], initial=np.inf))
+    if np.nanmean(moves) > 2 * np.nanmean(np.abs(values[2:] - values[:-2])):  # alike where all is noise
+        return f"{name} goes to and fro from row to row: are its rows of two logs?"
     for end in (np.nanmin(values), np.nanmax(values)):
         rows = _rows_beyond_jumps(values, values == end)
         edges = np.flatnonzero(np.diff(rows.astype(int)))
@@ -192,21 +196,69 @@ def doubt_readings(name: str, values: Floats, inputs: Sequence[Floats], time: Fl
             says = f"{name} jumps to {end:g} and stays in {rows.sum()} rows while no input moves"
             return f"{says}: if that is a sensor's code, leave those cells empty"
         edges = np.flatnonzero(np.diff((values == end).astype(int), prepend=0, append=0)).reshape(-1, 2)
-        start, stop = max(edges.tolist(), key=lambda run: run[1] - run[0])
-        moves_before = moves[max(start - SPIKE_WINDOW, 0) : max(start - 1, 0)]
-        # a reading that settles has stood still between its steps before; one with noise never stands still
-        if stop - start >= SPIKE_WINDOW and np.count_nonzero(moves_before) > SPIKE_WINDOW / 2:
-            says = f"{name} is held at {end:g} for {stop - start} rows, as where its sensor ends"
+        # a reading that settles goes to and fro by its least step before; one with noise never stands still
+        before = [moves[max(a - SPIKE_WINDOW, 0) : max(a - 1, 0)] for a, _ in edges.tolist()]
+        held = [
+            b - a
+            for (a, b), m in zip(edges.tolist(), before)
+            if b - a > 4 and np.count_nonzero(m) > SPIKE_WINDOW / 2 and np.nanmean(m) > 2 * least
+        ]
+        if sum(held) >= SPIKE_WINDOW:
+            says = f"{name} is held at {end:g} for {sum(held)} rows, as where its sensor ends"
             return f"{says}: leave those cells empty"
     row = int(np.nanargmax(moves))
     before, after = values[max(row - SPIKE_WINDOW, 0) : row + 1], values[row + 1 : row + 1 + SPIKE_WINDOW]
     stays = np.abs(np.nanmedian(after) - np.nanmedian(before)) > moves[row] / 2
     in_gap = time[row + 1] - time[row] > GAP_STEPS * np.median(np.diff(time))
     beyond_jump = _rows_beyond_jumps(values, np.arange(values.size) > row).any()
-    if not stays or in_gap or _any_moves(inputs, row) or not beyond_jump:
+    if not stays or in_gap or not beyond_jump:
         return ""
-    problem = f"{name} jumps from {values[row]:g} to {values[row + 1]:g} and stays there while no input moves"
-    return f"{problem}: if its sensor was changed there, cut the log: LOG@{time[row + 1] - time[0]:g}:"
+    problem = f"{name} jumps from {values[row]:g} to {values[row + 1]:g} and stays there, as nowhere else"
+    return f"{problem}: if its sensor or unit changed there, cut the log: LOG@{time[row + 1] - time[0]:g}:"
+
+
+def doubt_rows(name: str, values: Floats, inputs: Sequence[Floats]) -> str:
+    """Return the doubt on an output that is read in n-th rows only, held or drawn straight between."""
+    finite = values[np.isfinite(values)]
+    if finite.size < values.size or not finite.size:
+        return ""
+    moves = np.diff(values)
+    turns = np.diff(moves)
+    least = 2.0 * np.abs(moves[moves != 0]).min(initial=np.inf)  # twice the steps of its numbers
+    for between, of in (("held", moves != 0), ("drawn straight", (np.abs(turns) > least))):
+        rows = np.flatnonzero(of)
+        if rows.size < SPIKE_WINDOW or (n := int(np.median(np.diff(rows)))) < 2:
+            continue
+        alike = [np.bincount(r % n).max(initial=0) / max(r.size, 1) for r in (rows, *map(_moved, inputs))]
+        if alike[0] > 1 - _FEW and max(alike[1:], default=0.0) <= 1 - _FEW:
+            return f"{name} is read in every {n}th row only, {between} in those between: average the log"
+    return ""
+
+
+def _moved(values: Floats) -> NDArray[np.int64]:
+    return np.flatnonzero(np.diff(values))
+
+
+def doubt_repeats(columns: Sequence[Floats], lines: NDArray[np.int64]) -> list[str]:
+    """Return a line where rows repeat others, cell for cell, in more rows than by chance."""
+    rows = np.unique(np.nan_to_num(np.column_stack(columns)), axis=0, return_inverse=True)[1].ravel()
+    moves = np.concatenate([[0], np.cumsum(np.diff(rows) != 0)])
+    mixed = rows.astype(np.uint64) + np.uint64(1)
+    length = 1
+    while length < _REPEATED:  # each is a number of as many rows as its place is long
+        mixed = (mixed[:-length] * np.uint64(0x9E3779B97F4A7C15)) ^ (mixed[length:] + np.uint64(length))
+        length *= 2
+    if mixed.size < 2:
+        return []
+    telling = moves[length - 1 :] - moves[: moves.size - length + 1] > length / 2
+    places = np.flatnonzero(telling)
+    first, inverse = np.unique(mixed[places], return_index=True, return_inverse=True)[1:]
+    again = places[places[first[inverse.ravel()]] < places]
+    if not again.size:
+        return []
+    one = int(places[first[inverse.ravel()]][np.searchsorted(places, again[0])])
+    says = f"rows {lines[again[0]]} to {lines[again[-1] + length - 1]} repeat those from {lines[one]} on"
+    return [Doubt(f"{says}: cut the file there in two")]
 
 
 def _any_moves(inputs: Sequence[Floats], row: int) -> bool:

@@ -34,7 +34,7 @@ from thermogrip.datasets import limits
 from thermogrip.datasets.atomic_files import read_bytes
 from thermogrip.datasets.errors import UserError, as_user_error, reading
 from thermogrip.datasets.media import from_csv
-from thermogrip.datasets.repair import name_rows
+from thermogrip.datasets.repair import Doubt, name_rows
 from thermogrip.datasets.units import read_header
 
 if TYPE_CHECKING:
@@ -79,6 +79,8 @@ _NUMBER_CELL = re.compile(
 )
 # what programs print within numbers: a mark between thousands, blanks behind a sign
 _PRINTED_BLANKS = re.compile(r"(?<=\d)[\xa0\u2009\u202f'\u2019](?=\d{3}(?!\d))|(?<=^[+-])\s+(?=\d)")
+_OPEN = re.compile(r"[+-]?[1-9]\d{0,2}[.,]\d{3}")  # a number with a mark of decimals, or of thousands
+_SCALES = re.compile(r"(?i)scal(e|ing)|factor|faktor|multipl|offset|\bx ?10+\b")
 _WITH_UNIT = re.compile(r"([+-]?[\d.,]+(?:[eE][+-]?\d+)?)\s*([^\W\d_]{1,4}|%|[°º]\s?[CFK])")
 
 
@@ -217,6 +219,9 @@ def find_layout(text: str, file: str, *, named: bool = False) -> Layout:
     passed = sum(not line.startswith(_COMMENT) for _, line in head[:first]) - used
     if passed:
         notes.append(f"{passed} line(s) before the table passed over")
+    for place, line in head[:first]:
+        if _SCALES.search(line) and not {*_split_cells(line, separator)} & {*header}:
+            notes.append(Doubt(f"line {place} may change the numbers under it: {_quoted_cell(line)}"))
     return Layout(names, head[first][0] - 1, separator, tuple(notes), header)
 
 
@@ -451,8 +456,37 @@ def _parse_table(
             faults += [] if name.startswith(_LEFT_OUT) else [fault]
     if faults:
         raise _with_command(faults, names) if tolerated else faults[0]  # what may be broken is a log
-    notes += _left_empty_by_quality(columns) if tolerated else []
+    if tolerated:
+        notes += _left_empty_by_quality(columns)
+        notes += _open_marks(
+            {
+                c.name: cells
+                for c, cells in zip(columns, zip(*(cells for _, cells in rows)))
+                if c.numbers is not None
+            },
+            layout.separator,
+        )
     return _table_of(columns, file, lines, notes)
+
+
+def _open_marks(cells_of: Mapping[str, Sequence[str]], separator: str) -> list[str]:
+    """Return a line for each column whose mark may be of decimals or thousands (``1,250``) where no other
+    column shows which mark is the one of decimals."""
+    if separator == "," or not any("," in cells[0] + cells[-1] for cells in cells_of.values()):
+        return []
+    opened: dict[str, str] = {}
+    decimal: set[str] = set()
+    for name, cells in cells_of.items():
+        marked = [cell for cell in cells if "," in cell or "." in cell]
+        if marked and all(map(_OPEN.fullmatch, map(str.strip, marked))):
+            opened[name] = marked[0].strip()
+        else:
+            decimal |= {max(cell, key=lambda sign: cell.rfind(sign) * (sign in ",.")) for cell in marked}
+    return [
+        Doubt(f"{name}: is {cell} a number of thousands? It is read as {cell.replace(',', '.')}")
+        for name, cell in opened.items()
+        if decimal - {cell.strip("+-0123456789")} or (not decimal and "," in cell)
+    ]
 
 
 def _left_empty_by_quality(columns: Sequence[Column]) -> list[str]:
