@@ -120,7 +120,9 @@ def _standardised(columns: Sequence[Floats]) -> list[Floats]:
         moves = np.diff(filled, prepend=filled[0])
         usual = np.quantile(np.abs(moves[moves != 0]), 0.99) if moves.any() else 0.0
         # where a sensor or its unit is changed, the course before and after it tells all the same
-        filled = filled[0] + np.cumsum(np.where(np.abs(moves) > EVIDENCE.jump * usual, 0.0, moves))
+        beyond = np.abs(moves) > EVIDENCE.jump * usual
+        if np.count_nonzero(beyond) == 1:  # a drive jumps more often
+            filled = filled[0] + np.cumsum(np.where(beyond, 0.0, moves))
         scaled.append((filled - filled.mean()) / (np.std(filled) or 1.0))
     return scaled
 
@@ -251,9 +253,6 @@ def _unlike_an_input(
     values = columns[name]
     if only_rises(values):
         return "only rises or falls, as a total does"
-    others_held = any(is_held(columns[n]) for n in other_inputs)
-    if others_held and not is_held(values) and is_moved(columns, name, other_inputs, at_lags=all):
-        return f"responds to {', '.join(other_inputs)}: is it read?"
     for pair in () if is_held(values) else combinations(read, 2):
         # under a proportional controller one reading is enough
         both = [columns[n] for n in pair]
@@ -262,6 +261,9 @@ def _unlike_an_input(
     for other in other_inputs:
         if share_followed(values, columns[other]) > EVIDENCE.follows:
             return f"follows {other}: it may be a reading of it, and their effects cannot be told apart"
+    others_held = any(is_held(columns[n]) for n in other_inputs)
+    if others_held and not is_held(values) and is_moved(columns, name, other_inputs, at_lags=all):
+        return f"responds to {', '.join(other_inputs)}: is it read?"
     beside = [*other_inputs, *outputs]
     if values.size >= EVIDENCE.telling_rows and not any(_acts(columns, name, y, beside) for y in outputs):
         return f"no reading responds to it ({', '.join(outputs)})"

@@ -197,10 +197,10 @@ def doubt_readings(name: str, values: Floats, inputs: Sequence[Floats], time: Fl
             return f"{says}: if that is a sensor's code, leave those cells empty"
         edges = np.flatnonzero(np.diff((values == end).astype(int), prepend=0, append=0)).reshape(-1, 2)
         # a reading that settles goes to and fro by its least step before; one with noise never stands still
-        before = [moves[max(a - SPIKE_WINDOW, 0) : max(a - 1, 0)] for a, _ in edges.tolist()]
+        earlier = [moves[max(a - SPIKE_WINDOW, 0) : max(a - 1, 0)] for a, _ in edges.tolist()]
         held = [
             b - a
-            for (a, b), m in zip(edges.tolist(), before)
+            for (a, b), m in zip(edges.tolist(), earlier)
             if b - a > 4 and np.count_nonzero(m) > SPIKE_WINDOW / 2 and np.nanmean(m) > 2 * least
         ]
         if sum(held) >= SPIKE_WINDOW:

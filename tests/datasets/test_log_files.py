@@ -827,7 +827,7 @@ def test_sensors_changed_over_are_asked_about(write, swapped):
     pairs = zip(heater, np.where(late, far, near), np.where(late, near, far))
     rows = "".join(f"{k},{u},{a:.2f},{b:.2f}\n" for k, (u, a, b) in enumerate(pairs))
     doubts = read_log(write("time_s,heater,t_a_degC,t_b_degC\n" + rows)).attrs["role_doubts"]
-    assert doubts.count("stays there while no input moves") == 2 * swapped
+    assert doubts.count("stays there, as nowhere else") == 2 * swapped
     assert ("LOG@370:" in doubts) == swapped
 
 
