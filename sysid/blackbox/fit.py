@@ -23,6 +23,7 @@ from thermogrip.datasets.errors import UserError, known_names
 from thermogrip.datasets.schema import Log
 from thermogrip.sysid.blackbox.order_selection import (
     MANY_ROWS,
+    ORDER_MARGIN,
     Choice,
     Family,
     Model,
@@ -205,7 +206,7 @@ def _with_convention(
         except UserError:  # no structure of it is stable
             return grid, choice
         excess = np.log(choice.errors[choice.structure]) - np.log(other.errors[other.structure])
-        if excess_within_noise(excess):
+        if excess_within_noise(excess, ORDER_MARGIN):  # neither is richer
             return grid, choice
     return moved, other
 

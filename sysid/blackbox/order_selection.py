@@ -10,8 +10,7 @@ smallest structure is taken for which
     mean_f ln(e_sf / e_bf) <= min(se_f ln(e_sf / e_bf), ln 1.05),        ln 1.2 over whole logs,
 
 with the standard error of the paired differences. A richer class of models (with products of inputs, of a
-nonlinear kind, with inputs applied up to their rows) is taken only where the best of it wins by more than the
-standard error, or ln 1.1.
+nonlinear kind) is taken only where the best of it wins by more than the standard error, or ln 1.1.
 """
 
 from __future__ import annotations
