@@ -1,7 +1,7 @@
 """A lumped thermal network as a model: nodes, links, pipes, Peltiers, heaters, sensors.
 
 The network is declared in TOML (:mod:`thermogrip.sysid.models.network_spec`).  One arithmetic of a step runs
-on NumPy rows, CasADi symbols and SIMD vectors: no branch depends on a temperature, an input or a parameter.
+on numbers, NumPy rows and CasADi symbols: no branch depends on a temperature, an input or a parameter.
 
 Every state x_i is a temperature [degC] of a heat capacity C_i, and C_i dx_i/dt = sum of q, the heat that
 flows to it; z is x followed by the boundary temperatures (disturbances, then fixed ones).  A sensor is a
@@ -10,9 +10,9 @@ state too: its time constant is C, a unit flow from its node for q.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -23,8 +23,8 @@ from thermogrip.datasets.arrays import Array, Run, Values
 from thermogrip.datasets.errors import UserError
 from thermogrip.sysid.models.model import SMOOTH, Described, FreeRuns, Sizes
 from thermogrip.sysid.models.network_spec import (
-    Heater,
     Network,
+    Parameter,
     Peltier,
     Pipe,
     named_network,
@@ -41,221 +41,28 @@ GAMMA = 0.2928932188134524  # 1 - 1/sqrt(2)
 KELVIN = 273.15
 DROOP_SPAN = 50.0  # K between face and sink to which the droop refers
 
-# coefficients of one Peltier element, in this order
-PELTIER = (
-    *("seebeck", "resistance", "current", "offset", "heating_gain", "cooling_gain", "droop", "full"),
-    *("dead_zone", "seebeck_slope", "resistance_slope"),
-)
 REFERENCE = 25.0  # degC at which a Peltier element has its nominal numbers
 BEND_SPAN = 10.0  # K to which the bend of a conductance refers
+STEFAN_BOLTZMANN = 5.670374419e-8  # W m^-2 K^-4
 
 
-class Coefficient(NamedTuple):
-    """A number times at most two parameters, by their places in p."""
+class _Exchange(NamedTuple):
+    """Heat that flows along a conductance from a place to a state."""
 
-    scale: float
-    places: tuple[int, ...] = ()
-
-    def of(self, p: Values) -> Any:
-        """Return its value at the parameters p."""
-        value: Any = self.scale
-        for place in self.places:
-            value = value * p[place]
-        return value
-
-
-_NONE, _ONE = Coefficient(0.0), Coefficient(1.0)
-
-
-class _Link(NamedTuple):
-    """What heat flows along from ``source``, an index into z, to a state; ``both``: taken from there too."""
-
-    to: int
-    source: int
-    value: Coefficient
-    both: bool
-    switch: int = -1  # an input, or -1
-    off: Coefficient = _NONE  # the share that is left with the switch off
-    bend: Coefficient | None = None
-
-
-class _Heater(NamedTuple):
-    state: int
-    source: int  # an input, or an index into z of what is measured
-    measured: bool
-    power: Coefficient  # of one unit of the source
-
-
-class _Peltier(NamedTuple):
-    face: int
-    sink: int
-    input: int
-    duty: bool  # whether by a pulse-width driver
-    values: tuple[Coefficient, ...]  # in the order of PELTIER
+    to: str
+    source: str
+    conductance: Any  # [W/K]
+    both: bool = True  # whether it is taken from the source: the water of a flow moves on with its heat
+    bend: Any = None  # share by which the conductance grows per 10 K
 
 
 class _Pivot(NamedTuple):
     """One step of an elimination."""
 
-    state: int
+    state: str
     inverse: Any  # of the pivot
-    below: dict[int, Any]  # by row: what was taken of the pivot's
-    right: dict[int, Any]  # by column: the pivot's row
-
-
-@dataclass(frozen=True)
-class ThermalSteps:
-    """The equations of a network.  Places are numbers and no parameter has a value, so that networks of one
-    structure share what is compiled."""
-
-    sizes: Sizes
-    switches: tuple[int, ...]  # inputs that are on or off
-    capacities: tuple[Coefficient, ...]  # by state
-    fixed: tuple[Coefficient, ...]  # temperatures of the boundaries
-    links: tuple[_Link, ...]
-    radiation: tuple[_Link, ...]
-    heaters: tuple[_Heater, ...]
-    peltiers: tuple[_Peltier, ...]
-    outputs: tuple[int, ...]  # (n_y,) state that each output reads
-
-    def step(self, x: Values, u: Values, d: Values, p: Values, h: Any) -> list[Any]:
-        """Return the state ``h`` [s] later."""
-        capacity = self.capacity(p)
-        # A holds the conductances and flows, the only stiff terms
-        factors = self._factors(capacity, self._conductances(u, p), GAMMA * h)
-        # (1 - g h A) k_1 = f(x)
-        k = _solved(factors, [a / b for a, b in zip(self.heat(x, u, d, p), capacity)])
-        q = self.heat([a + h * b for a, b in zip(x, k)], u, d, p)
-        # (1 - g h A) k_2 = f(x + h k_1) - 2 k_1, x+ = x + h (3 k_1 + k_2) / 2
-        k2 = _solved(factors, [a / b - 2.0 * e for a, b, e in zip(q, capacity, k)])
-        return [a + h * (1.5 * e + 0.5 * b) for a, e, b in zip(x, k, k2)]
-
-    def output(self, x: Values, p: Values) -> list[Any]:
-        """Return what the sensors read [degC]."""
-        return [x[i] for i in self.outputs]
-
-    def capacity(self, p: Values) -> list[Any]:
-        """Return the heat capacity of each state [J/K] (sensors: time constant [s])."""
-        return [item.of(p) for item in self.capacities]
-
-    def _conductances(self, u: Values, p: Values) -> list[Any]:
-        """Return the conductance [W/K] of every link at these switch positions."""
-        # conductances and flows may hang on a switch, such as a pump, that leaves a share of them when off
-        values = []
-        for link in self.links:
-            value = link.value.of(p)
-            if link.switch >= 0:
-                off = link.off.of(p)
-                value = value * (off + (1.0 - off) * u[link.switch])
-            values.append(value)
-        return values
-
-    def heat(self, x: Values, u: Values, d: Values, p: Values) -> list[Any]:
-        """Return the heat that each state receives [W] (sensors: [K])."""
-        z, n = [*x, *d, *(item.of(p) for item in self.fixed)], self.sizes.n_x
-        q = [0.0 * z[i] for i in range(n)]
-
-        def move(i: int, j: int, flow: Any, both: bool = True) -> None:
-            q[i] = q[i] + flow
-            if both and j < n:
-                q[j] = q[j] - flow
-
-        for link, conductance in zip(self.links, self._conductances(u, p)):
-            # taken from j, given to i; of a flow given to i only, the water of i moved on with its heat
-            rise = z[link.source] - z[link.to]
-            move(link.to, link.source, conductance * rise, link.both)
-            if link.bend is not None:
-                # q_ij = G_ij (z_j - z_i) (1 + b |z_j - z_i| / 10 K)
-                bent = conductance * link.bend.of(p) / BEND_SPAN * rise * abs(rise)
-                move(link.to, link.source, bent, link.both)
-        for link in self.radiation:
-            # q_ij = k (T_j^4 - T_i^4)
-            a, b = z[link.to] + KELVIN, z[link.source] + KELVIN
-            move(link.to, link.source, link.value.of(p) * (b * b * b * b - a * a * a * a))
-        for heater in self.heaters:
-            # P u, or P d of what is measured and not moved
-            drive = (z if heater.measured else u)[heater.source]
-            q[heater.state] = q[heater.state] + heater.power.of(p) * drive
-        for element in self.peltiers:
-            at_face, at_sink = _peltier_heat(element, u[element.input], z[element.face], z[element.sink], p)
-            q[element.face] = q[element.face] + at_face
-            q[element.sink] = q[element.sink] + at_sink
-        return q
-
-    def _factors(self, capacity: Values, g: Values, gh: Any) -> list[_Pivot]:
-        """Return the LU factors of 1 - gh A, by rows of what is not 0."""
-        rows: list[dict[int, Any]] = [{i: 1.0} for i in range(self.sizes.n_x)]
-
-        def add(row: int, column: int, value: Any) -> None:
-            rows[row][column] = rows[row][column] + value if column in rows[row] else value
-
-        for link, conductance in zip(self.links, g):
-            i, j = link.to, link.source
-            share = gh * conductance / capacity[i]
-            add(i, i, share)
-            if j < len(rows):
-                add(i, j, -share)
-                if link.both:
-                    share = gh * conductance / capacity[j]
-                    add(j, j, share)
-                    add(j, i, -share)
-        # 1 - gh A is diagonally dominant by columns and needs no pivots for its size
-        factors, remaining = [], set(range(len(rows)))
-        while remaining:
-            # the state with the fewest neighbours first, so that little is filled in
-            neighbours = {i: sum(j in rows[i] or i in rows[j] for j in remaining) for i in remaining}
-            pivot = min(remaining, key=lambda i: (neighbours[i], i))
-            remaining.remove(pivot)
-            inverse = 1.0 / rows[pivot][pivot]
-            right = {column: value for column, value in rows[pivot].items() if column in remaining}
-            below = {row: rows[row][pivot] * inverse for row in sorted(remaining) if pivot in rows[row]}
-            for row, share in below.items():
-                for column, value in right.items():
-                    add(row, column, -(share * value))
-            factors.append(_Pivot(pivot, inverse, below, right))
-        return factors
-
-
-def _peltier_heat(peltier: _Peltier, u: Any, t_face: Any, t_sink: Any, p: Values) -> tuple[Any, Any]:
-    """Return the heat that face and sink of an element receive [W]."""
-    element = {name: item.of(p) for name, item in zip(PELTIER, peltier.values)}
-    v, dead = u / element["full"] + element["offset"], element["dead_zone"]
-    # beyond a dead zone v_d, v - v_d replaces the command v
-    v = v - 0.5 * (abs(v + dead) - abs(v - dead))
-    # the current follows by two gains, I = I_max (g_heat max(v, 0) + g_cool min(v, 0)), and droops by a share
-    # per 50 K between face and sink
-    size = abs(v)
-    up, down = element["heating_gain"] * 0.5 * (v + size), element["cooling_gain"] * 0.5 * (v - size)
-    droop = element["droop"] / DROOP_SPAN * (t_face - t_sink)
-    if peltier.duty:
-        # pulses of I_max (1 - r dT / 50) for the share v of the time: Joule heat goes with v, not its square
-        on = element["current"] * (1.0 - droop)
-        current, square = up * on, up * on * on
-    else:
-        current = element["current"] * ((up + down) - droop * (up - down))
-        square = current * current
-    # a and R follow the mean temperature of the element by a share per kelvin
-    warm = 0.5 * (t_face + t_sink) - REFERENCE
-    pumped = element["seebeck"] * (1.0 + element["seebeck_slope"] * warm) * current
-    joule = 0.5 * element["resistance"] * (1.0 + element["resistance_slope"] * warm) * square
-    # a I T_face + R I^2 / 2 and -a I T_sink + R I^2 / 2, T in kelvin
-    return pumped * (t_face + KELVIN) + joule, joule - pumped * (t_sink + KELVIN)
-
-
-def _solved(factors: list[_Pivot], q: list[Any]) -> list[Any]:
-    """Return the solution of (1 - gh A) k = q, in the place of ``q``."""
-    for pivot in factors:
-        for row, share in pivot.below.items():
-            q[row] = q[row] - share * q[pivot.state]
-    for pivot in reversed(factors):
-        value = q[pivot.state]
-        for column, entry in pivot.right.items():
-            value = value - entry * q[column]
-        q[pivot.state] = value * pivot.inverse
-    return q
-
-
-STEFAN_BOLTZMANN = 5.670374419e-8  # W m^-2 K^-4
+    below: dict[str, Any]  # by row: what was taken of the pivot's
+    right: dict[str, Any]  # by column: the pivot's row
 
 
 def state_names(network: Network) -> tuple[str, ...]:
@@ -270,120 +77,144 @@ def state_names(network: Network) -> tuple[str, ...]:
     return (*network.nodes, *cells, *sensors)
 
 
-class _Places:
-    """Where the names of a network stand in z, u and p."""
-
-    def __init__(self, network: Network) -> None:
-        states = state_names(network)
-        self.n_x = len(states)
-        self.z = {name: i for i, name in enumerate([*states, *network.disturbances, *network.boundaries])}
-        self.u = {name: i for i, name in enumerate(network.inputs)}
-        self._p = list(network.parameters)
-
-    def coefficient(self, *names: str, scale: float = 1.0) -> Coefficient:
-        return Coefficient(scale, tuple(self._p.index(name) for name in names))
-
-    def share(self, off: str | None) -> Coefficient:
-        return _NONE if off is None else self.coefficient(off)
-
-    def switch(self, name: str | None) -> int:
-        return -1 if name is None else self.u[name]
-
-    def receiver(self, between: list[str]) -> tuple[int, int]:
-        """Return (to, from) such that the receiver is a state."""
-        a, b = (self.z[name] for name in between)
-        return (a, b) if a < self.n_x else (b, a)
-
-
-def thermal_steps(network: Network) -> ThermalSteps:
-    """Return the equations of a checked network."""
-    at = _Places(network)
-    return ThermalSteps(
-        sizes=Sizes(at.n_x, len(network.inputs), len(network.disturbances), len(network.parameters)),
-        switches=tuple(k for k, item in enumerate(network.inputs.values()) if item.switch),
-        capacities=tuple(_capacities(network, at)),
-        fixed=tuple(at.coefficient(item.temperature) for item in network.boundaries.values()),
-        links=tuple(_links(network, at)),
-        radiation=tuple(
-            _Link(*at.receiver(r.between), at.coefficient(r.area, r.emissivity, scale=STEFAN_BOLTZMANN), True)
-            for r in network.radiation.values()
-        ),
-        heaters=tuple(_heater(network, heater, at) for heater in network.heaters.values()),
-        peltiers=tuple(_peltier(network, element, at) for element in network.peltiers.values()),
-        outputs=tuple(
-            at.z[o.node if o.lag is None else f"{name}.sensor"] for name, o in network.outputs.items()
-        ),
-    )
-
-
-def _capacities(network: Network, at: _Places) -> Iterator[Coefficient]:
-    """Yield the capacity of each state in order."""
+def _capacities(network: Network, p: Mapping[str, Any]) -> Iterator[Any]:
+    """Yield the heat capacity [J/K] of each state in order (sensors: the time constant [s])."""
     for node in network.nodes.values():
-        yield at.coefficient(node.capacity)
+        yield p[node.capacity]
     # A pipe of n cells with flow F and delay t holds F t of water.  The mean delay of the chain is t exactly
     # and its spread t / sqrt(n), as in a tube with some mixing.
     for pipe in network.pipes.values():
         for _ in range(pipe.cells):
-            yield at.coefficient(pipe.flow, pipe.delay, scale=1.0 / pipe.cells)
+            yield 1.0 / pipe.cells * p[pipe.flow] * p[pipe.delay]
             if pipe.wall_capacity is not None:
-                yield at.coefficient(pipe.wall_capacity, scale=1.0 / pipe.cells)
+                yield 1.0 / pipe.cells * p[pipe.wall_capacity]
     for output in network.outputs.values():
         if output.lag is not None:
-            yield at.coefficient(output.lag)
+            yield p[output.lag]
 
 
-def _links(network: Network, at: _Places) -> Iterator[_Link]:
+def _exchanges(network: Network, u: Mapping[str, Any], p: Mapping[str, Any]) -> Iterator[_Exchange]:
+    """Yield what links, elements, pipes and sensors exchange at these inputs."""
     for link in network.links.values():
-        bend = None if link.bend is None else at.coefficient(link.bend)
-        value, switch = at.coefficient(link.conductance), at.switch(link.switch)
-        yield _Link(*at.receiver(link.between), value, True, switch, at.share(link.off), bend)
+        to, source = _receiver(network, link.between)
+        bend = None if link.bend is None else p[link.bend]
+        yield _Exchange(to, source, p[link.conductance] * _open(link.switch, link.off, u, p), bend=bend)
     for element in network.peltiers.values():
         if element.conductance is not None:
-            yield _Link(at.z[element.face], at.z[element.sink], at.coefficient(element.conductance), True)
+            yield _Exchange(element.face, element.sink, p[element.conductance])
     for name, pipe in network.pipes.items():
-        yield from _pipe(name, pipe, at)
+        yield from _pipe(name, pipe, u, p)
     for name, output in network.outputs.items():
         if output.lag is not None:
-            yield _Link(at.z[f"{name}.sensor"], at.z[output.node], _ONE, both=False)
+            yield _Exchange(f"{name}.sensor", output.node, 1.0, both=False)
 
 
-def _pipe(name: str, pipe: Pipe, at: _Places) -> Iterator[_Link]:
+def _pipe(name: str, pipe: Pipe, u: Mapping[str, Any], p: Mapping[str, Any]) -> Iterator[_Exchange]:
     """Yield the flow through the cells and out of them, and what each cell exchanges with wall and
     surroundings."""
-    upstream, share, switch = at.z[pipe.source], 1.0 / pipe.cells, at.switch(pipe.switch)
-    flow, off = at.coefficient(pipe.flow), at.share(pipe.off)
+    upstream, share = pipe.source, 1.0 / pipe.cells
+    flow = p[pipe.flow] * _open(pipe.switch, pipe.off, u, p)
     for k in range(1, pipe.cells + 1):
-        water = outside = at.z[f"{name}.{k}"]
-        yield _Link(water, upstream, flow, False, switch, off)
+        water = outside = f"{name}.{k}"
+        yield _Exchange(water, upstream, flow, both=False)
         if pipe.film is not None:
-            outside = at.z[f"{name}.{k}.wall"]
-            film_switch = -1 if pipe.film_off is None else switch
-            film = at.coefficient(pipe.film, scale=share)
-            yield _Link(water, outside, film, True, film_switch, at.share(pipe.film_off))
+            outside = f"{name}.{k}.wall"
+            film_switch = None if pipe.film_off is None else pipe.switch
+            yield _Exchange(water, outside, share * p[pipe.film] * _open(film_switch, pipe.film_off, u, p))
         if pipe.loss is not None and pipe.surroundings is not None:
-            yield _Link(outside, at.z[pipe.surroundings], at.coefficient(pipe.loss, scale=share), True)
+            yield _Exchange(outside, pipe.surroundings, share * p[pipe.loss])
         upstream = water
-    yield _Link(at.z[pipe.target], upstream, flow, False, switch, off)
+    yield _Exchange(pipe.target, upstream, flow, both=False)
 
 
-def _heater(network: Network, heater: Heater, at: _Places) -> _Heater:
-    measured = heater.input in network.disturbances
-    source = (network.disturbances if measured else network.inputs)[heater.input]
-    power = at.coefficient(heater.power, scale=1.0 / source.full_scale)
-    return _Heater(at.z[heater.node], (at.z if measured else at.u)[heater.input], measured, power)
+def _open(switch: str | None, off: str | None, u: Mapping[str, Any], p: Mapping[str, Any]) -> Any:
+    """Return the share of a conductance or flow that a switch, such as a pump, leaves of it."""
+    left_off = 0.0 if off is None else p[off]
+    return 1.0 if switch is None else left_off + (1.0 - left_off) * u[switch]
 
 
-def _peltier(network: Network, element: Peltier, at: _Places) -> _Peltier:
-    values = []
-    for name in PELTIER:
-        if name == "full":
-            values.append(Coefficient(network.inputs[element.input].full_scale))
-        elif (parameter := getattr(element, name)) is None:
-            values.append(_ONE if name.endswith("gain") else _NONE)
-        else:
-            values.append(at.coefficient(parameter))
-    duty = element.driver == "duty"
-    return _Peltier(at.z[element.face], at.z[element.sink], at.u[element.input], duty, tuple(values))
+def _receiver(network: Network, between: Sequence[str]) -> tuple[str, str]:
+    """Return (to, from) such that the receiver is a state."""
+    a, b = between
+    return (b, a) if a in network.disturbances or a in network.boundaries else (a, b)
+
+
+def _peltier_heat(
+    peltier: Peltier, v: Any, t_face: Any, t_sink: Any, p: Mapping[str, Any]
+) -> tuple[Any, Any]:
+    """Return the heat that face and sink of an element receive [W] at a command, a share of full scale."""
+
+    def of(name: str, absent: float = 0.0) -> Any:
+        parameter = getattr(peltier, name)
+        return absent if parameter is None else p[parameter]
+
+    v, dead = v + of("offset"), of("dead_zone")
+    # beyond a dead zone v_d, v - v_d replaces the command v
+    v = v - 0.5 * (abs(v + dead) - abs(v - dead))
+    # the current follows by two gains, I = I_max (g_heat max(v, 0) + g_cool min(v, 0)), and droops by a share
+    # per 50 K between face and sink
+    size = abs(v)
+    up, down = of("heating_gain", 1.0) * 0.5 * (v + size), of("cooling_gain", 1.0) * 0.5 * (v - size)
+    droop = of("droop") / DROOP_SPAN * (t_face - t_sink)
+    if peltier.driver == "duty":
+        # pulses of I_max (1 - r dT / 50) for the share v of the time: Joule heat goes with v, not its square
+        on = of("current") * (1.0 - droop)
+        current, square = up * on, up * on * on
+    else:
+        current = of("current") * ((up + down) - droop * (up - down))
+        square = current * current
+    # a and R follow the mean temperature of the element by a share per kelvin
+    warm = 0.5 * (t_face + t_sink) - REFERENCE
+    pumped = of("seebeck") * (1.0 + of("seebeck_slope") * warm) * current
+    joule = 0.5 * of("resistance") * (1.0 + of("resistance_slope") * warm) * square
+    # a I T_face + R I^2 / 2 and -a I T_sink + R I^2 / 2, T in kelvin
+    return pumped * (t_face + KELVIN) + joule, joule - pumped * (t_sink + KELVIN)
+
+
+def _factors(exchanges: Sequence[_Exchange], capacity: Mapping[str, Any], gh: Any) -> list[_Pivot]:
+    """Return the LU factors of 1 - gh A, by rows of what is not 0."""
+    rows: dict[str, dict[str, Any]] = {state: {state: 1.0} for state in capacity}
+
+    def add(row: str, column: str, value: Any) -> None:
+        rows[row][column] = rows[row][column] + value if column in rows[row] else value
+
+    for to, source, conductance, both, _ in exchanges:
+        share = gh * conductance / capacity[to]
+        add(to, to, share)
+        if source in rows:
+            add(to, source, -share)
+            if both:
+                share = gh * conductance / capacity[source]
+                add(source, source, share)
+                add(source, to, -share)
+    # 1 - gh A is diagonally dominant by columns and needs no pivots for its size
+    factors, remaining = [], list(rows)
+    while remaining:
+        # the state with the fewest neighbours first, so that little is filled in
+        pivot = min(remaining, key=lambda i: sum(j in rows[i] or i in rows[j] for j in remaining))
+        remaining.remove(pivot)
+        inverse = 1.0 / rows[pivot][pivot]
+        right = {column: value for column, value in rows[pivot].items() if column in remaining}
+        below = {row: rows[row][pivot] * inverse for row in remaining if pivot in rows[row]}
+        for row, share in below.items():
+            for column, value in right.items():
+                add(row, column, -(share * value))
+        factors.append(_Pivot(pivot, inverse, below, right))
+    return factors
+
+
+def _solved(factors: Sequence[_Pivot], q: dict[str, Any]) -> list[Any]:
+    """Return the solution of (1 - gh A) k = q, by state in the order of ``q``."""
+    k = dict(q)
+    for pivot in factors:
+        for row, share in pivot.below.items():
+            k[row] = k[row] - share * k[pivot.state]
+    for pivot in reversed(factors):
+        value = k[pivot.state]
+        for column, entry in pivot.right.items():
+            value = value - entry * k[column]
+        k[pivot.state] = value * pivot.inverse
+    return list(k.values())
 
 
 @dataclass(frozen=True)
@@ -408,7 +239,6 @@ class NetworkModel(Described):
     def __init__(self, network: Network) -> None:
         super().__init__(network)
         self.network = network
-        self.steps = thermal_steps(network)
         self.states = state_names(network)
         self.n_x = len(self.states)
         self.reference = next((name for name, item in network.outputs.items() if item.reference), None)
@@ -427,11 +257,63 @@ class NetworkModel(Described):
 
     def step(self, x: Values, u: Values, d: Values, p: Values, dt: float) -> list[Any]:
         """Return the state after ``dt`` seconds; numbers, NumPy rows or CasADi symbols alike."""
-        return self.steps.step(x, u, d, p, dt)
+        inputs, parameters = dict(zip(self.inputs, u)), dict(zip(self.parameters, p))
+        capacity = dict(zip(self.states, _capacities(self.network, parameters)))
+        # A holds the conductances and flows, the only stiff terms
+        factors = _factors(list(_exchanges(self.network, inputs, parameters)), capacity, GAMMA * dt)
+        # (1 - g h A) k_1 = f(x)
+        k = _solved(factors, self.rates(x, u, d, p))
+        later = self.rates([a + dt * b for a, b in zip(x, k)], u, d, p)
+        # (1 - g h A) k_2 = f(x + h k_1) - 2 k_1, x+ = x + h (3 k_1 + k_2) / 2
+        k2 = _solved(factors, {name: b - 2.0 * e for (name, b), e in zip(later.items(), k)})
+        return [a + dt * (1.5 * e + 0.5 * b) for a, e, b in zip(x, k, k2)]
 
     def output(self, x: Values, p: Values) -> list[Any]:
         """Return what the sensors read at state x [degC], a list of length n_y."""
-        return self.steps.output(x, p)
+        z = dict(zip(self.states, x))
+        return [z.get(f"{name}.sensor", z[item.node]) for name, item in self.network.outputs.items()]
+
+    def rates(self, x: Values, u: Values, d: Values, p: Values) -> dict[str, Any]:
+        """Return dx/dt [K/s] by state."""
+        capacities = _capacities(self.network, dict(zip(self.parameters, p)))
+        return {name: q / c for (name, q), c in zip(self.heat(x, u, d, p).items(), capacities)}
+
+    def heat(self, x: Values, u: Values, d: Values, p: Values) -> dict[str, Any]:
+        """Return the heat that each state receives [W] (sensors: [K])."""
+        network, inputs = self.network, dict(zip(self.inputs, u))
+        parameters, measured = dict(zip(self.parameters, p)), dict(zip(self.disturbances, d))
+        z = dict(zip(self.states, x)) | measured
+        z |= {name: parameters[item.temperature] for name, item in network.boundaries.items()}
+        q = {name: 0.0 * z[name] for name in self.states}
+
+        def move(to: str, source: str, flow: Any, both: bool = True) -> None:
+            q[to] = q[to] + flow
+            if both and source in q:
+                q[source] = q[source] - flow
+
+        for to, source, conductance, both, bend in _exchanges(network, inputs, parameters):
+            rise = z[source] - z[to]
+            move(to, source, conductance * rise, both)
+            if bend is not None:
+                # q_ij = G_ij (z_j - z_i) (1 + b |z_j - z_i| / 10 K)
+                move(to, source, conductance * bend / BEND_SPAN * rise * abs(rise), both)
+        for item in network.radiation.values():
+            # q_ij = k (T_j^4 - T_i^4)
+            to, source = _receiver(network, item.between)
+            a, b = z[to] + KELVIN, z[source] + KELVIN
+            factor = STEFAN_BOLTZMANN * parameters[item.area] * parameters[item.emissivity]
+            move(to, source, factor * (b * b * b * b - a * a * a * a))
+        full = {name: item.full_scale for name, item in (network.inputs | network.disturbances).items()}
+        for heater in network.heaters.values():
+            # P u, or P d of what is measured and not moved
+            power = 1.0 / full[heater.input] * parameters[heater.power]
+            q[heater.node] = q[heater.node] + power * (inputs | measured)[heater.input]
+        for element in network.peltiers.values():
+            command, (face, sink) = inputs[element.input] / full[element.input], (element.face, element.sink)
+            at_face, at_sink = _peltier_heat(element, command, z[face], z[sink], parameters)
+            q[face] = q[face] + at_face
+            q[sink] = q[sink] + at_sink
+        return q
 
     def rest(self, y: ArrayLike, u: ArrayLike, d: ArrayLike, p: ArrayLike) -> Array:
         """Return the state (n_x,) of a plant at rest whose sensors read y."""
@@ -477,11 +359,11 @@ class NetworkModel(Described):
         inputs: list[Any] = list(u)
         for share, i in enumerate(moved):
             inputs[i] = v[..., share] * full[share]
-        flow = self.steps.heat(states, inputs, list(d), list(p.T[:, :, None]))
+        flow = self.heat(states, inputs, list(d), list(p.T[:, :, None])).values()
         is_read = np.isfinite(y)
         read = np.stack(self.output(states, ()), axis=-1)
         residuals = [
-            np.stack(flow, axis=-1),
+            np.stack(list(flow), axis=-1),
             REST.sensor * (read - y)[..., is_read],
             REST.input * (v - u[moved] / full),
             REST.level * (x - np.nanmean(y)),
@@ -491,7 +373,13 @@ class NetworkModel(Described):
     def rollout(self, x0: ArrayLike, u: ArrayLike, d: ArrayLike, p: ArrayLike, dt: float) -> Run:
         """Simulate a batch."""
         x0, u, d, p = (np.ascontiguousarray(value, dtype=float) for value in (x0, u, d, p))
-        return _kernel(self.steps).rollout(x0, u, d, p, float(dt))
+        return _kernel(self._structure).rollout(x0, u, d, p, float(dt))
+
+    @cached_property
+    def _structure(self) -> str:
+        """The network without the numbers of its parameters."""
+        some = dict.fromkeys(self.parameters, Parameter(unit="1", value=1.0, fixed=True))
+        return self.network.model_copy(update={"parameters": some}).model_dump_json(by_alias=True)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the whole network as plain JSON."""
@@ -569,8 +457,10 @@ def _bounded_moves(jacobian: Array, residual: Array, v: Array, low: Array, high:
 
 
 @lru_cache(maxsize=64)
-def _kernel(steps: ThermalSteps) -> Kernel:
-    """Return the compiled steps."""
+def _kernel(structure: str) -> Kernel:
+    """Return the compiled steps of all networks of a structure."""
     from thermogrip.sysid.models.jit_rollout import Kernel  # pulls in llvmlite
 
-    return Kernel(steps.step, steps.output, steps.sizes, steps.switches)
+    model = NetworkModel(Network.model_validate_json(structure))
+    sizes = Sizes(model.n_x, len(model.inputs), len(model.disturbances), len(model.parameters))
+    return Kernel(model.step, model.output, sizes, [model.inputs.index(name) for name in model.switches])

@@ -14,7 +14,7 @@ python-control and scipy are handed these; CasADi one step of the plant itself, 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -43,6 +43,7 @@ class LinearSettings:
     growth: float = 1e-6  # of the modulus of a pole beyond one, that rounding does not explain
     integrator: float = 1e-10  # of 1 - A, below which a state stays wherever it is put
     delay: float = 1e-8  # modulus of a discrete pole that represents a delay
+    short_step: float = 1e-3  # of the plant's step: errors of 1e-7 by its order, of 1e-8 by rounding
 
 
 LINEAR = LinearSettings()
@@ -127,7 +128,7 @@ def linearise_plant(
             hint="choose another point, or identify a model that is stable",
         )
     if dt is None:
-        A, B = _continuous(plant, x, u, d, moved, A, B)
+        A, B = _continuous(plant, x, u, d, moved)
     else:
         A, B = composed(A, B, steps_in(plant, dt))
     C, level = output_matrix(plant)
@@ -186,10 +187,11 @@ def output_matrix(plant: PlantData) -> tuple[Array, Array]:
     return np.stack(moved, axis=1) - zero[:, None], zero
 
 
-def states_after(plant: PlantData, x: Array, u: Array, d: Array) -> Array:
-    """Return the states (B, n_x) one step after x (B, n_x) under u (B, n_u), d (B, n_d)."""
+def states_after(plant: PlantData, x: Array, u: Array, d: Array, dt: float | None = None) -> Array:
+    """Return the states (B, n_x) a step of ``dt`` [s], or of the plant, after x (B, n_x) under u (B, n_u), d
+    (B, n_d)."""
     p = np.repeat(plant.p[None], len(x), axis=0)
-    return np.asarray(plant.model.rollout(x, u[:, None], d[:, None], p, plant.dt)[1])
+    return np.asarray(plant.model.rollout(x, u[:, None], d[:, None], p, dt or plant.dt)[1])
 
 
 def _steady_state(plant: PlantData, u: Array, d: Array) -> Array:
@@ -214,27 +216,21 @@ def _steady_state(plant: PlantData, u: Array, d: Array) -> Array:
     )
 
 
-def _jacobians(
-    function: Callable[[Array, Array, Array], Array], x: Array, u: Array, d: Array, moved: Sequence[int]
+def discrete_matrices(
+    plant: PlantData, x: Array, u: Array, d: Array, moved: Sequence[int], dt: float | None = None
 ) -> tuple[Array, Array]:
-    """Return central differences of function(x, u, d) by x, and by moved inputs and disturbances."""
-    # exact for anything bilinear; where a drive of a Peltier heats and cools with different gains the slope
-    # at zero is the mean of the two
+    """Return A, and B of ``moved`` inputs and then disturbances, of a step of ``dt`` [s], or of the plant."""
+    # central differences are exact for anything bilinear; where a drive of a Peltier heats and cools with
+    # different gains the slope at zero is the mean of the two
     point, ends = np.concatenate([x, u, d]), [x.size, x.size + u.size]
     columns = [*range(x.size), *(x.size + k for k in moved), *range(ends[1], point.size)]
     size = LINEAR.difference_step * np.maximum(1.0, np.abs(point[columns]))
     ahead = np.zeros((len(columns), point.size))
     ahead[np.arange(len(columns)), columns] = size
-    values = function(*np.split(np.vstack([point + ahead, point - ahead]), ends, axis=1))
+    around = np.split(np.vstack([point + ahead, point - ahead]), ends, axis=1)
+    values = states_after(plant, *map(np.ascontiguousarray, around), dt)
     both = ((values[: len(columns)] - values[len(columns) :]) / (2 * size[:, None])).T
     return both[:, : x.size], both[:, x.size :]
-
-
-def discrete_matrices(
-    plant: PlantData, x: Array, u: Array, d: Array, moved: Sequence[int]
-) -> tuple[Array, Array]:
-    """Return A, and B of ``moved`` inputs and then disturbances, of the plant's own step at a point."""
-    return _jacobians(lambda *w: states_after(plant, *map(np.ascontiguousarray, w)), x, u, d, moved)
 
 
 def steps_in(plant: PlantData, dt: float) -> int:
@@ -255,14 +251,11 @@ def composed(A: Array, B: Array, n: int) -> tuple[Array, Array]:
     return power[:n_x, :n_x], power[:n_x, n_x:]
 
 
-def _continuous(
-    plant: PlantData, x: Array, u: Array, d: Array, moved: Sequence[int], A: Array, B: Array
-) -> tuple[Array, Array]:
-    # of a network the heat balance itself, of a class its rhs, of a black box the logarithm of [[A, B], [0,
-    # 1]] over its step, which undoes the hold; a delay (a pole at zero) has none
-    rate = _rate(plant)
-    if rate is not None:
-        return _jacobians(rate, x, u, d, moved)
+def _continuous(plant: PlantData, x: Array, u: Array, d: Array, moved: Sequence[int]) -> tuple[Array, Array]:
+    # the logarithm of [[A, B], [0, 1]] over a step undoes the hold: a step so short that its own error is
+    # lost, or over that of a black box, which takes no other; a delay has none
+    dt = plant.dt * (LINEAR.short_step if isinstance(plant.model, GreyModel) else 1.0)
+    A, B = discrete_matrices(plant, x, u, d, moved, dt=dt)
     poles = np.linalg.eigvals(A)
     if np.abs(poles).min() < LINEAR.delay or np.any((np.abs(poles.imag) < 1e-9) & (poles.real <= 0)):
         raise UserError(
@@ -270,31 +263,8 @@ def _continuous(
             hint=f"export it at its own step, dt={plant.dt:g}",
         )
     n_x, n_w = B.shape
-    log: Array = np.real(logm(np.block([[A, B], [np.zeros((n_w, n_x)), np.eye(n_w)]]))) / plant.dt
+    log: Array = np.real(logm(np.block([[A, B], [np.zeros((n_w, n_x)), np.eye(n_w)]]))) / dt
     return log[:n_x, :n_x], log[:n_x, n_x:]
-
-
-def _rate(plant: PlantData) -> Callable[[Array, Array, Array], Array] | None:
-    """Return dx/dt as a function of batches x, u, d; None: the model has steps only."""
-    model: Any = plant.model
-    p = plant.p.tolist()
-    if plant.model.kind == "network":
-        capacities = model.steps.capacity(p)
-
-        def heated(x: Array, u: Array, d: Array) -> Array:
-            flows = model.steps.heat(list(x.T), list(u.T), list(d.T), p)
-            rates = [np.broadcast_to(flow / capacity, len(x)) for flow, capacity in zip(flows, capacities)]
-            return np.stack(rates, axis=1)
-
-        return heated
-    if plant.model.kind == "own":
-
-        def own(x: Array, u: Array, d: Array) -> Array:
-            rows = [model.code.rhs(a.tolist(), b.tolist(), c.tolist(), p) for a, b, c in zip(x, u, d)]
-            return np.array(rows, dtype=float)
-
-        return own
-    return None
 
 
 def control_system(labels: Any, numbers: Sequence[Any], name: str) -> Any:

@@ -115,7 +115,7 @@ def test_a_network_takes_its_inputs_in_the_unit_of_the_log(unit, values, full_sc
     for model in (network, NetworkModel(named_network("hotend"))):
         p = [parameter.value for parameter in model.network.parameters.values()]
         half = model.network.inputs["heater"].full_scale / 2
-        heat.append(np.array(model.steps.heat([25.0, 25.0, 25.0], [half], [], p), dtype=float))
+        heat.append(np.array(list(model.heat([25.0, 25.0, 25.0], [half], [], p).values()), dtype=float))
     np.testing.assert_allclose(*heat, rtol=1e-12)
     assert heat[0].max() == pytest.approx(20.0)  # W, of a cartridge of 40
 

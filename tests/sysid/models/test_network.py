@@ -13,7 +13,7 @@ from scipy.optimize import least_squares
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.sysid.models.model import roll_rows
-from thermogrip.sysid.models.network import PELTIER, NetworkModel, load_network
+from thermogrip.sysid.models.network import NetworkModel, load_network
 from thermogrip.sysid.models.network_spec import builtin_networks, network_from_dict, read_network
 
 KELVIN = 273.15
@@ -251,7 +251,7 @@ def declared(numbers: dict[str, tuple[str, float]], **tables: Any) -> dict[str, 
 
 
 def heats(model: NetworkModel, x: list[float], u: list[float], d: tuple[float, ...] = ()) -> list[float]:
-    return [float(q) for q in model.steps.heat(x, u, list(d), model.prior.tolist())]
+    return [float(q) for q in model.heat(x, u, list(d), model.prior.tolist()).values()]
 
 
 def test_a_bent_link_between_two_bodies_takes_from_one_what_it_gives_to_the_other():
@@ -293,7 +293,8 @@ def test_of_two_elements_of_each_kind_each_has_its_own_numbers():
 
 
 def test_of_two_peltiers_each_has_its_own_numbers():
-    names = (*PELTIER[:2], "conductance", "current", *PELTIER[3:7], "dead_zone")
+    names = ("seebeck", "resistance", "conductance", "current", "offset")
+    names += ("heating_gain", "cooling_gain", "droop", "dead_zone")
     units = ["V/K", "ohm", "W/K", "A", "1", "1", "1", "1", "1"]
     first = [0.05, 2.0, 0.3, 6.0, 0.1, 0.9, 0.8, 0.2, 0.05]
     second = [0.02, 3.0, 0.7, 4.0, -0.2, 1.1, 0.7, 0.1, 0.1]
@@ -333,9 +334,9 @@ def test_what_a_network_says_of_its_signals_is_what_its_file_says():
     assert (model.switches, model.average, model.dt) == (("pump",), 7.0, 0.5)
     assert (model.independent, model.warmup, model.smooth) == (60.0, 60.0, 20.0)
     np.testing.assert_allclose(np.sqrt(np.diag(model.spread)), [1.0, 3.0, 1.0] + [0.5] * 6)
-    assert [float(c) for c in model.steps.capacity(model.prior.tolist())] == pytest.approx(
-        [500.0, 200.0, 80.0, 48.0, 15.0, 48.0, 15.0, 96.0, 3.0]
-    )
+    point = np.arange(20.0, 29.0) ** 1.5, [0.3, 1.0, 40.0], [22.0], model.prior
+    capacities = [q / rate for q, rate in zip(model.heat(*point).values(), model.rates(*point).values())]
+    assert capacities == pytest.approx([500.0, 200.0, 80.0, 48.0, 15.0, 48.0, 15.0, 96.0, 3.0])
     plain = model_of(everything())
     assert (plain.reference, plain.command_steps) == (None, {})
     assert "lag" not in model.to_dict()["network"]["outputs"]["ref"]
@@ -531,7 +532,7 @@ def test_rest_for_many_parameters_is_that_for_each(name: str, y: list[float], u:
     np.testing.assert_allclose(found[-1], model.rest_of_each(y, u, d, p[-1:])[0], rtol=0, atol=0)
     if name == "tclab":  # all of the heater holds some of them there, and not others
         nodes, full = len(model.network.nodes), [100.0, 0.0]
-        gains = [sum(model.steps.heat(x, full, d, row)[:nodes]) for x, row in zip(found, p)]
+        gains = [sum(list(model.heat(x, full, d, row).values())[:nodes]) for x, row in zip(found, p)]
         assert min(gains) < -0.01
         assert max(gains) > 0.01
 
