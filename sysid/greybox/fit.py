@@ -1,6 +1,6 @@
 """Grey-box fit: from a network, or a model of the user's own, and logs to a plant with its covariance.
 
-1. Levenberg-Marquardt with priors as residuals, from the prior medians
+1. Least squares with priors as residuals, from the prior medians
    (:mod:`thermogrip.sysid.greybox.problem`).
 2. The correlation of residuals (tau) is measured on the fit, which is repeated with more weight where they
    are whiter than one reading a minute.
@@ -11,12 +11,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
+from itertools import count
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
+from scipy.optimize import OptimizeResult, least_squares
 
 from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.errors import UserError
@@ -34,107 +35,40 @@ from thermogrip.sysid.plant.log_grid import cut_stretches, match_logs, rows_of
 from thermogrip.sysid.plant.plant import Plant
 from thermogrip.sysid.plant.simulation import find_starts, predict
 
-_DAMPINGS = np.array([1e-2, 0.1, 1.0, 10.0, 100.0])  # times the damping that last succeeded
-_PROBE = 0.1  # of the step, for the second derivative along it
 _HUGE = 1e150  # residuals beyond it would overflow when squared
 
 
-@dataclass(frozen=True, eq=False)
-class Solution:
-    """Where the fit ended."""
-
-    z: Array  # (n,)
-    cost: float  # |r|^2 there
-    residual: Array  # (m,)
-    jacobian: Array  # (m, n)
-    iterations: int
-    converged: bool  # False: the iterations ran out
-
-
-class _Trial(NamedTuple):
-    z: Array
-    cost: float
-    damping: float
-
-
-def levenberg_marquardt(
-    linearise: Callable[[Array], tuple[Array, Array]],
-    residuals: Callable[[Array], Array],
+def bounded_least_squares(
+    residual: Callable[[Array], Array],
+    jacobian: Callable[[Array], Array],
     z0: Array,
     *,
     low: Array,
     high: Array,
-    iterations: int = 60,
+    evaluations: int = 200,
     tolerance: float = 1e-5,
-    callback: Callable[[int, float], None] | None = None,
-) -> Solution:
-    """Minimise |r|^2 inside a box, by r (m,) and J (m, n) at a point and r (k, m) at k points, until none of
-    the dampings lowers it or a step lowers it by less than ``tolerance`` of it."""
-    z, damping = np.clip(z0, low, high), 1.0
-    residual, jacobian = linearise(z)
-    cost = float(residual @ residual)
-    for iteration in range(iterations):
-        trial = _best_trial(residuals, z, residual, jacobian, low, high, damping)
-        if not trial.cost < cost:
-            if damping >= 1e8:
-                return Solution(z, cost, residual, jacobian, iteration, True)
-            damping *= 1e4
-            continue
-        fall = cost - trial.cost
-        z = trial.z
-        damping = float(np.clip(trial.damping, 1e-6, 1e8))
-        residual, jacobian = linearise(z)
-        cost = float(residual @ residual)
-        if callback is not None:
-            callback(iteration, cost)
-        if fall < tolerance * trial.cost:
-            return Solution(z, cost, residual, jacobian, iteration + 1, True)
-    return Solution(z, cost, residual, jacobian, iterations, False)
+) -> OptimizeResult:
+    """Minimise |r|^2 inside a box, by r (m,) and J (m, n) at a point; see
+    :func:`scipy.optimize.least_squares`, for what is not finite is huge here and never wins."""
 
+    def finite(z: Array) -> Array:
+        r = np.nan_to_num(residual(z), nan=_HUGE, posinf=_HUGE, neginf=-_HUGE)
+        return np.asarray(np.clip(r, -_HUGE, _HUGE))
 
-def _best_trial(
-    residuals: Callable[[Array], Array], z: Array, r: Array, J: Array, low: Array, high: Array, damping: float
-) -> _Trial:
-    """Return the best of several damped steps, straight and bent."""
-    # Combinations of parameters that the logs barely determine make |r(z)|^2 a narrow curved valley, which
-    # straight steps leave at once; half of the geodesic acceleration bends with it: M. K. Transtrum, J. P.
-    # Sethna, "Improvements to the Levenberg-Marquardt algorithm for nonlinear least-squares minimization",
-    # arXiv 1201.5885 (2012).
-    # SciPy's trust region stops in such valleys: at 303 for 51 on a printer's heater block
-    gradient, normal = J.T @ r, J.T @ J
-    # a coordinate on its bound whose step would leave the box is held there
-    on_bound = ((z <= low) & (gradient > 0)) | ((z >= high) & (gradient < 0))
-    free = np.flatnonzero(~on_bound)
-    if free.size == 0:
-        return _Trial(z, np.inf, damping)
-    size, axes = np.linalg.eigh(normal[np.ix_(free, free)])
-    inverse = 1.0 / (np.maximum(size, 0.0) + damping * _DAMPINGS[:, None])  # (n_damping, n_free)
+    def finite_slopes(z: Array) -> Array:
+        return np.nan_to_num(jacobian(z), nan=0.0, posinf=0.0, neginf=0.0)
 
-    def solve(right: Array) -> Array:
-        """Return -(J'J + lambda)^-1 right for each lambda; right (n_damping or 1, n)."""
-        out = np.zeros((len(_DAMPINGS), len(z)))
-        out[:, free] = -(inverse * (right[:, free] @ axes)) @ axes.T
-        return out
-
-    # v = -(J'J + lambda)^-1 J'r
-    step = solve(gradient[None])
-    probe = _finite_residuals(residuals(np.clip(z + _PROBE * step, low, high)))
-    # r_vv = (2 / h^2) (r(z + h v) - r(z) - h J v)
-    curvature = 2.0 / _PROBE**2 * (probe - r - _PROBE * step @ J.T)
-    # a = -(J'J + lambda)^-1 J' r_vv
-    bend = solve(curvature @ J)
-    # a bend longer than the step: the expansion is not valid there
-    longer = np.linalg.norm(bend, axis=1) > 1.5 * np.linalg.norm(step, axis=1)
-    bend[longer] = 0.0
-    trials = np.clip(np.concatenate([z + step, z + step + bend / 2]), low, high)
-    cost = (_finite_residuals(residuals(trials)) ** 2).sum(axis=1)
-    best = int(np.argmin(cost))
-    return _Trial(trials[best], float(cost[best]), float(damping * _DAMPINGS[best % len(_DAMPINGS)]))
-
-
-def _finite_residuals(r: Array) -> Array:
-    """Replace what is not finite by a huge residual, so that it never wins and never overflows."""
-    return np.asarray(np.clip(np.nan_to_num(r, nan=_HUGE, posinf=_HUGE, neginf=-_HUGE), -_HUGE, _HUGE))
+    # combinations of parameters that the logs barely determine make |r|^2 a narrow curved valley, in which
+    # SciPy's other method with bounds stops: at 201 for 51 on a printer's heater block
+    return least_squares(
+        finite,
+        np.clip(z0, low, high),
+        finite_slopes,
+        bounds=(low, high),
+        method="dogbox",
+        ftol=tolerance,
+        max_nfev=evaluations,
+    )
 
 
 _STUCK = 5.0  # rms residual in sensor sd from which a fit does not explain the logs
@@ -205,19 +139,19 @@ def fit_network(
     problem = make_problem(model, logs, average=average, independent=model.independent)
     report(0.0, "fitting from the priors")
     solution = _descend(problem, np.zeros(len(problem.free)), report, (0.0, 0.6))
-    tau = residual_tau(problem.errors(solution.z), problem.tau)
+    tau = residual_tau(problem.errors(solution.x), problem.tau)
     # data have at least the weight of one reading a minute: a slow error of the model must not leave the fit
     # to the priors
     whiter = tau < 0.8 * problem.tau
     if whiter.any():
         problem = problem.with_tau(np.where(whiter, tau, problem.tau))
-        solution = _descend(problem, solution.z, report, (0.8, 0.95))
-    finer = model.prepared(runs, spread, problem.parameters(solution.z[None])[0])
+        solution = _descend(problem, solution.x, report, (0.8, 0.95))
+    finer = model.prepared(runs, spread, problem.parameters(solution.x[None])[0])
     if finer is not model:  # its step was short enough at the prior, and is not where the fit ended
         problem = make_problem(finer, logs, average=average, independent=model.independent).with_tau(
             problem.tau
         )
-        solution = _descend(problem, solution.z, report, (0.9, 0.95))
+        solution = _descend(problem, solution.x, report, (0.9, 0.95))
     report(0.95, "covariance")
     plant = _as_plant(problem, solution)
     scores = replace(plant.scores, reading_excess=reading_excess(rows, model.outputs, problem.average))
@@ -246,14 +180,17 @@ def residual_tau(errors: Sequence[Sequence[Sequence[Array]]], least: Array) -> A
     return out
 
 
-def _descend(problem: Problem, z0: Array, report: Progress, part: tuple[float, float]) -> Solution:
+def _descend(problem: Problem, z0: Array, report: Progress, part: tuple[float, float]) -> OptimizeResult:
     low, high = problem.box
+    iterations = count(1)
 
-    def callback(iteration: int, cost: float) -> None:
+    def jacobian(z: Array) -> Array:
+        iteration = next(iterations)
         share = 1 - 0.85**iteration  # the number of iterations is not known beforehand
-        report(part[0] + (part[1] - part[0]) * share, f"fitting, iteration {iteration + 1}, cost {cost:.4g}")
+        report(part[0] + (part[1] - part[0]) * share, f"fitting, iteration {iteration}")
+        return problem.jacobian(z)
 
-    return levenberg_marquardt(problem.linearise, problem.trials, z0, low=low, high=high, callback=callback)
+    return bounded_least_squares(problem.residual, jacobian, z0, low=low, high=high)
 
 
 def _rms(parts: Sequence[Array]) -> float:
@@ -261,8 +198,8 @@ def _rms(parts: Sequence[Array]) -> float:
     return float(np.sqrt(np.mean(joined**2))) if joined.size else 0.0
 
 
-def _as_plant(problem: Problem, solution: Solution) -> Plant:
-    model, z = problem.model, solution.z
+def _as_plant(problem: Problem, solution: OptimizeResult) -> Plant:
+    model, z = problem.model, np.asarray(solution.x)
     names = tuple(model.parameters[i] for i in problem.free)
     by_log = problem.by_log(z, central=True)
     spread = score_covariance(problem, z, by_log)
@@ -300,15 +237,17 @@ def _as_plant(problem: Problem, solution: Solution) -> Plant:
     )
 
 
-def _fit_verdict(problem: Problem, solution: Solution, identifiability: fit_record.Identifiability) -> str:
-    by_log = problem.errors(solution.z)
+def _fit_verdict(
+    problem: Problem, solution: OptimizeResult, identifiability: fit_record.Identifiability
+) -> str:
+    by_log = problem.errors(solution.x)
     rms = [_rms([s[k] for log in by_log for s in log]) / sd for k, sd in enumerate(problem.sd)]
     errors = ", ".join(
         f"{name} {r * sd:.2f} {problem.plant.units.get(name, 'degC')}"
         for name, r, sd in zip(problem.model.outputs, rms, problem.sd)
     )
     clauses = [f"in-sample error {errors}"]
-    if not solution.converged:
+    if not solution.success:
         clauses.append("the fit ran out of iterations")
     if max(rms) > _STUCK:
         clauses.append("it does not explain the logs, do not use it")

@@ -37,7 +37,7 @@ from thermogrip.datasets.atomic_files import atomic_path
 from thermogrip.datasets.errors import UserError, known_names
 from thermogrip.datasets.log_files import Logs, as_logs
 from thermogrip.datasets.schema import Log
-from thermogrip.sysid.greybox.fit import levenberg_marquardt
+from thermogrip.sysid.greybox.fit import bounded_least_squares
 from thermogrip.sysid.greybox.noise_model import ErrorModel
 from thermogrip.sysid.greybox.problem import Problem, make_problem
 from thermogrip.sysid.greybox.sandwich import ScoreCovariance, score_covariance
@@ -53,6 +53,7 @@ class DrawSettings:
 
     difference_step: float = 1e-4  # of z
     enough: float = 1e-2  # share of the objective by which the last step lowers it
+    evaluations: int = 40  # at most, of one: with 20 the objective of one log's is a tenth larger
     least_error: float = 1e-3  # of A: the least that V may be in any direction
     unseen_slope: float = 1e-9  # of the largest one: what moves the runs by less is lost in the differences
     proposal_freedom: float = 6.0  # of the t: a tail
@@ -134,7 +135,6 @@ class RandomizedMap:
         seed: int = 0,
         held: Array | None = None,
         columns: Sequence[int] = (),
-        iterations: int = 8,
         progress: Callable[[float, str], None] | None = None,
     ) -> Array:
         """Return draws (n, n_free) of z, in prior units, inside the bounds."""
@@ -149,10 +149,10 @@ class RandomizedMap:
         for k in range(n):
             if progress is not None:
                 progress(k / n, "plants that agree with the logs")
-            z[k, moving] = self._draw(z[k], xi[k], noise[k], moving, iterations)
+            z[k, moving] = self._draw(z[k], xi[k], noise[k], moving)
         return z
 
-    def _draw(self, z: Array, xi: Array, noise: Array, moving: NDArray[np.int_], iterations: int) -> Array:
+    def _draw(self, z: Array, xi: Array, noise: Array, moving: NDArray[np.int_]) -> Array:
         """Return the parameters ``moving`` of the least objective, the others at z (n_free,)."""
 
         # |z - z_fit - xi|^2 + |K^(1/2) Q'd(z) - e|^2 + |d(z) - Q Q'd(z)|^2 / T is least, xi, e ~ N(0, 1):
@@ -164,23 +164,22 @@ class RandomizedMap:
             along, off_span = self._moved(whole)
             return np.hstack([whole - self.z - xi, along - noise, off_span])
 
-        def linearise(point: Array) -> tuple[Array, Array]:
+        def slopes(point: Array) -> Array:
             sign = np.where(point + DRAW.difference_step > self.high[moving], -1.0, 1.0)
             ahead = DRAW.difference_step * np.diag(sign)
             r = residuals(np.vstack([point, point + ahead]))
-            slopes = (r[1:] - r[0]) / (DRAW.difference_step * sign[:, None])
-            return r[0], np.nan_to_num(slopes, nan=0.0, posinf=0.0, neginf=0.0).T  # a run that blew up
+            return np.asarray(((r[1:] - r[0]) / (DRAW.difference_step * sign[:, None])).T)
 
-        least = levenberg_marquardt(
-            linearise,
-            residuals,
+        least = bounded_least_squares(
+            lambda point: residuals(point[None])[0],
+            slopes,
             z[moving],
             low=self.low[moving],
             high=self.high[moving],
-            iterations=iterations,
+            evaluations=DRAW.evaluations,
             tolerance=DRAW.enough,
         )
-        return least.z
+        return np.asarray(least.x)
 
     def _moved(self, z: Array) -> tuple[Array, Array]:
         """Return K^(1/2) Q'd (n, n_free) and d, off the span and weighed (n, m)."""
@@ -414,7 +413,7 @@ def sample_posterior(
     )
     report(0.95, "completing the samples")
     sampled_z = chain.kept(n_samples)
-    whole = target.draws(len(sampled_z), seed=seed, held=sampled_z, columns=sampled, iterations=5)
+    whole = target.draws(len(sampled_z), seed=seed, held=sampled_z, columns=sampled)
     record = _record(plant, problem, z, sampled, chain, whole, uncertainty)
     report(1.0, record.verdict)
     sampling = Sampling(record.verdict, record.converged, record.likelihood, record.tau)

@@ -7,8 +7,8 @@ positive; z ~ N(0, 1) is the prior and adds n residuals z to the cost.
 difference is divided by the sensor's ``sd``. The model's error is slow, so neighbouring bins are
 correlated: all residuals of an output are divided by sqrt(tau), with tau the bins per independent one.
 
-**Starts** are nuisances of each log (:mod:`thermogrip.sysid.plant.simulation`), estimated anew at each
-iteration and held while the sensitivities are taken: differences over all parameters in one batch.
+**Starts** are nuisances of each log (:mod:`thermogrip.sysid.plant.simulation`), estimated anew at each z and
+held while the sensitivities are taken: differences over all parameters in one batch.
 """
 
 from __future__ import annotations
@@ -46,11 +46,10 @@ class _Bins:
 
 @dataclass(eq=False)
 class _Starts:
-    """Starts of all stretches by log: those at the last z, and those held since the last linearisation."""
+    """Starts of all stretches by log at the last z."""
 
     z: Array | None = None
     last: list[list[Start]] = field(default_factory=list)
-    linearised: list[list[Start]] = field(default_factory=list)
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,11 +124,13 @@ class Problem:
                 for run, cells in zip(runs, bins)
             ]
 
-    def linearise(self, z: Array) -> tuple[Array, Array]:
-        """Return residuals (m + n,) and Jacobian (m + n, n), the prior's rows last."""
-        log_rows = self.by_log(z)
-        residual = np.concatenate([*(r for r, _ in log_rows), z])
-        return residual, np.vstack([*(J for _, J in log_rows), np.eye(len(z))])
+    def residual(self, z: Array) -> Array:
+        """Return the residuals (m + n,) of all logs at z (n,), the prior's rows last."""
+        return np.concatenate([*(r[0] for r in self.residuals(z[None], self.start(z))), z])
+
+    def jacobian(self, z: Array) -> Array:
+        """Return the slopes (m + n, n) of :meth:`residual`."""
+        return np.vstack([*(J for _, J in self.by_log(z)), np.eye(len(z))])
 
     def by_log(self, z: Array, *, central: bool = False) -> list[tuple[Array, Array]]:
         """Return residual (m,) and Jacobian (m, n) of each log, without the prior, by ``central`` differences
@@ -140,23 +141,14 @@ class Problem:
         ahead = _DIFFERENCE_STEP * np.diag(sign)
         around = np.vstack([z, z + ahead, z - ahead] if central else [z, z + ahead])
         out = []
-        for r in self.residuals(around, self._kept(z)):
+        for r in self.residuals(around, self.start(z)):
             rise = (r[1 : len(z) + 1] - r[len(z) + 1 :]) / 2 if central else r[1:] - r[0]
             out.append((r[0], (rise / (_DIFFERENCE_STEP * sign[:, None])).T))
         return out
 
-    def trials(self, z: Array) -> Array:
-        """Return residuals (k, m + n) at each row of z, with the starts of the last linearisation."""
-        return np.concatenate([*self.residuals(z, self._kept(None)), z], axis=1)
-
     def with_tau(self, tau: Array) -> Problem:
         """Return the problem with another autocorrelation."""
-        return replace(self, tau=tau, _starts=_Starts(self._starts.z, self._starts.last))
-
-    def _kept(self, z: Array | None) -> list[list[Start]]:
-        if z is not None:
-            self._starts.linearised = self.start(z)
-        return self._starts.linearised
+        return replace(self, tau=tau)
 
     @property
     def width(self) -> Array:

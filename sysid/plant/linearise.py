@@ -227,8 +227,8 @@ def discrete_matrices(
     size = LINEAR.difference_step * np.maximum(1.0, np.abs(point[columns]))
     ahead = np.zeros((len(columns), point.size))
     ahead[np.arange(len(columns)), columns] = size
-    around = np.split(np.vstack([point + ahead, point - ahead]), ends, axis=1)
-    values = states_after(plant, *map(np.ascontiguousarray, around), dt)
+    around_x, around_u, around_d = np.split(np.vstack([point + ahead, point - ahead]), ends, axis=1)
+    values = states_after(plant, around_x, around_u, around_d, dt)
     both = ((values[: len(columns)] - values[len(columns) :]) / (2 * size[:, None])).T
     return both[:, : x.size], both[:, x.size :]
 

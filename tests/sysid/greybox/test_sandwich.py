@@ -14,7 +14,7 @@ from scipy.stats import chi2
 from tests.sysid.greybox.makers import TRUTH, TwoGains, a_log, heater, made
 from thermogrip.datasets.errors import UserError
 from thermogrip.sysid.greybox import noise_model
-from thermogrip.sysid.greybox.fit import fit_network, levenberg_marquardt
+from thermogrip.sysid.greybox.fit import bounded_least_squares, fit_network
 from thermogrip.sysid.greybox.noise_model import Block, ErrorModel, LogData, information
 from thermogrip.sysid.greybox.problem import Problem, make_problem
 from thermogrip.sysid.greybox.random_effects import linearise_logs
@@ -146,9 +146,9 @@ def fitted(*seeds: int, seconds: int = 600) -> tuple[Problem, Array, list[tuple[
     logs = [a_log(seed, seconds=seconds) for seed in seeds]
     problem = make_problem(TwoGains(), logs, average=4.0, independent=60.0)
     low, high = problem.box
-    z = levenberg_marquardt(
-        problem.linearise, problem.trials, np.zeros(2), low=low, high=high, tolerance=1e-12
-    ).z
+    z = bounded_least_squares(
+        problem.residual, problem.jacobian, np.zeros(2), low=low, high=high, tolerance=1e-12
+    ).x
     return problem, z, problem.by_log(z, central=True)
 
 
