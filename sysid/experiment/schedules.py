@@ -14,9 +14,6 @@ from thermogrip.datasets.schema import Log, make_log
 
 KINDS = ("prbs", "multisine", "staircase")
 
-# Feedback taps of maximum-length registers of n bits (primitive trinomials, one pentanomial).
-_TAPS = {3: [1], 4: [1], 5: [2], 6: [1], 7: [1], 8: [2, 3, 4], 9: [4], 10: [3]}
-
 REST = 6.0  # [s] at the middle before anything moves
 
 
@@ -92,7 +89,7 @@ def prbs(n: int, *, hold: int, seed: int = 0) -> Array:
     from scipy.signal import max_len_seq  # slow to import, and the other schedules do without
 
     bits = max(3, min(10, int(np.floor(np.log2(max(n / hold, 7) + 1)))))
-    register, _ = max_len_seq(bits, state=[0] * (bits - 1) + [1], taps=_TAPS[bits])
+    register, _ = max_len_seq(bits)
     sequence = np.where(register, 1.0, -1.0)
     # golden steps: whichever seeds several inputs have, they begin far apart and barely correlate
     begin = round(seed * 0.6180339887498949 * len(sequence)) % len(sequence)

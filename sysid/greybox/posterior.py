@@ -275,22 +275,13 @@ def run_chain(
 
 def _proposals(mean: Array, covariance: Array) -> Callable[..., tuple[Array, Array]]:
     """Return the function of (points (n, n_dim), random) to new points and ln t(old) - ln t(new)."""
-    root = DRAW.proposal_width * np.linalg.cholesky(covariance)
+    from scipy.stats import multivariate_t  # slow to import, and draws do without
 
-    def log_t(x: Array) -> Array:
-        squares = (np.linalg.solve(root, (x - mean).T) ** 2).sum(axis=0)
-        return np.asarray(
-            -0.5 * (DRAW.proposal_freedom + mean.size) * np.log1p(squares / DRAW.proposal_freedom)
-        )
+    t = multivariate_t(mean, DRAW.proposal_width**2 * covariance, df=DRAW.proposal_freedom)
 
     def propose(points: Array, random: np.random.RandomState) -> tuple[Array, Array]:
-        normal = random.standard_normal(points.shape)
-        drawn = (
-            normal
-            * np.sqrt(DRAW.proposal_freedom / random.chisquare(DRAW.proposal_freedom, len(points)))[:, None]
-        )
-        new = mean + drawn @ root.T
-        return new, log_t(points) - log_t(new)
+        new = t.rvs(len(points), random_state=random).reshape(points.shape)
+        return new, t.logpdf(points) - t.logpdf(new)
 
     return propose
 

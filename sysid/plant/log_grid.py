@@ -412,6 +412,8 @@ def _smooth(time: Array, values: Array, edges: Array, seconds: float) -> Array:
 
 def _line_mean(t: Array, values: Array, grid: Array, step: float) -> Array:
     """Mean over [t_k - step/2, t_k + step/2] of the line through the finite samples, NaN without any."""
+    from scipy.interpolate import make_interp_spline  # slow to import, and a network does without
+
     out = np.full((grid.size, values.shape[1]), np.nan)
     for i in range(values.shape[1]):
         is_read = np.isfinite(values[:, i])
@@ -419,22 +421,12 @@ def _line_mean(t: Array, values: Array, grid: Array, step: float) -> Array:
         if s.size < 2:
             continue
         half = np.minimum(step / 2, np.maximum(np.minimum(grid - s[0], s[-1] - grid), 0))
-        low, high = grid - half, grid + half
-        area = np.append(0.0, np.cumsum((v[1:] + v[:-1]) / 2 * np.diff(s)))
-        mean = np.interp(grid, s, v)
+        area, mean = make_interp_spline(s, v, k=1).antiderivative(), np.interp(grid, s, v)
         wide = half > 0
-        mean[wide] = (_area_at(high[wide], s, v, area) - _area_at(low[wide], s, v, area)) / (2 * half[wide])
+        mean[wide] = (area((grid + half)[wide]) - area((grid - half)[wide])) / (2 * half[wide])
         count = np.searchsorted(s, grid + step * 0.501) - np.searchsorted(s, grid - step * 0.501)
         out[count > 0, i] = mean[count > 0]
     return out
-
-
-def _area_at(at: Array, s: Array, v: Array, area: Array) -> Array:
-    """Integral of the line through (s, v) from s[0] to ``at``."""
-    i = np.clip(np.searchsorted(s, at, side="right") - 1, 0, s.size - 2)
-    run = at - s[i]
-    slope = (v[i + 1] - v[i]) / (s[i + 1] - s[i])
-    return np.asarray(area[i] + v[i] * run + slope * run**2 / 2)
 
 
 def _rms_move(time: Array, values: Array, step: float) -> float:
