@@ -56,7 +56,7 @@ class DrawSettings:
     evaluations: int = 40  # at most, of one: with 20 the objective of one log's is a tenth larger
     least_error: float = 1e-3  # of A: the least that V may be in any direction
     unseen_slope: float = 1e-9  # of the largest one: what moves the runs by less is lost in the differences
-    proposal_freedom: float = 6.0  # of the t: a tail
+    proposal_freedom: int = 6  # of the t: a tail
     proposal_width: float = 1.25  # the factor s
     check_steps: int = 50  # of the chain, between two looks at its length
     n_sampled: int = 6  # parameters: a chain of emcee's walkers slows down with each more
@@ -277,7 +277,7 @@ def _proposals(mean: Array, covariance: Array) -> Callable[..., tuple[Array, Arr
     """Return the function of (points (n, n_dim), random) to new points and ln t(old) - ln t(new)."""
     from scipy.stats import multivariate_t  # slow to import, and draws do without
 
-    t = multivariate_t(mean, DRAW.proposal_width**2 * covariance, df=DRAW.proposal_freedom)
+    t: Any = multivariate_t(mean, DRAW.proposal_width**2 * covariance, df=DRAW.proposal_freedom)
 
     def propose(points: Array, random: np.random.RandomState) -> tuple[Array, Array]:
         new = t.rvs(len(points), random_state=random).reshape(points.shape)

@@ -187,19 +187,3 @@ class Described:
         sensors = (*tables.outputs.items(), *tables.disturbances.items())
         self.nuisance: dict[str, float] = {name: item.log_sd for name, item in sensors}
         self.prior = np.array([item.value for item in self.specs.values()])  # (n_p,), median or mean
-
-
-def roll_rows(
-    step: Step, output: Output, x0: Array, u: Array, d: Array, p: Array, h: float, pieces: int = 1
-) -> Run:
-    """Do without a compiler what a compiled kernel does: the same lines on rows with one entry a member."""
-    x, parameters = list(x0.T.copy()), list(p.T)
-    with np.errstate(all="ignore"):  # what is not finite is found afterwards
-        outputs = [*output(x, parameters)]
-        for u_row, d_row in zip(u.transpose(1, 2, 0), d.transpose(1, 2, 0)):
-            for _ in range(pieces):
-                x = step(x, list(u_row), list(d_row), parameters, h)
-            outputs += output(x, parameters)
-    y, last = ([np.broadcast_to(value, len(x0)) for value in values] for values in (outputs, x))
-    rows = u.shape[1] + 1
-    return np.array(y, dtype=float).reshape(rows, -1, len(x0)).transpose(2, 0, 1), np.array(last).T

@@ -10,10 +10,9 @@
         def rhs(self, x, u, d, p):
             return [p.inflow * u.pump - p.outflow * np.sqrt(np.maximum(x.level, 0.0))]
 
-The arguments are named tuples.  The same lines run on numbers, on rows of a batch and on CasADi symbols, so a
-choice between two values is ``np.where`` or ``np.maximum``, never ``if``, and comparisons are joined by
-``np.logical_and``, not by ``&``; what symbols cannot say (sorting, a function of SciPy) NumPy runs on whole
-batches, more slowly than the machine code that is made of symbols.
+The arguments are named tuples.  The same lines run on numbers and on CasADi symbols, of which machine code is
+made: a choice between two values is ``np.where`` or ``np.maximum``, never ``if``.  What symbols cannot say
+(sorting, a function of SciPy) is refused.
 """
 
 from __future__ import annotations
@@ -29,10 +28,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from functools import lru_cache
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Self
 
 import numpy as np
+from numpy.lib.mixins import NDArrayOperatorsMixin
 from numpy.typing import ArrayLike
 from pydantic import (
     AfterValidator,
@@ -46,7 +47,7 @@ from pydantic import (
 
 from thermogrip.datasets.arrays import Array, Run, Values
 from thermogrip.datasets.errors import UserError, known_names, reading
-from thermogrip.sysid.models.model import Described, FreeRuns, Sizes, roll_rows
+from thermogrip.sysid.models.model import Described, FreeRuns, Sizes
 from thermogrip.sysid.models.network_spec import Parameter
 
 if TYPE_CHECKING:
@@ -187,14 +188,9 @@ class OwnCode:
         text = Path(self.file).read_bytes().replace(b"\r\n", b"\n")
         return hashlib.sha256(text).hexdigest()
 
-    @property
-    def sizes(self) -> Sizes:
-        """Numbers of states, inputs, disturbances and parameters."""
-        return Sizes(len(self.states), len(self.inputs), len(self.disturbances), len(self.parameters))
-
     def step(self, x: Values, u: Values, d: Values, p: Values, h: Any) -> list[Any]:
         """Return the state one Runge-Kutta step of ``h`` on; CasADi's symbols too."""
-        x, u, d, p = (_for_numpy(values) for values in (x, u, d, p))
+        x, u, d, p, (h,) = (_for_numpy(values) for values in (x, u, d, p, [h]))
         # the classical rule of fourth order for dx/dt = f(x, u, d, p), u and d held over a step
         k1 = self.rhs(x, u, d, p)
         k2 = self.rhs([a + h / 2 * k for a, k in zip(x, k1)], u, d, p)
@@ -239,13 +235,13 @@ class OwnCode:
             hint, fields = f"correct {what}", getattr(getattr(error, "obj", None), "_fields", None)
             if fields is not None:  # of a named tuple of the arguments
                 hint = f"the {type(error.obj).__name__} are {', '.join(fields) or 'none'}"  # type: ignore[attr-defined]
-            elif "ArrayInterface" in str(error):
-                hint = "join comparisons with np.logical_and, not with &"
-            elif "truth value" in str(error):
-                hint = "an if about many values at once: choose with np.where or np.maximum"
+            elif "not known yet" in str(error):
+                hint = "choose with np.where or np.maximum"
+            elif "ArrayInterface" in str(error) or "_Symbol" in str(error):
+                hint = "use arithmetic and NumPy's elementary functions"
             problem = f"fails in {what}: {type(error).__name__}: {error}"
             raise self.fault(problem, line=_line_of(error, self.file), hint=hint) from error
-        values = list(got) if np.iterable(got) else [got]
+        values = [got] if getattr(got, "ndim", None) == 0 or not np.iterable(got) else list(got)
         if len(values) != len(names):
             problem = f"returns {len(values)} numbers from {what}, not {len(names)}"
             raise self.fault(problem, hint=f"return one for each of {', '.join(names)}")
@@ -313,14 +309,12 @@ OWN = OwnSettings()
 
 
 @lru_cache(maxsize=32)
-def compile_steps(code: OwnCode) -> tuple[Kernel | None, str]:
-    """Return the compiled steps of a class, or None and why there are none."""
+def _kernel(code: OwnCode) -> Kernel:
+    """Return the compiled steps of a class."""
     from thermogrip.sysid.models.jit_rollout import Kernel  # pulls in llvmlite
 
-    try:
-        return Kernel(code.step, code.output, code.sizes), ""
-    except UserError as error:
-        return None, error.problem
+    sizes = (len(group) for group in (code.states, code.inputs, code.disturbances, code.parameters))
+    return Kernel(code.step, code.output, Sizes(*sizes))
 
 
 def still(code: OwnCode, y: Array, u: Array, d: Array, p: Array, *, sd: Array, seconds: float) -> Array:
@@ -379,11 +373,6 @@ class OwnModel(Described):
         self.reference: str | None = None
         self.spread = np.diag(np.square(list(code.states.values())))
 
-    @property
-    def slow_because(self) -> str:
-        """Why NumPy does the rollouts though they should be compiled; "" where it does not."""
-        return compile_steps(self.code)[1]
-
     def step(self, x: Values, u: Values, d: Values, p: Values, dt: float) -> list[Any]:
         """Return the state after ``dt`` seconds; numbers, NumPy rows or CasADi symbols alike."""
         n, state = self._pieces(dt), list(x)
@@ -419,10 +408,7 @@ class OwnModel(Described):
         """Simulate a batch."""
         x0, u, d, p = (np.ascontiguousarray(value, dtype=float) for value in (x0, u, d, p))
         n = self._pieces(dt)
-        kernel = compile_steps(self.code)[0]
-        if kernel is None:
-            return roll_rows(self.code.step, self.code.output, x0, u, d, p, dt / n, pieces=n)
-        return kernel.rollout(x0, u, d, p, dt / n, pieces=n)
+        return _kernel(self.code).rollout(x0, u, d, p, dt / n, pieces=n)
 
     def prepared(self, free_runs: FreeRuns, spread: Mapping[str, float], p: Array | None = None) -> OwnModel:
         """Return the model with steps short enough for these logs and its sensors' sd known."""
@@ -502,21 +488,47 @@ class OwnModel(Described):
         return bool(np.max(rms) < OWN.step_error and np.max(most) < 1)  # NaN is not less
 
 
+_LOGICAL = {np.bitwise_and: np.logical_and, np.bitwise_or: np.logical_or, np.invert: np.logical_not}
+
+
+class _Symbol(NDArrayOperatorsMixin):
+    """A symbol of CasADi that NumPy's functions take and that may stand in an array; ``view`` is CasADi's own
+    for NumPy, which would fill an array with NaN."""
+
+    def __init__(self, view: Any) -> None:
+        self.view = view
+
+    def __array_ufunc__(self, function: Any, method: str, *inputs: Any, **options: Any) -> Any:
+        if method != "__call__" or options:
+            raise TypeError(f"{function.__name__}.{method} of a value that is not known yet")
+        if any(isinstance(value, np.ndarray) and value.ndim for value in inputs):
+            return np.frompyfunc(function, len(inputs), 1)(
+                *(np.asarray(value, dtype=object) for value in inputs)
+            )
+        return self.__array_function__(_LOGICAL.get(function, function), (), inputs, {})
+
+    def __array_function__(self, function: Any, _types: Any, inputs: Any, options: Any) -> Any:
+        bare = [value.view if isinstance(value, _Symbol) else value for value in inputs]
+        return _Symbol(function(*bare, **options))
+
+    def __bool__(self) -> bool:
+        raise TypeError("an if about a value that is not known yet")
+
+
 def _for_numpy(values: Values) -> list[Any]:
     """Return values with CasADi's symbols made such that NumPy's functions take them."""
-    casadi = sys.modules.get("casadi")  # not loaded: there is no symbol
-    view = getattr(casadi, "ArrayInterface", None)  # CasADi without it has no such warning
-    if casadi is None or view is None:
-        return list(values)
+    casadi: Any = import_module("casadi")
     kinds = (casadi.SX, casadi.MX)
-    return [view(value, ndim=0) if isinstance(value, kinds) else value for value in values]
+    return [
+        _Symbol(casadi.ArrayInterface(value, ndim=0)) if isinstance(value, kinds) else value
+        for value in values
+    ]
 
 
 def _plain(values: Values) -> list[Any]:
     """Return values with CasADi's symbols as CasADi knows them."""
-    casadi: Any = sys.modules.get("casadi")
-    kind = getattr(casadi, "ArrayInterface", ())
-    return [casadi.vertcat(value) if isinstance(value, kind) else value for value in values]
+    casadi: Any = import_module("casadi")
+    return [casadi.vertcat(value.view) if isinstance(value, _Symbol) else value for value in values]
 
 
 def own_model(kind: Any) -> OwnModel:
@@ -554,10 +566,10 @@ def own_model(kind: Any) -> OwnModel:
         raise UserError(problem, file=where, hint="give its arguments defaults") from error
     code = OwnCode(made)
     model = OwnModel(code)
-    two = [np.full(2, value) for value in model.prior]  # rows of two, so that an if is found out
-    x, u, d = ([np.ones(2)] * n for n in (model.n_x, len(model.inputs), len(model.disturbances)))
+    groups = (code.states, code.inputs, code.disturbances, code.parameters)
+    x, u, d, p = ([import_module("casadi").SX.sym(name) for name in group] for group in groups)
+    code.step(x, u, d, p, code.dt)  # finds out an if, and what symbols cannot say
+    code.output(x, p)
     with np.errstate(all="ignore"):
-        code.rhs(x, u, d, two)
-        code.output(x, two)
         code.rest([1.0] * len(model.outputs), [1.0] * len(u), [1.0] * len(d), model.prior.tolist())
     return model

@@ -292,16 +292,8 @@ def to_casadi(plant: PlantData, *, dt: float | None = None) -> Any:
     x, u, d, p = (ca.SX.sym(name, size) for name, size in zip(("x", "u", "d", "p"), sizes))
     state = ca.vertsplit(x)
     inputs, disturbances, parameters = (ca.vertsplit(v) if v.numel() else [] for v in (u, d, p))
-    try:
-        y = model.output(state, parameters)
-        for _ in range(n):
-            state = model.step(state, inputs, disturbances, parameters, plant.dt)
-        ports = [x, u, d, p], [ca.vertcat(*state), ca.vertcat(*y)]
-        return ca.Function("step", *ports, ["x", "u", "d", "p"], ["x_next", "y"])
-    except (TypeError, NotImplementedError, AttributeError, RuntimeError) as error:
-        if model.kind != "own":
-            raise
-        raise UserError(
-            f"the class cannot be written in symbols ({type(error).__name__}: {error})".splitlines()[0],
-            hint="use plain arithmetic in it, and no branch on a state, an input or a parameter",
-        ) from error
+    y = model.output(state, parameters)
+    for _ in range(n):
+        state = model.step(state, inputs, disturbances, parameters, plant.dt)
+    ports = [x, u, d, p], [ca.vertcat(*state), ca.vertcat(*y)]
+    return ca.Function("step", *ports, ["x", "u", "d", "p"], ["x_next", "y"])

@@ -316,7 +316,7 @@ class Plant(Shown, plant_data.PlantData):
         Raises
         ------
         UserError
-            If dt is no multiple, or a model of the user's own cannot be written in symbols.
+            If dt is no multiple.
 
         Examples
         --------

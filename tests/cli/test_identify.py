@@ -297,17 +297,6 @@ def test_a_posterior_is_an_answer_of_yes_where_it_has_converged(
         assert "posterior: c" in done.err
 
 
-def test_a_model_that_runs_slowly_says_why(room: SimpleNamespace) -> None:
-    model = SimpleNamespace(kind="own", slow_because="it calls print")
-    plant = SimpleNamespace(
-        model=model, save=lambda out: None, free=(), intervals=lambda level: {}, values={}, units={}
-    )
-    room.found = found_of("arx", plant=plant)
-    done = room.bench.run("identify", "good.csv", "--out", "p.json")
-    assert done.code == 0, done
-    assert "warning: own model not compiled, and so slower: it calls print" in done.err
-
-
 def test_a_plant_is_scored_log_by_log_beside_its_baselines(bench: Bench) -> None:
     words = ["validate", "plant.json", "good.csv@:100", "good.csv@100:250"]
     options = ["--warmup", "7", "--score-from", "9"]

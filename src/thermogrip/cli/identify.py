@@ -164,9 +164,6 @@ def identify(
     if posterior:
         console.say(lost if record is None else record.verdict)
     console.say(f"wrote {out}")
-    slow = getattr(plant.model, "slow_because", "")
-    if slow:
-        console.warn(f"{plant.model.kind} model not compiled, and so slower: {slow}")
     more = {"dynamics": None if dynamics is None else dynamics.to_dict(), "repairs": repairs}
     console.answer(_identified(identified, plant, record, out) | more)
     for doubt in identified.doubts:

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 from scipy.optimize import least_squares
 
+from tests.sysid.models.makers import roll_rows
 from thermogrip.datasets.errors import UserError
-from thermogrip.sysid.models.model import roll_rows
 from thermogrip.sysid.models.network import NetworkModel, load_network
 from thermogrip.sysid.models.network_spec import builtin_networks, network_from_dict, read_network
 

@@ -15,12 +15,12 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
+from tests.sysid.models.makers import roll_rows
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log, make_log
 from thermogrip.sysid.greybox.fit import fit_network, free_runs
 from thermogrip.sysid.greybox.posterior import fit_problem, with_draws
 from thermogrip.sysid.greybox.problem import prior_plant
-from thermogrip.sysid.models.model import roll_rows
 from thermogrip.sysid.models.user_model import OwnModel, load_object, own_model
 from thermogrip.sysid.plant.plant import Plant
 
@@ -159,7 +159,6 @@ def test_compiled_rows_and_symbols_agree():
     run = x0, pump, np.zeros((1, 200, 0)), p
     code = fast.code
     ends = [roll_rows(code.step, code.output, *run, 4.0 / 3, pieces=3), fast.rollout(*run, 4.0)]
-    assert fast.slow_because == ""
     np.testing.assert_allclose(ends[0][0], ends[1][0], atol=1e-10)
     np.testing.assert_allclose(ends[0][1], ends[1][1], atol=1e-10)
     x, u, q = (casadi.SX.sym(name, n) for name, n in (("x", 2), ("u", 1), ("p", 3)))
@@ -339,7 +338,7 @@ def test_what_a_plant_file_says_of_a_class_is_checked():
         OwnModel.from_dict({})
 
 
-def test_a_class_may_call_what_it_likes_and_what_cannot_be_compiled_runs_in_numpy_and_reports_it():
+def test_a_class_may_call_what_it_likes_and_what_cannot_be_compiled_is_refused():
     class Helped(Block):
         def loss(self, p: Any, x: Any, d: Any) -> Any:
             return p.G * (x.t - d.air)
@@ -355,11 +354,15 @@ def test_a_class_may_call_what_it_likes_and_what_cannot_be_compiled_runs_in_nump
         def loss(self, p: Any, x: Any, d: Any) -> Any:
             return p.G * (np.interp(x.t, [-50.0, 30.0, 100.0], [-50.0, 30.0, 100.0]) - d.air)
 
-    assert [own_model(kind).slow_because for kind in (Helped, Tabled)] == ["", ""]
-    assert "sort" in own_model(Sorted).slow_because
+    class Arrays(Block):
+        def rhs(self, x: Any, u: Any, d: Any, p: Any) -> Any:
+            return np.array([p.P * u.q + p.G * (d.air - x.t)]) / p.C
+
+    with pytest.raises(UserError, match=r"Sorted fails in rhs: .*sort"):
+        own_model(Sorted)
     plain = own_model(Block)
     arguments = ([[25.0]], np.ones((1, 9, 1)), np.full((1, 9, 1), 21.0), plain.prior[None], 1.0)
-    for kind in (Helped, Sorted, Tabled):
+    for kind in (Helped, Tabled, Arrays):
         got = own_model(kind).rollout(*arguments)[0]
         np.testing.assert_allclose(got, plain.rollout(*arguments)[0], atol=1e-12)
 
@@ -520,7 +523,6 @@ def test_the_class_of_the_how_to_is_accepted(tmp_path):
     file = tmp_path / "tank.py"
     file.write_text(page.split("```python\n")[1].split("```")[0])
     model = own_model(load_object(file, "Tank"))
-    assert model.slow_because == ""
     assert [name for name, spec in model.specs.items() if not spec.fixed] == ["gain", "drain", "volts"]
     x = model.rest([4.0], [1.0], [], model.prior)
     np.testing.assert_allclose(x, [2.0], atol=1e-4)  # 2 V/m
