@@ -498,14 +498,14 @@ class _Symbol(NDArrayOperatorsMixin):
     def __init__(self, view: Any) -> None:
         self.view = view
 
-    def __array_ufunc__(self, function: Any, method: str, *inputs: Any, **options: Any) -> Any:
+    def __array_ufunc__(self, ufunc: Any, method: Any, *inputs: Any, **options: Any) -> Any:
         if method != "__call__" or options:
-            raise TypeError(f"{function.__name__}.{method} of a value that is not known yet")
+            raise TypeError(f"{ufunc.__name__}.{method} of a value that is not known yet")
         if any(isinstance(value, np.ndarray) and value.ndim for value in inputs):
-            return np.frompyfunc(function, len(inputs), 1)(
+            return np.frompyfunc(ufunc, len(inputs), 1)(
                 *(np.asarray(value, dtype=object) for value in inputs)
             )
-        return self.__array_function__(_LOGICAL.get(function, function), (), inputs, {})
+        return self.__array_function__(_LOGICAL.get(ufunc, ufunc), (), inputs, {})
 
     def __array_function__(self, function: Any, _types: Any, inputs: Any, options: Any) -> Any:
         bare = [value.view if isinstance(value, _Symbol) else value for value in inputs]
