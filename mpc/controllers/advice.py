@@ -22,11 +22,8 @@ def silence(seconds: float) -> str:
 
 def lost_readings(names: Sequence[str], *, stuck: bool) -> str:
     """Return what is said of sensors without a usable reading, nothing where there are none."""
-    return (
-        f"{', '.join(names)}: no usable reading{', stuck: it should have moved' if stuck else ''}"
-        if names
-        else ""
-    )
+    stays = ", stuck: it should have moved" if stuck else ""
+    return f"{', '.join(names)}: no usable reading{stays}" if names else ""
 
 
 def jump(names: Sequence[str], *, offset: bool) -> str:

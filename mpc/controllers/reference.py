@@ -76,21 +76,18 @@ class ReferenceController(SampledController):
         self.observer = design.observer(model)
         self.pi = PIController(plant, design)
         self.monitor = ReadingMonitor(model.n_y, spike=model.spike)
-        lost = np.full(model.n_y, np.nan)
-        self._start(lost, model.undisturbed(design.ambient), self.observer.reset)
+        self._begin(np.full(model.n_y, np.nan), model.undisturbed(design.ambient), self.observer.reset)
 
     @property
     def plan(self) -> Array | None:
         """The plan that is still ahead, (N, n_u)."""
-        return (
-            None if self._follows.plan is None else shifted(self._follows.plan, self._follows.age_s / self.dt)
-        )
+        plan = self._follows.plan
+        return None if plan is None else shifted(plan, self._follows.age_s / self.dt)
 
     def reset(self, reading: Readings, *, in_room: bool = False) -> None:
         """Forget the past, see :meth:`thermogrip.mpc.controllers.mpc.Controller.reset`; ``in_room`` with the
         plant linearised in its room, as C has it."""
-        begin = self.observer.reset_in_room if in_room else self.observer.reset
-        self._start(*self._read(reading), begin)
+        self._begin(*self._read(reading), self.observer.reset_in_room if in_room else self.observer.reset)
         self._u = self._applied(reading, self._u)
         self.pi.reset(reading)
         self.times.reset()
@@ -132,17 +129,25 @@ class ReferenceController(SampledController):
             status = "infeasible"
         return self._answer(self._within(choice.u), status, wrong or lasting or event, started)
 
-    def _start(self, y: Array, d: Array, begin: Callable[[Array, Array], None]) -> None:
-        """Forget the past at readings y, disturbances d; the estimate is begun by one of the observer's two
-        ways: in the middle of a loop there is no time for the better one."""
-        d = np.where(np.isfinite(d), d, self.model.undisturbed(self.design.ambient))
-        begin(y, d)
+    def _begin(self, y: Array, d: Array, estimate: Callable[[Array, Array], None]) -> None:
+        """Forget the past at readings y, disturbances d."""
         self._forget()
-        n_c = len(self._rows)
-        self._follows = _Follows(side=np.zeros(n_c), ramped=np.full(n_c, np.nan))
+        d = np.where(np.isfinite(d), d, self.model.undisturbed(self.design.ambient))
+        self._start(y, d, estimate, side=np.zeros(len(self._rows)))
+
+    def _start(self, y: Array, d: Array, estimate: Callable[[Array, Array], None], *, side: Array) -> None:
+        """Start the estimate again, by one of the observer's two ways: in the middle of a loop there is no
+        time for the better one.  Drives in force and targets stay."""
+        estimate(y, d)
+        self._unread_s = np.zeros(len(self._rows))
+        self._follows = _Follows(side, ramped=np.full(len(self._rows), np.nan))
         self._past = _Past(y, d, self.observer.now)
         self.monitor.forget(y)
         self.optimiser.forget()
+
+    def _start_in_room(self, y: Array, d: Array) -> None:
+        d = np.where(np.isfinite(d), d, self._past.d)
+        self._start(y, d, self.observer.reset_in_room, side=self._follows.side)
 
     def _pass(self, seconds: float, applied: Array) -> None:
         """Let the estimate and the plan go on by so many seconds under the drives that were applied."""
@@ -158,14 +163,8 @@ class ReferenceController(SampledController):
         """Correct the estimate with this reading; return what the operator should know."""
         elapsed, silent = self.times.waited_s, self._past.silent_s
         if silent and np.isfinite(y).any():
-            u = self._u
-            target = self._target
-            side = self._follows.side
-            self._start(y, np.where(np.isfinite(d), d, self._past.d), self.observer.reset_in_room)
-            self._u, self._past.fresh = u, False
-            self._target = target
-            self._follows.side = side
-            self._past.y = y
+            self._start_in_room(y, d)
+            self._past.fresh = False
             return advice.silence(silent)
         if not self._past.fresh:
             self.observer.look(self._past.d)
@@ -207,10 +206,9 @@ class ReferenceController(SampledController):
 
     def _pause(self, y: Array, d: Array, target: Trajectory, started: float) -> Move:
         """Take the drive back while no water moves its heat; the estimate starts again afterwards."""
-        u, before = self._within(self.drives.neutral), self._u
+        u = self._within(self.drives.neutral)
         wanted, _ = self._wanted(target)
-        self._start(y, np.where(np.isfinite(d), d, self._past.d), self.observer.reset_in_room)
-        self._u = before
+        self._start_in_room(y, d)
         self._target, self._follows.side = wanted, self._sides(wanted)
         stands = advice.pump_off(self.model.model.switches)
         # without a pump that is asked for nobody would switch it on again

@@ -139,11 +139,9 @@ class ObserverNoise:
 
 def reading_noise(plant: Plant, output: str) -> float | None:
     """Return the standard deviation of a reading, as the plant's record has it."""
-    scores = plant.scores
-    readings_sd = (
-        (scores.innovations.reading if scores.innovations else {}) or scores.reading_sd or plant.noise
-    )
-    return readings_sd.get(output)
+    innovations = plant.scores.innovations
+    by_fit = innovations.reading if innovations else {}
+    return (by_fit or plant.scores.reading_sd or plant.noise).get(output)
 
 
 def detectability_margin(

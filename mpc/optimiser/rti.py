@@ -217,7 +217,10 @@ class Optimiser:
         bias = sample.bias
         drive_bias = sample.drive_bias
         guess = self._park(sample.guess, problem)
-        y_guess, G = self._linearised(x, guess + drive_bias, d)
+        y_guess, response = model.trajectory(x, guess + drive_bias, d, self.design.blocks)
+        if self._G is None or model.affine is None:
+            self._G = response.reshape(self.N, model.n_y, -1) * self._spans
+        G = self._G  # by drives in their ranges
         authority = self._authority(G)
         y_guess = y_guess + bias
         free = y_guess - G @ (guess / model.span).ravel()  # the response without any plan
@@ -251,13 +254,6 @@ class Optimiser:
             parked=np.flatnonzero(lost[self.pair]).tolist(),
             more=0.0 if sample.slew_s is None else sample.slew_s / self.design.dt - 1.0,
         )
-
-    def _linearised(self, x: Array, plan: Array, d: Array) -> tuple[Array, Array]:
-        """Return the outputs along a plan, and G (N, n_y, n) by drives in their ranges."""
-        y, G = self.model.trajectory(x, plan, d, self.design.blocks)
-        if self._G is None or self.model.affine is None:
-            self._G = G.reshape(self.N, self.model.n_y, -1) * self._spans
-        return y, self._G
 
     def _slewed(self, ends: Array, problem: Problem) -> Array:
         """Return plans (..., n_b, n_u) that go to these ends as fast as the slew allows."""

@@ -36,18 +36,15 @@ static void forget_calls(tg_controller *c)
     c->stood_s = c->before_s = c->unspent_s = 0.0;
 }
 
+/* Start the estimate again; drives in force and targets stay. */
 static void start(tg_controller *c, const double *y, const double *d)
 {
     const tg_design *s = c->design;
     for (int i = 0; i < TG_ND; i++)
         c->d[i] = isfinite(d[i]) ? d[i] : s->usual_d[i];
     tg_observer_reset(c, y, c->d);
-    for (int j = 0; j < TG_NU; j++)
-        c->u[j] = s->neutral[j];
-    for (int r = 0; r < TG_NC; r++) {
-        c->target[r] = c->ramped[r] = NAN;
-        c->side[r] = 0.0;
-    }
+    for (int r = 0; r < TG_NC; r++)
+        c->ramped[r] = NAN;
     c->ramps = 0;
     c->has_plan = c->solves = c->on_pi = 0;
     memset(c->spikes, 0, sizeof c->spikes);
@@ -71,6 +68,10 @@ void tg_reset(tg_controller *c, const tg_design *design, const double *y, const 
         clean_y[i] = clean(design, y[i]);
     for (int i = 0; i < TG_ND; i++)
         clean_d[i] = clean_measured(design, i, d[i]);
+    for (int j = 0; j < TG_NU; j++)
+        c->u[j] = design->neutral[j];
+    for (int r = 0; r < TG_NC; r++)
+        c->target[r] = NAN;
     start(c, clean_y, clean_d);
     forget_calls(c);
 }
@@ -234,16 +235,10 @@ static int absorb(tg_controller *c, double *y, const double *d, const double *ap
     for (int i = 0; i < TG_NY; i++)
         any = any || isfinite(y[i]);
     if (c->silent_s > 0.0 && any) {
-        double known[TG_SOME(TG_ND)], u[TG_NU], target[TG_NC], side[TG_NC];
+        double known[TG_SOME(TG_ND)];
         for (int i = 0; i < TG_ND; i++)
             known[i] = isfinite(d[i]) ? d[i] : c->d[i];
-        memcpy(u, c->u, sizeof u);
-        memcpy(target, c->target, sizeof target);
-        memcpy(side, c->side, sizeof side);
         start(c, y, known);
-        memcpy(c->u, u, sizeof u);
-        memcpy(c->target, target, sizeof target);
-        memcpy(c->side, side, sizeof side);
         c->fresh = 0;
         return TG_RESTARTED;
     }
@@ -294,22 +289,28 @@ static int moves(tg_controller *c, const double *target)
     return c->due || at_once;
 }
 
+/* Note whence the outputs come to their targets. */
+static void take_sides(tg_controller *c)
+{
+    double mean[TG_NY];
+    tg_expected(c, mean);
+    for (int r = 0; r < c->design->n_c; r++) {
+        double far = c->target[r] - mean[c->design->controlled[r]];
+        c->side[r] = far > 0.0 ? 1.0 : far < 0.0 ? -1.0 : 0.0;
+    }
+}
+
+/* Take targets, the last good one where one cannot be; return whether there is such a one. */
 static int set_target(tg_controller *c, const double *target)
 {
-    const tg_design *s = c->design;
-    double mean[TG_NY], wanted;
-    int wrong = 0, moved = is_new(c, target);
-    for (int r = 0; r < s->n_c; r++)
-        wrong = wrong || !isfinite(clean(s, target[r]));
-    tg_expected(c, mean);
-    for (int r = 0; r < s->n_c; r++) {
-        wanted = isfinite(clean(s, target[r])) ? target[r] : c->target[r];
-        if (moved) {
-            double far = wanted - mean[s->controlled[r]];
-            c->side[r] = far > 0.0 ? 1.0 : far < 0.0 ? -1.0 : 0.0;
-        }
-        c->target[r] = wanted;
-    }
+    int wrong = 0, other = is_new(c, target);
+    for (int r = 0; r < c->design->n_c; r++)
+        if (isfinite(clean(c->design, target[r])))
+            c->target[r] = target[r];
+        else
+            wrong = 1;
+    if (other)
+        take_sides(c);
     return wrong;
 }
 
@@ -675,7 +676,7 @@ tg_move tg_step(tg_controller *c, tg_time time_s, const double *y, const double 
 tg_move tg_pause(tg_controller *c, tg_time time_s, const double *y, const double *d, const double *target)
 {
     tg_move move;
-    double clean_y[TG_NY], clean_d[TG_SOME(TG_ND)], kept[TG_NC], did[TG_NU];
+    double clean_y[TG_NY], clean_d[TG_SOME(TG_ND)], did[TG_NU];
     memset(&move, 0, sizeof move);
     receive(c, time_s, y, d, NULL, clean_y, clean_d, did);
     memcpy(move.drive, c->design->neutral, sizeof move.drive);
@@ -683,11 +684,9 @@ tg_move tg_pause(tg_controller *c, tg_time time_s, const double *y, const double
     note_move(c, move.drive);
     for (int i = 0; i < TG_ND; i++)
         clean_d[i] = isfinite(clean_d[i]) ? clean_d[i] : c->d[i];
-    for (int r = 0; r < TG_NC; r++) /* the last good one stays */
-        kept[r] = r < c->design->n_c && isfinite(clean(c->design, target[r])) ? target[r] : c->target[r];
     start(c, clean_y, clean_d);
-    set_target(c, kept);
-    memcpy(c->u, move.drive, sizeof c->u);
+    set_target(c, target);
+    take_sides(c);
     move.pump = 1; /* nobody would switch it on again */
     move.status = c->status = TG_OFF;
     move.advice = c->advice = TG_PUMP_OFF;
