@@ -80,7 +80,8 @@ class _Filter:
     input_range: Array  # (n,) of the graded inputs in the logs
 
     def gains(self, sd: Array, ratios: Sequence[tuple[float, float]]) -> tuple[Array, Array]:
-        """Return the gains and the covariances of innovations that the filter settles at, by ratio."""
+        """Return the gains and the covariances of innovations that the filter settles at, by ratio; NaN where
+        it does not."""
         dt, r = self.plant.dt, float(np.sqrt(np.mean(sd**2)))
         states, inputs = r**2 * self.state_covariance, np.diag(self.input_range**2)
         # what moves nothing by itself has a gain all the same
@@ -89,7 +90,10 @@ class _Filter:
         for q, b in ratios:
             drift = dt * block_diag(q**2 * states, b**2 * inputs)
             # the gains that the filter settles at; predictions are the plant's own
-            P = solve_discrete_are(self.F.T, self.H.T, drift + trace, np.diag(sd**2))
+            try:
+                P = solve_discrete_are(self.F.T, self.H.T, drift + trace, np.diag(sd**2))
+            except ValueError:  # it settles nowhere, or the eigenvalues could not be ordered
+                P = np.full_like(self.F, np.nan)
             S = self.H @ P @ self.H.T + np.diag(sd**2)
             gains.append(np.linalg.solve(S, self.H @ P).T)
             spreads.append(S)

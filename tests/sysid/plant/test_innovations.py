@@ -57,6 +57,24 @@ def test_noise_is_the_same_in_any_coordinates_of_the_states():
     assert (other.input, other.reading) == (pytest.approx(one.input, rel=1e-3), pytest.approx(one.reading))
 
 
+@pytest.mark.parametrize(
+    ("a", "b", "course", "sd"),  # of which LAPACK fails on one ratio
+    [
+        ([2.272, -1.5653, 0.2933], [1.696, -1.674, 0.0], [1.0, -1.96, 0.96], 3.0),
+        ([2.957, -2.9145, 0.9575], [0.03, -0.03, 0.0], [1.0, -1.957, 0.9575], 0.1),
+    ],
+)
+def test_a_filter_that_does_not_settle_leaves_those_that_do(
+    a: list[float], b: list[float], course: list[float], sd: float
+) -> None:
+    A, spread = np.column_stack([a, np.eye(3)[:, :2]]), 240.0 * np.outer(course, course)
+    B, C = np.reshape(b, (3, 1)), np.eye(3)[:1]
+    model = StateSpaceModel(("q",), (), ("t",), A=A, B=B, C=C, dt=5.0, y0=[25.0], spread=spread)
+    plant, log = replace(heater(), model=model, dt=5.0, noise={"t": sd}), logged(0.05, 0.0, 0.05)
+    found = innovation_noise(plant, [log.assign(q=log["q"] / 60)])
+    assert 0 < found.reading["t"] < np.inf
+
+
 def test_lost_readings_and_two_logs_change_little():
     log = logged(0.05, 0.0, 0.05)
     holes = log.copy(deep=True)
