@@ -36,12 +36,13 @@ from thermogrip.sysid.blackbox.fit import (
 )
 from thermogrip.sysid.blackbox.order_selection import BARELY_MORE, excess_within_noise
 from thermogrip.sysid.data.data_quality import DataCheck, Evidence, check_data, evidence
-from thermogrip.sysid.data.rest_before import doubt_of_gains, with_rest
-from thermogrip.sysid.data.signal_roles import (
+from thermogrip.sysid.data.preparation import (
     SignalRole,
+    doubt_of_gains,
     role_doubts,
     signal_roles,
     still_inputs,
+    with_rest,
     without_still,
 )
 from thermogrip.sysid.plant.fit_record import HELD_OUT_SHARE, TAIL, ExpectedError, HeldOut

@@ -15,7 +15,7 @@ import numpy as np
 
 from thermogrip.datasets.roles import guess_role, is_room_temperature
 from thermogrip.datasets.schema import Log, column
-from thermogrip.sysid.data.signal_roles import moves
+from thermogrip.sysid.data.preparation import moves
 from thermogrip.sysid.models.network import NetworkModel
 from thermogrip.sysid.models.network_spec import (
     Disturbance,

@@ -21,7 +21,7 @@ from thermogrip.datasets.schema import make_log
 from thermogrip.report.console import short
 from thermogrip.report.plant import band_words
 from thermogrip.sysid.data.data_quality import Finding
-from thermogrip.sysid.data.signal_roles import SignalRole
+from thermogrip.sysid.data.preparation import SignalRole
 from thermogrip.sysid.experiment.information import plant_from_prior
 from thermogrip.sysid.export.dynamics import plant_dynamics
 from thermogrip.sysid.models.network import load_network

@@ -14,7 +14,7 @@ from thermogrip.datasets.schema import Log, make_log
 from thermogrip.report import plant
 from thermogrip.report.html import Plot, Table, Text
 from thermogrip.report.plant import _prior_intervals, free_run_section, parameter_table
-from thermogrip.sysid.data.signal_roles import SignalRole
+from thermogrip.sysid.data.preparation import SignalRole
 from thermogrip.sysid.experiment.information import plant_from_prior
 from thermogrip.sysid.models.network import load_network
 from thermogrip.sysid.models.state_space import StateSpaceModel

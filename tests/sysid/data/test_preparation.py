@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from thermogrip.datasets.schema import make_log
-from thermogrip.sysid.data.rest_before import with_rest
+from thermogrip.sysid.data.preparation import with_rest
 from thermogrip.sysid.identification import identify
 from thermogrip.sysid.validation.free_run import free_run
 

@@ -1,4 +1,10 @@
-"""What each column of several logs is taken for, why, and which guesses decide."""
+"""What of the logs is fitted: what each column is taken for and why, and rest before an only move.
+
+A step test is often recorded from the step on: a row or two of the plant at rest, the step, and no other
+move. What a plant does from an unknown start is then the same as what the step does to it, so no gain follows
+from such a log alone. It does if the plant rested before the first row, as its readings up to the step say
+where they are flat.
+"""
 
 from __future__ import annotations
 
@@ -7,12 +13,20 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
-from thermogrip.datasets.schema import Log, column, log_name, names
-from thermogrip.sysid.plant.log_grid import roles_of
+from thermogrip.datasets.arrays import Array
+from thermogrip.datasets.schema import Log, column, columns, log_name, names
+from thermogrip.sysid.data.data_quality import reading_excess
+from thermogrip.sysid.plant.fit_record import fit_logs
+from thermogrip.sysid.plant.log_grid import MOVED, quantum, roles_of, rows_of
 
 if TYPE_CHECKING:
     from thermogrip.sysid.models.model import GreyModel
+
+_EARLY = 10  # rows: more of them before the move are a rest of their own
+_ADDED = 50  # rows
+_FLAT = 6.0  # sd of the readings' noise: ten of them differ by more once in a thousand times
 
 
 @dataclass(frozen=True)
@@ -109,3 +123,80 @@ def signal_roles(
         if more := ", ".join(name for name in signals_of if name not in taken):
             unused.append(f"{log_name(log)}: {more} left out, for {log_name(logs[0])} has no such signal")
     return tuple(out), unused
+
+
+def with_rest(
+    logs: Sequence[Log], inputs: Sequence[str], outputs: Sequence[str]
+) -> tuple[list[Log], list[str]]:
+    """Return the logs, and a line for each to which rows of rest were added at its start: of logs whose
+    inputs move in their first ten rows alone, those with flat readings up to the move.
+
+    >>> from thermogrip.datasets.schema import make_log
+    >>> t = np.arange(300.0)
+    >>> y = 21 + 20 * (1 - np.exp(-np.maximum(t - 1, 0) / 80))
+    >>> log = make_log(t, {"q": (40.0 * (t > 0), "percent", "input"), "t": (y, "degC", "output")})
+    >>> rested, said = with_rest([log], ["q"], ["t"])
+    >>> rested[0].sizes["time"], float(rested[0].time[0]), float(rested[0].t[0]), len(said)
+    (350, -50.0, 21.0, 1)
+    """
+    moved = _moved_rows(logs, inputs)
+    if not _moved_early_alone(moved):
+        return list(logs), []
+    out, notes = [], []
+    for log, rows in zip(logs, moved):
+        if not len(rows) or not (at_rest := _first_readings(log, outputs, int(rows[0]) + 1)):
+            out.append(log)
+            continue
+        out.append(_begun_earlier(log, at_rest))
+        notes.append(
+            f"{log_name(log)}: begins with the only move of an input; taken to have rested at its first "
+            f"readings before ({_ADDED} rows of that are in the fit): record a minute of rest to make sure"
+        )
+    return out, notes
+
+
+def doubt_of_gains(logs: Sequence[Log], inputs: Sequence[str]) -> list[str]:
+    """Return a line where the inputs of all logs, with the rest that was added, move in first rows alone."""
+    if not _moved_early_alone(_moved_rows(logs, inputs)):
+        return []
+    name = inputs[0] if len(inputs) == 1 else "each input"
+    return [
+        f"{name} moves in the first rows alone, where the plant was not at rest: no gain follows from that "
+        "(record a minute of rest before the move, or move it again)"
+    ]
+
+
+def _moved_rows(logs: Sequence[Log], inputs: Sequence[str]) -> list[NDArray[np.int64]]:
+    """Return for each log the rows at which an input is another than before."""
+    u = [columns(log, inputs) for log in logs]
+    least = MOVED * np.ptp(np.concatenate(u), axis=0)
+    changes = [np.any(np.abs(np.diff(inputs_of_log, axis=0)) > least, axis=1) for inputs_of_log in u]
+    return [np.flatnonzero(change) + 1 for change in changes]
+
+
+def _moved_early_alone(moved: Sequence[NDArray[np.int64]]) -> bool:
+    return any(map(len, moved)) and all(rows[-1] <= _EARLY for rows in moved if len(rows))
+
+
+def _first_readings(log: Log, outputs: Sequence[str], n: int) -> dict[str, float]:
+    """Return the mean of the first n readings of each output; none where those of one move, or are lost."""
+    whole = columns(log, outputs)
+    noise = reading_excess([rows_of(log, (), outputs, ())], outputs, np.inf)
+    means = {}
+    for name, y in zip(outputs, whole.T):
+        first: Array = y[:n][np.isfinite(y[:n])]
+        if not first.size or np.ptp(first) > max(1.01 * quantum(y), _FLAT * noise[name]):
+            return {}
+        means[name] = float(first.mean())
+    return means
+
+
+def _begun_earlier(log: Log, readings: dict[str, float]) -> Log:
+    time = np.asarray(log["time"].values, dtype=float)
+    step = float(np.median(np.diff(time)))
+    longer = log.isel(time=np.r_[np.zeros(_ADDED, dtype=int), : len(time)])
+    before = time[0] - step * np.arange(_ADDED, 0, -1)
+    longer = longer.assign_coords(time=("time", np.r_[before, time], log["time"].attrs))
+    for name, value in readings.items():
+        longer[name] = longer[name].copy(data=np.r_[np.full(_ADDED, value), log[name].values])
+    return longer.assign_attrs(sha256=fit_logs([log])[0].sha256)
