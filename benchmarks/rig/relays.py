@@ -10,10 +10,10 @@ The plants are explicit equations that share nothing with the package, stepped b
   with 40 s, a sensor of 30 s; the compressor stays on for 60 s and off for 180 s, the heater likewise, and
   60 s are between them.  To 18 degC from 24, then the room goes from 24 to 8 degC.
 
-Each is identified from one log of pulses that relays can play, and controlled by a PI of that plant and by
-the MPC's default design through :class:`~thermogrip.rig.drivers.relays.RelayRig`.  A thermostat switches at
-its half width about the target.  A line has: settled within the band [s], overshoot [K], rms at rest and
-under the load [K], switchings an hour.
+Each is identified from one log of pulses that relays can play, and controlled by a PI of that plant, by the
+MPC's default design, and by what a tuning with these relays makes of it, through
+:class:`~thermogrip.rig.drivers.relays.RelayRig`.  A thermostat switches at its half width about the target.
+A line has: settled within the band [s], overshoot [K], rms at rest and under the load [K], switchings an hour.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 
 from thermogrip.datasets.schema import make_log
-from thermogrip.mpc import Controller, PIController
+from thermogrip.mpc import Controller, PIController, Spec, tune
 from thermogrip.mpc.design.relays import Relay
 from thermogrip.mpc.interface import Move
 from thermogrip.rig.drivers.relays import RelayRig
@@ -195,7 +195,10 @@ def main() -> None:
     for kind in (Plant, Chamber):
         found = identified(kind, seed)
         name = found.inputs[0]
+        tuning = tune(found, Spec.of(found).model_copy(update={"relays": {name: kind.relay}}), seed=seed)
+        of_kind = "PI" if isinstance(tuning.controller, PIController) else "MPC"
         loops: dict[str, Any] = {"PI by SIMC": PIController(found), "default MPC": Controller(found)}
+        loops[f"tuned: {of_kind}"] = tuning.controller
         for half in (0.1, 0.5):
             loops[f"thermostat +-{half:g}"] = Thermostat(half, kind.full[0], name)
         for title, controller in loops.items():
