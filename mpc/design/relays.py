@@ -64,6 +64,7 @@ class Switch:
     opposite: Switch | None = field(default=None, repr=False)  # off for dead_s before this one comes on
     share: float = 0.0  # that is requested, below zero where the other sign is
     on: bool = False
+    fresh: bool = True  # it has not been on, and for what it waited until then nothing is owed
     owed_s: float = 0.0
     since_s: float = 0.0  # it last went over
 
@@ -76,7 +77,7 @@ class Switch:
         # -on_s / 2 <= owed <= max(on_s / 2, off_s), whatever is requested: over a window of W seconds the
         # mean is off by at most the width of that over W
         least = min(self.owed_s, 0.0) if self.share < 0 else -inf
-        most = max(0.5 * self.on_s, self.off_s) + SHORTEST_S
+        most = max(0.5 * self.on_s, 0.0 if self.fresh else self.off_s) + SHORTEST_S
         self.owed_s = min(max(self.owed_s + self.share * seconds, least), most)
 
     def due_s(self) -> float:
@@ -118,7 +119,7 @@ class Switches:
         """Switch what is due, one after the other: of two that are due one comes on, and the other waits."""
         for switch in self.each:
             if switch.due_s() <= NOW_S:
-                switch.on, switch.since_s = not switch.on, 0.0
+                switch.on, switch.since_s, switch.fresh = not switch.on, 0.0, False
 
     def pass_time(self, seconds: float) -> None:
         """Let time pass."""

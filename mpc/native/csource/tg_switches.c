@@ -32,6 +32,7 @@ void tg_switches_reset(tg_switch *s, int n)
 {
     for (int i = 0; i < n; i++) {
         s[i].on = 0;
+        s[i].fresh = 1;
         s[i].owed_s = s[i].since_s = 0.0;
     }
 }
@@ -47,7 +48,7 @@ void tg_switches_pass(const tg_relay *r, tg_switch *s, int n, const double *driv
         }
         /* the bounds within which the mean is that of what is requested; the other sign takes back what is owed */
         least = share < 0.0 ? fmin(s[i].owed_s, 0.0) : -INFINITY;
-        most = fmax(0.5 * r[i].on_s, r[i].off_s) + TG_SHORTEST_S;
+        most = fmax(0.5 * r[i].on_s, s[i].fresh ? 0.0 : r[i].off_s) + TG_SHORTEST_S;
         s[i].owed_s = fmin(fmax(s[i].owed_s + share * seconds, least), most);
     }
 }
@@ -59,6 +60,7 @@ double tg_switches_turn(const tg_relay *r, tg_switch *s, int n, const double *dr
         if (running ? due_s(r, s, i, drive) > TG_NOW_S : !s[i].on)
             continue;
         s[i].on = !s[i].on;
+        s[i].fresh = 0;
         s[i].since_s = 0.0;
         if (!running)
             s[i].owed_s = 0.0;

@@ -71,7 +71,12 @@ def test_a_trial_with_relays_is_the_same_in_c_and_after_a_file(make, relays, tmp
 
 
 class _Switch(ctypes.Structure):
-    _fields_ = [("on", ctypes.c_int), ("owed_s", ctypes.c_double), ("since_s", ctypes.c_double)]
+    _fields_ = [
+        ("on", ctypes.c_int),
+        ("fresh", ctypes.c_int),
+        ("owed_s", ctypes.c_double),
+        ("since_s", ctypes.c_double),
+    ]
 
 
 @GCC

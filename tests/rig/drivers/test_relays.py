@@ -172,6 +172,9 @@ def test_least_off_is_kept_from_the_start_and_after_a_stop() -> None:
         rig.wait(0.5)
     on_again_s = next(at for at, drive in board.set if at > stopped_s and drive["drive"])
     assert on_again_s - stopped_s == pytest.approx(30.0, abs=0.5)
+    board = Board(drive="1")  # what it waited for at the start is not owed
+    played(board, Relay("drive", on_s=10.0, off_s=60.0), np.repeat([1.0, 0.0], [200, 40]))
+    assert board.spells("drive") == [(0.0, pytest.approx(60.0)), (1.0, pytest.approx(45.0, abs=0.1))]
 
 
 def test_a_lost_sensor_switches_off_at_once() -> None:
