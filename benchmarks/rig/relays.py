@@ -13,7 +13,8 @@ The plants are explicit equations that share nothing with the package, stepped b
 Each is identified from one log of pulses that relays can play, and controlled by a PI of that plant, by the
 MPC's default design, and by what a tuning with these relays makes of it, through
 :class:`~thermogrip.rig.drivers.relays.RelayRig`.  A thermostat switches at its half width about the target.
-A line has: settled within the band [s], overshoot [K], rms at rest and under the load [K], switchings an hour.
+A line has: settled within the band [s], overshoot [K], rms at rest and under the load [K], switchings an
+hour.
 """
 
 from __future__ import annotations
