@@ -35,6 +35,7 @@ from thermogrip.sysid.effusivity.data import (
     Touches,
     at_knots,
     noise_fit,
+    room_temperature,
     stack_touches,
     touches,
     whiten,
@@ -299,9 +300,8 @@ class Problem:
         u = np.empty((self.which.size, N_NUISANCE))
         u[:, H] = self.ln_h(theta)[self.which]
         u[:, BUILD_UP], u[:, ONSET], u[:, LEVEL] = value["ln_build_up"], value["onset"], self.data.level
-        # the room's temperature, the skin's where that is not known
-        room = np.where(np.isfinite(self.data.t_ambient), self.data.t_ambient, self.data.level)
-        nominal = np.where(self.known, self.data.t_object + value["bias"], room)
+        stated = self.data.t_object + value["bias"]
+        nominal = np.where(self.known, stated, room_temperature(self.data.t_ambient))
         u[:, T_OBJECT] = nominal + value["transit_loss"] * self.room_difference()
         if (discrepancy := self.discrepancy(theta)) is not None:
             u[:, ONSET] += discrepancy.onset[self.which]
@@ -517,9 +517,9 @@ def calibrate_gripper(
 
 def _calibrated_sensors(
     data: Touches, materials: Mapping[str, Material], start: GripperModel | None, prior: GripperModel | None,
-    length: float, names: tuple[str, ...], report: Progress,
+    length: float, names: tuple[str, ...], report: Progress, first: GripperModel | None = None,
 ) -> GripperModel:  # fmt: skip
-    """Return what the first sensor supports, and with it what a second one does."""
+    """Return what the first sensor supports, and with it what a second one does, which is given ``first``."""
     earlier = start or prior
     problem = _problem(data, materials, prior, length)
     if earlier is not None and earlier.discrepancy is not None:
@@ -547,7 +547,7 @@ def _calibrated_sensors(
             slope = SETTINGS.noise_slope if i == rounds - 2 else SETTINGS.noise_slope_roughly
             noise = _fit_noise(problem, linearise(problem, theta, w, spread), w, noise, slope)
     if rounds > 1:
-        fit = _discrepant(fit, report)
+        fit = _discrepant(fit, report, first)
     gripper = _gripper_model(fit, length, names, prior)
     if data.second is None:
         return gripper
@@ -565,6 +565,7 @@ def _calibrated_sensors(
         length,
         names,
         report,
+        gripper,
     )
     return replace(gripper, second=beside)
 
@@ -580,10 +581,11 @@ class _Fit:
     noise: Noise
 
 
-def _discrepant(bare: _Fit, progress: Progress) -> _Fit:
+def _discrepant(bare: _Fit, progress: Progress, first: GripperModel | None) -> _Fit:
     """Return the fit with a discrepancy in a smooth noise where its evidence is greater, else as it was; a
     first look at twice three steps decides whether a search is worth it.  The evidence has several maxima, so
-    that the search begins from contacts that build up fast, near the fit without one, and from slow ones."""
+    that the search begins from contacts that build up fast, near the fit without one, from slow ones, and
+    for a second sensor also from what surrounds the first."""
     least = _log_evidence(bare)
     problem, near = _with_discrepancy(bare.problem, bare.step.theta)
     begin = replace(_SMOOTH, white=bare.noise.white)  # from elsewhere a search may end without misfit
@@ -596,6 +598,11 @@ def _discrepant(bare: _Fit, progress: Progress) -> _Fit:
     starts = [fast, (slow, np.zeros(bare.w.shape), spread, (begin, begin))]
     if not problem.known.all():  # objects as warm as the skin may show nothing, as far beyond too much
         starts.append((slow, _first_nuisances(problem, slow, spread), spread, (begin, begin)))
+    if first is not None:
+        # the same skin: on contacts of two sensors 1,300 to 3,600 nats above where the other starts end
+        theta_of_first = gripper_theta(first, problem.labels, bare.problem.prior.mean)
+        alike = _with_discrepancy(bare.problem, theta_of_first)[1]
+        starts.append((alike, np.zeros(bare.w.shape), spread, (begin, begin)))
     looks = (SETTINGS.steps, SETTINGS.steps, SETTINGS.steps)
     searched = [_search_discrepancy(problem, *start, looks, least, progress) for start in starts]
     found = [fit for fit in searched if fit is not None]

@@ -23,7 +23,14 @@ from thermogrip.datasets.arrays import Array, Mask
 from thermogrip.datasets.errors import UserError
 from thermogrip.sysid.contact.materials import Material, find_material
 from thermogrip.sysid.contact.simulation import Stack, TimeNodes, gripper_modes, time_nodes
-from thermogrip.sysid.effusivity.data import UNKNOWN_OBJECT_SD, Touches, Whitened, graded, whiten
+from thermogrip.sysid.effusivity.data import (
+    UNKNOWN_OBJECT_SD,
+    Touches,
+    Whitened,
+    graded,
+    room_temperature,
+    whiten,
+)
 from thermogrip.sysid.effusivity.gripper_model import (
     INSULATOR,
     LEVEL_SD,
@@ -245,7 +252,7 @@ def prior_of(gripper: GripperModel, data: Touches, hypotheses: Hypotheses) -> Pr
     mean[:, LEVEL], sd[:, LEVEL] = data.level, LEVEL_SD
     is_stated = np.isfinite(data.t_object)
     lost = gripper.transit_loss * np.nan_to_num(data.t_ambient - data.t_object)
-    room = np.where(np.isfinite(data.t_ambient), data.t_ambient, data.level)
+    room = room_temperature(data.t_ambient)
     mean[:, T_OBJECT] = np.where(is_stated, data.t_object + gripper.bias + lost, room)
     # normal, so that it can be integrated exactly: with the variance of Student's t, which has none at two
     # degrees of freedom, of one training grasp a material: then the nominal one counts little
