@@ -154,7 +154,7 @@ def _loops_at(controller: PIController, target: Array) -> tuple[_Loops, Any]:
             controller.drives.slew,
             UNCUT * model.span,
         ),
-        *(controller.integral, controller.applied),
+        *(controller.integral, controller.u),
     ]
     arrays = [*places, *(np.array(values, dtype=float) for values in numbers)]
     bounds = (controller.dt, model.coldest, model.hottest)

@@ -39,11 +39,11 @@ class SampledController:
         self._rows = [model.outputs.index(name) for name in controlled]
         self._patience_s = patience_s * (1 + SAME)
         self._forget()
-        self._move = Move(as_drive(model.drives, self._u))
+        self._move = Move(as_drive(model.drives, self.u))
 
     def _forget(self) -> None:
         """Return to no drive and no target, every output just read."""
-        self._u = self.drives.neutral.copy()
+        self.u = self.drives.neutral.copy()  # (n_u,) in force, from which the slew limit counts
         self._target = np.full(len(self.controlled), np.nan)
         self._unread_s = np.zeros(len(self.controlled))  # since each controlled output was read
 
@@ -99,14 +99,14 @@ class SampledController:
 
     def _within(self, u: Array) -> Array:
         """Return drives (n_u,) that are finite, in range, and within the slew limit since the last ones."""
-        return self.drives.follow(u, self._u, self.times.slew_s / self.dt)
+        return self.drives.follow(u, self.u, self.times.slew_s / self.dt)
 
     def _answer(self, u: Array, status: str, why: str, started: float) -> Move:
         """Return the move to drives (n_u,), from now on in force; without any, the pump may rest."""
-        self.times.moved(self.dt * float(np.max(np.abs(u - self._u) / self.drives.slew)))
-        self._u = u
-        pump = 0 if status == "off" and not np.any(self._u) else 1
-        drive = as_drive(self.model.drives, self._u)
+        self.times.moved(self.dt * float(np.max(np.abs(u - self.u) / self.drives.slew)))
+        self.u = u
+        pump = 0 if status == "off" and not np.any(self.u) else 1
+        drive = as_drive(self.model.drives, self.u)
         self._move = Move(drive, pump, status, why, self.clock() - started)
         return self._move
 

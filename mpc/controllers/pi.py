@@ -97,7 +97,7 @@ class PIController(SampledController):
         reading has."""
         self._forget()
         self.integral = np.zeros(len(self.loops))
-        self._u = self._applied(reading, self._u)
+        self.u = self._applied(reading, self.u)
         y, room = self._read(reading)
         self._target = self._begun = y[self._rows]
         if np.isfinite(self._target).all():
@@ -122,7 +122,7 @@ class PIController(SampledController):
         usable = np.isfinite(y) & np.isfinite(wanted).all()
         self._unread_s = np.where(usable, 0.0, self._unread_s + self.times.waited_s)
         status, advice = "fallback_plan", wrong or "reading lost: the drive is held"
-        u = self._u
+        u = self.u
         if usable.any():
             u = self.propose(y, wanted, self.times)
             lost = [name for name, is_usable in zip(self.controlled, usable) if not is_usable]
@@ -148,8 +148,8 @@ class PIController(SampledController):
             if np.isfinite(error[i]):
                 v[j] = loop.Kc * (error[i] - left_out) + self.integral[k]
             else:
-                v[j] = self.drives.safe[j] if self._lost[i] else self._u[j]
-        u = self.drives.follow(v, self._u, slew_s / self.dt)
+                v[j] = self.drives.safe[j] if self._lost[i] else self.u[j]
+        u = self.drives.follow(v, self.u, slew_s / self.dt)
         for k, (loop, (j, i), _) in enumerate(loops):
             if np.isfinite(error[i]):
                 # the integrator stands while the drive is limited, which is most of the time after a step of
@@ -165,22 +165,13 @@ class PIController(SampledController):
         weights = np.array([loop.setpoint for loop in self.loops])
         return np.asarray((1 - weights) * (target - self._begun)[[i for _, i in self.ends]])
 
-    @property
-    def applied(self) -> Array:
-        """Drives (n_u,) of the last move."""
-        return self._u
-
-    def hold(self, u: Array) -> None:
-        """Note the drives (n_u,) that were applied, from which the slew limit counts."""
-        self._u = np.asarray(u, dtype=float)
-
     def follow(self, u: Array, y: Array, target: Array) -> None:
         """Set the integrators so that the next proposal, with the arguments of :meth:`propose`, starts from
         drives u (n_u,): a bumpless take-over."""
-        self._u, self._begun = np.asarray(u, dtype=float), target
+        self.u, self._begun = np.asarray(u, dtype=float), target
         error = target - y
         for k, (loop, (j, i)) in enumerate(zip(self.loops, self.ends)):
-            self.integral[k] = self._u[j] - loop.Kc * error[i]
+            self.integral[k] = self.u[j] - loop.Kc * error[i]
 
 
 @lru_cache(maxsize=1024)

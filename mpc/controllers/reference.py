@@ -88,7 +88,7 @@ class ReferenceController(SampledController):
         """Forget the past, see :meth:`thermogrip.mpc.controllers.mpc.Controller.reset`; ``in_room`` with the
         plant linearised in its room, as C has it."""
         self._begin(*self._read(reading), self.observer.reset_in_room if in_room else self.observer.reset)
-        self._u = self._applied(reading, self._u)
+        self.u = self._applied(reading, self.u)
         self.pi.reset(reading)
         self.times.reset()
 
@@ -101,7 +101,7 @@ class ReferenceController(SampledController):
             y = np.full(self.model.n_y, np.nan)
         if is_off([name for name in self.model.model.switches if name not in self.model.drives], reading):
             return self._pause(y, d, target, started)
-        applied = self._applied(reading, self._u)
+        applied = self._applied(reading, self.u)
         self._pass(self.times.seconds, applied)
         wanted, wrong = self._wanted(target)
         is_new = self._is_new(wanted)
@@ -170,7 +170,7 @@ class ReferenceController(SampledController):
             self.observer.look(self._past.d)
             self.monitor.expect(self.model.C @ (self.observer.now - self._past.x))
         self._past.fresh = False
-        self._u = applied  # the slew limit counts from what was really applied
+        self.u = applied  # the slew limit counts from what was really applied
         self._past.d = np.where(np.isfinite(d), d, self._past.d)
         y, stays = self.monitor.screen(y, self.observer.reading())
         jumped = self._accept_jump(y, stays) if stays.any() else ""
@@ -228,14 +228,14 @@ class ReferenceController(SampledController):
             if not self._lost.all():
                 # no usable reading: the last plan goes on, for ``patience_s``
                 plan = self._young_plan()
-                return _Choice(self._u if plan is None else self._first_of(plan), "fallback_plan", "")
+                return _Choice(self.u if plan is None else self._first_of(plan), "fallback_plan", "")
             self._follows.plan = None
             return _Choice(self.drives.safe, "off", advice.blind(self._unread_s.min()))
         if self.clock() - started >= self.design.deadline_s:
             # the deadline passed: the last plan goes on, or the PI, where there is none
             return self._fall_back("late", advice.TOO_LATE)
         low, high = self.drives.lowest - 1e-9, self.drives.highest + 1e-9
-        outside = bool(np.any((self._u < low) | (self._u > high)))
+        outside = bool(np.any((self.u < low) | (self.u > high)))
         try:
             outcome = self._optimise(wanted, ahead)
         except (np.linalg.LinAlgError, ArithmeticError):
@@ -278,7 +278,7 @@ class ReferenceController(SampledController):
         return advice.unseen(names, parked, float(unread_s.max()), lost=gone)
 
     def _optimise(self, wanted: Array, ahead: Array | None) -> Outcome:
-        last = self.drives.cut(self._u)
+        last = self.drives.cut(self.u)
         observer = self.observer
         d = self._past.d + observer.disturbance_bias
         # linearised along the last plan, shifted, by blocks; else along the drive of now
@@ -329,8 +329,8 @@ class ReferenceController(SampledController):
             return _Choice(self.drives.safe, "off", why)
         if not self._follows.on_pi:
             # taken over without a bump
-            self.pi.follow(self._u, y, self._target)
+            self.pi.follow(self.u, y, self._target)
         self._follows.on_pi = True
-        self.pi.hold(self.drives.cut(self._u))
+        self.pi.u = self.drives.cut(self.u)
         u = self.pi.propose(y, self._target, self.times)
         return _Choice(u, "fallback_pi" if status == "fallback_plan" else status, why)

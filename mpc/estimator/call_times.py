@@ -123,11 +123,7 @@ def shifted(plan: Array, samples: float) -> Array:
 def opening(plan: Array, samples: float) -> Array:
     """Return the mean drives (n_u,) of a plan (N, n_u) over its first so many samples, at least one: held
     until the next late call, they do to a slow plant what the plan would have done one after the other."""
-    samples = min(samples, float(len(plan)))
-    whole = math.floor(samples + SAME)
-    if whole < 1 or (whole == 1 and samples - whole <= SAME):
+    if samples <= 1:
         return np.asarray(plan[0])
-    total = plan[:whole].sum(axis=0)
-    if samples - whole > SAME:
-        total = total + (samples - whole) * plan[whole]
-    return np.asarray(total / samples)
+    shares = np.clip(samples - np.arange(len(plan)), 0.0, 1.0)  # of each sample
+    return np.asarray(shares @ plan / shares.sum())

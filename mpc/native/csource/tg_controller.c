@@ -370,17 +370,12 @@ double tg_planned(const tg_controller *c, int k, int j)
 static void open_plan(const tg_controller *c, double *drive)
 {
     const tg_design *s = c->design;
-    double samples = fmin(c->slew_s / s->dt, (double)s->N), whole = floor(samples + TG_SAME), rest = samples - whole;
+    double samples = fmin(fmax(c->slew_s / s->dt, 1.0), (double)s->N);
     for (int j = 0; j < TG_NU; j++) {
-        double sum = tg_planned(c, 0, j);
-        if (whole > 1.5 || (whole > 0.5 && rest > TG_SAME)) {
-            for (int k = 1; k < (int)whole; k++)
-                sum += tg_planned(c, k, j);
-            if (rest > TG_SAME)
-                sum += rest * tg_planned(c, (int)whole, j);
-            sum /= samples;
-        }
-        drive[j] = sum;
+        double sum = 0.0;
+        for (int k = 0; k < samples; k++)
+            sum += fmin(samples - k, 1.0) * tg_planned(c, k, j);
+        drive[j] = sum / samples;
     }
 }
 
