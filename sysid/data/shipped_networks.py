@@ -18,6 +18,7 @@ from thermogrip.datasets.schema import Log, column
 from thermogrip.sysid.data.preparation import moves
 from thermogrip.sysid.models.network import NetworkModel
 from thermogrip.sysid.models.network_spec import (
+    SHARES,
     Disturbance,
     Input,
     Network,
@@ -25,7 +26,7 @@ from thermogrip.sysid.models.network_spec import (
     named_network,
     network_from_dict,
 )
-from thermogrip.sysid.plant.log_grid import SHARES, misfit
+from thermogrip.sysid.plant.log_grid import misfit
 
 # keys of elements that name signals or places
 _NAMING = ("between", "from", "to", "surroundings", "node", "face", "sink", "switch", "input")

@@ -19,7 +19,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from thermogrip.datasets.arrays import Array
@@ -266,13 +265,7 @@ def _binned_block(
     grids = []
     for j in outputs:
         stacked = np.column_stack([slopes[j], *(column[j] for column in columns), residual[j]])
-        grid = _interpolated(places[j], stacked, n)
+        # linear between the bins that were read, held beyond
+        grid = np.column_stack([np.interp(np.arange(n), places[j], column) for column in stacked.T])
         grids.append(grid.reshape(-1, merge, grid.shape[1]).mean(axis=1))
     return [Block.of(np.stack(grids, axis=1), outputs)]
-
-
-def _interpolated(place: NDArray[np.int64], values: Array, n: int) -> Array:
-    """Return values (m, c) known at bins ``place`` at the first n bins: linear between, held beyond."""
-    if place.size >= n and place[n - 1] == n - 1:
-        return values[:n]
-    return np.column_stack([np.interp(np.arange(n), place, column) for column in values.T])

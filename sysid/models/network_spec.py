@@ -21,7 +21,8 @@ from thermogrip.datasets.atomic_files import read_toml
 from thermogrip.datasets.errors import UserError, known_names
 from thermogrip.datasets.limits import LARGEST, STEP_RANGE
 
-_SHARES = {"1": 1.0, "percent": 100.0, "0_255": 255.0}  # full scale of what is a share of it already
+#: What full scale reads in the units of a share of it.
+SHARES = {"1": 1.0, "percent": 100.0, "0_255": 255.0}
 
 
 class Quantity(NamedTuple):
@@ -76,7 +77,7 @@ class _Scaled(_Table):
         ends = content.get("range")
         numbers = isinstance(ends, (list, tuple)) and all(isinstance(end, (int, float)) for end in ends)
         reach = max((abs(float(end)) for end in ends), default=0.0) if numbers and ends is not None else 0.0
-        full = _SHARES.get(str(content.get("unit")), 0.0)
+        full = SHARES.get(str(content.get("unit")), 0.0)
         if full <= 1.0 and reach > full:
             full = reach
         return {**content, "full_scale": full or 1.0}

@@ -44,25 +44,17 @@ def innovation_noise(plant: PlantData, logs: Sequence[Log]) -> InnovationNoise |
     graded = [j for j, move in enumerate(moves) if move > 0 and plant.inputs[j] not in model.switches]
     if not (np.all(sd > 0) and graded):
         return None
-    try:
-        with np.errstate(all="ignore"):  # a filter that diverges is the least likely one
-            estimate = _most_likely(plant, stretches, sd, graded)
-    except np.linalg.LinAlgError:
-        return None
-    if estimate is None:
-        return None
     names = [plant.inputs[j] for j in graded]
     fastest = dict.fromkeys(names, 0.0)
     for log, name in product(logs, names):
         time, values = (np.asarray(log[key].values, dtype=float) for key in ("time", name))
         rates = np.abs(np.diff(values)) / np.diff(time)
         fastest[name] = max(fastest[name], float(rates.max(initial=0.0)))
-    return InnovationNoise(
-        state=estimate.state,
-        reading=dict(zip(outputs, estimate.reading.tolist())),
-        input=dict(zip(names, estimate.input.tolist())),
-        fastest=fastest,
-    )
+    try:
+        with np.errstate(all="ignore"):  # a filter that diverges is the least likely one
+            return _most_likely(plant, stretches, sd, graded, fastest)
+    except np.linalg.LinAlgError:
+        return None
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,18 +140,9 @@ def _filter_of(plant: PlantData, stretches: Sequence[Stretch], graded: list[int]
     return _Filter(plant, graded, F, H, level, offset, middle, covariance, size)
 
 
-@dataclass(frozen=True, eq=False)
-class _NoiseSd:
-    """Noise in a second."""
-
-    state: float
-    reading: Array  # (n_y,)
-    input: Array  # (n,) of the graded inputs
-
-
 def _most_likely(
-    plant: PlantData, stretches: Sequence[Stretch], sd: Array, graded: list[int]
-) -> _NoiseSd | None:
+    plant: PlantData, stretches: Sequence[Stretch], sd: Array, graded: list[int], fastest: dict[str, float]
+) -> InnovationNoise | None:
     filtered = _filter_of(plant, stretches, graded)
     if filtered is None:
         return None
@@ -181,10 +164,11 @@ def _most_likely(
     q = _parabola_minimum(_STATE_RATIOS, table[:, by_input], by_state)
     b = _parabola_minimum(_INPUT_RATIOS, table[by_state], by_input)
     times = float(np.sqrt(scale[best]))
-    return _NoiseSd(
+    return InnovationNoise(
         state=times * q * float(np.sqrt(np.mean(sd**2))),
-        reading=times * sd,
-        input=times * b * filtered.input_range,
+        reading=dict(zip(plant.outputs, (times * sd).tolist())),
+        input=dict(zip(fastest, (times * b * filtered.input_range).tolist())),
+        fastest=fastest,
     )
 
 

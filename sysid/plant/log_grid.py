@@ -24,6 +24,7 @@ from thermogrip.datasets.resample import held_means
 from thermogrip.datasets.roles import guess_role
 from thermogrip.datasets.schema import Log, column, columns, log_name
 from thermogrip.datasets.schema import names as names_of
+from thermogrip.sysid.models.network_spec import SHARES
 
 if TYPE_CHECKING:
     from thermogrip.sysid.models.model import GreyModel
@@ -456,8 +457,6 @@ def _first_order_times(part: Segment, step: float) -> list[float]:
     return out
 
 
-#: What full scale reads in the units of a share of it.
-SHARES = {"1": 1.0, "percent": 100.0, "0_255": 255.0}
 _SLACK = 1e-9  # beyond 1, by rounding
 
 

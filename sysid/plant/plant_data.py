@@ -188,7 +188,7 @@ class PlantData:
 
 SCHEMA, VERSION = "thermogrip.plant", 1
 _MOST_ERROR, _MOST_READING = 1e6, 1e9  # of a sensor, in any unit
-_PLAIN = ("values", "units", "scales", "noise", "offsets", "nuisance", "reference", "verdict")
+_PLAIN = ("values", "units", "scales", "noise", "offsets", "nuisance", "reference", "verdict", "nominal")
 
 
 def check_plant_file(
@@ -216,14 +216,10 @@ def plain_content(plant: PlantData) -> dict[str, Any]:
         content[kind] = {n: [end if np.isfinite(end) else None for end in ends] for n, ends in ranges.items()}
     content["covariance"] = None if plant.covariance is None else np.asarray(plant.covariance).tolist()
     content["samples"] = None
-    if plant.inputs_end_at_row:  # absent otherwise: files of version 0.1.0 have no such key
-        content["inputs_end_at_row"] = True
+    content["inputs_end_at_row"] = plant.inputs_end_at_row
     if np.isfinite(plant.offset_memory):
         content["offset_memory"] = plant.offset_memory
-    if plant.nominal:
-        content["nominal"] = plant.nominal
-    if plant.refits:
-        content["refits"] = [model.to_dict() for model in plant.refits]
+    content["refits"] = [model.to_dict() for model in plant.refits]
     return content
 
 
@@ -243,7 +239,7 @@ def fields_of(content: Mapping[str, Any]) -> dict[str, Any]:
             "nuisance": _finite_numbers(content, "nuisance", 0.0, _MOST_ERROR),
             "reference": content["reference"],
             "valid": _valid(content["valid"]),
-            "nominal": _finite_numbers(content, "nominal") if "nominal" in content else {},
+            "nominal": _finite_numbers({"nominal": {}} | dict(content), "nominal"),
             "logs": tuple(str(name) for name in content["logs"]),
             "fitted_to": tuple(_fit_log(log) for log in content.get("fitted_to", ())),
             "scores": PlantScores.from_json(content["scores"]),

@@ -99,9 +99,7 @@ def test_the_ends_of_what_a_plant_may_hold_are_held(tmp_path: Path):
     back = Plant.from_dict(bare.to_dict() | edge)
     assert (back.noise, back.offsets, back.nuisance) == ({"t": 1e6}, {"t": -1e6}, {"t": 0.0})
     assert back.valid == {"t": (3.0, 3.0), "q": (-1e9, np.inf)}
-    assert "inputs_end_at_row" not in bare.to_dict()
     assert "offset_memory" not in bare.to_dict()
-    assert "refits" not in bare.to_dict()
     log = FitLog("a", "0" * 64, -3.0, 7.5)
     more = replace(
         bare, refits=(bare.model, bare.model), inputs_end_at_row=True, fitted_to=(log,), offset_memory=7.5
