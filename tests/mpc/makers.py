@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import ctypes
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import ArrayLike
 
+from thermogrip.datasets.arrays import Array
 from thermogrip.mpc.controllers.mpc import Controller
 from thermogrip.mpc.controllers.reference import ReferenceController
 from thermogrip.mpc.design.design import default_design
@@ -74,16 +77,16 @@ def crossed(q2: str = "percent") -> Plant:
     return Plant(model, {}, dt=2.0, units=units, valid={"q1": (0.0, 100.0), "q2": (0.0, 100.0)})
 
 
-def heater(make=Controller, **changes) -> Controller:
+def heater(make: Callable[..., Any] = Controller, **changes: Any) -> Any:
     """Return the controller of one drive and one output, nothing measured beside."""
     a = float(np.exp(-0.05))
-    A, B = [[a, 40 * (1 - a)], [0, 0]], [[0], [1]]
-    model = StateSpaceModel(("q",), (), ("t",), A=A, B=B, C=[[1.0, 0]], dt=5.0, y0=[25.0])
+    A, B = np.array([[a, 40 * (1 - a)], [0, 0]]), np.array([[0.0], [1.0]])
+    model = StateSpaceModel(("q",), (), ("t",), A=A, B=B, C=np.eye(1, 2), dt=5.0, y0=np.full(1, 25.0))
     plant = Plant(model, {}, dt=5.0, units={"q": "1"}, valid={"q": (0.0, 1.0), "t": (20.0, 60.0)})
     return make(plant, default_design(plant, **changes))
 
 
-def kit(make=Controller, *, dt: float = 5.0, **changes) -> Controller:
+def kit(make: Callable[..., Any] = Controller, *, dt: float = 5.0, **changes: Any) -> Any:
     """Return the controller of two heaters and two sensors in a fan's room: drives in percent."""
     plant = network_plant("tclab", t1=(20.0, 60.0), t2=(20.0, 60.0))
     return make(plant, default_design(plant, dt=dt, **changes))
@@ -93,15 +96,27 @@ def kit(make=Controller, *, dt: float = 5.0, **changes) -> Controller:
 WAYS = [ReferenceController, pytest.param(Controller, marks=GCC)]
 
 
-def start_in_c(controller: Controller, y: ArrayLike) -> np.ndarray:
+def start_in_c(controller: Controller, y: ArrayLike) -> Array:
     """Return the state (n_x,) at which the C alone starts from outputs y (n_y,)."""
     y, c = np.asarray(y, dtype=float), controller.c
+    assert c is not None
     c.given[:] = [*y.tolist(), *[float("nan")] * (len(c.given) - len(y))]
     c.reset()
     return c.view("x", (controller.model.n_x,)).copy()
 
 
-def solve_in_c(c: CompiledController, H, f, A, lower, upper, *, linear: float, quadratic: float, warm=False):
+def solve_in_c(
+    c: CompiledController,
+    H: Array,
+    f: Array,
+    A: Array,
+    lower: Array,
+    upper: Array,
+    *,
+    linear: float,
+    quadratic: float,
+    warm: bool = False,
+) -> tuple[Array, str, int]:
     """Return x (n,), status and iterations of one QP: bounds, differences of neighbours, then soft rows A."""
     bounds = [np.clip(v, -1e30, 1e30) for v in (lower, upper)]
     given = [np.ascontiguousarray(v, float) for v in (H, f, *bounds, A)]

@@ -3,19 +3,31 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 
+from thermogrip.datasets.arrays import Array
+from thermogrip.report.html import Section
+
+T = TypeVar("T")
+
+
+def part(section: Section, at: int, kind: type[T]) -> T:
+    """Return a part of a section, which must be of this kind."""
+    found = section.parts[at]
+    assert isinstance(found, kind)
+    return found
+
 
 def described(figure: Figure) -> Iterator[str]:
     """Yield lines on the size of a figure, the style of its panels, their artists and its legends."""
     figure.draw_without_rendering()
     constrained = type(figure.get_layout_engine()).__name__
-    grid = figure.axes[0].get_gridspec()
+    grid: Any = figure.axes[0].get_gridspec()
     heights = _numbers(grid.get_height_ratios())
     yield f"figure {_numbers(figure.get_size_inches())} {constrained} rows {heights}"
     yield from sorted({f"  style {_style(axes)}" for axes in figure.axes})
@@ -51,10 +63,12 @@ def _panel(axes: Axes) -> Iterator[str]:
             f"{line.get_linewidth():g} {line.get_linestyle()} {line.get_alpha()} {line.get_drawstyle()[:10]} "
             f"{line.get_zorder():g}"
         )
-    bars = [patch for patch in axes.patches if patch.get_path().vertices.shape == (5, 2)]
+    patches: list[Any] = list(axes.patches)
+    bars = [patch for patch in patches if patch.get_path().vertices.shape == (5, 2)]
     if len(bars) > 2:
         heights = np.array([bar.get_height() for bar in bars])
         yield f"{len(bars)} bars {_data(heights)} {_fill(bars[0])}"
+    found: Any
     for found in (*axes.collections, *(bars if len(bars) <= 2 else bars[:0])):
         box = found.get_datalim(axes.transData) if found in axes.collections else found.get_bbox()
         yield f"{type(found).__name__} {_numbers(box.extents)} {_fill(found)}"
@@ -78,7 +92,7 @@ def _numbers(values: Sequence[float] | Any) -> str:
     return " ".join(f"{value:.4g}" for value in np.asarray(values, dtype=float))
 
 
-def _data(values: np.ndarray) -> str:
+def _data(values: Array) -> str:
     """Return the number of points, their mean, and the first and the last."""
     ends = [values.mean(), values[0], values[-1]] if values.size else []
     return f"{values.size}({_numbers(ends)})"

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from thermogrip.report.charts import Chart, Curve, Panel
 from thermogrip.report.html import Commands, Picture, Plot, Section, Table, Text, write_report
 
-TIME = np.arange(0.0, 1000.0)
+TIME = np.arange(1000, dtype=float)
 
 
 def panel(title: str, *, log: bool = False) -> Panel:

@@ -12,13 +12,14 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
+from tests.report.conftest import part
 from thermogrip.classify import evaluate, make_classifier
 from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.datasets.schema import make_log
 from thermogrip.report import classification
 from thermogrip.report.charts import Chart
 from thermogrip.report.classification import comparison_sections, effusivity_section, touch_section
-from thermogrip.report.html import Picture, Section, Text
+from thermogrip.report.html import Picture, Section, Table, Text
 from thermogrip.sysid.effusivity import EffusivityRow
 
 
@@ -74,25 +75,25 @@ def test_touches_are_counted_by_what_was_taught_and_what_was_not() -> None:
     ],
 )
 def test_a_review_counts_what_passes_and_names_the_rest(verdicts: str, said: str, tone: str) -> None:
-    checks = [
+    checks: Any = [
         SimpleNamespace(name=f"c{k}", verdict=verdict, finding=f"f{k}", fix="")
         for k, verdict in enumerate(verdicts.split())
     ]
     section = classification.review_section(checks)
     assert (section.verdict, section.tone) == (said, tone)
-    assert section.parts[0].rows[0] == ("c0", verdicts.split()[0], "f0", "")
+    assert part(section, 0, Table).rows[0] == ("c0", verdicts.split()[0], "f0", "")
 
 
 def test_sessions_that_did_not_settle_are_counted_and_their_advice_shown() -> None:
     log = make_log([0.0, 1.0], {"target_t_surface": ([38.0, 38.0], "degC", "other")})
     rest = {"log": log, "settle_time": 9.0, "overshoot": 0.1, "bias": 0.02}
-    runs = [
+    runs: Any = [
         ("first", SimpleNamespace(verdict="settled", advice="", **rest)),
         ("second", SimpleNamespace(verdict="tripped", advice="look at the pump", **rest)),
     ]
     section = classification.session_section(runs, "the twin")
     assert (section.verdict, section.tone) == ("1 of 2 sessions settled on the twin.", "warn")
-    assert section.parts[1].rows[1] == ("second", "tripped", 9.0, 0.1, 0.02)
+    assert part(section, 1, Table).rows[1] == ("second", "tripped", 9.0, 0.1, 0.02)
     assert [part for part in section.parts if isinstance(part, Text)] == [Text("second: look at the pump")]
     assert classification.session_section(runs[:1], "the twin").tone == "good"
 
@@ -109,7 +110,7 @@ def test_who_wins_has_the_least_log_loss_and_is_set_apart_only_where_n_can(p_val
         score | {"classifier": "c", "log_loss": 0.1, "accuracy": 1.0, "condition": "other"},
     ]
     pairs = [{"first": "b", "second": "a", "p_value": p_value}, {"first": "b", "second": "c", "p_value": 0.9}]
-    found = SimpleNamespace(scores=lambda: scores, differences=lambda condition: pairs)
+    found: Any = SimpleNamespace(scores=lambda: scores, differences=lambda condition: pairs)
     assert classification._who_wins(found, "pooled") == (
         "a has the lowest log loss (0.25; chance 1.10) and 90 % right of n = 20 grasps (68 to 99 %).",
         f"b: 85 %, log loss 0.50.{more}",
@@ -135,15 +136,16 @@ def test_each_score_stands_under_its_name_with_its_own_interval() -> None:
         low, high = ("low", "high") if key == "accuracy" else (f"{key}_low", f"{key}_high")
         row |= {key: 0.5 + at / 100, low: 0.1 + at / 100, high: 0.9 + at / 100}
     row |= {"ece_calibrated": 0.0321, "fit_s": 1.234}
-    head, [cells] = classification.score_table(SimpleNamespace(scores=lambda: [row]))
+    found: Any = SimpleNamespace(scores=lambda: [row])
+    head, [cells] = classification.score_table(found)
     assert dict(zip(head, cells, strict=True)) == {
         "classifier": "a", "condition": "b", "n": 7, "accuracy": "0.500 (.10\N{EN DASH}.90)",
         "log loss": "0.510 (.11\N{EN DASH}.91)", "by chance": "1.10", "by base rates": "0.87",
         "Brier": "0.520 (.12\N{EN DASH}.92)",
         "ECE": "0.530 (.13\N{EN DASH}.93)", "if calibrated": "0.032", "fit [s]": "1.23",
     }  # fmt: skip
-    more = [row | {"n_test": 9, "caution": "2 unseen (zinc): iron 2"}, row]
-    head, beside = classification.score_table(SimpleNamespace(scores=lambda: more))
+    found.scores = lambda: [row | {"n_test": 9, "caution": "2 unseen (zinc): iron 2"}, row]
+    head, beside = classification.score_table(found)
     assert head[2:5] == ("n", "accuracy", "caution")
     assert [line[2] for line in beside] == ["7/9", 7]
     assert [line[4] for line in beside] == ["2 unseen (zinc): iron 2", ""]
@@ -168,7 +170,7 @@ def test_a_page_of_effusivities_has_every_grasp_and_says_what_is_missing() -> No
     known = asdict(row) | {"misfit_sd": 0.0}
     lost = {key: value if key == "grasp_id" else math.nan for key, value in known.items()} | {"grasp_id": "b"}
     section = effusivity_section([(known, ""), (known | {"grasp_id": "c"}, "too slow"), (lost, "")], 500)
-    picture, table = section.parts
+    picture, table = section.parts[0], part(section, 1, Table)
     assert section.verdict == (
         "2 of 3 grasps have an effusivity. The model does not explain 1 of them. "
         "The first 3 of 500 are shown."

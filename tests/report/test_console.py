@@ -74,7 +74,7 @@ def test_a_table_is_as_wide_as_its_terminal_or_100_columns_and_breaks_no_word(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     prose = "held-out readings of the whole day in one sentence that is longer than its column can be wide"
-    rows = [["features-lda", 1.5, prose], ["long name", None, "c"]]
+    rows: list[list[object]] = [["features-lda", 1.5, prose], ["long name", None, "c"]]
     for terminal, width in ((False, 100), (True, 60)):
         monkeypatch.setenv("COLUMNS", "60")
         monkeypatch.setattr("sys.stdout.isatty", lambda terminal=terminal: terminal)

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 
 from tests.mpc.makers import make_tank
+from tests.report.conftest import part
 from thermogrip.mpc.closed_loop.simulate import ClosedLoop, Segment
 from thermogrip.mpc.controllers.mpc import Controller
 from thermogrip.mpc.controllers.pi import PIController
@@ -84,7 +86,7 @@ def tuning_of(**changes: Any) -> Any:
         ({"bias": -0.06}, "warn"),
     ],
 )
-def test_a_step_is_good_where_each_output_is_as_the_spec_asks(figures: dict, tone: str) -> None:
+def test_a_step_is_good_where_each_output_is_as_the_spec_asks(figures: dict[str, float], tone: str) -> None:
     met = {"output": "t1", "settle_s": 440.0, "overshoot": 0.29, "bias": -0.04}
     run: Any = SimpleNamespace(segments=[SimpleNamespace(**met), SimpleNamespace(**met | figures)])
     assert control._tone(Spec(steps=STEPS), run) == tone
@@ -104,15 +106,16 @@ def test_a_tuned_controller_stands_with_its_scores_and_what_it_did_not_know(
     tuning.controller.plant.uncertain = known
     section = control.tuning_section(tuning)
     assert (section.verdict, section.tone) == (says, tone)
-    picture, table, finding, about, scores = section.parts
-    assert finding.text == "Tuned. Faster."
+    table = part(section, 1, Table)
+    finding, about, scores = (part(section, at, Text).text for at in (2, 3, 4))
+    assert finding == "Tuned. Faster."
     assert table.head == control.tuning_table(tuning)[0]
     assert table.caption.startswith(f"Closed loops on {of}")
-    assert isinstance(picture, Plot)
-    assert about.text.startswith("Band 0.25 degC. ")
-    assert "offset of 0.3 degC" in about.text
+    assert isinstance(section.parts[0], Plot)
+    assert about.startswith("Band 0.25 degC. ")
+    assert "offset of 0.3 degC" in about
     words = "At most 30 designs of each kind were tried"
-    assert f"lower is better: tuned 1.235, PI 2.000. {words}" in scores.text
+    assert f"lower is better: tuned 1.235, PI 2.000. {words}" in scores
 
 
 def test_what_was_asked_stands_beside_the_design_by_the_names_of_their_files() -> None:
@@ -120,7 +123,7 @@ def test_what_was_asked_stands_beside_the_design_by_the_names_of_their_files() -
     spec = Spec(steps=STEPS, zones={"t_surface": 0.05})
     controller = Controller(tank, spec.design(tank, move=0.125))
     section = control.spec_section(tuning_of(spec=spec, controller=controller))
-    asked, found = (dict(part.rows) for part in section.parts)
+    asked, found = (dict(part(section, at, Table).rows) for at in (0, 1))
     assert section.verdict == "Seed 7; the same seed gives the same design."
     assert (asked["steps"], asked["settle_within_s"]) == ("[[28, 38], [28, 18]]", "450")
     assert asked["zones"] == "t_surface = 0.05"
@@ -133,7 +136,7 @@ def test_the_page_of_a_pi_has_its_loops_and_no_weights() -> None:
     tank = make_tank()
     pi = PIController(tank, Spec(steps=STEPS).design(tank))
     tuning = tuning_of(spec=Spec(steps=STEPS), controller=pi)
-    found = dict(control.spec_section(tuning).parts[1].rows)
+    found = dict(part(control.spec_section(tuning), 1, Table).rows)
     assert list(found) == ["dt", "controlled", "drive_range", "slew_per_s", "loops"]
     assert found["loops"].startswith("[drive = drive; output = t_surface; Kc = ")
     assert control.tuning_section(tuning).verdict == "The PI meets the spec on every draw."
@@ -163,10 +166,8 @@ def test_a_session_stands_with_its_events_its_grasp_and_its_loop(
     verdict: str, advice: str, tone: str, moves: int, sections: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     run = SimpleNamespace(segments=(), status=("ok",), advice=(), band=0.25)
-    looped: list[Any] = []
-    monkeypatch.setattr(
-        control, "session_loop", lambda *args, **options: (looped.append((args, options)), run)[1]
-    )
+    looped = Mock(return_value=run)
+    monkeypatch.setattr(control, "session_loop", looped)
     event = SimpleNamespace(time_s=3.0, kind="phase", text="settle")
     session: Any = SimpleNamespace(
         verdict=verdict, advice=advice, events=(event,), grasps="a grasp", contact=0.5, log="a log",
@@ -186,10 +187,8 @@ def test_a_session_stands_with_its_events_its_grasp_and_its_loop(
     assert table.rows == ((3.0, "phase", "settle"),)
     assert rest == [Text("Advice: look.")] * bool(advice)
     if moves > 1:
-        [((log, given), options)] = looped
         figures = {"t1": {"settle_s": 9.0, "overshoot": 0.1, "bias": 0.0}}
-        assert (log, given) == ("a log", moved)
-        assert options == {"drive_range": {"q": (0.0, 100.0)}, "figures": figures}
+        looped.assert_called_once_with("a log", moved, drive_range={"q": (0.0, 100.0)}, figures=figures)
         assert found[2].tone == tone
 
 
@@ -206,13 +205,12 @@ def test_a_closed_loop_is_reported_by_output_with_its_statuses(settle: float, to
     run = ClosedLoop(
         none, {}, none, {}, {}, {}, ("ok", "late", "ok"), ("", "wait", "wait"), none, 0.2, {}, (segment,)
     )
-    section = control.loop_section(run, SimpleNamespace(limits={}, slew_per_s={}), "loop")
+    design: Any = SimpleNamespace(limits={}, slew_per_s={})
+    section = control.loop_section(run, design, "loop")
     assert (section.verdict, section.tone) == (said, tone)
-    assert section.parts[0].caption.endswith("By status: 2 ok, 1 late.")
+    assert part(section, 0, Plot).caption.endswith("By status: 2 ok, 1 late.")
     assert section.parts[1] == Text("Advice of the controller: wait.")
-    assert (
-        control.loop_section(run, SimpleNamespace(limits={}, slew_per_s={}), "loop", tone="bad").tone == "bad"
-    )
+    assert control.loop_section(run, design, "loop", tone="bad").tone == "bad"
 
 
 @pytest.mark.parametrize(
@@ -226,12 +224,13 @@ def test_a_closed_loop_is_reported_by_output_with_its_statuses(settle: float, to
     ],
 )
 def test_when_the_skin_felt_the_object_is_reported(contact: float, said: str, tone: str) -> None:
-    section = control._contact_section(None, contact)
+    grasps: Any = None
+    section = control._contact_section(grasps, contact)
     assert (section.verdict, section.tone) == (said, tone)
 
 
 def test_what_never_settled_has_no_bias_and_several_outputs_no_common_figures() -> None:
-    session = SimpleNamespace(settle_time=12.0, overshoot=0.3, bias=NAN)
+    session: Any = SimpleNamespace(settle_time=12.0, overshoot=0.3, bias=NAN)
     assert control._figures_of(session, ("t",)) == {"t": {"settle_s": 12.0, "overshoot": 0.3}}
     session.bias = 0.05
     assert control._figures_of(session, ("t",))["t"]["bias"] == 0.05
@@ -244,7 +243,7 @@ def test_controllers_stand_beside_each_other_step_by_step_and_load_by_load() -> 
         "bias_worst": 0.01, "energy_mean_s": 7.0, "bound_s": INF, "output": "", "iae_mean": 55.5,
         "travel_mean": 2.5,
     }  # fmt: skip
-    tuning = SimpleNamespace(
+    tuning: Any = SimpleNamespace(
         spec=SimpleNamespace(steps=[(28.0, 38.0), (28.0, 18.0)]),
         rows=[
             SimpleNamespace(controller="tuned", start=28.0, target=38.0, load="", **row),

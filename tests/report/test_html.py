@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
+from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.provenance import work
 from thermogrip.report.charts import Chart, Curve, Panel
 from thermogrip.report.html import (
@@ -37,7 +38,7 @@ def picture(points: int = 3) -> Picture:
 
 
 def plot(points: int = 500, curves: int = 1, name: str = "skin") -> Plot:
-    x = np.arange(float(points))
+    x = np.arange(points, dtype=float)
     y = np.where(x == 7, np.nan, np.sin(x / 10))
     own = tuple(Curve(name, x, y + k, low=y + k - 1, high=y + k + 1) for k in range(curves))
     return Plot(Chart(((Panel("T [degC]", own, name),),)), "a curve")
@@ -133,8 +134,8 @@ def test_a_verdict_has_a_sign_and_a_word_and_so_have_cells_of_verdicts() -> None
     assert words.count("\u2715 fail") == words.count("\u2713 pass") == 4
 
 
-def numbers(text: str) -> list[float]:
-    return np.frombuffer(base64.b64decode(text), dtype="<f4").tolist()
+def numbers(text: str) -> Array:
+    return np.frombuffer(base64.b64decode(text), dtype="<f4").astype(float)
 
 
 def test_the_numbers_of_a_chart_are_those_of_its_curves_and_a_gap_is_no_number() -> None:
@@ -145,13 +146,14 @@ def test_the_numbers_of_a_chart_are_those_of_its_curves_and_a_gap_is_no_number()
     own = drawn.chart.columns[0][0].curves[0]
     np.testing.assert_allclose(x, own.x, rtol=1e-6)
     np.testing.assert_allclose(y, own.y, rtol=1e-6, atol=1e-6)
+    assert own.low is not None
     np.testing.assert_allclose(low, own.low, rtol=1e-6, atol=1e-6)
     assert np.isnan(y[7])
     assert content["columns"][0][0]["unit"] == " s"
 
 
 def test_arrays_that_curves_share_are_there_once() -> None:
-    x = np.arange(9.0)
+    x = np.arange(9, dtype=float)
     chart = Chart(((Panel("a", (Curve("a", x, x), Curve("b", x, x), Curve("c", x, x + 1))),),))
     assert len(json.loads(Plot(chart, "").data(100))["arrays"]) == 2
 

@@ -5,11 +5,14 @@ from __future__ import annotations
 import re
 from dataclasses import replace
 from types import SimpleNamespace
+from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
+from tests.report.conftest import part
 from thermogrip.datasets.schema import Log, make_log
 from thermogrip.report import plant
 from thermogrip.report.html import Plot, Table, Text
@@ -27,7 +30,7 @@ from thermogrip.sysid.validation.stated_errors import Band
 @pytest.fixture(scope="module")
 def run() -> tuple[Plant, Log, FreeRun]:
     """Return a plant, a log of it with white noise, and its free run."""
-    block = StateSpaceModel(("q",), (), ("t",), A=[[0.9]], B=[[1.0]], C=[[1.0]], dt=1.0)
+    block = StateSpaceModel(("q",), (), ("t",), A=np.full((1, 1), 0.9), B=np.eye(1), C=np.eye(1), dt=1.0)
     q = np.repeat([0.0, 1.0, 0.0, 2.0], 50)
     y = block.rollout([[0.0]], q[None, :, None], np.zeros((1, 200, 0)), (), 1.0)[0][0, :-1, 0]
     y = y + 0.05 * np.random.default_rng(0).standard_normal(200)
@@ -68,8 +71,7 @@ def test_a_free_run_s_page_has_its_scores_band_and_baselines(run: tuple[Plant, L
     assert section.title == f"Free run: {log.attrs['name']}"
     assert free_run_section(found, seen=True).title.endswith(" (in the fit)")
     assert free_run_section(found, seen=True, title="Mine").title == "Mine"
-    picture, table = section.parts[:2]
-    assert isinstance(picture, Plot)
+    picture, table = part(section, 0, Plot), part(section, 1, Table)
     assert [panel.label for panel in picture.chart.columns[0]] == ["t [degC]", "error [K]", "inputs"]
     assert f"Readings of the first {found.warmup:.3g} s set the state" in picture.caption
     score, naive = found.scores["t"], found.naive
@@ -98,7 +100,8 @@ def test_signals_are_shown_with_their_roles_and_guesses_are_marked() -> None:
         SignalRole("q", "W", "input", "named", False),
         SignalRole("s", "degC", "left out", "its name", True),
     )
-    assert plant.signal_table(SimpleNamespace(signals=signals)) == (
+    found: Any = SimpleNamespace(signals=signals)
+    assert plant.signal_table(found) == (
         ("column", "unit", "role", "why"),
         (("q", "W", "input", "named"), ("s", "degC", "left out", "guess: its name")),
     )
@@ -112,7 +115,7 @@ def no_figures(monkeypatch: pytest.MonkeyPatch) -> None:
     )
 
 
-def identified(good: bool = True) -> SimpleNamespace:
+def identified(good: bool = True) -> Any:
     rows = [
         SimpleNamespace(model="oe", log=log, output="t", rmse=0.5, no_input_rmse=2.0, held_out=held,
                         unit="degC", fit_percent=90.0, n=50)
@@ -153,21 +156,21 @@ def test_an_identification_has_its_tables_and_verdict(good: bool, tone: str) -> 
 @pytest.mark.usefixtures("no_figures")
 def test_parameters_stand_where_there_are_any(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(plant, "free_run_section", lambda *args, **options: (args, options))
-    asked: list[tuple[object, ...]] = []
-    monkeypatch.setattr(
-        "thermogrip.sysid.validation.free_run.free_run", lambda *args: (asked.append(args), "a run")[1]
-    )
+    simulated = Mock(return_value="a run")
+    monkeypatch.setattr("thermogrip.sysid.validation.free_run.free_run", simulated)
     found = identified()
     found.runs = (SimpleNamespace(warmup=9.0),)
     board = plant_from_prior(load_network("tclab"))
-    sections = plant.identification_sections(found, ["a log"], board, None)
-    assert asked == [(board, "a log", 9.0)]
-    assert sections[-1] == (("a run",), {"seen": True})
+    logs: Any = ["a log"]
+    sections = plant.identification_sections(found, logs, board, None)
+    simulated.assert_called_once_with(board, "a log", 9.0)
+    own_run: Any = sections[-1]
+    assert own_run == (("a run",), {"seen": True})
     assert [section.title for section in sections[:2]] == [
         "Which plant is behind the logs?", "How well are its parameters known?",
     ]  # fmt: skip
-    black = SimpleNamespace(free=())
-    assert len(plant.identification_sections(found, ["a log"], black, None)) == 2
+    black: Any = SimpleNamespace(free=())
+    assert len(plant.identification_sections(found, logs, black, None)) == 2
 
 
 def test_what_was_held_out_is_drawn_and_its_error_is_the_answer(run: tuple[Plant, Log, FreeRun]) -> None:
@@ -194,24 +197,24 @@ def test_parameters_answer_for_themselves_and_the_sampler_only_where_it_failed()
     least = max(off, key=lambda name: off[name])
     near = sum(width <= 0.1 for width in off.values())
     assert section.verdict.startswith(f"{near} of {len(rows)} parameters are known within \u00b110 %")
-    assert section.parts[1].text.startswith(f"Known least: {least} (")
+    assert part(section, 1, Text).text.startswith(f"Known least: {least} (")
     assert section.parts[-1] == Text("U is known.")
     names = board.free
     samples = np.random.default_rng(0).normal(3.0, 0.5, (400, len(names)))
-    record = SimpleNamespace(
+    record: Any = SimpleNamespace(
         samples=samples, free=names, units={}, fitted={}, tau={names[0]: 10.0}, sampled=names[:1],
         likelihood="normal", n_steps=500, acceptance=0.3, off_centre=0.123, converged=True,
         verdict="converged: 50 autocorrelation times", ess={names[0]: 812.4},
     )  # fmt: skip
     known = plant.parameters_section(board, record)
     assert (known.verdict, known.tone) == (section.verdict, "plain")
-    table = known.parts[0]
+    table = part(known, 0, Table)
     assert table.head == (
         "parameter", "value", "unit", "mean", "sd", "5 %", "95 %", "ESS", "prior 5 %", "prior 95 %"
     )  # fmt: skip
     assert table.rows[0][3:5] == (pytest.approx(3.0, abs=0.1), pytest.approx(0.5, abs=0.1))
     assert (table.rows[0][7], table.rows[1][7]) == (812, None)
-    assert "500 steps, converged: 50 autocorrelation times, 30 % accepted" in known.parts[4].text
+    assert "500 steps, converged: 50 autocorrelation times, 30 % accepted" in part(known, 4, Text).text
     record.converged = False
     record.verdict = "not converged: 9 autocorrelation times"
     unsure = plant.parameters_section(board, record)
@@ -225,7 +228,7 @@ def test_parameters_answer_for_themselves_and_the_sampler_only_where_it_failed()
 
 def test_blocks_of_a_log_share_a_row_that_shows_each() -> None:
     row = {"model": "oe", "output": "t", "unit": "degC", "held_out": True}
-    rows = [
+    rows: Any = [
         SimpleNamespace(log=log, rmse=rmse, fit_percent=fit, n=n, no_input_rmse=idle, **row)
         for log, rmse, fit, n, idle in (
             ("block 1 of 2", 3.0, 80.0, 10, 6.0),
@@ -247,7 +250,7 @@ def test_blocks_of_a_log_share_a_row_that_shows_each() -> None:
 
 def test_a_parameter_is_known_as_well_as_half_its_interval_is_wide() -> None:
     ends = {"a": (9.0, 11.0), "b": (1.6, 2.4), "c": (-3.0, 1.0)}
-    known = SimpleNamespace(
+    known: Any = SimpleNamespace(
         free=tuple(ends),
         units={"b": "W/K"},
         values={"a": 10.0, "b": 2.0, "c": -1.0},
@@ -260,7 +263,7 @@ def test_a_parameter_is_known_as_well_as_half_its_interval_is_wide() -> None:
 
 def test_a_pair_of_poles_is_said_once_with_its_period() -> None:
     poles = np.array([-0.05 + 0.5j, -0.05 - 0.5j, -1.0])
-    found = SimpleNamespace(
+    found: Any = SimpleNamespace(
         linear=SimpleNamespace(inputs=("q",), w=(0.5,)), units={"q": "W"}, poles=poles, draws=(), level=0.9,
         time_constants=-1 / poles.real, gain=SimpleNamespace(low=np.array([np.nan])),
     )  # fmt: skip

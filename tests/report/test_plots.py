@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -48,7 +49,7 @@ def waves(n: int, shift: float = 0.0) -> Any:
 
 def free_run_of(n: int) -> Figure:
     band = Band(0.9, {name: np.full(n, 0.5) for name in ("t1", "level")}, {"t1": 0.9, "level": 0.8}, 3)
-    run = SimpleNamespace(measured=waves(n), log=waves(n, 0.25), scores=dict.fromkeys(("t1", "level")))
+    run: Any = SimpleNamespace(measured=waves(n), log=waves(n, 0.25), scores=dict.fromkeys(("t1", "level")))
     return draw_chart(free_run_chart(run, ("t1", "level"), band))
 
 
@@ -58,10 +59,10 @@ def corner_of() -> Figure:
     samples = rng.standard_normal((200, 4)) + [0.0, 10.0, 20.0, 30.0]
     quantiles = {name: tuple(np.quantile(samples[:, k], [0.05, 0.5, 0.95])) for k, name in enumerate(free)}
     fitted = {name: 10.0 * k for k, name in enumerate(free)}
-    return corner_figure(
-        SimpleNamespace(sampled=("a", "c", "d"), free=free, samples=samples, quantiles=quantiles,
-                        fitted=fitted, units={"a": "W/K", "c": "s"})
-    )  # fmt: skip
+    units = {"a": "W/K", "c": "s"}
+    known = {"samples": samples, "quantiles": quantiles, "fitted": fitted, "units": units}
+    posterior: Any = SimpleNamespace(sampled=("a", "c", "d"), free=free, **known)
+    return corner_figure(posterior)
 
 
 def loops_of() -> Figure:
@@ -72,7 +73,7 @@ def loops_of() -> Figure:
 def steps_of() -> Figure:
     time = np.arange(5.0)
 
-    def loop(level: float) -> SimpleNamespace:
+    def loop(level: float) -> Any:
         out, drive = {"t": level + time}, {"u": level / 100 + time / 10}
         target = {"t": np.full(4, 38.0)}
         return SimpleNamespace(
@@ -89,7 +90,7 @@ def grasps_of(*labels: str) -> Any:
     return make_grasps([-0.1, 0.1, 0.4], traces, ["a", "b"], name="unlabelled", **known)
 
 
-FIGURES = {
+FIGURES: dict[str, Callable[[], Figure]] = {
     "free run": lambda: free_run_of(12),
     "free run of many rows": lambda: free_run_of(3001),
     "corner": corner_of,
@@ -119,7 +120,7 @@ def test_each_figure_shows_what_it_should_in_the_colours_widths_and_units_of_the
 
 def test_a_phase_is_drawn_with_its_band_where_its_magnitude_is_on_the_axis() -> None:
     size = np.array([1.0, 1e-3, 1e-6])[:, None, None]
-    found = SimpleNamespace(
+    found: Any = SimpleNamespace(
         linear=SimpleNamespace(outputs=("y",), inputs=("u",)),
         frequency_response=lambda: (
             np.array([0.1, 1.0, 10.0]),
@@ -127,7 +128,7 @@ def test_a_phase_is_drawn_with_its_band_where_its_magnitude_is_on_the_axis() -> 
             Estimate(*(np.full((3, 1, 1), turn) for turn in (-90.0, -95.0, -85.0))),
         ),
     )
-    ((above, below),) = bode_chart(found).columns  # type: ignore[arg-type]
+    ((above, below),) = bode_chart(found).columns
     for curve, ends in ((above.curves[0], (0.9, 1.1)), (below.curves[0], (-95.0, -85.0))):
         assert np.isfinite(curve.y).tolist() == [True, True, False]
         assert curve.low is not None
@@ -138,7 +139,7 @@ def test_a_phase_is_drawn_with_its_band_where_its_magnitude_is_on_the_axis() -> 
 
 
 def test_a_parameter_that_was_not_sampled_has_no_corner() -> None:
-    posterior = SimpleNamespace(free=("a", "b"))
+    posterior: Any = SimpleNamespace(free=("a", "b"))
     with pytest.raises(UserError, match="'c' was not sampled; use a, b"):
         corner_figure(posterior, ("a", "c"))
 
