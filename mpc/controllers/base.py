@@ -112,9 +112,8 @@ class SampledController:
 
     def _held_move(self, started: float) -> Move:
         """Return the last move again, for a call before the next one is due; its advice stays."""
-        return replace(
-            self._move, advice=self._move.advice or advice.TOO_EARLY, seconds=self.clock() - started
-        )
+        again = self._move.advice or advice.TOO_EARLY
+        return replace(self._move, advice=again, seconds=self.clock() - started)
 
 
 def has_preview(target: Trajectory) -> bool:

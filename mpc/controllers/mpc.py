@@ -163,7 +163,8 @@ class Controller(Shown):
         ----------
         reading : mapping of str to float
             Temperatures by name [degC]; ``time_s`` may be absent, then one sample time has passed.  Before
-            its sample time is over a move is held; the seconds count all the same.  A drive's
+            its sample time is over a move is held, but for a target that has stood for a sample time and is
+            another one now; the seconds count all the same.  A drive's
             own name may stand there too: then that is what was applied, whatever was asked.  So may that of a
             switch (``"pump": 0``): then no water moves the heat, and the drive goes to zero until it runs.
         target : float or mapping of str to float

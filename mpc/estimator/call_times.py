@@ -46,7 +46,8 @@ class CallTimes:
     def call(self, reading: Mapping[str, float]) -> None:
         """Note a call with this reading."""
         now, before = number(reading, "time_s"), self._time
-        self.seconds, self.stale, self.early = 0.0, False, False
+        self.seconds = 0.0
+        self.stale = self.early = False
         if not math.isfinite(now):
             self.seconds, self._time = self.dt, before + self.dt
         elif not math.isfinite(before):

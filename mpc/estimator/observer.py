@@ -200,11 +200,9 @@ def choose_disturbances(
     if len(chosen) < len(controlled):
         from thermogrip.sysid.plant.plant import said_not_good
 
-        raise UserError(
-            f"no disturbance model of {model.n_y} states is detectable from {', '.join(model.outputs)}",
-            hint="control an output that a drive can move"
-            + (": identify does not call this plant good" if said_not_good(model.plant.verdict) else ""),
-        )
+        problem = f"no disturbance model of {model.n_y} states is detectable from {', '.join(model.outputs)}"
+        not_good = ": identify does not call this plant good" * said_not_good(model.plant.verdict)
+        raise UserError(problem, hint=f"control an output that a drive can move{not_good}")
     on = _disturbance_matrices(model, chosen)
     names = {"input": model.drives, "output": model.outputs, "disturbance": model.disturbances}
     labels = tuple(f"{kind} {names[kind][row]}" for kind, row in chosen)
@@ -272,6 +270,7 @@ class Observer:
         self._P = np.zeros((self._n, self._n))
         self._held = np.zeros(self._n, dtype=bool)
         self._one = np.eye(self._n)
+        self._to_drive = disturbance.on_drive * model.span[:, None]  # (n_u, n_w) in the drives' units
         self._on_sample()
 
     def hold_drives(self, weak: Mask) -> None:
@@ -318,15 +317,11 @@ class Observer:
 
     def _begin(self, x: Array, P: Array, y: Array) -> None:
         """Start from a Gaussian state and a reading (n_y,)."""
-        n_x, n = self.model.n_x, self._n
         self.x, self.w = x, np.zeros(self.disturbance.n_w)
         self._held[:] = False
         self._on_sample()
         self.found_offset = np.zeros(self.model.n_y)
-        whole = np.zeros((n, n))
-        whole[:n_x, :n_x] = P
-        whole[n_x:, n_x:] = np.diag(self.P0)
-        self._P = whole
+        self._P = block_diag(P, np.diag(self.P0))
         # one Kalman update is the weighted least-squares answer for state, offsets and past drive together
         self._correct(y, self.R_start)
         self.set_offsets(y, np.asarray(self.fixed))
@@ -452,7 +447,5 @@ class Observer:
         after, A, B, E = self.model.linearise(self.x, u + self.drive_bias, d + self.disturbance_bias)
         step = self._one.copy()
         step[:n_x, :n_x] = A
-        step[:n_x, n_x:] = (
-            B @ (disturbance.on_drive * self.model.span[:, None]) + E @ disturbance.on_disturbance
-        )
+        step[:n_x, n_x:] = B @ self._to_drive + E @ disturbance.on_disturbance
         return after, step
