@@ -106,10 +106,21 @@ def clock_of(table: Table, read: Mapping[str, Header], dt: float | None) -> Cloc
         place = f" in place of {', '.join(h for h in [*named, *others[:1]])}" if instead else ""
         rows = np.arange(len(table.lines), dtype=float)
         return Clock(rows * dt, instead, (f"time: rows are {dt:g} s apart, as asked{place}",))
-    for header in [*named, *others]:
-        clock = _of_text(header, table) if header in table.text else _of_numbers(header, table, read[header])
-        if clock is not None:
-            return clock
+    clocks = [
+        _of_text(header, table) if header in table.text else _of_numbers(header, table, read[header])
+        for header in [*named, *others]
+    ]
+    if likely := [clock for clock in clocks if clock is not None]:
+        known = [clock for clock in likely if not clock.doubt]
+        first, *others_known = known or likely
+        lengths = [float(np.ptp(c.seconds[np.isfinite(c.seconds)])) for c in (first, *others_known)]
+        differ = [
+            c for c, length in zip(others_known, lengths[1:]) if abs(length / lengths[0] - 1) > _CLOCK.late
+        ]
+        if known and differ:
+            names = (", ".join(sorted(c.columns)) for c in (first, differ[0]))
+            return replace(first, doubt="{} is taken as the time, and {} is of another length".format(*names))
+        return first
     return _of_rows(table, read)
 
 

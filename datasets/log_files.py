@@ -147,7 +147,7 @@ def read_log(
         log.attrs.update({k: v for k, v in table.meta.items() if k not in ("schema", "version")})
     else:
         repaired = _repair(read.clock.seconds, read.values, read.units, roles.of, table)
-        roles = replace(roles, doubts=(*roles.doubts, *_reading_doubts(roles.of, repaired)))
+        roles = replace(roles, doubts=(*_reading_doubts(roles.of, repaired), *roles.doubts))
         if outputs is None:
             roles = _without_half_lost(roles, repaired.time, repaired.columns)
         repairs = [*read.repairs, *repaired.repairs]
@@ -155,7 +155,7 @@ def read_log(
         of_clock = [line for line in repairs if isinstance(line, repair.ClockDoubt)]
         others = [line for line in repairs if isinstance(line, repair.Doubt) and line not in of_clock]
         log.attrs["clock_doubts"] = "\n".join(filter(None, [read.clock.doubt, *of_clock]))
-        log.attrs["role_doubts"] = "\n".join([*roles.doubts, *others])
+        log.attrs["role_doubts"] = "\n".join([*others, *roles.doubts])
     for header, name in read.names_of.items():
         if (words := table.attrs.get(header, {}).get("flag_meanings")) and name in log:
             log[name].attrs["flag_meanings"] = words
@@ -322,6 +322,10 @@ def _convert(table: Table, dt: float | None) -> _Columns:
     words = [header for header in table.text if header not in clock.columns]
     repairs += [f"read {', '.join(renamed)}"] if renamed else []
     repairs += [f"left out, no numbers: {', '.join(words)}"] if words else []
+    for header in words:
+        cells = [cell for cell in table.text[header] if any(map(str.isdigit, cell))]
+        if len({*cells}) > MOST_STATES and 2 * len(cells) > len(table.lines) and read_clock(cells) is None:
+            repairs.append(repair.Doubt(f"{header} is left out: its cells are no numbers ({cells[0]})"))
     return _Columns(clock, columns, units, names_of, repairs)
 
 
@@ -448,6 +452,7 @@ def _reading_doubts(roles: Mapping[str, str], log: _Repaired) -> list[str]:
     inputs = [values for name, values in log.columns.items() if roles[name] == "input"]
     readings = {name: v for name, v in log.columns.items() if roles[name] in ("output", "disturbance")}
     doubts = [repair.doubt_readings(name, values, inputs, log.time) for name, values in readings.items()]
+    doubts += [repair.doubt_levels(name, v) for name, v in log.columns.items() if roles[name] == "input"]
     doubts += [repair.doubt_rows(name, v, inputs) for name, v in readings.items() if roles[name] == "output"]
     return [doubt for doubt in doubts if doubt]
 

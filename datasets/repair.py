@@ -36,6 +36,9 @@ _SLOW_ROWS = 60.0  # s
 GAP_SECONDS = 10.0  # of the least gap
 GAP_STEPS = 5.0  # median steps of the rows, of the least gap
 _REPEATED = 32  # rows with moves in most of them, that are not alike by chance
+_OTHER_SCALES = (2.55, 10.0, 100.0, 255.0, 1000.0)  # of percent, 0 to 255, 0 to 1, W and kW
+_MOST_LEVELS = 20  # of an input that is set
+_FEWEST_HELD = 4  # rows, of a standstill
 _OTHER_STEP = 1.5  # times as long: no jitter, another step
 _FEW, _MOST_MOVED = 0.05, 10  # share of rows whose time may be wrong; rows that one may be out of place
 
@@ -181,11 +184,10 @@ def drop_codes(name: str, values: Floats) -> tuple[Floats, list[str]]:
 
 
 def doubt_readings(name: str, values: Floats, inputs: Sequence[Floats], time: Floats) -> str:
-    """Return the doubt on a reading's ends of its range, largest jump or order, empty where there is none."""
+    """Return the doubt on a reading's order, codes, standstills or largest jump, empty without one."""
     moves = np.abs(np.diff(values))
-    if values.size < SPIKE_WINDOW or not np.isfinite(moves).any():
+    if values.size < SPIKE_WINDOW or not np.nansum(moves):
         return ""
-    least = float(np.min(moves[moves > 0], initial=np.inf))
     if np.nanmean(moves) > 2 * np.nanmean(np.abs(values[2:] - values[:-2])):  # alike where all is noise
         return f"{name} goes to and fro from row to row: are its rows of two logs?"
     for end in (np.nanmin(values), np.nanmax(values)):
@@ -195,17 +197,11 @@ def doubt_readings(name: str, values: Floats, inputs: Sequence[Floats], time: Fl
         if rows.sum() > SPIKE_LENGTH * max(edges.size / 2, 1) and 2 * sum(quiet) >= edges.size:
             says = f"{name} jumps to {end:g} and stays in {rows.sum()} rows while no input moves"
             return f"{says}: if that is a sensor's code, leave those cells empty"
-        edges = np.flatnonzero(np.diff((values == end).astype(int), prepend=0, append=0)).reshape(-1, 2)
-        # a reading that settles goes to and fro by its least step before; one with noise never stands still
-        earlier = [moves[max(a - SPIKE_WINDOW, 0) : max(a - 1, 0)] for a, _ in edges.tolist()]
-        held = [
-            b - a
-            for (a, b), m in zip(edges.tolist(), earlier)
-            if b - a > 4 and np.count_nonzero(m) > SPIKE_WINDOW / 2 and np.nanmean(m) > 2 * least
-        ]
-        if sum(held) >= SPIKE_WINDOW:
-            says = f"{name} is held at {end:g} for {sum(held)} rows, as where its sensor ends"
-            return f"{says}: leave those cells empty"
+    value, held = _longest_standstill(values, moves)
+    if held >= SPIKE_WINDOW:
+        return (
+            f"{name} is held at {value:g} for {held} rows, as where its sensor ends: leave those cells empty"
+        )
     row = int(np.nanargmax(moves))
     before, after = values[max(row - SPIKE_WINDOW, 0) : row + 1], values[row + 1 : row + 1 + SPIKE_WINDOW]
     stays = np.abs(np.nanmedian(after) - np.nanmedian(before)) > moves[row] / 2
@@ -217,6 +213,35 @@ def doubt_readings(name: str, values: Floats, inputs: Sequence[Floats], time: Fl
     return f"{problem}: if its sensor or unit changed there, cut the log: LOG@{time[row + 1] - time[0]:g}:"
 
 
+def _longest_standstill(values: Floats, moves: Floats) -> tuple[float, int]:
+    """Return the value that a reading stands still at in most rows, and in how many, although it moved until
+    then by more than the to and fro of one that settles."""
+    least = 2 * float(moves[moves > 0].min())
+    ends = np.flatnonzero(np.append(moves != 0, True))
+    rows_at: dict[float, int] = {}
+    for start, stop in zip(np.append(0, ends[:-1] + 1).tolist(), (ends + 1).tolist()):
+        earlier = moves[max(start - SPIKE_WINDOW, 0) : max(start - 1, 0)]
+        moving = np.count_nonzero(earlier) > SPIKE_WINDOW / 2 and np.nansum(earlier) > least * earlier.size
+        if stop - start > _FEWEST_HELD and moving:
+            rows_at[values[start]] = rows_at.get(values[start], 0) + stop - start
+    return max(rows_at.items(), key=lambda item: item[1], default=(np.nan, 0))
+
+
+def doubt_levels(name: str, values: Floats) -> str:
+    """Return the doubt on an input with two levels or more that come again, as multiples, after some row."""
+    levels = np.unique(values[values != 0])
+    for factor in _OTHER_SCALES if levels.size <= _MOST_LEVELS else ():
+        small = [v for v in levels.tolist() if np.isclose(levels, v * factor, rtol=1e-3).any()]
+        rows = np.flatnonzero(np.isin(values, small))
+        large = np.flatnonzero(np.isclose(values[:, None], np.array(small) * factor, rtol=1e-3).any(axis=1))
+        if len(small) > 1 and (rows.max() < large.min() or large.max() < rows.min()):
+            row = max(rows.min(), large.min())
+            return (
+                f"{name} has other levels from row {row + 1} on, {factor:g} times apart: did its unit change?"
+            )
+    return ""
+
+
 def doubt_rows(name: str, values: Floats, inputs: Sequence[Floats]) -> str:
     """Return the doubt on an output that is read in n-th rows only, held or drawn straight between."""
     finite = values[np.isfinite(values)]
@@ -225,18 +250,15 @@ def doubt_rows(name: str, values: Floats, inputs: Sequence[Floats]) -> str:
     moves = np.diff(values)
     turns = np.diff(moves)
     least = 2.0 * np.abs(moves[moves != 0]).min(initial=np.inf)  # twice the steps of its numbers
-    for between, of in (("held", moves != 0), ("drawn straight", (np.abs(turns) > least))):
+    driven = np.concatenate([np.flatnonzero(np.diff(u)) for u in inputs]) if inputs else np.empty(0)
+    for between, of in (("held", moves != 0), ("drawn straight", np.abs(turns) > least)):
         rows = np.flatnonzero(of)
         if rows.size < SPIKE_WINDOW or (n := int(np.median(np.diff(rows)))) < 2:
             continue
-        alike = [np.bincount(r % n).max(initial=0) / max(r.size, 1) for r in (rows, *map(_moved, inputs))]
-        if alike[0] > 1 - _FEW and max(alike[1:], default=0.0) <= 1 - _FEW:
+        by_inputs = np.isin(rows, np.concatenate([driven - 1, driven, driven + 1])).mean() > 0.5
+        if np.bincount(rows % n).max() > (1 - _FEW) * rows.size and not by_inputs:
             return f"{name} is read in every {n}th row only, {between} in those between: average the log"
     return ""
-
-
-def _moved(values: Floats) -> NDArray[np.int64]:
-    return np.flatnonzero(np.diff(values))
 
 
 def doubt_repeats(columns: Sequence[Floats], lines: NDArray[np.int64]) -> list[str]:

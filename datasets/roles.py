@@ -157,13 +157,7 @@ def assign_roles(
         roles[name] = chosen.get(name, "other" if lists.get(guess) is not None else guess)
         if why and roles[name] == guess:
             reasons[name] = why
-    # a role that the course of a column alone shows: whoever states the roles has no doubt
-    doubts = [
-        f"{name} is {'left out' if role == 'other' else f'taken as {role}'}: {why}"
-        for name, (role, why) in evidence.items()
-        if reasons.get(name) == why and (role != "other" or why.endswith(FOLLOWED))
-    ]
-    doubts += [f"{name} is left out: {why}" for name, why in reasons.items() if why.startswith(_TOGETHER)]
+    doubts = [f"{name} is left out: {why}" for name, why in reasons.items() if why.startswith(_TOGETHER)]
     if columns is not None and lists["input"] is None:  # what was not listed was not meant
         named = {name: why for name, why in reasons.items() if name not in evidence}
         goals = [name for name, why in named.items() if why == IS_SET_POINT]
@@ -172,6 +166,12 @@ def assign_roles(
         for goal in [n for n in goals if _name_words(n).rpartition("_")[0] in words]:
             del named[goal]  # its reading is called as it is
         doubts += role_doubts(columns, roles, named, sound, goals)
+    # a role that the course of a column alone shows: whoever states the roles has no doubt
+    doubts += [
+        f"{name} is {'left out' if role == 'other' else f'taken as {role}'}: {why}"
+        for name, (role, why) in evidence.items()
+        if reasons.get(name) == why and (role != "other" or why.endswith(FOLLOWED))
+    ]
     return Roles(roles, reasons, tuple(doubts))
 
 

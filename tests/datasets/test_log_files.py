@@ -818,6 +818,56 @@ def test_runs_of_an_unknown_code_are_asked_about_unless_a_drive_makes_them(write
     assert ("jumps" in doubts) == bool(said)
 
 
+PLACES = np.arange(600)
+HEATER = np.random.default_rng(1).choice([20.0, 50.0, 90.0], 30).repeat(20)
+PLATE = np.convolve(HEATER, np.ones(60) / 60)[:600] + 0.1 * np.random.default_rng(0).standard_normal(600)
+LATER = (PLACES >= 300) * 1.0
+
+
+@pytest.mark.parametrize(
+    ("order", "heater", "plate", "doubt"),
+    [
+        (PLACES, HEATER, PLATE, ""),
+        (np.r_[:300, 200:500], HEATER, PLATE, "rows 302 to 401 repeat those from 202 on"),
+        (np.c_[:300, 300:600].ravel(), HEATER, PLATE, "goes to and fro from row to row"),
+        (PLACES, HEATER, np.repeat(PLATE[::10], 10), "read in every 10th row only, held"),
+        (
+            PLACES,
+            HEATER,
+            np.interp(PLACES, PLACES[::10], PLATE[::10]),
+            "read in every 10th row only, drawn straight",
+        ),
+        (PLACES, HEATER, np.where((PLACES > 300) & (PLACES < 340), PLATE[300], PLATE), "is held at"),
+        (PLACES, HEATER, PLATE + LATER * (32 + 0.8 * PLATE), "stays there, as nowhere else"),
+        (PLACES, HEATER * np.where(LATER, 2.55, 1), PLATE, "2.55 times apart: did its unit change"),
+    ],
+)
+def test_columns_that_are_not_one_course_of_one_unit_are_doubts(write, order, heater, plate, doubt):
+    cells = zip(PLACES, heater[order], plate[order])
+    text = "time_s,heater,plate_degC\n" + "".join(f"{k},{u:g},{y:.3f}\n" for k, u, y in cells)
+    doubts = read_log(write(text)).attrs["role_doubts"]
+    assert doubt in doubts
+    assert bool(doubts) == bool(doubt)
+
+
+@pytest.mark.parametrize(
+    ("head", "cells", "doubt"),
+    [
+        ("time_s;heater;t_a_degC", "{k};1.{u:.0f}00;{y:.1f}", ""),
+        ("time_s;heater;t_a_degC", "{k};1,{u:.0f}00;{y:.1f}", "a number of thousands? It is read as 1."),
+        ("time_s;heater;t_a_degC", "{k};1.{u:.0f}00;{y:.0f},5", "a number of thousands? It is read as 1."),
+        ("time_s;heater;t_a_degC", "{k};1,{u:.0f}00;{y:.0f},5", ""),
+        ("Scale;values x10;\ntime_s;heater;t_a_degC", "{k};{u};{y:.1f}", "line 1 may change the numbers"),
+        ("time_s;heater;t_a_degC;code", "{k};{u};{y:.1f};0x{k:03x}/7", "code is left out: its cells are no"),
+    ],
+)
+def test_numbers_that_can_be_read_in_two_ways_are_doubts(write, head, cells, doubt):
+    rows = [cells.format(k=k, u=u / 10, y=y) for k, u, y in zip(PLACES, HEATER, PLATE)]
+    doubts = read_log(write("\n".join([head, *rows]) + "\n")).attrs["role_doubts"]
+    assert doubt in doubts
+    assert ("thousands" in doubts) == ("thousands" in doubt)
+
+
 @pytest.mark.parametrize("swapped", [True, False])
 def test_sensors_changed_over_are_asked_about(write, swapped):
     heater = np.repeat([20, 80, 50, 90, 30, 70], 100)

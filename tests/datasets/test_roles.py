@@ -441,6 +441,32 @@ def test_what_a_drive_without_a_name_moves_is_no_weather():
     assert roles == {"fan": "input", "chiller": "input", "kettle": "output", "pipe": "output"}
 
 
+STEPS = np.repeat(np.random.default_rng(3).choice([0.0, 20.0, 50.0, 90.0], 40), 25)
+SLOW, SMOOTH = plant_of(STEPS), np.cumsum(plant_of(0 * STEPS, noise=1, seed=2)) / 50
+
+
+@pytest.mark.parametrize(
+    ("name", "values", "doubt"),
+    [
+        ("pump", np.repeat(np.random.default_rng(5).choice([0.0, 1.0], 50), 20), "no reading responds to it"),
+        ("heater_total", np.cumsum(STEPS), "only rises or falls"),
+        ("valve_feedback", np.r_[np.zeros(7), STEPS[:-7]], "follows heater"),
+        ("power", 19 * STEPS + 20 * np.random.default_rng(6).standard_normal(STEPS.size), "follows heater"),
+        ("ambient", plant_of(0.2 * STEPS, seed=7), "ambient is taken as disturbance"),
+        ("sample", plant_of(0.3 * STEPS, 0.9, seed=8), "sample is left out"),
+        ("target_plate", plant_of(0.3 * STEPS, 0.9, seed=8), "target_plate is left out"),
+        ("power", plant_of(0.3 * STEPS, 0.9, seed=8), "power is taken as input"),
+        ("level", np.cumsum(plant_of(0 * STEPS, noise=1, seed=9)), "level is taken as output"),
+    ],
+)
+def test_a_name_that_the_course_of_the_column_denies_is_a_doubt(name, values, doubt):
+    columns = {"heater": STEPS, "t_plate": SLOW + SMOOTH, name: values}
+    roles = assign_roles({"heater": "percent", "t_plate": "degC", name: "1"}, columns=columns)
+    assert any(doubt in line and name in line for line in roles.doubts)
+    del columns[name]
+    assert not assign_roles({"heater": "percent", "t_plate": "degC"}, columns=columns).doubts
+
+
 def test_what_readings_say_of_each_other_is_a_doubt():
     drive = np.repeat(np.random.default_rng(3).choice([0.0, 40.0, 90.0], 40), 25)
     t_in = plant_of(drive)
@@ -451,8 +477,8 @@ def test_what_readings_say_of_each_other_is_a_doubt():
     }
     roles = assign_roles(dict.fromkeys(columns, "1"), columns=columns)
     assert list(roles.of.values()) == ["input", "output", "output", "input", "disturbance"]
-    assert "but is computed from t_in and t_out: a heat" in roles.doubts[1]
-    assert roles.doubts[0] == "t_hall is taken as disturbance: it does not respond to duty, q"
+    assert "but is computed from t_in and t_out: a heat" in roles.doubts[0]
+    assert roles.doubts[1] == "t_hall is taken as disturbance: it does not respond to duty, q"
 
 
 def test_a_held_column_that_moves_as_the_input_does_is_a_doubt():

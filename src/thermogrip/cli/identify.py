@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 
 MODELS = ("arx", "oe", "armax", "bj", "subspace", "parsim", "sindy", "neural", "network")
 USUAL_MODELS = ",".join(model for model in MODELS if model not in ("armax", "bj", "parsim", "sindy"))
+MOST_DOUBTS = 6  # that are printed: one command states what all of them are about
 NO_POSTERIOR = "no posterior: the model that was kept is a black box, only networks have parameters to sample"
 
 
@@ -166,8 +167,10 @@ def identify(
     console.say(f"wrote {out}")
     more = {"dynamics": None if dynamics is None else dynamics.to_dict(), "repairs": repairs}
     console.answer(_identified(identified, plant, record, out) | more)
-    for doubt in identified.doubts:
+    for doubt in identified.doubts[:MOST_DOUBTS]:
         console.warn(f"in doubt: {doubt}")
+    if (unprinted := len(identified.doubts) - MOST_DOUBTS) > 0:
+        console.warn(f"in doubt: {unprinted} more, which --json lists")
     if posterior and (record is None or not record.converged):
         return cli.ANSWER_IS_NO
     if identified.good:
