@@ -18,7 +18,7 @@ from thermogrip.datasets.schema import log_name, make_log
 from thermogrip.sysid import Plant, identification, identify
 from thermogrip.sysid.blackbox.fit import fit_black_box
 from thermogrip.sysid.blackbox.order_selection import Structure
-from thermogrip.sysid.data import signal_roles
+from thermogrip.sysid.data import preparation
 from thermogrip.sysid.greybox.problem import prior_plant
 from thermogrip.sysid.identification import Held, beyond_reach, choose_black_box
 from thermogrip.sysid.models.network import load_network
@@ -529,10 +529,10 @@ def test_columns_are_what_was_named_what_the_network_has_or_what_was_guessed():
     second.attrs["guesses"] = "fan: other\nt: its name is: x"
     second["q"].attrs["units"] = "V"
     logs = [first, second]
-    assert signal_roles.moves([first.assign(lamp=first["lamp"] * np.nan)], "lamp")
+    assert preparation.moves([first.assign(lamp=first["lamp"] * np.nan)], "lamp")
     network: Any = SimpleNamespace(name="block", inputs=("q",), disturbances=("room",), outputs=("t",))
     lists = {"inputs": ["q"], "disturbances": None, "outputs": None}
-    found, unused = signal_roles.signal_roles(logs, (("q",), ("room",), ("t",)), lists, network)
+    found, unused = preparation.signal_roles(logs, (("q",), ("room",), ("t",)), lists, network)
     assert unused == []  # a list says what is used
     assert [(s.name, s.unit, s.role, s.why, s.guessed) for s in found] == [
         ("q", "1", "input", "named", False),
