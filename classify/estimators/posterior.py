@@ -169,7 +169,7 @@ class PosteriorClassifier(GraspClassifier):
             best = np.arange(single.size) * len(names) + evidence[single].argmax(axis=1)
             if unknown:
                 free = free_evidence(self.device_, data, fitted.mode.u[best], noise)
-                odds[single] = logsumexp(evidence[single], axis=1) - np.log(len(names)) - free
+                odds[single] = logsumexp(fitted.sure, axis=1) - np.log(len(names)) - free
                 self._explain(answered, single, data, names, fitted, best)
         # touches of one block are one question: they share its temperature
         if single.size < group.size:

@@ -68,7 +68,7 @@ from thermogrip.sysid.effusivity.laplace_approximation import (
     material_hypotheses,
     nodes_for,
     predict,
-    stack_slopes,
+    shared_slopes,
 )
 
 if TYPE_CHECKING:
@@ -339,17 +339,7 @@ def linearise(problem: Problem, theta: Array, w: Array, spread: Spread) -> Linea
     beyond = problem.beyond(theta)
     y, by_u = jacobian(stack_of(theta), nodes, data, u, np.ones(u.shape, dtype=bool), beyond)
     k = np.zeros((*y.shape, theta.size))
-    by_stack = stack_slopes(theta, data, u, beyond)
-    k[:, :, : by_stack.shape[2]] = by_stack
-    shared = {
-        "ln_build_up": by_u[:, :, BUILD_UP],
-        "onset": by_u[:, :, ONSET],
-        "transit_loss": by_u[:, :, T_OBJECT] * problem.room_difference()[:, None],
-        "bias": by_u[:, :, T_OBJECT] * problem.known[:, None],
-        "ln_depth": by_u[:, :, CAPACITY],
-    }
-    for name, values in shared.items():
-        k[:, :, SHARED_NAMES.index(name)] = values
+    k[:, :, : len(SHARED_NAMES)] = shared_slopes(theta, data, u, by_u, beyond)
     n = len(problem.labels)
     for m in range(n):
         of_label = problem.which == m

@@ -35,8 +35,10 @@ from thermogrip.sysid.effusivity.gripper_model import (
     INSULATOR,
     LEVEL_SD,
     NOISE_TIMES,
+    SHARED_NAMES,
     STACK_NAMES,
     GripperModel,
+    block_names,
     stack_numbers,
     stack_of,
 )
@@ -57,9 +59,6 @@ class DoubtSettings:
     gain_sd: float = 0.1
     # an object that is less well known is one of a range of temperatures, 5 K or more
     stated_sd_K: float = 1.5
-    # probability that a grasp shows what a calibration left open: by ten foreign grippers with one known
-    # grasp it takes the largest log loss from 2.64 to 1.37 (chance 1.61) and the others by .01
-    gripper_prior: float = 0.2
     # where logarithms of the rest are one off: a message that is late by a third of a second
     unlike_onset_s: float = 0.3
     # of an object's distance from the skin there: one that has gone a fifth of its way
@@ -149,6 +148,26 @@ def stack_slopes(theta: Array, data: Touches, u: Array, beyond: Array | None = N
         if name == "ln_first" and moved[i] > 0:  # a share is 1 at most: the difference is taken inwards
             moved[i] = theta[i] - 1e-4
         slopes[:, :, i] = (predict(stack_of(moved), nodes, data, u, beyond) - y) / (moved[i] - theta[i])
+    return slopes
+
+
+def shared_slopes(theta: Array, data: Touches, u: Array, by_u: Array, beyond: Array | None = None) -> Array:
+    """Return the derivatives of what nuisances u predict of n touches by the numbers that all grasps share,
+    which begin ``theta``, (n, n_bin, n_shared); ``by_u`` are those by the nuisances."""
+    slopes = np.zeros((*by_u.shape[:2], len(SHARED_NAMES)))
+    by_stack = stack_slopes(theta, data, u, beyond)
+    slopes[:, :, : by_stack.shape[2]] = by_stack
+    is_stated = np.isfinite(data.t_object)
+    to_room = np.nan_to_num(data.t_ambient - data.t_object)
+    shared = {
+        "ln_build_up": by_u[:, :, BUILD_UP],
+        "onset": by_u[:, :, ONSET],
+        "transit_loss": by_u[:, :, T_OBJECT] * to_room[:, None],
+        "bias": by_u[:, :, T_OBJECT] * is_stated[:, None],
+        "ln_depth": by_u[:, :, CAPACITY],
+    }
+    for name, values in shared.items():
+        slopes[:, :, SHARED_NAMES.index(name)] = values
     return slopes
 
 
@@ -409,6 +428,7 @@ class Fitted(NamedTuple):
     plain: Mode  # as grasps like those of the training
     plain_prior: Prior
     unlike: Array  # (n,), probability that a touch is unlike those
+    sure: Array  # (n, m), evidence were the calibration exact, as it counts beside a free effusivity
 
 
 def fit_candidates(
@@ -434,12 +454,13 @@ def fit_candidates(
     mode = fit_rivals(gripper, every, row, hypotheses, start=begin, noise=noise, prior=prior)
     place, candidate = np.arange(n)[:, None] * n_grade, np.arange(m)
     first = (place * m + candidate).ravel()
+    sure = logsumexp(over_grades(gripper, mode.log_evidence.reshape(n, n_grade, m)), axis=1)
     if gripper.uncertainty is not None and gripper.discrepancy is None:
         pairs = data.take(np.repeat(np.arange(n), m))
         every_pair = Hypotheses(*(np.tile(field, n) for field in one))
-        doubt = evidence_in_doubt(gripper, pairs, every_pair, prior.take(first), mode.take(first))
-        sure = np.log1p(-DOUBT.gripper_prior) + mode.log_evidence[first]
-        mode.log_evidence[first] = np.logaddexp(sure, np.log(DOUBT.gripper_prior) + doubt)
+        mode.log_evidence[first] = evidence_in_doubt(
+            gripper, pairs, every_pair, prior.take(first), mode.take(first)
+        )
     by_grade_and_candidate = over_grades(gripper, mode.log_evidence.reshape(n, n_grade, m))
     best_grade = ((place + by_grade_and_candidate.argmax(axis=1)) * m + candidate).ravel()
     by_grade = logsumexp(by_grade_and_candidate, axis=2)
@@ -449,6 +470,7 @@ def fit_candidates(
         mode.take(first),
         prior.take(first),
         -np.expm1(by_grade[:, 0] - logsumexp(by_grade, axis=1)),
+        sure,
     )
 
 
@@ -456,14 +478,32 @@ def evidence_in_doubt(
     gripper: GripperModel, data: Touches, hypotheses: Hypotheses, prior: Prior, mode: Mode
 ) -> Array:
     """Return the log evidence of pairs, a row of data each, where the calibration errs by as much as it knows
-    (n,): with covariance P of the stack's numbers and K the slopes by them at the modes, K P K' is noise."""
+    (n,): with covariance P of all that grasps share and of the pair's block, and K the slopes by them at the
+    modes, K P K' is noise."""
+    # P of the stack alone would count twice what one known grasp leaves open: its conductance and its stack
+    # compensate each other (ten other grippers, one known grasp: log loss 1.05, with all of P .90)
     assert gripper.uncertainty is not None
-    slopes = stack_slopes(stack_numbers(gripper.stack), data, mode.u)
-    place = [gripper.uncertainty.names.index(name) for name in STACK_NAMES[: slopes.shape[2]]]
-    spread = gripper.uncertainty.covariance[np.ix_(place, place)]
+    known, n = gripper.uncertainty, data.level.size
+    _, by_u = jacobian(gripper.stack, nodes_for(data), data, mode.u, np.ones(mode.u.shape, dtype=bool))
+    shared = shared_slopes(stack_numbers(gripper.stack), data, mode.u, by_u)
+    slopes = np.concatenate([shared, by_u[:, :, [H, EFFUSIVITY]]], axis=2)
+    spread, sd = np.zeros((n, slopes.shape[2], slopes.shape[2])), prior.sd.copy()
+    blocks = hypotheses.block.astype(int)
+    for block in np.unique(blocks):
+        of_block, names = blocks == block, [*SHARED_NAMES]
+        if block >= 0 and (own := block_names([gripper.materials[block]]))[0] in known.names:
+            names += own
+            # what of the block is not known is in P
+            rest = sd[of_block, H] ** 2 - known.sd(own[0]) ** 2
+            sd[of_block, H] = np.sqrt(np.maximum(rest, gripper.spreads.ln_h**2))
+        place = [known.names.index(name) for name in names]
+        spread[of_block, : len(place), : len(place)] = known.covariance[np.ix_(place, place)]
+    in_spread = gripper.nominal_sd(data.t_ambient - data.t_object)
+    sd[:, T_OBJECT] = np.sqrt(np.maximum(sd[:, T_OBJECT] ** 2 - in_spread**2, 0.0))
     noise = whiten(data, gripper.noise, slopes @ spread @ slopes.transpose(0, 2, 1))
-    row = np.arange(data.level.size)
-    return fit_pairs(gripper, data, row, hypotheses, start=mode.u, noise=noise, prior=prior).log_evidence
+    own_prior = prior._replace(sd=sd)
+    row = np.arange(n)
+    return fit_pairs(gripper, data, row, hypotheses, start=mode.u, noise=noise, prior=own_prior).log_evidence
 
 
 def unexplained(data: Touches, row: NDArray[np.int64], mode: Mode, prior: Prior) -> list[tuple[float, str]]:

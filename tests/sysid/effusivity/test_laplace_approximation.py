@@ -258,7 +258,7 @@ def test_what_each_kind_of_hypothesis_expects(device):
         (43.0, np.nan, 28.0, 12.0, 43.0 + 0.1 - 0.02 * 15, 0.4 * np.sqrt(12 / 10)),
         (43.0, 0.3, 28.0, 12.0, 42.8, 0.3), (43.0, np.nan, np.nan, 12.0, 43.1, 0.4 * np.sqrt(12 / 10)),
         (43.0, np.nan, 28.0, 2.0, 42.8, 20 / 3**0.5), (np.nan, 0.3, 28.0, 12.0, 28.0, 20 / 3**0.5),
-        (np.nan, np.nan, np.nan, 12.0, 23.0, 20 / 3**0.5),
+        (np.nan, np.nan, np.nan, 12.0, 22.5, 20 / 3**0.5),
     ],
 )  # fmt: skip
 def test_what_a_nominal_temperature_says_of_the_object(device, t_object, sd, room, dof, mean, want):

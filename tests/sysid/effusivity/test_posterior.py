@@ -316,3 +316,19 @@ def test_what_a_calibration_leaves_open_makes_answers_less_sure(device):
     )
     np.testing.assert_allclose(known, exact, atol=2e-3)
     assert np.log(unsure).mean() > np.log(exact).mean() + 0.1
+    # nor is it the stack's numbers alone: iron that is pressed harder, and whose conductance is open
+    iron = replace(device.blocks["iron"], ln_h=device.blocks["iron"].ln_h + 0.5)
+    pressed = simulated(
+        replace(device, blocks={**device.blocks, "iron": iron}),
+        ["iron"],
+        n=4,
+        t_gripper=23.0,
+        t_object=43.0,
+        seed=6,
+    )
+    open_h = nothing.covariance.copy()
+    place = nothing.names.index("ln_h iron")
+    open_h[place, place] = 0.5**2
+    loose = replace(device, uncertainty=ParameterCovariance(nothing.names, open_h))
+    exact, unsure = (material_fit(gripper, pressed, names).probabilities[:, 1] for gripper in (device, loose))
+    assert np.log(unsure).mean() > np.log(exact).mean() + 0.05
