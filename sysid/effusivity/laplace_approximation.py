@@ -481,9 +481,9 @@ def evidence_in_doubt(
     (n,): with covariance P of all that grasps share and of the pair's block, and K the slopes by them at the
     modes, K P K' is noise."""
     # P of the stack alone would count twice what one known grasp leaves open: its conductance and its stack
-    # compensate each other (ten other grippers, one known grasp: log loss 1.05, with all of P .90)
-    assert gripper.uncertainty is not None
-    known, n = gripper.uncertainty, data.level.size
+    # compensate each other (six other grippers, one known grasp: log loss 1.05, with all of P .99)
+    uncertainty, n = gripper.uncertainty, data.level.size
+    assert uncertainty is not None
     _, by_u = jacobian(gripper.stack, nodes_for(data), data, mode.u, np.ones(mode.u.shape, dtype=bool))
     shared = shared_slopes(stack_numbers(gripper.stack), data, mode.u, by_u)
     slopes = np.concatenate([shared, by_u[:, :, [H, EFFUSIVITY]]], axis=2)
@@ -491,19 +491,20 @@ def evidence_in_doubt(
     blocks = hypotheses.block.astype(int)
     for block in np.unique(blocks):
         of_block, names = blocks == block, [*SHARED_NAMES]
-        if block >= 0 and (own := block_names([gripper.materials[block]]))[0] in known.names:
-            names += own
+        if block >= 0 and (names_of_block := block_names([gripper.materials[block]]))[0] in uncertainty.names:
+            names += names_of_block
             # what of the block is not known is in P
-            rest = sd[of_block, H] ** 2 - known.sd(own[0]) ** 2
-            sd[of_block, H] = np.sqrt(np.maximum(rest, gripper.spreads.ln_h**2))
-        place = [known.names.index(name) for name in names]
-        spread[of_block, : len(place), : len(place)] = known.covariance[np.ix_(place, place)]
+            outside_spread = sd[of_block, H] ** 2 - uncertainty.sd(names_of_block[0]) ** 2
+            sd[of_block, H] = np.sqrt(np.maximum(outside_spread, gripper.spreads.ln_h**2))
+        place = [uncertainty.names.index(name) for name in names]
+        spread[of_block, : len(place), : len(place)] = uncertainty.covariance[np.ix_(place, place)]
     in_spread = gripper.nominal_sd(data.t_ambient - data.t_object)
     sd[:, T_OBJECT] = np.sqrt(np.maximum(sd[:, T_OBJECT] ** 2 - in_spread**2, 0.0))
     noise = whiten(data, gripper.noise, slopes @ spread @ slopes.transpose(0, 2, 1))
-    own_prior = prior._replace(sd=sd)
     row = np.arange(n)
-    return fit_pairs(gripper, data, row, hypotheses, start=mode.u, noise=noise, prior=own_prior).log_evidence
+    return fit_pairs(
+        gripper, data, row, hypotheses, start=mode.u, noise=noise, prior=prior._replace(sd=sd)
+    ).log_evidence
 
 
 def unexplained(data: Touches, row: NDArray[np.int64], mode: Mode, prior: Prior) -> list[tuple[float, str]]:
