@@ -89,7 +89,8 @@ def prbs(n: int, *, hold: int, seed: int = 0) -> Array:
     from scipy.signal import max_len_seq  # slow to import, and the other schedules do without
 
     bits = max(3, min(10, int(np.floor(np.log2(max(n / hold, 7) + 1)))))
-    register, _ = max_len_seq(bits)
+    # begun with one bit alone, as all ones hold the drive for as many bits as there are
+    register, _ = max_len_seq(bits, state=[0] * (bits - 1) + [1])
     sequence = np.where(register, 1.0, -1.0)
     # golden steps: whichever seeds several inputs have, they begin far apart and barely correlate
     begin = round(seed * 0.6180339887498949 * len(sequence)) % len(sequence)
