@@ -589,7 +589,7 @@ def _discrepant(bare: _Fit, progress: Progress, first: GripperModel | None) -> _
     if not problem.known.all():  # objects as warm as the skin may show nothing, as far beyond too much
         starts.append((slow, _first_nuisances(problem, slow, spread), spread, (begin, begin)))
     if first is not None:
-        # the same skin: on contacts of two sensors 1,300 to 3,600 nats above where the other starts end
+        # the same skin: on two of three folds of real contacts 1,300 and 3,600 nats above the other starts
         theta_of_first = gripper_theta(first, problem.labels, bare.problem.prior.mean)
         alike = _with_discrepancy(bare.problem, theta_of_first)[1]
         starts.append((alike, np.zeros(bare.w.shape), spread, (begin, begin)))
