@@ -111,15 +111,14 @@ def clock_of(table: Table, read: Mapping[str, Header], dt: float | None) -> Cloc
         for header in [*named, *others]
     ]
     if likely := [clock for clock in clocks if clock is not None]:
-        known = [clock for clock in likely if not clock.doubt]
-        first, *others_known = known or likely
-        lengths = [float(np.ptp(c.seconds[np.isfinite(c.seconds)])) for c in (first, *others_known)]
-        differ = [
-            c for c, length in zip(others_known, lengths[1:]) if abs(length / lengths[0] - 1) > _CLOCK.late
-        ]
-        if known and differ:
-            names = (", ".join(sorted(c.columns)) for c in (first, differ[0]))
-            return replace(first, doubt="{} is taken as the time, and {} is of another length".format(*names))
+        known = [clock for clock in likely if not clock.doubt and np.isfinite(clock.seconds).any()]
+        first, *others_known = known or likely[:1]
+        lengths = [float(np.ptp(clock.seconds[np.isfinite(clock.seconds)])) for clock in known]
+        for clock, length in zip(others_known, lengths[1:]):
+            if abs(length - lengths[0]) > _CLOCK.late * lengths[0]:
+                names = (", ".join(sorted(c.columns)) for c in (first, clock))
+                doubt = "{} is taken as the time, and {} is of another length".format(*names)
+                return replace(first, doubt=doubt)
         return first
     return _of_rows(table, read)
 
