@@ -24,6 +24,7 @@ from scipy.optimize import least_squares
 from thermogrip.datasets.arrays import Array, Mask, Values
 from thermogrip.datasets.errors import UserError
 from thermogrip.sysid.models.model import Sizes
+from thermogrip.sysid.plant.linearise import settled
 
 if TYPE_CHECKING:
     from thermogrip.sysid.models.jit_rollout import Kernel
@@ -324,19 +325,8 @@ class PredictionModel:
     def steady_state(self, u: ArrayLike, d: ArrayLike) -> Array:
         """Return the state (n_x,) in which the plant stays under drives u (Newton); NaN: there is none."""
         u, d = np.asarray(u, float).reshape(self.n_u), np.asarray(d, float)
-        x = self.rest(self.usual(self.room(d)), d)
-        for _ in range(30):
-            step = self.linearise(x, u, d)
-            try:
-                change = np.linalg.solve(np.eye(self.n_x) - step.A, step.after - x)
-            except np.linalg.LinAlgError:
-                return np.full(self.n_x, np.nan)  # an integrator: any state may stay
-            x = x + np.clip(change, -200.0, 200.0)
-            if not np.isfinite(x).all():
-                break
-            if np.max(np.abs(change)) < 1e-7:
-                return x
-        return np.full(self.n_x, np.nan)
+        start = self.rest(self.usual(self.room(d)), d)
+        return settled(lambda x: self.linearise(x, u, d)[:2], start)
 
     def steady_output(self, u: ArrayLike, d: ArrayLike) -> Array:
         """Return the outputs (n_y,) that the plant settles at under drives u."""

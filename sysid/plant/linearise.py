@@ -14,7 +14,7 @@ python-control and scipy are handed these; CasADi one step of the plant itself, 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -115,9 +115,20 @@ def linearise_plant(
     ([40.1, 34.5], [[0.49, 0.09], [0.12, 0.38]])
     """
     u, d = operating_point(plant, inputs, disturbances)
-    x = _steady_state(plant, u, d) if state is None else np.asarray(state, dtype=float)
+
+    def step(x: Array) -> tuple[Array, Array]:
+        return states_after(plant, x[None], u[None], d[None])[0], discrete_matrices(plant, x, u, d, [])[0]
+
+    if state is None:
+        start = plant.model.rest(np.full(len(plant.outputs), ROOM), u, d, plant.p)
+        x = settled(step, np.asarray(start, dtype=float))
+    else:
+        x = np.asarray(state, dtype=float)
     if x.shape != (plant.model.n_x,):
         raise UserError(f"the state has {x.size} numbers", hint=f"give {plant.model.n_x}")
+    if not np.isfinite(x).all():
+        hint = "name other inputs, or give the state yourself"
+        raise UserError("the plant does not settle under these inputs", hint=hint)
     moved = [k for k, name in enumerate(plant.inputs) if name not in plant.model.switches]
     A, B = discrete_matrices(plant, x, u, d, moved)
     size = np.abs(np.linalg.eigvals(A))
@@ -194,26 +205,20 @@ def states_after(plant: PlantData, x: Array, u: Array, d: Array, dt: float | Non
     return np.asarray(plant.model.rollout(x, u[:, None], d[:, None], p, dt or plant.dt)[1])
 
 
-def _steady_state(plant: PlantData, u: Array, d: Array) -> Array:
-    """Return the state in which the plant stays under u and d, by Newton's method."""
-    start = np.full(len(plant.outputs), ROOM)
-    x = np.asarray(plant.model.rest(start, u, d, plant.p), dtype=float)
+def settled(step: Callable[[Array], tuple[Array, Array]], x: Array) -> Array:
+    """Return the state (n_x,) that a step leaves as it is, by Newton's method from x, NaN where there is none
+    or any may stay; ``step(x)`` is the state after it and its derivative (n_x, n_x)."""
     with np.errstate(all="ignore"):
         for _ in range(60):
-            A, _ = discrete_matrices(plant, x, u, d, [])
+            after, A = step(x)
             I_minus_A = np.eye(x.size) - A
-            if (
-                not np.isfinite(I_minus_A).all()
-                or np.linalg.svd(I_minus_A, compute_uv=False)[-1] < LINEAR.integrator
-            ):
+            if not np.isfinite(A).all() or np.linalg.norm(I_minus_A, -2) < LINEAR.integrator:
                 break
-            move = np.linalg.solve(I_minus_A, states_after(plant, x[None], u[None], d[None])[0] - x)
+            move = np.linalg.solve(I_minus_A, after - x)
             x = np.asarray(x + np.clip(move, -100.0, 100.0))
             if np.max(np.abs(move)) < 1e-7 * max(1.0, float(np.abs(x).max())):
                 return x
-    raise UserError(
-        "the plant does not settle under these inputs", hint="name other inputs, or give the state yourself"
-    )
+    return np.full(x.size, np.nan)
 
 
 def discrete_matrices(
