@@ -214,15 +214,16 @@ def doubt_readings(name: str, values: Floats, inputs: Sequence[Floats], time: Fl
 
 
 def _longest_standstill(values: Floats, moves: Floats) -> tuple[float, int]:
-    """Return the value that a reading stands still at in most rows, and in how many, although it moved until
-    then by more than the to and fro of one that settles."""
+    """Return the value that a reading stands still at in most rows, and their number, although it moved
+    until then by more than the to and fro of one that settles."""
     least = 2 * float(moves[moves > 0].min())
     ends = np.flatnonzero(np.append(moves != 0, True))
     rows_at: dict[float, int] = {}
-    for start, stop in zip(np.append(0, ends[:-1] + 1).tolist(), (ends + 1).tolist()):
+    runs = np.column_stack([np.append(0, ends[:-1] + 1), ends + 1])
+    for start, stop in runs[np.ptp(runs, axis=1) > _FEWEST_HELD].tolist():
         earlier = moves[max(start - SPIKE_WINDOW, 0) : max(start - 1, 0)]
         moving = np.count_nonzero(earlier) > SPIKE_WINDOW / 2 and np.nansum(earlier) > least * earlier.size
-        if stop - start > _FEWEST_HELD and moving:
+        if moving:
             rows_at[values[start]] = rows_at.get(values[start], 0) + stop - start
     return max(rows_at.items(), key=lambda item: item[1], default=(np.nan, 0))
 
