@@ -51,12 +51,8 @@ class ExperimentForecast:
         self.highest = highest
         self.room = room
         self.n_draws = draws if plant.covariance is not None or plant.samples is not None else 0
-        self._d = np.array(
-            [
-                room if _is_celsius(plant, name) else 0.5 * sum(plant.valid.get(name, (0.0, 0.0)))
-                for name in plant.disturbances
-            ]
-        )
+        self._d = np.nan_to_num(plant.undisturbed(room))
+        self._celsius = np.array([plant.units.get(name, "degC") == "degC" for name in plant.outputs])
 
     def outputs(self, u: Array) -> Array:
         """Return the outputs (1 + n_draws, N + 1, n_y) of the plant and of its draws under u (N, n_u)."""
@@ -65,7 +61,7 @@ class ExperimentForecast:
     def stays(self, u: Array, *, margin: float = 0.0) -> bool:
         """Say whether all outputs in degC stay inside the limits, by so much, under u (N, n_u)."""
         y = self.outputs(u)
-        temperatures = y[:, :, [_is_celsius(self.plant, name) for name in self.plant.outputs]]
+        temperatures = y[:, :, self._celsius]
         low, high = temperatures.min(initial=np.inf), temperatures.max(initial=-np.inf)
         return bool(np.isfinite(y).all() and low >= self.lowest + margin and high <= self.highest - margin)
 
@@ -143,14 +139,11 @@ class ExperimentForecast:
 
     def _rest(self, p: Array) -> Array:
         model = self.plant.model
-        still = np.array([1.0 if name in model.switches else self._still(name) for name in model.inputs])
-        lowest = {name: self.plant.valid.get(name, (0.0, 0.0))[0] for name in model.outputs}
-        y = np.array([self.room if _is_celsius(self.plant, n) else low for n, low in lowest.items()])
+        seen = [self.plant.valid.get(name, (0.0, 0.0)) for name in (*model.inputs, *model.outputs)]
+        (least, lowest), (most, _) = (np.split(end, [len(model.inputs)]) for end in np.array(seen).T)
+        still = np.where([name in model.switches for name in model.inputs], 1.0, np.clip(0.0, least, most))
+        y = np.where(self._celsius, self.room, lowest)
         return np.asarray(model.rest(y, still, self._d, p), dtype=float)
-
-    def _still(self, name: str) -> float:
-        low, high = self.plant.valid.get(name, (0.0, 0.0))
-        return float(np.clip(0.0, low, high)) if low < high else 0.0
 
 
 def plant_from_prior(model: GreyModel) -> Plant:
@@ -181,7 +174,3 @@ def interval_widths(plant: Plant, covariance: Array, level: float = 0.9) -> dict
     """Return the width of each free parameter's central interval, in natural units, at a covariance."""
     expected = replace(plant, covariance=covariance, samples=None)
     return {name: high - low for name, (low, high) in expected.intervals(level).items()}
-
-
-def _is_celsius(plant: Plant, name: str) -> bool:
-    return plant.units.get(name, "degC") == "degC"
