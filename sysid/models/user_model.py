@@ -21,6 +21,7 @@ import hashlib
 import importlib.util
 import inspect
 import keyword
+import reprlib
 import sys
 import traceback
 from collections import namedtuple
@@ -29,6 +30,7 @@ from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from functools import lru_cache
 from importlib import import_module
+from numbers import Real
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Self
 
@@ -228,22 +230,28 @@ class OwnCode:
 
     def _call(self, what: str, names: Mapping[str, Any], args: tuple[Any, ...]) -> list[Any]:
         try:
-            got = getattr(self.made, what)(*args)
+            with np.errstate(all="ignore"):  # CasADi leaves flags of its own in arrays of symbols
+                got = getattr(self.made, what)(*args)
         except UserError:
             raise
         except Exception as error:  # the user's own code may raise anything
             hint, fields = f"correct {what}", getattr(getattr(error, "obj", None), "_fields", None)
             if fields is not None:  # of a named tuple of the arguments
                 hint = f"the {type(error.obj).__name__} are {', '.join(fields) or 'none'}"  # type: ignore[attr-defined]
-            elif "not known yet" in str(error):
+            elif "an if about" in str(error):
                 hint = "choose with np.where or np.maximum"
-            elif "ArrayInterface" in str(error) or "_Symbol" in str(error):
-                hint = "use arithmetic and NumPy's elementary functions"
+            elif any(word in str(error) for word in ("ArrayInterface", "_Symbol", "not known yet")):
+                hint = "use arithmetic, NumPy's elementary functions, and np.array of a list"
             problem = f"fails in {what}: {type(error).__name__}: {error}"
             raise self.fault(problem, line=_line_of(error, self.file), hint=hint) from error
-        values = [got] if getattr(got, "ndim", None) == 0 or not np.iterable(got) else list(got)
-        if len(values) != len(names):
-            problem = f"returns {len(values)} numbers from {what}, not {len(names)}"
+        alone = isinstance(got, str) or getattr(got, "ndim", None) == 0 or not np.iterable(got)
+        values = [v.item() if getattr(v, "ndim", None) == 0 else v for v in ([got] if alone else got)]
+        problem = f"returns {len(values)} numbers from {what}, not {len(names)}"
+        numbers = (_Symbol, Real, np.bool_, *{type(v) for group in args for v in group})  # or rows
+        wrong = [v for v in values if not isinstance(v, numbers)]
+        if wrong:
+            problem = f"returns {reprlib.repr(wrong[0])} from {what}, which is no number"
+        if wrong or len(values) != len(names):
             raise self.fault(problem, hint=f"return one for each of {', '.join(names)}")
         return values
 
@@ -499,6 +507,10 @@ class _Symbol(NDArrayOperatorsMixin):
         self.view = view
 
     def __array_ufunc__(self, ufunc: Any, method: Any, *inputs: Any, **options: Any) -> Any:
+        into = options.pop("out", (None,))[0]  # of h += 1, where the name h then means the sum
+        if isinstance(into, np.ndarray):
+            into[...] = ufunc(*inputs, **options)
+            return into
         if method != "__call__" or options:
             raise TypeError(f"{ufunc.__name__}.{method} of a value that is not known yet")
         if any(isinstance(value, np.ndarray) and value.ndim for value in inputs):
@@ -508,11 +520,20 @@ class _Symbol(NDArrayOperatorsMixin):
         return self.__array_function__(_LOGICAL.get(ufunc, ufunc), (), inputs, {})
 
     def __array_function__(self, function: Any, _types: Any, inputs: Any, options: Any) -> Any:
-        bare = [value.view if isinstance(value, _Symbol) else value for value in inputs]
-        return _Symbol(function(*bare, **options))
+        result = function(*_bared(inputs), **options)
+        if result.shape:
+            raise TypeError(f"{function.__name__} of values that are not known yet makes an array")
+        return _Symbol(result)
 
     def __bool__(self) -> bool:
         raise TypeError("an if about a value that is not known yet")
+
+
+def _bared(value: Any) -> Any:
+    """Return CasADi's own in place of symbols, in lists too."""
+    if isinstance(value, (list, tuple)):
+        return [_bared(item) for item in value]
+    return value.view if isinstance(value, _Symbol) else value
 
 
 def _for_numpy(values: Values) -> list[Any]:

@@ -358,11 +358,20 @@ def test_a_class_may_call_what_it_likes_and_what_cannot_be_compiled_is_refused()
         def rhs(self, x: Any, u: Any, d: Any, p: Any) -> Any:
             return np.array([p.P * u.q + p.G * (d.air - x.t)]) / p.C
 
+    class InPlace(Block):
+        def rhs(self, x: Any, u: Any, d: Any, p: Any) -> Any:
+            heat, loss = p.P * u.q, np.array([x.t, 1.0])
+            loss[0] -= d.air
+            loss *= p.G
+            heat -= loss[0]
+            heat /= p.C
+            return [np.select([x.t > -99.0, x.t > -300.0], [heat, 1.0], 2.0)]
+
     with pytest.raises(UserError, match=r"Sorted fails in rhs: .*sort"):
         own_model(Sorted)
     plain = own_model(Block)
     arguments = ([[25.0]], np.ones((1, 9, 1)), np.full((1, 9, 1), 21.0), plain.prior[None], 1.0)
-    for kind in (Helped, Tabled, Arrays):
+    for kind in (Helped, Tabled, Arrays, InPlace):
         got = own_model(kind).rollout(*arguments)[0]
         np.testing.assert_allclose(got, plain.rollout(*arguments)[0], atol=1e-12)
 
@@ -437,6 +446,11 @@ def test_a_plant_refuses_a_class_that_has_changed_or_is_another(tmp_path):
         ({"__init__": lambda self, size: None}, r"cannot be made without arguments \(TypeError"),
         ({"limit": {"t": (0, 1)}}, "'limit', which nothing reads; call it 'limits'"),
         ({"rhs": lambda self, x, u, d, p: [x.t, x.t]}, "returns 2 numbers from rhs, not 1"),
+        ({"rhs": lambda self, x, u, d, p: None}, "returns None from rhs, which is no number; return one for"),
+        ({"rhs": lambda self, x, u, d, p: ["a"]}, "returns 'a' from rhs"),
+        ({"rhs": lambda self, x, u, d, p: [np.array([x.t, 1.0])]}, r"returns array.* from rhs, which is no"),
+        ({"rhs": lambda self, x, u, d, p: np.stack([x.t])}, r"stack of values .* makes an array; use arith"),
+        ({"rhs": lambda self, x, u, d, p: [np.piecewise(x.t, [x.t > 0], [1.0])]}, r"no impl.*; use arithm"),
         ({"rhs": lambda self, x, u, d, p: [p.K * x.t]}, "no attribute 'K'; the parameters are C, G, P"),
         ({"rhs": lambda self, x, u, d, p: [x.t if x.t > 0 else 0.0]}, r"choose with np\.where"),
         ({"rhs": lambda self, x: [0.0]}, "fails in rhs: TypeError"),
