@@ -3,7 +3,8 @@ r"""A drive that does another share than before, and a sensor that has stopped.
 Both compare what a plant was driven with and what was read, and neither asks for a posterior.
 
 What this cannot tell: anything before five changes of target; a drive that did another share of its model
-from the start; a loss of less than a fifth; and a load that comes with each of several targets from a loss.
+from the start; a loss of less than a fifth; and a load against each of several targets, up and down, from a
+loss.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermogrip.datasets.arrays import Array, Mask
+from thermogrip.datasets.arrays import Array
 from thermogrip.mpc.estimator.reading_checks import SHARE
 from thermogrip.sysid.plant.fit_record import RUN_GAIN_SD
 
@@ -30,6 +31,8 @@ _LAST_TARGETS = 4
 # share of a drive's gain: the geometric middle of 1 and .6.  Without a fault it was .80 to 1.11 on those
 # plants, with a loss of 40 % .49 to .74
 _CHANGED = 0.775
+# standard deviations beyond which, on either side, is a hundredth of a normal: so seldom a word may be false
+_RARE = 2.576
 
 
 class GainMonitor:
@@ -43,11 +46,13 @@ class GainMonitor:
     def forget(self) -> None:
         """Begin anew, as with other readings."""
         n = len(self.filters)
-        self._before, self._window = np.zeros((3, n)), np.zeros((3, n))  # sums of psi^2, psi e, (psi e)^2
+        self._window = np.zeros((2, n))  # P = sum(psi^2 / R), E = sum(psi e / R)
+        self._before = np.zeros((6, n))  # sums over windows of 1, P, E, P^2, P E, E^2
         self._last: deque[Array] = deque()
         self._since_s, self._was_new = np.inf, False
         # what each drive (n_u,) does of what it did before, NaN until enough targets were new
-        self.share, self._reported = np.full(n, np.nan), np.zeros(n, dtype=bool)
+        self.share = np.full(n, np.nan)
+        self._changed, self._reported = np.zeros((2, n), dtype=bool)
 
     def restart(self, y: Array, d: Array) -> None:
         """Begin the filters anew at readings y (n_y,) and d (n_d,); what was found stays."""
@@ -75,30 +80,30 @@ class GainMonitor:
         self._since_s, self._was_new = 0.0 if new else self._since_s + seconds, new
         # after a new target a drive moves for the target and not for a load
         if self._since_s <= self._settling_s:
-            psi, effect = np.nan_to_num(slopes), np.nan_to_num(slopes) @ (np.nan_to_num(innovation) / R)
-            # g = sum(psi e / R) / sum(psi^2 / R), sd^2 = sum((psi e / R)^2) / sum(psi^2 / R)^2
-            self._window = self._window + np.array([psi**2 @ (1.0 / R), effect, effect**2])
+            psi, e = np.nan_to_num(slopes), np.nan_to_num(innovation)
+            self._window = self._window + np.array([psi**2 @ (1.0 / R), psi @ (e / R)])
 
     def _end_window(self) -> None:
         """Compare the last windows with those before."""
-        if self._window[0].any():
-            self._last.append(self._window)
+        power, effect = self._window
+        if power.any():
+            products = [np.ones_like(power), power, effect, power**2, power * effect, effect**2]
+            self._last.append(np.array(products))
         self._window = np.zeros_like(self._window)
-        changed = self._changed()  # windows of a drive that has changed are not added to those before
+        was = self._changed  # windows of a drive that has changed are not added to those before
         if len(self._last) > _LAST_TARGETS:
-            self._before = self._before + np.where(changed, 0.0, self._last.popleft())
-        if len(self._last) == _LAST_TARGETS and self._before[0].all():
-            power, effect, _ = np.sum(self._last, axis=0)
-            variance = self._before[2] / self._before[0] ** 2  # loads are in it, without a model of them
+            self._before = self._before + np.where(was, 0.0, self._last.popleft())
+        if len(self._last) == _LAST_TARGETS and self._before[1].all():
+            now, variance = _gain(np.sum(self._last, axis=0))
+            before, doubt = _gain(self._before)
             # shrunk by the share of the prior in prior and variance: few windows before say little
-            known = self._before[1] / self._before[0] * _PRIOR_SD**2 / (_PRIOR_SD**2 + variance)
+            shrink = _PRIOR_SD**2 / (_PRIOR_SD**2 + doubt)
+            known, variance = shrink * before, variance + shrink * doubt
             # a model's own gain may be wrong (of a kiln by 30 %) and no fault: 1 + g of now and of before
-            self.share = (1.0 + effect / power) / (1.0 + known)
-        self._reported = changed & self._changed()  # at two new targets in a row
-
-    def _changed(self) -> Mask:
-        """Return of each drive (n_u,) whether it does another share."""
-        return np.asarray((self.share < _CHANGED) | (self.share > 1.0 / _CHANGED))
+            self.share = (1.0 + now) / (1.0 + known)
+            large = (self.share < _CHANGED) | (self.share > 1.0 / _CHANGED)
+            self._changed = large & (np.abs(now - known) > _RARE * np.sqrt(variance))
+        self._reported = was & self._changed  # at two new targets in a row
 
     @property
     def message(self) -> str:
@@ -108,6 +113,18 @@ class GainMonitor:
         drive = int(self._reported.argmax())
         does = f"{list(self.filters)[drive]} does {self.share[drive]:.0%} of what it did before"
         return f"{does}: has it changed, or is it a load?"
+
+
+def _gain(windows: Array) -> tuple[Array, Array]:
+    """Return g = sum(E) / sum(P) of each drive (n_u,) by sums over windows (6, n_u), and its variance."""
+    count, power, effect, power2, product, effect2 = windows
+    gain = effect / power
+    # The misses of a window have one cause, such as a load that goes as the target comes: a window is one
+    # observation, and g varies by sum((E - g P)^2) / sum(P)^2 n / (n - 1).  A single one has
+    # no scatter: its miss is that from the model, E.
+    center = np.where(count > 1, gain, 0.0)
+    scatter = effect2 - 2.0 * center * product + center**2 * power2
+    return gain, np.maximum(scatter, 0.0) / power**2 * count / np.maximum(count - 1.0, 1.0)
 
 
 class StuckMonitor:

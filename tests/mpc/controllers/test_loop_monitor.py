@@ -116,16 +116,24 @@ def test_a_draw_is_no_other_plant_and_half_the_power_is():
 
 
 @pytest.mark.parametrize(
-    ("share", "said"),
-    [pytest.param(1.0, "", marks=pytest.mark.slow), (0.9, ""), (0.6, "q1 does 6"), (1.5, "q1 does 1")],
+    ("share", "begin", "every", "said"),
+    [
+        pytest.param(1.0, 450, 1500, "", marks=pytest.mark.slow),
+        (0.9, 450, 1500, ""),
+        (0.6, 450, 1500, "q1 does 6"),
+        (1.5, 450, 1500, "q1 does 1"),
+        (0.5, 135, 150, ""),  # for a minute until each new target: against one move, with the other
+    ],
 )
-def test_a_drive_that_comes_to_do_another_share_is_told_after_some_targets(share: float, said: str):
+def test_a_drive_that_comes_to_do_another_share_is_told_after_some_targets(
+    share: float, begin: int, every: int, said: str
+):
     design = default_design(KIT, dt=4.0)
     controller, monitor = Controller(KIT, design), LoopMonitor(KIT, design)
     truth = Truth(KIT, 4.0, Surroundings(noise=0.05, quantum=0.0), None, 0)
     words = []
     for k in range(1500):
-        truth.around = replace(truth.around, drive_share=share if k >= 450 else 1.0)
+        truth.around = replace(truth.around, drive_share=share if k % every >= begin else 1.0)
         reading, target = truth.reading(), 40.0 + 10.0 * (k // 150 % 2)
         if not k:
             controller.reset(reading)
