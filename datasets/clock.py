@@ -49,7 +49,7 @@ class ClockSettings:
     days_apart: float = 1 / 24  # rows of a plant are closer than an hour, seconds so late in a day are not
 
 
-_CLOCK = ClockSettings()
+CLOCK = ClockSettings()
 _ELAPSED = " as minutes and seconds"  # how times of two numbers are taken that begin at 00:00 or pass 23
 _MONTH_NAMES = ("jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec")
 _MONTHS = {month: str(number) for number, month in enumerate(_MONTH_NAMES, 1)}
@@ -113,24 +113,32 @@ def clock_of(table: Table, read: Mapping[str, Header], dt: float | None) -> Cloc
     if likely := [clock for clock in clocks if clock is not None]:
         known = [clock for clock in likely if not clock.doubt and np.isfinite(clock.seconds).any()]
         first, *others_known = known or likely[:1]
-        lengths = [float(np.ptp(clock.seconds[np.isfinite(clock.seconds)])) for clock in known]
-        for clock, length in zip(others_known, lengths[1:]):
-            if abs(length - lengths[0]) > _CLOCK.late * lengths[0]:
+        usual = _seconds_a_row(first)
+        for clock in others_known:
+            if abs(_seconds_a_row(clock) - usual) > CLOCK.late * usual:
                 names = (", ".join(sorted(c.columns)) for c in (first, clock))
-                doubt = "{} is taken as the time, and {} is of another length".format(*names)
+                steps = f"{_seconds_a_row(clock):.4g} s a row, not {usual:.4g}"
+                doubt = "{} is taken as the time of all columns, and {} goes ".format(*names) + steps
                 return replace(first, doubt=doubt)
         return first
     return _of_rows(table, read)
 
 
+def _seconds_a_row(clock: Clock) -> float:
+    """Return the mean step of a clock between the first and last row that have a time [s]."""
+    rows = np.flatnonzero(np.isfinite(clock.seconds))
+    return float(np.ptp(clock.seconds[rows])) / max(int(np.ptp(rows)), 1)
+
+
 def _behaves_as_clock(header: str, read: Header, values: Floats) -> bool:
     """Tell whether a column that is not named as a time rises in nearly even steps, as only a clock does."""
+    values = values[np.isfinite(values)]  # a table beside may end earlier
     steps = np.diff(_unwrapped(values, np.arange(values.size))[0])
-    enough = 4 if re.fullmatch(r"c1", header) or _COUNTER.fullmatch(header) else _CLOCK.piece_rows
+    enough = 4 if re.fullmatch(r"c1", header) or _COUNTER.fullmatch(header) else CLOCK.piece_rows
     if read.unit not in _TIME_UNITS or steps.size < enough or not np.all(steps > 0):
         return False
     usual = float(np.median(steps))
-    return bool(np.mean(np.abs(steps - usual) <= _CLOCK.evenness * usual) >= _CLOCK.monotone_share)
+    return bool(np.mean(np.abs(steps - usual) <= CLOCK.evenness * usual) >= CLOCK.monotone_share)
 
 
 def _of_text(header: str, table: Table) -> Clock | None:
@@ -156,7 +164,7 @@ def _of_numbers(header: str, table: Table, read: Header) -> Clock | None:
     counts, notes = _unwrapped(counts, table.lines)
     finite = counts[np.isfinite(counts)]
     stated = name == "time" and unit != "1"
-    rising = finite.size > 1 and np.mean(np.diff(finite) >= 0) >= _CLOCK.monotone_share and np.ptp(finite) > 0
+    rising = finite.size > 1 and np.mean(np.diff(finite) >= 0) >= CLOCK.monotone_share and np.ptp(finite) > 0
     if not (stated or rising):
         return None
     meant = _what_counts_mean(name, finite, wrapped=bool(notes)) if unit == "1" else _Counts(scale)
@@ -181,11 +189,11 @@ def _what_counts_mean(name: str, counts: Floats, *, wrapped: bool) -> _Counts:
     steps = np.diff(counts)
     usual = float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
     whole = bool(np.all(counts == np.rint(counts)))
-    likely = (date for date in _DATES if not date.calendar or (not whole and usual <= _CLOCK.days_apart))
+    likely = (date for date in _DATES if not date.calendar or (not whole and usual <= CLOCK.days_apart))
     # dates between the years 2000 and 2100 they may be, as programs count them: in s, ms, us or ns since
     # 1970, or in what Windows, .NET, spreadsheets and MATLAB count
     dates = next((date for date in likely if date.has(float(counts[0]))), None)
-    of_board = whole and usual >= _CLOCK.counts_apart and not np.all(steps % 60 == 0)
+    of_board = whole and usual >= CLOCK.counts_apart and not np.all(steps % 60 == 0)
     if word is not None and (dates is None or dates.seconds == 1.0):  # a board's counter may be as large
         return _Counts(word)
     if dates is not None and dates.calendar:
@@ -200,7 +208,7 @@ def _what_counts_mean(name: str, counts: Floats, *, wrapped: bool) -> _Counts:
         guess = f"{name} has no unit: taken as seconds, so that rows are {usual:g} s apart"
         return _Counts(1.0, doubt="" if known else guess)
     # 32 bits of microseconds last for 72 minutes, of milliseconds for 50 days
-    fine = usual >= _CLOCK.microseconds_apart or (wrapped and counts[-1] > 2**32)
+    fine = usual >= CLOCK.microseconds_apart or (wrapped and counts[-1] > 2**32)
     scale, unit = (1e-6, "microseconds") if fine else (1e-3, "milliseconds")
     # a guess, as is a time that counts rows: it is reported as a doubt, with the option that settles it
     doubt = f"{name} has no unit: taken as {unit}, so that rows are {usual * scale:g} s apart"
@@ -211,12 +219,12 @@ def _of_loop(steps: Floats) -> bool:
     """Tell whether steps are those of a program's loop, which counts in seconds: they differ from row to row
     by more than rounding, and are 0.1, 0.2, 0.5, 1, ... s long or not round in minutes or hours."""
     usual = float(np.median(steps))
-    off = steps[np.abs(steps - usual) <= _CLOCK.evenness * usual] - usual
+    off = steps[np.abs(steps - usual) <= CLOCK.evenness * usual] - usual
     if usual < 0.095 or np.unique(np.round(off, 9)).size < 5 or off.std() < 5e-4 * usual:
         return False
     in_seconds, *in_others = (usual * 10.0 ** -np.floor(np.log10(usual * n)) * n for n in (1, 60, 3600))
-    is_round = [any(abs(step / one - 1) < _CLOCK.late for one in (1, 1.5, 2, 3, 5, 10)) for step in in_others]
-    return any(abs(in_seconds / one - 1) < _CLOCK.late for one in (1, 2, 5, 10)) or not any(is_round)
+    is_round = [any(abs(step / one - 1) < CLOCK.late for one in (1, 1.5, 2, 3, 5, 10)) for step in in_others]
+    return any(abs(in_seconds / one - 1) < CLOCK.late for one in (1, 2, 5, 10)) or not any(is_round)
 
 
 def _unwrapped(counts: Floats, lines: NDArray[np.int64]) -> tuple[Floats, list[str]]:
@@ -245,8 +253,8 @@ def _in_pieces(seconds: Floats, lines: NDArray[np.int64]) -> tuple[Floats, list[
     if not back.size:
         return seconds, []
     usual = float(np.nanmedian(np.diff(seconds)))
-    begins = seconds[0] + max(GAP_SECONDS, _CLOCK.piece_rows * usual)  # a board begins where it began before
-    whole = [piece.size >= _CLOCK.piece_rows and piece[1] - piece[0] <= GAP_STEPS * usual for piece in pieces]
+    begins = seconds[0] + max(GAP_SECONDS, CLOCK.piece_rows * usual)  # a board begins where it began before
+    whole = [piece.size >= CLOCK.piece_rows and piece[1] - piece[0] <= GAP_STEPS * usual for piece in pieces]
     if not all(whole) or any(piece[0] > begins for piece in pieces):
         return seconds, []  # a stamp that is wrong begins no part that goes on as a clock does
     # both parts rise on their own: a board was reset, and for how long it was off is not known
@@ -279,7 +287,7 @@ def read_clock(cells: Sequence[str]) -> tuple[Floats, str] | None:
     import pandas as pd
 
     fields = pd.Series(list(cells), dtype=object).str.strip().str.extract(STAMP)
-    if fields[[1, 4]].isna().all(axis=1).mean() > 1 - _CLOCK.monotone_share:
+    if fields[[1, 4]].isna().all(axis=1).mean() > 1 - CLOCK.monotone_share:
         return None
 
     def numbers(key: int) -> Floats:

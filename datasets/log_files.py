@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from thermogrip.datasets import repair
 from thermogrip.datasets.atomic_files import atomic_path, write_atomic
-from thermogrip.datasets.clock import EPOCH, Clock, clock_of, read_clock, since_first_row
+from thermogrip.datasets.clock import CLOCK, EPOCH, Clock, clock_of, read_clock, since_first_row
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.file_names import file_format, file_stem, split_cut
 from thermogrip.datasets.limits import MOST_NUMBER
@@ -52,6 +52,7 @@ Logs: TypeAlias = "Log | DataFrame | str | Path | Sequence[Log | DataFrame | str
 
 MOST_SIGNALS = 40  # of a table with a reading of one of them in a row
 LOST_SHARE = 0.25  # of an output: one of the four blocks of a log that are held out would have no reading
+NO_NUMBERS = "is left out: its cells are no numbers"
 MOST_STATES = 12  # words of a column that may be the states of a program
 
 
@@ -325,7 +326,7 @@ def _convert(table: Table, dt: float | None) -> _Columns:
     for header in words:
         cells = [cell for cell in table.text[header] if any(map(str.isdigit, cell))]
         if len({*cells}) > MOST_STATES and 2 * len(cells) > len(table.lines) and read_clock(cells) is None:
-            repairs.append(repair.Doubt(f"{header} is left out: its cells are no numbers ({cells[0]})"))
+            repairs.append(repair.Doubt(f"{header} {NO_NUMBERS} ({cells[0]})"))
     return _Columns(clock, columns, units, names_of, repairs)
 
 
@@ -376,17 +377,42 @@ def _one_column_a_signal(table: Table) -> Table:
     clock_of_text = read_clock(table.text[clock]) if clock in table.text else None
     time = table.numbers[clock] if clock_of_text is None else clock_of_text[0]
     order = np.argsort(time, kind="stable")
+    rows_of = {signal: order[np.asarray(signals)[order] == signal] for signal in dict.fromkeys(signals)}
+    kept, in_turn = _rows_in_turn([time[rows] for rows in rows_of.values()])
     times, first = np.unique(time[order], return_index=True)
+    first = first if kept is None else first[np.isin(times, kept)]
+    times = time[order[first]]
     text = {clock: [table.text[clock][row] for row in order[first]]} if clock in table.text else {}
     numbers = {} if text else {clock: times}
-    for signal in dict.fromkeys(signals):
-        rows_of_signal = order[np.asarray(signals)[order] == signal]
-        newest = np.searchsorted(time[rows_of_signal], times, side="right") - 1
-        numbers[signal] = np.where(newest < 0, np.nan, readings[values[0]][rows_of_signal[newest]])
-    signal_names = ", ".join(sorted({*signals}))
-    note = f"a reading of one signal in a row: {signal_names} each hold until their next reading"
+    for signal, rows in rows_of.items():
+        newest = np.searchsorted(time[rows], times, side="right") - 1
+        numbers[signal] = np.where(newest < 0, np.nan, readings[values[0]][rows[newest]])
+    signal_names = ", ".join(sorted(rows_of))
+    notes = [f"a reading of one signal in a row: {signal_names} each hold until their next reading", *in_turn]
     lines = np.arange(1, times.size + 1)
-    return replace(table, numbers=numbers, text=text, lines=lines, notes=(*table.notes, note))
+    return replace(table, numbers=numbers, text=text, lines=lines, notes=(*table.notes, *notes))
+
+
+def _rows_in_turn(times_of: Sequence[Floats]) -> tuple[Floats | None, list[str]]:
+    """Return the times of the rows of signals that are read in turn, once a period each, and a doubt; None
+    where they are not."""
+    steps = [np.diff(np.unique(times)) for times in times_of]
+    stamps = np.unique(np.concatenate(times_of)).size
+    if min(map(len, steps)) < CLOCK.piece_rows or stamps < 2 * max(map(len, steps)):
+        return None, []
+    periods = [float(np.median(step)) for step in steps]
+    even = [np.mean(np.abs(step - periods[0]) < CLOCK.evenness * periods[0]) for step in steps]
+    if min(even) < CLOCK.monotone_share:
+        return None, []
+
+    def oldest(at: Floats) -> float:
+        """Return the age of the oldest of the newest readings [s]."""
+        newest = (np.searchsorted(times, at, side="right") - 1 for times in times_of)
+        return max(float(np.median(at - times[rows])) for times, rows in zip(times_of, newest))
+
+    kept = min(times_of, key=oldest)
+    says = f"signals are read in turn every {periods[0]:g} s"
+    return kept, [repair.Doubt(f"{says}: those of one row are up to {oldest(kept):g} s apart")]
 
 
 class _Repaired(NamedTuple):

@@ -243,17 +243,23 @@ def doubt_levels(name: str, values: Floats) -> str:
     return ""
 
 
+def _goes_on(values: Floats) -> dict[str, NDArray[np.bool_]]:
+    """Return which rows but the last go on as before: held at one value, or drawn straight within the steps
+    of the column's numbers."""
+    moves = np.diff(values)
+    step = float(np.abs(moves[moves != 0]).min(initial=np.inf))
+    turns = np.abs(np.diff(moves, prepend=np.nan))
+    return {"held": moves == 0, "drawn straight": turns < 1.5 * step}  # half a step is for rounding
+
+
 def doubt_rows(name: str, values: Floats, inputs: Sequence[Floats]) -> str:
     """Return the doubt on an output that is read in n-th rows only, held or drawn straight between."""
     finite = values[np.isfinite(values)]
     if finite.size < values.size or not finite.size:
         return ""
-    moves = np.diff(values)
-    turns = np.diff(moves)
-    least = 2.0 * np.abs(moves[moves != 0]).min(initial=np.inf)  # twice the steps of its numbers
     driven = np.concatenate([np.flatnonzero(np.diff(u)) for u in inputs]) if inputs else np.empty(0)
-    for between, of in (("held", moves != 0), ("drawn straight", np.abs(turns) > least)):
-        rows = np.flatnonzero(of)
+    for between, goes_on in _goes_on(values).items():
+        rows = np.flatnonzero(~goes_on)
         if rows.size < SPIKE_WINDOW or (n := int(np.median(np.diff(rows)))) < 2:
             continue
         by_inputs = np.isin(rows, np.concatenate([driven - 1, driven, driven + 1])).mean() > 0.5
@@ -308,30 +314,36 @@ def _rows_beyond_jumps(values: Floats, rows: NDArray[np.bool_]) -> NDArray[np.bo
 
 
 def drop_stuck(name: str, values: Floats, inputs: Sequence[Floats]) -> tuple[Floats, list[str]]:
-    """Return an output without the run in which it repeats itself although the inputs move, and a line."""
-    spans = [float(np.nanmax(u) - np.nanmin(u)) for u in inputs]
+    """Return an output without the run in which it stands still, or goes on straight, although the inputs
+    move, and a line."""
     travel = np.zeros(values.size)  # of all inputs since the first row, in ranges
-    for u, span in zip(inputs, spans):
-        if span > 0:
+    for u in inputs:
+        if (span := float(np.nanmax(u) - np.nanmin(u))) > 0:
             travel[1:] += np.cumsum(np.abs(np.nan_to_num(np.diff(u))) / span)
-    ends = np.flatnonzero(np.append(np.diff(values) != 0, True))
-    starts = np.append(0, ends[:-1] + 1)
-    moved = travel[ends] - travel[starts]
-    longest = int(np.argmax(moved))
-    run, most = slice(int(starts[longest]), int(ends[longest]) + 1), float(moved[longest])
-    # but for the first row of each run: its reading is from before its move
-    stayed = float(np.maximum(np.delete(moved, longest) - 1, 0).sum())
-    # With M the moves of the inputs, in ranges, of the whole log, m those within the run that has most of
-    # them and k those within all other runs, a sound reading stays through a move with a chance of about p =
-    # (k + 1) / (M - m + 2) (Laplace's rule); the run is stuck where p^(m - 1) is below 1e-3.
-    chance = (stayed + 1) / (travel[-1] - most + 2)
-    likely = most <= 2 or chance >= 1 or chance ** (most - 1) > _STUCK_CHANCE
-    if values.size < SPIKE_WINDOW or likely or not np.isfinite(values[run]).all():
-        return values, []
-    rows = np.zeros(values.size, dtype=bool)
-    rows[run] = True
-    problem = f"{name}: stuck at {values[run.start]:g} for {rows.sum()} rows while the inputs move: left out"
-    return np.where(rows, np.nan, values), [problem]
+    for how, goes_on in _goes_on(values).items() if values.size >= SPIKE_WINDOW else ():
+        # a settled reading stands still, but not through moves; one with noise goes straight in no rows
+        trials = travel if how == "held" else np.arange(values.size)
+        ends = np.flatnonzero(np.append(~goes_on, True))
+        starts = np.append(0, ends[:-1] + 1)
+        passed = trials[ends] - trials[starts]
+        longest = int(np.argmax(passed))
+        run, most = slice(int(starts[longest]), int(ends[longest]) + 1), float(passed[longest])
+        # but for the first row of each run: its reading is from before its move
+        others = float(np.maximum(np.delete(passed, longest) - 1, 0).sum())
+        # With M the trials (moves of the inputs, in ranges; rows) of the whole log, m those within the run
+        # that has most of them and k those within all other runs, a sound reading goes on through one with a
+        # chance of about p = (k + 1) / (M - m + 2) (Laplace's rule); none where p^(m - 1) is under 1e-3.
+        chance = (others + 1) / (trials[-1] - most + 2)
+        likely = most <= 2 or chance >= 1 or chance ** (most - 1) > _STUCK_CHANCE
+        likely |= how != "held" and most > trials[-1] / 2  # a slow one may go straight in all of them
+        if likely or np.ptp(travel[run]) <= 1 or not np.isfinite(values[run]).all():
+            continue
+        first, last = values[run][[0, -1]]
+        what = f"stuck at {first:g}" if how == "held" else f"{how} from {first:g} to {last:g}"
+        lost = np.isin(np.arange(values.size), np.arange(run.start, run.stop))
+        problem = f"{name}: {what} for {lost.sum()} rows while the inputs move: left out"
+        return np.where(lost, np.nan, values), [problem]
+    return values, []
 
 
 def reject_spikes(

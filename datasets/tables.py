@@ -840,7 +840,9 @@ def _decoded(data: bytes, file: str, *, strict: bool = False) -> tuple[str, tupl
             row = data.count(b"\n", 0, error.start) + 1
             raise UserError("is not UTF-8 text", file=file, row=row, hint="save the file as UTF-8") from error
         text, coding = _first_coding(data)
-        notes = (f"text is not UTF-8: read as {coding}",)
+        strange = any(sign.isalpha() for sign in text if sign > "\x7f" and sign not in "\xb5\xaa\xba")
+        advice = "; if names look wrong, save it as UTF-8" if strange else ""
+        notes = (f"text is not UTF-8: read as {coding}{advice}",)
     if not text.strip():
         raise UserError("is empty", file=file, hint="give a header and at least two rows")
     return text if "\n" in text else text.replace("\r", "\n"), notes

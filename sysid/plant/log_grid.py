@@ -18,7 +18,7 @@ import numpy as np
 from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.limits import most_bytes
-from thermogrip.datasets.log_files import Logs, as_logs
+from thermogrip.datasets.log_files import NO_NUMBERS, Logs, as_logs
 from thermogrip.datasets.resample import gaps as gaps_of
 from thermogrip.datasets.resample import held_means
 from thermogrip.datasets.roles import guess_role
@@ -317,6 +317,8 @@ def signals(
         hint = f"name {'it' if len(lacking) == 1 else 'them'} with {options}, of {', '.join(moving)}"
         hint += moved_before(logs[0]) if "input" in lacking else ""
         problem = " and ".join(f"no {role}" for role in lacking) + " among the columns"
+        said = str(logs[0].attrs.get("role_doubts", "")).splitlines()
+        problem += "".join(f"; {doubt}" for doubt in said if NO_NUMBERS in doubt)
         raise UserError(problem, file=log_name(logs[0]), hint=hint)
     return SignalNames(u, y, d)
 

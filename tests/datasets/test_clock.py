@@ -62,6 +62,13 @@ def test_a_file_without_a_clock_is_a_doubt_and_a_stated_step_is_none(tmp_path):
     assert read_log(tmp_path / "log.csv", dt=0.5).attrs["clock_doubts"] == ""
 
 
+def test_tables_side_by_side_with_clocks_of_other_rates_are_a_doubt(tmp_path):
+    beside = [f"{5 * k},{k % 2}" if k < 40 else "," for k in range(100)]
+    rows = "".join(f"{2 * k},{20 + k % 3},{cells}\n" for k, cells in enumerate(beside))
+    (tmp_path / "log.csv").write_text("Time (s),Tank (C),Time (s),Heater (%)\n" + rows)
+    assert "2_Time (s) goes 5 s a row, not 2" in read_log(tmp_path / "log.csv").attrs["clock_doubts"]
+
+
 @pytest.mark.parametrize("bits", [16, 32])
 @pytest.mark.parametrize(("header", "count"), [("millis", 1e-3), ("micros", 1e-6), ("time_s", 1e-3)])
 def test_a_counter_that_wraps_goes_on(tmp_path, bits, header, count):

@@ -767,6 +767,11 @@ def test_a_table_with_a_reading_of_one_signal_in_a_row_has_a_column_for_each_sig
     assert column(log, "plate_temperature")[1:7].tolist() == [20, 20, 21, 21, 22, 22]
     assert np.isnan(column(log, "plate_temperature")[[0, 7, 8]]).all()  # not read yet, and lost
     assert np.diff(log["time"].values).tolist() == [30.0] * 39
+    in_turn = [f"{60 * k},plate,{20 + k}\n{60 * k + 1},fan,{k}\n" for k in range(30)]
+    path.write_text("".join(["time_s,name,value\n", *in_turn]))
+    log = read_log(path)
+    assert (column(log, "plate")[:3].tolist(), set(np.diff(log["time"]))) == ([20, 21, 22], {60.0})
+    assert "those of one row are up to 1 s apart" in log.attrs["role_doubts"]
     path.write_text("".join(["note,state,time_s\n", *(f"n{k},{k},{k}\n" for k in range(10))]))  # all differ
     assert list(read_log(path).data_vars) == ["state"]
 
@@ -946,3 +951,13 @@ def test_the_rows_after_the_only_sensor_stuck_are_left_out(tmp_path):
     log = read_log(tmp_path / "stuck.csv")
     assert log.sizes["time"] == 300
     assert "300 rows at the ends of the log, in which no output reads, left out" in log.attrs["repairs"]
+
+
+def test_a_gap_that_was_drawn_straight_is_left_out(write):
+    for filled, said in ((slice(0), ""), (slice(150, 230), "drawn straight from")):
+        plate = PLATE.copy()
+        plate[filled] = np.linspace(PLATE[149], PLATE[230], 82)[1:-1][: plate[filled].size]
+        rows = [f"{k},{u},{y:.3f}\n" for k, u, y in zip(PLACES, HEATER, plate)]
+        log = read_log(write("".join(["time_s,heater,plate_degC\n", *rows])))
+        assert said in log.attrs["repairs"]
+        assert np.isnan(column(log, "plate")).sum() == pytest.approx(plate[filled].size, abs=2)

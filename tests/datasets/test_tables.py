@@ -219,7 +219,7 @@ def test_a_table_has_4096_columns_at_most():
         (b"a,b\xb5\n1,2\n3,4\n", {"a": "1 3", "b\xb5": "2 4"}, [2, 3],
          ["text is not UTF-8: read as Windows-1252"]),
         ("a,番号\n1,2\n3,4\n".encode("cp932"), {"a": "1 3", "番号": "2 4"}, [2, 3],
-         ["text is not UTF-8: read as Shift-JIS"]),
+         ["text is not UTF-8: read as Shift-JIS; if names look wrong, save it as UTF-8"]),
         ("a;b\n1;\u22122,5\n2;2\u202f400,0\n3;12'345,5\n", {"a": "1 2 3", "b": "-2.5 2400 12345.5"},
          [2, 3, 4],
          ["numbers are as printed: a long minus, marks between thousands", "numbers have a decimal comma"]),

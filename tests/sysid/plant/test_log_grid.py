@@ -7,9 +7,11 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.log_files import read_log
 from thermogrip.datasets.schema import Log, make_log
 from thermogrip.sysid.greybox.problem import prior_plant
 from thermogrip.sysid.models.network import load_network
@@ -257,6 +259,9 @@ def test_what_cannot_be_fitted_is_refused_by_name():
     assert signals([log_of(np.where(T == 3, np.nan, T))])[1] == ("t",)  # a reading may be lost
     with pytest.raises(UserError, match=r"no output among the columns; name it with --outputs"):
         signals([make_log(T, {"q": (T, "1", "input")})])
+    counts = pd.DataFrame({"time_s": T, "q": T % 7, "adc": [f"0x{k:03x}" for k in range(T.size)]})
+    with pytest.raises(UserError, match=r"adc is left out: its cells are no numbers \(0x000\); name"):
+        signals([read_log(counts, inputs=["q"])])
     with pytest.raises(UserError, match=r"no input among the columns; name it with --inputs"):
         signals([make_log(T, {"t": (T, "degC", "output")})])
     still = {"t": (T, "degC", "other"), "number": (0 * T, "1", "other")}
