@@ -133,6 +133,8 @@ def assign_roles(
             chosen[name] = role
     stated = dict(given or {}) | chosen
     guesses = {n: explain_role(n, unit) for n, unit in units.items() if n not in stated}
+    requests = {f"asked_{n}": n for n in units}
+    guesses |= {n: ("other", f"it is what was asked of {requests[n]}") for n in guesses if n in requests}
     evidence: dict[str, tuple[str, str]] = {}  # of the data alone
     if columns is not None:  # what is beyond all use is no reading, and its squares are none either
         columns = {n: np.where(np.abs(v) <= MOST_NUMBER, v, np.nan) for n, v in columns.items()}

@@ -58,7 +58,8 @@ class Reading:
     pump : int
         1 running, 0 off.
     mean_drive : mapping of str to float, optional
-        What was applied on average since the reading before, where a drive is switched between two readings.
+        What was applied on average since the reading before, by input that is switched between two readings;
+        None where none is.
     """
 
     time_s: float

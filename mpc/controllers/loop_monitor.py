@@ -117,7 +117,8 @@ class LoopMonitor:
         self._unreachable = ""
 
     def note(self, reading: Readings, move: Move, target: Trajectory) -> str:
-        """Note a reading, the move that answered it, and the target; return what is to be said."""
+        """Note a reading, the move that answered it, and the target; return what is to be said.  Where relays
+        switch a drive, ``mean_<drive>`` of the reading is what they gave since the one before."""
         now = number(reading, "time_s")
         seconds = now - self._time_s if np.isfinite(now - self._time_s) else self.model.dt
         y = np.array([number(reading, name) for name in self.model.outputs])
@@ -130,8 +131,9 @@ class LoopMonitor:
             return self.message
         self._time_s = now
         applied = u if self._u is None else self._u
-        read_drives = np.array([number(reading, name) for name in self.model.drives])
-        applied = np.where(np.isfinite(read_drives), read_drives, applied)
+        for prefix in ("", "mean_"):  # what relays gave since the last reading is more than what they do now
+            read_drives = np.array([number(reading, prefix + name) for name in self.model.drives])
+            applied = np.where(np.isfinite(read_drives), read_drives, applied)
         wanted = target_now(target)
         by_name = wanted if isinstance(wanted, Mapping) else dict.fromkeys(self.controlled, wanted)
         goals = [number(by_name, p.output) for p in self.loops]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from math import inf
 from pathlib import Path
 
 from pydantic import TypeAdapter, ValidationError
@@ -54,7 +55,8 @@ class RelayRig:
         self._on_s = dict.fromkeys(self._signs, 0.0)  # integral of each drive since the last reading
         self._requested = dict.fromkeys(self.units, 0.0)
         self._now = clock()
-        self._read_at = clock()
+        self._read_at, self._newest_s = self._now, -inf  # the newest reading, by this clock and by its own
+        self._means = dict.fromkeys(self._signs, 0.0)
 
     def read(self) -> Reading:
         """Return the newest sample."""
@@ -68,12 +70,12 @@ class RelayRig:
                 shares = (sign * reading.drive[channel] / full[channel] for channel, sign in signs.items())
                 drive[name] = sum(shares) * UNIT_RANGES[self.units[name]][1]
         self._pass_time()
-        seconds, self._read_at = self._now - self._read_at, self._now
-        on_s, self._on_s = self._on_s, dict.fromkeys(self._signs, 0.0)
-        if seconds <= 0:
-            return replace(reading, drive=drive, mean_drive=None)
-        means = {name: value / seconds for name, value in on_s.items()}
-        return replace(reading, drive=drive, mean_drive=self._requested | means)
+        seconds = self._now - self._read_at
+        if reading.time_s > self._newest_s and seconds > 0:  # one that is read twice has its mean
+            self._means = {name: value / seconds for name, value in self._on_s.items()}
+            self._on_s = dict.fromkeys(self._signs, 0.0)
+            self._read_at, self._newest_s = self._now, reading.time_s
+        return replace(reading, drive=drive, mean_drive=self._means)
 
     def apply(self, drive: Mapping[str, float], pump: int) -> None:
         """Request drives from now on; with the pump off all relays are off at once."""

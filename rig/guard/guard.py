@@ -288,7 +288,7 @@ class Guard:
         recent |= self.model is not None and reading.time_s < self.model.compared_from
         masked = frozenset((self.skin, f"{self.skin}_2")) if recent else frozenset()
         rooms = self.rooms(reading.values)
-        self._mean_drive = self._drive if reading.mean_drive is None else dict(reading.mean_drive)
+        self._mean_drive = self._drive | dict(reading.mean_drive or {})
         jumped = self._predict(reading)
         checked = self.sensors.check(
             reading.time_s, reading.values, touching=masked, jumped=jumped, rooms=rooms

@@ -54,6 +54,26 @@ class Recorder(Protocol):
 
 
 @dataclass
+class MeanDrive:
+    """The mean of what relays gave, reading by reading."""
+
+    seconds: float = 0.0
+    integrals: dict[str, float] = field(default_factory=dict)
+
+    def add(self, mean_drive: Mapping[str, float], seconds: float) -> None:
+        """Add what they gave in so many seconds."""
+        self.seconds += seconds
+        for name, mean in mean_drive.items():
+            self.integrals[name] = self.integrals.get(name, 0.0) + mean * seconds
+
+    def take(self) -> dict[str, float]:
+        """Return it, and begin anew; empty where no time has passed."""
+        means = {name: value / self.seconds for name, value in self.integrals.items() if self.seconds > 0}
+        self.seconds, self.integrals = 0.0, {}
+        return means
+
+
+@dataclass
 class Loop:
     """The state of a running session: rows, events, the newest reading and the move that is applied."""
 
@@ -78,10 +98,14 @@ class Loop:
     ends: float = np.inf
     dt: float = np.nan
     trip: Trip | None = None  # what ended it
+    unwritten: bool = False  # whether the recorder still has to get the newest row
+    row_mean: MeanDrive = field(default_factory=MeanDrive)  # since the newest row
+    move_mean: MeanDrive = field(default_factory=MeanDrive)
 
     def __post_init__(self) -> None:
         self.rig.notices()  # what happened before is not of this session
         self.accepted: dict[str, float] = {}
+        self._counted_s = np.nan  # the newest reading whose drive is in the means
         self.read(self.rig.read)
 
     @contextmanager
@@ -94,6 +118,10 @@ class Loop:
                 self.trip = tripped.trip
             finally:
                 self.power_off()
+                try:
+                    self.end_row()
+                except TripError as tripped:
+                    self.trip = self.trip or tripped.trip
         if self.trip is not None:
             self.record_last()
             self.note("tripped", self.trip.line(), asdict(self.trip))
@@ -107,8 +135,17 @@ class Loop:
         it afterwards is no fault of the rig's clock."""
         asked_s = None if self.clock is None else self.clock()
         self.reading: Reading = read()
+        self._count(self.reading)
         self.heard = self.now()
         self.asked = self.heard if asked_s is None else asked_s
+
+    def _count(self, reading: Reading) -> None:
+        """Add what relays gave until a reading to the means."""
+        seconds = reading.time_s - self._counted_s
+        if reading.mean_drive is not None and seconds > 0:
+            for mean in (self.row_mean, self.move_mean):
+                mean.add(reading.mean_drive, seconds)
+        self._counted_s = reading.time_s
 
     @property
     def rooms(self) -> frozenset[str]:
@@ -162,7 +199,8 @@ class Loop:
                 self.target.update(profile.at(passed))
                 target = profile.ahead(passed, self.controller.dt)  # which a controller may look at
             if self.fresh:
-                self.move = self.controller.step(self.controller_reading(), target)
+                means = {f"mean_{name}": mean for name, mean in self.move_mean.take().items()}
+                self.move = self.controller.step(self.controller_reading() | means, target)
                 if self.move.status != self.status:
                     self.status = self.move.status
                     advice = f": {self.move.advice}" if self.move.advice else ""
@@ -214,7 +252,7 @@ class Loop:
             raise TripError(refused)
         if (late := self.guard.late(self.now())) is not None:
             # a device that ends its drives itself has the last word: it goes on where that one has held
-            self.ask(self.rig.read)
+            self._count(self.ask(self.rig.read))
             self._note_notices()
             if self.rig.expires_s == np.inf:
                 raise TripError(self.of_this_rig(late))
@@ -229,7 +267,9 @@ class Loop:
         return drive
 
     def record(self, phase: str) -> None:
-        """Apply the present move and write the row; inputs of a row hold from it until the next."""
+        """Apply the present move and write the row; inputs of a row hold from it until the next.  One whose
+        drives are switched is written when it is over, for it has what they gave."""
+        self.end_row()
         drive = self.apply()
         if phase != self.phase:
             first, self.phase = not self.phase, phase
@@ -237,6 +277,18 @@ class Loop:
         row = {"time_s": self.reading.time_s, **self._orders(drive), **_measured(self.reading)}
         row |= {f"target_{name}_degC": value for name, value in self.target.items()}
         self.rows.append(row | {"phase": float(PHASES.index(phase))})
+        self.unwritten = True
+        if self.reading.mean_drive is None:
+            self.end_row()
+        self.show(drive)
+
+    def end_row(self) -> None:
+        """Write the newest row, where that is still to be done, with what relays gave since its time."""
+        if not self.unwritten:
+            return
+        self.unwritten = False
+        means = self.row_mean.take()
+        self.rows[-1] |= {join_header(name, self.rig.units[name]): mean for name, mean in means.items()}
         if self.recorder is not None and not self.disk_fault:
             try:
                 self.recorder.sample(self.rows[-1])
@@ -244,7 +296,6 @@ class Loop:
                 self.disk_fault = error.strerror or str(error)
                 trip = Trip("disk", self.reading.time_s, "the run folder", "to be written", self.disk_fault)
                 raise TripError(trip) from error
-        self.show(drive)
 
     def show(self, drive: Mapping[str, float], *, verdict: str = "", trip: Trip | None = None) -> None:
         """Hand a snapshot to the listener; one that fails gets nothing more, which is noted."""
@@ -289,9 +340,12 @@ class Loop:
                     self.recorder.sample(self.rows[-1])
 
     def _orders(self, drive: Mapping[str, float]) -> dict[str, float]:
-        """Return a row's columns of what is applied: the drives, and the pump of the present move, if any."""
+        """Return a row's columns of what is applied: the drives, what is asked of those with a relay, and the
+        pump of the present move, if any."""
         drives = {join_header(name, self.rig.units[name]): value for name, value in drive.items()}
-        return drives | ({"pump": float(self.move.pump)} if self.rig.has_pump else {})
+        switched = self.reading.mean_drive or ()
+        requests = {join_header(f"asked_{name}", self.rig.units[name]): drive[name] for name in switched}
+        return drives | requests | ({"pump": float(self.move.pump)} if self.rig.has_pump else {})
 
     def wait(self, seconds: float) -> None:
         """Let time pass, looking at the rig and renewing its drive; the last look is the next sample."""
@@ -429,7 +483,7 @@ def log_of_rows(
     for header in headers:
         variable, unit = split_header(header)
         role = "input"
-        if variable == "phase" or variable.startswith("target_"):
+        if variable == "phase" or variable.startswith(("target_", "asked_")):
             role = "other"
         elif unit == "degC":
             role = "disturbance" if variable in rooms else "output"

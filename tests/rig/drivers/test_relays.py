@@ -13,12 +13,21 @@ import pytest
 from tests.rig.makers import STILL, Constant, make_lab
 from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.log_files import read_log
+from thermogrip.datasets.schema import make_log
+from thermogrip.mpc import PIController
+from thermogrip.mpc.closed_loop.simulate import RecordedController
+from thermogrip.mpc.controllers.loop_monitor import LoopMonitor
 from thermogrip.mpc.design.relays import Relay
+from thermogrip.mpc.plant.prediction import step_response
 from thermogrip.rig.drivers.relays import RelayRig, read_relays
 from thermogrip.rig.guard.guard import Guard
+from thermogrip.rig.guard.settings import GuardSettings
 from thermogrip.rig.interface import Reading, Rig
-from thermogrip.rig.session.session import run_session
+from thermogrip.rig.records.run_folder import RunFolder
+from thermogrip.rig.session.session import play, run_session
 from thermogrip.rig.simulation.twin import Twin
+from thermogrip.sysid.identification import identify
 
 
 class Board:
@@ -152,20 +161,12 @@ def test_a_drive_of_one_sign_gets_its_mean_from_its_own_relay() -> None:
     assert board.integral("cool")[1][-1] / 2000.0 == pytest.approx(0.3, abs=0.005)
 
 
-def test_an_end_switches_off_at_once_whatever_the_least_time() -> None:
+@pytest.mark.parametrize("by_hand", [0.0, 1.0])  # a hand-over is a start
+def test_least_off_is_kept_from_the_start_and_after_a_stop(by_hand: float) -> None:
     board = Board(drive="1")
-    rig = played(board, Relay("drive", on_s=60.0), np.full(80, 0.9))
-    assert board.drive == {"drive": 1.0}
-    rig.apply({"drive": 0.0}, 0)
-    assert (board.drive, board.pump) == ({"drive": 0.0}, 0)
-    rig.wait(100.0)
-    assert board.drive == {"drive": 0.0}
-
-
-def test_least_off_is_kept_from_the_start_and_after_a_stop() -> None:
-    board = Board(drive="1")
+    board.set[0][1]["drive"] = by_hand
     rig = played(board, Relay("drive", on_s=60.0, off_s=30.0), np.full(100, 1.0))
-    assert board.spells("drive")[0] == (0.0, pytest.approx(30.0))  # nobody knows since when it was off
+    assert board.spells("drive")[-1] == (0.0, pytest.approx(30.0))  # nobody knows since when it was off
     rig.apply({"drive": 0.0}, 0)  # on for 20 s
     stopped_s = board.now
     for _ in range(80):
@@ -178,7 +179,8 @@ def test_least_off_is_kept_from_the_start_and_after_a_stop() -> None:
     assert board.spells("drive") == [(0.0, pytest.approx(60.0)), (1.0, pytest.approx(45.0, abs=0.1))]
 
 
-def test_a_lost_sensor_switches_off_at_once() -> None:
+@pytest.mark.parametrize(("lost_s", "highest", "kind"), [(90.0, 60.0, "lost"), (np.inf, 28.0, "limit")])
+def test_a_trip_switches_off_at_once(lost_s: float, highest: float, kind: str) -> None:
     lab = make_lab()
     twin = Twin(lab, **STILL, skin="t1")
     rig = RelayRig(twin, {"q1": Relay(on_s=100.0)}, lambda: twin.time)
@@ -186,15 +188,14 @@ def test_a_lost_sensor_switches_off_at_once() -> None:
 
     def read_until_lost() -> Reading:
         reading = read()
-        return reading if twin.time < 90 else replace(reading, values={**reading.values, "t1": np.nan})
+        return reading if twin.time < lost_s else replace(reading, values={**reading.values, "t1": np.nan})
 
     rig.read = read_until_lost  # type: ignore[method-assign]
-    session = run_session(
-        rig, Constant({"q1": 90.0, "q2": 0.0}), {"t1": 50.0}, output="t1", guard=Guard(lab, skin="t1")
-    )
-    assert session.trip is not None
-    assert max(row["q1"] for row in twin.history) == 100.0
-    assert (twin.read().drive, twin.time < 150) == ({"q1": 0.0, "q2": 0.0}, True)
+    watch = Guard(lab, GuardSettings.of(lab, "t1").below(highest), skin="t1")
+    session = run_session(rig, Constant({"q1": 90.0, "q2": 0.0}), {"t1": 27.0}, output="t1", guard=watch)
+    on_s = [row["time_s"] for row in twin.history if row["q1"] == 100.0]
+    assert (session.trip and session.trip.kind, twin.read().drive) == (kind, {"q1": 0.0, "q2": 0.0})
+    assert 10.0 < on_s[-1] - on_s[0] < 90.0  # of the 100 s that it is on at least
 
 
 def test_a_reading_has_the_request_while_the_device_does_what_it_was_told() -> None:
@@ -207,26 +208,48 @@ def test_a_reading_has_the_request_while_the_device_does_what_it_was_told() -> N
     assert reading.drive == {"t": 0.25, "drive": -0.5}
     assert reading.mean_drive is not None
     assert reading.mean_drive["t"] == pytest.approx(board.integral("heat")[1][-1] / 100.0 / 40.0)
-    assert rig.read().mean_drive is None  # no time has passed
+    assert rig.read().mean_drive == reading.mean_drive  # the same sample
     board.drive = {"drive": -0.5, "heat": 0.0, "cool": 100.0}  # a relay that sticks
     assert rig.read().drive == {"t": -1.0, "drive": -0.5}
 
 
-def test_a_session_under_relays_settles_and_switches_off() -> None:
+def test_a_log_under_relays_has_what_they_gave_and_identifies_the_plant(tmp_path: Path) -> None:
     lab = make_lab()
+    twin = Twin(lab, seed=1, skin="t1")
+    relays = {name: Relay(on_s=10.0, off_s=10.0) for name in lab.inputs}
+    rig = RelayRig(twin, relays, lambda: twin.time)
+    levels = np.repeat(np.random.default_rng(1).uniform(0.0, 100.0, (2, 171)), 7, axis=1)
+    columns = {name: (level, "percent", "input") for name, level in zip(lab.inputs, levels)}
+    schedule = make_log(np.arange(levels.shape[1]), columns, name="levels")
+    with RunFolder(tmp_path / "run") as folder:
+        log, ended = play(rig, schedule, guard=Guard(lab, skin="t1"), recorder=folder)
+        folder.played(ended)
+    assert (isinstance(rig, Rig), ended) == (True, "")
+    written = read_log(tmp_path / "run" / "samples.csv")
+    for name in lab.inputs:
+        device = np.array([row[name] for row in twin.history[1:]])
+        np.testing.assert_allclose(log[name].values, device, atol=1e-6)  # a row is a step of the twin
+        np.testing.assert_allclose(written[name].values, device, atol=1e-6)
+        assert {written[name].attrs["role"], written[f"asked_{name}"].attrs["role"]} == {"input", "other"}
+        assert np.ptp(written[f"asked_{name}"].values) < 100.0 == np.ptp(device)
+    found = identify(tmp_path / "run" / "samples.csv", models=("arx",), draws=0).plant
+    for drive, output in (("q1", "t1"), ("q2", "t2")):
+        assert step_response(found, drive, output).gain == pytest.approx(30.3, rel=0.05)
     twin = Twin(lab, **STILL, skin="t1")
-    rig = RelayRig(twin, {"q1": Relay("q1", on_s=10.0, off_s=10.0)}, lambda: twin.time)
-    assert isinstance(rig, Rig)
-    half = Constant({"q1": 50.0, "q2": 0.0})  # 15.15 K, by the lab's equations
-    # the guard's model is told what was switched, of which a pulse is more than it allows
-    session = run_session(
-        rig, half, {"t1": 40.15}, output="t1", band=1.5, settle_timeout=2000.0, guard=Guard(lab, skin="t1")
-    )
-    assert session.verdict == "settled"
-    assert session.bias == pytest.approx(0.0, abs=1.5)
-    assert {round(row["q1"], 6) for row in twin.history} == {0.0, 100.0}
-    assert set(session.log["q1"].values) == {50.0}
-    assert twin.read().drive == {"q1": 0.0, "q2": 0.0}
+    rig = RelayRig(twin, relays, lambda: twin.time)
+    half, watch = Constant({"q1": 50.0, "q2": 0.0}), Guard(found, skin="t1")  # 15.15 K by its equations
+    session = run_session(rig, half, {"t1": 40.15}, output="t1", band=1.5, settle_timeout=2000.0, guard=watch)
+    assert (session.trip, session.verdict) == (None, "settled")
+    assert set(session.log["asked_q1"].values) == {50.0}
+
+
+def test_what_relays_gave_is_no_fault_of_the_plant() -> None:
+    lab, relays = make_lab(), {"q1": Relay(on_s=100.0, off_s=100.0)}
+    loop, twin = PIController(lab, controlled=("t1",)), Twin(lab, seed=2, skin="t1")
+    watched = RecordedController(loop, LoopMonitor(lab, loop.design))
+    rig = RelayRig(twin, relays, lambda: twin.time)
+    run_session(rig, watched, {"t1": 40.0}, output="t1", settle_timeout=1500.0, band=0.05)
+    assert {move.advice for _, move in watched.moves} == {""}
 
 
 @pytest.mark.parametrize(
