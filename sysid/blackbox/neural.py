@@ -36,7 +36,9 @@ MANY = 2500  # readings: beyond it fewer starts
 # of the drives' reach in the data, further out they are clipped: with 1.25 a controller that may drive beyond
 # its log took the rest of its range for lost (a PCR block's IAE 1.38 of a PI's, 1.05 with 10)
 BEYOND = 10.0
-SLOWEST = 0.9995  # largest pole of the linear part
+# of the spread, that a linear fit errs by at least: with 1e-6 rounding left the normal equations of a log
+# without noise indefinite
+LEAST_ERROR = 1e-4
 ALIKE = 1e6  # condition of C: beyond it outputs are combinations of others, and cannot be states
 ITERATIONS = 30
 KEPT = 0.75  # of the members that fit best, and of those that agree best
@@ -159,8 +161,7 @@ def _linear_starts(grid: Grid, data: _Data, orders: Sequence[int]) -> dict[int, 
     """Return for each order the stable subspace model with the least free-run error on its own data."""
     best: dict[int, tuple[float, StateSpaceModel]] = {}
     for model in subspace_family(grid, orders=orders, terms=((),)).values():
-        alike = np.linalg.cond(model.C / data.y_size[:, None]) > ALIKE
-        if alike or np.abs(model.poles()).max() > SLOWEST:
+        if np.linalg.cond(model.C / data.y_size[:, None]) > ALIKE:
             continue
         total = 0.0
         for segment in grid.segments:
@@ -242,7 +243,7 @@ def _train_member(data: _Data, linear: _Linear, h: int, *, seed: int) -> _Member
             slopes.append(J)
         return np.concatenate(rows), np.concatenate(slopes)
 
-    size = max(float(np.sqrt(np.mean(residuals(z0[None], 1.0)[0, len(z0) :] ** 2))), 1e-6)
+    size = max(float(np.sqrt(np.mean(residuals(z0[None], 1.0)[0, len(z0) :] ** 2))), LEAST_ERROR)
     z = _levenberg_marquardt(lambda z: linearise(z, size), lambda z: residuals(z, size), z0)
     miss = float(np.sum(residuals(z[None], 1.0)[0, len(z) :] ** 2))
     return _Member(linear.A, z[:n_p], z[n_p:].reshape(-1, n), h, miss)

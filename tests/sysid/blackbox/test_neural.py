@@ -6,10 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
+from thermogrip.datasets.schema import make_log
 from thermogrip.sysid.blackbox import neural
 from thermogrip.sysid.blackbox.neural import _Data, _Linear, _Member, saturation_levels
-from thermogrip.sysid.blackbox.order_selection import Structure
+from thermogrip.sysid.blackbox.order_selection import Run, Structure, free_run_errors, priors_of
 from thermogrip.sysid.models.recurrences import run_states
 from thermogrip.sysid.plant.log_grid import Grid, Segment, make_grid
 
@@ -131,7 +133,7 @@ def test_linear_starts_run_as_the_best_subspace_model_in_scaled_units(coupled):
     family = list(neural.subspace_family(grid, orders=(2, 3), terms=((),)).values())
     for n, linear in starts.items():
         runs = []
-        for model in (some for some in family if some.n_x == n and np.abs(some.poles()).max() <= 0.9995):
+        for model in (some for some in family if some.n_x == n):
             x0 = [neural._head_start(model, s.y, s.u, s.d) for s in grid.segments]
             run = [
                 model.rollout(x[None], s.u[None], s.d[None], (), 1.0)[0][0, :-1]
@@ -147,6 +149,19 @@ def test_linear_starts_run_as_the_best_subspace_model_in_scaled_units(coupled):
                 x = linear.A @ x + linear.B @ row + linear.c
             np.testing.assert_allclose(seen, (run - data.y_middle) / data.y_size, atol=1e-6)
     assert list(starts) == [2, 3]
+
+
+@pytest.mark.parametrize(("pole", "n"), [(0.98, 400), (1.0, 2400)], ids=["without noise", "an integrator"])
+def test_a_plain_log_is_fitted(pole, n):
+    q = np.repeat(np.random.default_rng(0).choice([-1.0, 1.0], n // 20), 20)
+    noise = 0.0 if pole < 1 else 0.05 * np.random.default_rng(1).standard_normal(n)
+    y = lfilter([0, 0.1], [1, -pole], q) + noise
+    log = make_log(np.arange(float(n)), {"q": (q, "1", "input"), "t": (y, "degC", "output")})
+    grid = make_grid([log], average=1.0)
+    (model,) = neural.neural_family(grid, states=(2,), units=(3,), members=1).values()
+    scale, runs = grid.output_spread(), [Run(segment) for segment in grid.segments]
+    errors = free_run_errors(model, runs, dt=1.0, scale=scale, warmup=50, priors=priors_of(grid)) / scale
+    assert errors.min() < 0.1
 
 
 def test_outputs_that_are_sums_of_others_are_no_states_to_start_from(coupled):
