@@ -22,9 +22,9 @@ from thermogrip.sysid.blackbox.order_selection import (
     column_sizes,
     default_terms,
     drives,
-    first_readings,
     with_spread,
 )
+from thermogrip.sysid.models.lti import first_readings
 from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.log_grid import Grid
 
@@ -119,7 +119,7 @@ def _solve(
     starts = []
     for segment, w in zip(grid.segments, drives(grid, terms)):
         # its first reading and first drives have always stood
-        middle = np.nan_to_num(first_readings(segment), nan=0.0)
+        middle = np.nan_to_num(first_readings(segment.y), nan=0.0)
         past_drives = np.tile(w[0], orders.delay + orders.poles - 2)
         starts.append(np.concatenate([np.tile(middle, orders.poles), past_drives]))
     return with_spread(model, grid, starts)

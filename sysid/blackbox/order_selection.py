@@ -381,11 +381,6 @@ def state_spread(x: Array) -> Array:
     return np.asarray(spread + 1e-8 * max(np.trace(spread), 1e-12) * np.eye(len(spread)))
 
 
-def first_readings(segment: Segment) -> Array:
-    """Return the first reading (n_y,) of each output that there is."""
-    return np.asarray(segment.y[np.argmax(np.isfinite(segment.y), axis=0), np.arange(segment.y.shape[1])])
-
-
 def excess_within_noise(excess: Array, most: float = float(np.log(BARELY_MORE))) -> bool:
     """Return whether paired differences of log errors are zero to within one standard error, and ``most``."""
     return bool(excess.mean() <= min(excess.std(ddof=1) / np.sqrt(excess.size), most))

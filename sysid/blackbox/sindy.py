@@ -25,7 +25,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thermogrip.datasets.arrays import Array
-from thermogrip.sysid.blackbox.order_selection import Structure, first_readings, state_spread
+from thermogrip.sysid.blackbox.order_selection import Structure, state_spread
+from thermogrip.sysid.models.lti import first_readings
 from thermogrip.sysid.models.polynomial import SindyModel
 from thermogrip.sysid.plant.log_grid import Grid, whole_readings
 
@@ -128,7 +129,7 @@ def _bounded_model(grid: Grid, exponents: NDArray[np.int_], natural: Array, memo
     model = SindyModel(*labels, grid.dt, memory, exponents, natural, low, high)
     states = []
     for segment in grid.segments:
-        start = model.rest(first_readings(segment), (), (), ())
+        start = model.rest(first_readings(segment.y), (), (), ())
         (outputs,), _ = model.rollout(start[None], segment.u[None], segment.d[None], (), grid.dt)
         if not np.isfinite(outputs).all():
             return None

@@ -24,6 +24,7 @@ from scipy.signal import lfilter
 from thermogrip.datasets.arrays import Array
 from thermogrip.sysid.greybox.noise_model import Block, LogData
 from thermogrip.sysid.greybox.problem import Problem, start_seconds
+from thermogrip.sysid.models.lti import symmetric_root
 from thermogrip.sysid.models.model import Model
 from thermogrip.sysid.plant.simulation import READING_EVERY, Start, predict
 
@@ -193,8 +194,7 @@ def _log_effects(
 def _of_start(problem: Problem, at: int, k: int, p: Array, start: Start) -> list[_Column]:
     """Return what an uncertain start of stretch k does, where it matters, without a name."""
     stretches, bins = problem.logs[at]
-    size, axes = np.linalg.eigh(problem.model.spread)
-    root = axes * np.sqrt(np.maximum(size, 0.0)) * (1.0 if k == 0 else EFFECTS.start_after_gap)
+    root = symmetric_root(problem.model.spread) * (1.0 if k == 0 else EFFECTS.start_after_gap)
     # a tenth of a spread: a state near a limit must not cross it
     x0 = np.vstack([start.x0, start.x0 + 0.1 * root.T])
     d = stretches[k].d - start.d_offset

@@ -16,7 +16,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from thermogrip.datasets.arrays import Array
+from thermogrip.datasets.arrays import Array, Values
+from thermogrip.datasets.errors import UserError
 
 if TYPE_CHECKING:
     from thermogrip.sysid.models.model import Model
@@ -49,13 +50,6 @@ def constrained_lstsq(rows: Array, right: Array, fixed: Array, value: Array) -> 
     return np.asarray(z + free @ move)
 
 
-def covariance_root(covariance: Array) -> Array:
-    """Return R with R R' = covariance, columns of no variance left out."""
-    size, vectors = np.linalg.eigh((covariance + covariance.T) / 2)
-    keep = size > 1e-12 * max(float(size.max(initial=0.0)), 1e-300)
-    return np.asarray(vectors[:, keep] * np.sqrt(size[keep]))
-
-
 def symmetric_root(covariance: Array) -> Array:
     """Return R with R R' = covariance, one column an axis; a variance lost to rounding is 0."""
     size, axes = np.linalg.eigh(covariance)
@@ -84,11 +78,25 @@ def join_columns(u: Array, d: Array) -> Array:
 
 
 def whole_steps(dt: float, own: float) -> int:
-    """Return ``dt`` in steps of ``own`` seconds; raise ValueError where it is no whole multiple."""
+    """Return ``dt`` [s] in steps of ``own``, or refuse it."""
     times = round(dt / own)
     if times < 1 or abs(times * own - dt) > 1e-6 * dt:
-        raise ValueError(f"step of {dt:g} s is not a whole multiple of the model's {own:g} s")
+        problem = f"{dt:g} s is no whole multiple of the plant's step"
+        raise UserError(problem, hint=f"take a multiple of {own:g} s")
     return times
+
+
+def dot(row: Array, values: Values) -> Any:
+    """Return the dot product without the zero entries, so that symbolic graphs stay small."""
+    total: Any = 0.0
+    for i in np.flatnonzero(row):
+        total = total + float(row[i]) * values[int(i)]
+    return total
+
+
+def first_readings(y: Array) -> Array:
+    """Return the first reading (n_y,) of each output of y (n, n_y), NaN where it has none."""
+    return np.asarray(y[np.argmax(np.isfinite(y), axis=0), np.arange(y.shape[1])])
 
 
 @dataclass(frozen=True)
@@ -105,12 +113,11 @@ def estimate_starts(
 ) -> tuple[Array, Array]:
     """Return the start for each prior."""
     n_y = y.shape[1]
-    first = y[np.argmax(np.isfinite(y), axis=0), np.arange(n_y)]  # NaN where a channel is lost
-    x_rest = model.rest(first, u.mean(axis=0), d.mean(axis=0), ())
+    x_rest = model.rest(first_readings(y), u.mean(axis=0), d.mean(axis=0), ())
     is_read = np.isfinite(y)
     if not is_read.any():
         return np.tile(x_rest, (len(priors), 1)), np.zeros((len(priors), n_y))
-    root = covariance_root(model.spread)
+    root = symmetric_root(model.spread)
     runs = model.rollout(np.vstack([x_rest, x_rest + root.T]), u[None], d[None], (), dt)[0][:, :-1]
     if not np.isfinite(runs).all():  # equations that diverge within the warm-up
         return np.tile(x_rest, (len(priors), 1)), np.zeros((len(priors), n_y))

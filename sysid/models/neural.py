@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from thermogrip.datasets.arrays import Array, Run, Values
-from thermogrip.sysid.models.lti import join_columns, whole_steps
+from thermogrip.sysid.models.lti import dot, join_columns, whole_steps
 from thermogrip.sysid.models.model import BlackBox
 
 _RAILS = ("low", "high")
@@ -206,9 +206,9 @@ class NeuralModel(BlackBox):
 
     def _member_step(self, k: int, x: Values, w: Values) -> list[Any]:
         units = zip(self.W[k], self.U[k], self.b[k])
-        t = [_tanh(_dot(row, x) + _dot(column, w) + float(shift)) for row, column, shift in units]
+        t = [_tanh(dot(row, x) + dot(column, w) + float(shift)) for row, column, shift in units]
         after = [
-            _dot(self.A[k, i], x) + _dot(self.B[k, i], w) + _dot(self.V[k, i], t) + float(self.c[k, i])
+            dot(self.A[k, i], x) + dot(self.B[k, i], w) + dot(self.V[k, i], t) + float(self.c[k, i])
             for i in range(len(x))
         ]
         for i in range(len(self.outputs)):
@@ -222,10 +222,6 @@ class NeuralModel(BlackBox):
 
 def _batched_product(matrices: Array, vectors: Array) -> Array:
     return np.asarray(np.einsum("kij,kj->ki", matrices, vectors))
-
-
-def _dot(row: Array, values: Values) -> Any:
-    return sum(float(gain) * value for gain, value in zip(row, values))
 
 
 def _tanh(value: Any) -> Any:

@@ -22,6 +22,7 @@ from thermogrip.datasets.limits import array_within
 from thermogrip.sysid.models.lti import (
     StartPrior,
     constrained_lstsq,
+    dot,
     estimate_starts,
     evaluate_terms,
     join_columns,
@@ -98,16 +99,15 @@ class StateSpaceModel(BlackBox):
         """Return the state one step later, in plain arithmetic (numbers, NumPy rows or CasADi symbols)."""
         phi = products(self.terms, self.inputs + self.disturbances, [*u, *d])
         push = [
-            self.c[i] + _dot(self.B[i], u) + _dot(self.E[i], d) + _dot(self.F[i], phi)
-            for i in range(self.n_x)
+            self.c[i] + dot(self.B[i], u) + dot(self.E[i], d) + dot(self.F[i], phi) for i in range(self.n_x)
         ]
         switched = [(self.inputs.index(name), matrix) for name, matrix in self.A_switch.items()]
         now = [x[i] for i in range(self.n_x)]
         for _ in range(whole_steps(dt, self.dt)):
             now = [
-                _dot(self.A[i], now)
+                dot(self.A[i], now)
                 + push[i]
-                + sum(u[input_index] * _dot(matrix[i], now) for input_index, matrix in switched)
+                + sum(u[input_index] * dot(matrix[i], now) for input_index, matrix in switched)
                 for i in range(self.n_x)
             ]
         return now
@@ -115,7 +115,7 @@ class StateSpaceModel(BlackBox):
     def output(self, x: Values, p: Values) -> list[Any]:
         """Return the outputs y = C x + y0 as a list of length n_y, in plain arithmetic."""
         # no direct term: an input that is applied at a row cannot have moved the reading of that row
-        return [_dot(self.C[i], x) + self.y0[i] for i in range(len(self.outputs))]
+        return [dot(self.C[i], x) + self.y0[i] for i in range(len(self.outputs))]
 
     def rest(self, y: ArrayLike, u: ArrayLike, d: ArrayLike, p: ArrayLike) -> Array:
         """Return the state (n_x,) of a plant at rest whose outputs read y."""
@@ -234,11 +234,3 @@ def _shaped(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
     if not np.all(np.isfinite(array)):
         raise ValueError(f"{name} is not finite everywhere")
     return array
-
-
-def _dot(row: Array, values: Values) -> Any:
-    """Return the dot product without the zero entries, so that symbolic graphs stay small."""
-    total: Any = 0.0
-    for i in np.flatnonzero(row):
-        total = total + float(row[i]) * values[int(i)]
-    return total

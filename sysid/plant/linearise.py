@@ -27,6 +27,7 @@ from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.atomic_files import atomic_path, write_atomic
 from thermogrip.datasets.errors import UserError, known_names
 from thermogrip.datasets.provenance import KEY, provenance
+from thermogrip.sysid.models.lti import whole_steps
 from thermogrip.sysid.models.model import GreyModel
 
 if TYPE_CHECKING:
@@ -141,7 +142,7 @@ def linearise_plant(
     if dt is None:
         A, B = _continuous(plant, x, u, d, moved)
     else:
-        A, B = composed(A, B, steps_in(plant, dt))
+        A, B = composed(A, B, whole_steps(dt, plant.dt))
     C, level = output_matrix(plant)
     names = (*(plant.inputs[k] for k in moved), *plant.disturbances)
     w = np.concatenate([u[moved], d])
@@ -238,16 +239,6 @@ def discrete_matrices(
     return both[:, : x.size], both[:, x.size :]
 
 
-def steps_in(plant: PlantData, dt: float) -> int:
-    """Return ``dt`` [s] in steps of the plant, or refuse it."""
-    n = round(dt / plant.dt)
-    if n < 1 or abs(n * plant.dt - dt) > 1e-6 * dt:
-        raise UserError(
-            f"{dt:g} s is no whole multiple of the plant's step", hint=f"take a multiple of {plant.dt:g} s"
-        )
-    return n
-
-
 def composed(A: Array, B: Array, n: int) -> tuple[Array, Array]:
     """Return the matrices of n steps with the input held."""
     n_x, n_w = B.shape
@@ -292,7 +283,7 @@ def to_casadi(plant: PlantData, *, dt: float | None = None) -> Any:
     import casadi as ca
 
     model = plant.model
-    n = 1 if dt is None else steps_in(plant, dt)
+    n = 1 if dt is None else whole_steps(dt, plant.dt)
     sizes = (model.n_x, len(model.inputs), len(model.disturbances), len(model.parameters))
     x, u, d, p = (ca.SX.sym(name, size) for name, size in zip(("x", "u", "d", "p"), sizes))
     state = ca.vertsplit(x)

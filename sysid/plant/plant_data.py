@@ -27,6 +27,7 @@ from thermogrip.datasets.atomic_files import atomic_path, read_json
 from thermogrip.datasets.errors import UserError, reading
 from thermogrip.datasets.limits import LARGEST, MOST_NUMBER, STEP_RANGE, array_within, number_within
 from thermogrip.datasets.roles import is_room_temperature
+from thermogrip.sysid.models.lti import symmetric_root
 from thermogrip.sysid.models.model import Model
 from thermogrip.sysid.plant.fit_record import FitLog, PlantScores
 
@@ -138,10 +139,9 @@ class PlantData:
         if self.samples is not None:
             drawn = np.asarray(self.samples[int(along * len(self.samples))], dtype=float)
         elif self.covariance is not None:
-            # eigh, not Cholesky: a weakly determined direction may have lost its last digits
-            size, axes = np.linalg.eigh(np.asarray(self.covariance))
-            normal = np.random.default_rng(k).standard_normal(len(size))
-            drawn = self._inside(self.theta + axes @ (np.sqrt(np.maximum(size, 0.0)) * normal))
+            # not Cholesky's: a weakly determined direction may have lost its last digits
+            root = symmetric_root(np.asarray(self.covariance))
+            drawn = self._inside(self.theta + root @ np.random.default_rng(k).standard_normal(len(root)))
         else:
             raise UserError("the plant has no uncertainty to draw from", hint="fit a network, or use draw 0")
         return replace(self, values=self.values | dict(zip(self.free, drawn.tolist())))

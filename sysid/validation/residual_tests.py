@@ -29,6 +29,7 @@ from scipy.signal import lfilter
 from scipy.special import chdtrc
 
 from thermogrip.datasets.arrays import Array, Mask
+from thermogrip.sysid.models.lti import symmetric_root
 from thermogrip.sysid.plant.log_grid import Stretch, at_rows
 from thermogrip.sysid.plant.simulation import find_starts
 
@@ -170,8 +171,7 @@ def _start_changes(
     """Return by output what a start of each stretch further by one prior sd in each direction changes in its
     blocks, as columns (n, n_stretch n_x); what diverges is left at 0."""
     n_x, n_y = plant.model.n_x, len(plant.outputs)
-    variances, axes = np.linalg.eigh(plant.model.spread)
-    directions = (axes * np.sqrt(np.maximum(variances, 0.0))).T
+    directions = symmetric_root(plant.model.spread).T
     blocks = [np.unique(block[rows]) for rows in read.T]
     columns = [np.zeros((len(numbers), len(stretches) * n_x)) for numbers in blocks]
     for index, (stretch, start) in enumerate(zip(stretches, find_starts(plant, plant.p, stretches, warmup))):

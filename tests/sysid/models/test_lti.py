@@ -13,12 +13,12 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.sysid.models.lti import (
     StartPrior,
     constrained_lstsq,
-    covariance_root,
     estimate_starts,
     evaluate_terms,
     join_columns,
     products,
     read_terms,
+    symmetric_root,
     whole_steps,
 )
 from thermogrip.sysid.models.state_space import StateSpaceModel
@@ -44,7 +44,9 @@ def test_a_step_is_a_whole_number_of_steps_within_a_millionth(dt: float, times: 
     if times:
         assert whole_steps(dt, 2.0) == times
     else:
-        with pytest.raises(ValueError, match=rf"step of {dt:g} s is not a whole multiple of the model's 2 s"):
+        with pytest.raises(
+            ValueError, match=f"{dt:g} s is no whole multiple of the plant's step; take a multiple of 2 s"
+        ):
             whole_steps(dt, 2.0)
 
 
@@ -68,23 +70,17 @@ def test_directions_that_nearly_repeat_others_are_left_out():
         fixed = np.array([[1.0, 0.0], [1.0, off]])
         z = constrained_lstsq(np.eye(2), np.array([0.0, 7.0]), fixed, np.array([3.0, 3.0]))
         np.testing.assert_allclose(z, [3.0, 0.0 if n == 2 else 7.0], atol=1e-5)
-    assert covariance_root(np.diag([4.0, 4e-13])).shape == (2, 1)
-    assert covariance_root(np.diag([4.0, 8e-12])).shape == (2, 2)
-    assert covariance_root(np.diag([1e-3, 3e-15])).shape == (2, 2)
-    assert covariance_root(np.zeros((2, 2))).shape == (2, 0)
-    assert covariance_root(np.zeros((0, 0))).shape == (0, 0)
 
 
 @given(
     size=st.lists(st.floats(-6.0, 3.0).map(lambda e: 10.0**e), min_size=1, max_size=5),
     seed=st.integers(0, 99),
 )
-def test_a_root_gives_its_covariance_back_and_leaves_out_what_does_not_vary(size: list[float], seed: int):
+def test_a_root_gives_its_covariance_back(size: list[float], seed: int):
     n = len(size)
     axes = np.linalg.qr(np.random.default_rng(seed).standard_normal((n + 2, n + 2)))[0][:, :n]
     covariance = axes * size @ axes.T  # of rank n in n + 2 dimensions
-    root = covariance_root(covariance)
-    assert root.shape == (n + 2, n)
+    root = symmetric_root(covariance)
     np.testing.assert_allclose(root @ root.T, covariance, atol=1e-9 * max(size))
 
 
