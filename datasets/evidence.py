@@ -21,7 +21,7 @@ from itertools import combinations, pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from thermogrip.datasets.repair import drop_stuck
+from thermogrip.datasets.repair import drop_stuck, find_spikes
 
 Floats = NDArray[np.float64]
 
@@ -207,6 +207,10 @@ def role_doubts(
     )
     if not inputs or not outputs:
         return
+    # one spike hides every effect; repairs reject it once roles are known
+    columns = {
+        n: np.where(find_spikes(v, floor=None), np.nan, v) if n in outputs else v for n, v in columns.items()
+    }
     guessed = [name for name in moving if name in reasons and not reasons[name].startswith(tuple(sound))]
     moved = [name for name in outputs if is_moved(columns, name, inputs)]
     while more := [n for n in outputs if n not in moved and is_moved(columns, n, moved)]:

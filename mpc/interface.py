@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol, TypeAlias
+from typing import Any, Protocol, TypeAlias
 
 #: One sample: ``{"time_s": .., "t_tank": .., "t_surface": .., "t_ambient": ..}``, degC.  Without ``time_s``
 #: a call is one sample time.
@@ -89,7 +89,13 @@ def target_now(target: Trajectory) -> Target:
     """Return a target without what is ahead."""
     if not isinstance(target, Mapping):
         return target
-    return {name: value[0] if isinstance(value, Sequence) else value for name, value in target.items()}
+    lines: Mapping[str, Any] = target
+    return {name: next(iter(v), float("nan")) if is_line(v) else v for name, v in lines.items()}
+
+
+def is_line(value: object) -> bool:
+    """Return whether the target of an output is those of several samples, an array too."""
+    return bool(getattr(value, "ndim", isinstance(value, (list, tuple))))
 
 
 def number(reading: Mapping[str, float], name: str) -> float:

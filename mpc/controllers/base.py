@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from thermogrip.datasets.arrays import Array, Mask
 from thermogrip.mpc.controllers import advice
 from thermogrip.mpc.estimator.call_times import SAME, CallTimes
-from thermogrip.mpc.interface import Move, Readings, Trajectory, number, target_now
+from thermogrip.mpc.interface import Move, Readings, Trajectory, is_line, number, target_now
 from thermogrip.mpc.optimiser.drive_limits import DriveLimits
 from thermogrip.mpc.plant.prediction import PredictionModel
 
@@ -118,7 +118,7 @@ class SampledController:
 
 def has_preview(target: Trajectory) -> bool:
     """Return whether targets of the samples ahead are known."""
-    return isinstance(target, Mapping) and any(isinstance(value, Sequence) for value in target.values())
+    return isinstance(target, Mapping) and any(map(is_line, target.values()))
 
 
 def targets_ahead(
@@ -128,7 +128,8 @@ def targets_ahead(
     where targets do.  What is not from low to high is the target now (n_controlled,)."""
     if not isinstance(target, Mapping) or not has_preview(target):
         return None
-    lines = [np.atleast_1d(target.get(name, target_now)) for name, target_now in zip(controlled, now)]
+    lines = [np.append([], target.get(name, [])) for name in controlled]
+    lines = [line if line.size else np.array([target_now]) for line, target_now in zip(lines, now)]
     ahead = np.column_stack([line[np.minimum(at, len(line) - 1)] for line in lines]).astype(float)
     return np.where((ahead >= low) & (ahead <= high), ahead, now)  # NaN is neither
 

@@ -247,7 +247,8 @@ class OwnCode:
         alone = isinstance(got, str) or getattr(got, "ndim", None) == 0 or not np.iterable(got)
         values = [v.item() if getattr(v, "ndim", None) == 0 else v for v in ([got] if alone else got)]
         problem = f"returns {len(values)} numbers from {what}, not {len(names)}"
-        numbers = (_Symbol, Real, np.bool_, *{type(v) for group in args for v in group})  # or rows
+        # rows where its arguments are
+        numbers: tuple[type, ...] = (_Symbol, Real, np.bool_, *{type(v) for group in args for v in group})
         wrong = [v for v in values if not isinstance(v, numbers)]
         if wrong:
             problem = f"returns {reprlib.repr(wrong[0])} from {what}, which is no number"

@@ -467,6 +467,12 @@ def test_a_name_that_the_course_of_the_column_denies_is_a_doubt(name, values, do
     assert not assign_roles({"heater": "percent", "t_plate": "degC"}, columns=columns).doubts
 
 
+def test_a_spike_hides_no_response():
+    spiked = np.where(np.arange(STEPS.size) == 300, 9e3, SLOW + SMOOTH)
+    columns = {"heater": STEPS, "t_plate": spiked}
+    assert not assign_roles({"heater": "percent", "t_plate": "degC"}, columns=columns).doubts
+
+
 def test_what_readings_say_of_each_other_is_a_doubt():
     drive = np.repeat(np.random.default_rng(3).choice([0.0, 40.0, 90.0], 40), 25)
     t_in = plant_of(drive)

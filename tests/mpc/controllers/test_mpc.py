@@ -45,6 +45,15 @@ def test_a_good_reading_gives_ok_and_no_advice(controller):
     assert controller.plan.shape == (sum(controller.design.blocks), 1)
 
 
+def test_targets_ahead_may_be_an_array_and_no_target_is_the_last_one(controller):
+    listed = controller.step(REST, {"t_surface": [31.0, 32.0]})
+    controller.reset(REST)
+    assert controller.step(REST, {"t_surface": np.array([31.0, 32.0])}).drive == listed.drive
+    none = controller.step(REST, {"t_surface": []})
+    assert_legal(none, listed.drive)
+    assert none.advice.startswith("target of t_surface")
+
+
 @pytest.mark.parametrize("bad", [{**REST, "t_surface": None}, {**REST, "t_surface": "warm"}, {}])
 def test_a_lost_skin_reading_follows_the_plan_then_switches_off(controller, bad):
     before = controller.step(REST, 38.0).drive
