@@ -475,11 +475,14 @@ def _repair(
 
 def _reading_doubts(roles: Mapping[str, str], log: _Repaired) -> list[str]:
     """Return a line for each reading with runs like a sensor's code, or a jump that no input makes."""
-    inputs = [values for name, values in log.columns.items() if roles[name] == "input"]
+    drives = {name: values for name, values in log.columns.items() if roles[name] == "input"}
+    inputs = [*drives.values()]
     readings = {name: v for name, v in log.columns.items() if roles[name] in ("output", "disturbance")}
     doubts = [repair.doubt_readings(name, values, inputs, log.time) for name, values in readings.items()]
-    doubts += [repair.doubt_levels(name, v) for name, v in log.columns.items() if roles[name] == "input"]
-    doubts += [repair.doubt_rows(name, v, inputs) for name, v in readings.items() if roles[name] == "output"]
+    doubts += [repair.doubt_levels(name, values) for name, values in drives.items()]
+    for name in [name for name in readings if roles[name] == "output"]:
+        doubts.append(repair.doubt_rows(name, readings[name], inputs))
+        doubts += [repair.doubt_lead(name, readings[name], *drive, log.time) for drive in drives.items()]
     return [doubt for doubt in doubts if doubt]
 
 

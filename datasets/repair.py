@@ -252,6 +252,31 @@ def _goes_on(values: Floats) -> dict[str, NDArray[np.bool_]]:
     return {"held": moves == 0, "drawn straight": turns < 1.5 * step}  # half a step is for rounding
 
 
+def doubt_lead(name: str, values: Floats, drive: str, moved: Floats, time: Floats) -> str:
+    """Return the doubt on a reading that bends before a drive moves, as under no plant and no controller."""
+    rows = np.flatnonzero(np.diff(moved)) + 1
+    if np.unique(moved).size > _MOST_LEVELS or rows.size < SPIKE_WINDOW // 2 or np.isnan(values).any():
+        return ""
+    hold = int(np.median(np.diff(rows)))
+    half = max(hold // 4, 1)
+    rows = rows[(rows > hold + half) & (rows < values.size - hold - half)]
+    if rows.size < SPIKE_WINDOW // 2:
+        return ""
+    lags = np.arange(-hold, hold + 1)
+    at = rows + lags[:, None]
+    # what a reading bends by at each lag from a move, times the move: at its response all have one sign
+    bends = (moved[rows] - moved[rows - 1]) * (values[at + half] - 2 * values[at] + values[at - half])
+    size, scatter = np.abs(bends.sum(axis=1)), np.sqrt((bends**2).sum(axis=1))
+    lead = int(np.argmax(size))
+    # of a loop that swings, the bend of the last move is as large: 182 sound logs had at most 1.31 of what
+    # comes after, logs with readings ahead have 2 to 3.6; 2.6 is one bend in a hundred by chance
+    largest_after = size[lags >= -1].max()
+    if lags[lead] >= -1 or size[lead] < 1.5 * largest_after or size[lead] < 2.6 * scatter[lead]:
+        return ""
+    ahead = -float(lags[lead]) * float(np.median(np.diff(time)))
+    return f"{name} moves {ahead:g} s before {drive} does: are their clocks alike?"
+
+
 def doubt_rows(name: str, values: Floats, inputs: Sequence[Floats]) -> str:
     """Return the doubt on an output that is read in n-th rows only, held or drawn straight between."""
     finite = values[np.isfinite(values)]

@@ -140,8 +140,7 @@ def assign_roles(
         columns = {n: np.where(np.abs(v) <= MOST_NUMBER, v, np.nan) for n, v in columns.items()}
         if all(len(values) >= EVIDENCE.fewest_rows for values in columns.values()):
             guesses |= _copied_columns(columns, guesses, units)
-            guesses |= _unlike_inputs(columns, guesses, [n for n, role in stated.items() if role == "input"])
-        guesses |= _controllers(guesses, units, columns)
+        guesses |= _controllers(guesses, units)
         evidence |= _followed_levels(columns, guesses)
         guesses |= evidence
         fixed = {name: role for name, (role, why) in guesses.items() if why != NO_CLUE} | stated
@@ -178,7 +177,7 @@ def assign_roles(
 
 
 def _controllers(
-    guesses: Mapping[str, tuple[str, str]], units: Mapping[str, str], columns: Mapping[str, Floats]
+    guesses: Mapping[str, tuple[str, str]], units: Mapping[str, str]
 ) -> dict[str, tuple[str, str]]:
     """Return the columns that are what a controller calls them, where a set point shows that it does: what it
     reads, what it drives, and its terms."""
@@ -191,11 +190,6 @@ def _controllers(
     if drives and (reads or any(role == "output" for role, _ in guesses.values())):
         out |= {by_name[name]: ("output", f"{_OF_CONTROLLER} what it reads") for name in reads}
         out |= {by_name[name]: ("input", f"{_OF_CONTROLLER} what it drives") for name in drives}
-    without_clue = {_name_words(name): name for name, (_, why) in guesses.items() if why == NO_CLUE}
-    moving = [name for name, (role, _) in guesses.items() if role == "input" and np.nanstd(columns[name]) > 0]
-    for name in {_SETPOINT.sub("", goal) for goal in goals} & without_clue.keys():
-        if is_moved(columns, without_clue[name], moving):
-            out[without_clue[name]] = "output", "its set point stands beside it, and a drive moves it"
     out |= {by_name[n]: ("other", f"{_OF_CONTROLLER} its mode") for n in by_name.keys() & _MODES}
     terms = by_name.keys() & {"p", "i", "d"}
     if len(terms) > 1:
@@ -326,20 +320,6 @@ def _unnamed_causes(
 def _name_words(name: str) -> str:
     """Return a name in lower case with its words apart: ``BeerSet`` as ``beer_set``."""
     return re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", name).lower()
-
-
-def _unlike_inputs(
-    columns: Mapping[str, Floats], guesses: Mapping[str, tuple[str, str]], stated: Sequence[str]
-) -> dict[str, tuple[str, str]]:
-    """Return the columns that are inputs by unit alone and move in most rows while one of them or of the
-    ``stated`` is held; where none is, a controller moves them."""
-    by_unit = [n for n, (role, why) in guesses.items() if role == "input" and why.startswith("its unit")]
-    likely = [n for n, (role, why) in guesses.items() if role == "input" or why == NO_CLUE]
-    held_input = next((name for name in (*stated, *likely) if is_held(columns[name])), None)
-    finite = {name: columns[name][np.isfinite(columns[name])] for name in by_unit}
-    moving = [n for n, v in finite.items() if np.count_nonzero(np.diff(v)) > EVIDENCE.held_share * len(v)]
-    why = f"it moves in most rows, and {held_input} is held between its moves, as inputs are"
-    return dict.fromkeys(moving if held_input else (), ("other", why))
 
 
 def _copied_columns(

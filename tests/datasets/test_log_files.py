@@ -843,6 +843,7 @@ LATER = (PLACES >= 300) * 1.0
             "read in every 10th row only, drawn straight",
         ),
         (PLACES, HEATER, np.where((PLACES > 300) & (PLACES < 340), PLATE[300], PLATE), "is held at"),
+        (PLACES, HEATER, PLATE[np.minimum(PLACES + 10, 599)], "plate moves 11 s before heater does"),
         (PLACES, HEATER, PLATE + LATER * (32 + 0.8 * PLATE), "stays there, as nowhere else"),
         (PLACES, HEATER * np.where(LATER, 2.55, 1), PLATE, "2.55 times apart: did its unit change"),
     ],

@@ -193,15 +193,6 @@ def test_beside_a_set_point_input_and_output_are_the_controllers():
     assert assign_roles(units, columns=columns).of["input"] == "input"
 
 
-def test_what_has_a_set_point_of_its_own_name_beside_it_is_read():
-    bed = 20 + 5 * plant_of(HELD)
-    columns = {"T": bed + NOISY, "B": bed, "B_target": np.full(bed.size, 60.0), "@": HELD}
-    roles = assign_roles(dict.fromkeys(columns, "1"), columns=columns)
-    assert (roles.of["B"], roles.reasons["B"].split(",")[0]) == ("output", "its set point stands beside it")
-    cold = columns | {"B": 20 + 0.1 * NOISY}
-    assert assign_roles(dict.fromkeys(cold, "1"), columns=cold).of["B"] == "other"
-
-
 def test_one_column_beside_the_weather_is_the_output():
     columns = {"oat": ROOM, "meter": 2 * NOISY}
     roles = assign_roles({"oat": "1", "meter": "W"}, columns=columns).of
@@ -242,11 +233,6 @@ GOAL = np.repeat([30.0, 60.0], 300)
         # a second sensor of the same thing is none
         ({"u": ("1", HELD), "t_a": ("degC", READING), "t_b": ("degC", READING + 0.02 * NOISY)},
          "input output output", "its name is that of a reading"),
-        # volts: of a sensor where the drive is held, of a drive where a controller moves it or it is held
-        ({"a": ("1", HELD), "t_a": ("degC", READING), "cell": ("V", NOISY)},
-         "input output other", "it moves in most rows, and a is held between its moves, as inputs are"),
-        ({"a": ("1", HELD), "t_a": ("degC", READING), "cell": ("V", np.r_[[np.inf] * 3, NOISY[3:]])},
-         "input output other", "it moves in most rows, and a is held between its moves, as inputs are"),
         ({"t_a": ("degC", READING), "cell": ("V", NOISY)}, "output input", "its unit is V"),
         ({"t_a": ("degC", READING), "cell": ("V", HELD)}, "output input", "its unit is V"),
         # counts of rows, and of the hours of a day
