@@ -61,13 +61,6 @@ def test_the_prbs_example_is_repaired_and_says_how():
     assert names(log, "output") == ("t_tank", "t_surface")
 
 
-def test_the_step_example_comes_out_of_kelvin():
-    log = read_log(example_path("step_up_down"))
-    assert repairs(log) == ["t_tank: converted from K to degC"]
-    assert column(log, "t_tank")[0] == 25.0
-    assert log["t_tank"].attrs["units"] == "degC"
-
-
 @pytest.mark.parametrize("name", ["multisine", "pump_on_off"])
 def test_the_clean_examples_need_no_repair(name):
     assert repairs(read_log(example_path(name))) == []
