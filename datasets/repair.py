@@ -268,8 +268,8 @@ def doubt_lead(name: str, values: Floats, drive: str, moved: Floats, time: Float
     bends = (moved[rows] - moved[rows - 1]) * (values[at + half] - 2 * values[at] + values[at - half])
     size, scatter = np.abs(bends.sum(axis=1)), np.sqrt((bends**2).sum(axis=1))
     lead = int(np.argmax(size))
-    # of a loop that swings, the bend of the last move is as large: no log of a loop, a thermostat or a rig that
-    # was tried is beyond both limits, logs with readings ahead have 2 to 3.6 and 3.0 to 3.8
+    # of a loop that swings, the bend of the last move is as large: no log of a loop, a thermostat or a rig
+    # tried is beyond both limits, logs with readings ahead have 2 to 3.6 and 3.0 to 3.8
     largest_after = size[lags >= -1].max()
     if lags[lead] >= -1 or size[lead] < 1.5 * largest_after or size[lead] < 2.6 * scatter[lead]:
         return ""
