@@ -235,9 +235,14 @@ def role_doubts(
         helped = next((n for n in outputs if helps_beside(columns, name, n, beside)), None)
         if helped is not None:
             yield f"{name} is left out ({reasons[name]}), and helps to predict {helped}"
-        elif is_moved(columns, name, inputs, at_lags=all):
-            says = f"responds to {', '.join(inputs)}: is it an output?"
-            yield f"{name} is left out ({reasons[name]}), but {says}"
+            continue
+        # what is left out may be an output with an input of its own, which is left out with it
+        idle = [] if is_held(columns[name]) else [n for n in others if n in guessed and n not in goals]
+        for drives in (inputs, [n for n in idle if is_held(columns[n])]):
+            if is_moved(columns, name, drives, at_lags=all):
+                says = f"responds to {', '.join(drives)}: is it an output?"
+                yield f"{name} is left out ({reasons[name]}), but {says}"
+                break
 
 
 def _is_goal(columns: Mapping[str, Floats], name: str, inputs: Sequence[str], outputs: Sequence[str]) -> bool:

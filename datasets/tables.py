@@ -199,7 +199,7 @@ def find_layout(text: str, file: str, *, named: bool = False) -> Layout:
     hollow = not header[-1] and all(row[-1] == "" for row in rows)  # every line ends with a separator
     nameless = [f"c{place}" for place, name in enumerate(header[: n - hollow], 1) if not name]
     above = _split_cells(head[first - 1][1].lstrip("#%/ "), separator) if first else []
-    if 1 < len(above) == n - 1 and _number_share(above, separator) < 0.5 and not (hollow or named):
+    if 1 < len(above) == n - 1 and _number_share(above) < 0.5 and not (hollow or named):
         # commas may be decimals, or the first column be without a name: each name would be another column's
         hint = f"name all with --columns {','.join(['NAME'] * n)}, or write decimals with a point"
         raise UserError(f"has {n - 1} names above rows of {n} cells", file=file, hint=hint)
@@ -233,16 +233,16 @@ def _best_separator(lines: Sequence[str]) -> tuple[str, int | None]:
     for separator in "\t;|, ":
         rows = [[] if line.startswith(_COMMENT) else _split_cells(line, separator) for line in lines]
         # a preamble may have a line like a row, of another length than the rows of the table
-        lengths = [len(row) if _number_share([*filter(None, row)], separator) >= 0.5 else 0 for row in rows]
+        lengths = [len(row) if _number_share([*filter(None, row)]) >= 0.5 else 0 for row in rows]
         n = max(filter(None, lengths), key=lambda length: (lengths.count(length), length), default=0)
-        values = sum(_number_share(row, separator) for row in rows if len(row) == n > 1)
+        values = sum(_number_share(row) for row in rows if len(row) == n > 1)
         if n and values > most_values + 1e-9:
             most_values = values
             places = [place for place, length in enumerate(lengths) if length == n]
             # a line of properties (`Size 8 Size 2`) has words, and half of a row's numbers at most
-            numbers = [sum(_is_value(cell, separator) for cell in row if cell) for row in rows]
+            numbers = [sum(_is_value(cell) for cell in row if cell) for row in rows]
             usual = np.median([numbers[place] for place in places])
-            places = [k for k in places if _number_share(rows[k], separator) == 1 or numbers[k] > usual / 2]
+            places = [k for k in places if _number_share(rows[k]) == 1 or numbers[k] > usual / 2]
             # one that is alone, without names above it, is of a preamble
             of_table = (k for k in places if k + 1 in places or (k and len(rows[k - 1]) == n))
             best, best_first = separator, next(of_table, places[0])
@@ -268,11 +268,10 @@ def _as_typed(cell: str) -> str:
     return _PRINTED_BLANKS.sub("", cell.replace("\u2212", "-"))
 
 
-def _is_value(cell: str, separator: str) -> bool:
+def _is_value(cell: str) -> bool:
     cell = _as_typed(cell)
-    plain = cell if separator == "," else cell.replace(",", ".")
     if (
-        _NUMBER_CELL.fullmatch(plain)
+        _NUMBER_CELL.fullmatch(cell.replace(",", "."))
         or STAMP.fullmatch(cell)
         or cell in _LOST_CELLS
         or cell.lower() in _SWITCH
@@ -281,9 +280,9 @@ def _is_value(cell: str, separator: str) -> bool:
     return (match := _WITH_UNIT.fullmatch(cell)) is not None and _is_unit(match[2])
 
 
-def _number_share(row: Sequence[str], separator: str) -> float:
+def _number_share(row: Sequence[str]) -> float:
     """Return the share of a row's cells that are numbers, times or lost."""
-    return sum(_is_value(cell, separator) for cell in row) / max(len(row), 1)
+    return sum(_is_value(cell) for cell in row) / max(len(row), 1)
 
 
 def _names_above(lines: Sequence[str], n: int, separator: str) -> tuple[list[str], int]:
@@ -298,7 +297,7 @@ def _names_above(lines: Sequence[str], n: int, separator: str) -> tuple[list[str
             cells = [cell.strip() for cell in re.split(r"\s{2,}|\t|,|;", line.strip("#%/ "))]
         words = [*filter(None, cells)]
         fits = len(cells) == n or len(cells) == n - 1 > 1
-        if fits and words and _number_share(words, separator) < 0.5 and not (comment and headers):
+        if fits and words and _number_share(words) < 0.5 and not (comment and headers):
             headers.append([*cells, ""][:n])
             counted.append(not comment)
     if not headers:
@@ -422,7 +421,7 @@ def _parse_table(
         notes.append(f"row {line} is the last and was cut off ({len(cells)} of {n} cells): dropped")
     again = [line for line, cells in rows if any(layout.header) and cells == layout.header]
     for line, cells in rows if tolerated and any(layout.header) else ():
-        is_header = cells[0] and cells[0] in layout.header and _number_share(cells, layout.separator) == 0
+        is_header = cells[0] and cells[0] in layout.header and _number_share(cells) == 0
         if is_header and cells != layout.header:
             problem = f"the header stands again with other columns: {_quoted_cell(','.join(cells))}"
             raise UserError(problem, file=file, row=line, hint="cut the file there in two")
@@ -451,7 +450,7 @@ def _parse_table(
             columns.append(Column(name, text=[from_csv(cell.strip()) for cell in column]))
             continue
         try:
-            columns.append(read_column(name, column, lines, file, layout.separator, tolerated))
+            columns.append(read_column(name, column, lines, file, tolerated))
         except UserError as fault:
             faults += [] if name.startswith(_LEFT_OUT) else [fault]
     if faults:
@@ -463,16 +462,15 @@ def _parse_table(
                 c.name: cells
                 for c, cells in zip(columns, zip(*(cells for _, cells in rows)))
                 if c.numbers is not None
-            },
-            layout.separator,
+            }
         )
     return _table_of(columns, file, lines, notes)
 
 
-def _open_marks(cells_of: Mapping[str, Sequence[str]], separator: str) -> list[str]:
+def _open_marks(cells_of: Mapping[str, Sequence[str]]) -> list[str]:
     """Return a line for each column whose mark may be of decimals or thousands (``1,250``) where no other
     column shows which mark is the one of decimals."""
-    if separator == "," or not any("," in cells[0] + cells[-1] for cells in cells_of.values()):
+    if not any("," in cells[0] + cells[-1] for cells in cells_of.values()):
         return []
     opened: dict[str, str] = {}
     decimal: set[str] = set()
@@ -527,12 +525,7 @@ def _cell_rows(text: str, layout: Layout, file: str) -> Iterator[tuple[int, list
 
 
 def read_column(
-    name: str,
-    cells: Sequence[str],
-    lines: NDArray[np.int64],
-    file: str,
-    separator: str = ",",
-    tolerated: float = _TOLERATED,
+    name: str, cells: Sequence[str], lines: NDArray[np.int64], file: str, tolerated: float = _TOLERATED
 ) -> Column:
     """Return what the cells of a column are: numbers, a switch, or words; UserError for a cell that is no
     number among more numbers than are tolerated."""
@@ -543,13 +536,13 @@ def read_column(
     values = _to_numbers(cells)
     notes = [] if cells == printed else ["numbers are as printed: a long minus, marks between thousands"]
     wrong = _not_numbers(cells, values)
-    if wrong.size and separator != "," and _has_decimal_comma(cells):
+    if wrong.size and _has_decimal_comma(cells):  # between commas such cells stand in quotes
         pointed = [cell.replace(".", "").replace(",", ".") for cell in cells]  # 1.234,5 is 1234.5
         values, notes = _to_numbers(pointed), [*notes, _COMMAS]
         wrong = _not_numbers(cells, values)
     cells_known = len(cells) - sum(cell in _LOST_CELLS for cell in cells)
     if tolerated and wrong.size and (united := _without_unit(name, cells)) is not None:
-        return read_column(*united, lines, file, separator, tolerated)
+        return read_column(*united, lines, file, tolerated)
     first = cells[wrong[0]] if wrong.size else ""
     states = switched(cells) if tolerated else None
     if states is not None and np.isfinite(values).any() and len({cells[row].lower() for row in wrong}) > 1:
