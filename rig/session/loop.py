@@ -340,7 +340,7 @@ class Loop:
                     self.recorder.sample(self.rows[-1])
 
     def _orders(self, drive: Mapping[str, float]) -> dict[str, float]:
-        """Return a row's columns of what is applied: the drives, what is asked of those with a relay, and the
+        """Return a row's columns of what is applied: the drives, the requests of those with a relay, and the
         pump of the present move, if any."""
         drives = {join_header(name, self.rig.units[name]): value for name, value in drive.items()}
         switched = self.reading.mean_drive or ()

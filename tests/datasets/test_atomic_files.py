@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import json
 import os
 import pickle
 
@@ -13,7 +12,7 @@ from hypothesis import strategies as st
 
 from thermogrip.datasets import atomic_files
 from thermogrip.datasets.atomic_files import atomic_path, read_bytes, read_json, write_atomic, write_json
-from thermogrip.datasets.errors import UserError, os_fault
+from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.provenance import hash_file
 
 KEYS = {"schema": "thermogrip.test", "version": 2}
@@ -173,13 +172,3 @@ def test_what_is_not_the_expected_json_is_one_line(tmp_path, content, words):
     assert words in str(fault.value)
     assert "a.json" in str(fault.value)
     assert "\n" not in str(fault.value)
-
-
-def test_an_unknown_refusal_keeps_the_systems_words():
-    for error in (OSError(errno.EMLINK, "Too many links"), OSError("Too many links")):
-        assert str(os_fault(error, "a")) == "a: Too many links; check the path and the disk"
-
-
-def test_json_is_an_object_with_its_keys_first(tmp_path):
-    path = write_json(tmp_path / "a.json", {"é": 1}, schema="s", version=1)
-    assert list(json.loads(path.read_text(encoding="utf-8"))) == ["schema", "version", "é", "provenance"]

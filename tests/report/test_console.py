@@ -100,17 +100,6 @@ def test_what_is_known_so_far_is_a_table_on_a_terminal_and_a_line_elsewhere(
     assert (out, err.startswith("\r\x1b[Ktitle\n"), err.split()[-2:]) == ("", True, ["a", "1"])
 
 
-def test_work_that_goes_on_counts_the_time_left_from_where_it_began(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    clock = iter((0.0, 0.1, 20.0))
-    monkeypatch.setattr("time.monotonic", lambda: next(clock))
-    with Console().progress("grasps") as progress:
-        progress(0.4, "a")
-        progress(0.5, "b")
-    assert capsys.readouterr().err.endswith("grasps  50 %   20 s, 100 s left b\n")
-
-
 def test_on_a_terminal_progress_is_one_line_with_the_time_left(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -139,11 +128,3 @@ def test_progress_says_each_change_of_work_and_each_twentieth(capsys: pytest.Cap
             progress(fraction, what)
     lines = capsys.readouterr().err.splitlines()
     assert [line.split(" s ")[1] for line in lines] == ["a: 1", "b: 1", "b: 2"]
-
-
-def test_the_first_progress_is_said_at_any_fraction_and_without_words(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    with Console().progress("tune") as progress:
-        progress(0.05, "")
-    assert capsys.readouterr().err.startswith("tune   5 %")

@@ -229,14 +229,6 @@ def test_when_the_skin_felt_the_object_is_reported(contact: float, said: str, to
     assert (section.verdict, section.tone) == (said, tone)
 
 
-def test_what_never_settled_has_no_bias_and_several_outputs_no_common_figures() -> None:
-    session: Any = SimpleNamespace(settle_time=12.0, overshoot=0.3, bias=NAN)
-    assert control._figures_of(session, ("t",)) == {"t": {"settle_s": 12.0, "overshoot": 0.3}}
-    session.bias = 0.05
-    assert control._figures_of(session, ("t",))["t"]["bias"] == 0.05
-    assert control._figures_of(session, ("t1", "t2")) == {}
-
-
 def test_controllers_stand_beside_each_other_step_by_step_and_load_by_load() -> None:
     row = {
         "settle_mean_s": 10.04, "settle_worst_s": NAN, "overshoot_mean": 0.12345, "overshoot_worst": 0.5,

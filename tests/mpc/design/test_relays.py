@@ -71,12 +71,8 @@ def test_a_trial_with_relays_is_the_same_in_c_and_after_a_file(make, relays, tmp
 
 
 class _Switch(ctypes.Structure):
-    _fields_ = [
-        ("on", ctypes.c_int),
-        ("fresh", ctypes.c_int),
-        ("owed_s", ctypes.c_double),
-        ("since_s", ctypes.c_double),
-    ]
+    _fields_ = [(name, ctypes.c_int) for name in ("on", "fresh")]
+    _fields_ += [(name, ctypes.c_double) for name in ("owed_s", "since_s")]
 
 
 @GCC
