@@ -112,7 +112,9 @@ def clock_of(table: Table, read: Mapping[str, Header], dt: float | None) -> Cloc
     ]
     if likely := [clock for clock in clocks if clock is not None]:
         known = [clock for clock in likely if not clock.doubt and np.isfinite(clock.seconds).any()]
-        first, *others_known = known or likely[:1]
+        if not known:
+            return likely[0]
+        first, *others_known = known
         usual = _seconds_a_row(first)
         for clock in others_known:
             if abs(_seconds_a_row(clock) - usual) > CLOCK.late * usual:

@@ -271,7 +271,7 @@ class ReferenceController(SampledController):
     def say_unseen(self, unread_s: Array) -> str:
         """Return what is said where controlled outputs were not read for so long (n_controlled,)."""
         lost = unread_s > self._patience_s
-        parked = [name for name, pair in zip(self.model.drives, self.optimiser.pair) if lost[pair]]
+        parked = [name for name, pair in zip(self.model.drives, self.optimiser.at_rest.pair) if lost[pair]]
         gone = bool(lost.any())
         out = lost if gone else unread_s > 0
         names = [name for name, is_out in zip(self.controlled, out) if is_out]

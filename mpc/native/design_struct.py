@@ -236,10 +236,10 @@ def numbers_of(controller: ControllerParts, k: Array) -> dict[str, Any]:
     same_names = (
         (model, "sub dt span C spike unit coldest hottest least_d most_d warm"),
         (design, "iterations blocks track terminal move drive price overshoot patience_s ambient"),
-        (optimiser, "pair reach"),
+        (optimiser, "reach"),
         (optimiser.drives, "lowest highest slew neutral safe"),
         (optimiser.weights, "dear zone"),
-        (optimiser.at_rest, "strongest seen"),
+        (optimiser.at_rest, "pair strongest seen"),
         (observer, "fixed offset R Q P0 R_start"),
         (observer.disturbance, "on_drive on_disturbance on_output"),
     )

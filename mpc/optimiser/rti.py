@@ -105,7 +105,8 @@ class RestGains:
     """How the controlled outputs answer to drives at rest, in the drives' ranges."""
 
     strongest: NDArray[np.int_]  # (n_u,) which controlled output each drive moves most
-    rows: NDArray[np.int_]  # (n_u,) its place among all outputs
+    pair: NDArray[np.int_]  # (n_u,) which each is there for: its PI loop's, else what it moves most
+    rows: NDArray[np.int_]  # (n_u,) the place of the strongest among all outputs
     response: Array  # (n_b, n_u) of that output to each block, summed over time
     # (n_b, n_u) whether the horizon shows the response of a drive whose gain may fade or turn over
     seen: Mask
@@ -117,12 +118,15 @@ class RestGains:
         x, u, d = model.at_rest(design.ambient)
         _, G = model.trajectory(x, np.repeat(u[None, :], len(design.blocks), axis=0), d, design.blocks)
         strongest = np.argmax(np.abs(G[:, rows].sum(axis=(0, 2))), axis=0)
+        pair = np.array(strongest)
+        for loop in design.loops:
+            pair[model.drives.index(loop.drive)] = design.controlled.index(loop.output)
         response = _strongest_response(G * model.span, rows[strongest])
         is_seen = np.abs(response) > 0.02 * np.max(np.abs(response), axis=0)
         # of a drive that is no loop's and serves a limit, what it does to a target may fade or turn over
         paired = {loop.drive for loop in design.loops}
         is_seen &= np.array([name in paired or not (paired and design.limits) for name in model.drives])
-        return cls(strongest, rows[strongest], response, is_seen)
+        return cls(strongest, pair, rows[strongest], response, is_seen)
 
 
 def _strongest_response(G: Array, rows: NDArray[np.int_]) -> Array:
@@ -167,10 +171,6 @@ class Optimiser:
         self.n_b, self.N = len(design.blocks), sum(design.blocks)
         self.drives = DriveLimits.of(model, design.drive_range, design.slew_per_s, design.safe_drive)
         self.weights, self.at_rest = Weights.of(model, design), RestGains.of(model, design)
-        # controlled output that each drive is there for: its PI loop's, else what it moves most
-        self.pair = np.array(self.at_rest.strongest)
-        for loop in design.loops:
-            self.pair[model.drives.index(loop.drive)] = design.controlled.index(loop.output)
         self._rows = [model.outputs.index(name) for name in design.controlled]
         self._limits = [(model.outputs.index(name), *ends) for name, ends in design.limits.items()]
         self._spans = np.tile(model.span, self.n_b)  # of each unknown
@@ -251,7 +251,7 @@ class Optimiser:
             target=sample.target[None] if sample.ahead is None else sample.ahead,
             side=np.where(lost | moves, 0.0, sample.side),
             counted=np.flatnonzero(~lost).tolist(),
-            parked=np.flatnonzero(lost[self.pair]).tolist(),
+            parked=np.flatnonzero(lost[self.at_rest.pair]).tolist(),
             more=0.0 if sample.slew_s is None else sample.slew_s / self.design.dt - 1.0,
         )
 

@@ -110,7 +110,7 @@ def test_close_switches_everything_off_for_good_and_may_be_called_twice(rig: Rig
         rig.apply(dict.fromkeys(rig.units, 0.5), 0)
 
 
-CHANGING = {"Loop", "InputSteps", "DeviceCore", "_BadCount", "_Memory", "_Contact"}
+CHANGING = {"Loop", "InputSteps", "DeviceCore", "MeanDrive", "_BadCount", "_Memory", "_Contact"}
 
 
 @pytest.mark.parametrize(

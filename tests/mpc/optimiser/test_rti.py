@@ -210,12 +210,12 @@ def test_the_share_of_the_way_to_an_optimum(end, share):
 
 def test_gains_at_rest(optimiser):
     at_rest = optimiser.at_rest
-    assert (at_rest.strongest.tolist(), optimiser.pair.tolist()) == ([0, 1], [0, 1])
+    assert (at_rest.strongest.tolist(), at_rest.pair.tolist()) == ([0, 1], [0, 1])
     G, _ = condensed(optimiser)
     sums = G.sum(axis=0).reshape(2, 3, 2)
     np.testing.assert_allclose(at_rest.response, np.stack([sums[1, :, 0], sums[0, :, 1]], axis=1))
     loops = (PILoop("q2", "b", Kc=1.0, Ti=1.0), PILoop("q1", "a", Kc=1.0, Ti=1.0))
-    assert Optimiser(optimiser.model, replace(DESIGN, loops=loops)).pair.tolist() == [1, 0]
+    assert Optimiser(optimiser.model, replace(DESIGN, loops=loops)).at_rest.pair.tolist() == [1, 0]
 
 
 def test_a_solve_predicts_what_its_plan_does_and_parks_what_is_lost(optimiser):

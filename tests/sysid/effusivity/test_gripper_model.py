@@ -252,7 +252,7 @@ STORE, LOGARITHM, PRECISE = (1e-9, 1e9), (-50.0, 50.0), (1e-12, 100.0)
         ("slate", "ln_h_sd ln_effusivity_sd library_sd_ln", *S), ("slate", "library_effusivity", *E),
         ("slate", "heat_capacity", *STORE), ("slate", "n_grasp", 0.0, 1e9), (None, "onset", -100.0, 100.0),
         (None, "carry", -10.0, 10.0), (None, "bias", -1e3, 1e3),
-        (None, "depth_share block_length", 1e-9, 10.0),
+        (None, "depth_share", 1e-2, 10.0), (None, "block_length", 1e-4, 10.0),
         (None, "finish_level finish_slope", *LOGARITHM),
     ],
 )  # fmt: skip
