@@ -198,7 +198,7 @@ _OF_BLOCK = {"library_effusivity": _EFFUSIVITY, "heat_capacity": _STORE, "n_gras
 _OF_BLOCK |= dict.fromkeys(("ln_h", "ln_effusivity"), _LOGARITHM)
 _OF_BLOCK |= dict.fromkeys(("ln_h_sd", "ln_effusivity_sd", "library_sd_ln"), _SD)
 _OF_GRIPPER = {"onset": (-100.0, 100.0), "transit_loss": _RATIO, "bias": (-1e3, 1e3)}
-# a block that is a film, or that hardly takes part, stores nothing: no posterior of its material has a width
+# a block thinner than these is a film: it stores nothing, and no posterior of its material has a width
 _OF_GRIPPER |= {"depth_share": (1e-2, 10.0), "block_length": (1e-4, 10.0)}
 _OF_GRIPPER |= dict.fromkeys(("ln_h_level", "ln_h_slope"), _LOGARITHM)
 
