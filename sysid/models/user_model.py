@@ -521,6 +521,8 @@ class _Symbol(NDArrayOperatorsMixin):
         return self.__array_function__(_LOGICAL.get(ufunc, ufunc), (), inputs, {})
 
     def __array_function__(self, function: Any, _types: Any, inputs: Any, options: Any) -> Any:
+        if function is np.interp and (options or len(inputs) > 3):  # CasADi has none of them
+            raise TypeError("np.interp takes no left, right or period here: clip or wrap its argument")
         result = function(*_bared(inputs), **options)
         if result.shape:
             raise TypeError(f"{function.__name__} of values that are not known yet makes an array")

@@ -450,7 +450,7 @@ def test_a_plant_refuses_a_class_that_has_changed_or_is_another(tmp_path):
         ({"rhs": lambda self, x, u, d, p: ["a"]}, "returns 'a' from rhs"),
         ({"rhs": lambda self, x, u, d, p: [np.array([x.t, 1.0])]}, r"returns array.* from rhs, which is no"),
         ({"rhs": lambda self, x, u, d, p: np.stack([x.t])}, r"stack of values .* makes an array; use arith"),
-        ({"rhs": lambda self, x, u, d, p: [np.piecewise(x.t, [x.t > 0], [1.0])]}, r"no impl.*; use arithm"),
+        ({"rhs": lambda self, x, u, d, p: [np.interp(x.t, [0], [1], period=2)]}, "no left, right or period"),
         ({"rhs": lambda self, x, u, d, p: [p.K * x.t]}, "no attribute 'K'; the parameters are C, G, P"),
         ({"rhs": lambda self, x, u, d, p: [x.t if x.t > 0 else 0.0]}, r"choose with np\.where"),
         ({"rhs": lambda self, x: [0.0]}, "fails in rhs: TypeError"),
