@@ -269,7 +269,7 @@ def _unlike_an_input(
             return f"is computed from {' and '.join(pair)}: a heat or a flow, or a drive under feedback"
     for other in other_inputs:
         if share_followed(values, columns[other]) > EVIDENCE.follows:
-            return f"follows {other}: it may be a reading of it, and their effects cannot be told apart"
+            return f"follows {other}: it may be its reading, and their effects cannot be estimated separately"
     others_held = any(is_held(columns[n]) for n in other_inputs)
     if others_held and not is_held(values) and is_moved(columns, name, other_inputs, at_lags=all):
         return f"responds to {', '.join(other_inputs)}: is it read?"

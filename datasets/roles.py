@@ -340,11 +340,11 @@ def _copied_columns(
             # what is read is no copy of what is driven, a multiple of it under a proportional controller
             if not one_signal(values, moving[other]) or {role, role_of_other} == {"input", "output"}:
                 continue
-            # two inputs that always move together cannot be told apart by any fit: one stays for both
+            # no fit estimates the effects of two inputs that always move together: one stays for both
             drives = role == role_of_other == "input"
             drives |= guesses.get(other, ("", ""))[1] == NO_CLUE == why and is_held(values)
             if drives and units[name] == units[other]:
-                says = f"{_TOGETHER} {other}, and their effects cannot be told apart"
+                says = f"{_TOGETHER} {other}, and their effects cannot be estimated separately"
                 out[name] = "other", f"{says}: {other} is kept for both"
             # of two states every pair would be copies
             elif min(np.unique(v).size for v in (values, moving[other])) > 2:

@@ -199,10 +199,10 @@ def relay_and_duty(rng: Rng) -> Case:
 
 
 def elements_together(rng: Rng) -> Case:
-    """Two elements that are always driven alike: their effects cannot be told apart."""
+    """Two elements that are always driven alike: their effects cannot be estimated separately."""
     u = steps(rng, 1500, [0, 20, 50, 80, 100], 20, 110)
     oven = sensor(rng, 24 + lag(0.5 * u, 1, 80) + lag(0.3 * u, 1, 190), 0.1, 0.25)
-    return Case(1, {"element_left": u, "element_right": u}, {"oven_degC": oven}, says=("told apart",))
+    return Case(1, {"element_left": u, "element_right": u}, {"oven_degC": oven}, says=("separately",))
 
 
 def heater_and_cooler(rng: Rng) -> Case:

@@ -298,7 +298,7 @@ def test_heaters_that_always_move_together_are_one_named_pair_and_a_doubt(course
     columns = {"top": course, "bottom": 0.5 * course + 1, "oven": 20 + plant_of(course)}
     roles = assign_roles({"top": "percent", "bottom": "percent", "oven": "degC"}, columns=columns)
     assert roles.of == {"top": "input", "bottom": "other", "oven": "output"}
-    assert "their effects cannot be told apart: top is kept for both" in roles.doubts[0]
+    assert "their effects cannot be estimated separately: top is kept for both" in roles.doubts[0]
     stated = assign_roles(
         {"top": "percent", "bottom": "percent", "oven": "degC"}, columns=columns, inputs=["top", "bottom"]
     )
