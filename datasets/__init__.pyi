@@ -10,11 +10,11 @@ from thermogrip.datasets.log_files import read_log as read_log
 from thermogrip.datasets.log_files import write_log as write_log
 from thermogrip.datasets.public_sets import read_hold as read_hold
 from thermogrip.datasets.public_sets import read_toh as read_toh
-from thermogrip.datasets.resample import cut as cut
 from thermogrip.datasets.schema import Grasps as Grasps
 from thermogrip.datasets.schema import Log as Log
+from thermogrip.datasets.schema import cut as cut
 from thermogrip.datasets.schema import make_grasps as make_grasps
 from thermogrip.datasets.schema import make_log as make_log
 
 if typing.TYPE_CHECKING:  # doors of 0.1.0, which are found and not listed
-    from thermogrip.datasets.resample import gaps as gaps
+    from thermogrip.datasets.schema import gaps as gaps

@@ -17,9 +17,8 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from thermogrip.datasets.atomic_files import write_atomic
 from thermogrip.datasets.errors import UserError, reading
-from thermogrip.datasets.file_names import file_format, file_stem
+from thermogrip.datasets.files import file_format, file_stem, write_atomic
 from thermogrip.datasets.media import csv_cell
 from thermogrip.datasets.netcdf import open_netcdf, record_unit, write_netcdf
 from thermogrip.datasets.schema import GRASP_LABELS, GRASP_NUMBERS, check_grasps, make_grasps, with_lead_in

@@ -10,7 +10,6 @@ from __future__ import annotations
 import io
 import math
 import os
-import stat
 import sys
 from collections.abc import Callable, Mapping
 from importlib import import_module
@@ -18,8 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, TypeVar, cast
 from warnings import catch_warnings, simplefilter
 
-from thermogrip.datasets.errors import UserError, os_faults
-from thermogrip.datasets.provenance import note_read
+from thermogrip.datasets.errors import UserError
 
 if TYPE_CHECKING:
     import numpy as np
@@ -51,20 +49,6 @@ def most_bytes(share: int = 1) -> int:
 def most_unpacked(packed: int) -> int:
     """Return the bytes that may come out of a file of ``packed`` bytes."""
     return most_bytes() if _chosen() else min(most_bytes(), max(_FLOOR, _LARGEST_EXPANSION * packed))
-
-
-def check_source(path: str | Path) -> int:
-    """Return the size of a file [bytes], 0 where it is a pipe; UserError where there is none to read."""
-    with os_faults(path):
-        about = os.stat(path)
-    if stat.S_ISDIR(about.st_mode):
-        raise UserError("is a folder", file=path, hint="name a file")
-    # what a shell makes of <(command), and stdin
-    handed = str(path).startswith(("/dev/fd/", "/proc/self/fd/")) or str(path) == "/dev/stdin"
-    if not stat.S_ISREG(about.st_mode) and not (handed and stat.S_ISFIFO(about.st_mode)):
-        raise UserError("is no file but a device, a pipe or a socket", file=path, hint="name a file")
-    note_read(path)
-    return about.st_size if stat.S_ISREG(about.st_mode) else 0
 
 
 def check_size(size: int, *, file: str | Path, what: str = "is", share: int = 1) -> None:
@@ -100,7 +84,6 @@ def in_own_process(read: Callable[[Path], _Record], path: str | Path) -> _Record
     keep for ever; UserError where it does.  Other systems than Linux read it in this one."""
     import multiprocessing as mp
 
-    size = check_source(path)  # which notes here that it is read
     if sys.platform != "linux" or mp.current_process().daemon:
         return read(Path(path))
     receiver, sender = mp.get_context("fork").Pipe(duplex=False)
@@ -110,7 +93,7 @@ def in_own_process(read: Callable[[Path], _Record], path: str | Path) -> _Record
         reader.start()
     sender.close()
     try:
-        if not receiver.poll(_READ_S + size / _SLOWEST_DISK):
+        if not receiver.poll(_READ_S + os.stat(path).st_size / _SLOWEST_DISK):
             raise UserError("its reader does not come to an end", file=path, hint=_DAMAGED)
         record, fault = receiver.recv()
     except EOFError as error:

@@ -20,14 +20,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thermogrip.datasets import repair
-from thermogrip.datasets.atomic_files import atomic_path, write_atomic
 from thermogrip.datasets.clock import CLOCK, EPOCH, Clock, clock_of, read_clock, since_first_row
 from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.file_names import file_format, file_stem, split_cut
+from thermogrip.datasets.files import atomic_path, file_format, file_stem, split_cut, write_atomic
 from thermogrip.datasets.limits import MOST_NUMBER
 from thermogrip.datasets.media import csv_cell
 from thermogrip.datasets.roles import Roles, assign_roles, guess_role
-from thermogrip.datasets.schema import check_log, hash_columns, make_log
+from thermogrip.datasets.schema import check_log, cut, hash_columns, make_log
 from thermogrip.datasets.tables import (
     Table,
     check_header,
@@ -520,8 +519,6 @@ def _repair_column(
 
 
 def _cut(log: Log, start: float, stop: float) -> Log:
-    from thermogrip.datasets.resample import cut  # it loads xarray
-
     log_part = cut(log, start, stop)
     first, last = (f"{end:.10g}" if np.isfinite(end) else "" for end in (start, stop))
     log_part.attrs["name"] = f"{log.attrs['name']}@{first}:{last or 'end'}"

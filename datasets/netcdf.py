@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from thermogrip.datasets.atomic_files import atomic_path
 from thermogrip.datasets.errors import UserError, os_faults, reading
-from thermogrip.datasets.limits import check_source, check_unpacked, in_own_process, most_bytes, most_unpacked
+from thermogrip.datasets.files import atomic_path, check_source
+from thermogrip.datasets.limits import check_unpacked, in_own_process, most_bytes, most_unpacked
 from thermogrip.datasets.units import UNITS, any_unit, to_record_unit
 
 if TYPE_CHECKING:

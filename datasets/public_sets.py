@@ -18,8 +18,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from thermogrip.datasets.atomic_files import read_bytes
 from thermogrip.datasets.errors import UserError, as_user_error, reading
+from thermogrip.datasets.files import read_bytes
 from thermogrip.datasets.schema import Grasps, make_grasps, with_lead_in
 
 _HOLD = re.compile(r"(?P<object>.+)_(?P<number>\d+)_(?P<trial>\d+)_HOLD\.mat")

@@ -24,10 +24,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from thermogrip.datasets.atomic_files import read_bytes, read_toml
 from thermogrip.datasets.errors import UserError, known_names, os_faults, reading
-from thermogrip.datasets.file_names import file_stem
-from thermogrip.datasets.limits import Unpacker, check_size, check_source
+from thermogrip.datasets.files import check_source, file_stem, read_bytes, read_toml
+from thermogrip.datasets.limits import Unpacker, check_size
 from thermogrip.datasets.roles import guess_role
 from thermogrip.datasets.schema import ROLES
 from thermogrip.datasets.tables import Table

@@ -31,8 +31,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thermogrip.datasets import limits
-from thermogrip.datasets.atomic_files import read_bytes
 from thermogrip.datasets.errors import UserError, as_user_error, reading
+from thermogrip.datasets.files import check_source, read_bytes
 from thermogrip.datasets.media import from_csv
 from thermogrip.datasets.repair import Doubt, name_rows
 from thermogrip.datasets.units import read_header
@@ -666,6 +666,7 @@ def frame_table(
 def read_matlab_table(path: str | Path, columns: Sequence[str] | None = None) -> Table:
     """Return the columns of a MATLAB file (up to version 7): vectors and columns of matrices of one length (a
     matrix alone without names); a scalar ``Ts``, ``dt`` or ``fs`` is the step (``meta["dt"]``)."""
+    check_source(path)
     import_module("scipy.io.matlab")  # here, so that each reader need not load it
     return limits.in_own_process(partial(_matlab_table, columns=columns), path)
 

@@ -22,8 +22,7 @@ from scipy.signal import lfilter
 from thermogrip.cli.excite import optimal_for, schedule_for
 from thermogrip.datasets.examples import example_path
 from thermogrip.datasets.log_files import read_log
-from thermogrip.datasets.resample import held_means
-from thermogrip.datasets.schema import Log, columns, make_log
+from thermogrip.datasets.schema import Log, columns, held_means, make_log
 from thermogrip.sysid.experiment.information import ExperimentForecast, plant_from_prior
 from thermogrip.sysid.experiment.optimal import inputs_of
 from thermogrip.sysid.greybox.fit import fit_network

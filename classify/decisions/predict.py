@@ -37,8 +37,8 @@ from thermogrip.classify.estimators.base import (
     pick,
     record_list,
 )
-from thermogrip.datasets.atomic_files import write_atomic
 from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.files import write_atomic
 from thermogrip.datasets.media import csv_text
 from thermogrip.datasets.schema import has_touch_groups, label_values, log_name, unit_names
 from thermogrip.sysid.effusivity.data import touches, with_object_range

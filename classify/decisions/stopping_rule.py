@@ -31,8 +31,8 @@ from thermogrip.classify.estimators.base import (
     record_list,
 )
 from thermogrip.classify.estimators.registry import load_classifier
-from thermogrip.datasets.atomic_files import read_json, write_json
 from thermogrip.datasets.errors import UserError, reading
+from thermogrip.datasets.files import read_json, write_json
 from thermogrip.datasets.limits import LARGEST, array_within, number_within
 from thermogrip.datasets.schema import HOTTEST, log_name, make_grasps
 from thermogrip.sysid.effusivity.posterior import material_fit

@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 
 from thermogrip.classify.estimators import CLASSIFIERS, check_name
 from thermogrip.classify.estimators.base import GraspClassifier
-from thermogrip.datasets.atomic_files import make_folder, read_bytes, read_json, write_atomic, write_json
 from thermogrip.datasets.errors import UserError, known_names, reading
+from thermogrip.datasets.files import make_folder, read_bytes, read_json, write_atomic, write_json
 from thermogrip.datasets.limits import array_within
 from thermogrip.datasets.schema import make_grasps
 

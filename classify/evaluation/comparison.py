@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from thermogrip.classify.decisions.predict import Row, table_csv
 from thermogrip.classify.evaluation import metrics as s
 from thermogrip.classify.evaluation.metrics import calibration_interval, mean_intervals
-from thermogrip.datasets.atomic_files import make_folder, write_atomic, write_json
+from thermogrip.datasets.files import make_folder, write_atomic, write_json
 from thermogrip.datasets.media import Shown
 
 POOLED = "pooled"

@@ -10,8 +10,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from thermogrip.datasets.atomic_files import read_json, write_json
 from thermogrip.datasets.errors import UserError, reading
+from thermogrip.datasets.files import read_json, write_json
 from thermogrip.mpc.design.design import SCHEMA, Design
 from thermogrip.mpc.interface import FILE_VERSIONS
 

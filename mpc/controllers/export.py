@@ -23,8 +23,8 @@ import numpy as np
 
 from thermogrip import __version__
 from thermogrip.datasets.arrays import Array
-from thermogrip.datasets.atomic_files import write_atomic
 from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.files import write_atomic
 from thermogrip.datasets.media import markdown
 from thermogrip.datasets.parallel import Progress
 from thermogrip.mpc.controllers.mpc import Controller

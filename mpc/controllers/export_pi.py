@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from thermogrip.datasets.arrays import Array
-from thermogrip.datasets.atomic_files import write_atomic
 from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.files import write_atomic
 from thermogrip.datasets.media import markdown
 from thermogrip.datasets.parallel import Progress
 from thermogrip.mpc.controllers.export import Agreement, Export, footprint, relay_files, run_build

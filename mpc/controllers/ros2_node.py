@@ -16,8 +16,8 @@ from itertools import count
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from thermogrip.datasets.atomic_files import write_atomic
 from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.files import write_atomic
 from thermogrip.datasets.rosbag import (
     Column,
     Message,

@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
-from thermogrip.datasets.atomic_files import read_toml
 from thermogrip.datasets.errors import UserError, known_names
+from thermogrip.datasets.files import read_toml
 from thermogrip.datasets.limits import LARGEST
 from thermogrip.mpc.design.design import (
     Design,

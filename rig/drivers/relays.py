@@ -9,8 +9,8 @@ from pathlib import Path
 
 from pydantic import TypeAdapter, ValidationError
 
-from thermogrip.datasets.atomic_files import read_toml
 from thermogrip.datasets.errors import UserError, known_names
+from thermogrip.datasets.files import read_toml
 from thermogrip.mpc.design.design import problem_of
 from thermogrip.mpc.design.relays import NOW_S, Relay, Switches, two_signed
 from thermogrip.rig.interface import UNIT_RANGES, Reading, Rig, check_order

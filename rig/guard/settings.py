@@ -14,8 +14,8 @@ from typing import Annotated, Any, ClassVar
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, PrivateAttr, Strict, ValidationError
 from pydantic import model_validator as whole
 
-from thermogrip.datasets.atomic_files import read_toml
 from thermogrip.datasets.errors import UserError, known_names
+from thermogrip.datasets.files import read_toml
 from thermogrip.mpc.design.design import problem_of
 from thermogrip.sysid.plant.plant import Plant
 

@@ -21,8 +21,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from thermogrip.datasets.atomic_files import make_folder, read_json, write_json
 from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.files import make_folder, read_json, write_json
 from thermogrip.datasets.parallel import sub_progress
 from thermogrip.datasets.schema import Log, column
 from thermogrip.rig.guard.guard import LIMIT_MARGIN, Guard

@@ -18,8 +18,8 @@ from typing import Any
 
 import numpy as np
 
-from thermogrip.datasets.atomic_files import make_folder, read_json, write_json
 from thermogrip.datasets.errors import UserError, known_names, reading
+from thermogrip.datasets.files import make_folder, read_json, write_json
 from thermogrip.datasets.grasp_files import read_grasps, write_grasps
 from thermogrip.datasets.schema import GRASP_LABELS, GRASP_NUMBERS, Grasps, make_grasps
 from thermogrip.datasets.tables import read_csv_table

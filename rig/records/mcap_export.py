@@ -11,8 +11,8 @@ from typing import Any
 
 import xarray as xr
 
-from thermogrip.datasets.atomic_files import atomic_path
 from thermogrip.datasets.errors import as_user_error
+from thermogrip.datasets.files import atomic_path
 from thermogrip.rig.interface import Event
 
 

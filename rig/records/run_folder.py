@@ -26,19 +26,20 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, NamedTuple
 
-from thermogrip.datasets.atomic_files import (
+from thermogrip.datasets.errors import UserError, os_faults
+from thermogrip.datasets.files import (
+    hash_file,
     make_folder,
+    note_written,
     parse_json,
     read_bytes,
     read_json,
     write_atomic,
     write_json,
 )
-from thermogrip.datasets.errors import UserError, os_faults
 from thermogrip.datasets.grasp_files import read_grasps, write_grasps
 from thermogrip.datasets.log_files import write_log
 from thermogrip.datasets.media import csv_text, from_csv
-from thermogrip.datasets.provenance import hash_file, note_written
 from thermogrip.datasets.schema import Grasps, Log
 from thermogrip.rig.guard.sensor_checks import room_sensors
 from thermogrip.rig.interface import Event

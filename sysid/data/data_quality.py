@@ -29,9 +29,8 @@ from scipy.stats import f as f_distribution
 from thermogrip.datasets.arrays import Array, Mask
 from thermogrip.datasets.log_files import Logs, as_logs
 from thermogrip.datasets.repair import GAP_SECONDS, GAP_STEPS
-from thermogrip.datasets.resample import gaps
 from thermogrip.datasets.roles import FOLLOWED, IS_SET_POINT, explain_role
-from thermogrip.datasets.schema import Log, column, log_name
+from thermogrip.datasets.schema import Log, column, gaps, log_name
 from thermogrip.sysid.plant.log_grid import Grid, Rows, make_grid, quantum
 from thermogrip.sysid.plant.plant import Plant
 

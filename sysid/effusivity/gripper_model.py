@@ -23,8 +23,8 @@ from typing import Any
 import numpy as np
 
 from thermogrip.datasets.arrays import Array
-from thermogrip.datasets.atomic_files import read_json, write_json
 from thermogrip.datasets.errors import reading
+from thermogrip.datasets.files import read_json, write_json
 from thermogrip.datasets.limits import number_within
 from thermogrip.sysid.contact.materials import load_materials
 from thermogrip.sysid.contact.simulation import Grip, Stack

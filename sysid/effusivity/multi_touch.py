@@ -30,8 +30,8 @@ from numpy.typing import NDArray
 from scipy.special import logsumexp
 
 from thermogrip.datasets.arrays import Array, Mask
-from thermogrip.datasets.atomic_files import read_json, write_json
 from thermogrip.datasets.errors import UserError, reading
+from thermogrip.datasets.files import read_json, write_json
 from thermogrip.datasets.limits import number_within
 from thermogrip.datasets.schema import label_values, log_name
 from thermogrip.sysid.contact.materials import Material

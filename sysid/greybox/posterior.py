@@ -33,8 +33,8 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
 from thermogrip.datasets.arrays import Array
-from thermogrip.datasets.atomic_files import atomic_path
 from thermogrip.datasets.errors import UserError, known_names
+from thermogrip.datasets.files import atomic_path
 from thermogrip.datasets.log_files import Logs, as_logs
 from thermogrip.datasets.schema import Log
 from thermogrip.sysid.greybox.fit import bounded_least_squares

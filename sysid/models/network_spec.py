@@ -17,8 +17,8 @@ from typing import Annotated, Any, Literal, NamedTuple
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from thermogrip.datasets.atomic_files import read_toml
 from thermogrip.datasets.errors import UserError, known_names
+from thermogrip.datasets.files import read_toml
 from thermogrip.datasets.limits import LARGEST, STEP_RANGE
 
 #: What full scale reads in the units of a share of it.

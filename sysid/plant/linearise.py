@@ -24,9 +24,8 @@ from numpy.typing import ArrayLike
 from scipy.linalg import logm
 
 from thermogrip.datasets.arrays import Array
-from thermogrip.datasets.atomic_files import atomic_path, write_atomic
 from thermogrip.datasets.errors import UserError, known_names
-from thermogrip.datasets.provenance import KEY, provenance
+from thermogrip.datasets.files import KEY, atomic_path, provenance, write_atomic
 from thermogrip.sysid.models.lti import whole_steps
 from thermogrip.sysid.models.model import GreyModel
 

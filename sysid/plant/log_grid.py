@@ -19,10 +19,9 @@ from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.limits import most_bytes
 from thermogrip.datasets.log_files import NO_NUMBERS, Logs, as_logs
-from thermogrip.datasets.resample import gaps as gaps_of
-from thermogrip.datasets.resample import held_means
 from thermogrip.datasets.roles import guess_role
-from thermogrip.datasets.schema import Log, column, columns, log_name
+from thermogrip.datasets.schema import Log, column, columns, held_means, log_name
+from thermogrip.datasets.schema import gaps as gaps_of
 from thermogrip.datasets.schema import names as names_of
 from thermogrip.sysid.models.network_spec import SHARES
 

@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from thermogrip.datasets.arrays import Array
-from thermogrip.datasets.atomic_files import check_json, read_json, write_json
 from thermogrip.datasets.errors import UserError, known_names, reading
+from thermogrip.datasets.files import check_json, read_json, write_json
 from thermogrip.datasets.media import Shown
 from thermogrip.datasets.schema import Log, column, log_name, make_log
 from thermogrip.sysid.models.model import Model

@@ -23,8 +23,8 @@ from typing import Any, Self
 import numpy as np
 
 from thermogrip.datasets.arrays import Array, Mask
-from thermogrip.datasets.atomic_files import atomic_path, read_json
 from thermogrip.datasets.errors import UserError, reading
+from thermogrip.datasets.files import atomic_path, read_json
 from thermogrip.datasets.limits import LARGEST, MOST_NUMBER, STEP_RANGE, array_within, number_within
 from thermogrip.datasets.roles import is_room_temperature
 from thermogrip.sysid.models.lti import symmetric_root

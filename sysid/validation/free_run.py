@@ -27,8 +27,7 @@ import numpy as np
 
 from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.resample import block_means, gaps
-from thermogrip.datasets.schema import Log, column, columns, log_name
+from thermogrip.datasets.schema import Log, block_means, column, columns, gaps, log_name
 from thermogrip.sysid.plant.fit_record import SEVERAL, fit_logs, said_of_fit
 from thermogrip.sysid.plant.log_grid import cut_stretches, match_logs
 from thermogrip.sysid.validation.residual_tests import SQUARED, ResidualCorrelations, residual_correlations

@@ -22,8 +22,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from thermogrip.datasets import limits, netcdf, tables
-from thermogrip.datasets.atomic_files import read_json, read_toml
 from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.files import read_json, read_toml
 from thermogrip.datasets.grasp_files import read_grasps
 from thermogrip.datasets.log_files import read_log
 from thermogrip.datasets.tables import read_csv_table

@@ -22,7 +22,7 @@ from scipy.signal import lfilter
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.examples import example_path
-from thermogrip.datasets.file_names import split_cut
+from thermogrip.datasets.files import split_cut
 from thermogrip.datasets.log_files import as_logs, read_clock, read_log, write_log
 from thermogrip.datasets.schema import column, make_log, names
 

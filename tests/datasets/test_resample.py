@@ -12,8 +12,7 @@ from hypothesis import strategies as st
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.examples import example_path
 from thermogrip.datasets.log_files import read_log
-from thermogrip.datasets.resample import block_means, cut, gaps, held_means
-from thermogrip.datasets.schema import column, make_log
+from thermogrip.datasets.schema import block_means, column, cut, gaps, held_means, make_log
 
 
 def made(time, drive, t_a=None):

@@ -14,7 +14,7 @@ import pytest
 from scipy.io import savemat
 
 from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.file_names import file_format, file_stem
+from thermogrip.datasets.files import file_format, file_stem
 from thermogrip.datasets.tables import (
     find_layout,
     parse_text,

@@ -118,16 +118,6 @@ def test_a_classifier_whose_parts_do_not_fit_together_is_damaged(bench: Bench) -
             load_classifier(folder)
 
 
-def test_an_epoch_that_is_no_number_is_refused_before_numpy_reads_it(
-    bench: Bench, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("SOURCE_DATE_EPOCH", "abc")
-    done = bench.run("simulate", "plant.json", "good.csv", "--out", "s.csv")
-    assert (done.code, done.said) == (
-        2, ["thermogrip: SOURCE_DATE_EPOCH is 'abc'; set it to seconds since 1970, or unset it"]
-    )  # fmt: skip
-
-
 def test_no_warning_of_python_reaches_the_terminal(tmp_path: Path) -> None:
     program = (
         "import warnings, thermogrip.cli.main as line\n"

@@ -16,7 +16,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from thermogrip.datasets.arrays import Array
-from thermogrip.datasets.provenance import work
+from thermogrip.datasets.files import work
 from thermogrip.report.charts import Chart, Curve, Panel
 from thermogrip.report.html import (
     SETTINGS,
@@ -118,9 +118,9 @@ def test_a_page_begins_with_its_contents_and_ends_with_where_it_comes_from(tmp_p
     assert {"thermogrip", "written"} <= set(page.texts["dt"])
 
 
-def test_two_equal_pages_are_the_same_bytes(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("SOURCE_DATE_EPOCH", "1700000000")
-    first, second = (html_page("t", "l", [Section("s", (picture(), plot()), "v")]) for _ in range(2))
+def test_two_equal_pages_are_the_same_but_for_their_date() -> None:
+    pages = [html_page("t", "l", [Section("s", (picture(), plot()), "v")]) for _ in range(2)]
+    first, second = (re.sub(r"\d{4}-\d\d-\d\dT[\d:]{8}Z", "", page) for page in pages)
     assert first == second
 
 

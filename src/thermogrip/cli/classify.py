@@ -575,7 +575,7 @@ def _with_gripper(model: GraspClassifier) -> PosteriorClassifier:
 
 def check_place(out: Path, given: Sequence[str]) -> None:
     """Refuse a place for answers that cannot be written, or is among the files that are read."""
-    from thermogrip.datasets.file_names import file_format
+    from thermogrip.datasets.files import file_format
     from thermogrip.datasets.grasp_files import meta_path
 
     if as_folder := out.is_dir() or not out.suffix:
@@ -604,7 +604,7 @@ def answer_files(
 ) -> list[dict[str, Any]]:
     """Return the answers to files of grasps, read one by one, with the ``rows`` of their tables written; CSV
     has ``unknown`` for NaN."""
-    from thermogrip.datasets.file_names import file_stem
+    from thermogrip.datasets.files import file_stem
     from thermogrip.datasets.parallel import in_order
     from thermogrip.sysid.effusivity.quality import torn_groups
 
@@ -642,7 +642,7 @@ def write_table(rows: Sequence[dict[str, Any]], path: Path, unknown: str = "") -
     """Write rows as CSV or, by the ending of ``path``, Parquet, whole or not at all; columns are those of all
     rows, in order of appearance."""
     from thermogrip.classify.decisions.predict import table_csv
-    from thermogrip.datasets.atomic_files import atomic_path, write_atomic
+    from thermogrip.datasets.files import atomic_path, write_atomic
 
     if path.suffix.lower() == ".csv":
         write_atomic(path, table_csv(rows, unknown))

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from thermogrip.datasets.errors import UserError, os_faults
-from thermogrip.datasets.file_names import file_stem
+from thermogrip.datasets.files import file_stem
 
 if TYPE_CHECKING:
     from thermogrip.datasets.schema import Grasps

@@ -45,7 +45,7 @@ def _beside_log(ctx: typer.Context, value: Path | None) -> Path:
     """Return where the plant goes: LOG_plant.json where nothing names it (``callback=``)."""
     if value is not None:
         return value
-    from thermogrip.datasets.file_names import file_stem, split_cut
+    from thermogrip.datasets.files import file_stem, split_cut
 
     return Path(f"{file_stem(split_cut(ctx.params['paths'][0]).file)}_plant.json")
 

@@ -27,8 +27,8 @@ from thermogrip import __version__
 from thermogrip.cli.options import ExitCode
 from thermogrip.cli.verbs import Verb, Verbs
 from thermogrip.datasets.errors import UserError, known_names, os_fault
+from thermogrip.datasets.files import work
 from thermogrip.datasets.media import printable, without_password
-from thermogrip.datasets.provenance import work
 
 app = typer.Typer(
     name="thermogrip",

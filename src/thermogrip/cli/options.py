@@ -18,8 +18,8 @@ from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 import typer
 
 from thermogrip.cli.kinds import check_exists
-from thermogrip.datasets.atomic_files import make_folder
 from thermogrip.datasets.errors import UserError, as_user_error, known_names
+from thermogrip.datasets.files import make_folder
 
 if TYPE_CHECKING:
     from thermogrip.datasets.schema import Grasps, Log

@@ -122,7 +122,7 @@ def init(
     if out is None:
         console.say(text.rstrip("\n"))
     else:
-        from thermogrip.datasets.atomic_files import write_atomic
+        from thermogrip.datasets.files import write_atomic
 
         cli.new_file(out, (".toml",))
         if out.exists():
@@ -161,8 +161,8 @@ def warm_up(as_json: cli.AsJson = False) -> int:
 def copy_examples(folder: Path) -> list[Path]:
     """Write the bundled logs into a folder, the grasps into ``grasps`` in it and what each file is into
     ``EXAMPLES.md``, and return their paths; UserError before any is written where another file is there."""
-    from thermogrip.datasets.atomic_files import write_atomic
     from thermogrip.datasets.examples import EXAMPLE_LOGS, example_path
+    from thermogrip.datasets.files import write_atomic
 
     source, content = example_path(EXAMPLE_LOGS[0]).parent, {}
     for original in sorted(source.glob("*.csv.xz")):

@@ -23,8 +23,8 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 from thermogrip.cli.kinds import TYPED, check_files
+from thermogrip.datasets.files import note_seed
 from thermogrip.datasets.media import printable
-from thermogrip.datasets.provenance import note_seed
 
 #: Options that may stand alone, and what they mean then: any free port, and the one that Foxglove asks for.
 ALONE = {"--live": "0", "--foxglove": "8765"}

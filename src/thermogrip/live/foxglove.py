@@ -12,7 +12,7 @@ import json
 import time
 from typing import Any
 
-from thermogrip.datasets.atomic_files import write_atomic
+from thermogrip.datasets.files import write_atomic
 
 
 class Mirror:

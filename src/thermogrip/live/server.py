@@ -26,7 +26,7 @@ from dataclasses import dataclass
 from importlib.resources import files
 from typing import TYPE_CHECKING, Any
 
-from thermogrip.datasets.atomic_files import parse_json
+from thermogrip.datasets.files import parse_json
 
 if TYPE_CHECKING:
     from starlette.requests import Request

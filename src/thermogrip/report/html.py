@@ -24,9 +24,8 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 
 from thermogrip.datasets.arrays import Array
-from thermogrip.datasets.atomic_files import write_atomic
+from thermogrip.datasets.files import provenance, write_atomic
 from thermogrip.datasets.media import printable
-from thermogrip.datasets.provenance import provenance
 from thermogrip.report.charts import Chart, Curve, Panel, draw_chart, thinned
 from thermogrip.report.console import short
 

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from tests.mpc.makers import make_tank
-from thermogrip.datasets.atomic_files import read_json
 from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.files import read_json
 from thermogrip.mpc.controllers.mpc import Controller
 from thermogrip.mpc.design.design import (
     Design,

@@ -28,8 +28,8 @@ from hypothesis import strategies as st
 
 from tests.rig.fault_injection.drills import drill_plants
 from tests.rig.makers import Bench, Constant
-from thermogrip.datasets.atomic_files import read_json
 from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.files import read_json
 from thermogrip.datasets.schema import names
 from thermogrip.rig.guard.trip import Trip
 from thermogrip.rig.interface import Event

@@ -109,7 +109,7 @@ def test_what_is_ignored_stays_ignored(number: signal.Signals) -> None:
         signal.signal(number, before)
 
 
-TRACED = ("run_folder.py", "signals.py", "contextlib.py", "atomic_files.py")
+TRACED = ("run_folder.py", "signals.py", "contextlib.py", "files.py")
 
 
 def at_line(n: int, act: Callable[[], None]) -> Callable[..., Any]:

@@ -1,19 +1,34 @@
-"""Whole files or none, and JSON that says what it is."""
+"""Whole files or none, JSON that says what it is, and where it comes from."""
 
 from __future__ import annotations
 
 import errno
+import json
 import os
 import pickle
+import sys
+from hashlib import sha256
+from pathlib import Path
 
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from thermogrip.datasets import atomic_files
-from thermogrip.datasets.atomic_files import atomic_path, read_bytes, read_json, write_atomic, write_json
+from thermogrip.datasets import files
 from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.provenance import hash_file
+from thermogrip.datasets.files import (
+    KEY,
+    atomic_path,
+    hash_file,
+    note_seed,
+    provenance,
+    read_bytes,
+    read_json,
+    work,
+    write_atomic,
+    write_json,
+)
+from thermogrip.sysid.contact.materials import find_material
 
 KEYS = {"schema": "thermogrip.test", "version": 2}
 
@@ -47,7 +62,7 @@ def test_a_disk_that_refuses_is_one_line_and_leaves_nothing(tmp_path, monkeypatc
     def refuse(*_args):
         raise OSError(code, os.strerror(code))
 
-    monkeypatch.setattr(atomic_files.os, "fsync", refuse)
+    monkeypatch.setattr(files.os, "fsync", refuse)
     with pytest.raises(UserError, match=words) as fault:
         write_atomic(tmp_path / "a.txt", "x")
     assert "a.txt" in str(fault.value)
@@ -57,8 +72,8 @@ def test_a_disk_that_refuses_is_one_line_and_leaves_nothing(tmp_path, monkeypatc
 def test_the_data_is_on_the_disk_before_the_name(tmp_path, monkeypatch):
     order = []
     sync, replace = os.fsync, os.replace
-    monkeypatch.setattr(atomic_files.os, "fsync", lambda fd: (order.append("sync"), sync(fd)))
-    monkeypatch.setattr(atomic_files.os, "replace", lambda a, b: (order.append("rename"), replace(a, b)))
+    monkeypatch.setattr(files.os, "fsync", lambda fd: (order.append("sync"), sync(fd)))
+    monkeypatch.setattr(files.os, "replace", lambda a, b: (order.append("rename"), replace(a, b)))
     write_atomic(tmp_path / "a.txt", "x")
     assert order == ["sync", "rename", "sync"]
     assert os.listdir(tmp_path) == ["a.txt"]
@@ -172,3 +187,69 @@ def test_what_is_not_the_expected_json_is_one_line(tmp_path, content, words):
     assert words in str(fault.value)
     assert "a.json" in str(fault.value)
     assert "\n" not in str(fault.value)
+
+
+@pytest.fixture
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def test_a_json_says_who_wrote_it_from_what_and_is_read_with_and_without_that(here: Path) -> None:
+    old = here / "old.json"
+    old.write_text(json.dumps({"schema": "thing", "version": 1, "a": 1}))
+    outside = here.parent / f"{here.name}.json"
+    outside.write_text(old.read_text())
+    with work(["thermogrip", "identify", "a b.csv"]):
+        note_seed(7)
+        assert read_json(old, "thing", 1) == read_json(outside, "thing", 1)
+        write_json(here / "new.json", {"a": 2}, schema="thing", version=1)
+        read_json(here / "new.json", "thing", 1)  # what the command wrote itself is none of its inputs
+        write_json(here / "next.json", {"a": 3}, schema="thing", version=1)
+    outside.unlink()
+    digest = sha256(old.read_bytes()).hexdigest()
+    for name, a in (("new.json", 2), ("next.json", 3)):
+        content = read_json(here / name, "thing", 1)
+        found = content.pop(KEY)
+        assert content == {"schema": "thing", "version": 1, "a": a}
+        assert found.pop("written").endswith("Z")
+        assert found.pop("thermogrip")
+        inputs = {"old.json": digest, str(outside): digest}
+        assert found == {"command": "thermogrip identify 'a b.csv'", "seed": 7, "inputs": inputs}
+
+
+def test_what_the_package_brings_is_no_input() -> None:
+    with work(["thermogrip"]):
+        find_material("copper")
+        assert provenance()["inputs"] == {}
+
+
+def test_outside_of_a_command_there_are_the_program_s_words_and_no_inputs(
+    here: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["/somewhere/night.py", "--fast"])
+    write_json(here / "a.json", {}, schema="thing", version=1)
+    read_json(here / "a.json", "thing", 1)
+    found = provenance()
+    assert (found["command"], found["seed"], found["inputs"]) == ("night.py --fast", None, {})
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs POSIX: a folder in use cannot be removed")
+def test_a_working_folder_that_was_removed_costs_nothing_that_is_written(
+    here: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    gone = here / "gone"
+    gone.mkdir()
+    monkeypatch.chdir(gone)
+    gone.rmdir()
+    with work(["thermogrip", "run"]):
+        write_json(here / "run.json", {"a": 1}, schema="thing", version=1)
+    assert json.loads((here / "run.json").read_text())[KEY]["command"] == "thermogrip run"
+
+
+def test_a_file_that_is_gone_has_no_sum(here: Path) -> None:
+    (here / "a.json").write_text(json.dumps({"schema": "thing", "version": 1}))
+    with work(["thermogrip"]):
+        read_json(here / "a.json", "thing", 1)
+        (here / "a.json").unlink()
+        assert provenance()["inputs"] == {"a.json": ""}

@@ -1,33 +1,184 @@
-"""Whole files or none: atomic writing, and JSON that says what it is.
+"""Files on disk: what a name says, whole files or none, and where each comes from.
 
 Ctrl-C, a full disk or ``kill -9`` leave the old file in place.  Every JSON file of the toolkit has the keys
-``schema``, ``version`` (an integer) and ``provenance`` (:mod:`thermogrip.datasets.provenance`); reading it
-runs no code.
+``schema``, ``version`` (an integer) and ``provenance``: version, date, command, seed, and the SHA-256 of what
+was read; a page has it in its foot.  Two runs of one command with one seed differ in this alone.  Reading a
+file runs no code.
 """
 
 from __future__ import annotations
 
+import hashlib
 import json
+import math
 import os
 import re
+import shlex
 import shutil
+import stat
+import sys
+import time
 import tomllib
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from contextvars import ContextVar
+from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, NamedTuple
 
 from thermogrip.datasets.errors import UserError, as_user_error, os_faults
-from thermogrip.datasets.limits import check_content, check_size, check_source, most_bytes, read_within
-from thermogrip.datasets.provenance import KEY, note_written, provenance
+from thermogrip.datasets.limits import check_content, check_size, most_bytes, read_within
 
+FORMATS = {
+    ".csv": "csv", ".csv.gz": "csv", ".csv.xz": "csv",
+    ".txt": "text", ".dat": "text", ".tsv": "text", ".tab": "text", ".asc": "text", ".log": "text",
+    ".lvm": "text", ".txt.gz": "text", ".txt.xz": "text", ".dat.gz": "text", ".dat.xz": "text",
+    ".mat": "matlab", ".xlsx": "excel",
+    ".nc": "netcdf", ".h5": "netcdf", ".hdf5": "netcdf",
+    ".parquet": "parquet", ".pq": "parquet",
+    ".bag": "rosbag", ".db3": "rosbag", ".mcap": "rosbag",
+}  # fmt: skip
+_CUT = re.compile(r"^(?P<path>.+)@(?P<start>[^@:/\\]*):(?P<stop>[^@:/\\]*)$")
 #: A document's part of what a file of records may have (:mod:`thermogrip.datasets.limits`): 8 MiB, 1 MiB.
 JSON_SHARE, _TOML_SHARE = 256, 2048
 _SURROGATE = re.compile(r"\\u[dD][89a-fA-F]")
 _LONG_KEY = re.compile(
     r"""(?<![\w-])(?:(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+\.[ \t]*+){32}""", re.ASCII
 )  # possessive: linear in the text
+KEY = "provenance"
+_ROOMS = tuple(
+    str(Path(__file__).resolve().parent.parent / room) + os.sep
+    for room in ("datasets", "sysid", "mpc", "rig", "classify")
+)  # what they bring belongs to the version
+
+
+def file_format(path: str | Path) -> str:
+    """Return ``"csv"``, ``"netcdf"``, ``"parquet"`` or ``"rosbag"`` by a file name's ending."""
+    ending = _ending(path)
+    if ending not in FORMATS:
+        raise UserError(f"ending {ending!r} is unknown", file=path, hint=f"use one of {' '.join(FORMATS)}")
+    return FORMATS[ending]
+
+
+def file_stem(path: str | Path) -> str:
+    """Return the file name without its ending."""
+    return Path(path).name[: -len(_ending(path)) or None]
+
+
+def _ending(path: str | Path) -> str:
+    name = Path(path).name.lower()
+    return next((e for e in FORMATS if name.endswith(e)), Path(path).suffix.lower())
+
+
+class CutFile(NamedTuple):
+    """A file, and the part of it that is meant."""
+
+    file: Path
+    start: float  # [s], -inf from the first row on
+    stop: float  # [s], inf to the last one
+
+
+def split_cut(path: str | Path) -> CutFile:
+    """Return file, start and stop [s] of ``PATH@START:STOP``; a path that exists is whole, whatever it is."""
+    match = _CUT.match(str(path))
+    if match is None or os.path.exists(path):
+        return CutFile(Path(path), -math.inf, math.inf)
+    ends = []
+    for text, empty in ((match["start"], -math.inf), (match["stop"], math.inf)):
+        hint = "write PATH@START:STOP in seconds"
+        with as_user_error(ValueError, f"{text!r} is not a time", file=str(path), hint=hint):
+            ends.append(float(text) if text.strip() else empty)
+    start, stop = ends
+    if not start < stop:
+        raise UserError(f"the cut {start:g}:{stop:g} is empty", file=str(path), hint="write the start first")
+    return CutFile(Path(match["path"]), start, stop)
+
+
+@dataclass
+class _Work:
+    """One command while it runs."""
+
+    words: Sequence[str]
+    seed: int | None = None
+    read: dict[str, str] = field(default_factory=dict)  # path -> SHA-256, "" until it is asked for
+    written: set[str] = field(default_factory=set)
+
+
+_WORK: ContextVar[_Work | None] = ContextVar("work", default=None)
+
+
+@contextmanager
+def work(words: Sequence[str]) -> Iterator[None]:
+    """Gather what one command, the words as typed, reads and writes: readers and writers of files report it,
+    and a writer asks :func:`provenance`."""
+    token = _WORK.set(_Work(words))
+    try:
+        yield
+    finally:
+        _WORK.reset(token)
+
+
+def note_seed(seed: int | None) -> None:
+    """Report the seed of the command."""
+    if now := _WORK.get():
+        now.seed = seed
+
+
+def note_read(path: str | Path) -> None:
+    """Report a file that is read; those of the package itself and those that the command wrote do not
+    count."""
+    now, name = _WORK.get(), os.path.abspath(path)
+    if now and name not in now.written and not os.path.realpath(name).startswith(_ROOMS):
+        now.read.setdefault(name, "")
+
+
+def note_written(path: str | Path) -> None:
+    """Report a file that was written."""
+    if now := _WORK.get():
+        now.written.add(os.path.abspath(path))
+
+
+def provenance() -> dict[str, Any]:
+    """Return the provenance of what is being written, as plain JSON."""
+    from thermogrip import __version__
+
+    now = _WORK.get() or _Work([Path(sys.argv[0]).name, *sys.argv[1:]])
+    try:
+        folder = os.getcwd()
+    except OSError:  # it was removed, which must not cost what is being written
+        folder = ""
+    below = folder.rstrip(os.sep) + os.sep
+    for name in now.read:
+        with suppress(UserError):  # it is gone
+            now.read[name] = now.read[name] or (hash_file(name) if os.path.isfile(name) else "")
+    return {
+        "thermogrip": __version__,
+        "written": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
+        "command": shlex.join(now.words),
+        "seed": now.seed,
+        "inputs": {name.removeprefix(below): digest for name, digest in now.read.items()},
+    }
+
+
+def hash_file(path: str | Path) -> str:
+    """Return the SHA-256 of a file as 64 hexadecimal digits."""
+    with os_faults(path), open(path, "rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def check_source(path: str | Path) -> int:
+    """Return the size of a file [bytes], 0 where it is a pipe; UserError where there is none to read."""
+    with os_faults(path):
+        about = os.stat(path)
+    if stat.S_ISDIR(about.st_mode):
+        raise UserError("is a folder", file=path, hint="name a file")
+    # what a shell makes of <(command), and stdin
+    handed = str(path).startswith(("/dev/fd/", "/proc/self/fd/")) or str(path) == "/dev/stdin"
+    if not stat.S_ISREG(about.st_mode) and not (handed and stat.S_ISFIFO(about.st_mode)):
+        raise UserError("is no file but a device, a pipe or a socket", file=path, hint="name a file")
+    note_read(path)
+    return about.st_size if stat.S_ISREG(about.st_mode) else 0
 
 
 def make_folder(path: str | Path) -> None:
