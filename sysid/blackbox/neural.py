@@ -14,7 +14,7 @@ state of its own.  Several members start from different random W, U, b.
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import product
 from typing import Any
 
@@ -24,7 +24,7 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.linalg.blas import dsyrk
 
 from thermogrip.datasets.arrays import Array
-from thermogrip.sysid.blackbox.order_selection import Structure, state_spread
+from thermogrip.sysid.blackbox.order_selection import Structure, with_spread
 from thermogrip.sysid.blackbox.subspace import subspace_family
 from thermogrip.sysid.models.neural import NeuralModel
 from thermogrip.sysid.models.state_space import StateSpaceModel
@@ -201,7 +201,8 @@ def _averaged(grid: Grid, data: _Data, members: Sequence[_Member]) -> NeuralMode
     n, h = max(len(members[k].A) for k in fitting), max(members[k].h for k in fitting)
     alike = [members[k].padded(n, h) for k in np.sort(fitting)]
     kept = [alike[k] for k in _nearest_to_median(data, alike, h)]
-    return _with_spread(_as_model(grid, data, kept, h), grid, np.stack([some.x0 for some in kept]))
+    starts = np.hstack([some.x0 for some in kept])  # by segment
+    return with_spread(_as_model(grid, data, kept, h), grid, list(starts))
 
 
 def _train_member(data: _Data, linear: _Linear, h: int, *, seed: int) -> _Member:
@@ -312,8 +313,8 @@ def _as_model(grid: Grid, data: _Data, members: Sequence[_Member], h: int) -> Ne
         grid.inputs,
         grid.disturbances,
         grid.outputs,
-        grid.switches,
         grid.dt,
+        grid.switches,
         A=np.stack([some.A for some in members]),
         **weights_by_name,
         y_middle=data.y_middle,
@@ -324,9 +325,3 @@ def _as_model(grid: Grid, data: _Data, members: Sequence[_Member], h: int) -> Ne
         low=data.y_middle + data.y_size * data.low,
         high=data.y_middle + data.y_size * data.high,
     )
-
-
-def _with_spread(model: NeuralModel, grid: Grid, starts: Array) -> NeuralModel:
-    """Return the model with the covariance of its states over the training data; starts (K, n_segment, n)."""
-    rows = [model.states(starts[:, segment], s.u, s.d, grid.dt) for segment, s in enumerate(grid.segments)]
-    return replace(model, spread=state_spread(np.concatenate(rows)))

@@ -18,13 +18,14 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise, product
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 
 from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.errors import UserError
 from thermogrip.sysid.models.lti import StartPrior, estimate_starts, evaluate_terms
+from thermogrip.sysid.models.model import BlackBox
 from thermogrip.sysid.models.model import Model as PlantModel
 from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.fit_record import HELD_OUT_SHARE, SEVERAL, TAIL
@@ -45,6 +46,8 @@ _LINEAR_CORRELATION = (
 )
 
 _FADING_SHARE = 0.25  # of a held-out part: the memory of an offset that fades; a longer one looks lasting
+
+_Fitted = TypeVar("_Fitted", bound=BlackBox)
 
 
 class Model(PlantModel, Protocol):
@@ -364,14 +367,12 @@ def as_state_space(
     )
 
 
-def with_spread(model: StateSpaceModel, grid: Grid, starts: Sequence[Array]) -> StateSpaceModel:
+def with_spread(model: _Fitted, grid: Grid, starts: Sequence[Array]) -> _Fitted:
     """Return the model with the covariance of its state over the training data."""
-    rows = [
-        model.states(x0[None], segment.u[None], segment.d[None], model.dt)[0]
-        for x0, segment in zip(starts, grid.segments)
-    ]
+    rows = [model.states(x0[None], s.u[None], s.d[None])[0] for x0, s in zip(starts, grid.segments)]
     x = np.concatenate(rows)
-    return replace(model, spread=state_spread(x)) if np.isfinite(x).all() else model
+    more: dict[str, Any] = {"spread": state_spread(x)} if np.isfinite(x).all() else {}
+    return replace(model, **more)
 
 
 def state_spread(x: Array) -> Array:

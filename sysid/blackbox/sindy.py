@@ -125,16 +125,12 @@ def _bounded_model(grid: Grid, exponents: NDArray[np.int_], natural: Array, memo
     low, high = np.nanmin(y, axis=0), np.nanmax(y, axis=0)
     if not np.isfinite(natural).all() or not np.all(high > low):
         return None
-    labels = (grid.inputs, grid.disturbances, grid.outputs, grid.switches)
-    model = SindyModel(*labels, grid.dt, memory, exponents, natural, low, high)
-    states = []
-    for segment in grid.segments:
-        start = model.rest(first_readings(segment.y), (), (), ())
-        (outputs,), _ = model.rollout(start[None], segment.u[None], segment.d[None], (), grid.dt)
-        if not np.isfinite(outputs).all():
-            return None
-        states.append(np.hstack([outputs[memory - 1 - lag : len(outputs) - lag] for lag in range(memory)]))
-    return replace(model, spread=state_spread(np.concatenate(states)))
+    labels = (grid.inputs, grid.disturbances, grid.outputs, grid.dt, grid.switches)
+    model = SindyModel(*labels, memory, exponents, natural, low, high)
+    starts = [model.rest(first_readings(segment.y), (), (), ())[None] for segment in grid.segments]
+    runs = [model.states(x0, s.u[None], s.d[None])[0] for x0, s in zip(starts, grid.segments)]
+    x = np.concatenate([run[memory - 1 :] for run in runs])
+    return replace(model, spread=state_spread(x)) if np.isfinite(x).all() else None
 
 
 class _Trajectory(NamedTuple):

@@ -14,7 +14,8 @@ parameter, how well each sensor reads, and the times over which the fit averages
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, fields
 from typing import Any, ClassVar, NamedTuple, Protocol, Self, runtime_checkable
 
@@ -96,13 +97,17 @@ class Model(Protocol):
         ...
 
 
+_STATES_AT_ONCE = 2_000_000  # numbers of states at a time, 16 MB, of which a simulation has five copies
+
+
 @dataclass(frozen=True, eq=False)
-class BlackBox:
+class BlackBox(ABC):
     """What linear, polynomial and neural models share: their numbers are fields, and keys of a file."""
 
     inputs: tuple[str, ...]
     disturbances: tuple[str, ...]
     outputs: tuple[str, ...]
+    dt: float  # step [s]
 
     kind: ClassVar[str]
     title: ClassVar[str]
@@ -116,6 +121,40 @@ class BlackBox:
     def stable(self) -> bool:
         """Whether free runs stay bounded; true where the fit or the model's own form sees to that."""
         return True
+
+    @property
+    @abstractmethod
+    def n_x(self) -> int:
+        """Number of states."""
+
+    @abstractmethod
+    def output(self, x: Values, p: Values) -> list[Any]:
+        """Return the outputs at state x, in plain arithmetic (numbers, NumPy rows or CasADi symbols)."""
+
+    @abstractmethod
+    def states(self, x0: Array, u: Array, d: Array, times: int = 1) -> Array:
+        """Return the states (B, N + 1, n_x) of :meth:`rollout`, ``times`` steps with each row."""
+
+    def rollout(self, x0: ArrayLike, u: ArrayLike, d: ArrayLike, p: ArrayLike, dt: float) -> Run:
+        """Simulate a batch."""
+        x_end = np.asarray(x0, dtype=float)
+        readings: list[Array] = []
+        for x in self.state_blocks(x_end, np.asarray(u, dtype=float), np.asarray(d, dtype=float), dt):
+            y = np.stack(self.output(list(np.moveaxis(x, -1, 0)), ()), axis=-1)
+            readings.append(y[:, 1:] if readings else y)
+            x_end = x[:, -1]
+        return np.concatenate(readings, axis=1), x_end
+
+    def state_blocks(self, x0: Array, u: Array, d: Array, dt: float) -> Iterator[Array]:
+        """Yield the states of :meth:`rollout`, each time so many rows that they have :data:`_STATES_AT_ONCE`
+        numbers, from the last row of the ones before on."""
+        times = max(1, round(dt / self.dt))  # the step of a gap may differ a little from the model's
+        rows = max(1, _STATES_AT_ONCE // max(1, x0.size))
+        for begin in range(0, max(1, u.shape[1]), rows):
+            block = slice(begin, begin + rows)
+            x = self.states(x0, u[:, block], d[:, block], times)
+            yield x
+            x0 = x[:, -1]
 
     def to_dict(self) -> dict[str, Any]:
         """Return the model as plain lists and numbers, for JSON."""

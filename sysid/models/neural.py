@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from thermogrip.datasets.arrays import Array, Run, Values
+from thermogrip.datasets.arrays import Array, Values
 from thermogrip.sysid.models.lti import dot, join_columns, whole_steps
 from thermogrip.sysid.models.model import BlackBox
 
@@ -37,7 +37,6 @@ class NeuralModel(BlackBox):
     """A mean of K small neural state-space models in scaled units."""
 
     switches: tuple[str, ...]
-    dt: float  # step [s]
     A: Array  # (K, n, n) linear part, stable
     B: Array  # (K, n, m) of m inputs and disturbances
     c: Array  # (K, n)
@@ -146,52 +145,20 @@ class NeuralModel(BlackBox):
             z[:, free] += np.clip(step, -1.0, 1.0)
         return np.asarray(z[:, :n]).ravel()
 
-    def rollout(self, x0: ArrayLike, u: ArrayLike, d: ArrayLike, p: ArrayLike, dt: float) -> Run:
-        """Simulate a batch."""
-        from thermogrip.sysid.models.recurrences import run_outputs  # pulls in numba
+    def states(self, x0: Array, u: Array, d: Array, times: int = 1) -> Array:
+        """Return the states (B, N + 1, n_x) of :meth:`rollout`, ``times`` steps with each row."""
+        from thermogrip.sysid.models.recurrences import run_states  # pulls in numba
 
-        times = self._steps_per_row(dt)
-        drives = self._scaled_drives(u, d, times)
-        weights = self._joined_weights()
-        rails = self._scaled_rails()
-        x0 = np.asarray(x0, dtype=float).reshape(-1, *self.A.shape[:2])
-        together = [slice(None)] if len(drives) == 1 else [slice(b, b + 1) for b in range(len(x0))]
-        runs = [
-            run_outputs(self.A, weights, self.b.shape[1], x0[rows], w, *rails)
-            for rows, w in zip(together, drives)
-        ]
-        y, x_end = runs[0] if len(runs) == 1 else (np.concatenate(results) for results in zip(*runs))
-        y = y[:, ::times]
-        y *= self.y_size
-        y += self.y_middle
-        return y, x_end.reshape(len(x0), self.n_x)
-
-    def states(self, x0: ArrayLike, u: ArrayLike, d: ArrayLike, dt: float) -> Array:
-        """Return the states (N + 1, n_x) from one x0 (n_x,) under u (N, n_u) and d (N, n_d)."""
-        from thermogrip.sysid.models.recurrences import run_states
-
-        times = self._steps_per_row(dt)
-        (w,) = self._scaled_drives(np.asarray(u)[None], np.asarray(d)[None], times)
-        x0 = np.asarray(x0, dtype=float).reshape(self.A.shape[:2])
-        x = run_states(self.A, self._joined_weights(), self.b.shape[1], x0, w, *self._scaled_rails())
-        return np.moveaxis(x[:, ::times], 0, 1).reshape(-1, self.n_x)
-
-    def _steps_per_row(self, dt: float) -> int:
-        return max(1, round(dt / self.dt))  # the step of a gap may differ a little from the model's
-
-    def _scaled_drives(self, u: ArrayLike, d: ArrayLike, times: int) -> list[Array]:
-        """Return the drives (N, m) of each run, every row ``times`` times."""
-        w = join_columns(np.asarray(u, dtype=float), np.asarray(d, dtype=float))
-        w = np.clip((w - self.w_middle) / self.w_size, -self.reach, self.reach)
-        return list(np.ascontiguousarray(np.repeat(w, times, axis=1)))
-
-    def _joined_weights(self) -> Array:
-        """Return each member's weights but A in a row."""
+        w = np.clip((join_columns(u, d) - self.w_middle) / self.w_size, -self.reach, self.reach)
+        drives = np.ascontiguousarray(np.repeat(w, times, axis=1))
         matrices = (self.B, self.c, self.V, self.W, self.U, self.b)
-        return np.hstack([matrix.reshape(len(self.A), -1) for matrix in matrices])
-
-    def _scaled_rails(self) -> tuple[Array, Array]:
-        return (self.low - self.y_middle) / self.y_size, (self.high - self.y_middle) / self.y_size
+        weights = np.hstack([matrix.reshape(len(self.A), -1) for matrix in matrices])
+        low, high = ((rail - self.y_middle) / self.y_size for rail in (self.low, self.high))
+        runs = [
+            run_states(self.A, weights, self.b.shape[1], start, drives[k % len(drives)], low, high)
+            for k, start in enumerate(x0.reshape(-1, *self.A.shape[:2]))
+        ]
+        return np.moveaxis(np.stack(runs)[:, :, ::times], 1, 2).reshape(len(runs), -1, self.n_x)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the model as plain lists and numbers, for JSON (``None``: no rail)."""

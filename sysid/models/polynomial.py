@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from thermogrip.datasets.arrays import Array, Run, Values
+from thermogrip.datasets.arrays import Array, Values
 from thermogrip.datasets.limits import array_within, number_within
 from thermogrip.sysid.models.lti import join_columns, whole_steps
 from thermogrip.sysid.models.model import BlackBox
@@ -30,7 +30,6 @@ class SindyModel(BlackBox):
     """Polynomial difference equations of the outputs."""
 
     switches: tuple[str, ...]
-    dt: float  # step [s]
     # number of past values of each output the equations see, at least 1; the state is [y[k], y[k-1], ...]
     memory: int
     # (n_term, n_variable) powers of the variables [state, inputs, disturbances] in each term
@@ -91,20 +90,18 @@ class SindyModel(BlackBox):
         y = np.asarray(y, dtype=float)
         return np.tile(np.where(np.isfinite(y), y, (self.low + self.high) / 2), self.memory)
 
-    def rollout(self, x0: ArrayLike, u: ArrayLike, d: ArrayLike, p: ArrayLike, dt: float) -> Run:
-        """Simulate a batch; a state beyond :data:`BOUND` times the range of the data has diverged and is
-        infinite from there on."""
+    def states(self, x0: Array, u: Array, d: Array, times: int = 1) -> Array:
+        """Return the states (B, N + 1, n_x) of :meth:`rollout`; an output beyond :data:`BOUND` times the
+        range of the data has diverged, and the state is infinite from there on."""
         from thermogrip.sysid.models.recurrences import run_polynomial  # pulls in numba
 
-        w = np.ascontiguousarray(join_columns(np.asarray(u, dtype=float), np.asarray(d, dtype=float)))
-        x0 = np.ascontiguousarray(x0, dtype=float)
-        times = max(1, round(dt / self.dt))  # the step of a gap may differ a little from the model's
-        y, x = run_polynomial(self.exponents, self.coefficients, x0, w, times)
+        w = np.ascontiguousarray(join_columns(u, d))
+        x = run_polynomial(self.exponents, self.coefficients, np.ascontiguousarray(x0), w, times)
         middle, reach = (self.low + self.high) / 2, BOUND * (self.high - self.low)
         with np.errstate(invalid="ignore"):
-            gone = np.maximum.accumulate(~(np.abs(y - middle) < reach).all(axis=2), axis=1)
-        y[gone], x[gone[:, -1]] = np.inf, np.inf
-        return y, x
+            within = np.abs(x[:, :, : len(self.outputs)] - middle) < reach
+        x[np.maximum.accumulate(~within.all(axis=2), axis=1)] = np.inf
+        return np.asarray(x)
 
     def equations(self) -> tuple[str, ...]:
         """Return one equation per output as text, in natural units."""

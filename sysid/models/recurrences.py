@@ -49,17 +49,16 @@ def run_linear(A: Array, on: Array, push: Array, x0: Array, times: int) -> Array
 @numba.njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def run_polynomial(
     exponents: NDArray[np.int_], coefficients: Array, x0: Array, w: Array, times: int
-) -> tuple[Array, Array]:
-    """Return the outputs (B, N + 1, n_y) of y+ = coefficients m(x, w) with each row of w (1 or B, N, m)
-    ``times`` times, m the monomials of x, the outputs from the newest on, and the last states (B, n_x)."""
+) -> Array:
+    """Return the states (B, N + 1, n_x), the outputs from the newest on, of y+ = coefficients m(x, w) with
+    each row of w (1 or B, N, m) ``times`` times, m the monomials of x and w."""
     n_batch, n_x = x0.shape
     n_y, n_term = coefficients.shape
     rows = w.shape[1]
-    y, last = np.empty((n_batch, rows + 1, n_y)), x0.copy()
+    x = np.empty((n_batch, rows + 1, n_x))
     variables, after = np.empty(n_x + w.shape[2]), np.empty(n_y)
     for b in range(n_batch):
-        y[b, 0] = x0[b, :n_y]
-        variables[:n_x] = x0[b]
+        x[b, 0] = variables[:n_x] = x0[b]
         for k in range(rows):
             variables[n_x:] = w[min(b, len(w) - 1), k]
             for _ in range(times):
@@ -75,9 +74,8 @@ def run_polynomial(
                 for i in range(n_x - 1, n_y - 1, -1):
                     variables[i] = variables[i - n_y]
                 variables[:n_y] = after
-            y[b, k + 1] = variables[:n_y]
-        last[b] = variables[:n_x]
-    return y, last
+            x[b, k + 1] = variables[:n_x]
+    return x
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[untyped-decorator]
@@ -161,46 +159,18 @@ def _add_direct(p: Array, x: Array, w: Array, t: Array, s: Array, S: Array) -> N
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def _member_step(
-    A: Array, p: Array, w: Array, low: Array, high: Array, x: Array, t: Array, after: Array
-) -> None:
-    """Set ``after`` to the next state, clipped; ``t`` is room for the units."""
-    _units(p, x, w, t)
-    _advance(A, p, x, w, t, after)
-    for i in range(low.shape[0]):
-        after[i] = min(max(after[i], low[i]), high[i])
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def run_states(A: Array, theta: Array, h: int, x0: Array, w: Array, low: Array, high: Array) -> Array:
     """Return states (k, N + 1, n) for A (k, n, n), theta (k, n_theta), x0 (k, n) and one w (N, m)."""
     x, t = np.empty((theta.shape[0], w.shape[0] + 1, x0.shape[1])), np.empty(h)
     for k in range(theta.shape[0]):
         x[k, 0] = x0[k]
         for row in range(w.shape[0]):
-            _member_step(A[k], theta[k], w[row], low, high, x[k, row], t, x[k, row + 1])
+            after = x[k, row + 1]
+            _units(theta[k], x[k, row], w[row], t)
+            _advance(A[k], theta[k], x[k, row], w[row], t, after)
+            for i in range(low.shape[0]):
+                after[i] = min(max(after[i], low[i]), high[i])
     return x
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def run_outputs(
-    A: Array, theta: Array, h: int, x0: Array, w: Array, low: Array, high: Array
-) -> tuple[Array, Array]:
-    """Return the mean outputs (B, N + 1, n_y) of members A (k, n, n), theta (k, n_theta) and their last
-    states (B, k, n), for x0 (B, k, n) and one w (N, m); no states on the way are kept."""
-    batch, members, n = x0.shape
-    rows, n_y = w.shape[0] + 1, low.shape[0]
-    y, last = np.zeros((batch, rows, n_y)), x0.copy()
-    after, t = np.empty(n), np.empty(h)
-    for b in range(batch):
-        for k in range(members):
-            for row in range(rows):
-                for i in range(n_y):
-                    y[b, row, i] += last[b, k, i] / members
-                if row < rows - 1:
-                    _member_step(A[k], theta[k], w[row], low, high, last[b, k], t, after)
-                    last[b, k] = after
-    return y, last
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[untyped-decorator]

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from thermogrip.datasets.arrays import Array, Run, Values
+from thermogrip.datasets.arrays import Array, Values
 from thermogrip.datasets.limits import array_within
 from thermogrip.sysid.models.lti import (
     StartPrior,
@@ -32,8 +32,6 @@ from thermogrip.sysid.models.lti import (
 )
 from thermogrip.sysid.models.model import BlackBox
 
-_STATES_AT_ONCE = 2_000_000  # numbers of states at a time, 16 MB, of which a simulation has five copies
-
 
 @dataclass(frozen=True, eq=False)
 class StateSpaceModel(BlackBox):
@@ -42,7 +40,6 @@ class StateSpaceModel(BlackBox):
     A: Array  # (n_x, n_x)
     B: Array  # (n_x, n_u)
     C: Array  # (n_y, n_x)
-    dt: float  # step of the model [s]
     E: Array = field(default_factory=lambda: np.empty(0))  # (n_x, n_d) disturbance matrix; zero where absent
     c: Array = field(default_factory=lambda: np.empty(0))  # (n_x,) constant drive
     y0: Array = field(default_factory=lambda: np.empty(0))  # (n_y,) offset of the outputs, in their unit
@@ -140,28 +137,13 @@ class StateSpaceModel(BlackBox):
         fixed = np.hstack([self.C[is_read], np.zeros((int(is_read.sum()), n_v))])
         return constrained_lstsq(rows, right, fixed, (y - self.y0)[is_read])[: self.n_x]
 
-    def rollout(self, x0: ArrayLike, u: ArrayLike, d: ArrayLike, p: ArrayLike, dt: float) -> Run:
-        """Simulate a batch, so many rows at a time that their states have :data:`_STATES_AT_ONCE` numbers."""
-        x_end, u, d = (np.asarray(value, dtype=float) for value in (x0, u, d))
-        rows = max(1, _STATES_AT_ONCE // max(1, x_end.size))
-        y = np.empty((len(x_end), u.shape[1] + 1, len(self.outputs)))
-        y[:, 0] = x_end @ self.C.T + self.y0
-        for begin in range(0, u.shape[1], rows):
-            block = slice(begin, begin + rows)
-            x = self.states(x_end, u[:, block], d[:, block], dt)
-            y[:, begin : begin + x.shape[1]] = x @ self.C.T + self.y0
-            x_end = x[:, -1]
-        return y, x_end
-
-    def states(self, x0: ArrayLike, u: ArrayLike, d: ArrayLike, dt: float) -> Array:
-        """Return the states (n_batch, N + 1, n_x) of :meth:`rollout`."""
+    def states(self, x0: Array, u: Array, d: Array, times: int = 1) -> Array:
+        """Return the states (B, N + 1, n_x) of :meth:`rollout`, ``times`` steps with each row."""
         from thermogrip.sysid.models.recurrences import run_linear  # pulls in numba
 
-        x0, u, d = (np.ascontiguousarray(value, dtype=float) for value in (x0, u, d))
-        times = max(1, round(dt / self.dt))  # the step of a gap may differ a little from the model's
         on = np.ascontiguousarray(u[:, :, [self.inputs.index(name) for name in self.A_switch]])
-        A = np.stack([self.A, *self.A_switch.values()])
-        return np.asarray(run_linear(A, on, np.ascontiguousarray(self.push(u, d)), x0, times))
+        A, push = np.stack([self.A, *self.A_switch.values()]), np.ascontiguousarray(self.push(u, d))
+        return np.asarray(run_linear(A, on, push, np.ascontiguousarray(x0), times))
 
     @staticmethod
     def others(data: Mapping[str, Any]) -> dict[str, Any]:

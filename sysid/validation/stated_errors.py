@@ -261,7 +261,6 @@ def effect_of_run(plant: Plant, error: Array, log: Log) -> InputEffect | None:
 
 
 MOST_DISAGREEMENT = 0.4  # of the output's spread in the data of the fit
-_STATES_AT_ONCE = 1_000_000  # numbers, 8 MB
 
 
 def ensemble_disagreement(plant: Plant, log: Log, *, warmup: float = 5.0) -> dict[str, float]:
@@ -272,19 +271,13 @@ def ensemble_disagreement(plant: Plant, log: Log, *, warmup: float = 5.0) -> dic
     # members agree where the data constrain them, and their mean errs by about as much as they differ; that
     # depends on the drives alone, so that a run is refused before its readings are used
     stretches, n_y = cut_stretches(plant, log), len(model.outputs)
-    rows = max(1, _STATES_AT_ONCE // model.n_x)
     variance, count = np.zeros(n_y), 0
     for stretch, start in zip(stretches, find_starts(plant, plant.p, stretches, warmup)):
-        x_end = start.x0
-        for begin in range(0, len(stretch.u), rows):
-            rows_at_once = slice(begin, begin + rows)
-            x = model.states(
-                x_end, stretch.u[rows_at_once], stretch.d[rows_at_once] - start.d_offset, plant.dt
-            )
-            fresh = x if begin == 0 else x[1:]
-            members = fresh.reshape(len(fresh), *model.A.shape[:2])[:, :, :n_y]
+        d = stretch.d - start.d_offset
+        for (x,) in model.state_blocks(start.x0[None], stretch.u[None], d[None], plant.dt):
+            members = x.reshape(len(x), *model.A.shape[:2])[:, :, :n_y]
             variance += members.var(axis=1).sum(axis=0)
-            count, x_end = count + len(fresh), x[-1]
+            count += len(x)
     return dict(zip(model.outputs, np.sqrt(variance / count).tolist()))
 
 

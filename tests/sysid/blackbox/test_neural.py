@@ -101,10 +101,10 @@ def test_the_inputs_run_in_reverse_order_and_the_quarter_that_fits_worst_is_left
     gains = [constant(0, gain=g) for g in (0.0, 1.0, 0.1, 0.2)]
     assert neural._nearest_to_median(w, gains, 1).tolist() == [0, 2, 3]
     monkeypatch.setattr(neural, "_as_model", lambda grid, data, members, h: [m.weights[1] for m in members])
-    monkeypatch.setattr(neural, "_with_spread", lambda model, grid, starts: (model, starts.shape))
+    monkeypatch.setattr(neural, "with_spread", lambda model, grid, starts: (model, np.shape(starts)))
     misses = (0.5, 0.1, 0.9, 0.2, 0.3)  # of five four fit; of four three agree
     members = [constant(v, m) for v, m in zip((1.0, 9.0, 1.5, 1.2, 1.1), misses)]
-    assert neural._averaged(None, w, members) == ([1.0, 1.2, 1.1], (3, 1, 1))
+    assert neural._averaged(None, w, members) == ([1.0, 1.2, 1.1], (1, 3))
 
 
 def test_a_linear_record_keeps_its_linear_fit_and_random_weights_are_drawn_to_zero():
@@ -185,7 +185,7 @@ def test_members_of_two_sizes_are_one_model_in_the_units_of_the_readings():
     model = neural._averaged(grid, data, members)
     assert (model.A.shape, model.V.shape, model.U.shape) == ((2, 3, 3), (2, 3, 3), (2, 3, 3))
     x0, drive = np.concatenate([some.padded(3, 3).x0[0] for some in members]), u[0]
-    rows = model.states(x0, drive[:, :2], drive[:, 2:], 1.0)
+    (rows,) = model.states(x0[None], drive[None, :, :2], drive[None, :, 2:])
     spread = np.cov(rows.T)
     np.testing.assert_allclose(model.spread, spread + 1e-8 * np.trace(spread) * np.eye(6), rtol=1e-12)
     n, h = sizes[0]

@@ -82,7 +82,7 @@ def test_rollout_is_step_and_casadi_runs_the_same_lines(grid, fit_one):
 
 
 def test_equations_that_diverge_are_infinite_not_wrong_and_no_model(grid):
-    runaway = SindyModel(("q",), (), ("t",), (), 1.0, 1, [[0, 0], [2, 0]], [[0.0, 1.0]], [20.0], [30.0])
+    runaway = SindyModel(("q",), (), ("t",), 1.0, (), 1, [[0, 0], [2, 0]], [[0.0, 1.0]], [20.0], [30.0])
     y, _ = runaway.rollout([[25.0], [0.5]], np.zeros((1, 50, 1)), np.zeros((1, 50, 0)), (), 1.0)
     assert np.isinf(y[0, -1])
     assert np.isfinite(y[1]).all()  # each member of the batch for itself

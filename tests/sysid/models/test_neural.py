@@ -59,19 +59,6 @@ def test_slopes_are_finite_differences_of_the_run():
     np.testing.assert_allclose(np.moveaxis((runs[: len(z)] - runs[len(z) :]) / 2e-6, 0, 2), slopes, atol=1e-7)
 
 
-def test_runs_of_a_batch_that_have_come_together_are_those_of_their_members(tank):
-    rng, rows = np.random.default_rng(12), 800
-    u = rng.uniform(0.2, 1.3, (rows, 1))
-    x0 = rng.normal(size=(3, tank.n_x))
-    x0[2] = x0[0] + 1e-9
-    y, x_end = tank.rollout(x0, u[None], np.zeros((1, rows, 0)), (), 1.0)
-    for k in range(3):
-        states = tank.states(x0[k], u, np.zeros((rows, 0)), 1.0)
-        seen = states.reshape(rows + 1, *tank.A.shape[:2])[:, :, :1].mean(axis=1)
-        np.testing.assert_allclose(y[k], tank.y_middle + tank.y_size * seen, rtol=0, atol=1e-11)
-        np.testing.assert_allclose(x_end[k], states[-1], rtol=0, atol=1e-11)
-
-
 def test_what_bends_the_plant_is_learnt_and_a_linear_model_misses_it(tank, fit_one):
     fresh = tank_log(seed=1)
     grid = make_grid([tank_log()], average=1.0)
@@ -127,8 +114,8 @@ def _wild(seed):
         ("q",),
         (),
         ("level",),
-        (),
         1.0,
+        (),
         A=A,
         **some,
         y_middle=[5.0],

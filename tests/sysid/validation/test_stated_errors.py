@@ -250,7 +250,7 @@ def test_the_band_of_a_fit_to_means_covers_readings(heater, schedule):
 def pair(bend: float, *, size: float = 2.0) -> Plant:
     """Two members of one block; one is pushed by ``bend`` spreads at large drives."""
     model = NeuralModel(
-        ("q",), (), ("t",), (), 1.0,
+        ("q",), (), ("t",), 1.0, (),
         A=[[[0.9]]] * 2, B=[[[0.1]]] * 2, c=[[0.0]] * 2,
         V=[[[0.0]], [[0.1 * bend]]], W=[[[0.0]]] * 2, U=[[[1.0]]] * 2, b=[[0.0]] * 2,
         y_middle=[30.0], y_size=[size], w_middle=[0.0], w_size=[1.0], reach=[9.0],
@@ -285,7 +285,7 @@ def test_the_share_is_an_rms_over_the_log_at_the_models_own_pace():
 
 def test_a_disturbance_is_read_less_its_offset():
     model = NeuralModel(
-        ("q",), ("room",), ("t",), (), 1.0,
+        ("q",), ("room",), ("t",), 1.0, (),
         A=[[[0.9]]] * 2, B=[[[0.1, 0.0]]] * 2, c=[[0.0]] * 2,
         V=[[[0.0]], [[0.1]]], W=[[[0.0]]] * 2, U=[[[0.0, 1.0]]] * 2, b=[[0.0]] * 2,
         y_middle=[30.0], y_size=[2.0], w_middle=[0.0, 20.0], w_size=[1.0, 1.0], reach=[9.0, 9.0],
