@@ -24,8 +24,7 @@ from thermogrip.sysid.blackbox.order_selection import (
     drives,
     with_spread,
 )
-from thermogrip.sysid.models.lti import first_readings
-from thermogrip.sysid.models.state_space import StateSpaceModel
+from thermogrip.sysid.models.state_space import StateSpaceModel, first_readings
 from thermogrip.sysid.plant.log_grid import Grid
 
 

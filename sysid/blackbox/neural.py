@@ -24,7 +24,7 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.linalg.blas import dsyrk
 
 from thermogrip.datasets.arrays import Array
-from thermogrip.sysid.blackbox.order_selection import Structure, with_spread
+from thermogrip.sysid.blackbox.order_selection import StartPrior, Structure, estimate_starts, with_spread
 from thermogrip.sysid.blackbox.subspace import subspace_family
 from thermogrip.sysid.models.neural import NeuralModel
 from thermogrip.sysid.models.state_space import StateSpaceModel
@@ -175,7 +175,9 @@ def _linear_starts(grid: Grid, data: _Data, orders: Sequence[int]) -> dict[int, 
 
 def _head_start(model: StateSpaceModel, y: Array, u: Array, d: Array) -> Array:
     head = slice(0, max(3, min(50, len(y) // 4)))
-    return model.start(y[head], u[head], d[head])
+    scale = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", model.C, model.spread, model.C), 1e-12))
+    rows = y[head], u[head], d[head]
+    return np.asarray(estimate_starts(model, *rows, dt=model.dt, scale=scale, priors=[StartPrior()])[0][0])
 
 
 def _outputs_first(grid: Grid, data: _Data, model: StateSpaceModel) -> _Linear:

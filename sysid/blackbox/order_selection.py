@@ -24,10 +24,14 @@ import numpy as np
 
 from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.errors import UserError
-from thermogrip.sysid.models.lti import StartPrior, estimate_starts, evaluate_terms
 from thermogrip.sysid.models.model import BlackBox
 from thermogrip.sysid.models.model import Model as PlantModel
-from thermogrip.sysid.models.state_space import StateSpaceModel
+from thermogrip.sysid.models.state_space import (
+    StateSpaceModel,
+    evaluate_terms,
+    first_readings,
+    symmetric_root,
+)
 from thermogrip.sysid.plant.fit_record import HELD_OUT_SHARE, SEVERAL, TAIL
 from thermogrip.sysid.plant.log_grid import MOVED, Grid, Segment
 
@@ -158,6 +162,49 @@ def _last_parts(grid: Grid) -> Fold:
             training += [segment.part(0, cut)] if cut >= FEWEST_HELD_OUT_ROWS else []
             runs += [Run(segment, cut)] if cut < len(segment.time) else []
     return Fold(f"{TAIL}{' and '.join(grid.logs)}", grid.having(training), tuple(runs))
+
+
+@dataclass(frozen=True)
+class StartPrior:
+    """Noise of a reading and spread of a sensor's offset, in units of the output's standard deviation."""
+
+    noise: float = 0.1  # r, per row of the warm-up
+    nuisance: float = 0.0  # q; 0 means that sensors have no offset of their own
+    memory: float = np.inf  # [s] in which an offset falls to 1/e
+
+
+def estimate_starts(
+    model: Model, y: Array, u: Array, d: Array, *, dt: float, scale: Array, priors: Sequence[StartPrior]
+) -> tuple[Array, Array]:
+    """Return the start and the sensors' offsets for each prior."""
+    # With x0 = x_rest + s, s ~ N(0, P), offsets o ~ N(0, q^2) that are constant over the log and white
+    # reading noise r, the readings of the warm-up are linear in (s, o), so their posterior mean is a ridge
+    # regression.  P comes from the data of the fit; (r, q) share a first error between state and sensor, and
+    # cannot be read off one-step errors.
+    n_y = y.shape[1]
+    x_rest = model.rest(first_readings(y), u.mean(axis=0), d.mean(axis=0), ())
+    is_read = np.isfinite(y)
+    if not is_read.any():
+        return np.tile(x_rest, (len(priors), 1)), np.zeros((len(priors), n_y))
+    root = symmetric_root(model.spread)
+    runs = model.rollout(np.vstack([x_rest, x_rest + root.T]), u[None], d[None], (), dt)[0][:, :-1]
+    if not np.isfinite(runs).all():  # equations that diverge within the warm-up
+        return np.tile(x_rest, (len(priors), 1)), np.zeros((len(priors), n_y))
+    weight = np.broadcast_to(1 / scale, y.shape)[is_read]
+    by_state = (runs[1:] - runs[0])[:, is_read].T * weight[:, None]
+    by_offset = np.broadcast_to(np.eye(n_y), (len(y), n_y, n_y))[is_read] * (scale * weight[:, None])
+    miss = (y - runs[0])[is_read] * weight
+    r, q = (np.array([getattr(prior, name) for prior in priors]) for name in ("noise", "nuisance"))
+    n, n_s = len(miss), root.shape[1]
+    # the prior as rows of their own: squares of a nearly unstable model's slopes would swamp it
+    rows = np.zeros((len(priors), n + n_s + n_y, n_s + n_y))
+    rows[:, :n, :n_s] = by_state / r[:, None, None]
+    rows[:, :n, n_s:] = by_offset * (q / r)[:, None, None]
+    rows[:, n:] = np.eye(n_s + n_y)
+    orthogonal, triangle = np.linalg.qr(rows)
+    right = np.einsum("bnk,n->bk", orthogonal[:, :n], miss) / r[:, None]
+    z = np.linalg.solve(triangle, right[:, :, None])[:, :, 0]
+    return x_rest + z[:, :n_s] @ root.T, q[:, None] * scale * z[:, n_s:]
 
 
 def priors_of(grid: Grid) -> tuple[StartPrior, ...]:
@@ -371,8 +418,8 @@ def with_spread(model: _Fitted, grid: Grid, starts: Sequence[Array]) -> _Fitted:
     """Return the model with the covariance of its state over the training data."""
     rows = [model.states(x0[None], s.u[None], s.d[None])[0] for x0, s in zip(starts, grid.segments)]
     x = np.concatenate(rows)
-    more: dict[str, Any] = {"spread": state_spread(x)} if np.isfinite(x).all() else {}
-    return replace(model, **more)
+    more: dict[str, Any] = {"spread": state_spread(x)}
+    return replace(model, **more) if np.isfinite(x).all() else model
 
 
 def state_spread(x: Array) -> Array:

@@ -26,8 +26,8 @@ from numpy.typing import NDArray
 
 from thermogrip.datasets.arrays import Array
 from thermogrip.sysid.blackbox.order_selection import Structure, state_spread
-from thermogrip.sysid.models.lti import first_readings
 from thermogrip.sysid.models.polynomial import SindyModel
+from thermogrip.sysid.models.state_space import first_readings
 from thermogrip.sysid.plant.log_grid import Grid, whole_readings
 
 

@@ -16,9 +16,9 @@ import numpy as np
 from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.errors import UserError
 from thermogrip.sysid.greybox.problem import prior_plant
-from thermogrip.sysid.models.lti import symmetric_root
 from thermogrip.sysid.models.model import GreyModel
 from thermogrip.sysid.models.network import NetworkModel
+from thermogrip.sysid.models.state_space import symmetric_root
 from thermogrip.sysid.plant.plant import Plant
 
 DIFFERENCE_STEP = 1e-3  # of a parameter's sd

@@ -24,8 +24,8 @@ from scipy.signal import lfilter
 from thermogrip.datasets.arrays import Array
 from thermogrip.sysid.greybox.noise_model import Block, LogData
 from thermogrip.sysid.greybox.problem import Problem, start_seconds
-from thermogrip.sysid.models.lti import symmetric_root
 from thermogrip.sysid.models.model import Model
+from thermogrip.sysid.models.state_space import symmetric_root
 from thermogrip.sysid.plant.simulation import READING_EVERY, Start, predict
 
 Parts = list[list[list[Array]]]  # by log, stretch and output

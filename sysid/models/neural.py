@@ -26,8 +26,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from thermogrip.datasets.arrays import Array, Values
-from thermogrip.sysid.models.lti import dot, join_columns, whole_steps
 from thermogrip.sysid.models.model import BlackBox
+from thermogrip.sysid.models.state_space import dot, join_columns, whole_steps
 
 _RAILS = ("low", "high")
 

@@ -18,8 +18,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from thermogrip.datasets.arrays import Array, Values
 from thermogrip.datasets.limits import array_within, number_within
-from thermogrip.sysid.models.lti import join_columns, whole_steps
 from thermogrip.sysid.models.model import BlackBox
+from thermogrip.sysid.models.state_space import join_columns, whole_steps
 
 BOUND = 10.0  # spreads beyond the range of the data: a simulation that leaves it has diverged
 _MOST_DEGREE, _MOST_MEMORY = 20, 1000

@@ -10,7 +10,7 @@ disturbances (``"drive*|drive|"``); with ``A_s`` a switch such as the pump chang
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -18,18 +18,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from thermogrip.datasets.arrays import Array, Values
+from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.limits import array_within
-from thermogrip.sysid.models.lti import (
-    StartPrior,
-    constrained_lstsq,
-    dot,
-    estimate_starts,
-    evaluate_terms,
-    join_columns,
-    products,
-    read_terms,
-    whole_steps,
-)
 from thermogrip.sysid.models.model import BlackBox
 
 
@@ -153,17 +143,6 @@ class StateSpaceModel(BlackBox):
 
     # ---- what only a linear model can do ----
 
-    def start(self, y: ArrayLike, u: ArrayLike, d: ArrayLike, noise: ArrayLike | None = None) -> Array:
-        """Estimate the state (n_x,) at the first row from the readings of a warm-up."""
-        if noise is None:
-            noise = 0.1 * np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", self.C, self.spread, self.C), 1e-12))
-        rows = [np.asarray(value, dtype=float) for value in (y, u, d)]
-        # x0 = x_rest + s, s ~ N(0, P): the readings are linear in s and the estimate is a ridge regression; P
-        # is the state's covariance in the fit
-        prior = [StartPrior(noise=1.0, nuisance=0.0)]
-        sd = np.asarray(noise, dtype=float)
-        return np.asarray(estimate_starts(self, *rows, dt=self.dt, scale=sd, priors=prior)[0][0])
-
     def push(self, u: Array, d: Array) -> Array:
         """Return B u + E d + F phi(u, d) + c for rows of inputs, shape (..., n_x)."""
         out = u @ self.B.T + d @ self.E.T + self.c
@@ -216,3 +195,79 @@ def _shaped(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
     if not np.all(np.isfinite(array)):
         raise ValueError(f"{name} is not finite everywhere")
     return array
+
+
+def products(terms: Sequence[str], names: Sequence[str], signals: Sequence[Any]) -> list[Any]:
+    """Return the products ``terms`` of the signals ``names`` (numbers, columns or symbols)."""
+    out = []
+    for factors in read_terms(terms, names):
+        value: Any = 1.0
+        for index, magnitude in factors:
+            value = value * (abs(signals[index]) if magnitude else signals[index])
+        out.append(value)
+    return out
+
+
+def evaluate_terms(terms: Sequence[str], names: Sequence[str], rows: Array) -> Array:
+    """Return the products ``terms`` of the columns ``names``."""
+    columns = products(terms, names, list(np.moveaxis(rows, -1, 0)))
+    return np.stack(columns, axis=-1) if columns else np.ones((*rows.shape[:-1], 0))
+
+
+def constrained_lstsq(rows: Array, right: Array, fixed: Array, value: Array) -> Array:
+    """Return the z of least |rows z - right| with fixed z = value (least squares where that conflicts)."""
+    z, *_ = np.linalg.lstsq(fixed, value, rcond=None) if len(value) else (np.zeros(rows.shape[1]),)
+    _, sizes, vh = np.linalg.svd(fixed)
+    rank = int(np.sum(sizes > 1e-10 * max(1e-300, float(sizes.max(initial=0.0)))))
+    free = vh[rank:].T
+    move, *_ = np.linalg.lstsq(rows @ free, right - rows @ z, rcond=None)
+    return np.asarray(z + free @ move)
+
+
+def symmetric_root(covariance: Array) -> Array:
+    """Return R with R R' = covariance, one column an axis; a variance lost to rounding is 0."""
+    size, axes = np.linalg.eigh(covariance)
+    return np.asarray(axes * np.sqrt(np.maximum(size, 0.0)))
+
+
+def read_terms(terms: Sequence[str], names: Sequence[str]) -> list[list[tuple[int, bool]]]:
+    """Read each term as a list of (column, whether its magnitude is meant)."""
+    out = []
+    for term in terms:
+        words = term.split("*")
+        bare = [word.strip("|") for word in words]
+        unknown = [word for word in bare if word not in names]
+        if unknown:
+            raise ValueError(f"term {term!r} names {unknown[0]!r}, which is not among {', '.join(names)}")
+        out.append([(list(names).index(name), word.startswith("|")) for name, word in zip(bare, words)])
+    return out
+
+
+def join_columns(u: Array, d: Array) -> Array:
+    """Return u and d side by side in the last axis, batches broadcast against each other."""
+    shape = np.broadcast_shapes(u.shape[:-1], d.shape[:-1])
+    return np.concatenate(
+        [np.broadcast_to(columns, (*shape, columns.shape[-1])) for columns in (u, d)], axis=-1
+    )
+
+
+def whole_steps(dt: float, own: float) -> int:
+    """Return ``dt`` [s] in steps of ``own``, or refuse it."""
+    times = round(dt / own)
+    if times < 1 or abs(times * own - dt) > 1e-6 * dt:
+        problem = f"{dt:g} s is no whole multiple of the plant's step"
+        raise UserError(problem, hint=f"take a multiple of {own:g} s")
+    return times
+
+
+def dot(row: Array, values: Values) -> Any:
+    """Return the dot product without the zero entries, so that symbolic graphs stay small."""
+    total: Any = 0.0
+    for i in np.flatnonzero(row):
+        total = total + float(row[i]) * values[int(i)]
+    return total
+
+
+def first_readings(y: Array) -> Array:
+    """Return the first reading (n_y,) of each output of y (n, n_y), NaN where it has none."""
+    return np.asarray(y[np.argmax(np.isfinite(y), axis=0), np.arange(y.shape[1])])

@@ -27,8 +27,8 @@ from thermogrip.datasets.errors import UserError, reading
 from thermogrip.datasets.files import atomic_path, read_json
 from thermogrip.datasets.limits import LARGEST, MOST_NUMBER, STEP_RANGE, array_within, number_within
 from thermogrip.datasets.roles import is_room_temperature
-from thermogrip.sysid.models.lti import symmetric_root
 from thermogrip.sysid.models.model import Model
+from thermogrip.sysid.models.state_space import symmetric_root
 from thermogrip.sysid.plant.fit_record import FitLog, PlantScores
 
 

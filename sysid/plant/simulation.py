@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from thermogrip.datasets.arrays import Array
-from thermogrip.sysid.models.lti import symmetric_root
+from thermogrip.sysid.models.state_space import symmetric_root
 from thermogrip.sysid.plant.log_grid import Stretch
 
 if TYPE_CHECKING:

@@ -29,7 +29,7 @@ from scipy.signal import lfilter
 from scipy.special import chdtrc
 
 from thermogrip.datasets.arrays import Array, Mask
-from thermogrip.sysid.models.lti import symmetric_root
+from thermogrip.sysid.models.state_space import symmetric_root
 from thermogrip.sysid.plant.log_grid import Stretch, at_rows
 from thermogrip.sysid.plant.simulation import find_starts
 

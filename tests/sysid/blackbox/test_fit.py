@@ -15,8 +15,7 @@ from thermogrip.datasets.schema import make_log
 from thermogrip.sysid import Plant, identify
 from thermogrip.sysid.blackbox import fit as fitting
 from thermogrip.sysid.blackbox.fit import BlackBoxFit, family_of, fit_black_box, with_refits
-from thermogrip.sysid.blackbox.order_selection import Choice, Fold, Structure
-from thermogrip.sysid.models.lti import StartPrior
+from thermogrip.sysid.blackbox.order_selection import Choice, Fold, StartPrior, Structure
 from thermogrip.sysid.plant import log_grid
 from thermogrip.sysid.plant.log_grid import Grid, Segment, make_grid
 from thermogrip.sysid.validation.stated_errors import free_run_band

@@ -7,8 +7,7 @@ import pytest
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.sysid.blackbox import order_selection as selection
-from thermogrip.sysid.blackbox.order_selection import Choice, Run, Structure
-from thermogrip.sysid.models.lti import StartPrior
+from thermogrip.sysid.blackbox.order_selection import Choice, Run, StartPrior, Structure
 from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.log_grid import Grid, Segment
 

@@ -9,7 +9,7 @@ import pytest
 from scipy.signal import lfilter
 
 from thermogrip.datasets.schema import make_log
-from thermogrip.sysid.blackbox.order_selection import choose, drives
+from thermogrip.sysid.blackbox.order_selection import StartPrior, choose, drives, estimate_starts
 from thermogrip.sysid.blackbox.output_error import (
     Records,
     Search,
@@ -136,7 +136,8 @@ def test_a_search_over_many_structures_ends_no_worse_than_one_from_all_starts(fi
         alone = fit_one("oe", grid, poles=orders[0], zeros=orders[1], delays=orders[2])
         errors = []
         for model in (shared, alone):
-            run, _ = model.rollout(model.start(y, u, d)[None], u[None], d[None], (), grid.dt)
+            x0, _ = estimate_starts(model, y, u, d, dt=1.0, scale=np.std(y, axis=0), priors=[StartPrior()])
+            run, _ = model.rollout(x0, u[None], d[None], (), grid.dt)
             errors.append(np.mean((run[0, :-1] - y) ** 2))
         assert errors[0] <= 1.002 * errors[1]
 

@@ -10,10 +10,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from thermogrip.datasets.errors import UserError
-from thermogrip.sysid.models.lti import (
-    StartPrior,
+from thermogrip.sysid.blackbox.order_selection import StartPrior, estimate_starts
+from thermogrip.sysid.models.state_space import (
+    StateSpaceModel,
     constrained_lstsq,
-    estimate_starts,
     evaluate_terms,
     join_columns,
     products,
@@ -21,7 +21,6 @@ from thermogrip.sysid.models.lti import (
     symmetric_root,
     whole_steps,
 )
-from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.linearise import linearise_plant
 from thermogrip.sysid.plant.plant import Plant
 

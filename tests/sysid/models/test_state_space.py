@@ -134,14 +134,6 @@ def test_rest_goes_by_no_scale_of_the_states_and_shares_what_is_missing_by_slope
     np.testing.assert_allclose(model.rest([104.0], [2.0, 3.0], [], ()), [100.0, 6.0, 4.0], rtol=1e-4)
 
 
-def test_a_start_without_noise_has_a_tenth_of_the_spread_of_the_outputs():
-    model = replace(block(), spread=np.diag([4.0, 1.0, 2.0, 3.0]))
-    u, d, y = np.full((6, 1), 0.3), np.full((6, 1), 25.0), np.linspace(30.0, 27.0, 6)[:, None]
-    plain = model.start(y, u, d)
-    np.testing.assert_allclose(plain, model.start(y, u, d, noise=[0.2]), rtol=1e-12)
-    assert np.abs(plain - model.start(y, u, d, noise=[0.4])).max() > 1e-3
-
-
 def test_a_step_that_is_nearly_a_multiple_is_one():
     model = StateSpaceModel(("q",), (), ("t",), A=[[0.0]], B=[[1.0]], C=[[1.0]], dt=2.0)
     y, end = model.rollout([[5.0]], np.array([1.0, 4.0])[None, :, None], np.zeros((1, 2, 0)), (), 2.3)
@@ -172,17 +164,6 @@ def test_the_gain_is_of_the_matrices_as_they_stand():
     assert (model.origin, model.spread.tolist(), model.E.shape, model.c.tolist()) == (
         "statespace", np.eye(2).tolist(), (2, 0), [0.0, 0.0]
     )  # fmt: skip
-
-
-def test_start_finds_the_state_of_a_moving_plant_and_ignores_lost_samples():
-    model = block()
-    rng = np.random.default_rng(3)
-    u, d = (rng.random((40, 1)) > 0.5).astype(float), np.full((40, 1), 25.0)
-    x0 = np.array([33.0, 1.0, 0.0, 1.0])
-    y, _ = model.rollout(x0[None], u[None], d[None], (), 10.0)
-    y = y[0, :-1] + 0.001 * rng.standard_normal((40, 1))
-    y[5::3] = np.nan
-    np.testing.assert_allclose(model.start(y, u, d, noise=[0.001]), x0, atol=0.02)
 
 
 def test_poles_gain_and_time_constants_are_those_of_the_block():
