@@ -191,16 +191,16 @@ def find_modes(
     dof = np.full(u.shape, np.inf) if prior.dof is None else prior.dof
     w_matrix, log_det = whitener
     pairs = pairs_asked(stack, nodes_for(data), data, row, beyond)
-    law = Law.of(prior.mean, prior.sd, dof)
-    ended = search(pairs, w_matrix, law, prior.sd, u, rivals=rivals)
-    inverse, log_det_curvature = curvature(ended.matrix, law.penalty(ended.u).own)
+    heavy = vary & np.isfinite(dof)
+    law = Law(prior.mean, prior.sd, np.where(heavy, 1.0 / dof, 0.0))
+    ended = search(pairs, w_matrix, law, u, rivals=rivals)
+    inverse, log_det_curvature = curvature(ended.matrix, ended.own)
     covariance = inverse * (prior.sd[:, :, None] * prior.sd[:, None, :])
     # b and T_obj enter f linearly, so for them this is exact; the others are nearly Gaussian given them
     objective = ended.cost + log_det_curvature
     # a nuisance whose spread was learnt from few grasps has Student's t as its prior: the sum of (nu + 1)
     # ln(1 + w^2 / nu) replaces its w^2, the density's own curvature its 1 in A, and ln Z gains the ratio of
     # the peaks of Student's densities over the normal ones' of the same scale
-    heavy = vary & np.isfinite(dof)
     nu = np.where(heavy, dof, 1.0)
     ratio = gammaln(0.5 * (nu + 1)) - gammaln(0.5 * nu) - 0.5 * np.log(0.5 * nu)
     # ln Z = -1/2 objective - 1/2 ln det A - 1/2 ln det(2 pi C)

@@ -3,13 +3,12 @@
 
 Each pair takes damped Gauss-Newton steps on the responses of :mod:`thermogrip.sysid.contact.time_stepping`
 until the next one would gain less than 0.005 nat; that last step is taken on the quadratic model alone, and
-its predicted decrease counted.  What costs is compiled, in functions that call no other; the rest is
-NumPy's, for some hundred pairs at once, whose arrays stay in the processor's cache.
+its predicted decrease counted.  What costs is compiled: of one grasp some ten pairs take a step at once, and
+NumPy's hundred calls a step cost more than their arithmetic.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,8 +19,7 @@ from thermogrip.datasets.compiled import numba
 from thermogrip.sysid.contact.time_stepping import COMPILED, N_STEPPED, VALUE, Gripper, contacts
 
 
-@dataclass(frozen=True)
-class SearchSettings:
+class SearchSettings(NamedTuple):  # which kernels take
     """How the search for a mode steps, and when it ends."""
 
     pairs_at_once: int = 1024  # whose arrays stay in the processor's cache
@@ -32,6 +30,7 @@ class SearchSettings:
     unexplained_times: float = 3.0
     bent: float = 1.5  # times the quadratic model's curvature, from which on steps are shorter
     far_bent: float = 4.0  # and from which on they are damped
+    first_damping: float = 1e-3
     no_damping: float = 1e-3  # a damping that counts as none
     stale_K: float = 0.01  # that a temperature may move for slopes by the rest to stay
     least_decrease: float = 0.01  # of -2 ln posterior: smaller predicted decreases end the search
@@ -278,152 +277,98 @@ def squares(whitener: Array, row: NDArray[np.int64], columns: Array) -> Array:
     return np.asarray(np.matmul(white, white.copy().transpose(0, 2, 1)))
 
 
-class Penalty(NamedTuple):
-    """The prior's -2 ln density relative to its peak (n,), and by u / sd its halved slopes and curvatures."""
+@numba.njit(**COMPILED)  # type: ignore[untyped-decorator]
+def penalty(w: float, per_dof: float) -> tuple[float, float, float, float]:
+    """Return a prior's -2 ln density relative to its peak at ``w`` sds, half its slope there, what bounds its
+    curvature from above, so that a step on it cannot overshoot, and the curvature, kept from turning negative
+    far out in the tail: of Student's t, of a normal law where ``per_dof`` (1 / degrees of freedom) is 0."""
+    if per_dof == 0.0:
+        return w * w, w, 1.0, 1.0
+    beyond = w * w * per_dof
+    bound = (1.0 + per_dof) / (1.0 + beyond)
+    value = np.log1p(beyond) * (1.0 + per_dof) / per_dof
+    return value, w * bound, bound, max(bound * (1.0 - beyond) / (1.0 + beyond), 1e-3)
 
-    value: Array
-    slope: Array
-    bound: Array  # positive, bounds the curvature from above, so that a step on it cannot overshoot
-    own: Array  # the curvature, kept from turning negative far out in the tail
+
+@numba.njit(**COMPILED)  # type: ignore[untyped-decorator]
+def solve(matrix: Array, right: Array, lower: Array, out: Array) -> float:
+    """Fill ``out`` (m,) with the solution of a positive definite system and return its product with the
+    ``right`` side; ``lower`` (m, m) is room for L and D of L D L'."""
+    m = lower.shape[0]
+    for i in range(m):
+        out[i] = right[i]
+        for j in range(i + 1):
+            total = matrix[i, j]
+            for k in range(j):
+                total -= lower[i, k] * lower[j, k] * lower[k, k]
+            lower[i, j] = total if i == j else total / lower[j, j]
+        for k in range(i):
+            out[i] -= lower[i, k] * out[k]
+    for i in range(m - 1, -1, -1):
+        out[i] /= lower[i, i]
+        for k in range(i + 1, m):
+            out[i] -= lower[k, i] * out[k]
+    product = 0.0
+    for i in range(m):
+        product += out[i] * right[i]
+    return product
 
 
 class Law(NamedTuple):
-    """A prior as the search takes it: mean, 1 / sd, 0 where that is zero, and 1 / degrees of freedom, 0 where
-    these are infinite, (n, 7) each; whether some are not."""
+    """Priors of n pairs, (n, 7) each: mean, sd and 1 / degrees of freedom, 0 where these are infinite."""
 
     mean: Array
-    per_sd: Array
-    per_dof: Array
-    heavy: bool
-
-    @classmethod
-    def of(cls, mean: Array, sd: Array, dof: Array) -> Law:
-        """Return the law of means, sds and degrees of freedom."""
-        vary = sd > 0.0
-        per_dof = np.where(vary, 1.0 / dof, 0.0)
-        return cls(mean, vary / np.where(vary, sd, 1.0), per_dof, bool(per_dof.any()))
-
-    def take(self, index: Any) -> Law:
-        """Return some of the pairs' laws."""
-        return Law(self.mean[index], self.per_sd[index], self.per_dof[index], self.heavy)
-
-    def penalty(self, u: Array) -> Penalty:
-        """Return the penalty of points ``u`` (n, 7)."""
-        w = (u - self.mean) * self.per_sd
-        square = w * w
-        if not self.heavy:
-            one = np.ones(u.shape)
-            return Penalty(square.sum(axis=1), w, one, one)
-        k = self.per_dof
-        tail_square = square * k
-        tail = 1.0 + tail_square
-        bound = (1.0 + k) / tail
-        curvature = np.maximum(bound * (1.0 - tail_square) / tail, 1e-3)
-        value = np.log1p(tail_square) * (1.0 + k) / np.maximum(k, 1e-300)
-        return Penalty(np.where(k > 0.0, value, square).sum(axis=1), w * bound, bound, curvature)
-
-
-class _Search(NamedTuple):
-    """Where pairs are on their way to the mode: what was the best point of each, and what to try next."""
-
-    at: NDArray[np.int64]  # which pairs
-    law: Law
     sd: Array
-    trial: Array
-    point: Array
-    cost: Array
-    matrix: Array
-    slope: Array
-    bound: Array
-    damping: Array
-    part: Array  # of the next steps
-    slope_gain: Array  # what the trial's step should gain by its slope, and lose by its bend
-    bend: Array
-    stale: Mask  # whether slopes at the best point are those of another temperature
-
-    def take(self, index: Any) -> _Search:
-        """Return some of the pairs."""
-        some: Any = (part.take(index) if isinstance(part, Law) else part[index] for part in self)
-        return _Search(*some)
+    per_dof: Array
 
 
-class Found(NamedTuple):
-    """Where a search ended: points, products and -2 ln posterior there, and where it settled."""
+class Search(NamedTuple):
+    """Where ``n`` pairs are on their way to the mode: the best point of each, and what to try next."""
 
-    u: Array
-    matrix: Array
-    cost: Array
-    settled: Mask
+    trial: Array  # (n, 7)
+    u: Array  # (n, 7), the best point
+    matrix: Array  # (n, 8, 8), products there
+    slope: Array  # (n, 7), of the prior there, as the next two
+    bound: Array  # (n, 7)
+    own: Array  # (n, 7)
+    cost: Array  # (n,), -2 ln posterior
+    ahead: Array  # (n,), what the next step should come to
+    damping: Array  # (n,)
+    part: Array  # (n,), of the next steps
+    slope_gain: Array  # (n,), what the trial's step should gain by its slope, and lose by its bend
+    bend: Array  # (n,)
+    stale: Mask  # (n,), whether slopes at the best point are those of another temperature
+    settled: Mask  # (n,)
+    going_on: Mask  # (n,)
 
 
-def search(pairs: Pairs, whitener: Any, law: Law, sd: Array, u: Array, *, rivals: bool) -> Found:
-    """Return where damped Gauss-Newton steps from ``u`` (n, 7) end, under priors of a ``law`` and of ``sd``
-    (n, 7): where the next step would gain less than 0.005 nat, which then counts as taken.
+def search(pairs: Pairs, whitener: Any, law: Law, start: Array, *, rivals: bool) -> Search:
+    """Return where damped Gauss-Newton steps from ``start`` (n, 7) end under priors of a ``law``: where the
+    next step would gain less than 0.005 nat, which then counts as taken.
 
     Where readings are not explained, they may bend along a step twice as much as their slopes say, so that
     whole steps go to and fro across the mode.  So what a step gains tells how much they bend along it, and
     where that is more than 1.5 times the quadratic model's the next step is as much shorter.  Where pairs of
     one row are ``rivals``, one that is hopeless beside the best of them is left there, unsettled.
     """
-    n, m = u.shape
-    diagonal, none = np.arange(m), np.full(n, np.inf)
-    ended = Found(u.copy(), np.empty((n, m + 1, m + 1)), none.copy(), np.zeros(n, dtype=bool))
-    ahead = none.copy()  # what the next step should come to
-    state = _Search(
-        at=np.arange(n), law=law, sd=sd, trial=u, point=u, cost=none, matrix=ended.matrix, slope=u, bound=u,
-        damping=np.full(n, 1e-2), part=none, slope_gain=none, bend=none, stale=ended.settled,
+    n, m = start.shape
+    state = Search(
+        trial=start.copy(), u=start.copy(), matrix=np.empty((n, m + 1, m + 1)), slope=np.empty((n, m)),
+        bound=np.empty((n, m)), own=np.empty((n, m)), cost=np.empty(n), ahead=np.empty(n),
+        damping=np.full(n, SEARCH.first_damping), part=np.empty(n), slope_gain=np.empty(n), bend=np.empty(n),
+        stale=np.zeros(n, dtype=bool), settled=np.zeros(n, dtype=bool), going_on=np.zeros(n, dtype=bool),
     )  # fmt: skip
+    # room, as loops: arrays made and copied whole in a kernel take four times as long to compile
+    at, room = np.arange(n), np.empty((2 * m + 6, m + 1))
     for step in range(SEARCH.most_steps + 1):
-        tried = products(pairs.take(state.at), whitener, state.trial, state.sd)
-        state = _search_moved(*_refitted(state, tried), step)
-        rhs, curved = state.matrix[:, :m, m] - state.slope, state.matrix[:, :m, :m].copy()
-        curved[:, diagonal, diagonal] += state.bound
-        last = np.linalg.solve(curved, rhs[:, :, None])[:, :, 0]
-        decrease = (last * rhs).sum(axis=1)
-        settled = (decrease < SEARCH.least_decrease) & ~state.stale
-        going_on = ~settled & (state.damping <= 1e9)
-        if step == SEARCH.most_steps:
-            settled[:], going_on[:] = False, False
+        tried = products(pairs.take(at), whitener, state.trial[at], law.sd[at])
+        advance(at, tried, law, state, room, step, SEARCH)
         if rivals:
-            ahead[state.at] = state.cost - decrease
-            going_on &= _hopeful(pairs, step, ahead)[state.at]
-        if not going_on.all():
-            done = ~going_on
-            finished = state.at[done]
-            last_move = np.where(settled[done, None], last[done] * state.sd[done], 0.0)
-            ended.u[finished] = state.point[done] + last_move
-            ended.cost[finished] = state.cost[done] - np.where(settled[done], decrease[done], 0.0)
-            ended.matrix[finished], ended.settled[finished] = state.matrix[done], settled[done]
-            if done.all():
-                break
-            state = state.take(going_on)
-            curved = curved[going_on]
-            rhs = rhs[going_on]
-            decrease = decrease[going_on]
-            last = last[going_on]
-        gain = decrease
-        damping_loss = np.zeros(1)
-        move = last
-        damped = state.damping > SEARCH.no_damping
-        if damped.any():
-            own_curvature = curved[:, diagonal, diagonal]
-            curved[:, diagonal, diagonal] = own_curvature * (1.0 + state.damping[:, None])
-            shorter = np.linalg.solve(curved, rhs[:, :, None])[:, :, 0]
-            damping_loss = np.where(damped, state.damping * (own_curvature * shorter**2).sum(axis=1), 0.0)
-            move = np.where(damped[:, None], shorter, move)
-            gain = np.where(damped, (shorter * rhs).sum(axis=1), gain)
-        move = move * state.sd
-        # no logarithm moves too far
-        step_share = np.minimum(
-            state.part, SEARCH.longest_step / np.maximum(np.abs(move[:, _CONTACT]).max(axis=1), 1e-300)
-        )
-        step_share = np.where(state.stale, 0.0, step_share)  # slopes anew before another step
-        state = state._replace(
-            trial=state.point + step_share[:, None] * move,
-            slope_gain=2.0 * step_share * gain,
-            bend=step_share * step_share * (gain - damping_loss),
-        )
-    return ended
+            state.going_on[at] &= _hopeful(pairs, step, state.ahead)[at]
+        at = at[state.going_on[at]]
+        if not at.size:
+            break
+    return state
 
 
 def _hopeful(pairs: Pairs, step: int, ahead: Array) -> Mask:
@@ -435,66 +380,121 @@ def _hopeful(pairs: Pairs, step: int, ahead: Array) -> Mask:
     return np.asarray(ahead < (best + limit + SEARCH.unexplained_times * np.maximum(best, 0.0))[pairs.row])
 
 
-def _refitted(here: _Search, there: Array) -> tuple[_Search, Array, Mask]:
-    """Return the trials and their products with level and T_obj, in which readings are linear, at their best:
-    these go along with a step in all else, which is larger without bending; and whether other slopes, which
-    go with the difference of object and skin, must be pairs for anew."""
-    law = here.law
-    trial = here.trial.copy()
-    lin = there[:, _LEVEL : _T + 1]
-    away = ((trial - law.mean) * law.per_sd)[:, _LEVEL : _T + 1]
-    a = lin[:, 0, _LEVEL] + 1.0
-    d = lin[:, 0, _T]
-    b = lin[:, 1, _T] + 1.0
-    g, h = lin[:, 0, -1] - away[:, 0], lin[:, 1, -1] - away[:, 1]
-    det, before = a * b - d * d, trial[:, _T] - trial[:, _LEVEL]
-    level, warmer = (b * g - d * h) / det, (a * h - d * g) / det
-    trial[:, _LEVEL] += level * here.sd[:, _LEVEL]
-    trial[:, _T] += warmer * here.sd[:, _T]
-    gone = level[:, None] * lin[:, 0] + warmer[:, None] * lin[:, 1]
-    there[:, -1, -1] += level * gone[:, _LEVEL] + warmer * gone[:, _T] - 2.0 * gone[:, -1]
-    there[:, :-1, -1] -= gone[:, :-1]
-    there[:, -1, :-1] = there[:, :-1, -1]
-    apart = np.abs(before) > 0.1
-    grown = (trial[:, _T] - trial[:, _LEVEL]) / np.where(apart, before, np.inf)
-    scale = np.empty(there.shape[:2])
-    scale[:] = np.where(apart, np.minimum(np.maximum(grown, 0.2), 5.0), 1.0)[:, None]
-    scale[:, _LEVEL : _T + 1] = scale[:, -1:] = 1.0
-    there *= scale[:, :, None]
-    there *= scale[:, None, :]
-    out_of_scale = ~apart | (grown < 0.2) | (grown > 5.0)
-    stale = out_of_scale & (np.abs(trial[:, _T] - trial[:, _LEVEL] - before) > SEARCH.stale_K)
-    return here._replace(trial=trial), there, stale
+@numba.njit(**COMPILED)  # type: ignore[untyped-decorator]
+def refitted(there: Array, trial: Array, mean: Array, sd: Array, gone: Array) -> float:
+    """Move level and T_obj of a trial, in which readings are linear, and its products to their best, and
+    return how far slopes by all else, which go with the difference of object and skin, are from those of
+    that difference [K], where it turned or grew much: else they are scaled with it.
+
+    So these two go along with a step in all else, which is larger without bending; ``gone`` (8,) is room.
+    """
+    m = mean.size
+    before = trial[_T] - trial[_LEVEL]
+    a, b, d = there[_LEVEL, _LEVEL] + 1.0, there[_T, _T] + 1.0, there[_LEVEL, _T]
+    g = there[_LEVEL, m] - ((trial[_LEVEL] - mean[_LEVEL]) / sd[_LEVEL] if sd[_LEVEL] > 0.0 else 0.0)
+    h = there[_T, m] - ((trial[_T] - mean[_T]) / sd[_T] if sd[_T] > 0.0 else 0.0)
+    level, warmer = (b * g - d * h) / (a * b - d * d), (a * h - d * g) / (a * b - d * d)
+    trial[_LEVEL] += level * sd[_LEVEL]
+    trial[_T] += warmer * sd[_T]
+    for i in range(m + 1):
+        gone[i] = level * there[_LEVEL, i] + warmer * there[_T, i]
+    there[m, m] += level * gone[_LEVEL] + warmer * gone[_T] - 2.0 * gone[m]
+    after = trial[_T] - trial[_LEVEL]
+    apart = abs(before) > 0.1
+    grown = after / before if apart else np.inf
+    scale = min(max(grown, 0.2), 5.0) if apart else 1.0
+    for i in range(m):
+        there[i, m] -= gone[i]
+        there[m, i] = there[i, m]
+    for i in range(m):
+        if i != _LEVEL and i != _T:
+            for j in range(m + 1):
+                there[i, j] *= scale
+                there[j, i] *= scale
+    return 0.0 if 0.2 <= grown <= 5.0 else abs(after - before)
 
 
-def _search_moved(here: _Search, there: Array, stale: Mask, step: int) -> _Search:
-    """Return where pairs are after they were tried, and how the next steps are made."""
-    off = here.law.penalty(here.trial)
-    tried, damping = there[:, -1, -1] + off.value, here.damping
-    new = here._replace(
-        point=here.trial, cost=tried, matrix=there, slope=off.slope, bound=off.bound, stale=stale
-    )
-    if step == 0:
-        return new._replace(damping=0.1 * damping, part=np.ones(tried.size))
-    better = (tried < here.cost) | here.stale
-    bend = np.where(here.stale, 1.0, np.maximum(here.bend, 1e-300))  # of no step none
-    bent = np.where(here.stale, 0.0, (here.slope_gain + tried - here.cost) / bend)
-    strongly_bent = bent > SEARCH.far_bent
-    damping = np.where(better, np.maximum(damping * 0.1, 1e-9), damping * 10.0)
-    damping = np.where(strongly_bent, np.maximum(damping, 0.1 * np.minimum(bent, 1e6)), damping)
-    step_share = np.where((bent > SEARCH.bent) & ~strongly_bent, 1.0 / np.maximum(bent, 1.0), 1.0)
-    new = new._replace(damping=damping, part=np.where(np.isfinite(tried), step_share, 0.3 * here.part))
-    if better.all():
-        return new
-    row = better[:, None]
-    return new._replace(
-        point=np.where(row, here.trial, here.point),
-        cost=np.where(better, tried, here.cost),
-        matrix=np.where(row[:, :, None], there, here.matrix),
-        slope=np.where(row, off.slope, here.slope),
-        bound=np.where(row, off.bound, here.bound),
-        stale=np.where(better, stale, here.stale),
-    )
+@numba.njit(**COMPILED)  # type: ignore[untyped-decorator]
+def advance(
+    at: NDArray[np.int64],
+    tried: Array,
+    law: Law,
+    state: Search,
+    room: Array,
+    step: int,
+    settings: SearchSettings,
+) -> None:
+    """Take up of the pairs ``at`` some rows the products ``tried`` at their trials, and what to try next."""
+    m = law.mean.shape[1]
+    lower, curved, right, move = room[:m], room[m : 2 * m], room[2 * m], room[2 * m + 1]
+    slope, bound, own, gone = room[2 * m + 2], room[2 * m + 3], room[2 * m + 4], room[2 * m + 5]
+    for k in range(at.size):
+        p = at[k]
+        there, trial, mean, sd = tried[k], state.trial[p], law.mean[p], law.sd[p]
+        stale = refitted(there, trial, mean, sd, gone) > settings.stale_K
+        cost = there[m, m]
+        for i in range(m):
+            w = (trial[i] - mean[i]) / sd[i] if sd[i] > 0.0 else 0.0
+            value, slope[i], bound[i], own[i] = penalty(w, law.per_dof[p, i])
+            cost += value
+        # whether the trial is better, and how the next steps are made
+        better, part = True, 1.0
+        if step > 0:
+            bent = 0.0
+            better = cost < state.cost[p]
+            if state.stale[p]:  # of no step none
+                better = True
+            else:
+                bent = (state.slope_gain[p] + cost - state.cost[p]) / max(state.bend[p], 1e-300)
+            damping = max(0.1 * state.damping[p], 1e-9) if better else 10.0 * state.damping[p]
+            if bent > settings.far_bent:
+                damping = max(damping, 0.1 * min(bent, 1e6))
+            elif bent > settings.bent:
+                part = 1.0 / bent
+            state.damping[p] = damping
+            if not np.isfinite(cost):
+                part = 0.3 * state.part[p]
+        state.part[p] = part
+        if better:
+            state.cost[p], state.stale[p], state.matrix[p, m, m] = cost, stale, there[m, m]
+            for i in range(m):
+                state.u[p, i], state.matrix[p, i, m] = trial[i], there[i, m]
+                state.slope[p, i], state.bound[p, i], state.own[p, i] = slope[i], bound[i], own[i]
+                for j in range(m):
+                    state.matrix[p, i, j] = there[i, j]
+        # the next step, and what it should come to
+        matrix, u, damping = state.matrix[p], state.u[p], state.damping[p]
+        for i in range(m):
+            for j in range(m):
+                curved[i, j] = matrix[i, j]
+            curved[i, i] += state.bound[p, i]
+            right[i] = matrix[i, m] - state.slope[p, i]
+        gain, loss = solve(curved, right, lower, move), 0.0
+        state.ahead[p] = state.cost[p] - gain
+        last = step == settings.most_steps
+        state.settled[p] = gain < settings.least_decrease and not state.stale[p] and not last
+        state.going_on[p] = not state.settled[p] and damping <= 1e9 and not last
+        if state.settled[p]:
+            state.cost[p] = state.ahead[p]
+            for i in range(m):
+                u[i] += move[i] * sd[i]
+                w = (u[i] - mean[i]) / sd[i] if sd[i] > 0.0 else 0.0
+                state.own[p, i] = penalty(w, law.per_dof[p, i])[3]
+            continue
+        if damping > settings.no_damping:
+            for i in range(m):
+                curved[i, i] *= 1.0 + damping
+            gain = solve(curved, right, lower, move)
+            for i in range(m):
+                loss += damping * curved[i, i] / (1.0 + damping) * move[i] ** 2
+        farthest = 1e-300
+        for i in _CONTACT:
+            farthest = max(farthest, abs(move[i] * sd[i]))
+        # no logarithm moves too far; where slopes are stale they are asked for before another step
+        share = 0.0 if state.stale[p] else min(part, settings.longest_step / farthest)
+        for i in range(m):
+            trial[i] = u[i] + share * move[i] * sd[i]
+        state.slope_gain[p], state.bend[p] = 2.0 * share * gain, share * share * (gain - loss)
 
 
 def curvature(matrix: Array, own: Array) -> tuple[Array, Array]:

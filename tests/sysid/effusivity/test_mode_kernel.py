@@ -20,33 +20,26 @@ from thermogrip.sysid.effusivity.laplace_approximation import (
     prior_of,
 )
 
-SD = np.array([0.3, 0.5, 0.1, 3.0, 0.4, 0.0, 0.2])
-DOF = np.array([np.inf, 6.0, 4.0, np.inf, np.inf, 5.0, np.inf])
+
+@pytest.mark.parametrize("dof", [np.inf, 4.0, 6.0])
+def test_the_penalty_is_the_priors_density_beside_its_peak(dof):
+    law, h = norm() if np.isinf(dof) else student_t(dof), 1e-6
+    for w in (-2.7, -0.4, 0.0, 0.8, 6.0):
+        value, slope, bound, own = kernel.penalty.py_func(w, 1 / dof)
+        above, below = (kernel.penalty.py_func(w + off, 1 / dof) for off in (h, -h))
+        assert value == pytest.approx(2 * (law.logpdf(0) - law.logpdf(w)))
+        assert slope == pytest.approx((above[0] - below[0]) / (4 * h), rel=1e-5, abs=1e-8)
+        assert own == pytest.approx(max((above[1] - below[1]) / (2 * h), 1e-3), rel=1e-5)
+        # what makes of the slope a step to the mean
+        assert bound == pytest.approx(slope / w) if w else bound >= own
 
 
-def law(u, mean):
-    found = kernel.Law.of(mean[None], SD[None], DOF[None]).penalty(u[None])
-    return kernel.Penalty(*(part[0] for part in found))
-
-
-def test_the_penalty_is_the_priors_density_beside_its_peak():
+def test_a_damped_step_solves_its_equations():
     rng = np.random.default_rng(0)
-    mean = rng.normal(size=7)
-    u = mean + rng.normal(size=7)
-    w = np.where(SD > 0, (u - mean) / np.where(SD > 0, SD, 1.0), 0.0)
-    laws = [norm() if np.isinf(v) else student_t(v) for v in DOF]
-    here = law(u, mean)
-    want = sum(2 * (one.logpdf(0) - one.logpdf(x)) for one, x in zip(laws, w))
-    assert here.value == pytest.approx(want)
-    for a in range(7):
-        h = 1e-6 * SD[a] * (np.arange(7) == a)
-        up, down = law(u + h, mean), law(u - h, mean)
-        rise = (up.value - down.value) / 4e-6 if SD[a] > 0 else 0.0
-        assert here.slope[a] == pytest.approx(rise, rel=1e-5, abs=1e-8)
-        bend = (up.slope[a] - down.slope[a]) / 2e-6 if SD[a] > 0 else 1.0
-        assert here.own[a] == pytest.approx(max(bend, 1e-3), rel=1e-5)
-        # what makes of the slope a step to the mean; 1 of a normal law, and of what is known
-        assert here.bound[a] == pytest.approx(here.slope[a] / w[a] if w[a] else 1.0)
+    slopes, right, out = rng.normal(size=(9, 7)), rng.normal(size=7), np.empty(7)
+    product = kernel.solve.py_func(slopes.T @ slopes, right, np.empty((7, 7)), out)
+    np.testing.assert_allclose(slopes.T @ slopes @ out, right)
+    assert product == pytest.approx(right @ out)
 
 
 def test_products_are_in_units_of_each_spread_and_none_of_what_is_known():
