@@ -45,11 +45,11 @@ from thermogrip.sysid.data.preparation import (
     with_rest,
     without_still,
 )
-from thermogrip.sysid.plant.fit_record import HELD_OUT_SHARE, TAIL, ExpectedError, HeldOut
 from thermogrip.sysid.plant.innovations import innovation_noise
 from thermogrip.sysid.plant.log_grid import Grid, match_logs, misfit, moved_before, signals
 from thermogrip.sysid.plant.log_grid import rows_of as log_rows
 from thermogrip.sysid.plant.plant import Plant
+from thermogrip.sysid.plant.plant_data import HELD_OUT_SHARE, TAIL, ExpectedError, HeldOut
 from thermogrip.sysid.validation.free_run import FreeRun, free_run, no_input_baseline, warm_up_of
 from thermogrip.sysid.validation.stated_errors import (
     Row,

@@ -28,8 +28,8 @@ from thermogrip.sysid.experiment.optimal import inputs_of
 from thermogrip.sysid.greybox.fit import fit_network
 from thermogrip.sysid.models.network import NetworkModel, load_network
 from thermogrip.sysid.models.network_spec import network_from_dict
-from thermogrip.sysid.plant.fit_record import PlantScores
 from thermogrip.sysid.plant.plant import Plant
+from thermogrip.sysid.plant.plant_data import PlantScores
 
 
 def other_truths(name: str, minutes: float, highest: float) -> None:

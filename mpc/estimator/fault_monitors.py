@@ -17,7 +17,7 @@ import numpy as np
 
 from thermogrip.datasets.arrays import Array
 from thermogrip.mpc.estimator.reading_checks import SHARE
-from thermogrip.sysid.plant.fit_record import RUN_GAIN_SD
+from thermogrip.sysid.plant.plant_data import RUN_GAIN_SD
 
 if TYPE_CHECKING:
     from thermogrip.mpc.estimator.observer import Observer

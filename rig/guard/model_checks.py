@@ -151,7 +151,7 @@ class ModelMonitor:
         for j, (bias, sd) in enumerate(zip(self._filter.w.tolist(), self._filter.bias_spread().tolist())):
             if abs(bias) <= 5 * sd:  # five: of 5,700 estimates without a fault the largest was 3.1
                 continue
-            # from run to run the effect of inputs differs by 5 % of itself (fit_record.RUN_GAIN_SD)
+            # from run to run the effect of inputs differs by 5 % of itself (plant_data.RUN_GAIN_SD)
             limit = float(np.hypot(s.drive_limit * self._largest_drive(j), 5 * sd))
             if abs(bias) > limit:
                 residuals.append(Residual("bias", self.drives[j], 0.0, 0.0, bias, limit))

@@ -35,9 +35,9 @@ from thermogrip.sysid.blackbox.order_selection import (
     free_run_misses,
 )
 from thermogrip.sysid.data.data_quality import reading_excess
-from thermogrip.sysid.plant.fit_record import SEVERAL, PlantScores, fit_logs
 from thermogrip.sysid.plant.log_grid import Grid, Segment, make_grid, rows_of
 from thermogrip.sysid.plant.plant import Plant
+from thermogrip.sysid.plant.plant_data import SEVERAL, PlantScores, fit_logs
 from thermogrip.sysid.plant.simulation import READING_EVERY
 
 #: The module of each kind, which is loaded where that is first fitted.

@@ -32,8 +32,8 @@ from thermogrip.sysid.models.state_space import (
     first_readings,
     symmetric_root,
 )
-from thermogrip.sysid.plant.fit_record import HELD_OUT_SHARE, SEVERAL, TAIL
 from thermogrip.sysid.plant.log_grid import MOVED, Grid, Segment
+from thermogrip.sysid.plant.plant_data import HELD_OUT_SHARE, SEVERAL, TAIL
 
 # of log errors, to which a standard error of few parts is limited; over whole logs, of which there are fewer
 ORDER_MARGIN, ORDER_MARGIN_OF_LOGS = float(np.log(1.05)), float(np.log(1.2))

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.schema import Log, column, columns, log_name, names
 from thermogrip.sysid.data.data_quality import reading_excess
-from thermogrip.sysid.plant.fit_record import fit_logs
 from thermogrip.sysid.plant.log_grid import MOVED, quantum, roles_of, rows_of
+from thermogrip.sysid.plant.plant_data import fit_logs
 
 if TYPE_CHECKING:
     from thermogrip.sysid.models.model import GreyModel

@@ -9,7 +9,7 @@ interval is
     G +- z_p sqrt(mean (G_k - G)^2 + (g G)^2),
 
 g the spread of an input's gain between runs that few logs cannot show
-(:data:`~thermogrip.sysid.plant.fit_record.RUN_GAIN_SD`), 0 for disturbances and phases.
+(:data:`~thermogrip.sysid.plant.plant_data.RUN_GAIN_SD`), 0 for disturbances and phases.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from numpy.typing import NDArray
 
 from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.errors import UserError
-from thermogrip.sysid.plant.fit_record import RUN_GAIN_SD, SEVERAL
 from thermogrip.sysid.plant.linearise import LinearPlant, composed, linearise_plant
+from thermogrip.sysid.plant.plant_data import RUN_GAIN_SD, SEVERAL
 
 if TYPE_CHECKING:
     from thermogrip.sysid.plant.plant import Plant

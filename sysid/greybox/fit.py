@@ -30,7 +30,7 @@ from thermogrip.sysid.greybox.problem import Problem, make_problem, start_second
 from thermogrip.sysid.greybox.sandwich import score_covariance
 from thermogrip.sysid.models.model import GreyModel
 from thermogrip.sysid.models.network import load_network
-from thermogrip.sysid.plant import fit_record
+from thermogrip.sysid.plant import plant_data
 from thermogrip.sysid.plant.log_grid import cut_stretches, match_logs, rows_of
 from thermogrip.sysid.plant.plant import Plant
 from thermogrip.sysid.plant.simulation import find_starts, predict
@@ -158,7 +158,7 @@ def fit_network(
     valid = {name: (float(np.nanmin(values)), float(np.nanmax(values))) for name, values in logged.items()}
     plant = plant.with_medians({name: logged[name] for name in model.disturbances})
     report(1.0, "fitted")
-    return replace(plant, valid=valid, fitted_to=fit_record.fit_logs(logs), scores=scores)
+    return replace(plant, valid=valid, fitted_to=plant_data.fit_logs(logs), scores=scores)
 
 
 def residual_tau(errors: Sequence[Sequence[Sequence[Array]]], least: Array) -> Array:
@@ -214,12 +214,12 @@ def _as_plant(problem: Problem, solution: OptimizeResult) -> Plant:
     first = [begin[0] for begin in starts]
     offsets = dict(zip(model.outputs, np.mean([s.y_offset for s in first], axis=0).tolist()))
     offsets |= dict(zip(model.disturbances, np.mean([s.d_offset for s in first], axis=0).tolist()))
-    scores = fit_record.PlantScores(
+    scores = plant_data.PlantScores(
         identifiability=identifiability,
         average_s=problem.average,
         weight_s={k: float(t * problem.average) for k, t in zip(model.outputs, problem.tau)},
-        intervals=fit_record.Intervals(
-            numbers=fit_record.ErrorNumbers(**vars(spread.numbers)),
+        intervals=plant_data.Intervals(
+            numbers=plant_data.ErrorNumbers(**vars(spread.numbers)),
             between_logs=round(spread.phi, 3),
             coarsening=round(spread.coarsening, 3),
         ),
@@ -238,7 +238,7 @@ def _as_plant(problem: Problem, solution: OptimizeResult) -> Plant:
 
 
 def _fit_verdict(
-    problem: Problem, solution: OptimizeResult, identifiability: fit_record.Identifiability
+    problem: Problem, solution: OptimizeResult, identifiability: plant_data.Identifiability
 ) -> str:
     by_log = problem.errors(solution.x)
     rms = [_rms([s[k] for log in by_log for s in log]) / sd for k, sd in enumerate(problem.sd)]

@@ -21,8 +21,8 @@ import numpy as np
 
 from thermogrip.datasets.arrays import Array
 from thermogrip.sysid.models.network import NetworkModel
-from thermogrip.sysid.plant.fit_record import Identifiability
 from thermogrip.sysid.plant.plant import Plant
+from thermogrip.sysid.plant.plant_data import Identifiability
 
 
 @dataclass(frozen=True)

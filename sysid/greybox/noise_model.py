@@ -23,7 +23,7 @@ from scipy.fft import dct, irfft, rfft
 from scipy.optimize import minimize
 
 from thermogrip.datasets.arrays import Array
-from thermogrip.sysid.plant.fit_record import ErrorNumbers
+from thermogrip.sysid.plant.plant_data import ErrorNumbers
 
 N_SLOW = 2
 _SINGLE, _GROWTH = 12, 1.2  # bands of one frequency, then wider and wider

@@ -42,9 +42,9 @@ from thermogrip.sysid.greybox.noise_model import ErrorModel
 from thermogrip.sysid.greybox.problem import Problem, make_problem
 from thermogrip.sysid.greybox.sandwich import ScoreCovariance, score_covariance
 from thermogrip.sysid.models.model import GreyModel
-from thermogrip.sysid.plant.fit_record import Sampling
 from thermogrip.sysid.plant.log_grid import match_logs, roles_of
 from thermogrip.sysid.plant.plant import Plant
+from thermogrip.sysid.plant.plant_data import Sampling
 
 
 @dataclass(frozen=True)

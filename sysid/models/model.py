@@ -140,7 +140,9 @@ class BlackBox(ABC):
         x_end = np.asarray(x0, dtype=float)
         readings: list[Array] = []
         for x in self.state_blocks(x_end, np.asarray(u, dtype=float), np.asarray(d, dtype=float), dt):
-            y = np.stack(self.output(list(np.moveaxis(x, -1, 0)), ()), axis=-1)
+            y = np.empty((*x.shape[:-1], len(self.outputs)))
+            for k, column in enumerate(self.output(list(np.moveaxis(x, -1, 0)), ())):
+                y[..., k] = column
             readings.append(y[:, 1:] if readings else y)
             x_end = x[:, -1]
         return np.concatenate(readings, axis=1), x_end

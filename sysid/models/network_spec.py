@@ -11,11 +11,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from importlib import resources
-from math import exp
+from math import exp, inf
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
 from thermogrip.datasets.errors import UserError, known_names
 from thermogrip.datasets.files import read_toml
@@ -43,6 +43,9 @@ Number = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
 Positive = Annotated[float, Field(gt=0, le=LARGEST)]
 NotNegative = Annotated[float, Field(ge=0, le=LARGEST)]
 Step = Annotated[float, Field(ge=STEP_RANGE[0], le=STEP_RANGE[1])]
+# ends of a range, None where it is open
+OpenLow = Annotated[float, BeforeValidator(lambda end: -inf if end is None else end)]
+OpenHigh = Annotated[float, BeforeValidator(lambda end: inf if end is None else end)]
 # what is compiled and simulated grows with these, the time of a fit with their square
 Few = Field(max_length=50)
 Many = Field(max_length=200)
@@ -305,13 +308,19 @@ def network_from_dict(content: Mapping[str, Any], *, file: str | None = None) ->
     try:
         network = Network.model_validate(dict(content))
     except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(str(key) for key in first["loc"])
-        text = first["msg"].removeprefix("Value error, ")
-        raise UserError(f"{where}: {text}", file=file, hint="see 'thermogrip init network'") from error
+        raise UserError(fault_words(error), file=file, hint="see 'thermogrip init network'") from error
     for problem, hint in _network_faults(network):
         raise UserError(problem, file=file, hint=hint)
     return network
+
+
+def fault_words(error: ValidationError) -> str:
+    """Return the first thing that pydantic found wrong, behind the keys where it is."""
+    first = error.errors()[0]
+    text, value = first["msg"].removeprefix("Value error, "), first["input"]
+    if text.startswith("Input should be") and isinstance(value, (int, float, str)):
+        text += f", not {repr(value)[:40]}"
+    return f"{'.'.join(map(str, first['loc']))}: {text}"
 
 
 class _Named(NamedTuple):

@@ -50,7 +50,7 @@ from pydantic import (
 from thermogrip.datasets.arrays import Array, Run, Values
 from thermogrip.datasets.errors import UserError, known_names, reading
 from thermogrip.sysid.models.model import Described, FreeRuns, Sizes
-from thermogrip.sysid.models.network_spec import Parameter
+from thermogrip.sysid.models.network_spec import OpenHigh, OpenLow, Parameter
 
 if TYPE_CHECKING:
     from thermogrip.sysid.models.jit_rollout import Kernel
@@ -78,15 +78,10 @@ def _bare(key: str, **others: Any) -> BeforeValidator:
     return BeforeValidator(lambda item: item if isinstance(item, Mapping) else {key: item} | others)
 
 
-def _open(end: float) -> BeforeValidator:
-    return BeforeValidator(lambda given: end if given is None else given)
-
-
 _Name = Annotated[str, AfterValidator(_signal_name)]
 _Unit = Annotated[str, Field(min_length=1)]
 _Positive = Annotated[float, Field(gt=0, allow_inf_nan=False, strict=True)]
 _Some = Field(min_length=1)
-_Ends = tuple[Annotated[float, _open(-np.inf)], Annotated[float, _open(np.inf)]]
 
 
 class _Table(BaseModel):
@@ -129,7 +124,7 @@ class _Attributes(_Table):
     parameters: Annotated[dict[_Name, Annotated[_OwnParameter, _bare("value", fixed=True)]], _Some]
     dt: _Positive
     disturbances: dict[_Name, Annotated[Disturbance, _bare("unit")]] = {}
-    limits: dict[_Name, _Ends] = {}
+    limits: dict[_Name, tuple[OpenLow, OpenHigh]] = {}
     average: _Positive | None = None
     warmup: _Positive | None = None
 

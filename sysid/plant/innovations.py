@@ -18,10 +18,9 @@ from scipy.linalg import block_diag, solve_discrete_are
 
 from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.schema import Log
-from thermogrip.sysid.plant.fit_record import InnovationNoise
 from thermogrip.sysid.plant.linearise import discrete_matrices, output_matrix, states_after
 from thermogrip.sysid.plant.log_grid import Stretch, cut_stretches
-from thermogrip.sysid.plant.plant_data import PlantData
+from thermogrip.sysid.plant.plant_data import InnovationNoise, PlantData
 
 _MOST_STEPS = 4000  # of the logs, from their start on: a second of work, and numbers good to some percent
 _SETTLES = 20  # steps, in which a start that is not quite known dies out

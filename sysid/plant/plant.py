@@ -207,10 +207,8 @@ class Plant(Shown, plant_data.PlantData):
     @classmethod
     def from_dict(cls, content: Mapping[str, Any], *, model: Model | None = None) -> Plant:
         """Return the plant that :meth:`to_dict` wrote; ``model`` and errors as for :meth:`load`."""
-        body = {key: value for key, value in content.items() if key != "draws"}
-        check_json(body, plant_data.SCHEMA, plant_data.VERSION)
-        draws = content.get("draws")
-        return cls._of(body, model, None if draws is None else plant_data.draws_of(draws))
+        check_json(content, plant_data.SCHEMA, plant_data.VERSION)
+        return cls._of(content, model, content.get("draws"))
 
     def save(self, path: str | Path) -> Path:
         """Write the plant as JSON, with more than a few samples beside it as ``.nc``, and return the path."""
@@ -247,16 +245,16 @@ class Plant(Shown, plant_data.PlantData):
         content = read_json(path, plant_data.SCHEMA, plant_data.VERSION)
         with reading("is not a whole plant", file=path, hint="save the plant again"):
             samples = plant_data.read_samples(Path(path), content.get("samples"), content.get("free", ()))
-            draws = content.pop("draws", None)
-            return cls._of(content, model, samples if draws is None else plant_data.draws_of(draws))
+            return cls._of(content, model, content.get("draws", samples))
 
     @classmethod
-    def _of(cls, content: Mapping[str, Any], model: Model | None, samples: Array | None) -> Plant:
+    def _of(cls, content: Mapping[str, Any], model: Model | None, samples: Any) -> Plant:
         fields = plant_data.fields_of(content)
         with plant_data.whole_plant():
             equations = _load_model(content["model"], code=model)
             refits = tuple(_load_model(one) for one in content.get("refits") or ())
-            return cls(model=equations, samples=samples, refits=refits, **fields)
+            drawn = None if samples is None else np.asarray(samples, dtype=float)
+            return cls(model=equations, samples=drawn, refits=refits, **fields)
 
     def to_control(self, **point: Any) -> Any:
         """Return the plant about an operating point as a python-control ``StateSpace``.

@@ -1,4 +1,4 @@
-"""The numbers of a plant: a model, its parameters with their uncertainty, and where both may be trusted.
+"""The numbers of a plant: a model, its parameters with their uncertainty, where both may be trusted, its fit.
 
 **Scales.**  A positive parameter is uncertain by a factor, so its ``theta`` is its logarithm; any other has
 ``theta`` equal to itself.  Covariance and Laplace draws live in theta; values, samples and intervals are in
@@ -6,9 +6,14 @@ natural units.
 
 ``nuisance`` is the sd of each sensor's offset from log to log.
 
-**Files.**  One dictionary serves the plant's own file and others that contain a plant.  Samples stand beside
-the file as ``.nc``, or under ``draws`` where they are few or there is no file.  Reading never runs code.
-This module loads no xarray, so that a file can be refused at once.
+**Its fit.**  A free run over a log of the fit says how well the plant is fitted, not how well it predicts.  A
+log's name may change, so a plant keeps the hash of each log's data
+(:func:`thermogrip.datasets.schema.hash_columns`) beside the seconds of it that were used.
+
+**Files.**  One dictionary serves the plant's own file and others that contain a plant; :class:`PlantData`
+says what each key may hold.  Samples stand beside the file as ``.nc``, or under ``draws`` where they are few
+or there is no file.  Reading never runs code.  This module loads no xarray, so that a file can be refused at
+once.
 """
 
 from __future__ import annotations
@@ -16,20 +21,187 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass, field, replace
+from functools import cache
 from pathlib import Path
 from statistics import NormalDist
-from typing import Any, Self
+from typing import TYPE_CHECKING, Annotated, Any, Self, get_type_hints
 
 import numpy as np
+from pydantic import (
+    AfterValidator,
+    AliasChoices,
+    BaseModel,
+    Field,
+    PlainValidator,
+    ValidationError,
+    create_model,
+)
 
 from thermogrip.datasets.arrays import Array, Mask
 from thermogrip.datasets.errors import UserError, reading
 from thermogrip.datasets.files import atomic_path, read_json
-from thermogrip.datasets.limits import LARGEST, MOST_NUMBER, STEP_RANGE, array_within, number_within
+from thermogrip.datasets.limits import LARGEST, MOST_NUMBER, STEP_RANGE, array_within
 from thermogrip.datasets.roles import is_room_temperature
 from thermogrip.sysid.models.model import Model
+from thermogrip.sysid.models.network_spec import OpenHigh, OpenLow, fault_words
 from thermogrip.sysid.models.state_space import symmetric_root
-from thermogrip.sysid.plant.fit_record import FitLog, PlantScores
+
+if TYPE_CHECKING:
+    from thermogrip.datasets.schema import Log
+
+
+#: Of the inputs' effect, from run to run, of a plant of too few logs to show it: gains of four boards and
+#: motors were off by 0, 3 and 4 to 8 % on another day.
+RUN_GAIN_SD = 0.05
+SEVERAL = 3  # logs of a fit from which on its held-out errors show what differs between runs
+HELD_OUT_SHARE = 0.3  # of each log, where whole logs are not left out
+TAIL = f"last {100 * HELD_OUT_SHARE:.0f} % of "  # how what is held out of a log is called
+
+
+_MOST_ERROR, _MOST_READING = 1e6, 1e9  # of a sensor, in any unit
+
+
+def _ordered(ends: tuple[float, float]) -> tuple[float, float]:
+    low, high = ends
+    if not (low <= high and all(abs(end) <= _MOST_READING or np.isinf(end) for end in ends)):
+        raise ValueError(f"is {low:g} to {high:g}")
+    return ends
+
+
+def _covariance(rows: Any) -> Array | None:
+    if rows is None:
+        return None
+    covariance = array_within({"it": rows}, "it", MOST_NUMBER)
+    if covariance.ndim != 2 or (np.diag(covariance) < 0).any():
+        raise ValueError("has a negative variance")
+    return covariance
+
+
+_Finite = Annotated[float, Field(strict=True, ge=-LARGEST, le=LARGEST)]
+_Step = Annotated[float, Field(strict=True, ge=STEP_RANGE[0], le=STEP_RANGE[1])]
+_Sd = Annotated[float, Field(strict=True, ge=0.0, le=_MOST_ERROR)]
+_Offset = Annotated[float, Field(strict=True, ge=-_MOST_ERROR, le=_MOST_ERROR)]
+_Ends = tuple[OpenLow, OpenHigh]
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """The free run of one output over one log that the fit had not seen; n scored samples."""
+
+    log: str
+    output: str
+    rmse: float
+    fit_percent: float
+    unit: str
+    n: int
+
+
+@dataclass(frozen=True)
+class ExpectedError:
+    """The rms error of a free run over another run like those of the fit, in the output's unit."""
+
+    rmse: float  # as likely more as less
+    low: float  # less in one run of twenty
+    high: float  # more in one run of twenty
+    same_gain: float | None = None  # ``rmse`` without the gain that is assumed to vary; None where none is
+
+    def words(self, unit: str) -> str:
+        """Return it as it is printed everywhere."""
+        shown = "" if unit == "1" else f" {unit}"
+        return f"{self.rmse:.2g}{shown} ({self.low:.2g} to {self.high:.2g})"
+
+
+@dataclass(frozen=True)
+class Identifiability:
+    """What the logs say of the free parameters (:mod:`thermogrip.sysid.greybox.identifiability`)."""
+
+    condition: float  # of the scaled Hessian
+    flat: list[str]  # all directions that the logs barely determine, in words, the weakest first
+    # False: a direction changes no output at all (``told`` in files of 0.2.0 and before)
+    identifiable: Annotated[bool, Field(validation_alias=AliasChoices("identifiable", "told"))]
+    prior_only: list[str]  # names
+    on_bound: dict[str, str]  # name -> "low" or "high"
+
+
+@dataclass(frozen=True)
+class ErrorNumbers:
+    """Numbers of the errors of a fit (:class:`thermogrip.sysid.greybox.noise_model.ErrorModel`)."""
+
+    white: tuple[float, ...]  # w by output, of one bin
+    tau: tuple[float, ...]  # correlation times [bins]
+    sd: tuple[tuple[float, ...], ...]  # a by slow error and output
+    correlation: tuple[float, ...]  # between outputs, by slow error
+    spread: tuple[float, ...] = ()  # s by kind of column, in units of what was stated beforehand
+
+
+@dataclass(frozen=True)
+class Intervals:
+    """What the intervals of a grey-box fit rest on."""
+
+    numbers: ErrorNumbers | None = None
+    between_logs: float = 1.0
+    coarsening: float = 1.0  # times less information in a log than the fit's weights assume
+
+
+@dataclass(frozen=True)
+class Sampling:
+    """How a posterior was sampled; autocorrelation times ``tau`` by parameter."""
+
+    verdict: str
+    converged: bool
+    likelihood: str
+    tau: dict[str, float]
+
+
+@dataclass(frozen=True)
+class InnovationNoise:
+    """What the innovations of a filter over the logs say (:mod:`thermogrip.sysid.plant.innovations`), as
+    standard deviations, and how fast the inputs were moved."""
+
+    state: float  # of the states in a second, in units of the outputs' as each state is spread
+    reading: dict[str, float]  # of a reading, by output, in its unit
+    input: dict[str, float]  # of what an input lacks, in a second, in its unit
+    fastest: dict[str, float]  # change of an input from a row to the next, in a second
+
+
+@dataclass(frozen=True)
+class PlantScores:
+    """Numbers of a fit for tables, bands and later fits; what a kind of fit does not know keeps its default.
+
+    >>> PlantScores(average_s=2.0, structure="na 1").to_json()
+    {'structure': 'na 1', 'average_s': 2.0}
+    """
+
+    identifiability: Identifiability | None = None
+    structure: str = ""  # of a black box: its orders
+    average_s: float | None = None  # averaging step or bin of the fit [s]
+    average_why: str = ""  # which rule set it
+    reading_excess: dict[str, float] = field(default_factory=dict)  # one reading off its bin's mean, by noise
+    reading_sd: dict[str, float] = field(default_factory=dict)  # of a black box: white noise of one reading
+    # of a black box, by output: errors over the parts held out in turn
+    held_out_by_part: dict[str, list[float]] = field(default_factory=dict)
+    # between independent residuals, as the fit weighted them
+    weight_s: dict[str, float] = field(default_factory=dict)
+    intervals: Intervals | None = None
+    innovations: InnovationNoise | None = None
+    posterior: Sampling | None = None
+    held_out: list[HeldOut] = field(default_factory=list)  # free runs over what the fit had not seen
+    expected: dict[str, ExpectedError] = field(default_factory=dict)  # by output, of another run
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the content of key ``scores`` of ``plant.json``; a default is left out."""
+        default = asdict(PlantScores())
+        return {key: value for key, value in asdict(self).items() if value != default[key]}
+
+
+@dataclass(frozen=True)
+class FitLog:
+    """A log of a fit."""
+
+    name: str
+    sha256: str  # of the data of the whole log that it was cut from
+    start_s: _Finite  # the first row that was used [s]
+    stop_s: _Finite  # the last
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,27 +209,27 @@ class PlantData:
     """The fields of a plant, see :class:`thermogrip.sysid.plant.plant.Plant`, and what follows from them."""
 
     model: Model
-    values: dict[str, float]
-    dt: float
+    values: dict[str, _Finite]
+    dt: _Step
     units: dict[str, str] = field(default_factory=dict)
     free: tuple[str, ...] = ()
     scales: dict[str, str] = field(default_factory=dict)
-    bounds: dict[str, tuple[float, float]] = field(default_factory=dict)
-    covariance: Array | None = None
+    bounds: dict[str, _Ends] = field(default_factory=dict)
+    covariance: Annotated[Array | None, PlainValidator(_covariance)] = None
     samples: Array | None = None
     refits: tuple[Model, ...] = ()
-    noise: dict[str, float] = field(default_factory=dict)
-    offsets: dict[str, float] = field(default_factory=dict)
-    nuisance: dict[str, float] = field(default_factory=dict)
+    noise: dict[str, _Sd] = field(default_factory=dict)
+    offsets: dict[str, _Offset] = field(default_factory=dict)
+    nuisance: dict[str, _Sd] = field(default_factory=dict)
     reference: str | None = None
-    valid: dict[str, tuple[float, float]] = field(default_factory=dict)
-    nominal: dict[str, float] = field(default_factory=dict)
+    valid: dict[str, Annotated[_Ends, AfterValidator(_ordered)]] = field(default_factory=dict)
+    nominal: dict[str, _Finite] = field(default_factory=dict)
     logs: tuple[str, ...] = ()
     scores: PlantScores = field(default_factory=PlantScores)
     verdict: str = ""
     fitted_to: tuple[FitLog, ...] = ()
     inputs_end_at_row: bool = False
-    offset_memory: float = np.inf
+    offset_memory: Annotated[float, Field(strict=True, ge=1e-6, le=LARGEST)] = np.inf
 
     def __post_init__(self) -> None:
         missing = [name for name in self.model.parameters if name not in self.values]
@@ -187,8 +359,12 @@ class PlantData:
 
 
 SCHEMA, VERSION = "thermogrip.plant", 1
-_MOST_ERROR, _MOST_READING = 1e6, 1e9  # of a sensor, in any unit
-_PLAIN = ("values", "units", "scales", "noise", "offsets", "nuisance", "reference", "verdict", "nominal")
+_PLAIN = (
+    *("dt", "values", "units", "free", "scales", "noise", "offsets", "nuisance", "reference", "nominal"),
+    *("logs", "verdict", "inputs_end_at_row"),
+)
+# what a file may lack: others have no default, or damage would go unseen
+_ABSENT = {"nominal": {}, "fitted_to": (), "inputs_end_at_row": False, "offset_memory": np.inf}
 
 
 def check_plant_file(
@@ -206,9 +382,8 @@ def check_plant_file(
 
 def plain_content(plant: PlantData) -> dict[str, Any]:
     """Return everything of the plant but its samples as plain JSON."""
-    content: dict[str, Any] = {"model": plant.model.to_dict(), "dt": plant.dt}
+    content: dict[str, Any] = {"model": plant.model.to_dict()}
     content |= {name: getattr(plant, name) for name in _PLAIN}
-    content |= {"free": list(plant.free), "logs": list(plant.logs)}
     content["scores"] = plant.scores.to_json()
     content["fitted_to"] = [asdict(log) for log in plant.fitted_to]
     for kind in ("bounds", "valid"):  # an open end is null, for JSON has no infinity
@@ -216,39 +391,31 @@ def plain_content(plant: PlantData) -> dict[str, Any]:
         content[kind] = {n: [end if np.isfinite(end) else None for end in ends] for n, ends in ranges.items()}
     content["covariance"] = None if plant.covariance is None else np.asarray(plant.covariance).tolist()
     content["samples"] = None
-    content["inputs_end_at_row"] = plant.inputs_end_at_row
     if np.isfinite(plant.offset_memory):
         content["offset_memory"] = plant.offset_memory
     content["refits"] = [model.to_dict() for model in plant.refits]
     return content
 
 
+@cache
+def _plant_file() -> type[BaseModel]:
+    """Return what a plant's file may say, but for model, refits and samples: the kinds of the fields."""
+    kinds = get_type_hints(PlantData, include_extras=True)
+    fields: dict[str, Any] = {
+        name: (kind, _ABSENT.get(name, ...))
+        for name, kind in kinds.items()
+        if name not in ("model", "refits", "samples")
+    }
+    return create_model("PlantFile", **fields)
+
+
 def fields_of(content: Mapping[str, Any]) -> dict[str, Any]:
     """Return the fields of a plant from :func:`plain_content`, but for model and samples."""
     with whole_plant():
-        return {
-            "values": _finite_numbers(content, "values"),
-            "dt": number_within(content, "dt", *STEP_RANGE),
-            "units": _texts(content["units"]),
-            "free": tuple(str(name) for name in content["free"]),
-            "scales": _texts(content["scales"]),
-            "bounds": _ranges_of_json(content["bounds"]),
-            "covariance": _covariance(content),
-            "noise": _finite_numbers(content, "noise", 0.0, _MOST_ERROR),
-            "offsets": _finite_numbers(content, "offsets", -_MOST_ERROR, _MOST_ERROR),
-            "nuisance": _finite_numbers(content, "nuisance", 0.0, _MOST_ERROR),
-            "reference": content["reference"],
-            "valid": _valid(content["valid"]),
-            "nominal": _finite_numbers({"nominal": {}} | dict(content), "nominal"),
-            "logs": tuple(str(name) for name in content["logs"]),
-            "fitted_to": tuple(_fit_log(log) for log in content.get("fitted_to", ())),
-            "scores": PlantScores.from_json(content["scores"]),
-            "verdict": str(content["verdict"]),
-            "inputs_end_at_row": bool(content.get("inputs_end_at_row", False)),
-            "offset_memory": number_within(content, "offset_memory", 1e-6, LARGEST)
-            if "offset_memory" in content
-            else np.inf,
-        }
+        try:
+            return dict(_plant_file().model_validate(dict(content)))
+        except ValidationError as error:
+            raise ValueError(fault_words(error)) from error
 
 
 def whole_plant() -> AbstractContextManager[None]:
@@ -261,12 +428,6 @@ def thin(samples: Array, draws: int | None) -> Array:
     n = len(samples)
     rows = np.unique(np.linspace(0, n - 1, n if draws is None else min(n, draws)).astype(int))
     return np.asarray(np.asarray(samples)[rows], dtype=float)
-
-
-def draws_of(rows: Any) -> Array:
-    """Return samples that stand in the JSON itself."""
-    with whole_plant():
-        return np.asarray(rows, dtype=float)
 
 
 def write_samples(path: Path, free: Sequence[str], samples: Array, units: Mapping[str, str]) -> None:
@@ -299,40 +460,32 @@ def read_samples(plant: Path, name: str | None, free: Sequence[str]) -> Array | 
     return samples
 
 
-def _fit_log(content: Mapping[str, Any]) -> FitLog:
-    start_s, stop_s = (number_within(content, name, -LARGEST, LARGEST) for name in ("start_s", "stop_s"))
-    return FitLog(str(content["name"]), str(content["sha256"]), start_s, stop_s)
+def fit_logs(logs: Sequence[Log]) -> tuple[FitLog, ...]:
+    """Return what a plant keeps of the logs of its fit; the hash is that of a log's file where it has one."""
+    from thermogrip.datasets.schema import hash_columns, log_name
+
+    fitted = []
+    for log in logs:
+        time = log["time"].values
+        sha256 = log.attrs.get("sha256") or hash_columns(
+            {"time": time} | {str(name): log[name].values for name in log}
+        )
+        fitted.append(FitLog(log_name(log), str(sha256), float(time[0]), float(time[-1])))
+    return tuple(fitted)
 
 
-def _texts(content: Mapping[str, Any]) -> dict[str, str]:
-    return {str(name): str(value) for name, value in content.items()}
-
-
-def _finite_numbers(
-    content: Mapping[str, Any], key: str, low: float = -LARGEST, high: float = LARGEST
-) -> dict[str, float]:
-    return {str(name): number_within(content[key], name, low, high) for name in content[key]}
-
-
-def _covariance(content: Mapping[str, Any]) -> Array | None:
-    if content["covariance"] is None:
-        return None
-    covariance = array_within(content, "covariance", MOST_NUMBER)
-    if covariance.ndim != 2 or (np.diag(covariance) < 0).any():
-        raise ValueError("covariance has a negative variance")
-    return covariance
-
-
-def _valid(content: Mapping[str, Sequence[float | None]]) -> dict[str, tuple[float, float]]:
-    ranges = _ranges_of_json(content)
-    for name, (low, high) in ranges.items():
-        if not (low <= high and all(abs(end) <= _MOST_READING or np.isinf(end) for end in (low, high))):
-            raise ValueError(f"valid of {name} is {low:g} to {high:g}")
-    return ranges
-
-
-def _ranges_of_json(content: Mapping[str, Sequence[float | None]]) -> dict[str, tuple[float, float]]:
-    return {
-        str(name): (-np.inf if low is None else float(low), np.inf if high is None else float(high))
-        for name, (low, high) in content.items()
-    }
+def said_of_fit(fitted_to: Sequence[FitLog], seen: FitLog) -> list[str]:
+    """Return a line for each log of the fit that holds rows of the one that is ``seen``."""
+    start = seen.start_s
+    stop = seen.stop_s
+    lines = []
+    for used in fitted_to:
+        first, last = max(start, used.start_s), min(stop, used.stop_s)
+        if used.sha256 != seen.sha256 or not first < last:
+            continue
+        whole = (first, last) == (start, stop)
+        overlap = "all of it is" if whole else f"{first:g} to {last:g} s of {start:g} to {stop:g} s are"
+        name = "" if used.name == seen.name else f" (as {used.name})"
+        meaning = "the scores say how well the plant is fitted, not how well it predicts"
+        lines.append(f"{overlap} in the fit{name}: {'' if whole else 'there '}{meaning}")
+    return lines

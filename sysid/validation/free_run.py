@@ -28,8 +28,8 @@ import numpy as np
 from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log, block_means, column, columns, gaps, log_name
-from thermogrip.sysid.plant.fit_record import SEVERAL, fit_logs, said_of_fit
 from thermogrip.sysid.plant.log_grid import cut_stretches, match_logs
+from thermogrip.sysid.plant.plant_data import SEVERAL, fit_logs, said_of_fit
 from thermogrip.sysid.validation.residual_tests import SQUARED, ResidualCorrelations, residual_correlations
 from thermogrip.sysid.validation.stated_errors import (
     NO_BETTER,

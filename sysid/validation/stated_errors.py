@@ -9,7 +9,7 @@ error of one part more lies about them as they do about each other.
 
 *What differs between runs* (supply voltage, air about the plant, a sensor that was glued anew) is in the
 errors of whole logs that were held out. A plant of one or two logs cannot show it: the gain of its inputs
-varies from run to run by g ~ N(0, :data:`~thermogrip.sysid.plant.fit_record.RUN_GAIN_SD`^2).
+varies from run to run by g ~ N(0, :data:`~thermogrip.sysid.plant.plant_data.RUN_GAIN_SD`^2).
 
 **Bands.** With v the free run, a reading is expected within
 
@@ -41,9 +41,9 @@ from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log, column, columns, log_name
 from thermogrip.sysid.models.neural import NeuralModel
-from thermogrip.sysid.plant.fit_record import RUN_GAIN_SD, SEVERAL, TAIL, ExpectedError
 from thermogrip.sysid.plant.log_grid import cut_stretches, match_logs
 from thermogrip.sysid.plant.plant import WARMUP, Plant
+from thermogrip.sysid.plant.plant_data import RUN_GAIN_SD, SEVERAL, TAIL, ExpectedError
 from thermogrip.sysid.plant.simulation import find_starts
 
 if TYPE_CHECKING:

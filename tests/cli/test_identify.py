@@ -27,10 +27,10 @@ from thermogrip.sysid.export.dynamics import plant_dynamics
 from thermogrip.sysid.models.network import load_network
 from thermogrip.sysid.models.network_spec import builtin_networks
 from thermogrip.sysid.models.state_space import StateSpaceModel
-from thermogrip.sysid.plant.fit_record import ExpectedError, PlantScores
 from thermogrip.sysid.plant.linearise import linearise_plant
 from thermogrip.sysid.plant.log_grid import roles_of
 from thermogrip.sysid.plant.plant import Plant
+from thermogrip.sysid.plant.plant_data import ExpectedError, PlantScores
 from thermogrip.sysid.validation.free_run import free_run, usual_warmup
 from thermogrip.sysid.validation.stated_errors import Row, Standing, Verdict
 

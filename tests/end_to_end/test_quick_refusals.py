@@ -52,7 +52,7 @@ REFUSED = {
     "validate short.json x.csv nofile.csv@1:2": "nofile.csv@1:2: no such file or folder",
     "classify x.csv x.csv --out p.csv": "x.csv: is not a folder; give the folder that train",
     "validate deep.json x.csv": "deep.json: is nested too deeply",
-    "validate short.json x.csv": "short.json: is not a whole plant (KeyError: 'values')",
+    "validate short.json x.csv": "short.json: is not a whole plant (values: Field required)",
     "excite --kind optimal --minutes 5 --plant deep.json --out s.csv": "deep.json: is nested too deeply",
     "review deep.json": "deep.json: is nested too deeply",
     "review large.json": "large.json: design.dt is 1e+200, beyond",

@@ -21,8 +21,8 @@ from thermogrip.sysid.data.preparation import SignalRole
 from thermogrip.sysid.experiment.information import plant_from_prior
 from thermogrip.sysid.models.network import load_network
 from thermogrip.sysid.models.state_space import StateSpaceModel
-from thermogrip.sysid.plant.fit_record import Identifiability
 from thermogrip.sysid.plant.plant import Plant
+from thermogrip.sysid.plant.plant_data import Identifiability
 from thermogrip.sysid.validation.free_run import FreeRun, free_run
 from thermogrip.sysid.validation.stated_errors import Band
 

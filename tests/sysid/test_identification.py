@@ -23,7 +23,7 @@ from thermogrip.sysid.greybox.problem import prior_plant
 from thermogrip.sysid.identification import Held, beyond_reach, choose_black_box
 from thermogrip.sysid.models.network import load_network
 from thermogrip.sysid.models.state_space import StateSpaceModel
-from thermogrip.sysid.plant.fit_record import ExpectedError, HeldOut, fit_logs
+from thermogrip.sysid.plant.plant_data import ExpectedError, HeldOut, fit_logs
 from thermogrip.sysid.validation import stated_errors
 from thermogrip.sysid.validation.free_run import free_run, usual_warmup
 from thermogrip.sysid.validation.stated_errors import between_runs, expected_error

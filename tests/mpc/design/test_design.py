@@ -27,8 +27,8 @@ from thermogrip.mpc.tuning.design_review import review
 from thermogrip.sysid.greybox.problem import prior_plant
 from thermogrip.sysid.models.network import load_network
 from thermogrip.sysid.models.state_space import StateSpaceModel
-from thermogrip.sysid.plant.fit_record import InnovationNoise
 from thermogrip.sysid.plant.plant import Plant
+from thermogrip.sysid.plant.plant_data import InnovationNoise
 
 
 @pytest.fixture(scope="module")

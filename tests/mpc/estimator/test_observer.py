@@ -22,8 +22,8 @@ from thermogrip.mpc.estimator.observer import (
 )
 from thermogrip.mpc.plant.prediction import PredictionModel
 from thermogrip.sysid.models.state_space import StateSpaceModel
-from thermogrip.sysid.plant.fit_record import InnovationNoise, PlantScores
 from thermogrip.sysid.plant.plant import Plant
+from thermogrip.sysid.plant.plant_data import InnovationNoise, PlantScores
 
 A = np.array([[0.95, 0.02], [0.06, 0.9]])
 B, E = np.array([0.4, -0.1]), np.array([0.03, 0.05])

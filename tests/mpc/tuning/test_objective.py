@@ -33,7 +33,7 @@ from thermogrip.mpc.tuning.objective import (
     surroundings_of,
     trial,
 )
-from thermogrip.sysid.plant.fit_record import PlantScores
+from thermogrip.sysid.plant.plant_data import PlantScores
 
 STEPS = [(28.0, 36.0), (28.0, 20.0)]
 SPEC = Spec(steps=STEPS, hold_s=300.0, search_draws=2, check_draws=3, sensor_offset_degC=0.4, band_degC=0.3)

@@ -19,8 +19,8 @@ from thermogrip.sysid.experiment.information import (
 from thermogrip.sysid.models.network import NetworkModel, load_network
 from thermogrip.sysid.models.network_spec import network_from_dict
 from thermogrip.sysid.models.state_space import StateSpaceModel
-from thermogrip.sysid.plant.fit_record import Intervals, PlantScores
 from thermogrip.sysid.plant.plant import Plant
+from thermogrip.sysid.plant.plant_data import Intervals, PlantScores
 
 
 @pytest.fixture(scope="module")

@@ -21,8 +21,8 @@ from thermogrip.sysid.experiment.optimal import Expectation, expect, inputs_of, 
 from thermogrip.sysid.greybox.fit import fit_network
 from thermogrip.sysid.models.network import load_network
 from thermogrip.sysid.models.state_space import StateSpaceModel
-from thermogrip.sysid.plant.fit_record import PlantScores
 from thermogrip.sysid.plant.plant import Plant
+from thermogrip.sysid.plant.plant_data import PlantScores
 
 
 @pytest.fixture(scope="module")

@@ -10,8 +10,8 @@ import pytest
 from thermogrip.sysid.greybox.identifiability import describe, identifiability_report, trade_offs
 from thermogrip.sysid.greybox.problem import prior_plant
 from thermogrip.sysid.models.network import load_network
-from thermogrip.sysid.plant.fit_record import PlantScores
 from thermogrip.sysid.plant.plant import Plant
+from thermogrip.sysid.plant.plant_data import PlantScores
 
 
 def a_plant(correlation: float, jacobian: np.ndarray | None = None) -> Plant:

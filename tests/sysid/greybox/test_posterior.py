@@ -33,8 +33,8 @@ from thermogrip.sysid.greybox.problem import make_problem
 from thermogrip.sysid.greybox.sandwich import score_covariance
 from thermogrip.sysid.models.network_spec import Parameter
 from thermogrip.sysid.models.state_space import StateSpaceModel
-from thermogrip.sysid.plant.fit_record import PlantScores, Sampling
 from thermogrip.sysid.plant.plant import Plant
+from thermogrip.sysid.plant.plant_data import PlantScores, Sampling
 
 Array = NDArray[np.float64]
 

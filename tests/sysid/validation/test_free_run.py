@@ -13,8 +13,8 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.log_files import read_log, write_log
 from thermogrip.datasets.schema import make_log
 from thermogrip.sysid.models.state_space import StateSpaceModel
-from thermogrip.sysid.plant.fit_record import fit_logs
 from thermogrip.sysid.plant.plant import Plant
+from thermogrip.sysid.plant.plant_data import fit_logs
 from thermogrip.sysid.validation import free_run as module
 from thermogrip.sysid.validation.free_run import free_run, no_input_baseline, score
 from thermogrip.sysid.validation.residual_tests import CorrelationTest, ResidualCorrelations

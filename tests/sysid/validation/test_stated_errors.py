@@ -16,8 +16,8 @@ from thermogrip.sysid.identification import Held, run_held_out
 from thermogrip.sysid.models.network import load_network
 from thermogrip.sysid.models.neural import NeuralModel
 from thermogrip.sysid.models.state_space import StateSpaceModel
-from thermogrip.sysid.plant.fit_record import HeldOut, PlantScores
 from thermogrip.sysid.plant.plant import Plant
+from thermogrip.sysid.plant.plant_data import HeldOut, PlantScores
 from thermogrip.sysid.validation.free_run import free_run
 from thermogrip.sysid.validation.stated_errors import (
     MOST_DISAGREEMENT,

@@ -11,8 +11,8 @@ from scipy.signal import lfilter
 from thermogrip.datasets.schema import Log, make_log
 from thermogrip.sysid.blackbox.fit import fit_black_box
 from thermogrip.sysid.models.state_space import StateSpaceModel
-from thermogrip.sysid.plant.fit_record import fit_logs
 from thermogrip.sysid.plant.plant import Plant
+from thermogrip.sysid.plant.plant_data import fit_logs
 from thermogrip.sysid.validation.free_run import free_run
 from thermogrip.sysid.validation.stated_errors import NO_BETTER, Band, InputEffect, judge
 
