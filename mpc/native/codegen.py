@@ -18,6 +18,8 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
+from thermogrip.mpc.plant.prediction import symbolic_slope, symbolic_step
+
 if TYPE_CHECKING:
     from thermogrip.sysid.models.model import Model
 
@@ -199,17 +201,14 @@ def _graph(model: Model, drives: Sequence[int], h: float) -> Any:
     sizes = (len(model.parameters), model.n_x, len(drives), n_d)
     p, x, u, d = (ca.SX.sym(letter, n) for letter, n in zip("pxud", sizes))
     sx, su, sd = (ca.SX.sym("s" + letter, n) for letter, n in zip("xud", sizes[1:]))
-    full = [ca.SX(1.0)] * len(model.inputs)
-    for place, value in zip(drives, ca.vertsplit(u), strict=True):
-        full[place] = value
-    lists = [ca.vertsplit(item) if item.numel() else [] for item in (x, d, p)]
-    after = ca.vertcat(*model.step(lists[0], full, lists[1], lists[2], h))
-    along = (sx, su, sd)
+    point = (x, u, d)
+    about = model, drives, point, ca.vertsplit(p) if p.numel() else [], h
     # a dense Jacobian of an implicit step takes ten times the work of the step for every sample; a dozen
     # tangents that share their partial derivatives take two or three
-    tangents = [ca.jtimes(after, ca.vertcat(*(x, u, d)[:n]), ca.vertcat(*along[:n])) for n in range(1, 4)]
+    directions = [(sx, 0 * su, 0 * sd), (sx, su, 0 * sd), (sx, su, sd)]
+    after, tangents = symbolic_step(*about), [symbolic_slope(*about, along) for along in directions]
     results = ca.cse([ca.densify(item) for item in (after, *tangents)])
-    return ca.Function("model", [p, x, u, d, *along], results)
+    return ca.Function("model", [p, *point, sx, su, sd], results)
 
 
 def _straight(function: Any) -> _Line:
@@ -233,7 +232,8 @@ def _straight(function: Any) -> _Line:
             value = _Value(operation, inputs[source].format(place), (), stages[source], entry)
         elif operation == "OP_CONST":
             constant = float(function.instruction_constant(number))
-            value = _Value(operation, f"({constant!r})", (), 0, constant)
+            text = f"({constant!r})".replace("inf", "INFINITY")
+            value = _Value(operation, text, (), 0, constant)
         else:
             uses = tuple(value_at[place] for place in out_of)
             value = _operation(line, operation, uses)

@@ -110,6 +110,7 @@ class RestGains:
     response: Array  # (n_b, n_u) of that output to each block, summed over time
     # (n_b, n_u) whether the horizon shows the response of a drive whose gain may fade or turn over
     seen: Mask
+    drive: Array  # (n_u,) where that is
 
     @classmethod
     def of(cls, model: PredictionModel, design: Design) -> RestGains:
@@ -126,7 +127,7 @@ class RestGains:
         # of a drive that is no loop's and serves a limit, what it does to a target may fade or turn over
         paired = {loop.drive for loop in design.loops}
         is_seen &= np.array([name in paired or not (paired and design.limits) for name in model.drives])
-        return cls(strongest, pair, rows[strongest], response, is_seen)
+        return cls(strongest, pair, rows[strongest], response, is_seen, u)
 
 
 def _strongest_response(G: Array, rows: NDArray[np.int_]) -> Array:
@@ -318,17 +319,20 @@ class Optimiser:
         drives, fades = self.drives, authority < 1 - FADING
         low, high = (np.broadcast_to(end, guess.shape) for end in (drives.lowest, drives.highest))
         if fades.any():
-            away, last_away = guess - drives.neutral, problem.last - drives.neutral
+            # a Peltier's gain fades in proportion to its drive, to nothing at the optimum: what is left of it
+            # along the guess, of what it was at rest, says where that is; not where no drive is away from
+            # there.  The bias counts where the gain is evaluated, not in the share of the way there: it is a
+            # heat flow, and heat moves no optimum
+            begin = self.at_rest.drive
+            away, last_away = guess - begin, problem.last - begin
+            fades &= np.abs(away) > LITTLE * self.model.span
             reach = (self.reach[:, None] + problem.more) * drives.slew
             least = np.where(away * last_away > 0, np.abs(last_away) - reach, 0.0)  # what the slew allows
-            # a Peltier's gain fades in proportion to its drive, to nothing at the optimum: what is left of it
-            # along the guess says where that is.  The bias counts where the gain is evaluated, not in the
-            # share of the way there: it is a heat flow, and heat moves no optimum
             best = np.abs(away + drive_bias) / np.maximum(1 - authority, FADING)  # where the gain is nothing
-            end = np.abs(np.where(away < 0, drives.lowest, drives.highest) - drives.neutral)
+            end = np.abs(np.where(away < 0, drives.lowest, drives.highest) - begin)
             room = np.maximum(best * allowed_share(end, best, self.model.span), least)
-            low = drives.cut(np.where(fades & (away < 0), drives.neutral - room, drives.lowest))
-            high = drives.cut(np.where(fades & (away > 0), drives.neutral + room, drives.highest))
+            low = drives.cut(np.where(fades & (away < 0), begin - room, drives.lowest))
+            high = drives.cut(np.where(fades & (away > 0), begin + room, drives.highest))
         if not problem.parked:
             return low, high
         little = np.zeros(self.model.n_u)

@@ -23,7 +23,8 @@ from scipy.optimize import least_squares
 
 from thermogrip.datasets.arrays import Array, Mask, Values
 from thermogrip.datasets.errors import UserError
-from thermogrip.sysid.models.model import Sizes
+from thermogrip.sysid.models.model import Model, Sizes
+from thermogrip.sysid.models.user_model import OwnModel
 from thermogrip.sysid.plant.linearise import settled
 
 if TYPE_CHECKING:
@@ -229,12 +230,14 @@ class PredictionModel:
         import casadi as ca
 
         symbols = _symbols(self)
-        after = ca.vertcat(*_symbolic_step(self, symbols))
+        of_model = self.model, self.drive_index
+        numbers = self.p.tolist(), self.dt / self.sub
+        after = symbolic_step(*of_model, symbols, *numbers)
         if any(ca.which_depends(after, ca.vertcat(*symbols), 2, True)):
             return None
         # CasADi's own: once, which is not worth a compiled step
         for _ in range(1, self.sub):
-            after = ca.vertcat(*_symbolic_step(self, [after, *symbols[1:]]))
+            after = symbolic_step(*of_model, [after, *symbols[1:]], *numbers)
         blocks = [after, *(ca.densify(ca.jacobian(after, of)) for of in symbols)]
         from_zero = ca.Function("sample", symbols, blocks)(*(np.zeros(of.numel()) for of in symbols))
         at_zero, *derivatives = (np.asarray(value.full()) for value in from_zero)
@@ -346,15 +349,38 @@ def _symbols(model: PredictionModel, prefix: str = "") -> list[Any]:
     return [ca.SX.sym(prefix + name, n) for name, n in zip("xud", (model.n_x, model.n_u, model.n_d))]
 
 
-def _symbolic_step(model: PredictionModel, symbols: list[Any]) -> list[Any]:
-    """Return the state a step of the model after x under u, d, switches on, as CasADi's symbols."""
+def symbolic_step(model: Model, drives: Sequence[int], point: Sequence[Any], p: Values, h: float) -> Any:
+    """Return the state after a step from x under u, d, inputs that are no ``drives`` on, of CasADi's
+    symbols."""
     import casadi as ca
 
-    x, u, d = (ca.vertsplit(item) if item.numel() else [] for item in symbols)
-    full = [ca.SX(1.0)] * len(model.model.inputs)
-    for place, value in zip(model.drive_index, u, strict=True):
+    return ca.densify(ca.vertcat(*model.step(*_all_inputs(model, drives, point, 1.0), p, h)))
+
+
+def symbolic_slope(
+    model: Model, drives: Sequence[int], point: Sequence[Any], p: Values, h: float, along: Sequence[Any]
+) -> Any:
+    """Return the derivative of :func:`symbolic_step` along directions of x, of u, and of d."""
+    import casadi as ca
+
+    if isinstance(model, OwnModel):
+        directions = _all_inputs(model, drives, along, 0.0)
+        return model.slope(*_all_inputs(model, drives, point, 1.0), p, h, directions)
+    after = symbolic_step(model, drives, point, p, h)
+    return ca.densify(ca.jtimes(after, ca.vertcat(*point), ca.vertcat(*along)))
+
+
+def _all_inputs(
+    model: Model, drives: Sequence[int], point: Sequence[Any], others: float
+) -> tuple[list[Any], list[Any], list[Any]]:
+    """Return x, u, d as lists, u with the inputs that are no drives."""
+    import casadi as ca
+
+    x, u, d = (ca.vertsplit(item) if item.numel() else [] for item in point)
+    full = [ca.SX(others)] * len(model.inputs)
+    for place, value in zip(drives, u, strict=True):
         full[place] = value
-    return list(model.model.step(x, full, d, model.p.tolist(), model.dt / model.sub))
+    return x, full, d
 
 
 def _tangent_kernel(model: PredictionModel) -> Kernel:
@@ -369,8 +395,8 @@ def _tangent_kernel(model: PredictionModel) -> Kernel:
         point, along = zip(
             *((ca.vertcat(*v[: len(v) // 2]), ca.vertcat(*v[len(v) // 2 :])) for v in (x, u, d))
         )
-        after = ca.vertcat(*_symbolic_step(model, list(point)))
-        slope = ca.jtimes(after, ca.vertcat(*point), ca.vertcat(*along))
+        about = model.model, model.drive_index, point, model.p.tolist(), model.dt / model.sub
+        after, slope = symbolic_step(*about), symbolic_slope(*about, along)
         return [*ca.vertsplit(after), *ca.vertsplit(slope)]
 
     def output(x: Values, p: Values) -> list[Any]:

@@ -25,7 +25,7 @@ import reprlib
 import sys
 import traceback
 from collections import namedtuple
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Sized
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from functools import lru_cache
@@ -307,6 +307,12 @@ class OwnSettings:
     step_error: float = 0.1  # of a sensor's sd (rms), between n pieces and 2 n
     most_pieces: int = 256  # of a step
     sensor_sd: float = 0.02  # of an output's spread in the logs, where the class states no sd
+    # argument of a root, below which its slope is that of the chord: the difference of ``linearise_plant``
+    chord: float = 1e-3
+    # of a rate times a step: from where on the Runge-Kutta rule grows, and where it damps most, the root of
+    # 1 + z + z^2 / 2 + z^3 / 6
+    unstable: float = 2.785
+    strongest: float = 1.596
 
 
 OWN = OwnSettings()
@@ -353,6 +359,53 @@ def still(code: OwnCode, y: Array, u: Array, d: Array, p: Array, *, sd: Array, s
     return np.asarray(least_squares(residuals, z, bounds=(low, high)).x[:n_x] * scale)
 
 
+@lru_cache(maxsize=32)
+def _rate(code: OwnCode, h: float) -> Any:
+    """Return a function (x, u, d, p, su, sd) of CasADi's: dx/dt, its derivative by x, and along su and sd."""
+    ca: Any = import_module("casadi")
+    groups: list[Sized] = [code.states, code.inputs, code.disturbances, code.parameters]
+    sizes = [len(group) for group in groups]
+    x, u, d, p = (ca.SX.sym(letter, n) for letter, n in zip("xudp", sizes))
+    su, sd = (ca.SX.sym("s" + letter, n) for letter, n in zip("ud", sizes[1:]))
+    lists = [_for_numpy(ca.vertsplit(item) if item.numel() else []) for item in (x, u, d, p)]
+    rate = ca.vertcat(*_plain(code.rhs(*lists)))
+    blunt = _without_infinite_slopes(rate, [x, u, d, p])
+    by_x = ca.densify(ca.jacobian(blunt, x))
+    # a tank that runs empty has a rate that no step follows: the true answer of a sample dies out, that of
+    # the rule would grow without bound.  All that the state does is scaled, for what leaves one tank enters
+    # another
+    speed = -h * ca.diag(by_x)
+    scale = ca.if_else(speed > OWN.unstable, OWN.strongest / speed, 1)
+    slope = ca.jtimes(blunt, ca.vertcat(u, d), ca.vertcat(su, sd))
+    return ca.Function("rate", [x, u, d, p, su, sd], [rate, by_x @ ca.diag(scale), slope])
+
+
+def _without_infinite_slopes(values: Any, symbols: Sequence[Any]) -> Any:
+    """Return the same expressions of CasADi, but that roots are straight lines near 0."""
+    ca: Any = import_module("casadi")
+    # beside a factor that is 0, such as that of np.maximum(x, 0) below 0, an infinite slope is no number
+    function = ca.Function("values", symbols, [values])
+    work, results = dict[int, Any](), list(ca.vertsplit(values))
+    for k in range(function.n_instructions()):
+        operation = function.instruction_id(k)
+        into, of = function.instruction_output(k), function.instruction_input(k)
+        arguments = [work.get(place) for place in of]
+        if operation == ca.OP_OUTPUT:
+            results[into[1]] = work[of[0]]
+        elif operation == ca.OP_INPUT:
+            work[into[0]] = symbols[of[0]][of[1]]
+        elif operation == ca.OP_CONST:
+            work[into[0]] = ca.SX(function.instruction_constant(k))
+        elif operation in (ca.OP_SQRT, ca.OP_POW, ca.OP_CONSTPOW):
+            base, power = (*arguments, ca.SX(0.5))[:2]
+            is_root = ca.logic_and(base < OWN.chord, ca.logic_and(power > 0, power < 1))
+            work[into[0]] = ca.if_else(is_root, base * OWN.chord ** (power - 1), base**power)
+        else:
+            operate = ca.SX.unary if len(of) == 1 else ca.SX.binary
+            work[into[0]] = operate(operation, *arguments)
+    return ca.vertcat(*results)
+
+
 @dataclass(eq=False)
 class OwnModel(Described):
     """The equations of a user's class; the numbers come as ``p``, in the order of :attr:`parameters`."""
@@ -383,6 +436,31 @@ class OwnModel(Described):
         for _ in range(n):
             state = self.code.step(state, u, d, p, dt / n)
         return state
+
+    def slope(
+        self, x: Values, u: Values, d: Values, p: Values, dt: float, along: Sequence[Values]
+    ) -> Any:
+        """Return the derivative of :meth:`step` along directions of x, u and d, of CasADi's symbols."""
+        ca: Any = import_module("casadi")
+        state, u, d, p, slope, *others = (ca.vertcat(*values) for values in (x, u, d, p, *along))
+        n = self._pieces(dt)
+        h, rate = dt / n, _rate(self.code, dt / n)
+        for _ in range(n):
+            k, by, rates, slopes = 0, 0, [], []
+            for share in (0, h / 2, h / 2, h):
+                k, by_state, by_others = rate(state + share * k, u, d, p, *others)
+                by = by_state @ (slope + share * by) + by_others
+                rates.append(k)
+                slopes.append(by)
+            state, slope = (
+                value + h / 6 * (k1 + 2 * (k2 + k3) + k4)
+                for value, (k1, k2, k3, k4) in ((state, rates), (slope, slopes))
+            )
+            for i, (low, high) in enumerate(self.code.limits):
+                if np.isfinite([low, high]).any():
+                    slope[i] *= ca.logic_and(state[i] >= low, state[i] <= high)
+                    state[i] = ca.fmin(ca.fmax(state[i], low), high)
+        return slope
 
     def output(self, x: Values, p: Values) -> list[Any]:
         """Return what the outputs read at state x, a list of length n_y."""

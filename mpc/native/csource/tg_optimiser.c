@@ -325,21 +325,21 @@ static void set_bounds(tg_controller *c, const double *guess, const double *driv
     for (int b = 0; b < s->n_b; b++)
         for (int j = 0; j < TG_NU; j++) {
             int at = b * TG_NU + j;
-            double away = guess[at] - s->neutral[j], lost = 1.0 - c->authority[at];
+            double away = guess[at] - s->begin[j], lost = 1.0 - c->authority[at];
             double low = s->lowest[j], high = s->highest[j];
             double gap = (s->reach[b] - (b ? s->reach[b - 1] : -more)) * s->slew[j];
             double before = b ? 0.0 : last[j];
-            if (lost > TG_FADING) {
-                double best = fabs(away + drive_bias[j]) / lost, held = last[j] - s->neutral[j];
-                double end = fabs((away < 0.0 ? low : high) - s->neutral[j]);
+            if (lost > TG_FADING && fabs(away) > TG_LITTLE * s->span[j]) {
+                double best = fabs(away + drive_bias[j]) / lost, held = last[j] - s->begin[j];
+                double end = fabs((away < 0.0 ? low : high) - s->begin[j]);
                 double room = best * allowed_share(end, best, s->span[j]);
                 double still = away * held > 0.0 ? fabs(held) - (s->reach[b] + more) * s->slew[j] : 0.0;
                 if (room < still)
                     room = still; /* what the slew allows */
-                if (away < 0.0 && s->neutral[j] - room > low)
-                    low = s->neutral[j] - room;
-                if (away > 0.0 && s->neutral[j] + room < high)
-                    high = s->neutral[j] + room;
+                if (away < 0.0 && s->begin[j] - room > low)
+                    low = s->begin[j] - room;
+                if (away > 0.0 && s->begin[j] + room < high)
+                    high = s->begin[j] + room;
             }
             if (is_parked(c, j)) {
                 low = guess[at] - TG_LITTLE * s->span[j];
