@@ -242,33 +242,6 @@ def test_an_export_passes_where_drives_and_statuses_are_the_same(
     assert Agreement(7, difference, 3, status, 1, 1, 1, 1).passed == passed
 
 
-@pytest.mark.parametrize(("make", "span"), [(heater, 1.0), (kit, 100.0)])
-def test_a_difference_is_in_shares_of_a_drives_range(make: Any, span: float):
-    controller = make()
-    (sample,) = exports._random_loop(controller, 1, 0, None)
-    for shift, difference in ((0.0, 0.0), (1e-3, 1e-3)):
-        numbers = (span * (sample.drives + shift)).ravel()
-        answer = " ".join(["0", *(float(number).hex() for number in numbers)])
-        found = exports._drive_difference(sample, answer, controller.model.span)
-        assert found == pytest.approx(difference, abs=1e-12)
-    short = answer.rsplit(" ", controller.model.n_u)[0]
-    assert exports._drive_difference(sample, short, controller.model.span) == np.inf
-
-
-def test_random_loops_hold_some_of_every_misfortune():
-    controller = heater()
-    played = exports._random_loop(controller, 400, 1, None)
-    given = np.array([[float.fromhex(word) for word in sample.given.split()] for sample in played])
-    begins, late, y, applied, target = given.T
-    assert np.flatnonzero(begins).tolist() == list(range(0, 400, 40))
-    moved = np.mean((np.diff(target) != 0) & (begins[1:] == 0))
-    for share in (np.mean(late), np.mean(np.isnan(y)), moved):
-        assert 0.01 < share < 0.08
-    assert 0.0 < np.mean((applied < 0) | (applied > 1)) < 0.05
-    assert {sample.status for sample in played} >= {"ok", "late", "fallback_plan"}
-    assert 0.2 < np.mean([sample.free for sample in played]) < 0.9
-
-
 def test_the_readme_gives_the_controllers_own_numbers(tmp_path: Path):
     controller = kit(limits={"t1": (0.0, 50.0)})
     exports.export_controller(controller, tmp_path)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ctypes
-import re
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -148,21 +147,3 @@ def test_a_state_that_parameters_alone_decide_is_handed_over():
     model.step = lambda x, u, d, p, h: [2.0 * p[0]]
     code = write_model(model, [0], 1.0)
     assert (code.constants([3.0]), "xn[0] = k[0];" in code.source) == ([6.0], True)
-
-
-@pytest.mark.parametrize("name", ["gripper", "tank"])
-def test_an_argument_is_called_unused_exactly_where_the_body_does_not_read_it(name: str):
-    """With -Wextra a compiler warns of the first kind; of the second nobody would."""
-    plant = make_tank() if name == "tank" else network_plant(name)
-    model, seen = PredictionModel(plant, dt=plant.dt), 0
-    code = write_model(model.model, model.drive_index, model.dt)
-    for part in code.source.split("\n}\n"):
-        if "{" not in part:
-            continue
-        head, body = part.split("{", 1)
-        arguments = [item.split()[-1].lstrip("*") for item in head[head.index("(") + 1 : -2].split(",")]
-        unused = set(re.findall(r"\(void\)(\w+);", body))
-        rest = re.sub(r"\(void\)\w+;", "", body)
-        assert unused == {item for item in arguments if not re.search(rf"\b{item}\b", rest)}, head
-        seen += 1
-    assert seen == 9

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import replace
 
 import numpy as np
@@ -60,15 +59,3 @@ def test_what_is_smaller_than_its_field_stands_in_the_fields_first_corner():
     sizes = replace(sizes_of(heater(), CODE, room=False), NB=3, NU=4)
     found = design_struct._padded(sizes, "at_rest", [[1, 2], [3, 4]])
     assert found.tolist() == [[1, 2, 0, 0], [3, 4, 0, 0], [0, 0, 0, 0]]
-
-
-def test_what_counts_or_says_whether_is_an_int_in_c_and_all_else_is_a_double():
-    controller = kit(controlled=("t2",), limits={"t1": (0.0, 50.0)})
-    kinds = {
-        name: np.asarray(values).dtype.kind in "ib"
-        for name, values in numbers_of(controller, np.zeros(5)).items()
-        if np.size(values)
-    }
-    declared = design_struct.config_header(sizes_of(controller, CODE, room=False))
-    for name, whole in kinds.items():
-        assert re.search(rf"^    {'int' if whole else 'double'} {name}[;\[]", declared, re.MULTILINE), name

@@ -79,41 +79,6 @@ def test_derivatives_along_a_plan_are_those_that_casadi_finds(tank, gripper, nam
         )
 
 
-def test_a_step_that_is_more_than_arithmetic_is_linearised_too(tank):
-    class Bent(type(tank.model)):
-        """The tank, its drive through an arc tangent."""
-
-        def step(self, x, u, d, p, dt):
-            bent = u[0].arctan() if hasattr(u[0], "arctan") else np.arctan(u[0])
-            return super().step(x, [bent, *u[1:]], d, p, dt)
-
-        def rollout(self, x0, u, d, p, dt):
-            bent = np.concatenate([np.arctan(u[..., :1]), u[..., 1:]], axis=-1)
-            return super().rollout(x0, bent, d, p, dt)
-
-    names = [
-        "inputs",
-        "disturbances",
-        "outputs",
-        "A",
-        "B",
-        "C",
-        "dt",
-        "E",
-        "c",
-        "y0",
-        "switches",
-        "terms",
-        "F",
-    ]
-    bent = Bent(**{name: getattr(tank.model, name) for name in names})
-    model = PredictionModel(replace(tank, model=bent), dt=2.0)
-    x = model.rest(np.array([25.0, 25.0]), ROOM)
-    _, _, B, _ = model.linearise(x, np.array([0.5]), ROOM)
-    _, _, straight, _ = PredictionModel(tank, dt=2.0).linearise(x, np.array([0.5]), ROOM)
-    np.testing.assert_allclose(B, straight / (1 + 0.5**2), rtol=1e-9)
-
-
 def test_a_coarser_step_is_taken_only_where_it_predicts_the_same(gripper):
     coarse, fine = PredictionModel(gripper, dt=2.0), PredictionModel(gripper, dt=0.5)
     assert coarse.sub < 4
