@@ -70,7 +70,7 @@ def test_what_json_cannot_hold_is_text_and_collections_are_lists(value: object, 
     assert plain(value) == held
 
 
-def test_a_table_is_as_wide_as_its_terminal_or_100_columns_and_breaks_no_word(
+def test_a_table_is_as_wide_as_its_terminal_or_100_columns_and_breaks_names_alone(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     prose = "held-out readings of the whole day in one sentence that is longer than its column can be wide"
@@ -84,8 +84,9 @@ def test_a_table_is_as_wide_as_its_terminal_or_100_columns_and_breaks_no_word(
         assert max(map(len, (head, first, *more, last))) <= width
         assert " ".join([first, *more]).split() == ["features-lda", "1.5", *prose.split()]
         assert head.index("value") + 5 == first.index("1.5") + 3 == last.index("-") + 1
-    Console().table("title", ["name", "value"], [["x" * 59, 2.0]])
-    assert capsys.readouterr().out.split("\n\n")[1].splitlines() == [f"name: {'x' * 59}", "value: 2"]
+    for name, broken in (("x" * 59, [f"name: {'x' * 59}", "2"]), ("x_" * 33, ["x_" * 28 + "   2", "x_" * 5])):
+        Console().table("title", ["name", ""], [[name, 2.0]])
+        assert capsys.readouterr().out.split("\n\n")[1].splitlines()[-2:] == broken
 
 
 def test_what_is_known_so_far_is_a_table_on_a_terminal_and_a_line_elsewhere(

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -18,7 +19,7 @@ from dataclasses import dataclass, fields, is_dataclass
 from itertools import zip_longest
 from pathlib import Path
 from shutil import get_terminal_size
-from textwrap import TextWrapper, wrap
+from textwrap import TextWrapper
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from thermogrip.datasets.media import printable
@@ -68,8 +69,8 @@ class Console:
         self, title: str, head: Sequence[str], rows: Sequence[Sequence[Any]], *, wrap: bool = True
     ) -> None:
         """Print a table for people, as wide as the terminal (100 columns of what is none), or not wrapped;
-        numbers stand to the right, no word is broken, and where the columns are too many each row is a block
-        of lines."""
+        numbers stand to the right, a word is broken only after an underscore, where the columns are too many,
+        and where they still are each row is a block of lines."""
         if not self.as_json:
             sys.stdout.write(_table(title, head, rows, _room() if wrap else sys.maxsize))
 
@@ -155,19 +156,27 @@ def _table(title: str, head: Sequence[str], rows: Sequence[Sequence[Any]], width
     cells = [[printable(name) for name in head], *([printable(short(c)) for c in row] for row in rows)]
     columns = range(len(head))
     numeric = [all(isinstance(row[k], int | float) or row[k] is None for row in rows) for k in columns]
-    least = [max(len(word) for row in cells for word in row[k].split() or [""]) for k in columns]
-    wide = [max(len(row[k]) for row in cells) for k in columns]
     room = width - 2 * (len(head) - 1)
-    while sum(wide) > room and (open_ := [k for k in columns if wide[k] > least[k]]):
-        wide[max(open_, key=lambda k: wide[k])] -= 1
+    wrapper = TextWrapper(break_on_hyphens=False)
+    for breaks in (r"(\s+)", r"(\s+|(?<=_))"):  # names of logs and columns are long, and have no blanks
+        wrapper.wordsep_simple_re = re.compile(breaks)
+        least = [max(len(word) for row in cells for word in re.split(breaks, row[k])) for k in columns]
+        wide = [max(len(row[k]) for row in cells) for k in columns]
+        while sum(wide) > room and (open_ := [k for k in columns if wide[k] > least[k]]):
+            wide[max(open_, key=lambda k: wide[k])] -= 1
+        if sum(wide) <= room:
+            break
     lines = [printable(title), ""]
     for row_number, row in enumerate(cells):
         if sum(wide) > room:
-            lines += [f"{name}: {cell}" for name, cell in zip(cells[0], row)] + [""] if row_number else []
+            named = [f"{name}: {cell}" if name else cell for name, cell in zip(cells[0], row)]
+            lines += [*named, ""] if row_number else []
             continue
-        for line_cells in zip_longest(
-            *(wrap(row[k], wide[k], break_on_hyphens=False) or [""] for k in columns), fillvalue=""
-        ):
+        wrapped = []
+        for k in columns:
+            wrapper.width = wide[k]
+            wrapped.append(wrapper.wrap(row[k]))
+        for line_cells in zip_longest(*wrapped, fillvalue=""):
             aligned = (
                 words.rjust(w) if n else words.ljust(w) for words, w, n in zip(line_cells, wide, numeric)
             )
