@@ -52,7 +52,7 @@ def pages() -> dict[Path, str]:
 
 def page_of_verbs() -> str:
     """Return what ``thermogrip VERB --help`` prints, a section a verb; options of several verbs once."""
-    from thermogrip.cli.verbs import VERBS
+    from thermogrip.cli.main import VERBS
 
     helps = {verb: help_of(verb) for verb in VERBS}
     options = {verb: dict(re.findall(_OPTION, text)) for verb, text in helps.items()}

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -46,7 +47,7 @@ from thermogrip.sysid.data.preparation import (
     without_still,
 )
 from thermogrip.sysid.plant.innovations import innovation_noise
-from thermogrip.sysid.plant.log_grid import Grid, match_logs, misfit, moved_before, signals
+from thermogrip.sysid.plant.log_grid import match_logs, misfit, moved_before, signals
 from thermogrip.sysid.plant.log_grid import rows_of as log_rows
 from thermogrip.sysid.plant.plant import Plant
 from thermogrip.sysid.plant.plant_data import HELD_OUT_SHARE, TAIL, ExpectedError, HeldOut
@@ -213,14 +214,11 @@ class _Task:
 
     logs: list[Log]
     network: GreyModel | None
-    inputs: tuple[str, ...]
-    outputs: tuple[str, ...]
-    disturbances: tuple[str, ...]
+    fit_box: Callable[..., BlackBoxFit]  # of a kind to logs, with the signals and the step of all
     checked: DataCheck
     signals: tuple[SignalRole, ...]
     doubts: tuple[str, ...]
     notes: tuple[str, ...]  # what was converted, taken for rest, or left out
-    average: float | None
     leave_one_out: bool
 
 
@@ -258,7 +256,8 @@ def _read_logs(
     all_named = named["inputs"] is not None and named["outputs"] is not None
     doubts = (*role_doubts(logs, named_all=all_named), *doubt_of_gains(logs, u))
     notes = (*matched.converted, *rested, *unused)
-    return _Task(logs, model, u, y, d, checked, roles, doubts, notes, average, leave_one_out)
+    fit_box = partial(fit_black_box, inputs=u, outputs=y, disturbances=d, average=average)
+    return _Task(logs, model, fit_box, checked, roles, doubts, notes, leave_one_out)
 
 
 def _ask_for_excitation(checked: DataCheck, inputs: Sequence[str], log: Log) -> None:
@@ -342,7 +341,7 @@ def _fit_black_boxes(
                     "models err by little more than noise, or less than another run differs (--models neural "
                     "fits it)"
                 )
-            fits[kind] = _fit_box(kind, task.logs, task, report, grid=grid)
+            fits[kind] = task.fit_box(kind, task.logs, grid=grid, progress=report)
         except UserError as error:
             refused[kind] = f"{kind}: {error}"
             continue
@@ -353,21 +352,6 @@ def _fit_black_boxes(
     in_order = [fits[kind] for kind in boxes if kind in fits]
     chosen = choose_black_box(in_order, task.logs) if in_order else None
     return _Boxes(in_order, [refused[kind] for kind in boxes if kind in refused], chosen)
-
-
-def _fit_box(
-    kind: str, logs: Sequence[Log], task: _Task, report: Progress | None, grid: Grid | None = None
-) -> BlackBoxFit:
-    return fit_black_box(
-        kind,
-        logs,
-        inputs=task.inputs,
-        outputs=task.outputs,
-        disturbances=task.disturbances,
-        average=task.average,
-        grid=grid,
-        progress=report,
-    )
 
 
 # held out: the finalists on what they were fitted without
@@ -414,7 +398,7 @@ def run_held_out(plant: Plant, held: Held, *, unseen: bool = False) -> FreeRun:
     """Return the free run over what is held out; ``unseen`` by the fit, a neural model may be refused."""
     # a log may begin warm, and then its state needs more readings than one that begins at rest
     warmup = max(5.0 if held.score_from == 0 else warm_up_of(held.log["time"].values), plant.dt)
-    if unseen and plant.model.kind == "neural":
+    if unseen:
         check_ensemble(plant, held.log, warmup=warmup)
     return free_run(plant, held.log, warmup=warmup, score_from=max(warmup, held.score_from), tests=False)
 
@@ -463,9 +447,6 @@ class _Fold:
     runs: dict[str, FreeRun]  # by what was held out
 
 
-_FoldItem = tuple[str, Case, "BlackBoxFit | None", _Task, "Progress | None"]
-
-
 def _hold_out(
     kinds: Sequence[str],
     cases: Sequence[Case],
@@ -476,16 +457,13 @@ def _hold_out(
 ) -> list[_Fold]:
     """Fit each finalist without what is held out, and run it over that; on several processes where whole logs
     are left out and they can know the network, which is no class of the user's own."""
-    from thermogrip.sysid.models.network import NetworkModel
-
     pairs = [(kind, case) for case in cases for kind in kinds]
-    portable = task.network is None or isinstance(task.network, NetworkModel)
-    if task.leave_one_out and workers != 1 and portable:
-        items: list[_FoldItem] = [(kind, case, kept, task, None) for kind, case in pairs]
-        report = steps.start("left out", of=len(items))
-        return list(in_order(_fold_of, items, workers, report, what="fitting"))
+    fold_of = partial(_fold_of, kept=kept, task=task)
+    if task.leave_one_out and workers != 1 and (task.network is None or task.network.kind == "network"):
+        report = steps.start("left out", of=len(pairs))
+        return list(in_order(fold_of, pairs, workers, report, what="fitting"))
     return [
-        _fold_of((kind, case, kept, task, steps.start(f"{kind} without {_case_name(case)}")))
+        fold_of((kind, case), report=steps.start(f"{kind} without {_case_name(case)}"))
         for kind, case in pairs
     ]
 
@@ -495,9 +473,11 @@ def _case_name(case: Case) -> str:
     return case.held[0].name if len(case.held) == 1 else f"{TAIL}each log"
 
 
-def _fold_of(item: _FoldItem) -> _Fold:
+def _fold_of(
+    pair: tuple[str, Case], *, kept: BlackBoxFit | None, task: _Task, report: Progress | None = None
+) -> _Fold:
     """Fit a candidate to the training logs of a case and run it over what is held out."""
-    kind, case, kept, task, report = item
+    kind, case = pair
     fold = _Fold(kind, [], {})
     try:
         plant = _fitted(kind, case.train, kept, task, report)
@@ -531,7 +511,7 @@ def _fitted(
         assert task.network is not None
         return fit_network(task.network, train, progress=report)
     if kept is None:
-        return _fit_box(kind, train, task, report).plant
+        return task.fit_box(kind, train, progress=report).plant
     grid = kept.grid.of(train, ends=kept.grid.ends)
     model = family_of(kind)(grid, only=(kept.choice.structure,)).get(kept.choice.structure)
     if model is None:
@@ -601,7 +581,7 @@ def _refit(
 ) -> tuple[Plant, list[str]]:
     """Return the plant of a kind fitted to all logs with its draws, and in words why it has none."""
     report = steps.start(f"{kind} on all logs")
-    box = None if kind == "network" else kept or _fit_box(kind, task.logs, task, report)
+    box = None if kind == "network" else kept or task.fit_box(kind, task.logs, progress=report)
     plant = box.plant if box is not None else _fitted(kind, task.logs, None, task, report)
     if not draws or (box is not None and kind not in RESAMPLED):
         return plant, []

@@ -18,31 +18,65 @@ import numpy as np
 from thermogrip.datasets.arrays import Array
 from thermogrip.sysid.blackbox.order_selection import (
     Structure,
-    as_state_space,
     column_sizes,
     default_terms,
     drives,
-    with_spread,
+    held,
+    polynomial_model,
 )
 from thermogrip.sysid.models.state_space import StateSpaceModel, first_readings
 from thermogrip.sysid.plant.log_grid import Grid
 
 
-@dataclass(frozen=True)
-class _Orders:
-    poles: int  # and as many rows of the drives
-    delay: int
-    coupled: bool  # whether an output's past is in the equations of the others
-
-
 @dataclass(frozen=True, eq=False)
-class _Regression:
-    """Normal equations of the largest structure; every smaller one is a part of them."""
+class Regression:
+    """Normal equations of the largest structure, columns [y lags | w lags | 1], every lag from 1 to one
+    depth; those of all smaller ones are a part of them."""
 
     gram: Array  # X'X over standardised columns
     cross: Array  # X'Y
     size: Array  # norms of the columns of X
-    deep: int
+    lag: Array  # of each column; 0: the constant
+    signal: Array  # of each column: an output, or a drive after them
+
+    @classmethod
+    def of(cls, outputs: Sequence[Array], drives: Sequence[Array], deep: int) -> Regression | None:
+        """Return those of segments (n, n_y) and (n, n_w); None where too few rows are whole."""
+        # several logs only add rows; one that would reach across a gap or use a lost reading is left out
+        blocks, targets = [], []
+        for y, w in zip(outputs, drives):
+            n = len(y)
+            if n <= deep:
+                continue
+            past = [signals[deep - i : n - i] for signals in (y, w) for i in range(1, deep + 1)]
+            X = np.hstack([*past, np.ones((n - deep, 1))])
+            whole = np.isfinite(X).all(axis=1) & np.isfinite(y[deep:]).all(axis=1)
+            blocks.append(X[whole])
+            targets.append(y[deep:][whole])
+        if not blocks or sum(map(len, blocks)) < 2 * blocks[0].shape[1]:
+            return None
+        X, Y = np.concatenate(blocks), np.concatenate(targets)
+        size = column_sizes(np.linalg.norm(X, axis=0))
+        n_y, n_w, lags = outputs[0].shape[1], drives[0].shape[1], np.arange(1, deep + 1)
+        signal = np.concatenate([np.tile(np.arange(n_y), deep), np.tile(n_y + np.arange(n_w), deep), [-1]])
+        lag = np.concatenate([np.repeat(lags, n_y), np.repeat(lags, n_w), [0]])
+        return cls((X / size).T @ (X / size), (X / size).T @ Y, size, lag, signal)
+
+    def columns(self, output: int, poles: int, late: Sequence[int], *, coupled: bool) -> Array:
+        """Return which columns the equation of an output has: lags of the outputs, or its own alone where
+        these are not coupled, up to ``poles``, those of the drives in ``late``, and the constant."""
+        n_y = self.cross.shape[1]
+        is_past = (self.lag <= poles) & ((self.signal < n_y) if coupled else (self.signal == output))
+        is_drive = (self.signal >= n_y) & np.isin(self.lag, late)
+        return np.flatnonzero(is_past | is_drive | (self.lag == 0))
+
+    def solve(self, output: int, poles: int, late: Sequence[int], *, coupled: bool = True) -> Array:
+        """Return the weights of one output's equation, 0 for a column that it has not."""
+        columns = self.columns(output, poles, late, coupled=coupled)
+        weights = np.zeros(len(self.size))
+        gram, cross = self.gram[np.ix_(columns, columns)], self.cross[columns, output]
+        weights[columns] = np.linalg.lstsq(gram, cross, rcond=1e-13)[0] / self.size[columns]
+        return weights
 
 
 def arx_family(
@@ -59,8 +93,10 @@ def arx_family(
     out = {}
     n_y, n_drive = len(grid.outputs), len(grid.inputs) + len(grid.disturbances)
     couplings = (False, True) if n_y > 1 else (True,)
+    deep = max(poles) + max(delays) - 1
     for products in default_terms(grid) if terms is None else terms:
-        regression = _regress(grid, products, max(poles) + max(delays) - 1)
+        w = drives(grid, products)
+        regression = Regression.of([segment.y for segment in grid.segments], w, deep)
         if regression is None:
             continue
         for n, delay, coupled in product(poles, delays, couplings):
@@ -70,85 +106,25 @@ def arx_family(
             structure = Structure(label, n_y * (n * own_and_driven + 1), products)
             if only is not None and structure not in only:
                 continue
-            model = _solve(grid, products, regression, _Orders(n, delay, coupled))
-            if model is not None:
+            late = range(delay, delay + n)  # of an equation, and its rows of the drives
+            equations = [regression.solve(k, n, late, coupled=coupled) for k in range(n_y)]
+            model = _arx_model(grid, np.transpose(equations), w, late[-1], products)
+            if model.stable:
                 out[structure] = model
     return out
 
 
-def _regress(grid: Grid, terms: tuple[str, ...], deep: int) -> _Regression | None:
-    """Form X'X and X'Y, columns [y lags | w lags | 1], every lag from 1 to one depth."""
-    # the normal equations of the largest structure hold those of all smaller ones; several logs only add
-    # rows, and rows that would reach across a gap or use a lost reading are left out
-    blocks, targets = [], []
-    for segment, w in zip(grid.segments, drives(grid, terms)):
-        y, n = segment.y, len(segment.y)
-        if n <= deep:
-            continue
-        past_y = [y[deep - i : n - i] for i in range(1, deep + 1)]
-        past_w = [w[deep - i : n - i] for i in range(1, deep + 1)]
-        X = np.hstack([*past_y, *past_w, np.ones((n - deep, 1))])
-        whole = np.isfinite(X).all(axis=1) & np.isfinite(y[deep:]).all(axis=1)
-        blocks.append(X[whole])
-        targets.append(y[deep:][whole])
-    if not blocks or sum(map(len, blocks)) < 2 * blocks[0].shape[1]:
-        return None
-    X, Y = np.concatenate(blocks), np.concatenate(targets)
-    size = column_sizes(np.linalg.norm(X, axis=0))
-    return _Regression((X / size).T @ (X / size), (X / size).T @ Y, size, deep)
-
-
-def _solve(
-    grid: Grid, terms: tuple[str, ...], regression: _Regression, orders: _Orders
-) -> StateSpaceModel | None:
-    """Solve one structure from the normal equations; None where the model is unstable."""
-    n_y, n_w = len(grid.outputs), len(grid.inputs) + len(grid.disturbances) + len(terms)
-    solution = np.zeros((regression.gram.shape[0], n_y))
-    for output in range(n_y):
-        columns = _structure_columns(orders, regression.deep, n_y, n_w, output)
-        gram, cross = regression.gram[np.ix_(columns, columns)], regression.cross[columns, output]
-        solution[columns, output] = np.linalg.lstsq(gram, cross, rcond=1e-13)[0] / regression.size[columns]
-    lags = solution[:-1].T
-    A = [lags[:, i * n_y : (i + 1) * n_y] for i in range(orders.poles)]
-    first = regression.deep * n_y
-    B = [lags[:, first + i * n_w : first + (i + 1) * n_w] for i in range(orders.delay + orders.poles - 1)]
-    model = _arx_realisation(grid, terms, A, B, solution[-1])
-    if not model.stable:
-        return None
-    starts = []
-    for segment, w in zip(grid.segments, drives(grid, terms)):
-        # its first reading and first drives have always stood
-        middle = np.nan_to_num(first_readings(segment.y), nan=0.0)
-        past_drives = np.tile(w[0], orders.delay + orders.poles - 2)
-        starts.append(np.concatenate([np.tile(middle, orders.poles), past_drives]))
-    return with_spread(model, grid, starts)
-
-
-def _structure_columns(orders: _Orders, deep: int, n_y: int, n_w: int, output: int) -> list[int]:
-    """Return the columns of the full regression that this structure uses for one output."""
-    outputs = range(n_y) if orders.coupled else [output]
-    past_y = [lag * n_y + j for lag in range(orders.poles) for j in outputs]
-    first = deep * n_y
-    late = range(orders.delay - 1, orders.delay + orders.poles - 1)
-    return [*past_y, *(first + lag * n_w + j for lag in late for j in range(n_w)), first + deep * n_w]
-
-
-def _arx_realisation(
-    grid: Grid, terms: tuple[str, ...], A: Sequence[Array], B: Sequence[Array], c: Array
+def _arx_model(
+    grid: Grid, weights: Array, w: Sequence[Array], n: int, terms: tuple[str, ...]
 ) -> StateSpaceModel:
-    """Return the model with state [y[k], ..., y[k-n+1], w[k-1], ..., w[k-m]], m = len(B) - 1."""
-    n_y = len(grid.outputs)
-    n_w = B[0].shape[1]
-    m = len(B) - 1
-    n = len(A) * n_y + m * n_w
-    matrix = np.zeros((n, n))
-    matrix[:n_y] = np.hstack([*A, *B[1:]])
-    matrix[n_y : len(A) * n_y, : (len(A) - 1) * n_y] = np.eye((len(A) - 1) * n_y)
-    push = np.zeros((n, n_w))
-    push[:n_y] = B[0]
-    if m:
-        low = len(A) * n_y
-        push[low : low + n_w] = np.eye(n_w)
-        matrix[low + n_w :, low : n - n_w] = np.eye((m - 1) * n_w)
-    matrices = matrix, push, np.eye(n_y, n), np.concatenate([c, np.zeros(n - n_y)])
-    return as_state_space(grid, *matrices, terms=terms, origin="arx")
+    """Return the model of weights (columns, n_y), whose lags beyond n are 0."""
+    n_y, n_w = weights.shape[1], w[0].shape[1]
+    deep = len(weights) // (n_y + n_w)
+    A = weights[: n_y * deep].reshape(deep, n_y, n_y).swapaxes(1, 2)[:n]
+    B = weights[n_y * deep : -1].reshape(deep, n_w, n_y).swapaxes(1, 2)[:n]
+    starts = []
+    for segment, drive in zip(grid.segments, w):
+        # its first reading and first drives have always stood
+        first = np.nan_to_num(first_readings(segment.y), nan=0.0)
+        starts.append(np.vstack([first, held(A @ first + B @ drive[0])[1:]]))
+    return polynomial_model(grid, A, B, weights[-1], starts, terms=terms, origin="arx")

@@ -34,13 +34,11 @@ from thermogrip.sysid.blackbox.output_error import (
     Records,
     Search,
     Solution,
-    columns_of,
     fit_rest,
     is_stable,
     least_squares,
     oe_family,
     refine,
-    responses,
     solve,
 )
 
@@ -53,10 +51,8 @@ def solve_armax(c: Array, records: Records, nb: int, delay: int) -> Solution | N
     is unstable."""
     if not is_stable(c):
         return None
-    na, n_shared = len(c), len(c) + records.n_drive * nb + 1
-    impulse, step = responses(c, records)
-    columns, right = [], []
-    for segment, (y, is_read) in enumerate(zip(records.y, records.known)):
+    na, columns, right = len(c), [], []
+    for X, y, is_read in zip(records.columns(c, nb, delay), records.y, records.known):
         # a line replaces a lost reading, and rows that need one carry no weight; rows before the record enter
         # A y in its first na rows alone, where an impulse each takes them up
         rows = np.arange(len(y))
@@ -66,13 +62,10 @@ def solve_armax(c: Array, records: Records, nb: int, delay: int) -> Solution | N
         for i in range(1, na + 1):
             late[i - 1, i:] = -filtered[:-i]
             used[i:] &= is_read[:-i]
-        X = np.vstack([late, columns_of(c, records, segment, nb, delay, impulse, step, lost=True)])
-        columns.append(X * used)
+        columns.append(np.vstack([X[:na], late, X[na:]]) * used)
         right.append(filtered * used)
-    shared, first = least_squares([X[n_shared:] for X in columns], [X[:n_shared] for X in columns], right)
-    misses = [
-        y - shared @ X[:n_shared] - initial @ X[n_shared:] for y, X, initial in zip(right, columns, first)
-    ]
+    shared, first = least_squares(columns, na, right)
+    misses = [y - np.append(initial, shared) @ X for y, X, initial in zip(right, columns, first)]
     cost = float(sum(miss @ miss for miss in misses))
     return Solution(c, cost, shared, first, [-miss for miss in misses], misses, columns)
 

@@ -403,15 +403,43 @@ def default_terms(grid: Grid) -> tuple[tuple[str, ...], ...]:
 
 
 def as_state_space(
-    grid: Grid, A: Array, W: Array, C: Array, c: Array, *, terms: tuple[str, ...], origin: str, **more: Any
+    grid: Grid,
+    A: Array,
+    W: Array,
+    C: Array,
+    c: Array,
+    starts: Sequence[Array],
+    *,
+    terms: tuple[str, ...],
+    origin: str,
+    **more: Any,
 ) -> StateSpaceModel:
-    """Return x+ = A x + W w + c, y = C x as a model of the grid's signals; W (n_x, n_drive)."""
+    """Return x+ = A x + W w + c, y = C x as a model of the grid's signals; where it is stable with the
+    covariance of its state over the training data, of ``starts`` by segment. W (n_x, n_drive)."""
     labels = grid.inputs, grid.disturbances, grid.outputs
     B, E, F = np.split(W, np.cumsum([len(grid.inputs), len(grid.disturbances)]), axis=1)
     matrices = {"A": A, "B": B, "C": C, "E": E, "F": F, "c": c} | more
-    return StateSpaceModel(
+    model = StateSpaceModel(
         *labels, **matrices, dt=grid.dt, switches=grid.switches, terms=terms, origin=origin
     )
+    return with_spread(model, grid, starts) if model.stable else model
+
+
+def polynomial_model(
+    grid: Grid, A: Array, B: Array, c: Array, starts: Sequence[Array], *, terms: tuple[str, ...], origin: str
+) -> StateSpaceModel:
+    """Return y[k] = sum_i A_i y[k - i] + sum_i B_i w[k - i] + c, i = 1 ... n, in observer form: v_i+ =
+    A_i v_1 + v_(i+1) + B_i w, c in v_1, y = v_1; A (n, n_y, n_y), B (n, n_y, n_w), ``starts`` (n, n_y)."""
+    n, n_y, n_w = B.shape
+    matrix, C = np.eye(n * n_y, k=n_y), np.eye(n_y, n * n_y)
+    matrix[:, :n_y] += A.reshape(-1, n_y)
+    states = [start.ravel() for start in starts]
+    return as_state_space(grid, matrix, B.reshape(-1, n_w), C, c @ C, states, terms=terms, origin=origin)
+
+
+def held(moves: Array) -> Array:
+    """Return the states v (n, n_y) of an observer form whose equations (n, n_y) have always moved so."""
+    return np.cumsum(moves[::-1], axis=0)[::-1]
 
 
 def with_spread(model: _Fitted, grid: Grid, starts: Sequence[Array]) -> _Fitted:

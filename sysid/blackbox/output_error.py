@@ -20,12 +20,12 @@ from itertools import product
 from operator import attrgetter
 
 import numpy as np
-from scipy.linalg import block_diag
 from scipy.linalg.lapack import dgeqrf
 from scipy.signal import lfilter
 
 from thermogrip.datasets.arrays import Array
 from thermogrip.sysid.blackbox import order_selection
+from thermogrip.sysid.blackbox.arx import Regression
 from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.log_grid import Grid, bridge
 
@@ -65,6 +65,30 @@ class Records:
         w = [lfilter(D, [1.0], drive, axis=0)[len(D) - 1 :] for drive in self.w]
         return Records([lfilter(D, [1.0], y)[len(D) - 1 :] for y in self.y], w)
 
+    def columns(self, a: Array, nb: int, delay: int) -> list[Array]:
+        """Return what is linear at a denominator as rows (na + n_drive nb + 1, n), by segment: what initial
+        conditions add, the filtered drives at each lag, the filtered constant."""
+        # Columns are shifts: each drive less its first row, a step and an impulse are filtered by 1/A once.
+        # Every lag of a drive is a shift of its filtered rows plus its first value times the step response
+        # (before a segment the first row was held), every initial condition a shift of the impulse response.
+        tests = np.ones((2, self.longest))
+        tests[0, 1:] = 0.0
+        impulse, step = lfilter([1.0], np.append(1.0, a), tests, axis=1)
+        na, out = len(a), []
+        for first, moves in zip(self.first, self.moves):
+            n = moves.shape[1]
+            X = np.zeros((na + self.n_drive * nb + 1, n))
+            for row in range(min(na, n)):
+                X[row, row:] = impulse[: n - row]
+            filtered = lfilter([1.0], np.append(1.0, a), moves, axis=1)
+            for lag in range(nb):
+                late = min(delay + lag, n)
+                X[na + lag : -1 : nb, late:] = filtered[:, : n - late]
+            X[na:-1] += np.repeat(first, nb)[:, None] * step[:n]
+            X[-1] = step[:n]
+            out.append(X)
+        return out
+
 
 @dataclass(frozen=True, eq=False)
 class Solution:
@@ -76,7 +100,7 @@ class Solution:
     first: Array  # (n_segment, na), initial conditions
     outputs: list[Array]  # model output, segment by segment
     misses: list[Array]  # readings minus model output, 0 where lost
-    columns: list[Array]
+    columns: list[Array]  # of the initial conditions, then of what is shared; 0 where lost
 
     def slopes(self, records: Records) -> tuple[Array, Array]:
         """Return T and t of |T da - t|^2, the cost with the linear columns projected out of dv/da."""
@@ -86,7 +110,7 @@ class Solution:
             J = np.zeros((na, len(v)))
             for i in range(1, na + 1):
                 J[i - 1, i:] = -filtered[:-i]
-            rows.append(np.vstack([X[len(self.shared) :], X[: len(self.shared)], J * is_read, miss]))
+            rows.append(np.vstack([X, J * is_read, miss]))
         whole, _ = _triangles(rows, na)
         of_a = slice(len(self.shared), len(self.shared) + na)
         return whole[of_a, of_a], whole[of_a, -1]
@@ -101,20 +125,13 @@ def solve(a: Array, records: Records, nb: int, delay: int) -> Solution | None:
     """Solve for b, c and the initial conditions at this denominator; None where it is unstable."""
     if not is_stable(a):
         return None
-    n_shared = records.n_drive * nb + 1
-    impulse, step = responses(a, records)
-    segments = range(len(records.y))
-    columns = [columns_of(a, records, segment, nb, delay, impulse, step) for segment in segments]
+    whole = records.columns(a, nb, delay)
+    # where a reading is lost the columns are empty, yet the model runs on
+    columns = [X if is_read.all() else X * is_read for X, is_read in zip(whole, records.known)]
     right = [np.where(is_read, y, 0.0) for is_read, y in zip(records.known, records.y)]
-    shared, first = least_squares([X[n_shared:] for X in columns], [X[:n_shared] for X in columns], right)
-    outputs, misses = [], []
-    for segment, is_read in enumerate(records.known):
-        # where a reading is lost the columns are empty, yet the model runs on
-        whole = columns[segment]
-        if not is_read.all():
-            whole = columns_of(a, records, segment, nb, delay, impulse, step, lost=True)
-        outputs.append(shared @ whole[:n_shared] + first[segment] @ whole[n_shared:])
-        misses.append(np.where(is_read, records.y[segment] - outputs[-1], 0.0))
+    shared, first = least_squares(columns, len(a), right)
+    outputs = [np.append(initial, shared) @ X for X, initial in zip(whole, first)]
+    misses = [np.where(is_read, y - v, 0.0) for is_read, y, v in zip(records.known, records.y, outputs)]
     cost = float(sum(miss @ miss for miss in misses))
     return Solution(a, cost, shared, first, outputs, misses, columns)
 
@@ -161,11 +178,12 @@ def _square_r(rows: Array) -> Array:
 
 
 def least_squares(
-    own: Sequence[Array], shared: Sequence[Array], right: Sequence[Array], dependent: float = DEPENDENT
+    columns: Sequence[Array], na: int, right: Sequence[Array], dependent: float = DEPENDENT
 ) -> tuple[Array, Array]:
-    """Return the least-squares weights of the shared columns, and those of each part's own ones."""
-    na, n_own = len(own[0]), len(own) * len(own[0])
-    whole, by_part = _triangles([np.vstack(trio) for trio in zip(own, shared, right)], na)
+    """Return the least-squares weights of the columns (n_column, n) that parts share, and those of the first
+    na, which are each part's own."""
+    n_own = len(columns) * na
+    whole, by_part = _triangles([np.vstack(pair) for pair in zip(columns, right)], na)
     R = np.zeros((n_own + len(whole) - 1, n_own + len(whole)))
     for place, triangle in enumerate(by_part):
         rows = slice(place * na, (place + 1) * na)
@@ -176,52 +194,29 @@ def least_squares(
     return weights[n_own:], weights[:n_own].reshape(-1, na)
 
 
-def responses(a: Array, records: Records) -> Array:
-    """Return the responses of 1/A to an impulse and to a step."""
-    tests = np.zeros((2, records.longest))
-    tests[0, 0], tests[1] = 1.0, 1.0
-    return np.asarray(lfilter([1.0], np.append(1.0, a), tests, axis=1))
-
-
 def arx_start(records: Records, na: int, nb: int, delay: int) -> Array | None:
     """Return a_1 ... a_na of the ARX fit, None where it is unstable or too few rows are whole."""
-    deep = max(na, delay + nb - 1)
-    n = na + records.n_drive * nb + 1
-    gram = np.zeros((n, n))
-    right = np.zeros(n)
-    count = 0
-    for reading, drive in zip(records.y, records.w):
-        if len(reading) <= deep:
-            continue
-        whole = reading if np.isfinite(reading).all() else bridge(reading[:, None])[:, 0]
-        rows = len(whole) - deep
-        past = [-whole[deep - i : deep - i + rows, None] for i in range(1, na + 1)]
-        late = [drive[deep - i : deep - i + rows] for i in range(delay, delay + nb)]
-        X = np.hstack([*past, *late, np.ones((rows, 1))])
-        good = np.isfinite(X[:, :na]).all(axis=1) & np.isfinite(reading[deep:])
-        X, y = X[good], reading[deep:][good]
-        gram = gram + X.T @ X
-        right = right + X.T @ y
-        count = count + len(y)
-    if count < 2 * n:
+    late = range(delay, delay + nb)
+    whole = [
+        y[:, None] if is_read.all() else bridge(y[:, None]) for y, is_read in zip(records.y, records.known)
+    ]
+    regression = Regression.of(whole, records.w, max(na, late[-1]))
+    if regression is None:
         return None
-    size = order_selection.column_sizes(np.sqrt(np.diag(gram)))
-    a = np.asarray((np.linalg.lstsq(gram / size / size[:, None], right / size, rcond=1e-13)[0] / size)[:na])
+    a = -regression.solve(0, na, late)[:na]
     return a if is_stable(a) else None
 
 
 def fit_rest(found: Filter, records: Records) -> tuple[Filter, list[Array]]:
     """Return the filter with constant and initial conditions fitted again, and the errors left."""
-    a, (n_drive, nb) = found.a, found.b.shape
-    end = n_drive * nb
-    impulse, step = responses(a, records)
+    a, nb = found.a, found.b.shape[1]
     columns, right = [], []
-    for segment, is_read in enumerate(records.known):
-        X = columns_of(a, records, segment, nb, found.delay, impulse, step)
-        columns.append(X[end:])
-        right.append(np.where(is_read, records.y[segment], 0.0) - found.b.reshape(-1) @ X[:end])
-    shared, first = least_squares([X[1:] for X in columns], [X[:1] for X in columns], right)
-    misses = [y - shared @ X[:1] - initial @ X[1:] for y, X, initial in zip(right, columns, first)]
+    for X, y, is_read in zip(records.columns(a, nb, found.delay), records.y, records.known):
+        X = X * is_read
+        columns.append(np.delete(X, slice(len(a), -1), axis=0))
+        right.append(np.where(is_read, y, 0.0) - found.b.reshape(-1) @ X[len(a) : -1])
+    shared, first = least_squares(columns, len(a), right)
+    misses = [y - np.append(initial, shared) @ X for y, X, initial in zip(right, columns, first)]
     return Filter(a, found.b, float(shared[0]), found.delay, first), misses
 
 
@@ -238,47 +233,9 @@ def with_pole(a: Array) -> Array:
     return np.asarray(np.convolve(np.append(1.0, a), [1.0, -(fastest**4)])[1:])
 
 
-def columns_of(
-    a: Array,
-    records: Records,
-    at: int,
-    nb: int,
-    delay: int,
-    impulse: Array,
-    step: Array,
-    *,
-    lost: bool = False,
-) -> Array:
-    """Return the filtered columns of a segment as rows (n_drive nb + 1 + na, n), 0 at lost readings."""
-    moves, is_read = records.moves[at], records.known[at]
-    n_drive, n = moves.shape
-    na, end = len(a), n_drive * nb
-    # Columns are shifts: each drive less its first row, a step and an impulse are filtered by 1/A once.
-    # Every lag of a drive is a shift of its filtered rows plus its first value times the step response
-    # (before a segment the first row was held), every initial condition a shift of the impulse response.
-    filtered = lfilter([1.0], np.append(1.0, a), moves, axis=1)
-    X = np.zeros((end + 1 + na, n))
-    for lag in range(nb):
-        late = min(delay + lag, n)
-        X[lag:end:nb, late:] = filtered[:, : n - late]
-    X[:end] += np.repeat(records.first[at], nb)[:, None] * step[:n]
-    X[end] = step[:n]
-    for row in range(min(na, n)):
-        X[end + 1 + row, row:] = impulse[: n - row]
-    if not lost and not is_read.all():
-        X *= is_read
-    return X
-
-
 def is_stable(a: Array) -> bool:
-    """Return whether all roots lie inside of the unit circle (Schur-Cohn: every reflection is below one)."""
-    coefficients = [value / (1 - 1e-7) ** i for i, value in enumerate(a.tolist(), start=1)]
-    while coefficients:
-        last = coefficients.pop()
-        if not abs(last) < 1:
-            return False
-        coefficients = [(x - last * y) / (1 - last * last) for x, y in zip(coefficients, coefficients[::-1])]
-    return True
+    """Return whether all roots lie inside of the unit circle."""
+    return bool(np.isfinite(a).all() and np.abs(np.roots(np.append(1.0, a))).max() < 1 - 1e-7)
 
 
 def oe_family(
@@ -317,43 +274,22 @@ def oe_family(
 def assemble(
     grid: Grid, filters: Sequence[Filter], terms: tuple[str, ...], *, origin: str
 ) -> StateSpaceModel:
-    """Return the model of one filter per output, block by block, in observer form: v_1+ = -a_1 v_1 + v_2 +
-    (numerator row) w, ..., y = v_1, behind n_k - 1 rows of pure shift for a delay of n_k."""
-    A = []
-    W = []
-    c = []
-    C = []
-    for filter_of_output in filters:
-        na, (n_drive, nb) = len(filter_of_output.a), filter_of_output.b.shape
-        n = max(na, filter_of_output.delay - 1 + nb)
-        block = np.diag(np.ones(n - 1), 1)
-        block[:na, 0] -= filter_of_output.a
-        push = np.zeros((n, n_drive))
-        push[filter_of_output.delay - 1 : filter_of_output.delay - 1 + nb] = filter_of_output.b.T
-        A.append(block)
-        W.append(push)
-        c.append(np.concatenate([[filter_of_output.constant], np.zeros(n - 1)]))
-        C.append(np.eye(1, n))
-    matrices = block_diag(*A), np.vstack(W), block_diag(*C), np.concatenate(c)
-    model = order_selection.as_state_space(grid, *matrices, terms=terms, origin=origin)
-    starts = [
-        _first_states(filters, w[0], segment) for segment, w in enumerate(order_selection.drives(grid, terms))
-    ]
-    return order_selection.with_spread(model, grid, starts)
-
-
-def _first_states(filters: Sequence[Filter], held: Array, segment: int) -> Array:
-    """Return the state at a segment's first row, before which the drives ``held`` stood."""
-    out = []
-    for filter_of_output in filters:
-        na, (_, nb) = len(filter_of_output.a), filter_of_output.b.shape
-        x = np.zeros(max(na, filter_of_output.delay - 1 + nb))
-        x[:na] += filter_of_output.first[segment]
-        x[0] += filter_of_output.constant
-        for lag, gain in enumerate(filter_of_output.b.T @ held, start=filter_of_output.delay):
-            x[:lag] += gain  # a drive so many rows back still acts on the rows before its lag
-        out.append(x)
-    return np.concatenate(out)
+    """Return the model of one filter per output."""
+    na, (n_drive, nb), delay = len(filters[0].a), filters[0].b.shape, filters[0].delay
+    n, n_y = max(na, delay - 1 + nb), len(filters)
+    A, B = np.zeros((n, n_y, n_y)), np.zeros((n, n_y, n_drive))
+    for k, each in enumerate(filters):
+        A[:na, k, k] = -each.a
+        B[delay - 1 : delay - 1 + nb, k] = each.b.T
+    constant = np.array([each.constant for each in filters])
+    starts = []
+    for segment, drive in enumerate(order_selection.drives(grid, terms)):
+        # before its first row the drives stood
+        start = order_selection.held(B @ drive[0])
+        start[:na] += np.transpose([each.first[segment] for each in filters])
+        start[0] += constant
+        starts.append(start)
+    return order_selection.polynomial_model(grid, A, B, constant, starts, terms=terms, origin=origin)
 
 
 class Search:

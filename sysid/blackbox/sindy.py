@@ -18,11 +18,10 @@ import warnings
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
-from math import comb
-from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import comb
 
 from thermogrip.datasets.arrays import Array
 from thermogrip.sysid.blackbox.order_selection import Structure, state_spread
@@ -44,7 +43,7 @@ def sindy_family(
     out: dict[Structure, SindyModel] = {}
     n_y, outside = len(grid.outputs), len(grid.inputs) + len(grid.disturbances)
     for degree, memory in product(degrees, memories):
-        n_term = comb(memory * n_y + outside + degree, degree)
+        n_term = comb(memory * n_y + outside + degree, degree, exact=True)
         wanted: dict[Structure, float] = {}
         for rank, threshold in enumerate(sorted(thresholds)):
             # the same on every fold, however many terms survive there: all terms, less for each threshold
@@ -78,17 +77,25 @@ def _features(grid: Grid, degree: int, memory: int) -> _Features | None:
     """Return the terms of one degree and memory, None where too few rows are whole."""
     import pysindy
 
-    trajectories = _trajectories(grid, memory)
-    if sum(len(run.move) for run in trajectories) < 3 * memory * len(grid.outputs) + 20:
+    lagged = []
+    for segment, y in zip(grid.segments, whole_readings(grid.segments, memory + 5)):
+        now = max(len(y) - memory, 0)  # rows that have a past and a next one
+        states = [y[memory - 1 - lag :][:now] for lag in range(memory)]
+        outside = [each[memory - 1 :][:now] for each in (segment.u, segment.d)]
+        lagged.append(np.hstack([*states, *outside, np.diff(y, axis=0)[memory - 1 :]]))
+    rows = np.concatenate(lagged)
+    rows = rows[np.isfinite(rows).all(axis=1)]
+    n_y = len(grid.outputs)
+    if len(rows) < 3 * memory * n_y + 20:
         return None
-    variables = np.concatenate([run.variables for run in trajectories])
+    variables, move = rows[:, :-n_y], rows[:, -n_y:]
     middle, size = variables.mean(axis=0), variables.std(axis=0)
     size = np.where(size > 1e-9, size, 1.0)
     library = pysindy.PolynomialLibrary(degree=degree)
     theta = np.asarray(library.fit_transform((variables - middle) / size), dtype=float)
     return _Features(
         theta=theta,
-        move=np.concatenate([run.move for run in trajectories]),
+        move=move,
         powers=np.asarray(library.powers_, dtype=int),
         middle=middle,
         size=size,
@@ -110,13 +117,10 @@ def _fit_terms(grid: Grid, terms: _Features, threshold: float) -> SindyModel | N
         if threshold:
             relative = threshold * float(np.abs(scaled).max())
             scaled = pysindy.STLSQ(threshold=relative, alpha=1e-6).fit(theta, move / weight).coef_
-    coefficients = np.asarray(scaled, dtype=float) * weight[:, None]
-    exponents, natural = _natural(terms.powers, coefficients, terms.middle, terms.size)
-    for i in range(len(grid.outputs)):  # the increment was fitted
-        natural[
-            i, int(np.flatnonzero((exponents == np.eye(exponents.shape[1], dtype=int)[i]).all(axis=1))[0])
-        ] += 1
-    return _bounded_model(grid, exponents, natural, terms.memory)
+    natural = _natural(terms, np.asarray(scaled, dtype=float) * weight[:, None])
+    # the increment was fitted
+    natural += (terms.powers[:, : len(natural)].T == 1) & (terms.powers.sum(axis=1) == 1)
+    return _bounded_model(grid, terms.powers, natural, terms.memory)
 
 
 def _bounded_model(grid: Grid, exponents: NDArray[np.int_], natural: Array, memory: int) -> SindyModel | None:
@@ -133,46 +137,8 @@ def _bounded_model(grid: Grid, exponents: NDArray[np.int_], natural: Array, memo
     return replace(model, spread=state_spread(x)) if np.isfinite(x).all() else None
 
 
-class _Trajectory(NamedTuple):
-    """A run of whole rows."""
-
-    variables: Array  # states, then inputs and disturbances
-    move: Array  # increments of the outputs
-
-
-def _trajectories(grid: Grid, memory: int) -> list[_Trajectory]:
-    trajectories = []
-    readings = whole_readings(grid.segments, memory + 5)
-    for segment in (replace(some, y=y) for some, y in zip(grid.segments, readings)):
-        is_read = np.r_[0, np.isfinite(segment.y).all(axis=1), 0]
-        for begin, end in np.flatnonzero(np.diff(is_read)).reshape(-1, 2).tolist():
-            y = segment.y[begin:end]
-            if end - begin < memory + 5:
-                continue
-            now = range(memory - 1, len(y) - 1)
-            states = [y[[k - lag for k in now]] for lag in range(memory)]
-            outside = np.hstack([segment.u, segment.d])[begin:end][list(now)]
-            variables = np.hstack([*states, outside])
-            trajectories.append(_Trajectory(variables, np.diff(y, axis=0)[memory - 1 :]))
-    return trajectories
-
-
-def _natural(powers: NDArray[np.int_], coefficients: Array, middle: Array, size: Array) -> tuple[Any, Array]:
-    """Expand polynomials of (v - middle) / size into polynomials of v."""
-    expanded: dict[tuple[int, ...], Array] = {
-        tuple(row): np.zeros(len(coefficients)) for row in powers.tolist()
-    }
-    for row, column in zip(powers, coefficients.T):
-        product_terms: dict[tuple[int, ...], float] = {(0,) * len(row): 1.0}
-        for variable, power in enumerate(row):
-            for _ in range(power):
-                bigger: dict[tuple[int, ...], float] = {}
-                for key, value in product_terms.items():
-                    up = tuple(k + (i == variable) for i, k in enumerate(key))
-                    bigger[up] = bigger.get(up, 0.0) + value / size[variable]
-                    bigger[key] = bigger.get(key, 0.0) - value * middle[variable] / size[variable]
-                product_terms = bigger
-        for key, value in product_terms.items():
-            expanded[key] = expanded[key] + value * column
-    keys = list(expanded)
-    return np.array(keys, dtype=int), np.stack([expanded[key] for key in keys], axis=1)
+def _natural(terms: _Features, coefficients: Array) -> Array:
+    """Return the coefficients of polynomials of v, of those of (v - middle) / size."""
+    powers, fewer = terms.powers, terms.powers[:, None]
+    expanded = comb(powers, fewer) * (-terms.middle) ** np.maximum(powers - fewer, 0) / terms.size**powers
+    return np.asarray(coefficients @ np.prod(expanded, axis=2).T)

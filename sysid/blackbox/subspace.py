@@ -27,7 +27,6 @@ from thermogrip.sysid.blackbox.order_selection import (
     default_terms,
     drives,
     drives_of,
-    with_spread,
 )
 from thermogrip.sysid.blackbox.output_error import least_squares
 from thermogrip.sysid.models.state_space import StateSpaceModel
@@ -123,25 +122,24 @@ def fit_inputs(grid: Grid, A: Array, C: Array, terms: tuple[str, ...] = ()) -> S
         targets.append(((segment.y - y0) / scale).T[is_read])
     # B, E, the constant and one initial state per segment enter the *simulated* output linearly: a fit of the
     # free run, not of one step
-    weights, starts = least_squares([X[-n:] for X in columns], [X[:-n] for X in columns], targets, DEPENDENT)
+    weights, starts = least_squares(columns, n, targets, DEPENDENT)
     W = weights.reshape(len(centre) + 1, n).T
     c = W[:, -1] - W[:, :-1] @ centre
-    model = as_state_space(grid, A, W[:, :-1], C, c, terms=terms, origin="subspace", y0=y0)
-    return with_spread(model, grid, list(starts))
+    return as_state_space(grid, A, W[:, :-1], C, c, list(starts), terms=terms, origin="subspace", y0=y0)
 
 
 def _unit_responses(drive: Array, A: Array, C: Array) -> Array:
-    """Simulate outputs for each unit entry of [B E F c], drive by drive, then of x0: (n_y, N, n_w n + n)."""
+    """Simulate outputs for each unit entry of x0, then of [B E F c], drive by drive: (n_y, N, n + n_w n)."""
     # An entry e_k moves output i by C_i A^j e_k after j + 1 rows, which is entry k of A'^j C_i': one run of
     # the transposed system, pushed by the drive along C_i, has the responses to all n entries.
     from thermogrip.sysid.models.recurrences import run_linear  # pulls in numba
 
     n_y, n = C.shape
     rows = len(drive)
-    w = np.vstack([drive.T, np.ones(rows), np.zeros(rows)])  # the last one: a start and no drive
+    w = np.vstack([np.zeros(rows), drive.T, np.ones(rows)])  # the first one: a start and no drive
     push = w[None, :, :-1, None] * C[:, None, None, :]
     starts = np.zeros((n_y, len(w), n))
-    starts[:, -1] = C
+    starts[:, 0] = C
     pushes, nothing = push.reshape(-1, rows - 1, n), np.zeros((1, rows - 1, 0))
     runs = run_linear(np.ascontiguousarray(A.T)[None], nothing, pushes, starts.reshape(-1, n), 1)
     return np.asarray(np.moveaxis(runs.reshape(n_y, len(w), rows, n), 1, 2).reshape(n_y, rows, -1))

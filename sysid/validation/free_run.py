@@ -146,22 +146,21 @@ def free_run(
             hint=f"score from {warmup:g} s on",
         )
     simulated = plant.simulate(log, warmup=warmup, score_from=score_from)
-    pairs = _beside(plant, log, simulated, average)
-    scores, naive = _scores(plant, log, pairs), _baselines(plant, log, pairs)
+    compared = _compare(plant, log, simulated, average)
     held = {}
     # through a gap of more than 10 s the input is unknown: the run starts afresh after it, unscored for 60 s
     if gaps(log):
         through = plant.simulate(log, warmup=warmup, score_from=score_from, gaps="hold")
-        held = _scores(plant, log, _beside(plant, log, through, average))
+        held = _compare(plant, log, through, average).scores
     run = FreeRun(
         log=simulated,
-        scores=scores,
-        one_step=_one_step(plant, log, pairs),
-        naive=naive,
+        **compared._asdict(),
         held=held,
         residual=ResidualCorrelations({}, {}),
         no_better=tuple(
-            name for name in plant.outputs if not scores[name].rmse < NO_BETTER * naive["no_input"][name].rmse
+            name
+            for name, no_input in compared.naive["no_input"].items()
+            if not compared.scores[name].rmse < NO_BETTER * no_input.rmse
         ),
         notes=(),
         warmup=warmup,
@@ -215,13 +214,12 @@ def _judged(run: FreeRun, error: Array, by_inputs: InputEffect | None) -> FreeRu
         for name, share in zip(plant.outputs, offsets)
     }
     band = free_run_band(plant, log, run.log, warmup=run.warmup)
-    readings = _beside(plant, log, run.log)
-    scores, naive = _scores(plant, log, readings), _baselines(plant, log, readings)
+    of_readings = _compare(plant, log, run.log)
     rows = replace(fit_logs([log])[0], start_s=float(log["time"].values[np.argmax(scored)]))
     verdict = judge(
         band,
-        {name: each.rmse for name, each in scores.items()},
-        {name: each.rmse for name, each in naive["no_input"].items()},
+        {name: each.rmse for name, each in of_readings.scores.items()},
+        {name: each.rmse for name, each in of_readings.naive["no_input"].items()},
         causes=causes,
         by_inputs=by_inputs,
         seen=bool(said_of_fit(plant.fitted_to, rows)),
@@ -258,15 +256,16 @@ def no_input_baseline(time: Array, measured: Array) -> Array:
     return best
 
 
-class _Pairs(NamedTuple):
-    """Readings beside the run at the same times (n,), NaN where not scored."""
+class _Scores(NamedTuple):
+    """Scores by output of a free run, of one step, and of the baselines."""
 
-    time: Array
-    outputs: dict[str, tuple[Array, Array]]  # measured, simulated
+    scores: dict[str, Score]
+    one_step: dict[str, Score]
+    naive: dict[str, dict[str, Score]]
 
 
-def _beside(plant: Plant, log: Log, simulated: Log, average: float | None = None) -> _Pairs:
-    """Return what was measured beside the free run, in means over ``average`` [s] if given."""
+def _compare(plant: Plant, log: Log, simulated: Log, average: float | None = None) -> _Scores:
+    """Return the scores of a free run beside a log, in means over ``average`` [s] if given."""
     time, scored = log["time"].values, column(simulated, "scored") > 0
     if not scored.any():
         problem = f"nothing of its {np.ptp(time):g} s is left to score"
@@ -276,35 +275,17 @@ def _beside(plant: Plant, log: Log, simulated: Log, average: float | None = None
     if average is not None:
         time, means = block_means(log, np.hstack([read, run]), average)
         read, run = np.split(means, 2, axis=1)
-    return _Pairs(time, dict(zip(plant.outputs, zip(read.T, run.T))))
-
-
-def _unit(log: Log, name: str) -> str:
-    return str(log[name].attrs.get("units", "1"))
-
-
-def _scores(plant: Plant, log: Log, pairs: _Pairs) -> dict[str, Score]:
-    return {name: score(*pairs.outputs[name], _unit(log, name)) for name in plant.outputs}
-
-
-def _baselines(plant: Plant, log: Log, pairs: _Pairs) -> dict[str, dict[str, Score]]:
-    """Return the scores of the mean and of the decay without input, in hindsight."""
-    read = {name: pairs.outputs[name][0] for name in plant.outputs}
-    mean = {n: score(y, np.full(y.shape, np.nanmean(y)), _unit(log, n)) for n, y in read.items()}
-    no_input = {n: score(y, no_input_baseline(pairs.time, y), _unit(log, n)) for n, y in read.items()}
-    return {"mean": mean, "no_input": no_input}
-
-
-def _one_step(plant: Plant, log: Log, pairs: _Pairs) -> dict[str, Score]:
-    """Return the scores of the last reading that came plus the run's move."""
-    out = {}
-    for name in plant.outputs:
-        read, run = pairs.outputs[name]
-        known = np.isfinite(read)
-        read, run = read[known], run[known]
+    scores, one_step, mean, no_input = {}, {}, {}, {}
+    for name, y, v in zip(plant.outputs, read.T, run.T):
+        unit = str(log[name].attrs.get("units", "1"))
+        scores[name] = score(y, v, unit)
+        mean[name] = score(y, np.full(y.shape, np.nanmean(y)), unit)
+        no_input[name] = score(y, no_input_baseline(time, y), unit)
+        # of the last reading that came plus the run's move
+        y, v = y[np.isfinite(y)], v[np.isfinite(y)]
         with np.errstate(invalid="ignore"):  # a run that went to infinity makes no step there
-            out[name] = score(read[1:], read[:-1] + np.diff(run), _unit(log, name))
-    return out
+            one_step[name] = score(y[1:], y[:-1] + np.diff(v), unit)
+    return _Scores(scores, one_step, {"mean": mean, "no_input": no_input})
 
 
 def _notes(run: FreeRun, by_inputs: InputEffect | None) -> list[str]:
@@ -331,7 +312,7 @@ def _notes(run: FreeRun, by_inputs: InputEffect | None) -> list[str]:
         ]
     outside = _outside(plant, {name: column(log, name) for name in plant.valid if name in log})
     unseen = [name for name in outside if name not in plant.outputs]
-    units = {name: _unit(log, name) for name in plant.outputs}
+    units = {name: each.unit for name, each in run.scores.items()}
     small = verdict is not None and verdict.standing not in ("worse", "another plant")
     notes += _residual_notes(run, units, unseen, small=small)
     if by_inputs is not None:

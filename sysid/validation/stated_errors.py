@@ -31,7 +31,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from statistics import NormalDist
-from typing import TYPE_CHECKING, Literal, TypeAlias
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 import numpy as np
 from scipy.signal import lfilter
@@ -40,7 +40,6 @@ from scipy.special import ndtri, stdtrit
 from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log, column, columns, log_name
-from thermogrip.sysid.models.neural import NeuralModel
 from thermogrip.sysid.plant.log_grid import cut_stretches, match_logs
 from thermogrip.sysid.plant.plant import WARMUP, Plant
 from thermogrip.sysid.plant.plant_data import RUN_GAIN_SD, SEVERAL, TAIL, ExpectedError
@@ -265,8 +264,8 @@ MOST_DISAGREEMENT = 0.4  # of the output's spread in the data of the fit
 
 def ensemble_disagreement(plant: Plant, log: Log, *, warmup: float = 5.0) -> dict[str, float]:
     """Return by output the rms of the members' sd over the output's spread; empty where not neural."""
-    model = plant.model
-    if not isinstance(model, NeuralModel) or len(model.A) < 2:
+    model: Any = plant.model
+    if model.kind != "neural" or len(model.A) < 2:
         return {}
     # members agree where the data constrain them, and their mean errs by about as much as they differ; that
     # depends on the drives alone, so that a run is refused before its readings are used

@@ -14,9 +14,8 @@ from typing import Any
 import pytest
 import typer
 
-from thermogrip.cli.main import main
+from thermogrip.cli.main import VERBS, Verb, Verbs, main
 from thermogrip.cli.rig import RigOptions
-from thermogrip.cli.verbs import VERBS, Verb, Verbs
 from thermogrip.datasets.errors import UserError
 
 HEAVY = ["numpy", "scipy", "xarray", "pandas", "casadi", "numba", "llvmlite", "nlopt", "emcee", "arviz"]

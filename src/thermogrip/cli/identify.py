@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 import typer
 
 from thermogrip.cli import options as cli
-from thermogrip.cli.kinds import TYPED
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.media import printable
 from thermogrip.report.console import Console
@@ -176,7 +175,7 @@ def identify(
     if identified.good:
         return cli.Done("good")
     guessed = any(s.guessed for s in identified.signals) or any(log.attrs.get("clock_doubts") for log in logs)
-    stated = _stating(identified, paths, ctx.meta[TYPED], logs) if identified.doubts and guessed else ""
+    stated = _stating(identified, paths, ctx.meta[cli.TYPED], logs) if identified.doubts and guessed else ""
     return cli.Done("not good", cli.ANSWER_IS_NO, stated)
 
 
@@ -206,13 +205,15 @@ def _read(
     read: Callable[..., list[Log]], network: GreyModel | None, *, shipped: bool
 ) -> tuple[list[Log], GreyModel | None]:
     """Return the logs, and the network under the names of their columns: the given one, or a shipped one."""
+    if network is None and not shipped:
+        return read(), None
     from thermogrip.sysid.data.shipped_networks import in_columns, shipped_network
     from thermogrip.sysid.models.network import NetworkModel
     from thermogrip.sysid.plant.log_grid import roles_of
 
     logs = read() if network is None else read(known=roles_of(network))
     matching = network
-    if network is None and shipped:
+    if network is None:
         matching = shipped_network(logs)
     elif isinstance(network, NetworkModel):
         matching = in_columns(network, logs[0])

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Annotated
 
 from thermogrip.cli import options as cli
-from thermogrip.cli.kinds import KINDS, TEMPLATES, check_exists, kind_of, template_text
+from thermogrip.cli.options import KINDS, TEMPLATES, check_exists, kind_of, template_text
 from thermogrip.datasets.errors import UserError
 from thermogrip.report.console import Console
 

@@ -7,7 +7,7 @@ import pytest
 from scipy.signal import lfilter
 
 from thermogrip.datasets.schema import make_log
-from thermogrip.sysid.blackbox.arx import _Orders, _structure_columns, arx_family
+from thermogrip.sysid.blackbox.arx import Regression, arx_family
 from thermogrip.sysid.plant.log_grid import make_grid
 
 
@@ -61,12 +61,13 @@ def test_too_few_rows_give_no_model(first_order):
 
 
 @pytest.mark.parametrize(
-    ("orders", "output", "columns"),  # of 2 outputs and 3 drives at lags 1 to 4, and a constant
+    ("output", "poles", "late", "coupled", "columns"),  # of 2 outputs and 3 drives at lags 1 to 4, a constant
     [
-        ((2, 2, True), 1, [0, 1, 2, 3, 11, 12, 13, 14, 15, 16, 20]),
-        ((2, 1, False), 1, [1, 3, 8, 9, 10, 11, 12, 13, 20]),
-        ((1, 4, False), 0, [0, 17, 18, 19, 20]),
+        (1, 2, (2, 3), True, [0, 1, 2, 3, 11, 12, 13, 14, 15, 16, 20]),
+        (1, 2, (1, 2), False, [1, 3, 8, 9, 10, 11, 12, 13, 20]),
+        (0, 1, (4,), False, [0, 17, 18, 19, 20]),
     ],
 )
-def test_a_structure_uses_its_lags_of_the_one_regression(orders, output, columns):
-    assert _structure_columns(_Orders(*orders), 4, 2, 3, output) == columns
+def test_a_structure_uses_its_lags_of_the_one_regression(output, poles, late, coupled, columns):
+    regression = Regression.of([np.ones((90, 2))], [np.ones((90, 3))], 4)
+    assert regression.columns(output, poles, late, coupled=coupled).tolist() == columns
