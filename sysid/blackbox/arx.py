@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
+from numpy.typing import NDArray
 
 from thermogrip.datasets.arrays import Array
 from thermogrip.sysid.blackbox.order_selection import (
@@ -62,7 +63,7 @@ class Regression:
         lag = np.concatenate([np.repeat(lags, n_y), np.repeat(lags, n_w), [0]])
         return cls((X / size).T @ (X / size), (X / size).T @ Y, size, lag, signal)
 
-    def columns(self, output: int, poles: int, late: Sequence[int], *, coupled: bool) -> Array:
+    def columns(self, output: int, poles: int, late: Sequence[int], *, coupled: bool) -> NDArray[np.intp]:
         """Return which columns the equation of an output has: lags of the outputs, or its own alone where
         these are not coupled, up to ``poles``, those of the drives in ``late``, and the constant."""
         n_y = self.cross.shape[1]
