@@ -57,6 +57,7 @@ ALL = [
     ),
     Benchmark("classify/disturbed_grasps.py", quick="--parts rig --each 1"),
     Benchmark("classify/lstm.py", quick="--epochs 5 --blocks 2", needs=("torch",)),
+    Benchmark("classify/public_sets.py", "{data}", "{data} --classifiers pca-lda"),
     Benchmark("rig/relays.py"),
     Benchmark("rig/board.py"),
 ]

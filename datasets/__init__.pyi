@@ -8,8 +8,6 @@ from thermogrip.datasets.grasp_files import read_grasps as read_grasps
 from thermogrip.datasets.grasp_files import write_grasps as write_grasps
 from thermogrip.datasets.log_files import read_log as read_log
 from thermogrip.datasets.log_files import write_log as write_log
-from thermogrip.datasets.public_sets import read_hold as read_hold
-from thermogrip.datasets.public_sets import read_toh as read_toh
 from thermogrip.datasets.schema import Grasps as Grasps
 from thermogrip.datasets.schema import Log as Log
 from thermogrip.datasets.schema import cut as cut

@@ -2,7 +2,7 @@
 
 A few kilobytes can claim gigabytes (a compressed line of blanks, an array that was never written), so every
 reader asks here, with what a file declares, before it allocates anything; ``docs/reference/files.md`` lists
-the limits.  ``THERMOGRIP_MAX_MB`` sets the size of a file in MB, and growth is then left to it.
+the limits.
 """
 
 from __future__ import annotations
@@ -23,15 +23,14 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-LIMIT_VARIABLE = "THERMOGRIP_MAX_MB"
 #: Levels of brackets in a document, and the largest number in it.
 MOST_DEPTH, MOST_NUMBER = 64, 1e100
 
 #: Sample times and steps [s]; the largest value, gain or coefficient of a model, in any unit.
 STEP_RANGE, LARGEST = (1e-3, 86400.0), 1e12
 
-_BYTES = 2 << 30
-_MB = 1 << 20
+MOST_BYTES = 2 << 30  # of a file
+_PIECE = 4 << 20  # bytes that are read at once
 # times the packed size: a log of 500 000 rows whose sensors never move grows 104 times with xz
 _LARGEST_EXPANSION = 200
 _FLOOR = 8 << 20  # bytes that any packed file may unpack to
@@ -43,12 +42,12 @@ _Record = TypeVar("_Record")
 
 def most_bytes(share: int = 1) -> int:
     """Return the largest size of a file's content [bytes], or one ``share``-th of it."""
-    return (_chosen() or _BYTES) // share
+    return MOST_BYTES // share
 
 
 def most_unpacked(packed: int) -> int:
     """Return the bytes that may come out of a file of ``packed`` bytes."""
-    return most_bytes() if _chosen() else min(most_bytes(), max(_FLOOR, _LARGEST_EXPANSION * packed))
+    return min(MOST_BYTES, max(_FLOOR, _LARGEST_EXPANSION * packed))
 
 
 def check_size(size: int, *, file: str | Path, what: str = "is", share: int = 1) -> None:
@@ -56,9 +55,7 @@ def check_size(size: int, *, file: str | Path, what: str = "is", share: int = 1)
     most = most_bytes(share)
     if size > most:
         problem = f"{what} {_megabytes(size)}, more than the {_megabytes(most)} of a file"
-        enough = max(1, -(-share * size // _MB))
-        hint = f"if it is what you want to read, set {LIMIT_VARIABLE}={enough}"
-        raise UserError(problem, file=file, hint=hint if enough <= 1e9 else "write it anew")
+        raise UserError(problem, file=file, hint="write it anew, or in parts")
 
 
 def check_unpacked(packed: int, unpacked: int, *, file: str | Path, what: str = "unpacks to") -> None:
@@ -66,14 +63,13 @@ def check_unpacked(packed: int, unpacked: int, *, file: str | Path, what: str = 
     check_size(unpacked, file=file, what=what)
     if unpacked > most_unpacked(packed):
         growth = f"{_megabytes(unpacked)} or more from {_megabytes(packed)}"
-        hint = f"if it is what you want to read, set {LIMIT_VARIABLE} to its MB"
-        raise UserError(f"{what} {growth}, which no record does", file=file, hint=hint)
+        raise UserError(f"{what} {growth}, which no record does", file=file, hint="write it anew")
 
 
 def read_within(stream: BinaryIO, most: int) -> bytes:
     """Return what a stream holds, at most ``most`` + 1 bytes; the caller compares the length."""
     content, bytes_left = io.BytesIO(), most + 1  # its value is no second copy, as that of a join is
-    while bytes_left > 0 and (piece := stream.read(min(bytes_left, 4 * _MB))):
+    while bytes_left > 0 and (piece := stream.read(min(bytes_left, _PIECE))):
         content.write(piece)
         bytes_left -= len(piece)
     return content.getvalue()
@@ -196,20 +192,6 @@ def array_within(content: Mapping[str, Any], key: str, largest: float = LARGEST)
     if not (np.abs(values) <= largest).all():
         raise ValueError(f"{key} has an entry that is not within +-{largest:g}")
     return values
-
-
-def _chosen() -> int | None:
-    """Return the limit of the environment [bytes], None where it sets none."""
-    text = os.environ.get(LIMIT_VARIABLE, "").strip()
-    if not text:
-        return None
-    try:
-        size = float(text)
-    except ValueError:
-        size = 0.0
-    if not 1 <= size <= 1e9:
-        raise UserError(f"{LIMIT_VARIABLE} is {text!r}", hint="set it to a number of MB, such as 4096")
-    return int(size) * _MB
 
 
 def _megabytes(size: float) -> str:

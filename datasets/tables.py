@@ -12,11 +12,11 @@ import csv
 import gzip
 import io
 import lzma
+import math
 import re
 import shlex
 import warnings
 import zipfile
-import zlib
 from collections import Counter
 from collections.abc import Callable, Container, Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -25,7 +25,7 @@ from functools import partial
 from importlib import import_module
 from itertools import chain, count, islice, pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -675,11 +675,13 @@ def _matlab_table(path: Path, columns: Sequence[str] | None) -> Table:
     raw = read_bytes(path)
     if raw[:10] == b"MATLAB 7.3":
         raise UserError("is MATLAB 7.3", file=path, hint="save('x.mat', ..., '-v7') in MATLAB, or export CSV")
-    from scipy.io import loadmat
+    from scipy.io import loadmat, whosmat
     from scipy.io.matlab import MatReadWarning
 
+    source: Any = io.BytesIO(raw)  # the stubs know names only
     with reading("is no MATLAB file, or is damaged", file=path, hint="save it again"):
-        source: Any = io.BytesIO(_unpacked_matlab(raw, path))  # the stubs know names only
+        declared = sum(8 * math.prod(shape) for _, shape, _ in whosmat(source))
+        limits.check_unpacked(len(raw), declared, file=path, what="declares")
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", MatReadWarning)  # of objects without names
             content = loadmat(source, simplify_cells=True)
@@ -726,27 +728,6 @@ def _matlab_arrays(members: Sequence[tuple[str, Any]]) -> Iterator[tuple[str, ND
             rows = value[:, None] if value.ndim == 1 else value if len(value) >= value.shape[1] else value.T
             if len(rows) > 1 and rows.shape[1]:
                 yield name, np.asarray(rows, dtype=float)
-
-
-def _unpacked_matlab(raw: bytes, path: str | Path) -> bytes:
-    """Return a MATLAB 5 file with its parts unpacked, so that what is read is no larger than what is here."""
-    if raw[126:128] not in (b"IM", b"MI"):
-        return raw
-    order: Literal["little", "big"] = "little" if raw[126:128] == b"IM" else "big"
-    out = [raw[:128]]
-    offset, total = 128, 0
-    while offset < len(raw):
-        kind, size = (int.from_bytes(raw[offset + k : offset + k + 4], order) for k in (0, 4))
-        element, offset = raw[offset : offset + 8 + size], offset + 8 + size
-        if kind == 15:  # miCOMPRESSED
-            unpacker = zlib.decompressobj()
-            element = unpacker.decompress(element[8:], limits.most_unpacked(len(raw)) - total + 1)
-            total += len(element)
-            limits.check_unpacked(len(raw), total, file=path)
-        if offset > len(raw):
-            raise ValueError("it was cut off")
-        out.append(element)
-    return b"".join(out)
 
 
 def read_excel_table(path: str | Path, columns: Sequence[str] | None = None) -> Table:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gzip
 import importlib.util
 import io
 import json
@@ -161,10 +160,9 @@ def test_a_bag_whose_chunk_unpacks_to_too_much_is_refused(
         made.bag_of_chunk(path, size)
     else:
         made.mcap_of_chunk(path, size, kind.split(".")[0])
-    monkeypatch.setenv("THERMOGRIP_MAX_MB", "2")
-    assert "set THERMOGRIP_MAX_MB=" in refused(read_log, path)
-    monkeypatch.setenv("THERMOGRIP_MAX_MB", "4")
-    assert "THERMOGRIP_MAX_MB" not in refused(read_log, path)
+    for most, too_large in ((2 << 20, True), (4 << 20, False)):
+        monkeypatch.setattr(limits, "MOST_BYTES", most)
+        assert ("more than the 2097 kB of a file" in refused(read_log, path)) == too_large
 
 
 def test_a_chunk_that_says_less_than_it_holds_is_stopped(
@@ -174,7 +172,7 @@ def test_a_chunk_that_says_less_than_it_holds_is_stopped(
     made.mcap_of_chunk(tmp_path / "a.mcap", 3 << 20, "zstd")
     sizes = [size.to_bytes(8, "little") for size in (3 << 20, 9)]
     (tmp_path / "a.mcap").write_bytes((tmp_path / "a.mcap").read_bytes().replace(*sizes))
-    monkeypatch.setenv("THERMOGRIP_MAX_MB", "2")
+    monkeypatch.setattr(limits, "MOST_BYTES", 2 << 20)
     assert "unpacks to 2097 kB, more than" in refused(read_log, tmp_path / "a.mcap")
 
 
@@ -191,21 +189,6 @@ def test_a_group_that_holds_itself_or_points_elsewhere_is_refused(tmp_path: Path
     with h5py.File(tmp_path / "link.nc", "w") as file:
         file["time"] = h5py.ExternalLink("loop.nc", "/a")
     assert "column time: is a link" in refused(read_log, tmp_path / "link.nc")
-
-
-def test_the_limit_is_raised_by_the_environment(
-    made: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path = tmp_path / "a.csv.gz"
-    path.write_bytes(gzip.compress(b"#" * 17_000_000 + b"\n" + HEAD + b"0,25\n1,25\n"))
-    assert "set THERMOGRIP_MAX_MB to its MB" in refused(read_csv_table, path)
-    monkeypatch.setenv("THERMOGRIP_MAX_MB", "16")
-    assert "set THERMOGRIP_MAX_MB=17" in refused(read_csv_table, path)
-    monkeypatch.setenv("THERMOGRIP_MAX_MB", "17")
-    assert read_csv_table(path).lines.tolist() == [3, 4]
-    monkeypatch.setenv("THERMOGRIP_MAX_MB", "lots")
-    with pytest.raises(UserError, match="THERMOGRIP_MAX_MB is 'lots'; set it to a number of MB"):
-        read_csv_table(path)
 
 
 def test_what_a_shell_hands_over_is_read(tmp_path: Path) -> None:
@@ -239,7 +222,7 @@ def test_rows_among_empty_lines_keep_their_line_numbers(tmp_path: Path) -> None:
 def test_a_limit_itself_is_within_it(
     check: Callable[[int], object], most: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv("THERMOGRIP_MAX_MB", "1")
+    monkeypatch.setattr(limits, "MOST_BYTES", 1 << 20)
     check(most)
     with pytest.raises((UserError, ValueError)):
         check(most + 1)
@@ -249,20 +232,6 @@ def test_what_is_packed_may_grow_200_times() -> None:
     limits.check_unpacked(1 << 20, 200 << 20, file="a")
     with pytest.raises(UserError, match="210 MB or more from 1049 kB"):
         limits.check_unpacked(1 << 20, (200 << 20) + 1, file="a")
-
-
-@pytest.mark.parametrize(
-    ("value", "most"), [("1", 1 << 20), ("1e9", 10**9 << 20), ("", 2 << 30), ("0.9", None), ("1.1e9", None)]
-)
-def test_the_environment_sets_1_to_1e9_mb(
-    value: str, most: int | None, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("THERMOGRIP_MAX_MB", value)
-    if most:
-        assert limits.most_bytes() == most
-    else:
-        with pytest.raises(UserError, match="set it to a number of MB"):
-            limits.most_bytes()
 
 
 @pytest.mark.parametrize(("size", "left"), [(6, 0), (7, 0), (8, 1), (20, 13)])
