@@ -13,13 +13,12 @@ import ctypes
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from functools import cache, lru_cache, partial
+from functools import cache, partial
 from itertools import islice
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from llvmlite import binding, ir
-from numpy.typing import NDArray
 
 from thermogrip.datasets.arrays import Array, Run, Values
 from thermogrip.sysid.models.model import Output, Sizes, Step
@@ -205,21 +204,24 @@ class Kernel:
         lengths = len(u), len(d), len(p)
         if ends != ((n_x,), (n, n_u), (n, n_d), (n_p,)) or any(m not in (1, batch) for m in lengths):
             raise ValueError(f"shapes {x0.shape}, {u.shape}, {d.shape}, {p.shape} do not belong together")
-        moved = _unswitched(n)
-        if self.switches:
-            rows = moved.values.copy()
-            rows[1:n] = np.any(u[:, 1:, self.switches] != u[:, :-1, self.switches], axis=(0, 2))
-            moved = _Kept.of(rows)
+        # where what depends on switches is renewed; the row behind the last ends the loop
+        moved = np.ones(n + 1, dtype=np.uint8)
+        on = u[:, :, self.switches]
+        moved[1:n] = np.any(on[:, 1:] != on[:, :-1], axis=(0, 2)) if self.switches else 0
         arrays = [np.ascontiguousarray(a, dtype=float) for a in (x0, u, d, p)]
+        # which entry of each array a member begins at; places beyond the last member repeat it, so that a
+        # member's numbers do not depend on who its neighbours are
         n_block = -(-batch // WIDTH)
-        entries = (x0[0].size, *(a[0].size if len(a) > 1 else 0 for a in arrays[1:]))
-        begin = _entries(batch, entries if batch > 1 else (0,) * 4)
+        member = np.minimum(np.arange(n_block * WIDTH), batch - 1).reshape(n_block, 1, WIDTH)
+        begin = member * np.array([a[0].size if len(a) > 1 else 0 for a in arrays])[:, None]
         y = np.empty((self._n_y, n + 1, n_block * WIDTH))
         x_end = np.empty((n_x, n_block * WIDTH))
-        *addresses, to_y, to_end = (a.ctypes.data for a in (*arrays, y, x_end))
+        *addresses, to_y, to_end, from_begin, if_moved = (
+            a.ctypes.data for a in (*arrays, y, x_end, begin, moved)
+        )
         room = 8 * WIDTH  # bytes of a register
-        into = [(begin.address + k * 4 * room, to_y + k * room, to_end + k * room) for k in range(n_block)]
-        calls = [(*addresses, *places, n, n_block * WIDTH, pieces, h, moved.address) for places in into]
+        into = [(from_begin + k * 4 * room, to_y + k * room, to_end + k * room) for k in range(n_block)]
+        calls = [(*addresses, *places, n, n_block * WIDTH, pieces, h, if_moved) for places in into]
         if len(calls) == 1 or n < _WORTH_THREADS or _cores() == 1:
             for call in calls:
                 self._rollout(*call)
@@ -227,36 +229,6 @@ class Kernel:
             # without the interpreter's lock
             list(_threads().map(lambda call: self._rollout(*call), calls))
         return y.transpose(2, 1, 0)[:batch], x_end.T[:batch]
-
-
-class _Kept(NamedTuple):
-    """An array that stays, and where: to ask costs as much as a short run."""
-
-    values: NDArray[Any]
-    address: int
-
-    @classmethod
-    def of(cls, values: NDArray[Any]) -> _Kept:
-        """Return it of an array."""
-        return cls(values, values.ctypes.data)
-
-
-@lru_cache(maxsize=16)
-def _unswitched(n: int) -> _Kept:
-    """Return which of n rows are renewed where nothing is switched, and the row behind that ends the loop."""
-    moved = np.zeros(n + 1, dtype=np.uint8)
-    moved[[0, n]] = 1
-    return _Kept.of(moved)
-
-
-@lru_cache(maxsize=256)
-def _entries(batch: int, own: tuple[int, ...]) -> _Kept:
-    """Return by block which entry of each array a member begins at, where members have so many of their own
-    there."""
-    blocks = -(-batch // WIDTH)
-    # places beyond the last member repeat it: a member's numbers do not depend on who its neighbours are
-    member = np.minimum(np.arange(blocks * WIDTH), batch - 1).reshape(blocks, 1, WIDTH)
-    return _Kept.of(np.ascontiguousarray(member * np.array(own)[:, None]))
 
 
 def _cores() -> int:
