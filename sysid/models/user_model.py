@@ -437,9 +437,7 @@ class OwnModel(Described):
             state = self.code.step(state, u, d, p, dt / n)
         return state
 
-    def slope(
-        self, x: Values, u: Values, d: Values, p: Values, dt: float, along: Sequence[Values]
-    ) -> Any:
+    def slope(self, x: Values, u: Values, d: Values, p: Values, dt: float, along: Sequence[Values]) -> Any:
         """Return the derivative of :meth:`step` along directions of x, u and d, of CasADi's symbols."""
         ca: Any = import_module("casadi")
         state, u, d, p, slope, *others = (ca.vertcat(*values) for values in (x, u, d, p, *along))
