@@ -167,8 +167,15 @@ def find_column(entry: str, units: Mapping[str, str], file: str | None = None) -
     entry = entry.strip()
     if entry in units:
         return entry
-    likely = {entry, _bare_name(entry), read_header(entry).name}
+    name, unit, _ = read_header(entry)
+    unit = to_record_unit(np.empty(0), unit)[1]
+    # of heater_degC and heater_percent the second is called heater_2
+    numbered = re.compile(re.escape(name) + r"(_\d+)?", re.IGNORECASE)
+    of_unit = {n for n in units if unit != "1" and units[n] == unit and numbered.fullmatch(n)}
+    likely = {entry, _bare_name(entry), name}
     for candidates in (
+        of_unit & likely,
+        of_unit,
         likely & {*units},
         {n for n in units if n.lower() in {word.lower() for word in likely}},
     ):

@@ -119,8 +119,8 @@ def identify(
     read = partial(cli.load_logs, paths, *roles, columns=cli.comma(columns), dt=dt)
     logs, wanted_network = _read(read, wanted_network, shipped=a_network)
     repairs = _repaired(console, logs)
-    have = dict.fromkeys(map(str, logs[0].data_vars), "")  # what a word means may be written otherwise
-    inputs_read, outputs_read, disturbances_read = (
+    have = {str(name): str(values.attrs["units"]) for name, values in logs[0].data_vars.items()}
+    inputs_read, outputs_read, disturbances_read = (  # what a word means may be written otherwise
         None if words is None else tuple(find_column(w, have) for w in words) for words in roles
     )
     roles = inputs_read, outputs_read, disturbances_read
