@@ -619,7 +619,8 @@ def test_names_of_roles_may_be_headers_in_any_case(write):
     for pair in ("oven_degF,oven_percent", "oven_percent,oven_degF"):  # of two of one name the unit tells
         path = write(f"time_s,{pair},plate_degC\n0,1,2,3\n1,1,3,4\n", "pair.csv")
         log = read_log(path, inputs=["oven_percent"], outputs=["Oven_degF"])
-        assert [log[names(log, role)[0]].attrs["units"] for role in ("input", "output")] == ["percent", "degC"]
+        signals = (log[names(log, role)[0]] for role in ("input", "output"))
+        assert [signal.attrs["units"] for signal in signals] == ["percent", "degC"]
 
 
 def matlab(tmp_path, name="log.mat", **content):
