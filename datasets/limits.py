@@ -125,7 +125,9 @@ class Unpacker:
 
     def __call__(self, packing: str, data: bytes) -> bytes:
         """Return what ``data``, packed with bz2, lz4 or zstd, holds; KeyError if it is with another."""
-        unpacked = _unpacked(packing, data, most_unpacked(self._packed) - self._found + 1)
+        packed: Any = import_module({"bz2": "bz2", "lz4": "lz4.frame", "zstd": "zstandard"}[packing])
+        with packed.open(io.BytesIO(data), "rb") as stream:
+            unpacked = read_within(stream, most_unpacked(self._packed) - self._found)
         self._found += len(unpacked)
         check_unpacked(self._packed, self._found, file=self._file)
         return unpacked
@@ -133,25 +135,6 @@ class Unpacker:
     def declare(self, size: int) -> None:
         """Refuse a chunk that declares too much."""
         check_unpacked(self._packed, self._found + size, file=self._file, what="declares")
-
-
-def _unpacked(packing: str, data: bytes, most: int) -> bytes:
-    """Return what a chunk holds, ``most`` bytes of it at most."""
-    if packing == "zstd":
-        import zstandard
-
-        with zstandard.ZstdDecompressor().stream_reader(io.BytesIO(data)) as stream:
-            return bytes(stream.read(most))
-    if packing == "bz2":
-        unpacker: Any = import_module("bz2").BZ2Decompressor()
-    elif packing == "lz4":
-        unpacker = import_module("lz4.frame").LZ4FrameDecompressor()
-    else:
-        raise KeyError(packing)
-    unpacked: bytes = unpacker.decompress(data, max_length=most)
-    if len(unpacked) < most and not unpacker.eof:
-        raise EOFError("the chunk is cut off")
-    return unpacked
 
 
 def check_content(

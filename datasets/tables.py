@@ -171,18 +171,6 @@ def _new_names(columns: Sequence[str], n: int, file: str | Path) -> list[str]:
     return names
 
 
-def check_header(headers: Sequence[str], names: Sequence[str], file: str) -> None:
-    """Refuse names where a table has no header, with the ``--columns`` that would give them to it."""
-    header_words = {header.lower() for header in headers}
-    spare = len(headers) - len(names)
-    if not names or spare < 0 or header_words != {f"c{place + 1}" for place in range(len(headers))}:
-        return
-    if not header_words & {name.strip().lower() for name in names}:
-        words = [*["time_s"][:spare], *names, *["-"] * (spare - 1)]
-        hint = f"name its columns in their order, such as --columns {','.join(words)} (-: left out)"
-        raise UserError("has no header", file=file, hint=hint)
-
-
 def find_layout(text: str, file: str, *, named: bool = False) -> Layout:
     """Return how a text is a table, from its first lines; a header of fewer names than cells is refused, but
     where the columns are ``named`` otherwise."""
@@ -445,25 +433,21 @@ def _parse_table(
     lines = np.array([line for line, _ in rows], dtype=np.int64)
     faults: list[UserError] = []
     columns: list[Column] = []
-    for name, column in zip(names, zip(*(cells for _, cells in rows))):
+    cells_of_columns = list(zip(*(cells for _, cells in rows)))
+    for name, cells_of_column in zip(names, cells_of_columns):
         if is_text(name):
-            columns.append(Column(name, text=[from_csv(cell.strip()) for cell in column]))
+            columns.append(Column(name, text=[from_csv(cell.strip()) for cell in cells_of_column]))
             continue
         try:
-            columns.append(read_column(name, column, lines, file, tolerated))
+            columns.append(read_column(name, cells_of_column, lines, file, tolerated))
         except UserError as fault:
             faults += [] if name.startswith(_LEFT_OUT) else [fault]
     if faults:
         raise _with_command(faults, names) if tolerated else faults[0]  # what may be broken is a log
     if tolerated:
         notes += _left_empty_by_quality(columns)
-        notes += _open_marks(
-            {
-                c.name: cells
-                for c, cells in zip(columns, zip(*(cells for _, cells in rows)))
-                if c.numbers is not None
-            }
-        )
+        numbers = [(c.name, cells) for c, cells in zip(columns, cells_of_columns) if c.numbers is not None]
+        notes += _open_marks(dict(numbers))
     return _table_of(columns, file, lines, notes)
 
 
