@@ -136,6 +136,7 @@ class Touches:
     # conductance, build-up time and heat capacity, by proportional amounts in onset and object temperature
     unlike: Array
     since: Array  # (n,), when the discrepancy of the trace begins [s]
+    question: NDArray[np.int64]  # (n,), the same of rows of which only the likeliest count
     second: Touches | None = None  # what a second sensor of the finger read of the same grasps
 
     def take(self, index: NDArray[np.int64]) -> Touches:
@@ -216,7 +217,7 @@ def touches(
         count=count, ramp=mean(np.broadcast_to(np.maximum(time - PUMP_OFF, 0.0), data.shape)), level=level,
         t_object=t_object, t_object_sd=sd, t_ambient=t_ambient, excursion=np.abs(away).max(axis=1),
         share=np.zeros(level.size), unlike=np.zeros(level.size), since=np.full(level.size, -np.inf),
-        second=second,
+        question=np.arange(level.size), second=second,
     )  # fmt: skip
 
 
@@ -224,11 +225,17 @@ def graded(data: Touches, grades: Sequence[Grade]) -> Touches:
     """Return each touch under each of some grades, (n n_grade,) rows."""
     n = data.level.size
     share, unlike, _, since, misstated_K = (np.tile(column, n) for column in np.array(grades).T)
-    every = data.take(np.repeat(np.arange(n), len(grades)))
+    of = np.repeat(np.arange(n), len(grades))
+    every = data.take(of)
+    # what the first grade says of a grasp is reported, however much likelier others are
+    question = 2 * of + (np.arange(of.size) % len(grades) > 0)
 
     def of_grade(one: Touches, second: Touches | None) -> Touches:
         t_object_sd = np.where(misstated_K > 0, np.fmax(one.t_object_sd, misstated_K), one.t_object_sd)
-        return replace(one, second=second, share=share, unlike=unlike, since=since, t_object_sd=t_object_sd)
+        return replace(
+            one, second=second, share=share, unlike=unlike, since=since, t_object_sd=t_object_sd,
+            question=question,
+        )  # fmt: skip
 
     return of_grade(every, None if every.second is None else of_grade(every.second, None))
 

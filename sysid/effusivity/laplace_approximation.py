@@ -180,7 +180,7 @@ def find_modes(
     Pair p is touch ``row[p]`` under row p of ``prior``; ``whitener`` is what
     :func:`~thermogrip.sysid.effusivity.data.whiten` returns for ``data``.  It starts at the prior's mean with
     the level as measured, or at ``start`` (n_pair, 7); a pair that has not settled within 20 steps is
-    hopeless in practice, and where pairs of one touch are ``rivals`` one far behind the best is left early.
+    hopeless in practice, and where pairs of one question are ``rivals`` one far behind is left early.
     """
     from thermogrip.sysid.effusivity.mode_kernel import Law, curvature, search
 
@@ -189,11 +189,10 @@ def find_modes(
     if start is None:
         u[:, LEVEL] = np.where(vary[:, LEVEL], data.level[row], u[:, LEVEL])
     dof = np.full(u.shape, np.inf) if prior.dof is None else prior.dof
-    w_matrix, log_det = whitener
     pairs = pairs_asked(stack, nodes_for(data), data, row, beyond)
     heavy = vary & np.isfinite(dof)
     law = Law(prior.mean, prior.sd, np.where(heavy, 1.0 / dof, 0.0))
-    ended = search(pairs, w_matrix, law, u, rivals=rivals)
+    ended = search(pairs, whitener, law, u, rivals=rivals)
     inverse, log_det_curvature = curvature(ended.matrix, ended.own)
     covariance = inverse * (prior.sd[:, :, None] * prior.sd[:, None, :])
     # b and T_obj enter f linearly, so for them this is exact; the others are nearly Gaussian given them
@@ -204,7 +203,7 @@ def find_modes(
     nu = np.where(heavy, dof, 1.0)
     ratio = gammaln(0.5 * (nu + 1)) - gammaln(0.5 * nu) - 0.5 * np.log(0.5 * nu)
     # ln Z = -1/2 objective - 1/2 ln det A - 1/2 ln det(2 pi C)
-    evidence = -0.5 * (objective + log_det[row]) + np.where(heavy, ratio, 0.0).sum(axis=1)
+    evidence = -0.5 * (objective + whitener[1][row]) + np.where(heavy, ratio, 0.0).sum(axis=1)
     return Mode(ended.u, covariance, evidence, ended.settled, ended.matrix[:, -1, -1])
 
 

@@ -34,6 +34,7 @@ class SearchSettings(NamedTuple):  # which kernels take
     no_damping: float = 1e-3  # a damping that counts as none
     stale_K: float = 0.01  # that a temperature may move for slopes by the rest to stay
     least_decrease: float = 0.01  # of -2 ln posterior: smaller predicted decreases end the search
+    no_part: float = 45.0  # of -2 ln evidence behind the best: e^-22 of a sum
 
 
 SEARCH = SearchSettings()
@@ -333,6 +334,7 @@ class Search(NamedTuple):
     own: Array  # (n, 7)
     cost: Array  # (n,), -2 ln posterior
     ahead: Array  # (n,), what the next step should come to
+    log_volume: Array  # (n,), ln det of the curvature at the best point
     damping: Array  # (n,)
     part: Array  # (n,), of the next steps
     slope_gain: Array  # (n,), what the trial's step should gain by its slope, and lose by its bend
@@ -342,42 +344,52 @@ class Search(NamedTuple):
     going_on: Mask  # (n,)
 
 
-def search(pairs: Pairs, whitener: Any, law: Law, start: Array, *, rivals: bool) -> Search:
+def search(pairs: Pairs, noise: tuple[Array, Array], law: Law, start: Array, *, rivals: bool) -> Search:
     """Return where damped Gauss-Newton steps from ``start`` (n, 7) end under priors of a ``law``: where the
     next step would gain less than 0.005 nat, which then counts as taken.
 
     Where readings are not explained, they may bend along a step twice as much as their slopes say, so that
     whole steps go to and fro across the mode.  So what a step gains tells how much they bend along it, and
     where that is more than 1.5 times the quadratic model's the next step is as much shorter.  Where pairs of
-    one row are ``rivals``, one that is hopeless beside the best of them is left there, unsettled.
+    one question are ``rivals``, one that is hopeless beside the best of them is left there, unsettled;
+    ``noise`` is what :func:`~thermogrip.sysid.effusivity.data.whiten` returns.
     """
     n, m = start.shape
     state = Search(
         trial=start.copy(), u=start.copy(), matrix=np.empty((n, m + 1, m + 1)), slope=np.empty((n, m)),
         bound=np.empty((n, m)), own=np.empty((n, m)), cost=np.empty(n), ahead=np.empty(n),
-        damping=np.full(n, SEARCH.first_damping), part=np.empty(n), slope_gain=np.empty(n), bend=np.empty(n),
+        log_volume=np.empty(n), damping=np.full(n, SEARCH.first_damping), part=np.empty(n),
+        slope_gain=np.empty(n), bend=np.empty(n),
         stale=np.zeros(n, dtype=bool), settled=np.zeros(n, dtype=bool), going_on=np.zeros(n, dtype=bool),
     )  # fmt: skip
     # room, as loops: arrays made and copied whole in a kernel take four times as long to compile
     at, room = np.arange(n), np.empty((2 * m + 6, m + 1))
     for step in range(SEARCH.most_steps + 1):
-        tried = products(pairs.take(at), whitener, state.trial[at], law.sd[at])
+        tried = products(pairs.take(at), noise[0], state.trial[at], law.sd[at])
         advance(at, tried, law, state, room, step, SEARCH)
         if rivals:
-            state.going_on[at] &= _hopeful(pairs, step, state.ahead)[at]
+            state.going_on[at] &= _hopeful(pairs, noise[1][pairs.row], state, step)[at]
         at = at[state.going_on[at]]
         if not at.size:
             break
     return state
 
 
-def _hopeful(pairs: Pairs, step: int, ahead: Array) -> Mask:
-    """Return which pairs are worth another step beside the best of their touch."""
+def _hopeful(pairs: Pairs, log_det: Array, state: Search, step: int) -> Mask:
+    """Return which pairs are worth another step beside the best of their touch, and of their question."""
     best = np.full(pairs.data.level.size, np.inf)
-    np.minimum.at(best, pairs.row, ahead)
-    stated = np.isfinite(pairs.data.t_object)
-    limit = np.where(stated, _HOPELESS_STATED[step], _HOPELESS_COST.get(step, np.inf))
-    return np.asarray(ahead < (best + limit + SEARCH.unexplained_times * np.maximum(best, 0.0))[pairs.row])
+    np.minimum.at(best, pairs.row, state.ahead)
+    far, stated = _HOPELESS_COST.get(step, np.inf), np.isfinite(pairs.data.t_object)
+    limit = np.where(stated, _HOPELESS_STATED[step], far) + SEARCH.unexplained_times * np.maximum(best, 0.0)
+    # of -2 ln evidence the determinant of the noise stays, whatever comes of steps, and that of the
+    # posterior's curvature adds to it
+    question = pairs.data.question[pairs.row]
+    reached = np.full(question.max() + 1, np.inf)
+    np.minimum.at(reached, question, state.cost + state.log_volume + log_det)
+    no_part = reached[question] + SEARCH.no_part
+    may_fall = far + SEARCH.unexplained_times * np.maximum(no_part, 0.0)
+    hopeful = log_det + np.maximum(state.ahead - may_fall, 0.0) < no_part
+    return np.asarray(hopeful & (state.ahead < (best + limit)[pairs.row]))
 
 
 @numba.njit(**COMPILED)  # type: ignore[untyped-decorator]
@@ -470,7 +482,9 @@ def advance(
             curved[i, i] += state.bound[p, i]
             right[i] = matrix[i, m] - state.slope[p, i]
         gain, loss = solve(curved, right, lower, move), 0.0
-        state.ahead[p] = state.cost[p] - gain
+        state.ahead[p], state.log_volume[p] = state.cost[p] - gain, 0.0
+        for i in range(m):
+            state.log_volume[p] += np.log(lower[i, i])
         last = step == settings.most_steps
         state.settled[p] = gain < settings.least_decrease and not state.stale[p] and not last
         state.going_on[p] = not state.settled[p] and damping <= 1e9 and not last
