@@ -77,7 +77,8 @@ class _Around(ctypes.Structure):
 #: ``tg_relay`` and ``tg_switch`` of ``tg_switches.h``.
 _NUMBERS = ("full", "on_s", "off_s", "dead_s")
 _RELAY = np.dtype([("drive", "i4"), ("opposite", "i4"), *((name, "f8") for name in _NUMBERS)], align=True)
-_SWITCH = np.dtype([("on", "i4"), ("fresh", "i4"), ("owed_s", "f8"), ("since_s", "f8")], align=True)
+_STATES = ("on", "stopped", "fresh")
+_SWITCH = np.dtype([*((name, "i4") for name in _STATES), ("owed_s", "f8"), ("since_s", "f8")], align=True)
 
 
 class _Run:
@@ -94,7 +95,7 @@ class _Run:
         self.reading, self.drive = np.zeros((n, model.n_y + model.n_d)), np.zeros((n, model.n_u))
         self.status = np.full(n, STATUSES.index("ok"), dtype=np.int32)
         relays = np.array(relay_rows(truth.switches, model.drives), dtype=_RELAY)
-        states = np.array([(0, 1, 0.0, np.inf)] * len(relays), dtype=_SWITCH)  # as truth has them
+        states = np.array([(0, 0, 1, 0.0, np.inf)] * len(relays), dtype=_SWITCH)  # as truth has them
         self.plant, arrays_of_plant = CompiledTruth(model).at(truth.x, truth.offset)
         # they live as long as this
         self._held = (arrays_of_plant, truth.before, truth.d, noise, quanta, offset, relays, states)

@@ -31,7 +31,7 @@ static double due_s(const tg_relay *r, const tg_switch *s, int i, const double *
 void tg_switches_reset(tg_switch *s, int n)
 {
     for (int i = 0; i < n; i++) {
-        s[i].on = 0;
+        s[i].on = s[i].stopped = 0;
         s[i].fresh = 1;
         s[i].owed_s = s[i].since_s = 0.0;
     }
@@ -40,7 +40,7 @@ void tg_switches_reset(tg_switch *s, int n)
 void tg_switches_pass(const tg_relay *r, tg_switch *s, int n, const double *drive, double seconds)
 {
     for (int i = 0; i < n; i++) {
-        double share = share_of(r + i, drive), least, most;
+        double share = s[i].stopped ? 0.0 : share_of(r + i, drive), least, most;
         s[i].since_s += seconds;
         if (s[i].on) {
             s[i].owed_s += (fmax(share, 0.0) - 1.0) * seconds;
@@ -57,6 +57,7 @@ double tg_switches_turn(const tg_relay *r, tg_switch *s, int n, const double *dr
 {
     double next = INFINITY;
     for (int i = 0; i < n; i++) { /* one after the other: of two that are due one comes on, and the other waits */
+        s[i].stopped = !running;
         if (running ? due_s(r, s, i, drive) > TG_NOW_S : !s[i].on)
             continue;
         s[i].on = !s[i].on;

@@ -23,6 +23,7 @@ typedef struct {
 
 typedef struct {
     int on;         /* its state */
+    int stopped;    /* nothing is requested of it, whatever the drives are */
     int fresh;      /* it has not been on, and for what it waited until then nothing is owed */
     double owed_s;  /* of full power, requested and not given */
     double since_s; /* it last went over */

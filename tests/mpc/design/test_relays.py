@@ -71,7 +71,7 @@ def test_a_trial_with_relays_is_the_same_in_c_and_after_a_file(make, relays, tmp
 
 
 class _Switch(ctypes.Structure):
-    _fields_ = [(name, ctypes.c_int) for name in ("on", "fresh")]
+    _fields_ = [(name, ctypes.c_int) for name in ("on", "stopped", "fresh")]
     _fields_ += [(name, ctypes.c_double) for name in ("owed_s", "since_s")]
 
 
@@ -97,8 +97,6 @@ def test_the_exported_c_switches_at_the_same_samples(tmp_path):
         if rng.random() < 0.01:
             drive = dict(zip(drive, np.clip(rng.uniform(-0.5, 1.2, 2), 0, 1)))
         stopped = k % 3000 > 2900
-        if stopped:
-            drive = {"hot": 0.0, "cold": 0.0}
         c.tg_switches_turn(table, states, 2, (ctypes.c_double * 2)(*drive.values()), not stopped)
         python.request(drive, running=not stopped)
         switched[k] = [switch.on for switch in python.each]
