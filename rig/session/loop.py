@@ -98,6 +98,7 @@ class Loop:
     ends: float = np.inf
     dt: float = np.nan
     trip: Trip | None = None  # what ended it
+    cycle_s: float = 0.0  # of the relays, over which their ripple has no mean, where it settled by that
     unwritten: bool = False  # whether the recorder still has to get the newest row
     row_mean: MeanDrive = field(default_factory=MeanDrive)  # since the newest row
     move_mean: MeanDrive = field(default_factory=MeanDrive)

@@ -14,7 +14,8 @@ Whatever ends it (done, time-out, a trip, an exception, Ctrl-C, ``kill``), drive
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from typing import Any, Protocol
 
 import numpy as np
@@ -23,6 +24,7 @@ from numpy.typing import ArrayLike
 from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.errors import UserError, known_names
 from thermogrip.datasets.schema import GRASP_LABELS, GRASP_NUMBERS, Grasps, Log, make_grasps
+from thermogrip.datasets.units import join_header
 from thermogrip.mpc.interface import Controller, Move, Readings, Target
 from thermogrip.rig.guard.guard import Guard
 from thermogrip.rig.guard.trip import Trip
@@ -33,6 +35,7 @@ from thermogrip.rig.session.snapshot import Listener, Operator
 from thermogrip.sysid.effusivity.quality import find_contact
 
 FEWEST_ROWS = 5  # through which a line and the scatter about it are fitted
+ROUNDED = 1e-9  # of a mean over a row
 
 
 @dataclass(frozen=True)
@@ -255,6 +258,30 @@ def _settle(run: Loop, timeout: float, band: float) -> bool:
         errors = [run.column(f"{name}_degC", last=recent_s) - value for name, value in run.target.items()]
         if all(has_settled(time, error, band=band, window=window) for error in errors):
             return True
+        if _settled_but_for_ripple(run, band):
+            return True
+    return False
+
+
+def _settled_but_for_ripple(run: Loop, band: float) -> bool:
+    """Say whether the means over whole cycles of a relay have settled, once one has ended."""
+    # a relay gives more and less than it is asked for in turn, by as much: over a cycle the ripple has no mean
+    time = run.column("time_s")
+    for name in run.reading.mean_drive or ():
+        header = join_header(name, run.rig.units[name])
+        given, asked = (np.abs(run.column(column)) for column in (header, f"asked_{header}"))
+        is_on = (given > 0) & (given >= asked * (1 - ROUNDED))
+        begins = np.flatnonzero(is_on[1:-1] & ~is_on[:-2]) + 1  # the newest row is not over
+        if begins.size <= FEWEST_ROWS or begins[-1] < time.size - 2:
+            continue
+        cycles = [slice(*ends) for ends in pairwise(begins)]
+        middles = np.array([time[cycle].mean() for cycle in cycles])
+        errors = [run.column(f"{output}_degC") - value for output, value in run.target.items()]
+        means = [np.array([np.nanmean(error[cycle]) for cycle in cycles]) for error in errors]
+        window = max(30.0, float(middles[-1] - middles[-FEWEST_ROWS]))
+        if all(has_settled(middles, mean, band=band, window=window) for mean in means):
+            run.cycle_s = float(np.mean(np.diff(middles[-FEWEST_ROWS:])))
+            return True
     return False
 
 
@@ -359,7 +386,12 @@ def _figures(run: Loop, name: str, band: float) -> StepFigures:
     values, targets = run.column(f"{name}_degC")[regulated], run.column(f"target_{name}_degC")[regulated]
     if np.ptp(targets) > 0:
         return StepFigures(np.nan, np.nan, float(np.nanmean(values - targets)))
-    return step_figures(run.column("time_s")[regulated], values, float(targets[0]), band=band)
+    time, target = run.column("time_s")[regulated], float(targets[0])
+    figures = step_figures(time, values, target, band=band)
+    if not run.cycle_s:
+        return figures
+    by_cycle = step_figures(time, values, target, band=band, smooth=run.cycle_s)  # without the ripple
+    return replace(by_cycle, overshoot=figures.overshoot)
 
 
 class Player(Controller, Protocol):

@@ -15,9 +15,10 @@ from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.log_files import read_log
 from thermogrip.datasets.schema import make_log
-from thermogrip.mpc import PIController
+from thermogrip.mpc import Controller, PIController
 from thermogrip.mpc.closed_loop.simulate import RecordedController
 from thermogrip.mpc.controllers.loop_monitor import LoopMonitor
+from thermogrip.mpc.design.design import default_design
 from thermogrip.mpc.design.relays import Relay
 from thermogrip.mpc.plant.prediction import step_response
 from thermogrip.rig.drivers.relays import RelayRig, read_relays
@@ -241,6 +242,19 @@ def test_a_log_under_relays_has_what_they_gave_and_identifies_the_plant(tmp_path
     session = run_session(rig, half, {"t1": 40.15}, output="t1", band=1.5, settle_timeout=2000.0, guard=watch)
     assert (session.trip, session.verdict) == (None, "settled")
     assert set(session.log["asked_q1"].values) == {50.0}
+
+
+@pytest.mark.parametrize("on_s", [2.0, 10.0])
+def test_a_loop_has_settled_when_what_is_left_is_the_ripple_of_its_relays(on_s: float) -> None:
+    lab = make_lab()
+    twin = Twin(lab, seed=1, skin="t1")
+    rig = RelayRig(twin, {name: Relay(on_s=on_s, off_s=on_s) for name in lab.inputs}, lambda: twin.time)
+    design = default_design(lab, controlled=("t1",), drive_range=dict.fromkeys(lab.inputs, (0.0, 100.0)))
+    session = run_session(rig, Controller(lab, design), {"t1": 45.0}, output="t1", hold=200.0)
+    ripple = session.log["t1"].values[-200:] - 45.0
+    assert (np.std(ripple) > 0.25) == (on_s == 10.0)
+    assert (session.verdict, abs(session.bias) < 0.1) == ("settled", True)
+    assert session.settle_time < session.log["time"].values[-1] - 200.0
 
 
 def test_what_relays_gave_is_no_fault_of_the_plant() -> None:
