@@ -23,6 +23,7 @@
 #define TG_Z (TG_NX + TG_NW)               /* states of the observer */
 #define TG_SEEDS (TG_NX + TG_NU + TG_ND)   /* directions of a sample's Jacobian */
 #define TG_WIDE ((((TG_SEEDS > TG_Q_N ? TG_SEEDS : TG_Q_N) + 3) / 4) * 4)
+#define TG_ROOM (TG_Z * TG_Z > 2 * TG_NX * TG_WIDE ? TG_Z * TG_Z : 2 * TG_NX * TG_WIDE)
 #define TG_SOME(n) ((n) > 0 ? (n) : 1)
 
 enum tg_status { TG_OK = 0, TG_LATE, TG_INFEASIBLE, TG_FALLBACK_PLAN, TG_FALLBACK_PI, TG_OFF };
@@ -97,9 +98,9 @@ typedef struct {
     double G[TG_SOME(TG_NE)]; /* the response: the soft rows of the program, sample by sample */
     double y_guess[TG_NH * TG_NY], y_try[TG_NH * TG_NY];
     double free[TG_NH * TG_SOME(TG_NS)];
-    double seed[2 * TG_NX * TG_WIDE], seed_u[TG_NU * TG_WIDE], seed_d[TG_SOME(TG_ND) * TG_WIDE];
+    double seed[TG_ROOM], seed_u[TG_NU * TG_WIDE], seed_d[TG_SOME(TG_ND) * TG_WIDE];
     double by_drives[4 * TG_SOME(TG_NF)]; /* what the drives of four blocks fix in the model's step */
-    double partials[TG_SOME(TG_NM)], jacobian[TG_Z * TG_Z], spare[TG_Z * TG_Z];
+    double partials[TG_SOME(TG_NM)], jacobian[TG_Z * TG_Z];
 } tg_controller;
 
 #ifdef __cplusplus

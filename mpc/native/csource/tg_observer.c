@@ -334,21 +334,22 @@ static void add_noise(tg_controller *c, double share)
 static void carry_covariance(tg_controller *c)
 {
     int from[TG_Z], to[TG_Z];
-    memset(c->spare, 0, sizeof c->spare);
+    double *half = c->seed; /* of no use any more once there is a Jacobian */
+    memset(half, 0, TG_Z * TG_Z * sizeof(double));
     for (int i = 0; i < TG_Z; i++) {
         find_band(c->jacobian + i * TG_Z, from + i, to + i);
-        add_rows(c->spare + i * TG_Z, c->jacobian + i * TG_Z, from[i], to[i], c->P, TG_Z);
+        add_rows(half + i * TG_Z, c->jacobian + i * TG_Z, from[i], to[i], c->P, TG_Z);
     }
     for (int i = 0; i < TG_Z; i++)
         for (int j = 0; j < i; j++) {
-            double swap = c->spare[i * TG_Z + j];
-            c->spare[i * TG_Z + j] = c->spare[j * TG_Z + i];
-            c->spare[j * TG_Z + i] = swap;
+            double swap = half[i * TG_Z + j];
+            half[i * TG_Z + j] = half[j * TG_Z + i];
+            half[j * TG_Z + i] = swap;
         }
     memset(c->P, 0, sizeof c->P);
     for (int i = 0; i < TG_Z; i++) {
         int n = TG_WHOLE(i + 1) < TG_Z ? TG_WHOLE(i + 1) : TG_Z;
-        add_rows(c->P + i * TG_Z, c->jacobian + i * TG_Z, from[i], to[i], c->spare, n);
+        add_rows(c->P + i * TG_Z, c->jacobian + i * TG_Z, from[i], to[i], half, n);
     }
     for (int i = 0; i < TG_Z; i++)
         for (int j = 0; j < i; j++)
