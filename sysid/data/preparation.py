@@ -57,10 +57,9 @@ def without_still(logs: list[Log]) -> list[Log]:
 
 def still_inputs(network: GreyModel | None, logs: Sequence[Log], u: Sequence[str]) -> list[str]:
     """Return the inputs of a network, switches aside, that never move, if others of them do."""
-    still = [name for name in u if not moves(logs, name)] if network is not None else []
-    if not still or network is None:
+    if network is None:
         return []
-    still = [name for name in still if name not in network.switches]
+    still = [name for name in u if name not in network.switches and not moves(logs, name)]
     return still if len(still) < len(u) else []
 
 

@@ -44,14 +44,6 @@ class _Bins:
     places: tuple[NDArray[np.int64], ...]  # which bins these are
 
 
-@dataclass(eq=False)
-class _Starts:
-    """Starts of all stretches by log at the last z."""
-
-    z: Array | None = None
-    last: list[list[Start]] = field(default_factory=list)
-
-
 @dataclass(frozen=True, eq=False)
 class Problem:
     """Residuals of a model on logs; see the module's theory."""
@@ -63,7 +55,7 @@ class Problem:
     average: float  # length of a bin [s]
     sd: Array  # (n_y,), standard deviation of a bin about the model
     tau: Array  # (n_y,), bins per independent one
-    _starts: _Starts = field(default_factory=_Starts)
+    _starts: dict[bytes, list[list[Start]]] = field(default_factory=dict)  # of all stretches, at the last z
 
     @property
     def model(self) -> GreyModel:
@@ -90,14 +82,15 @@ class Problem:
 
     def start(self, z: Array) -> list[list[Start]]:
         """Return the starts of all stretches at z."""
-        if self._starts.z is None or not np.array_equal(z, self._starts.z):
+        point = z.tobytes()
+        if point not in self._starts:
             p = self.parameters(z[None])[0]
-            self._starts.last = [
+            self._starts.clear()
+            self._starts[point] = [
                 find_starts(self.plant, p, stretches, start_seconds(self.model, stretches, self.plant.dt))
                 for stretches, _ in self.logs
             ]
-            self._starts.z = z.copy()
-        return self._starts.last
+        return self._starts[point]
 
     def residuals(self, z: Array, starts: Sequence[Sequence[Start]]) -> list[Array]:
         """Return the residuals of each log, (k, m_log) each, at z (k, n_free)."""

@@ -11,6 +11,7 @@ state too: its time constant is C, a unit flow from its node for q.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from copy import deepcopy
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -400,22 +401,15 @@ class NetworkModel(Described):
 def _as_it_was_fitted(content: Mapping[str, Any]) -> dict[str, Any]:
     """Return a plant's network; 0.1.0 wrote no ``full_scale`` and took 1 for that of V, A, W and 1, and until
     0.2.0 the slow error of a sensor was a ``wander`` of the file."""
-    out = dict(content)
-    inputs, outputs = out.get("inputs"), out.get("outputs")
-    if isinstance(inputs, Mapping):
-        out["inputs"] = {
-            name: {"full_scale": 1.0, **item}
-            if isinstance(item, Mapping) and item.get("unit") in ("1", "A", "V", "W")
-            else item
-            for name, item in inputs.items()
-        }
-    if isinstance(outputs, Mapping):
-        out["outputs"] = {
-            name: {key: item[key] for key in item if key not in ("wander", "wander_time")}
-            if isinstance(item, Mapping)
-            else item
-            for name, item in outputs.items()
-        }
+    out = deepcopy(dict(content))
+    tables = {key: out[key] for key in ("inputs", "outputs") if isinstance(out.get(key), dict)}
+    for key, table in tables.items():
+        for item in (item for item in table.values() if isinstance(item, dict)):
+            if key == "inputs" and item.get("unit") in ("1", "A", "V", "W"):
+                item.setdefault("full_scale", 1.0)
+            elif key == "outputs":
+                item.pop("wander", None)
+                item.pop("wander_time", None)
     return out
 
 

@@ -8,7 +8,7 @@ coefficients and exponents: no pickle, and ``step`` is plain arithmetic.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from math import prod
 from typing import Any
@@ -108,10 +108,13 @@ class SindyModel(BlackBox):
         past = ["" if lag == 0 else f"[k-{lag}]" for lag in range(self.memory)]
         names = [f"{name}{lag_suffix}" for lag_suffix in past for name in self.outputs]
         names += [*self.inputs, *self.disturbances]
-        return tuple(
-            f"{name}[k+1] = {_polynomial_text(row, self.exponents, names)}"
-            for name, row in zip(self.outputs, self.coefficients)
-        )
+        powers = [[n if p == 1 else f"{n}^{p}" for n, p in zip(names, row) if p] for row in self.exponents]
+        terms = [
+            [" ".join([f"{value:.4g}", *factors]) for value, factors in zip(row, powers) if value]
+            for row in self.coefficients
+        ]
+        right = [" + ".join(summands).replace("+ -", "- ") or "0" for summands in terms]
+        return tuple(f"{name}[k+1] = {polynomial}" for name, polynomial in zip(self.outputs, right))
 
     def to_dict(self) -> dict[str, Any]:
         """Return the model as plain lists and numbers, for JSON, and its equations for readers."""
@@ -122,13 +125,3 @@ class SindyModel(BlackBox):
         """Return exponents and memory."""
         powers = array_within(data, "exponents", _MOST_DEGREE).astype(int)
         return {"exponents": powers, "memory": int(number_within(data, "memory", 1, _MOST_MEMORY))}
-
-
-def _polynomial_text(row: Array, exponents: NDArray[np.int_], names: Sequence[str]) -> str:
-    products = []
-    for value, powers in zip(row, exponents):
-        if value == 0:
-            continue
-        factors = [n if p == 1 else f"{n}^{p}" for n, p in zip(names, powers.tolist()) if p]
-        products.append(" ".join([f"{value:.4g}", *factors]))
-    return " + ".join(products).replace("+ -", "- ") or "0"

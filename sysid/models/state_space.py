@@ -164,13 +164,6 @@ class StateSpaceModel(BlackBox):
         """Whether every pole lies inside the unit circle, at every position of the switches."""
         return bool(np.all(np.abs(self.poles()) < 1))
 
-    def time_constants(self) -> Array:
-        """Return -dt / ln|pole| [s] of the poles that are not delays, slowest first (``inf``: unstable)."""
-        size = np.abs(self.poles())
-        size = np.sort(size[size > 1e-6])[::-1]
-        with np.errstate(divide="ignore"):
-            return np.where(size < 1, -self.dt / np.log(np.minimum(size, 1)), np.inf)
-
     def gain(self) -> Array:
         """Return the steady gain (n_y, n_u) of the linear part with the switches off."""
         return np.asarray(self.C @ np.linalg.solve(np.eye(self.n_x) - self.A, self.B))

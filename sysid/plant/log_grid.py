@@ -183,10 +183,7 @@ def make_grid(
 def cut_stretches(plant: PlantData, log: Log, *, gaps: str = "restart") -> list[Stretch]:
     """Return the stretches of a log, which is in the plant's units, on the plant's grid."""
     rows = rows_of(log, plant.inputs, plant.outputs, plant.disturbances)
-    for name, values in zip((*plant.inputs, *plant.disturbances), (*rows.u.T, *rows.d.T)):
-        if not np.isfinite(values).all():
-            problem, hint = "is unknown in some rows", "fill or cut them"
-            raise UserError(problem, file=rows.log, column=name, hint=hint)
+    _check_known(log, (*plant.inputs, *plant.disturbances))
     middle = float(log.attrs.get("averaged_s", 0.0)) / 2  # where the mean of a block belongs
 
     def steps(seconds: float) -> int:
@@ -295,11 +292,7 @@ def signals(
         for name in y:
             if not np.isfinite(column(log, name)).any():
                 raise UserError("has no reading", file=log_name(log), column=name, hint="leave the log out")
-        for name in (*u, *d):
-            if not np.isfinite(column(log, name)).all():
-                raise UserError(
-                    "is unknown in some rows", file=log_name(log), column=name, hint="fill or cut them"
-                )
+        _check_known(log, (*u, *d))
     for name in y:
         readings = np.concatenate([column(log, name) for log in logs])
         if not np.nanmax(readings) > np.nanmin(readings):
@@ -320,6 +313,13 @@ def signals(
         problem += "".join(f"; {doubt}" for doubt in said if NO_NUMBERS in doubt)
         raise UserError(problem, file=log_name(logs[0]), hint=hint)
     return SignalNames(u, y, d)
+
+
+def _check_known(log: Log, driven: Sequence[str]) -> None:
+    for name in driven:
+        if not np.isfinite(column(log, name)).all():
+            problem, hint = "is unknown in some rows", "fill or cut them"
+            raise UserError(problem, file=log_name(log), column=name, hint=hint)
 
 
 def moved_before(log: Log) -> str:

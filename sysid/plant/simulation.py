@@ -132,15 +132,12 @@ def _about_start(stretch: Stretch, start: Start) -> _RestPoint:
 
 def _first_reading(stretch: Stretch, seconds: float = 2.0) -> Array:
     """Return the mean reading of the first seconds, and of the first row that is read where all are lost."""
-    early = stretch.y[stretch.time <= seconds]
     out = np.full(stretch.y.shape[1], np.nan)
-    for k in range(out.size):
-        readings = early[np.isfinite(early[:, k]), k]
-        if readings.size:
-            out[k] = readings.mean()
-        else:
-            later = stretch.y[np.isfinite(stretch.y[:, k]), k]
-            out[k] = later[0] if later.size and stretch.time[np.isfinite(stretch.y[:, k])][0] < 60 else np.nan
+    for k, y in enumerate(stretch.y.T):
+        is_read = np.isfinite(y) & (stretch.time < 60)
+        if is_read.any():
+            early = y[is_read & (stretch.time <= seconds)]
+            out[k] = early.mean() if early.size else y[is_read][0]
     return out
 
 
