@@ -1,17 +1,11 @@
 """Checks that run before any fit: what the data can and cannot say.
 
-Every finding has a verdict (``ok``, ``warn``, ``fail``) and a consequence in words.  The tests are
-
-* **quantum** of each channel, against how far the output moves in a sample;
-* **noise** of each output: one that jumps and holds, or has none at all, may be a set point or computed;
-* **jitter** of the sample times, **gaps** of more than 10 s and five rows, share of **lost** readings;
-* **saturation**: share of the rows at which an input is on its own limit;
-* **excitation**: the order n up to which the input is persistently exciting, that is, the rank of the
-  covariance of n successive values, and the condition of the correlation between the inputs;
-* **feedback** from output to input: with u[k] regressed on its own past, does the past of y help?  An F test
-  in which only rows count at which the input moves.  A relay is asked whether it is switched at the same
-  readings; of one that is on for a share of even windows the shares are tested.  In closed loop the noise is
-  in the input too, and equation-error fits are biased.
+Every finding has a verdict (``ok``, ``warn``, ``fail``) and a consequence in words.  **Excitation** is the
+order n up to which an input is persistently exciting, the rank of the covariance of n successive values.
+**Feedback** from output to input: with u[k] regressed on its own past, does the past of y help?  An F test in
+which only rows count at which the input moves.  A relay is asked whether it is switched at the same readings;
+of one that is on for a share of even windows the shares are tested.  In closed loop the noise is in the input
+too, and equation-error fits are biased.
 
 :func:`evidence` says what a plant rests on: between which temperatures, and the minutes of each kind of
 drive, for what is rare weighs little in its errors.

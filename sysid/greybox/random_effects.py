@@ -28,8 +28,6 @@ from thermogrip.sysid.models.model import Model
 from thermogrip.sysid.models.state_space import symmetric_root
 from thermogrip.sysid.plant.simulation import READING_EVERY, Start, predict
 
-Parts = list[list[list[Array]]]  # by log, stretch and output
-
 
 @dataclass(frozen=True)
 class EffectSettings:
@@ -48,8 +46,8 @@ class EffectSettings:
 EFFECTS = EffectSettings()
 
 
-def discrepancy_responses(problem: Problem, runs: Sequence[Sequence[Array]]) -> list[tuple[str, Parts]]:
-    """Return the responses with s = 1, in the units of the readings, each with the name of its signal."""
+def discrepancy_responses(problem: Problem, runs: Sequence[Sequence[Array]]) -> list[tuple[str, list[Array]]]:
+    """Return what the responses with s = 1 do to the residuals of each log, with the names of signals."""
     signals_of = [
         [signals(problem.model, stretch.u, stretch.d, run) for stretch, run in zip(stretches, of_log)]
         for (stretches, _), of_log in zip(problem.logs, runs)
@@ -67,7 +65,7 @@ def discrepancy_responses(problem: Problem, runs: Sequence[Sequence[Array]]) -> 
         for name in names
         for lag in EFFECTS.lags
     ]
-    return [(name, moves) for name, moves in out if any(p.any() for log in moves for k in log for p in k)]
+    return [(name, moves) for name, moves in out if any(moved.any() for moved in moves)]
 
 
 def signals(model: Model, u: Array, d: Array, run: Array) -> dict[str, Array]:
@@ -87,8 +85,8 @@ def signals(model: Model, u: Array, d: Array, run: Array) -> dict[str, Array]:
 
 def _response(
     problem: Problem, signals_of: Sequence[Sequence[Mapping[str, Array]]], name: str, lag: float, rms: float
-) -> Parts:
-    """Return the response to a signal behind a lag [s], of this rms [sd of a bin]."""
+) -> list[Array]:
+    """Return the response by log to a signal behind a lag [s], of this rms [sd of a bin]."""
     keep = np.exp(-problem.plant.dt / lag)
     means = []
     for of_log, (_, bins) in zip(signals_of, problem.logs):
@@ -97,7 +95,10 @@ def _response(
     squares = [float(np.mean(mean**2)) for log in means for stretch in log for mean in stretch if mean.size]
     size = float(np.sqrt(np.mean(squares))) if squares else 0.0
     gains = rms * problem.sd / size if size > 1e-9 else np.zeros(len(problem.sd))
-    return [[[gain * mean for gain, mean in zip(gains, stretch)] for stretch in log] for log in means]
+    return [
+        _residuals(problem, [[gain * mean for gain, mean in zip(gains, stretch)] for stretch in log])
+        for log in means
+    ]
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,10 +114,10 @@ class Linearised:
 
 @dataclass(frozen=True, eq=False)
 class _Column:
-    """Something that moves the residuals of one log: values by stretch and output."""
+    """Something that moves the residuals of one log."""
 
     name: str  # empty of a start
-    moves: list[list[Array]]  # at the stated sd
+    moves: Array  # (m_log,), at the stated sd
 
 
 def linearise_logs(problem: Problem, z: Array, by_log: Sequence[tuple[Array, Array]]) -> Linearised:
@@ -131,13 +132,12 @@ def linearise_logs(problem: Problem, z: Array, by_log: Sequence[tuple[Array, Arr
     logs: list[LogData] = []
     effects_of_logs: list[list[_Column]] = []
     for log_index, (r, jacobian) in enumerate(by_log):
-        rows, slopes = _by_stretch(problem, log_index, -r[:, None]), _by_stretch(problem, log_index, jacobian)
-        effects = _log_effects(problem, log_index, p, starts[log_index], slopes)
-        alike = [_in_residual_units(problem, moves[log_index]) for _, moves in discrepancy]
+        effects = _log_effects(problem, log_index, p, starts[log_index], jacobian)
+        alike = [moves[log_index] for _, moves in discrepancy]
+        columns = np.column_stack([jacobian, *alike, *(effect.moves for effect in effects), -r])
         blocks = []
-        for k in range(len(rows)):
-            columns = [*(moves[k] for moves in alike), *(c.moves[k] for c in effects)]
-            blocks += _binned_block(problem, log_index, k, merge, slopes[k], columns, rows[k])
+        for k, by_output in enumerate(_by_stretch(problem, log_index, columns)):
+            blocks += _binned_block(problem, log_index, k, merge, by_output)
         if blocks:
             kind = np.array(shared + [-1] * len(effects), dtype=np.int64)
             effects_of_logs.append(effects)
@@ -153,9 +153,7 @@ def _simulations(problem: Problem, at: int, p: Array, starts: list[Start]) -> li
     return [run[0] for run in predict(problem.model, problem.plant.dt, p, problem.logs[at][0], starts)]
 
 
-def _log_effects(
-    problem: Problem, at: int, p: Array, starts: list[Start], slopes: list[list[Array]]
-) -> list[_Column]:
+def _log_effects(problem: Problem, at: int, p: Array, starts: list[Start], slopes: Array) -> list[_Column]:
     """Return everything that is the log's own."""
     plant, (stretches, bins) = problem.plant, problem.logs[at]
     # a log that began at rest has measured its sensors' offsets in its first seconds
@@ -168,7 +166,7 @@ def _log_effects(
                 [np.full(mean.size, spread if k == j else 0.0) for k, mean in enumerate(cells.means)]
                 for cells in bins
             ]
-            out.append(_Column(f"offset of {name}", _in_residual_units(problem, moves)))
+            out.append(_Column(f"offset of {name}", _residuals(problem, moves)))
     for j, name in enumerate(plant.disturbances):
         spread = min(plant.nuisance.get(name, 0.0), most)
         if spread > 0:
@@ -179,13 +177,12 @@ def _log_effects(
                 [np.asarray(operator @ (b[:, k] - a[:, k])) for k, operator in enumerate(cells.operators)]
                 for a, b, cells in zip(measured, biased, bins)
             ]
-            out.append(_Column(f"bias of {name}", _in_residual_units(problem, moves)))
+            out.append(_Column(f"bias of {name}", _residuals(problem, moves)))
     specs = list(problem.model.specs.values())
     for i, place in enumerate(problem.free):
         spread = specs[place].per_log or 0.0
         if spread > 0:
-            moves = [[s[:, i] * spread / problem.width[i] for s in stretch] for stretch in slopes]
-            out.append(_Column(problem.model.parameters[place], moves))
+            out.append(_Column(problem.model.parameters[place], slopes[:, i] * spread / problem.width[i]))
     for k in range(len(stretches)):
         out += _of_start(problem, at, k, p, starts[k])
     return out
@@ -222,8 +219,7 @@ def _of_start(problem: Problem, at: int, k: int, p: Array, start: Start) -> list
     out = []
     for mode in modes.T:
         moves = [bins_of_output * sd for bins_of_output, sd in zip(np.split(mode, ends), problem.sd)]
-        everywhere = _in_residual_units(problem, [*nothing[:k], moves, *nothing[k + 1 :]])
-        out.append(_Column("", everywhere))
+        out.append(_Column("", _residuals(problem, [*nothing[:k], moves, *nothing[k + 1 :]])))
     return out
 
 
@@ -237,35 +233,25 @@ def _by_stretch(problem: Problem, at: int, rows: Array) -> list[list[Array]]:
     return out
 
 
-def _in_residual_units(problem: Problem, parts: list[list[Array]]) -> list[list[Array]]:
-    """Return what moves the bins in the units of the fit's residuals."""
-    return [
-        [problem.scaled(k, moved_bins[None])[0] for k, moved_bins in enumerate(stretch)] for stretch in parts
-    ]
+def _residuals(problem: Problem, parts: list[list[Array]]) -> Array:
+    """Return what moves the bins of a log by stretch and output, in the order and units of its residuals."""
+    return np.concatenate([problem.scaled(k, bins) for stretch in parts for k, bins in enumerate(stretch)])
 
 
 def _n_bins(problem: Problem, at: int, k: int) -> int:
     return max((int(place[-1]) + 1 for place in problem.logs[at][1][k].places if place.size), default=0)
 
 
-def _binned_block(
-    problem: Problem,
-    at: int,
-    k: int,
-    merge: int,
-    slopes: list[Array],
-    columns: Sequence[list[Array]],
-    residual: list[Array],
-) -> list[Block]:
-    """Return stretch k of a log on a regular grid of bins; none where it is too short."""
+def _binned_block(problem: Problem, at: int, k: int, merge: int, columns: list[Array]) -> list[Block]:
+    """Return stretch k of a log, its columns by output, on a regular grid of bins; none where it is too
+    short."""
     places, n = problem.logs[at][1][k].places, _n_bins(problem, at, k) // merge * merge
     outputs = [j for j, place in enumerate(places) if n and place.size >= EFFECTS.least_read * n]
     if not outputs or n < EFFECTS.least_bins * merge:
         return []
     grids = []
     for j in outputs:
-        stacked = np.column_stack([slopes[j], *(column[j] for column in columns), residual[j]])
         # linear between the bins that were read, held beyond
-        grid = np.column_stack([np.interp(np.arange(n), places[j], column) for column in stacked.T])
+        grid = np.column_stack([np.interp(np.arange(n), places[j], column) for column in columns[j].T])
         grids.append(grid.reshape(-1, merge, grid.shape[1]).mean(axis=1))
     return [Block.of(np.stack(grids, axis=1), outputs)]

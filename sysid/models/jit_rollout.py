@@ -19,8 +19,9 @@ from typing import Any
 
 import numpy as np
 from llvmlite import binding, ir
+from numpy.typing import ArrayLike
 
-from thermogrip.datasets.arrays import Array, Run, Values
+from thermogrip.datasets.arrays import Run, Values
 from thermogrip.sysid.models.model import Output, Sizes, Step
 
 #: Numbers side by side.
@@ -146,14 +147,6 @@ def _instructions(function: Any, inputs: Sequence[Values], at: ir.IRBuilder) -> 
     return results
 
 
-def _gather(at: ir.IRBuilder, places: Values, index: Any) -> Any:
-    """Return a register of the entries ``index`` of eight arrays."""
-    filled = ir.Constant(VECTOR, ir.Undefined)
-    for k, place in enumerate(places):
-        filled = at.insert_element(filled, at.load(at.gep(place, [index])), _PLACE(k))
-    return filled
-
-
 def _spread(at: ir.IRBuilder, number: Any) -> Any:
     """Return a register of one number."""
     first = at.insert_element(ir.Constant(VECTOR, ir.Undefined), number, _PLACE(0))
@@ -196,8 +189,11 @@ class Kernel:
         kinds = [ctypes.c_void_p] * 7 + [ctypes.c_int64] * 3 + [ctypes.c_double, ctypes.c_void_p]
         self._rollout = ctypes.CFUNCTYPE(None, *kinds)(self._address("rollout"))
 
-    def rollout(self, x0: Array, u: Array, d: Array, p: Array, h: float, pieces: int = 1) -> Run:
+    def rollout(
+        self, x0: ArrayLike, u: ArrayLike, d: ArrayLike, p: ArrayLike, h: float, pieces: int = 1
+    ) -> Run:
         """Simulate a batch, ``pieces`` steps of h with each row of u and d."""
+        x0, u, d, p = arrays = [np.ascontiguousarray(value, dtype=float) for value in (x0, u, d, p)]
         batch, n = len(x0), u.shape[1]
         n_x, n_u, n_d, n_p = self.sizes
         ends = x0.shape[1:], u.shape[1:], d.shape[1:], p.shape[1:]
@@ -208,7 +204,6 @@ class Kernel:
         moved = np.ones(n + 1, dtype=np.uint8)
         on = u[:, :, self.switches]
         moved[1:n] = np.any(on[:, 1:] != on[:, :-1], axis=(0, 2)) if self.switches else 0
-        arrays = [np.ascontiguousarray(a, dtype=float) for a in (x0, u, d, p)]
         # which entry of each array a member begins at; places beyond the last member repeat it, so that a
         # member's numbers do not depend on who its neighbours are
         n_block = -(-batch // WIDTH)
@@ -322,9 +317,15 @@ class _Writer:
         builder.ret_void()
 
     def _row(self, array: int, entries: Sequence[int], t: Any = _FIRST) -> list[Any]:
-        """Return entries of row t of an array."""
-        base = self.at.mul(t, INTEGER(self.sizes[array]))
-        return [_gather(self.at, self.places[array], self.at.add(base, INTEGER(i))) for i in entries]
+        """Return registers of the entries of row t of an array, each of eight members."""
+        base, registers = self.at.mul(t, INTEGER(self.sizes[array])), []
+        for i in entries:
+            filled, entry = ir.Constant(VECTOR, ir.Undefined), self.at.add(base, INTEGER(i))
+            for k, place in enumerate(self.places[array]):
+                number = self.at.load(self.at.gep(place, [entry]))
+                filled = self.at.insert_element(filled, number, _PLACE(k))
+            registers.append(filled)
+        return registers
 
     def _put(self, values: Values, array: Any, row: Any, length: Any) -> None:
         """Write values[m] to the block's columns of array[m, row]."""

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from thermogrip.datasets.arrays import Array, Run, Values
-from thermogrip.datasets.errors import reading
+from thermogrip.datasets.errors import UserError, reading
 from thermogrip.datasets.limits import STEP_RANGE, array_within, number_within
 from thermogrip.sysid.models.network_spec import Parameter
 
@@ -128,12 +128,25 @@ class BlackBox(ABC):
         """Number of states."""
 
     @abstractmethod
+    def one_step(self, x: Values, u: Values, d: Values) -> list[Any]:
+        """Return the state one step of the model later, in plain arithmetic (numbers, NumPy rows or CasADi
+        symbols)."""
+
+    @abstractmethod
     def output(self, x: Values, p: Values) -> list[Any]:
-        """Return the outputs at state x, in plain arithmetic (numbers, NumPy rows or CasADi symbols)."""
+        """Return the outputs at state x, in plain arithmetic."""
 
     @abstractmethod
     def states(self, x0: Array, u: Array, d: Array, times: int = 1) -> Array:
         """Return the states (B, N + 1, n_x) of :meth:`rollout`, ``times`` steps with each row."""
+
+    def step(self, x: Values, u: Values, d: Values, p: Values, dt: float) -> list[Any]:
+        """Return the state ``dt`` seconds later, a multiple of the model's step."""
+        now = [x[i] for i in range(self.n_x)]
+        u, d = [u[i] for i in range(len(self.inputs))], [d[i] for i in range(len(self.disturbances))]
+        for _ in range(whole_steps(dt, self.dt)):
+            now = self.one_step(now, u, d)
+        return now
 
     def rollout(self, x0: ArrayLike, u: ArrayLike, d: ArrayLike, p: ArrayLike, dt: float) -> Run:
         """Simulate a batch."""
@@ -178,6 +191,15 @@ class BlackBox(ABC):
     def others(data: Mapping[str, Any]) -> dict[str, Any]:
         """Return the fields that are neither names nor plain arrays."""
         return {}
+
+
+def whole_steps(dt: float, own: float) -> int:
+    """Return ``dt`` [s] in steps of ``own``, or refuse it."""
+    times = round(dt / own)
+    if times < 1 or abs(times * own - dt) > 1e-6 * dt:
+        problem = f"{dt:g} s is no whole multiple of the plant's step"
+        raise UserError(problem, hint=f"take a multiple of {own:g} s")
+    return times
 
 
 def _plain_json(value: Any) -> Any:

@@ -373,7 +373,6 @@ class NetworkModel(Described):
 
     def rollout(self, x0: ArrayLike, u: ArrayLike, d: ArrayLike, p: ArrayLike, dt: float) -> Run:
         """Simulate a batch."""
-        x0, u, d, p = (np.ascontiguousarray(value, dtype=float) for value in (x0, u, d, p))
         return _kernel(self._structure).rollout(x0, u, d, p, float(dt))
 
     @cached_property

@@ -27,7 +27,7 @@ from numpy.typing import ArrayLike
 
 from thermogrip.datasets.arrays import Array, Values
 from thermogrip.sysid.models.model import BlackBox
-from thermogrip.sysid.models.state_space import dot, join_columns, whole_steps
+from thermogrip.sysid.models.state_space import dot, join_columns
 
 _RAILS = ("low", "high")
 
@@ -91,17 +91,13 @@ class NeuralModel(BlackBox):
 
     # ---- the Model protocol ----
 
-    def step(self, x: Values, u: Values, d: Values, p: Values, dt: float) -> list[Any]:
-        """Return the state one step later, in plain arithmetic (dt: a multiple of the model's)."""
-        outside = [u[i] for i in range(len(self.inputs))] + [d[i] for i in range(len(self.disturbances))]
-        scaled = [(v - float(a)) / float(s) for v, a, s in zip(outside, self.w_middle, self.w_size)]
+    def one_step(self, x: Values, u: Values, d: Values) -> list[Any]:
+        """Return the state one step of the model later."""
+        scaled = [(v - float(a)) / float(s) for v, a, s in zip([*u, *d], self.w_middle, self.w_size)]
         # |v + r| - |v - r| is twice v clipped to [-r, r]
         w = [(abs(v + float(r)) - abs(v - float(r))) / 2 for v, r in zip(scaled, self.reach)]
         n = self.A.shape[1]
-        now = [x[i] for i in range(self.n_x)]
-        for _ in range(whole_steps(dt, self.dt)):
-            now = [v for k in range(len(self.A)) for v in self._member_step(k, now[k * n : (k + 1) * n], w)]
-        return now
+        return [v for k in range(len(self.A)) for v in self._member_step(k, x[k * n : (k + 1) * n], w)]
 
     def output(self, x: Values, p: Values) -> list[Any]:
         """Return the mean of the members' outputs, in natural units."""

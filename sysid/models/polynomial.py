@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from thermogrip.datasets.arrays import Array, Values
 from thermogrip.datasets.limits import array_within, number_within
 from thermogrip.sysid.models.model import BlackBox
-from thermogrip.sysid.models.state_space import join_columns, whole_steps
+from thermogrip.sysid.models.state_space import join_columns
 
 BOUND = 10.0  # spreads beyond the range of the data: a simulation that leaves it has diverged
 _MOST_DEGREE, _MOST_MEMORY = 20, 1000
@@ -66,20 +66,15 @@ class SindyModel(BlackBox):
         """Number of states."""
         return self.memory * len(self.outputs)
 
-    def step(self, x: Values, u: Values, d: Values, p: Values, dt: float) -> list[Any]:
-        """Return the state one step later, in plain arithmetic (dt: a multiple of the model's)."""
-        now = [x[i] for i in range(self.n_x)]
-        outside = [*(u[i] for i in range(len(self.inputs))), *(d[i] for i in range(len(self.disturbances)))]
-        n_y = len(self.outputs)
-        for _ in range(whole_steps(dt, self.dt)):
-            variables = [*now, *outside]
-            terms = [
-                prod(variable for power, variable in zip(row, variables) for _ in range(power))
-                for row in self.exponents.tolist()
-            ]
-            after = [sum(float(c) * t for c, t in zip(row, terms) if c) for row in self.coefficients]
-            now = [*after, *now[: self.n_x - n_y]]
-        return now
+    def one_step(self, x: Values, u: Values, d: Values) -> list[Any]:
+        """Return the state one step of the model later."""
+        variables = [*x, *u, *d]
+        terms = [
+            prod(variable for power, variable in zip(row, variables) for _ in range(power))
+            for row in self.exponents.tolist()
+        ]
+        after = [sum(float(c) * t for c, t in zip(row, terms) if c) for row in self.coefficients]
+        return [*after, *x[: self.n_x - len(after)]]
 
     def output(self, x: Values, p: Values) -> list[Any]:
         """Return the outputs, the first states."""

@@ -18,7 +18,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from thermogrip.datasets.arrays import Array, Values
-from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.limits import array_within
 from thermogrip.sysid.models.model import BlackBox
 
@@ -82,22 +81,16 @@ class StateSpaceModel(BlackBox):
 
     # ---- the Model protocol ----
 
-    def step(self, x: Values, u: Values, d: Values, p: Values, dt: float) -> list[Any]:
-        """Return the state one step later, in plain arithmetic (numbers, NumPy rows or CasADi symbols)."""
+    def one_step(self, x: Values, u: Values, d: Values) -> list[Any]:
+        """Return the state one step of the model later."""
         phi = products(self.terms, self.inputs + self.disturbances, [*u, *d])
-        push = [
-            self.c[i] + dot(self.B[i], u) + dot(self.E[i], d) + dot(self.F[i], phi) for i in range(self.n_x)
+        switched = [(u[self.inputs.index(name)], matrix) for name, matrix in self.A_switch.items()]
+        return [
+            dot(self.A[i], x)
+            + (self.c[i] + dot(self.B[i], u) + dot(self.E[i], d) + dot(self.F[i], phi))
+            + sum(on * dot(matrix[i], x) for on, matrix in switched)
+            for i in range(self.n_x)
         ]
-        switched = [(self.inputs.index(name), matrix) for name, matrix in self.A_switch.items()]
-        now = [x[i] for i in range(self.n_x)]
-        for _ in range(whole_steps(dt, self.dt)):
-            now = [
-                dot(self.A[i], now)
-                + push[i]
-                + sum(u[input_index] * dot(matrix[i], now) for input_index, matrix in switched)
-                for i in range(self.n_x)
-            ]
-        return now
 
     def output(self, x: Values, p: Values) -> list[Any]:
         """Return the outputs y = C x + y0 as a list of length n_y, in plain arithmetic."""
@@ -242,15 +235,6 @@ def join_columns(u: Array, d: Array) -> Array:
     return np.concatenate(
         [np.broadcast_to(columns, (*shape, columns.shape[-1])) for columns in (u, d)], axis=-1
     )
-
-
-def whole_steps(dt: float, own: float) -> int:
-    """Return ``dt`` [s] in steps of ``own``, or refuse it."""
-    times = round(dt / own)
-    if times < 1 or abs(times * own - dt) > 1e-6 * dt:
-        problem = f"{dt:g} s is no whole multiple of the plant's step"
-        raise UserError(problem, hint=f"take a multiple of {own:g} s")
-    return times
 
 
 def dot(row: Array, values: Values) -> Any:

@@ -486,7 +486,6 @@ class OwnModel(Described):
 
     def rollout(self, x0: ArrayLike, u: ArrayLike, d: ArrayLike, p: ArrayLike, dt: float) -> Run:
         """Simulate a batch."""
-        x0, u, d, p = (np.ascontiguousarray(value, dtype=float) for value in (x0, u, d, p))
         n = self._pieces(dt)
         return _kernel(self.code).rollout(x0, u, d, p, dt / n, pieces=n)
 

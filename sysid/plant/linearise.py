@@ -26,8 +26,7 @@ from scipy.linalg import logm
 from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.errors import UserError, known_names
 from thermogrip.datasets.files import KEY, atomic_path, provenance, write_atomic
-from thermogrip.sysid.models.model import GreyModel
-from thermogrip.sysid.models.state_space import whole_steps
+from thermogrip.sysid.models.model import GreyModel, whole_steps
 
 if TYPE_CHECKING:
     from thermogrip.sysid.plant.plant_data import PlantData

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.sysid.blackbox.order_selection import StartPrior, estimate_starts
+from thermogrip.sysid.models.model import whole_steps
 from thermogrip.sysid.models.state_space import (
     StateSpaceModel,
     constrained_lstsq,
@@ -19,7 +20,6 @@ from thermogrip.sysid.models.state_space import (
     products,
     read_terms,
     symmetric_root,
-    whole_steps,
 )
 from thermogrip.sysid.plant.linearise import linearise_plant
 from thermogrip.sysid.plant.plant import Plant
