@@ -265,7 +265,7 @@ def _settle(run: Loop, timeout: float, band: float) -> bool:
 
 def _settled_but_for_ripple(run: Loop, band: float) -> bool:
     """Say whether the means over whole cycles of a relay have settled, once one has ended."""
-    # a relay gives more and less than it is asked for in turn, by as much: over a cycle the ripple has no mean
+    # a relay gives more and less than is asked for in turn, by as much: over a cycle the ripple has no mean
     time = run.column("time_s")
     for name in run.reading.mean_drive or ():
         header = join_header(name, run.rig.units[name])
