@@ -25,10 +25,11 @@ import reprlib
 import sys
 import traceback
 from collections import namedtuple
-from collections.abc import Mapping, Sequence, Sized
+from collections.abc import Iterator, Mapping, Sequence, Sized
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
-from functools import lru_cache
+from functools import lru_cache, partial
 from importlib import import_module
 from numbers import Real
 from pathlib import Path
@@ -225,8 +226,11 @@ class OwnCode:
 
     def _call(self, what: str, names: Mapping[str, Any], args: tuple[Any, ...]) -> list[Any]:
         try:
-            with np.errstate(all="ignore"):  # CasADi leaves flags of its own in arrays of symbols
-                got = getattr(self.made, what)(*args)
+            function = getattr(self.made, what)
+            traced = any(isinstance(value, _Symbol) for group in args for value in group)
+            with np.errstate(all="ignore"), _arrays_of_symbols(function) if traced else nullcontext():
+                # CasADi leaves flags of its own in arrays of symbols
+                got = function(*args)
         except UserError:
             raise
         except Exception as error:  # the user's own code may raise anything
@@ -598,8 +602,36 @@ class _Symbol(NDArrayOperatorsMixin):
             raise TypeError(f"{function.__name__} of values that are not known yet makes an array")
         return _Symbol(result)
 
+    def __getattr__(self, name: str) -> Any:
+        function = getattr(np, name, None)
+        if not isinstance(function, np.ufunc):  # which of an array of objects asks each for its own
+            raise AttributeError(name)
+        return partial(function, self)
+
     def __bool__(self) -> bool:
         raise TypeError("an if about a value that is not known yet")
+
+
+class _NumPyOfSymbols:
+    """NumPy, but that its new arrays take symbols."""
+
+    def __getattr__(self, name: str) -> Any:
+        made = getattr(np, name)
+        if name not in ("zeros", "ones", "empty"):
+            return made
+        return lambda shape, *_args, **_options: made(shape, dtype=object)
+
+
+@contextmanager
+def _arrays_of_symbols(function: Any) -> Iterator[None]:
+    """Let the file of a user's function have :class:`_NumPyOfSymbols` for as long as this."""
+    names = getattr(function, "__globals__", {})
+    aliases = [name for name, value in names.items() if value is np]
+    names.update(dict.fromkeys(aliases, _NumPyOfSymbols()))
+    try:
+        yield
+    finally:
+        names.update(dict.fromkeys(aliases, np))
 
 
 def _bared(value: Any) -> Any:
@@ -662,7 +694,10 @@ def own_model(kind: Any) -> OwnModel:
     model = OwnModel(code)
     groups = (code.states, code.inputs, code.disturbances, code.parameters)
     x, u, d, p = ([import_module("casadi").SX.sym(name) for name in group] for group in groups)
-    code.step(x, u, d, p, code.dt)  # finds out an if, and what symbols cannot say
+    # finds out an if, what symbols cannot say, and what is another each time
+    if str(code.step(x, u, d, p, code.dt)) != str(code.step(x, u, d, p, code.dt)):
+        problem = "gives another rhs each time it is called with the same arguments"
+        raise code.fault(problem, hint="draw no random numbers there, and keep nothing from call to call")
     code.output(x, p)
     with np.errstate(all="ignore"):
         code.rest([1.0] * len(model.outputs), [1.0] * len(u), [1.0] * len(d), model.prior.tolist())

@@ -367,11 +367,27 @@ def test_a_class_may_call_what_it_likes_and_what_cannot_be_compiled_is_refused()
             heat /= p.C
             return [np.select([x.t > -99.0, x.t > -300.0], [heat, 1.0], 2.0)]
 
+    class Filled(Block):
+        def rhs(self, x: Any, u: Any, d: Any, p: Any) -> Any:
+            rates, warm = np.zeros(1), np.ones((2,), dtype=float)
+            warm[:] = x.t - d.air, 4.0
+            rates[0] += p.P * u.q / p.C
+            return rates - p.G * warm[:1] * np.exp(np.log1p(0.0 * warm[:1])) / p.C
+
+    class Drawn(Block):
+        calls = 0
+
+        def rhs(self, x: Any, u: Any, d: Any, p: Any) -> Any:
+            self.calls += 1  # as np.random would
+            return [p.P * u.q + 1e-3 * self.calls]
+
     with pytest.raises(UserError, match=r"Sorted fails in rhs: .*sort"):
         own_model(Sorted)
+    with pytest.raises(UserError, match=r"Drawn gives another rhs each time .* draw no random numbers"):
+        own_model(Drawn)
     plain = own_model(Block)
     arguments = ([[25.0]], np.ones((1, 9, 1)), np.full((1, 9, 1), 21.0), plain.prior[None], 1.0)
-    for kind in (Helped, Tabled, Arrays, InPlace):
+    for kind in (Helped, Tabled, Arrays, InPlace, Filled):
         got = own_model(kind).rollout(*arguments)[0]
         np.testing.assert_allclose(got, plain.rollout(*arguments)[0], atol=1e-12)
 
