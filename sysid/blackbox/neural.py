@@ -14,7 +14,7 @@ state of its own.  Several members start from different random W, U, b.
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 from typing import Any
 
@@ -62,24 +62,16 @@ class _Data:
 
 @dataclass(frozen=True, eq=False)
 class _Member:
-    """A trained model: linear part A (n, n), weights (n_theta,), starts (n_segment, n), squared misses."""
+    """A trained model: its arrays by name, starts (n_segment, n), squared misses."""
 
-    A: Array
-    weights: Array
+    arrays: dict[str, Array]
     x0: Array
-    h: int
     miss: float
 
-    def padded(self, n: int, h: int) -> _Member:
-        """Return the same model with more states and units, which do nothing."""
-        states, h0 = len(self.A), self.h
-        m = (len(self.weights) - states - 2 * states * h0 - h0) // (states + h0)
-        before = [(states, m), (states,), (states, h0), (h0, states), (h0, m), (h0,)]
-        after = [(n, m), (n,), (n, h), (h, n), (h, m), (h,)]
-        weights = np.split(self.weights, np.cumsum([int(np.prod(shape)) for shape in before])[:-1])
-        grown = [_grown(weight.reshape(old), new).ravel() for weight, old, new in zip(weights, before, after)]
-        starts = _grown(self.x0, (len(self.x0), n))
-        return _Member(_grown(self.A, (n, n)), np.concatenate(grown), starts, h, self.miss)
+
+def _shapes(n: int, m: int, h: int) -> dict[str, tuple[int, ...]]:
+    """Return the shapes of a member's arrays: A, and the weights as they stand in a row."""
+    return {"A": (n, n), "B": (n, m), "c": (n,), "V": (n, h), "W": (h, n), "U": (h, m), "b": (h,)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,11 +192,32 @@ def _averaged(grid: Grid, data: _Data, members: Sequence[_Member]) -> NeuralMode
     """Return the mean of the members that fit and agree."""
     # what fits its own data worst is a poor minimum
     fitting = np.argsort([some.miss for some in members], kind="stable")[: int(np.ceil(KEPT * len(members)))]
-    n, h = max(len(members[k].A) for k in fitting), max(members[k].h for k in fitting)
-    alike = [members[k].padded(n, h) for k in np.sort(fitting)]
-    kept = [alike[k] for k in _nearest_to_median(data, alike, h)]
-    starts = np.hstack([some.x0 for some in kept])  # by segment
-    return with_spread(_as_model(grid, data, kept, h), grid, list(starts))
+    alike = [members[k] for k in np.sort(fitting)]
+    n, h = (max(len(some.arrays[name]) for some in alike) for name in "cb")
+    # one of fewer states and units has more that do nothing
+    arrays: dict[str, Any] = {
+        name: np.stack([_grown(some.arrays[name], shape) for some in alike])
+        for name, shape in _shapes(n, len(data.w_middle), h).items()
+    }
+    model = NeuralModel(
+        grid.inputs,
+        grid.disturbances,
+        grid.outputs,
+        grid.dt,
+        grid.switches,
+        **arrays,
+        y_middle=data.y_middle,
+        y_size=data.y_size,
+        w_middle=data.w_middle,
+        w_size=data.w_size,
+        reach=data.reach,
+        low=data.y_middle + data.y_size * data.low,
+        high=data.y_middle + data.y_size * data.high,
+    )
+    kept = _nearest_to_median(model, grid)
+    model = replace(model, spread=np.empty(0), **{name: array[kept] for name, array in arrays.items()})
+    starts = np.hstack([_grown(alike[k].x0, (len(grid.segments), n)) for k in kept])
+    return with_spread(model, grid, list(starts))
 
 
 def _train_member(data: _Data, linear: _Linear, h: int, *, seed: int) -> _Member:
@@ -249,7 +262,10 @@ def _train_member(data: _Data, linear: _Linear, h: int, *, seed: int) -> _Member
     size = max(float(np.sqrt(np.mean(residuals(z0[None], 1.0)[0, len(z0) :] ** 2))), LEAST_ERROR)
     z = _levenberg_marquardt(lambda z: linearise(z, size), lambda z: residuals(z, size), z0)
     miss = float(np.sum(residuals(z[None], 1.0)[0, len(z) :] ** 2))
-    return _Member(linear.A, z[:n_p], z[n_p:].reshape(-1, n), h, miss)
+    _, *weights = _shapes(n, m, h).items()
+    *parts, starts = np.split(z, np.cumsum([np.prod(shape) for _, shape in weights]))
+    arrays = {name: part.reshape(shape) for (name, shape), part in zip(weights, parts)}
+    return _Member({"A": linear.A} | arrays, starts.reshape(-1, n), miss)
 
 
 def _levenberg_marquardt(
@@ -279,51 +295,17 @@ def _levenberg_marquardt(
     return z
 
 
-def _nearest_to_median(data: _Data, members: Sequence[_Member], h: int) -> NDArray[np.int_]:
+def _nearest_to_median(model: NeuralModel, grid: Grid) -> NDArray[np.int_]:
     """Return which members are nearest to the median of all on the inputs in reverse order."""
-    from thermogrip.sysid.models.recurrences import run_states
-
-    count, n = len(members), len(members[0].A)
+    count = len(model.A)
     if count < 3:
         return np.arange(count)
-    A, x0 = np.stack([some.A for some in members]), np.zeros((count, n))
-    weights = np.stack([some.weights for some in members])
-    runs = [run_states(A, weights, h, x0, np.ascontiguousarray(w[::-1]), data.low, data.high) for w in data.w]
-    y = np.concatenate(runs, axis=1)[:, :, : len(data.low)]
-    off = np.sqrt(np.mean((y - np.median(y, axis=0)) ** 2, axis=(1, 2)))
+    start = np.zeros((1, model.n_x))
+    runs = [model.states(start, s.u[None, ::-1], s.d[None, ::-1])[0] for s in grid.segments]
+    y = np.concatenate(runs).reshape(-1, *model.c.shape)[:, :, : len(model.outputs)]
+    off = np.sqrt(np.mean((y - np.median(y, axis=1, keepdims=True)) ** 2, axis=(0, 2)))
     return np.sort(np.argsort(off, kind="stable")[: int(np.ceil(KEPT * count))])
 
 
 def _grown(part: Array, shape: tuple[int, ...]) -> Array:
-    out = np.zeros(shape)
-    out[tuple(slice(0, size) for size in part.shape)] = part
-    return out
-
-
-def _as_model(grid: Grid, data: _Data, members: Sequence[_Member], h: int) -> NeuralModel:
-    n = len(members[0].A)
-    m = len(data.w_middle)
-    count = len(members)
-    weights = np.stack([some.weights for some in members])
-    shapes = {"B": (n, m), "c": (n,), "V": (n, h), "W": (h, n), "U": (h, m), "b": (h,)}
-    ends = np.cumsum([int(np.prod(shape)) for shape in shapes.values()])
-    shaped = zip(shapes.items(), np.split(weights, ends[:-1], axis=1))
-    weights_by_name: dict[str, Any] = {
-        name: weight.reshape(count, *shape) for (name, shape), weight in shaped
-    }
-    return NeuralModel(
-        grid.inputs,
-        grid.disturbances,
-        grid.outputs,
-        grid.dt,
-        grid.switches,
-        A=np.stack([some.A for some in members]),
-        **weights_by_name,
-        y_middle=data.y_middle,
-        y_size=data.y_size,
-        w_middle=data.w_middle,
-        w_size=data.w_size,
-        reach=data.reach,
-        low=data.y_middle + data.y_size * data.low,
-        high=data.y_middle + data.y_size * data.high,
-    )
+    return np.pad(part, [(0, size - before) for size, before in zip(shape, part.shape)])

@@ -12,7 +12,7 @@ from thermogrip.datasets.schema import make_log
 from thermogrip.sysid.blackbox import neural
 from thermogrip.sysid.blackbox.neural import _Data, _Linear, _Member, saturation_levels
 from thermogrip.sysid.blackbox.order_selection import Run, Structure, free_run_errors, priors_of
-from thermogrip.sysid.models.recurrences import run_states
+from thermogrip.sysid.models.neural import NeuralModel
 from thermogrip.sysid.plant.log_grid import Grid, Segment, make_grid
 
 
@@ -82,9 +82,19 @@ def data_of(w, y=()):
     )
 
 
-def constant(value, miss=0.0, gain=0.0):
-    """One state, which is value + gain w after the first row; one unit that does nothing."""
-    return _Member(np.zeros((1, 1)), np.array([gain, value, 0, 0, 0, 0.0]), np.zeros((1, 1)), 1, miss)
+def alike(c, B=None):
+    """A model of one state and unit a member, which is c + B w after the first row."""
+    c, none = np.asarray(c, float)[:, None], np.zeros((len(c), 1, 1))
+    drive = none if B is None else np.asarray(B, float)[:, None, None]
+    weights = {"A": none, "B": drive, "c": c, "V": none, "W": none, "U": none, "b": none[:, 0]}
+    scales = {"y_middle": [0.0], "y_size": [1.0], "w_middle": [0.0], "w_size": [1.0], "reach": [10.0]}
+    return NeuralModel(("q",), (), ("t",), 1.0, (), **weights, **scales, low=[-np.inf], high=[np.inf])
+
+
+def driven(*drive):
+    w = np.array(drive, float)[:, None]
+    part = Segment(np.arange(float(len(w))), np.array([[2.0], [3.0], [4.0]][: len(w)]), w, w[:, :0], "a")
+    return Grid(("q",), (), ("t",), (), 1.0, (part,), 1.0, {})
 
 
 @pytest.mark.parametrize(
@@ -92,19 +102,28 @@ def constant(value, miss=0.0, gain=0.0):
     [((0, 9), [0, 1]), ((9, 0, 1), [0, 1, 2]), ((0, 9, 1, 2), [0, 2, 3]), ((4, 1, 2, 3, 0), [0, 1, 2, 3])],
 )
 def test_three_quarters_nearest_to_the_median_are_kept(values, kept):
-    members = [constant(v) for v in values]
-    assert neural._nearest_to_median(data_of([np.zeros((5, 1))]), members, 1).tolist() == kept
+    assert neural._nearest_to_median(alike(values), driven(0, 0, 0)).tolist() == kept
 
 
-def test_the_inputs_run_in_reverse_order_and_the_quarter_that_fits_worst_is_left_out(monkeypatch):
-    w = data_of([np.array([[5.0], [0.0], [0.0]])])  # reversed, all but the run's end is alike
-    gains = [constant(0, gain=g) for g in (0.0, 1.0, 0.1, 0.2)]
-    assert neural._nearest_to_median(w, gains, 1).tolist() == [0, 2, 3]
-    monkeypatch.setattr(neural, "_as_model", lambda grid, data, members, h: [m.weights[1] for m in members])
-    monkeypatch.setattr(neural, "with_spread", lambda model, grid, starts: (model, np.shape(starts)))
-    misses = (0.5, 0.1, 0.9, 0.2, 0.3)  # of five four fit; of four three agree
-    members = [constant(v, m) for v, m in zip((1.0, 9.0, 1.5, 1.2, 1.1), misses)]
-    assert neural._averaged(None, w, members) == ([1.0, 1.2, 1.1], (1, 3))
+def test_the_inputs_run_in_reverse_order_and_the_quarter_that_fits_worst_is_left_out():
+    grid, gains = driven(5.0, 0.0, 0.0), (0.0, 1.0, 0.1, 0.2)  # reversed, all but the run's end is alike
+    assert neural._nearest_to_median(alike([0.0] * 4, gains), grid).tolist() == [0, 2, 3]
+    members = [  # of five four fit; of four three agree
+        _Member(
+            {"A": np.zeros((1, 1)), **_numbered(np.array([0, value, 0, 0, 0, 0.0]), 1, 1, 1)},
+            np.zeros((1, 1)),
+            miss,
+        )
+        for value, miss in ((1.0, 0.5), (9.0, 0.1), (1.5, 0.9), (1.2, 0.2), (1.1, 0.3))
+    ]
+    assert neural._averaged(grid, neural._scaled_data(grid), members).c.ravel().tolist() == [1.0, 1.2, 1.1]
+
+
+def _numbered(row, n, m, h):
+    """A row of weights by name."""
+    sizes = {"B": (n, m), "c": (n,), "V": (n, h), "W": (h, n), "U": (h, m), "b": (h,)}
+    parts = np.split(row, np.cumsum([np.prod(size) for size in sizes.values()]))
+    return {name: part.reshape(size) for (name, size), part in zip(sizes.items(), parts)}
 
 
 def test_a_linear_record_keeps_its_linear_fit_and_random_weights_are_drawn_to_zero():
@@ -117,13 +136,12 @@ def test_a_linear_record_keeps_its_linear_fit_and_random_weights_are_drawn_to_ze
     linear = _Linear(np.array([[0.5]]), np.array([[0.4]]), np.array([0.1]), 2 * [np.array([0.7])])
     data = data_of([w, w], [y, y])
     found = neural._train_member(data, linear, 2, seed=0)
-    np.testing.assert_allclose(found.weights, [0.4, 0.1, *[0.0] * 8], atol=1e-5)
-    assert (found.x0[0, 0], found.h) == (pytest.approx(0.7, abs=1e-5), 2)
+    weights = np.concatenate([found.arrays[name].ravel() for name in ("B", "c", "V", "W", "U", "b")])
+    np.testing.assert_allclose(weights, [0.4, 0.1, *[0.0] * 8], atol=1e-5)
+    assert found.x0[0, 0] == pytest.approx(0.7, abs=1e-5)
     assert found.miss < 1e-8
     off = neural._train_member(data, _Linear(linear.A, linear.B, linear.c + 0.2, linear.x0), 2, seed=0)
-    assert off.weights[1] == pytest.approx(0.1, abs=0.02)  # drawn back by the readings
-    run = run_states(np.array(2 * [[[0.5]]]), np.tile(off.weights, (2, 1)), 2, off.x0, w, data.low, data.high)
-    assert off.miss == pytest.approx(np.nansum((run[:, :-1] - y) ** 2))
+    assert off.arrays["c"] == pytest.approx(0.1, abs=0.02)  # drawn back by the readings
 
 
 def test_linear_starts_run_as_the_best_subspace_model_in_scaled_units(coupled):
@@ -179,19 +197,22 @@ def test_members_of_two_sizes_are_one_model_in_the_units_of_the_readings():
     data, rng = neural._scaled_data(grid), np.random.default_rng(4)
     sizes = [(2, 3), (3, 1)]  # of n (3 + 1) + 2 n h + 3 h + h numbers
     members = [
-        _Member(0.3 * np.eye(n), rng.normal(size=n * 4 + 2 * n * h + 4 * h), rng.normal(size=(1, n)), h, 0.1)
+        _Member(
+            {"A": 0.3 * np.eye(n), **_numbered(rng.normal(size=n * 4 + 2 * n * h + 4 * h), n, 3, h)},
+            rng.normal(size=(1, n)),
+            0.1,
+        )
         for n, h in sizes
     ]
     model = neural._averaged(grid, data, members)
     assert (model.A.shape, model.V.shape, model.U.shape) == ((2, 3, 3), (2, 3, 3), (2, 3, 3))
-    x0, drive = np.concatenate([some.padded(3, 3).x0[0] for some in members]), u[0]
+    x0, drive = np.concatenate([members[0].x0[0], [0.0], members[1].x0[0]]), u[0]
     (rows,) = model.states(x0[None], drive[None, :, :2], drive[None, :, 2:])
     spread = np.cov(rows.T)
     np.testing.assert_allclose(model.spread, spread + 1e-8 * np.trace(spread) * np.eye(6), rtol=1e-12)
-    n, h = sizes[0]
-    B, c, V, W, U, b = np.split(members[0].weights, np.cumsum([6, 2, 6, 6, 9]))
+    B, c, V, W, U, b = (members[0].arrays[name] for name in ("B", "c", "V", "W", "U", "b"))
     w = data.w[0][0]
     x = members[0].x0[0]
-    z = np.tanh(W.reshape(h, n) @ x + U.reshape(h, 3) @ w + b)
-    np.testing.assert_allclose(rows[1][:2], 0.3 * x + B.reshape(n, 3) @ w + c + V.reshape(n, h) @ z)
+    z = np.tanh(W @ x + U @ w + b)
+    np.testing.assert_allclose(rows[1][:2], 0.3 * x + B @ w + c + V @ z)
     assert (model.y_middle.tolist(), model.low.tolist()) == ([2.0, 30.0], [-np.inf] * 2)
