@@ -14,7 +14,6 @@ from dataclasses import dataclass, replace
 from functools import partial
 from importlib import import_module
 from typing import Any
-from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -52,8 +51,7 @@ _MODULES = {
     "neural": "neural",
 }
 BLACK_BOXES = tuple(_MODULES)
-# what fits leave to the next ones: denominators where a search begins, triangles of segments
-_SEARCHED, _FACTORISED = ("oe", "armax", "bj"), ("subspace", "parsim")
+_SEARCHED = ("oe", "armax", "bj")  # whose searches may begin where those of fits before ended
 # a refit of a neural model takes as long as its fit
 RESAMPLED = ("arx", "oe", "armax", "bj", "subspace", "parsim", "sindy")
 
@@ -181,12 +179,8 @@ def _within_steps(grid: Grid, grids: Sequence[Grid]) -> float:
 
 
 def _remembering(kind: str, *, searches: bool = True) -> Family:
-    """Return the family with what its fits leave to the next ones."""
-    settings: dict[str, Any] = {}
-    if kind in _SEARCHED and searches:
-        settings["searches"] = []
-    if kind in _FACTORISED:
-        settings["triangles"] = WeakKeyDictionary()
+    """Return the family, with what its searches leave to the next ones."""
+    settings: dict[str, Any] = {"searches": []} if searches and kind in _SEARCHED else {}
     return partial(family_of(kind), **settings)
 
 

@@ -74,11 +74,7 @@ class ArmaxSearch(Search):
     """Fits one output, structure by structure, and remembers each C that it found."""
 
     origin = "armax"
-
-    @staticmethod
-    def numbers(na: int) -> int:
-        """Return the count of numbers of an output beside poles and zeros: the constant, C."""
-        return 1 + na
+    noise_per_pole = 1  # C
 
     def starts(self, records: Records, na: int) -> list[Array]:
         """Return where the search for C begins: at that of ARX, and where that for A would."""
@@ -140,11 +136,7 @@ class NoiseSearch(Search):
     """The same, with the filter fitted again with a model of its noise."""
 
     origin = "bj"
-
-    @staticmethod
-    def numbers(na: int) -> int:
-        """Return the count of numbers of an output beside poles and zeros: the constant, the noise."""
-        return 2
+    noise_numbers = 1  # D
 
     def __call__(self, records: Records, na: int, nb: int, delay: int) -> Filter | None:
         """Return the best stable filter of this structure."""

@@ -17,10 +17,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from itertools import pairwise, product
 from typing import Any, NamedTuple, Protocol, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.errors import UserError
@@ -138,30 +140,43 @@ def _cut_blocks(grid: Grid, blocks: int) -> list[Fold]:
             hint="give a longer log or average less",
         )
     edges = [round(total * block / blocks) for block in range(blocks + 1)]
-    parts = []
+    row, parts = np.arange(total), []
     for at, (first, last) in enumerate(pairwise(edges)):
-        inside, outside = _split_segments(grid.segments, first, last)
+        held_out, rest = _split_segments(grid, (first <= row) & (row < last))
+        inside = [segment.part(*ends) for segment, ends in held_out]
         # the second half is run once more from a warm-up of its own
         halves = [segment.part(len(segment.time) // 2, len(segment.time)) for segment in inside]
         # the readings of a short warm-up set the state, the others are scored
-        runs = tuple(Run(segment) for segment in (*inside, *halves))
-        parts.append(Fold(f"block {at + 1} of {blocks}", grid.having(outside), runs))
+        parts.append(Fold(f"block {at + 1} of {blocks}", rest, tuple(map(Run, (*inside, *halves)))))
     return parts
 
 
 def _last_parts(grid: Grid) -> Fold:
     """Return the last part of each log, to be run from the log's start."""
     # a block is too short to show the drift of an integrator, or of a pole that is a little too slow
-    training: list[Segment] = []
-    runs: list[Run] = []
+    is_last = []
     for log in grid.logs:
-        segments = [segment for segment in grid.segments if segment.log == log]
-        begin, end = segments[0].time[0], segments[-1].time[-1]
-        for segment in segments:
-            cut = int(np.searchsorted(segment.time, begin + (1 - HELD_OUT_SHARE) * (end - begin)))
-            training += [segment.part(0, cut)] if cut >= FEWEST_HELD_OUT_ROWS else []
-            runs += [Run(segment, cut)] if cut < len(segment.time) else []
-    return Fold(f"{TAIL}{' and '.join(grid.logs)}", grid.having(training), tuple(runs))
+        time = np.concatenate([segment.time for segment in grid.segments if segment.log == log])
+        is_last.append(time >= time[0] + (1 - HELD_OUT_SHARE) * (time[-1] - time[0]))
+    held_out, rest = _split_segments(grid, np.concatenate(is_last))
+    runs = tuple(Run(segment, first) for segment, (first, _) in held_out)
+    return Fold(f"{TAIL}{' and '.join(grid.logs)}", rest, runs)
+
+
+def _split_segments(
+    grid: Grid, is_held_out: NDArray[np.bool_]
+) -> tuple[list[tuple[Segment, tuple[int, int]]], Grid]:
+    """Return the segments with the ends of what is held out of them, and the rest of the grid."""
+    held_out, rest = [], []
+    ends = np.cumsum([len(segment.time) for segment in grid.segments])
+    for segment, inside in zip(grid.segments, np.split(is_held_out, ends)):
+        rows = np.flatnonzero(inside)
+        n = len(inside)
+        first, last = (int(rows[0]), int(rows[-1]) + 1) if rows.size else (n, n)
+        held_out += [(segment, (first, last))] if rows.size else []
+        outside = [segment.part(i, j) for i, j in ((0, first), (last, n))]
+        rest += [part for part in outside if len(part.time) >= FEWEST_HELD_OUT_ROWS]
+    return held_out, grid.having(rest)
 
 
 @dataclass(frozen=True)
@@ -282,16 +297,14 @@ def _first_sound(
     """Return the best structure whose fit to all data errs on them no more than it may, and that fit; None
     where there is none."""
     most = ORDER_MARGIN if len(grid.logs) < SEVERAL else ORDER_MARGIN_OF_LOGS
-    on_all: dict[Structure, tuple[Model, float] | None] = {}
+    fit = cache(lambda structure: _fit_to_all(grid, family, structure, scored[structure], warmup))
     for times in _ERROR_ON_ALL_RATIOS:
         remaining = {structure: errors.mean for structure, errors in scored.items()}
         while any(np.isfinite(errors).all() for errors in remaining.values()):
             structure = smallest_near_the_best(remaining, most)
-            if structure not in on_all:
-                on_all[structure] = _fit_to_all(grid, family, structure, scored[structure], warmup)
-            fit = on_all[structure]
-            if fit is not None and fit[1] <= times * float(np.max(scored[structure].mean)):
-                return structure, fit[0]
+            fitted = fit(structure)
+            if fitted is not None and fitted[1] <= times * float(np.max(remaining[structure])):
+                return structure, fitted[0]
             del remaining[structure]
     return None
 
@@ -372,16 +385,11 @@ def _fit_to_all(
 def drives(grid: Grid, terms: Sequence[str]) -> list[Array]:
     """Return the columns w = [u, d, phi(u, d)] of each segment, shape (n, n_drive); one that never moves is
     zero, so that its effect is fitted as none and not as an arbitrary share of the constant."""
-    w = [drives_of(grid, segment, terms) for segment in grid.segments]
+    rows = [np.hstack([segment.u, segment.d]) for segment in grid.segments]
+    w = [np.hstack([each, evaluate_terms(terms, grid.inputs + grid.disturbances, each)]) for each in rows]
     whole = np.concatenate(w)
     moves = np.ptp(whole, axis=0) > 1e-9 * np.maximum(np.abs(whole).max(axis=0), 1e-300)
     return [column * moves for column in w]
-
-
-def drives_of(grid: Grid, segment: Segment, terms: Sequence[str]) -> Array:
-    """Return the columns of one segment, of which none is set to zero."""
-    rows = np.hstack([segment.u, segment.d])
-    return np.hstack([rows, evaluate_terms(terms, grid.inputs + grid.disturbances, rows)])
 
 
 def column_sizes(norms: Array) -> Array:
@@ -478,20 +486,3 @@ def _moves_all(fold: Fold, *, least: Array) -> bool:
     held_out_inputs = np.concatenate([run.segment.u[run.scored_from :] for run in fold.runs])
     others = np.concatenate([segment.u for segment in fold.train.segments])
     return not np.any((np.ptp(held_out_inputs, axis=0) > least) & (np.ptp(others, axis=0) <= least))
-
-
-def _split_segments(
-    segments: Sequence[Segment], first: int, last: int
-) -> tuple[list[Segment], list[Segment]]:
-    """Cut the rows first to last, counted over all segments, out of the segments."""
-    inside = []
-    outside = []
-    first_row = 0
-    for segment in segments:
-        n = len(segment.time)
-        a, b = np.clip([first - first_row, last - first_row], 0, n)
-        if b > a:
-            inside.append(segment.part(int(a), int(b)))
-        outside += [segment.part(i, j) for i, j in ((0, int(a)), (int(b), n)) if j - i >= 20]
-        first_row += n
-    return inside, outside

@@ -260,7 +260,8 @@ def oe_family(
         records = [Records([s.y[:, i] for s in grid.segments], w) for i in range(len(grid.outputs))]
         for na, nb, nk in product(poles, zeros, delays):
             label = f"na {na}, nb {nb}, delay {nk}" + (f", with {', '.join(products)}" if products else "")
-            size = (na + w[0].shape[1] * nb + kind.numbers(na)) * len(grid.outputs)
+            noise = kind.noise_numbers + kind.noise_per_pole * na
+            size = (na + w[0].shape[1] * nb + 1 + noise) * len(grid.outputs)
             structure = order_selection.Structure(label, size, products)
             if only is not None and structure not in only:
                 continue
@@ -296,14 +297,10 @@ class Search:
     """Fits one output, structure by structure, and remembers the denominators that it found."""
 
     origin = "oe"
+    noise_numbers, noise_per_pole = 0, 0  # of the model of the noise
 
     def __init__(self) -> None:
         self._found: dict[int, list[Array]] = {}
-
-    @staticmethod
-    def numbers(na: int) -> int:
-        """Return the count of numbers of an output beside poles and zeros."""
-        return 1
 
     def __call__(self, records: Records, na: int, nb: int, delay: int) -> Filter | None:
         """Return the best stable filter of this structure, None where no start leads to one."""

@@ -16,21 +16,14 @@ from collections.abc import Collection, Mapping, Sequence
 from functools import partial
 from itertools import product
 from typing import NamedTuple
-from weakref import WeakKeyDictionary
 
 import numpy as np
 
 from thermogrip.datasets.arrays import Array
-from thermogrip.sysid.blackbox.order_selection import (
-    Structure,
-    as_state_space,
-    default_terms,
-    drives,
-    drives_of,
-)
+from thermogrip.sysid.blackbox.order_selection import Structure, as_state_space, default_terms, drives
 from thermogrip.sysid.blackbox.output_error import least_squares
 from thermogrip.sysid.models.state_space import StateSpaceModel
-from thermogrip.sysid.plant.log_grid import Grid, Segment, whole_readings
+from thermogrip.sysid.plant.log_grid import Grid, whole_readings
 
 DEPENDENT = 1e-8  # of the largest singular value: what is less is none
 
@@ -43,11 +36,8 @@ def subspace_family(
     terms: Sequence[tuple[str, ...]] | None = None,
     only: Collection[Structure] | None = None,
     weightings: Sequence[str] = ("moesp", "cva"),
-    triangles: Triangles | None = None,
 ) -> Mapping[Structure, StateSpaceModel]:
-    """Return a model for each order, number of block rows f and weighting that the data allow; ``triangles``,
-    empty at first, keep what segments add for later fits."""
-    triangles = WeakKeyDictionary() if triangles is None else triangles
+    """Return a model for each order, number of block rows f and weighting that the data allow."""
     models: dict[Structure, StateSpaceModel] = {}
     longest = max(len(segment.time) for segment in grid.segments)
     sets = default_terms(grid) if terms is None else terms
@@ -63,19 +53,19 @@ def subspace_family(
             if n < f
         }
         wanted = {of: name for of, name in names.items() if only is None or name in only}
-        models |= {wanted[of]: model for of, model in _realised(grid, wanted, some, triangles).items()}
+        models |= {wanted[of]: model for of, model in _realised(grid, wanted, some).items()}
     return models
 
 
 def _realised(
-    grid: Grid, wanted: Collection[tuple[int, str, int]], terms: tuple[str, ...], triangles: Triangles
+    grid: Grid, wanted: Collection[tuple[int, str, int]], terms: tuple[str, ...]
 ) -> dict[tuple[int, str, int], StateSpaceModel]:
     """Return the models of these block rows, weightings and orders."""
     out: dict[tuple[int, str, int], StateSpaceModel] = {}
     n_y, scale = len(grid.outputs), np.maximum(grid.output_spread(), 1e-9)
     longest = max(len(segment.time) for segment in grid.segments)
     for f in dict.fromkeys(f for f, _, _ in wanted):
-        triangle = _triangle(grid, f, terms, triangles)
+        triangle = _triangle(grid, f, terms)
         if triangle is None:
             continue
         for weighting in dict.fromkeys(w for size, w, _ in wanted if size == f):
@@ -157,53 +147,26 @@ def stabilised(A: Array, rows: int) -> Array:
     return np.asarray(np.real(vectors * poles @ np.linalg.pinv(vectors)))
 
 
-class _Windows(NamedTuple):
-    """All windows of a segment, less its means: R of their QR, which has the same inner products."""
-
-    triangle: Array
-    n_windows: int
-    mean: Array  # of the signals
-
-
-# by segment, as long as that is alive: by rows, terms, and whether its readings are bridged
-Triangles = WeakKeyDictionary[Segment, dict[tuple[int, tuple[str, ...], bool], _Windows]]
-
-
-def _triangle(grid: Grid, f: int, terms: tuple[str, ...], triangles: Triangles) -> Array | None:
-    """Return R of the QR of all windows, signals at unit spread; None with too few windows."""
+def _triangle(grid: Grid, f: int, terms: tuple[str, ...]) -> Array | None:
+    """Return R of the QR of all windows, signals at zero mean and unit spread; None with too few windows."""
     # Several logs are side by side in the Hankel matrices; a window that touches a gap or a lost reading is
     # left out.  Where less than half of the windows are whole, short holes are lines.
-    readings = whole_readings(grid.segments, 2 * f)
-    whole = np.hstack([np.concatenate(drives(grid, terms)), np.concatenate(readings)])
+    pairs = zip(drives(grid, terms), whole_readings(grid.segments, 2 * f))
+    signals = [np.hstack(pair) for pair in pairs]
+    whole = np.concatenate(signals)
     mean, size = np.nanmean(whole, axis=0), np.nanstd(whole, axis=0)
     per_unit = np.divide(1.0, size, out=np.zeros_like(size), where=size > 0)
     n_w = whole.shape[1] - len(grid.outputs)
-    parts, count = [], 0
-    for segment, y in zip(grid.segments, readings):
-        if len(y) <= 2 * f:
-            continue
-        known, key = triangles.setdefault(segment, {}), (f, terms, y is not segment.y)
-        if key not in known:
-            z = np.hstack([drives_of(grid, segment, terms), y])
-            own_mean = np.nan_to_num(np.nanmean(z, axis=0))
-            rows = _windows(z - own_mean, n_w, f)
-            # its own triangle, which does not depend on the other segments, serves each fold that has it
-            known[key] = _Windows(np.asarray(np.linalg.qr(rows, mode="r")), len(rows), own_mean)
-        windows = known[key]
-        shift = _by_column(windows.mean - mean, n_w, f, constant=0.0)
-        scale = _by_column(per_unit, n_w, f, constant=1.0)
-        constant = windows.triangle[:, f * n_w : f * n_w + 1]
-        parts.append((windows.triangle + constant * shift) * scale)
-        count += windows.n_windows
-    if not parts or count < 1.5 * parts[0].shape[1]:
+    triangles, count = [], 0
+    for z in signals:
+        if len(z) > 2 * f:
+            rows = _windows((z - mean) * per_unit, n_w, f)
+            # which has the same inner products
+            triangles.append(np.asarray(np.linalg.qr(rows, mode="r")))
+            count += len(rows)
+    if not triangles or count < 1.5 * triangles[0].shape[1]:
         return None
-    return np.asarray(np.linalg.qr(np.concatenate(parts), mode="r"))
-
-
-def _by_column(of_signal: Array, n_w: int, f: int, *, constant: float) -> Array:
-    """Return what each signal has for each column of a window."""
-    w, y = np.tile(of_signal[:n_w], f), np.tile(of_signal[n_w:], f)
-    return np.concatenate([w, [constant], w, y, y])
+    return np.asarray(np.linalg.qr(np.concatenate(triangles), mode="r"))
 
 
 def _factorise(triangle: Array, f: int, n_y: int) -> tuple[Array, Array]:

@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-from weakref import WeakKeyDictionary
-
 import numpy as np
 import pytest
 
 from thermogrip.datasets.schema import make_log
-from thermogrip.sysid.blackbox import subspace
-from thermogrip.sysid.blackbox.order_selection import folds
 from thermogrip.sysid.blackbox.subspace import (
     _windows,
     extended_observability,
@@ -126,27 +122,6 @@ def test_each_structure_is_stable_whatever_the_record(coupled):
     family = subspace_family(make_grid([log], average=1.0), orders=(1, 2, 3), rows=(8,), terms=((),))
     assert len(family) == 6
     assert all(model.stable for model in family.values())
-
-
-def test_the_windows_of_a_log_are_factorised_once_for_all_folds_which_are_as_without(monkeypatch, coupled):
-    factorised = []
-    monkeypatch.setattr(
-        subspace, "_windows", lambda z, *size: factorised.append(len(z)) or _windows(z, *size)
-    )
-    logs = [coupled.log(n, reading=0.05) for n in (400, 500, 600)]
-    logs[2]["q1"].values[:] = 0.3  # an input that stands in one log and moves in the others
-    logs[1]["t1"].values[100:103] = np.nan
-    for log, name in zip(logs, "abc"):
-        log.attrs["name"] = name
-    grid = make_grid(logs, average=1.0)
-    how = {"orders": (2,), "rows": (8,), "terms": ((),), "weightings": ("moesp",)}
-    triangles = WeakKeyDictionary()
-    for fold in folds(grid):
-        (model,) = subspace_family(fold.train, **how, triangles=triangles).values()
-        (alone,) = subspace_family(fold.train, **how).values()
-        wanted = markov(alone.A, alone.B, alone.C, 20)
-        np.testing.assert_allclose(markov(model.A, model.B, model.C, 20), wanted, atol=1e-9)
-    assert len(factorised) == 3 + 3 * 2
 
 
 def test_too_few_windows_give_no_model_and_unknown_weights_are_refused(coupled):
