@@ -1,10 +1,7 @@
 """Example data: four logs and thirteen sets of grasps of a gripper rig, simulated by an independent program.
 
-They are not measurements.  The program behind them shares no code with thermogrip and is richer than any
-model here (unequal modules, heatsinks that warm up, water plugs in the tubes, contact that builds up); its
-parameters are not known to thermogrip.  The files stand as they came out of that program, repeated stamps,
-spikes and a hung logger included, so that reading them goes through every repair.  ``data/README.md``
-describes each of them.
+They are not measurements, but stand as they came out of a program that is richer than any model here:
+repeated stamps, spikes and a hung logger included.  ``data/README.md`` describes each of them.
 """
 
 from __future__ import annotations

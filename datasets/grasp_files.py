@@ -354,7 +354,7 @@ def _of_dataset(data: xr.Dataset, path: str | Path, called: str | None = None) -
     for need in ("grasp", "time", "t_surface"):
         if need not in data.variables:
             raise UserError(f"no {need}", file=path, hint="give a file of grasps")
-    expected = {"time": "s", "t_surface": "degC", "t_surface_2": "degC", **GRASP_NUMBERS}
+    expected = _SAMPLES | GRASP_NUMBERS
     numbers: dict[str, Any] = {}
     for name in [name for name in expected if name in data.variables]:
         numbers[name], unit = record_unit(data[name], name, str(path))

@@ -391,13 +391,12 @@ def _one_column_a_signal(table: Table) -> Table:
 def _rows_in_turn(times_of: Sequence[Floats]) -> tuple[Floats | None, list[str]]:
     """Return the times of the rows of signals that are read in turn, once a period each, and a doubt; None
     where they are not."""
-    steps = [np.diff(np.unique(times)) for times in times_of]
-    stamps = np.unique(np.concatenate(times_of)).size
-    if min(map(len, steps)) < CLOCK.piece_rows or stamps < 2 * max(map(len, steps)):
+    fewest, most = min(map(len, times_of)), max(map(len, times_of))
+    steps = np.concatenate([np.diff(np.unique(times)) for times in times_of])
+    if fewest <= CLOCK.piece_rows or not steps.size or np.unique(np.concatenate(times_of)).size < 2 * most:
         return None, []
-    periods = [float(np.median(step)) for step in steps]
-    even = [np.mean(np.abs(step - periods[0]) < CLOCK.evenness * periods[0]) for step in steps]
-    if min(even) < CLOCK.monotone_share:
+    period = float(np.median(steps))
+    if np.mean(np.abs(steps - period) < CLOCK.evenness * period) < CLOCK.monotone_share:
         return None, []
 
     def oldest(at: Floats) -> float:
@@ -406,7 +405,7 @@ def _rows_in_turn(times_of: Sequence[Floats]) -> tuple[Floats | None, list[str]]
         return max(float(np.median(at - times[rows])) for times, rows in zip(times_of, newest))
 
     kept = min(times_of, key=oldest)
-    says = f"signals are read in turn every {periods[0]:g} s"
+    says = f"signals are read in turn every {period:g} s"
     return kept, [repair.Doubt(f"{says}: those of one row are up to {oldest(kept):g} s apart")]
 
 

@@ -23,7 +23,7 @@ DOORS = {
     "llvmlite": {"sysid.models.jit_rollout"},
     "mcap": {"datasets.rosbag", "rig.records.mcap_export"},
     "nlopt": {"mpc.tuning.tune"},
-    "numba": {"datasets.compiled"},
+    "numba": {"sysid.contact.time_stepping", "sysid.effusivity.mode_kernel", "sysid.models.recurrences"},
     "pysindy": {"sysid.blackbox.sindy"},
     "rosbags": {"datasets.rosbag"},
     "safetensors": {"classify.estimators.lstm", "classify.estimators.registry"},

@@ -7,6 +7,7 @@ one way: logs -> plant -> controller -> session -> grasps -> classifier -> repor
 from __future__ import annotations
 
 import ast
+import os
 import sys
 from collections.abc import Callable
 from importlib import import_module
@@ -14,6 +15,8 @@ from pathlib import Path
 from typing import Any
 
 __version__ = "0.2.0"
+
+os.environ.setdefault("NUMBA_CACHE_DIR", "")  # else numba's settings in the working folder may name one
 
 
 def lazy_exports(package: str) -> tuple[list[str], Callable[[str], Any], Callable[[], list[str]]]:

@@ -13,11 +13,11 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+import numba  # slow: what builds on this is imported where it is used
 import numpy as np
 from numpy.typing import NDArray
 
 from thermogrip.datasets.arrays import Array, Mask
-from thermogrip.datasets.compiled import numba  # slow: what builds on this is imported where it is used
 
 # sums over modes may be reordered, so that they run in vector registers; infinities stay what they are
 _SUMS = {"reassoc", "contract", "arcp", "nsz"}

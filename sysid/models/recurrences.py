@@ -12,11 +12,11 @@ This file alone of the models imports numba, so nothing pays for the compiler be
 
 from __future__ import annotations
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from thermogrip.datasets.arrays import Array
-from thermogrip.datasets.compiled import numba
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[untyped-decorator]
