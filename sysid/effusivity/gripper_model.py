@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.special import softmax
 
 from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.errors import reading
@@ -458,25 +459,36 @@ class GripperModel:
         """Return mean and sd of ln(found / true) at found values ln e, of the same shape.
 
         The anchors are the blocks, ln(found / library) with the library's uncertainty and 10 % for the block
-        itself.  Between them a Gaussian process interpolates (prior sd 0.3, with a discrepancy 0.6,
-        correlation length 1.5 in ln e), so a found value far from every known block is reported with that
-        prior's uncertainty.
+        itself, times a factor that the blocks share and that their scatter tells.  Between them a Gaussian
+        process interpolates (prior sd 0.3, with a discrepancy 0.6, correlation length 1.5 in ln e), so a
+        found value far from every known block is reported with that prior's uncertainty.
         """
         # the engine finds effusivities on the gripper's own scale: the data fix ratios such as e / e_inner
         # better than e itself; those that are reported are divided by this one
         x = np.asarray(ln_effusivity, dtype=float)
-        blocks = [*self.blocks.values()]
+        blocks = [block for name, block in self.blocks.items() if name not in self.unlisted]
         anchors = np.array([b.ln_effusivity for b in blocks])
         ln_ratio = anchors - np.log([b.library_effusivity for b in blocks])
         prior = 0.3**2 if self.discrepancy is None else 0.6**2
-        variance = np.array([b.library_sd_ln**2 + b.ln_effusivity_sd**2 for b in blocks]) + 0.1**2
 
         def kernel(a: Array, b: Array) -> Array:
             return np.asarray(prior * np.exp(-0.5 * ((a[:, None] - b[None, :]) / 1.5) ** 2))
 
+        stated = np.diag([b.library_sd_ln**2 + 0.1**2 for b in blocks])
+        estimated = np.diag([b.ln_effusivity_sd**2 for b in blocks])
+        # The handbook states by how much blocks deviate from it; those of one lab do so together, less or
+        # more.  The factor is half normal of mean square 1, so that over all labs its variance is the stated
+        # one; the even integrand is summed by Gauss's rule over the whole line.
+        factor, weight_before = np.polynomial.hermite_e.hermegauss(20)
+        inverse = np.linalg.inv(kernel(anchors, anchors) + estimated + factor[:, None, None] ** 2 * stated)
+        by_factor = inverse @ ln_ratio
+        likelihood = 0.5 * (np.linalg.slogdet(inverse)[1] - by_factor @ ln_ratio)
+        weight = softmax(np.log(weight_before) + likelihood)
+        mean_gain = weight @ by_factor
+        known = np.einsum("k,kij->ij", weight, inverse - by_factor[:, :, None] * by_factor[:, None, :])
+        known += mean_gain[:, None] * mean_gain
         cross = kernel(x.ravel(), anchors)
-        gain = np.linalg.solve(kernel(anchors, anchors) + np.diag(variance), cross.T).T
-        mean, variance_here = gain @ ln_ratio, prior - (gain * cross).sum(axis=1)
+        mean, variance_here = cross @ mean_gain, prior - ((cross @ known) * cross).sum(axis=1)
         return mean.reshape(x.shape), np.sqrt(np.maximum(variance_here, 0.0)).reshape(x.shape)
 
 

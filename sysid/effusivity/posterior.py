@@ -92,7 +92,7 @@ def effusivity_posterior(
 ) -> list[EffusivityRow]:
     """Return one row a grasp: effusivity, object temperature and contact conductance, no material assumed.
 
-    The prior of the effusivity is log-uniform between 17 and 110 000; an interval that ends near there is
+    The prior of the effusivity is log-uniform between 17 and 100 000; an interval that ends near there is
     bounded by it, as copper's often is.  The result is divided by the scale that the calibration's blocks
     show against the library, whose uncertainty widens the interval; so does an insulator's own scatter.
     Touches of one ``touch_group`` share the joint posterior of the effusivity; each row has the object's

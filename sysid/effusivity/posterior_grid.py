@@ -36,9 +36,9 @@ from thermogrip.sysid.effusivity.laplace_approximation import (
 )
 
 # On the gripper's scale.  Of solids at room temperature plastic foams have least (expanded polystyrene, 32),
-# diamond most (6.3e4, of one isotope 7.7e4); that far from its blocks a calibration's scale is known to 0.30
-# and 0.16 in the logarithm, and two of these are left on either side.
-LN_E_RANGE = (float(np.log(17.0)), float(np.log(1.1e5)))
+# diamond most (6.3e4, of one isotope 7.7e4); that far from its blocks a calibration's scale is known to 0.29
+# and 0.12 in the logarithm, and two of these are left on either side.
+LN_E_RANGE = (float(np.log(17.0)), float(np.log(1.0e5)))
 
 
 @dataclass(frozen=True)

@@ -160,6 +160,7 @@ def test_where_grippers_of_one_kind_lie():
     assert another_gripper(GRIPPER).uncertainty.names == names
 
 
+DISCREPANT = replace(GRIPPER, discrepancy=Discrepancy(np.zeros(16), np.zeros((1, 16)), np.zeros(1)))
 NAMED = (*SHARED_NAMES, "ln_h slate", "ln_e slate")
 
 
@@ -200,20 +201,33 @@ def test_how_well_a_nominal_temperature_is_known():
     np.testing.assert_array_equal(GRIPPER.nominal_sd([[-10.0, 3.0]]), [[0.0, 0.0]])
 
 
-def test_the_scale_of_one_block_is_that_of_a_normal_process():
-    """ln 8.2 - 8.0 found 0.2 too high; variance 0.03^2 + 0.04^2 + 0.1^2 about it, 0.09 of the process."""
-    far = 0.09 * np.exp(-0.5)  # 1.5 away
-    mean, sd = GRIPPER.effusivity_scale(np.array([[8.2, 9.7]]))
-    np.testing.assert_allclose(mean, [[0.2 * 0.09 / 0.1025, 0.2 * far / 0.1025]])
-    np.testing.assert_allclose(sd, np.sqrt([[0.09 - 0.0081 / 0.1025, 0.09 - far**2 / 0.1025]]))
-    # of a gripper with a discrepancy less is expected: 0.36
-    nothing = Discrepancy(np.zeros(16), np.zeros((1, 16)), np.zeros(1))
-    mean, sd = replace(GRIPPER, discrepancy=nothing).effusivity_scale(np.array([8.2]))
-    assert mean[0] == pytest.approx(0.2 * 0.36 / 0.3725)
-    assert sd[0] == pytest.approx(np.sqrt(0.36 - 0.1296 / 0.3725))
-    found = GRIPPER.found_effusivity(np.array([7.0, 8.0, 9.0]))
-    np.testing.assert_allclose(found - GRIPPER.effusivity_scale(found)[0], [7.0, 8.0, 9.0], atol=1e-6)
-    assert GRIPPER.expected_ln_h(np.array([9.0, 11.0])) == pytest.approx([6.6, 7.0])
+@pytest.mark.parametrize(("prior", "gripper"), [(0.09, GRIPPER), (0.36, DISCREPANT)])
+def test_the_scale_of_one_block_is_that_of_a_normal_process(prior, gripper):
+    """ln 8.2 - 8.0 found 0.2 too high; the prior's variance of the process, about it 0.03^2 and f^2 (0.04^2 +
+    0.1^2), of which f is half normal: averages over it, as likely as each makes the 0.2."""
+    f = np.arange(0.001, 8.0, 0.002)[:, None]
+    variance = prior + 0.03**2 + f**2 * (0.04**2 + 0.1**2)
+    weight = np.exp(-0.5 * (f**2 + 0.2**2 / variance)) / np.sqrt(variance)
+    weight /= weight.sum()
+    cross = prior * np.exp([0.0, -0.5])  # at the block, and 1.5 away
+    means = 0.2 * cross / variance
+    mean, sd = gripper.effusivity_scale(np.array([[8.2, 9.7]]))
+    np.testing.assert_allclose(mean, [(weight * means).sum(axis=0)], rtol=5e-3)
+    second_moment = (weight * (prior - cross**2 / variance + means**2)).sum(axis=0)
+    np.testing.assert_allclose(sd, [np.sqrt(second_moment - mean[0] ** 2)], rtol=5e-3)
+    found = gripper.found_effusivity(np.array([7.0, 8.0, 9.0]))
+    np.testing.assert_allclose(found - gripper.effusivity_scale(found)[0], [7.0, 8.0, 9.0], atol=1e-6)
+
+
+def test_blocks_that_agree_with_the_table_know_the_scale_better_than_blocks_that_scatter():
+    def scale_sd(ln_ratios):
+        library = np.exp(8.2 - np.array(ln_ratios))
+        blocks = {e: replace(GRIPPER.blocks["slate"], library_effusivity=e) for e in library.tolist()}
+        return float(replace(GRIPPER, blocks=blocks).effusivity_scale(np.array([8.2]))[1][0])
+
+    # did six blocks count as stated, it would be .045 whatever they show
+    assert scale_sd([0.2, 0.21, 0.201, 0.19, 0.202, 0.203]) < 0.03
+    assert scale_sd([0.4, -0.1, 0.5, 0.0, 0.3, 0.1]) > 0.055
 
 
 def test_what_a_simulation_is_given():

@@ -152,16 +152,6 @@ def test_few_degrees_of_freedom_forgive_a_far_grasp(device, data):
     assert mild > sure + 10
 
 
-def test_a_search_from_afar_ends_at_the_same_mode(device, data):
-    row = np.arange(3)
-    hypotheses = free_hypotheses(device, [10.4, 9.7, 6.2])
-    near = fit_pairs(device, data, row, hypotheses)
-    start = near.u + np.array([0.5, 0.1, 0.1, 0.3, -0.5, 0.0, 0.2])
-    again = fit_pairs(device, data, row, hypotheses, start=start)
-    np.testing.assert_allclose(again.log_evidence, near.log_evidence, atol=0.02)
-    assert again.converged.all()
-
-
 def test_the_compiled_search_has_the_slopes_of_the_prediction(device, monkeypatch):
     """Its covariance is that of the least squares that ``jacobian`` says, all seven nuisances unknown."""
     leaky = replace(device, stack=replace(device.stack, g_far=3000.0))

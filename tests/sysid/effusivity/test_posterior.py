@@ -17,6 +17,7 @@ from scipy.stats import t as student_t
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.sysid.contact.materials import find_material, load_materials
+from thermogrip.sysid.contact.simulation import simulate_grasps
 from thermogrip.sysid.effusivity.data import KNOTS, touches, whiten
 from thermogrip.sysid.effusivity.gripper_model import Discrepancy, ParameterCovariance, another_gripper
 from thermogrip.sysid.effusivity.laplace_approximation import (
@@ -65,6 +66,17 @@ def test_effusivity_is_recovered_with_intervals_that_cover(device):
     least, most = binom.ppf([1e-3, 1 - 1e-3], n, 0.9)
     assert least <= inside <= most
     assert least <= hits_t <= most
+
+
+def test_a_thin_sheet_is_a_block_but_for_what_it_stores(device):
+    """Of 1.5 mm in place of 20; intervals were 3.8 and 1.6 wide while contact was thought off with it."""
+    thin = replace(device.grip(), length=1.5e-3)
+    record = simulate_grasps(
+        thin, ["glass", "wood"], t_object=43.0, t_gripper=23.0, n=2, seed=3, **device.readings()
+    )
+    for row, material in zip(effusivity_posterior(device, record), record["material"].values):
+        assert row.effusivity_p05 < find_material(str(material)).effusivity < row.effusivity_p95
+        assert np.log(row.effusivity_p95 / row.effusivity_p05) < (1.3 if material == "glass" else 0.7)
 
 
 def test_confidence_in_a_material_is_its_frequency(device):
@@ -170,12 +182,6 @@ def test_a_measured_object_temperature_is_taken(device, files):
     row = effusivity_posterior(device, exact)[0]
     # bias and the way there still apply to the reading
     assert row.t_object_p95 - row.t_object_p05 == pytest.approx(2 * 1.645 * 0.01, rel=0.05)
-
-
-def test_less_contact_time_is_less_certain(device, files):
-    test = split_of(files["exp1A_obj43_grip23"], "test")
-    own, other = (material_fit(device, test, FIVE, until=until).probabilities for until in (None, 0.5))
-    assert other.max(axis=1).mean() < own.max(axis=1).mean()
 
 
 def test_a_library_row_is_a_candidate_without_training(device, files):
