@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from thermogrip.datasets import repair
 from thermogrip.datasets.clock import CLOCK, EPOCH, Clock, clock_of, read_clock, since_first_row
 from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.evidence import effect_doubts
 from thermogrip.datasets.files import atomic_path, file_format, file_stem, split_cut, write_atomic
 from thermogrip.datasets.limits import MOST_NUMBER
 from thermogrip.datasets.media import csv_cell
@@ -473,10 +474,13 @@ def _reading_doubts(roles: Mapping[str, str], log: _Repaired) -> list[str]:
     inputs = [*drives.values()]
     readings = {name: v for name, v in log.columns.items() if roles[name] in ("output", "disturbance")}
     doubts = [repair.doubt_readings(name, values, inputs, log.time) for name, values in readings.items()]
-    doubts += [repair.doubt_levels(name, values) for name, values in drives.items()]
+    for name, values in drives.items():
+        doubts += [repair.doubt_levels(name, values), repair.doubt_moves(name, values)]
     for name in [name for name in readings if roles[name] == "output"]:
         doubts.append(repair.doubt_rows(name, readings[name], inputs))
         doubts += [repair.doubt_lead(name, readings[name], *drive, log.time) for drive in drives.items()]
+    of_role = ([n for n in log.columns if roles[n] == role] for role in ("input", "output", "disturbance"))
+    doubts += effect_doubts(log.columns, *of_role)
     return [doubt for doubt in doubts if doubt]
 
 

@@ -6,7 +6,9 @@ lost disturbance is interpolated.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -39,6 +41,7 @@ _REPEATED = 32  # rows with moves in most of them, that are not alike by chance
 _OTHER_SCALES = (2.55, 10.0, 100.0, 255.0, 1000.0)  # of percent, 0 to 255, 0 to 1, W and kW
 _MOST_LEVELS = 20  # of an input that is set
 _FEWEST_HELD = 4  # rows, of a standstill
+_FEWEST_ALIKE, _MOST_TO_AND_FRO = 3, 0.4  # moves of an input; share of them
 _OTHER_STEP = 1.5  # times as long: no jitter, another step
 _FEW, _MOST_MOVED = 0.05, 10  # share of rows whose time may be wrong; rows that one may be out of place
 
@@ -240,6 +243,32 @@ def doubt_levels(name: str, values: Floats) -> str:
             return (
                 f"{name} has other levels from row {row + 1} on, {factor:g} times apart: did its unit change?"
             )
+    return ""
+
+
+def doubt_moves(name: str, values: Floats) -> str:
+    """Return the doubt on an input that goes from one level to another as no drive does."""
+    bounds = np.concatenate([[0], np.flatnonzero(np.diff(values)) + 1, [values.size]])
+    holds = np.flatnonzero(np.diff(bounds) > _FEWEST_HELD)
+    count, to_and_fro, ramps = 0, 0, []
+    for before, after in pairwise(holds.tolist()):
+        move = values[bounds[before + 1] - 1 : bounds[after] + 1]
+        if move[0] == move[-1]:
+            continue
+        count += 1
+        rows = move.size - 1
+        if 1 < rows <= 2 * _FEWEST_HELD and np.isin(move, move[[0, -1]]).all():
+            to_and_fro += 1
+        straight = np.linspace(move[0], move[-1], move.size)
+        if rows >= _FEWEST_HELD and np.abs(move - straight).max() <= _FEW * abs(move[-1] - move[0]):
+            ramps.append(rows)
+    # of 150 drives of sound logs a quarter of the moves at most, of rows shuffled in fives half and more
+    if to_and_fro > max(_MOST_TO_AND_FRO * count, _FEWEST_ALIKE):
+        return f"{name} goes to and fro in {to_and_fro} of its {count} moves: are its rows in order?"
+    # of those drives none did so once
+    rows, alike = Counter(ramps).most_common(1)[0] if ramps else (0, 0)
+    if alike >= _FEWEST_ALIKE:
+        return f"{name} goes straight from level to level in {rows} rows, {alike} times: is it an average?"
     return ""
 
 

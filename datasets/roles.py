@@ -142,16 +142,14 @@ def assign_roles(
             guesses |= _copied_columns(columns, guesses, units)
         guesses |= _controllers(guesses, units)
         evidence |= _followed_levels(columns, guesses)
-        guesses |= evidence
-        fixed = {name: role for name, (role, why) in guesses.items() if why != NO_CLUE} | stated
+        known = guesses | evidence
+        fixed = {name: role for name, (role, why) in known.items() if why != NO_CLUE} | stated
         if not {"input", "output"} <= {*fixed.values()}:
             evidence |= roles_of_data(columns, units, fixed)
-        guesses |= evidence
-        evidence |= _heated_rooms(columns, guesses, stated)
-        guesses |= evidence
+        evidence |= _heated_rooms(columns, guesses | evidence, stated)
         if not lists["input"]:
-            evidence |= _unnamed_causes(columns, guesses, stated)
-            guesses |= evidence
+            evidence |= _unnamed_causes(columns, guesses | evidence, stated)
+        guesses |= evidence
     roles, reasons = {}, {}
     for name in units:
         guess, why = guesses.get(name, (stated.get(name, "other"), ""))
@@ -226,19 +224,15 @@ def roles_of_data(
     roles |= {name: role for name, (role, _) in out.items()}
     has_held_input = any(roles.get(n) == "input" and is_held(columns[n]) for n in names)
     for name in [n for n in open_ if n not in roles]:
-        why = "no other column predicts its course"
-        out[name] = ("disturbance" if has_held_input or units[name] == "degC" else "input"), why
+        role = "disturbance" if has_held_input or units[name] == "degC" else "input"
+        out[name] = role, "no other column predicts its course"
     roles |= {name: role for name, (role, _) in out.items()}
-    clear = {role for name, role in roles.items() if name not in open_}
-    if len(open_) == 1 and "disturbance" in clear and "output" not in clear:
+    if len(open_) == 1 and "output" not in roles.values():
         roles[open_[0]], out[open_[0]] = "output", ("output", "there is nothing else to predict")
-    elif len(names) == 1 and open_:
-        roles[open_[0]], out[open_[0]] = "output", ("output", "no other column moves")
     elif open_ and "input" not in roles.values():
         lead = dict(zip(names, gain.sum(axis=1)))
         for name in [n for n in open_ if net[n] > 0] or [max(open_, key=lambda n: lead[n])]:
-            more = "it predicts the others more than they predict it"
-            roles[name], out[name] = "input", ("input", more if net[name] > 0 else "no other is likelier one")
+            roles[name], out[name] = "input", ("input", "no other predicts the others more")
     if len(open_) > 1 and "output" not in roles.values():
         name = min(reversed(open_), key=lambda n: net[n])
         out[name] = "output", "the others predict it more than it predicts them"
@@ -260,9 +254,8 @@ def _heated_rooms(
         # a rig warms the room around it too: beside another output only what is called a room is one
         if not (alone or re.search(r"(^|_)room(_|$)", words)):
             continue
-        gain = predictive_gain([columns[name], *(columns[drive] for drive in drives)])
-        if gain[1:, 0].max() > EVIDENCE.strong_gain:
-            drive = drives[int(gain[1:, 0].argmax())]
+        drive = next((n for n in drives if helps_beside(columns, n, name, ())), None)
+        if drive is not None:
             out[name] = "output", f"it follows the drive {drive}, as no surroundings do"
     return out
 
@@ -282,9 +275,7 @@ def _followed_levels(
         if reading is None:
             continue
         drives = [n for n, (role, why) in guesses.items() if role == "input" or why == NO_CLUE]
-        others = [columns[n] for n in drives if n not in (goal, reading)]
-        gains = predictive_gain([columns[reading], *others])
-        if gains[1:, 0].max(initial=0.0) > EVIDENCE.strong_gain:
+        if any(helps_beside(columns, n, reading, ()) for n in drives if n not in (goal, reading)):
             out[goal] = "other", f"{reading} {FOLLOWED}"
             if guesses.get(reading, ("", ""))[1] == NO_CLUE:
                 out[reading] = "output", f"it settles at the levels of {goal}"

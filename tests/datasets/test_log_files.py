@@ -825,6 +825,8 @@ PLACES = np.arange(600)
 HEATER = np.random.default_rng(1).choice([20.0, 50.0, 90.0], 30).repeat(20)
 PLATE = np.convolve(HEATER, np.ones(60) / 60)[:600] + 0.1 * np.random.default_rng(0).standard_normal(600)
 LATER = (PLACES >= 300) * 1.0
+SLOW = lfilter([0.03], [1, -0.97], HEATER) + 0.05 * np.random.default_rng(0).standard_normal(600)
+SHUFFLED_IN_FIVES = np.random.default_rng(0).permuted(PLACES[2:597].reshape(-1, 5), axis=1).ravel()
 
 
 @pytest.mark.parametrize(
@@ -844,6 +846,11 @@ LATER = (PLACES >= 300) * 1.0
         (PLACES, HEATER, PLATE[np.minimum(PLACES + 10, 599)], "plate moves 11 s before heater does"),
         (PLACES, HEATER, PLATE + LATER * (32 + 0.8 * PLATE), "stays there, as nowhere else"),
         (PLACES, HEATER * np.where(LATER, 2.55, 1), PLATE, "2.55 times apart: did its unit change"),
+        (PLACES, np.where(LATER, 110 - HEATER, HEATER), PLATE, "the other way later: did its sign change"),
+        (PLACES, 20 + (HEATER - 20) * np.where(LATER, 0.01, 1), PLATE, "in another: did its unit change"),
+        (PLACES, np.where((PLACES > 200) & (PLACES < 360), 90, HEATER), SLOW, "with heater held"),
+        (np.r_[:2, SHUFFLED_IN_FIVES, 597:600], HEATER, PLATE, "to and fro in 18 of its 18 moves"),
+        (PLACES, np.interp(PLACES, PLACES[::5], HEATER[::5]), PLATE, "in 5 rows, 18 times: is it an average"),
     ],
 )
 def test_columns_that_are_not_one_course_of_one_unit_are_doubts(write, order, heater, plate, doubt):
