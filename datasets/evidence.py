@@ -302,8 +302,8 @@ def _moved_alone(y: Floats, drives: Sequence[Floats], others: Sequence[Floats]) 
     moves = np.flatnonzero(np.any([np.diff(u) != 0 for u in drives], axis=0)) + 1
     if not EVIDENCE.fewest_moves <= moves.size <= EVIDENCE.held_share * y.size:
         return 0
-    bounds = np.concatenate([[0], moves, [y.size]])
-    first, last = max(pairwise(bounds.tolist()), key=lambda hold: hold[1] - hold[0])
+    bounds = [0, *(int(row) for row in moves), y.size]
+    first, last = max(pairwise(bounds), key=lambda hold: hold[1] - hold[0])
     for n in EVIDENCE.blocks:
         target, known, acting = _at_scale(n, y, drives, others)
         places = np.arange(2, 2 + target.size)
