@@ -28,7 +28,7 @@ from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 from thermogrip.datasets.errors import UserError, as_user_error, os_faults
-from thermogrip.datasets.limits import check_content, check_size, most_bytes, read_within
+from thermogrip.datasets.limits import MOST_BYTES, check_content, check_size, read_within
 
 FORMATS = {
     ".csv": "csv", ".csv.gz": "csv", ".csv.xz": "csv",
@@ -40,8 +40,7 @@ FORMATS = {
     ".bag": "rosbag", ".db3": "rosbag", ".mcap": "rosbag",
 }  # fmt: skip
 _CUT = re.compile(r"^(?P<path>.+)@(?P<start>[^@:/\\]*):(?P<stop>[^@:/\\]*)$")
-#: A document's part of what a file of records may have (:mod:`thermogrip.datasets.limits`): 8 MiB, 1 MiB.
-JSON_SHARE, _TOML_SHARE = 256, 2048
+_JSON_BYTES, _TOML_BYTES = 8 << 20, 1 << 20  # that a document may have
 _SURROGATE = re.compile(r"\\u[dD][89a-fA-F]")
 _LONG_KEY = re.compile(
     r"""(?<![\w-])(?:(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+\.[ \t]*+){32}""", re.ASCII
@@ -219,14 +218,14 @@ def write_atomic(path: str | Path, content: bytes | str) -> Path:
     return Path(path)
 
 
-def read_bytes(path: str | Path, *, share: int = 1) -> bytes:
-    """Return the bytes of a file, at most one ``share``-th of what any file may hold."""
+def read_bytes(path: str | Path, *, most: int = MOST_BYTES) -> bytes:
+    """Return the bytes of a file that has no more of them than it may."""
     # a null byte in the name is a ValueError
     with as_user_error(ValueError, "{error}", file=repr(str(path)), hint="check the path"), os_faults(path):
-        check_size(check_source(path), file=path, share=share)
+        check_size(check_source(path), file=path, most=most)
         with open(path, "rb") as stream:
-            data = read_within(stream, most_bytes(share))
-    check_size(len(data), file=path, share=share)  # a pipe says no size, and a file may grow
+            data = read_within(stream, most)
+    check_size(len(data), file=path, most=most)  # a pipe says no size, and a file may grow
     return data
 
 
@@ -238,7 +237,7 @@ def write_json(path: str | Path, content: Mapping[str, Any], *, schema: str, ver
 
 def read_toml(path: str | Path, *, hint: str) -> dict[str, Any]:
     """Return the content of a TOML file; ``hint`` says where a good one comes from."""
-    raw = read_bytes(path, share=_TOML_SHARE)
+    raw = read_bytes(path, most=_TOML_BYTES)
     too_deep = as_user_error(RecursionError, "is nested too deeply", file=path, hint=hint)
     # no text, no TOML, or an integer of thousands of digits
     with too_deep, as_user_error(ValueError, "is not TOML ({error})", file=path, hint=hint):
@@ -252,7 +251,7 @@ def read_toml(path: str | Path, *, hint: str) -> dict[str, Any]:
 
 def read_json(path: str | Path, schema: str, version: int) -> dict[str, Any]:
     """Return the JSON object in ``path``, which must have this schema and no newer version."""
-    raw = read_bytes(path, share=JSON_SHARE)
+    raw = read_bytes(path, most=_JSON_BYTES)
     place: dict[str, Any] = {"file": path, "hint": f"it must be a JSON file of schema {schema!r}"}
     too_deep = as_user_error(RecursionError, "is nested too deeply", **place)
     with too_deep, as_user_error(ValueError, "is not JSON ({error})", **place):  # or no text

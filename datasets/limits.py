@@ -40,19 +40,14 @@ _DAMAGED = "it is damaged: copy or write it again"
 _Record = TypeVar("_Record")
 
 
-def most_bytes(share: int = 1) -> int:
-    """Return the largest size of a file's content [bytes], or one ``share``-th of it."""
-    return MOST_BYTES // share
-
-
 def most_unpacked(packed: int) -> int:
     """Return the bytes that may come out of a file of ``packed`` bytes."""
     return min(MOST_BYTES, max(_FLOOR, _LARGEST_EXPANSION * packed))
 
 
-def check_size(size: int, *, file: str | Path, what: str = "is", share: int = 1) -> None:
+def check_size(size: int, *, file: str | Path, what: str = "is", most: int | None = None) -> None:
     """Raise :class:`UserError` where a size [bytes] that was found or declared is beyond the limit."""
-    most = most_bytes(share)
+    most = MOST_BYTES if most is None else most
     if size > most:
         problem = f"{what} {_megabytes(size)}, more than the {_megabytes(most)} of a file"
         raise UserError(problem, file=file, hint="write it anew, or in parts")
@@ -107,7 +102,7 @@ def _send_record(sender: Any, read: Callable[[Path], Any], path: Path) -> None:
     import resource  # no Windows has it
 
     pages, (_, hard) = Path("/proc/self/statm").read_text().split()[0], resource.getrlimit(resource.RLIMIT_AS)
-    most = int(pages) * resource.getpagesize() + _COPIES * most_bytes()
+    most = int(pages) * resource.getpagesize() + _COPIES * MOST_BYTES
     resource.setrlimit(resource.RLIMIT_AS, (most if hard < 0 else min(most, hard), hard))
     try:
         sender.send((read(path), None))

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from thermogrip.datasets.errors import UserError, os_faults, reading
 from thermogrip.datasets.files import atomic_path, check_source
-from thermogrip.datasets.limits import check_unpacked, in_own_process, most_bytes, most_unpacked
+from thermogrip.datasets.limits import MOST_BYTES, check_unpacked, in_own_process, most_unpacked
 from thermogrip.datasets.units import UNITS, any_unit, to_record_unit
 
 if TYPE_CHECKING:
@@ -25,15 +25,6 @@ if TYPE_CHECKING:
 
 _MOST_MEMBERS = 4096  # of a file
 _PART = 16 << 20  # bytes of text that are looked at in one piece
-
-
-def check_netcdf(path: str | Path) -> None:
-    """Refuse a NetCDF-4 file that is damaged, or declares more than it may hold."""
-    h5py = import_module("h5py")
-    # damage here leaves h5netcdf half built, and complaining when it is collected
-    with _not_damaged(path), h5py.File(path, "r") as tried:
-        tried.attrs.get("_nc3_strict")
-        check_hdf5(tried, path)
 
 
 def open_netcdf(path: str | Path) -> xr.Dataset:
@@ -70,31 +61,33 @@ def _not_damaged(path: str | Path) -> AbstractContextManager[None]:
     return reading("is damaged or not NetCDF-4", file=path, hint="copy or write it again")
 
 
-def check_hdf5(opened: Any, path: str | Path) -> None:
-    """Refuse an open ``h5py.File`` that declares more than it may hold, or data that stand in other files."""
+def check_netcdf(path: str | Path) -> None:
+    """Refuse a NetCDF-4 file that is damaged, declares more than it may hold, or has its data in others."""
     h5py = import_module("h5py")
     packed = Path(path).stat().st_size
     declared = members = 0
-    groups = [opened]
-    while groups:
-        group = groups.pop()
-        members += len(group)
-        if members > _MOST_MEMBERS:  # a group may hold itself
-            raise UserError(f"has more than {_MOST_MEMBERS} members", file=path, hint="leave some out")
-        for name in group:
-            link = group.get(name, getlink=True)
-            if not isinstance(link, h5py.HardLink):
-                hint = "write the data themselves"
-                raise UserError("is a link, not data", file=path, column=name, hint=hint)
-            member = group[name]
-            if isinstance(member, h5py.Group):
-                groups.append(member)
-            elif isinstance(member, h5py.Dataset):
-                if member.is_virtual or member.external:
-                    hint = "copy it into this"
-                    raise UserError("is stored in another file", file=path, column=name, hint=hint)
-                declared += _in_memory(member)
-                check_unpacked(packed, declared, file=path, what="declares")
+    # damage here leaves h5netcdf half built, and complaining when it is collected
+    with _not_damaged(path), h5py.File(path, "r") as opened:
+        opened.attrs.get("_nc3_strict")
+        groups = [opened]
+        while groups:
+            group = groups.pop()
+            members += len(group)
+            if members > _MOST_MEMBERS:  # a group may hold itself
+                raise UserError(f"has more than {_MOST_MEMBERS} members", file=path, hint="leave some out")
+            for name in group:
+                if not isinstance(group.get(name, getlink=True), h5py.HardLink):
+                    hint = "write the data themselves"
+                    raise UserError("is a link, not data", file=path, column=name, hint=hint)
+                member = group[name]
+                if isinstance(member, h5py.Group):
+                    groups.append(member)
+                elif isinstance(member, h5py.Dataset):
+                    if member.is_virtual or member.external:
+                        problem, hint = "is stored in another file", "copy it into this"
+                        raise UserError(problem, file=path, column=name, hint=hint)
+                    declared += _in_memory(member)
+                    check_unpacked(packed, declared, file=path, what="declares")
 
 
 def _in_memory(variable: Any) -> int:
@@ -107,7 +100,7 @@ def _in_memory(variable: Any) -> int:
     # each text may be one and the same long one: they are measured in parts that no length can make large
     longest = int(variable.file.id.get_filesize())
     rows_at_once, text_bytes = max(1, _PART // longest), 0
-    if size * longest <= _PART or size * cell_bytes > most_bytes() or variable.ndim != 1:
+    if size * longest <= _PART or size * cell_bytes > MOST_BYTES or variable.ndim != 1:
         return max(size * (cell_bytes if variable.ndim == 1 else longest), chunk)
     for start in range(0, size, rows_at_once):
         text_bytes += sum(len(text) + 64 for text in variable[start : start + rows_at_once])

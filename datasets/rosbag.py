@@ -174,7 +174,7 @@ def bag_parts(folder: str | Path) -> list[Path]:
     _need("rosbags", place)
     from ruamel.yaml import YAML
 
-    data, hint = read_bytes(listed, share=64), "copy the whole bag again"
+    data, hint = read_bytes(listed, most=32 << 20), "copy the whole bag again"
     with reading("is no metadata of a ROS 2 bag", file=listed, hint=hint):
         about_bag = YAML(typ="safe").load(data)["rosbag2_bagfile_information"]
         bag_files = [place / Path(str(name)).name for name in about_bag["relative_file_paths"]]

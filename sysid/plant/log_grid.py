@@ -17,7 +17,7 @@ import numpy as np
 
 from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.limits import most_bytes
+from thermogrip.datasets.limits import MOST_BYTES
 from thermogrip.datasets.log_files import NO_NUMBERS, Logs, as_logs
 from thermogrip.datasets.roles import guess_role
 from thermogrip.datasets.schema import Log, column, columns, held_means, log_name
@@ -189,7 +189,7 @@ def cut_stretches(plant: PlantData, log: Log, *, gaps: str = "restart") -> list[
     def steps(seconds: float) -> int:
         n = max(1, int(np.ceil((seconds + middle) / plant.dt - 1e-9)))
         n_signals = len(plant.inputs) + len(plant.disturbances) + len(plant.outputs)
-        if 8 * n * n_signals > most_bytes(_GRIDS):  # refused before its grid is made
+        if 8 * n * n_signals > MOST_BYTES // _GRIDS:  # refused before its grid is made
             hint = "cut the log, or use a plant of a longer step"
             raise UserError(f"would be simulated in {n} steps of {plant.dt:g} s", file=rows.log, hint=hint)
         return n

@@ -19,6 +19,7 @@ import pyarrow.parquet as parquet
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.io import savemat
 
 from thermogrip.datasets import limits, netcdf, tables
 from thermogrip.datasets.errors import UserError
@@ -134,6 +135,11 @@ def test_no_number_beyond_use_is_inside_a_document_that_passes(content: Any) -> 
         ("a.nc", lambda made, path: made.netcdf_of_rows(path, 10_000_000), "declares 80 MB or more from"),
         ("a.nc", lambda made, path: made.netcdf_elsewhere(path), "is stored in another file"),
         ("a.parquet", lambda made, path: made.parquet_of_rows(path, 1 << 22), "declares 67 MB or more from"),
+        (
+            "a.mat",
+            lambda made, path: savemat(path, {"x": np.zeros(1 << 21)}, do_compression=True),
+            "declares 17 MB or more from",
+        ),
         ("a.csv.xz", lambda made, path: made.xz_of(path, HEAD, b"\n", 40 << 20), "unpacks to 8389 kB or"),
         ("a.csv.xz", lambda made, path: made.xz_of(path, HEAD, b"\n", 3 << 20), "a header but no rows"),
         ("a.csv", lambda made, path: (path.touch(), os.truncate(path, 10**12)), "is 1000000 MB"),
@@ -210,7 +216,7 @@ def test_rows_among_empty_lines_keep_their_line_numbers(tmp_path: Path) -> None:
     ("check", "most"),
     [
         (lambda size: limits.check_size(size, file="a"), 1 << 20),
-        (lambda size: limits.check_size(size, file="a", share=256), 4096),
+        (lambda size: limits.check_size(size, file="a", most=4096), 4096),
         (lambda size: limits.check_unpacked(1, size, file="a"), 1 << 20),
         (lambda depth: limits.check_content(json.loads("[" * depth + "]" * depth)), 64),
         (lambda size: limits.number_within({"a": size}, "a", 0, 7), 7),

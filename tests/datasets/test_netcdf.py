@@ -83,7 +83,7 @@ def test_what_an_array_takes_in_memory_is_what_it_declares(
         assert taken == [80, 800, 24, 3 * size]
         declared: list[tuple[int, int]] = []
         monkeypatch.setattr(netcdf, "check_unpacked", lambda *sizes, **_: declared.append(sizes))
-        netcdf.check_hdf5(file, tmp_path / "a.nc")
+        netcdf.check_netcdf(tmp_path / "a.nc")
         each = [800, 80, 60, 3 * size, 24]  # by their names
         assert declared == [(size, total) for total in np.cumsum(each)]
         for part, most, limit, found in (  # of 3, 5 and 7 letters and 64 bytes each, some at a time
@@ -92,7 +92,7 @@ def test_what_an_array_takes_in_memory_is_what_it_declares(
         ):  # fmt: skip
             monkeypatch.setattr(netcdf, "_PART", part * size)
             monkeypatch.setattr(netcdf, "most_unpacked", lambda _, most=most: most)
-            monkeypatch.setattr(netcdf, "most_bytes", lambda limit=limit: limit)
+            monkeypatch.setattr(netcdf, "MOST_BYTES", limit)
             assert netcdf._in_memory(file["words"]) == found
 
 

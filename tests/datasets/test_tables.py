@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import gzip
 import lzma
-import struct
-import zlib
 
 import numpy as np
 import pyarrow as pa
@@ -347,21 +345,6 @@ def test_a_matlab_file_that_was_cut_off_or_is_of_no_byte_order_is_damaged(tmp_pa
     for data in (whole[:-1], whole[:-8], whole[:126] + b"XX" + whole[128:]):
         path.write_bytes(data)
         assert "is no MATLAB file, or is damaged (" in refusal(read_matlab_table, path)
-
-
-@pytest.mark.parametrize(("order", "mark"), [("<", b"IM"), (">", b"MI")])
-@pytest.mark.parametrize("packed", [True, False])
-def test_a_matlab_file_of_either_byte_order_is_read(tmp_path, order, mark, packed):
-    def part(kind, form, *values):
-        data = struct.pack(order + form, *values)
-        return struct.pack(order + "2I", kind, len(data)) + data + bytes(-len(data) % 8)
-
-    inner = part(6, "2I", 6, 0) + part(5, "2i", 3, 1) + part(1, "c", b"x") + part(9, "3d", 0.5, 2.0, -1.0)
-    array = struct.pack(order + "2I", 14, len(inner)) + inner  # flags, size, name and numbers
-    if packed:
-        array = struct.pack(order + "2I", 15, len(zlib.compress(array))) + zlib.compress(array)
-    (tmp_path / "a.mat").write_bytes(b"MATLAB".ljust(124) + struct.pack(order + "H", 256) + mark + array)
-    assert shown(read_matlab_table(tmp_path / "a.mat")) == ({"x": "0.5 2 -1"}, [1, 2, 3])
 
 
 def test_a_parquet_file_is_its_columns_with_what_is_said_of_them(tmp_path):

@@ -533,17 +533,10 @@ def test_gaps_may_be_held_and_steps_are_as_many_as_reach_the_last_row():
 def test_a_run_needs_every_input_and_room_for_its_grid(name: str, monkeypatch: pytest.MonkeyPatch):
     log = log_of(T[:9], 2 * T[:9], room=(3 * T[:9], "degC", "disturbance"))
     plant = heater(disturbances=("room",))
-    asked: list[int] = []
-
-    def most(arrays: int) -> int:
-        asked.append(arrays)
-        return room
-
-    monkeypatch.setattr("thermogrip.sysid.plant.log_grid.most_bytes", most)
-    room = 8 * 8 * 3  # 8 bytes, 8 steps of three signals
+    room = 4 * 8 * 8 * 3  # four arrays of 8 bytes, 8 steps and three signals
+    monkeypatch.setattr("thermogrip.sysid.plant.log_grid.MOST_BYTES", room)
     assert len(cut_stretches(plant, log)[0].u) == 8
-    assert asked == [4]
-    room -= 1
+    monkeypatch.setattr("thermogrip.sysid.plant.log_grid.MOST_BYTES", room - 1)
     with pytest.raises(UserError, match="a: would be simulated in 8 steps of 2 s; cut the log, or use"):
         cut_stretches(plant, log)
     log[name].values[4] = np.nan
