@@ -235,9 +235,33 @@ class GreyModel(Model, Protocol):
 FreeRuns = Callable[[GreyModel, Array], list[tuple[str, Array]]]
 
 
+@dataclass(frozen=True, eq=False)
+class RestWeights:
+    """Units and weights of a state at rest: readings are nearly exact, input and level tie-breakers."""
+
+    state: Array  # (n_x,) unit of each state
+    full: Array  # (n_u,) of each input
+    limits: Array  # (n_x, 2) of the states
+    ranges: Array  # (n_u, 2) of the inputs
+    flow: Array  # (n_x,) weights
+    sensor: Array  # (n_y,)
+    input: float  # of a unit
+    level: float = 1e-6  # of what is away from a first guess
+
+
+REST_STEPS = 50  # at most; what is bilinear settles in three or four
+
+
 class Described:
     """The part of a :class:`GreyModel` that its tables answer: ``inputs``, ``disturbances``, ``outputs`` and
-    ``parameters`` by name, ``name`` and ``dt``."""
+    ``parameters`` by name, ``name`` and ``dt``; and the state at rest, by what a model says of it."""
+
+    states: tuple[str, ...]
+    rest_weights: RestWeights
+
+    def first_guess(self, y: Array) -> Array:
+        """Return a state (n_x,) near which a plant that reads y (n_y,), in part perhaps, is at rest."""
+        return np.full(len(self.states), np.nanmean(y))
 
     def __init__(self, tables: Any) -> None:
         self.tables = tables
@@ -250,3 +274,70 @@ class Described:
         sensors = (*tables.outputs.items(), *tables.disturbances.items())
         self.nuisance: dict[str, float] = {name: item.log_sd for name, item in sensors}
         self.prior = np.array([item.value for item in self.specs.values()])  # (n_p,), median or mean
+
+    def balance(self, x: list[Any], u: list[Any], d: list[Any], p: list[Any]) -> tuple[Array, Array]:
+        """Return what flows to each state (..., n_x) and what the outputs read (..., n_y), at rows."""
+        raise NotImplementedError
+
+    def rest(self, y: ArrayLike, u: ArrayLike, d: ArrayLike, p: ArrayLike) -> Array:
+        """Return the state (n_x,) of a plant at rest whose sensors read y."""
+        return np.asarray(self.rest_of_each(y, u, d, np.asarray(p, dtype=float)[None])[0])
+
+    def rest_of_each(self, y: ArrayLike, u: ArrayLike, d: ArrayLike, p: ArrayLike) -> Array:
+        """Return the states (k, n_x) of :meth:`rest` for parameters p (k, n_p), found together; not finite
+        where the equations are not."""
+        y, u, d, p = (np.asarray(value, dtype=float) for value in (y, u, d, p))
+        is_read, weights, n_x = np.isfinite(y), self.rest_weights, len(self.states)
+        if not is_read.any():
+            hint = "give a log whose first rows are read"
+            raise UserError("no output has a reading to start from", hint=hint)
+        moved = [k for k, name in enumerate(self.inputs) if name not in self.switches]
+        scale = np.append(weights.state, weights.full[moved])
+        low, high = (np.vstack([weights.limits, weights.ranges[moved]]) / scale[:, None]).T
+        guess = self.first_guess(y)
+
+        def residuals(z: Array, p: Array) -> Array:
+            """Return the residuals (k, B, n_r) at z (k, B, n_z), of parameters p (k, n_p)."""
+            z = z * scale
+            inputs: list[Any] = list(u)
+            for column, k in enumerate(moved, n_x):
+                inputs[k] = z[..., column]
+            x = list(np.moveaxis(z[..., :n_x], -1, 0))
+            flow, read = self.balance(x, inputs, list(d), list(p.T[:, :, None]))
+            away = [weights.flow * flow, (weights.sensor * (read - y))[..., is_read]]
+            away.append((weights.input * (z[..., n_x:] - u[moved])) / scale[n_x:])
+            return np.concatenate([*away, weights.level * (z[..., :n_x] - guess)], axis=-1)
+
+        # a plant at rest was held by some input v inside its range, not necessarily that of the first row:
+        # min |flow(x, v)|^2 + w_y |y - output(x)|^2 + w_u |v - u|^2
+        z = np.tile(np.clip(np.append(guess, u[moved]) / scale, low, high), (len(p), 1))
+        unsettled = np.arange(len(p))  # each until it has settled by itself, whoever is beside it
+        for _ in range(REST_STEPS):
+            around = z[unsettled][:, None] + np.vstack([np.zeros(scale.size), 1e-4 * np.eye(scale.size)])
+            rows = residuals(around, p[unsettled])
+            slopes = np.nan_to_num((rows[:, 1:] - rows[:, :1]).transpose(0, 2, 1) / 1e-4)
+            move = _bounded_moves(slopes, rows[:, 0], z[unsettled], low, high)
+            before = np.sum(rows[:, 0] ** 2, axis=1) * (1 + 1e-9)
+            for _ in range(10):  # halved where the residuals would grow
+                after = np.sum(residuals((z[unsettled] + move)[:, None], p[unsettled])[:, 0] ** 2, axis=1)
+                if (after <= before).all():
+                    break
+                move[~(after <= before)] *= 0.5
+            z[unsettled] += move
+            unsettled = unsettled[~(np.abs(move).max(axis=1) < 1e-6)]
+            if not unsettled.size:
+                break
+        return np.asarray(z[:, :n_x] * scale[:n_x])
+
+
+def _bounded_moves(jacobian: Array, residual: Array, z: Array, low: Array, high: Array) -> Array:
+    """Return the Gauss-Newton steps (k, n_z) from z (k, n_z); what would leave its range goes to the end of
+    it, and the rest is found for that."""
+    span, root = np.linalg.qr(jacobian)
+    moves = -np.linalg.solve(root, span.transpose(0, 2, 1) @ residual[:, :, None])[:, :, 0]
+    beyond = (z + moves < low) | (z + moves > high)
+    for k in np.flatnonzero(beyond.any(axis=1)):
+        move = moves[k] = np.clip(z[k] + moves[k], low, high) - z[k]
+        remaining = residual[k] + jacobian[k][:, beyond[k]] @ move[beyond[k]]
+        moves[k, ~beyond[k]] = np.linalg.lstsq(jacobian[k][:, ~beyond[k]], -remaining, rcond=None)[0]
+    return np.asarray(np.clip(z + moves, low, high) - z)

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from copy import deepcopy
-from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -22,7 +21,7 @@ from numpy.typing import ArrayLike
 
 from thermogrip.datasets.arrays import Array, Run, Values
 from thermogrip.datasets.errors import UserError
-from thermogrip.sysid.models.model import SMOOTH, Described, FreeRuns, Sizes
+from thermogrip.sysid.models.model import SMOOTH, Described, FreeRuns, RestWeights, Sizes
 from thermogrip.sysid.models.network_spec import (
     Network,
     Parameter,
@@ -218,18 +217,6 @@ def _solved(factors: Sequence[_Pivot], q: dict[str, Any]) -> list[Any]:
     return list(k.values())
 
 
-@dataclass(frozen=True)
-class RestWeights:
-    """Weights of the state at rest: readings are nearly exact, input and level tie-breakers."""
-
-    sensor: float = 1e2
-    input: float = 1e-3
-    level: float = 1e-6
-
-
-REST = RestWeights()
-
-
 class NetworkModel(Described):
     """The equations of a network; the numbers come as ``p``, in the order of :attr:`parameters`."""
 
@@ -249,6 +236,16 @@ class NetworkModel(Described):
         sd = np.full(self.n_x, 0.5)
         sd[: len(network.nodes)] = [node.start_sd for node in network.nodes.values()]
         self.spread = np.diag(sd**2)
+        inputs = network.inputs.values()
+        self.rest_weights = RestWeights(
+            state=np.ones(self.n_x),
+            full=np.array([item.full_scale for item in inputs]),
+            limits=np.tile([-np.inf, np.inf], (self.n_x, 1)),
+            ranges=np.array([item.range for item in inputs]).reshape(-1, 2),
+            flow=np.ones(self.n_x),
+            sensor=np.full(len(self.outputs), 1e2),
+            input=1e-3,
+        )
 
     def prepared(
         self, free_runs: FreeRuns, spread: Mapping[str, float], p: Array | None = None
@@ -316,60 +313,10 @@ class NetworkModel(Described):
             q[sink] = q[sink] + at_sink
         return q
 
-    def rest(self, y: ArrayLike, u: ArrayLike, d: ArrayLike, p: ArrayLike) -> Array:
-        """Return the state (n_x,) of a plant at rest whose sensors read y."""
-        return np.asarray(self.rest_of_each(y, u, d, np.asarray(p, dtype=float)[None])[0])
-
-    def rest_of_each(self, y: ArrayLike, u: ArrayLike, d: ArrayLike, p: ArrayLike) -> Array:
-        """Return the states (k, n_x) of :meth:`rest` for parameters p (k, n_p), found together."""
-        y, u, d, p = (np.asarray(value, dtype=float) for value in (y, u, d, p))
-        if not np.isfinite(y).any():
-            raise UserError(
-                "no output has a reading to start from", hint="give a log whose first rows are read"
-            )
-        level = float(np.nanmean(y))
-        moved = [i for i, name in enumerate(self.inputs) if name not in self.switches]
-        low, high = np.array([self.network.inputs[self.inputs[i]].range for i in moved]).reshape(-1, 2).T
-        full = np.array([self.network.inputs[self.inputs[i]].full_scale for i in moved])
-        low, high = low / full, high / full
-        z = np.concatenate([np.full(self.n_x, level), np.clip(u[moved] / full, low, high)])
-        # a plant at rest was held by some input v inside its range, not necessarily that of the first row:
-        # min |heat(x, v)|^2 + w_y |y - output(x)|^2 + w_u |v - u|^2
-        z, ahead = np.tile(z, (len(p), 1)), 1e-4 * np.eye(len(z))
-        unsettled = np.arange(len(p))  # each until it has settled by itself, whoever is beside it
-        for _ in range(8):  # bilinear and T^4 at most: Gauss-Newton settles in three or four
-            z_now = z[unsettled]
-            around = np.concatenate([z_now[:, None], z_now[:, None] + ahead], axis=1)
-            rows = self._rest_residuals(around, y, u, d, p[unsettled], moved, full)
-            slopes = (rows[:, 1:] - rows[:, :1]).transpose(0, 2, 1) / 1e-4
-            move = _bounded_moves(slopes, rows[:, 0], z_now[:, self.n_x :], low, high)
-            z[unsettled] = z_now + move
-            z[unsettled, self.n_x :] = np.clip(z[unsettled, self.n_x :], low, high)
-            unsettled = unsettled[~(np.abs(move).max(axis=1) < 1e-6)]
-            if not unsettled.size:
-                break
-        return np.asarray(z[:, : self.n_x])
-
-    def _rest_residuals(
-        self, z: Array, y: Array, u: Array, d: Array, p: Array, moved: list[int], full: Array
-    ) -> Array:
-        """Return the residuals (k, B, n_r) at z (k, B, n_z), states and shares of the moved inputs, for
-        parameters p (k, n_p)."""
-        x, v = z[..., : self.n_x], z[..., self.n_x :]
-        states = list(np.moveaxis(x, -1, 0))
-        inputs: list[Any] = list(u)
-        for share, i in enumerate(moved):
-            inputs[i] = v[..., share] * full[share]
-        flow = self.heat(states, inputs, list(d), list(p.T[:, :, None])).values()
-        is_read = np.isfinite(y)
-        read = np.stack(self.output(states, ()), axis=-1)
-        residuals = [
-            np.stack(list(flow), axis=-1),
-            REST.sensor * (read - y)[..., is_read],
-            REST.input * (v - u[moved] / full),
-            REST.level * (x - np.nanmean(y)),
-        ]
-        return np.concatenate(residuals, axis=-1)
+    def balance(self, x: list[Any], u: list[Any], d: list[Any], p: list[Any]) -> tuple[Array, Array]:
+        """Return what flows to each state (..., n_x) [W] and what the outputs read (..., n_y), at rows."""
+        flow = list(self.heat(x, u, d, p).values())
+        return np.stack(flow, axis=-1), np.stack(self.output(x, p), axis=-1)
 
     def rollout(self, x0: ArrayLike, u: ArrayLike, d: ArrayLike, p: ArrayLike, dt: float) -> Run:
         """Simulate a batch."""
@@ -431,22 +378,6 @@ def load_network(name_or_path: str | Path) -> NetworkModel:
     ('C_heater', 'G_amb', 'G_between')
     """
     return NetworkModel(named_network(name_or_path))
-
-
-def _bounded_moves(jacobian: Array, residual: Array, v: Array, low: Array, high: Array) -> Array:
-    """Return the Gauss-Newton steps (k, n_z) of states and inputs v (k, n_v); what would leave its range goes
-    to the end of it, and the rest is found for that."""
-    span, root = np.linalg.qr(jacobian)
-    moves = -np.linalg.solve(root, span.transpose(0, 2, 1) @ residual[:, :, None])[:, :, 0]
-    first = moves.shape[1] - v.shape[1]
-    wanted = v + moves[:, first:]
-    outside = (wanted < low) | (wanted > high)
-    for k in np.flatnonzero(outside.any(axis=1)):
-        move, beyond = moves[k], np.append(np.zeros(first, dtype=bool), outside[k])
-        move[first:] = np.clip(wanted[k], low, high) - v[k]
-        remaining = residual[k] + jacobian[k][:, beyond] @ move[beyond]
-        move[~beyond] = np.linalg.lstsq(jacobian[k][:, ~beyond], -remaining, rcond=None)[0]
-    return np.asarray(moves)
 
 
 @lru_cache(maxsize=64)

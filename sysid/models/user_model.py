@@ -50,7 +50,7 @@ from pydantic import (
 
 from thermogrip.datasets.arrays import Array, Run, Values
 from thermogrip.datasets.errors import UserError, known_names, reading
-from thermogrip.sysid.models.model import Described, FreeRuns, Sizes
+from thermogrip.sysid.models.model import Described, FreeRuns, RestWeights, Sizes
 from thermogrip.sysid.models.network_spec import OpenHigh, OpenLow, Parameter
 
 if TYPE_CHECKING:
@@ -304,10 +304,8 @@ def _file_words(file: str, line: int | None = None) -> str:
 
 @dataclass(frozen=True)
 class OwnSettings:
-    """Accuracy of a user's class, and the weights of its state at rest."""
+    """Accuracy of a user's class."""
 
-    sensor_weight: float = 1e2  # readings are nearly exact
-    input_weight: float = 1e-2  # the input is a tie-breaker
     step_error: float = 0.1  # of a sensor's sd (rms), between n pieces and 2 n
     most_pieces: int = 256  # of a step
     sensor_sd: float = 0.02  # of an output's spread in the logs, where the class states no sd
@@ -331,36 +329,15 @@ def _kernel(code: OwnCode) -> Kernel:
     return Kernel(code.step, code.output, Sizes(*sizes))
 
 
-def still(code: OwnCode, y: Array, u: Array, d: Array, p: Array, *, sd: Array, seconds: float) -> Array:
-    """Return the state (n_x,) at rest; it may be not finite where the class's functions are not."""
-    from scipy.optimize import least_squares  # a class with a rest of its own needs none
-
-    n_x, is_read = len(code.states), np.isfinite(y)
-    scale = np.array(list(code.states.values()))
-    ranges = [item.range for item in code.inputs.values()]
-    wide = np.array([ends[1] - ends[0] if ends else 1.0 for ends in ranges])
-    moved = np.array([not item.switch for item in code.inputs.values()], dtype=bool)
-
-    # the state x, inside the limits, that some input v near u holds still and whose outputs read y, with s
-    # the class's spread of each state and T the seconds of a warm-up: min |T f(x, v) / s|^2 + w_y |(output(x)
-    # - y) / sd|^2 + w_u |(v - u) / range|^2
-    def residuals(z: Array) -> Array:
-        """Return the residuals (n_r,) at states, then inputs, in units of their scale."""
-        x, v = z[:n_x] * scale, np.where(moved, z[n_x:] * wide, u)
-        flow = seconds * np.array(code.rhs(list(x), list(v), list(d), list(p)), dtype=float)
-        read = np.array(code.output(list(x), list(p)), dtype=float)
-        miss = (OWN.sensor_weight * (read - y) / sd)[is_read]
-        return np.concatenate([flow / scale, miss, OWN.input_weight * (z[n_x:] - u / wide)])
-
-    ends = np.array([*code.limits, *((ends or (-np.inf, np.inf)) for ends in ranges)], dtype=float)
-    low, high = (ends / np.concatenate([scale, wide])[:, None]).T
-    # a first guess is the reading of the output of a state's name, else the mean of all
-    readings = dict(zip(code.outputs, np.where(is_read, y, np.nanmean(y)).tolist()))
-    guess = np.array([readings.get(name, np.nanmean(y)) for name in code.states])
-    z = np.clip(np.concatenate([guess / scale, u / wide]), low, high)
-    if not np.isfinite(residuals(z)).all():
-        return np.full(n_x, np.nan)
-    return np.asarray(least_squares(residuals, z, bounds=(low, high)).x[:n_x] * scale)
+@lru_cache(maxsize=32)
+def _balance(code: OwnCode) -> Any:
+    """Return a CasADi function of (x, u, d, p) to dx/dt and what the outputs read."""
+    casadi: Any = import_module("casadi")
+    groups: list[Sized] = [code.states, code.inputs, code.disturbances, code.parameters]
+    symbols = [casadi.SX.sym(letter, len(group)) for letter, group in zip("xudp", groups)]
+    x, u, d, p = (_for_numpy(casadi.vertsplit(item) if item.numel() else []) for item in symbols)
+    both = _plain([*code.rhs(x, u, d, p)]), code.output(_plain(x), _plain(p))
+    return casadi.Function("balance", symbols, [casadi.densify(casadi.vertcat(*values)) for values in both])
 
 
 @lru_cache(maxsize=32)
@@ -432,7 +409,18 @@ class OwnModel(Described):
         self.independent = 4 * self.average
         # no output defines a scale: a log that starts at rest is not recognised as such
         self.reference: str | None = None
-        self.spread = np.diag(np.square(list(code.states.values())))
+        scale = np.array(list(code.states.values()))
+        self.spread = np.diag(np.square(scale))
+        ends = [item.range for item in code.inputs.values()]
+        self.rest_weights = RestWeights(
+            state=scale,
+            full=np.array([high - low for low, high in (pair or (0.0, 1.0) for pair in ends)]),
+            limits=code.limits,
+            ranges=np.array([pair or (-np.inf, np.inf) for pair in ends]).reshape(-1, 2),
+            flow=self.warmup / scale,
+            sensor=1e2 / self._sensors,
+            input=1e-2,
+        )
 
     def step(self, x: Values, u: Values, d: Values, p: Values, dt: float) -> list[Any]:
         """Return the state after ``dt`` seconds; numbers, NumPy rows or CasADi symbols alike."""
@@ -468,22 +456,29 @@ class OwnModel(Described):
         """Return what the outputs read at state x, a list of length n_y."""
         return self.code.output(x, p)
 
-    def rest(self, y: ArrayLike, u: ArrayLike, d: ArrayLike, p: ArrayLike) -> Array:
-        """Return the state (n_x,) of a plant at rest whose outputs read y: the class's own or a found one."""
-        y, u, d, p = (np.asarray(value, dtype=float) for value in (y, u, d, p))
-        if not np.isfinite(y).any():
-            raise UserError(
-                "no output has a reading to start from", hint="give a log whose first rows are read"
-            )
+    def balance(self, x: list[Any], u: list[Any], d: list[Any], p: list[Any]) -> tuple[Array, Array]:
+        """Return dx/dt (..., n_x) and what the outputs read (..., n_y), at rows."""
+        rows = np.broadcast_shapes(*(np.shape(value) for value in (*x, *u, *d, *p)))
+        columns = [[np.broadcast_to(value, rows).ravel() for value in group] for group in (x, u, d, p)]
+        whole = [np.reshape(group, (len(group), int(np.prod(rows)))) for group in columns]
+        flow, read = _balance(self.code)(*whole)
+        return flow.full().T.reshape(*rows, -1), read.full().T.reshape(*rows, -1)
+
+    def first_guess(self, y: Array) -> Array:
+        """Return the reading of the output of each state's name, else the mean of all."""
+        readings = dict(zip(self.outputs, np.where(np.isfinite(y), y, np.nanmean(y)).tolist()))
+        return np.array([readings.get(name, np.nanmean(y)) for name in self.states])
+
+    def rest_of_each(self, y: ArrayLike, u: ArrayLike, d: ArrayLike, p: ArrayLike) -> Array:
+        """Return the states (k, n_x) of a plant at rest: the class's own, or found ones."""
         with np.errstate(all="ignore"):
-            class_rest = self.code.rest(list(y), list(u), list(d), list(p))
-            x = (
-                still(self.code, y, u, d, p, sd=self._sensors, seconds=self.warmup)
-                if class_rest is None
-                else np.array(class_rest, dtype=float)
-            )
+            if hasattr(self.code.made, "rest") and np.isfinite(y).any():
+                y, u, d = (list(np.asarray(value, dtype=float)) for value in (y, u, d))
+                x = np.array([self.code.rest(y, u, d, list(row)) for row in np.asarray(p)], dtype=float)
+            else:
+                x = super().rest_of_each(y, u, d, p)
         if not np.isfinite(x).all():
-            lost = self.states[int(np.flatnonzero(~np.isfinite(x))[0])]
+            lost = self.states[int(np.flatnonzero(~np.isfinite(x).all(axis=0))[0])]
             hint = "guard roots and divisions with np.maximum, or write rest(self, y, u, d, p)"
             raise self.code.fault(f"has no finite state at rest ({lost} is not)", hint=hint)
         return np.asarray(np.clip(x, *self.code.limits.T))

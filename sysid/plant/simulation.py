@@ -89,7 +89,7 @@ def predict(
             x0 = np.repeat(start.x0[None], len(p), axis=0)
             if start.level is None and len(p) > 1:
                 y, u, d_rest = _about_start(stretch, start)
-                if hasattr(model, "rest_of_each"):  # of networks: a fit asks for hundreds
+                if hasattr(model, "rest_of_each"):  # a fit asks for hundreds
                     x0 = model.rest_of_each(y, u, d_rest, p) + start.shift
                 else:
                     x0 = np.array([model.rest(y, u, d_rest, row) for row in p]) + start.shift
