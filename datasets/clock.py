@@ -102,10 +102,10 @@ def clock_of(table: Table, read: Mapping[str, Header], dt: float | None) -> Cloc
     others = [h for h in table.text if h not in named and read_clock(table.text[h][:20]) is not None]
     others += [h for h in table.numbers if h not in named and _behaves_as_clock(h, read[h], table.numbers[h])]
     if dt is not None:
-        instead = frozenset([*named, *others[:1]])
-        place = f" in place of {', '.join(h for h in [*named, *others[:1]])}" if instead else ""
+        instead = [*named, *others[:1]]
+        place = f" in place of {', '.join(instead)}" if instead else ""
         rows = np.arange(len(table.lines), dtype=float)
-        return Clock(rows * dt, instead, (f"time: rows are {dt:g} s apart, as asked{place}",))
+        return Clock(rows * dt, frozenset(instead), (f"time: rows are {dt:g} s apart, as asked{place}",))
     clocks = [
         _of_text(header, table) if header in table.text else _of_numbers(header, table, read[header])
         for header in [*named, *others]
@@ -255,9 +255,8 @@ def _in_pieces(seconds: Floats, lines: NDArray[np.int64]) -> tuple[Floats, list[
     if not back.size:
         return seconds, []
     usual = float(np.nanmedian(np.diff(seconds)))
-    begins = seconds[0] + max(GAP_SECONDS, CLOCK.piece_rows * usual)  # a board begins where it began before
     whole = [piece.size >= CLOCK.piece_rows and piece[1] - piece[0] <= GAP_STEPS * usual for piece in pieces]
-    if not all(whole) or any(piece[0] > begins for piece in pieces):
+    if not all(whole):
         return seconds, []  # a stamp that is wrong begins no part that goes on as a clock does
     # both parts rise on their own: a board was reset, and for how long it was off is not known
     gap = 1.0 + max(GAP_SECONDS, GAP_STEPS * usual)

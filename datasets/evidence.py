@@ -108,9 +108,10 @@ def explains(y: Floats, *some: Floats) -> bool:
 def predictive_gain(columns: Sequence[Floats]) -> Floats:
     """Return how much column i helps to predict column j, G (n, n), the least over the lags."""
     scaled = _standardised(columns)
-    gain = np.array([np.min([_gains(y, scaled, (), lags) for lags in EVIDENCE.lags], axis=0) for y in scaled])
+    least = [np.min([_gains(y, scaled, (), lags) for lags in EVIDENCE.lags], axis=0) for y in scaled]
+    gain = np.reshape(least, (len(scaled), len(scaled))).T
     np.fill_diagonal(gain, 0.0)
-    return gain.T
+    return gain
 
 
 def _standardised(columns: Sequence[Floats]) -> list[Floats]:
@@ -230,8 +231,11 @@ def role_doubts(
         if is_moved(columns, name, inputs, at_lags=all):
             yield f"{name} is taken as disturbance ({reasons[name]}), but responds to {', '.join(inputs)}"
     for name in [name for name in others if name in guessed and not only_rises(columns[name])]:
-        if name in goals and _is_goal(columns, name, inputs, outputs):
-            continue
+        if name in goals and is_held(columns[name]):
+            # a reading comes to it, or a drive responds to it
+            followed = any(comes_to(columns[n], columns[name]) for n in outputs)
+            if followed or any(is_moved(columns, n, [name]) for n in inputs):
+                continue
         # what is held like a drive may be the drive, and the input with a name its reading
         beside = [] if is_held(columns[name]) else inputs
         helped = next((n for n in outputs if helps_beside(columns, name, n, beside)), None)
@@ -318,12 +322,6 @@ def _moved_alone(y: Floats, drives: Sequence[Floats], others: Sequence[Floats]) 
         if is_moved_elsewhere and times > EVIDENCE.moved_alone:
             return last - first
     return 0
-
-
-def _is_goal(columns: Mapping[str, Floats], name: str, inputs: Sequence[str], outputs: Sequence[str]) -> bool:
-    """Tell whether a column is held, and a drive responds to it or a reading comes to it."""
-    followed = any(comes_to(columns[n], columns[name]) for n in outputs)
-    return is_held(columns[name]) and (followed or any(is_moved(columns, n, [name]) for n in inputs))
 
 
 def _unlike_an_input(

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from itertools import pairwise
+from itertools import pairwise, takewhile
 from typing import NamedTuple
 
 import numpy as np
@@ -162,9 +162,11 @@ def find_spikes(values: Floats, *, floor: float | None, step: float = 0.0) -> ND
     )
     is_far = np.abs(deviation) > threshold
     entered = np.concatenate([[False], np.abs(np.diff(good)) > threshold])
-    for start in np.flatnonzero(is_far & entered):
-        length = _spike_length(good, is_far, int(start), threshold)
-        spikes[finite_rows[start : start + length]] = True
+    for start in np.flatnonzero(is_far & entered).tolist():
+        # a stretch up to the end is none: the last sample is its own median
+        stops = takewhile(lambda stop: is_far[stop - 1], range(start + 1, start + SPIKE_LENGTH + 1))
+        stop = next((stop for stop in stops if _leaves_and_returns(good, start, stop, threshold)), start)
+        spikes[finite_rows[start:stop]] = True
     # in rows of a minute or more a plant moves and comes back by itself: there a spike is beyond all other
     # samples by more than their range
     if step >= _SLOW_ROWS and spikes.any():
@@ -196,8 +198,8 @@ def doubt_readings(name: str, values: Floats, inputs: Sequence[Floats], time: Fl
     for end in (np.nanmin(values), np.nanmax(values)):
         rows = _rows_beyond_jumps(values, values == end)
         edges = np.flatnonzero(np.diff(rows.astype(int)))
-        quiet = [not _any_moves(inputs, edge) for edge in edges.tolist()]
-        if rows.sum() > SPIKE_LENGTH * max(edges.size / 2, 1) and 2 * sum(quiet) >= edges.size:
+        driven = [any(np.ptp(u[max(edge - SPIKE_LENGTH, 0) : edge + 2]) for u in inputs) for edge in edges]
+        if rows.sum() > SPIKE_LENGTH * max(edges.size / 2, 1) and 2 * sum(driven) <= edges.size:
             says = f"{name} jumps to {end:g} and stays in {rows.sum()} rows while no input moves"
             return f"{says}: if that is a sensor's code, leave those cells empty"
     value, held = _longest_standstill(values, moves)
@@ -344,11 +346,6 @@ def doubt_repeats(columns: Sequence[Floats], lines: NDArray[np.int64]) -> list[s
     return [Doubt(f"{says}: cut the file there in two")]
 
 
-def _any_moves(inputs: Sequence[Floats], row: int) -> bool:
-    """Tell whether an input moves in the rows just before a row's end."""
-    return any(np.any(np.diff(u[max(row - SPIKE_LENGTH, 0) : row + 2])) for u in inputs)
-
-
 def _rows_beyond_jumps(values: Floats, rows: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Return those of the rows whose runs are entered and left by jumps as no other rows make."""
     moves = np.abs(np.diff(values))
@@ -438,11 +435,9 @@ def check_plausible(name: str, celsius: Floats, file: str) -> list[str]:
     if median < -273.15:
         problem = f"median of {median:g} degC is below absolute zero"
         raise UserError(problem, file=file, column=name, hint="check the unit in the header")
-    if 250 < median < 350:
-        return [f"{name}: median of {median:.1f} degC; name the column {name}_K if this is kelvin"]
-    if median < -150:
-        return [f"{name}: median of {median:.1f} degC; is the column really in kelvin?"]
-    return []
+    if -150 <= median <= 250 or median >= 350:
+        return []
+    return [f"{name}: median of {median:.1f} degC; name the column {name}_K if this is kelvin"]
 
 
 def _floor(values: Floats) -> float:
@@ -451,17 +446,6 @@ def _floor(values: Floats) -> float:
     quantum = float(moves[moves > 0].min()) if np.any(moves > 0) else 0.0
     # 2 % of the channel's 1-99 % range, and at least five of its smallest increments
     return max(0.02 * float(high - low), 5 * quantum, np.finfo(float).tiny)
-
-
-def _spike_length(values: Floats, far: NDArray[np.bool_], start: int, threshold: float) -> int:
-    """Return the length of the spike that begins at a sample, 0 where none does."""
-    for length in range(1, SPIKE_LENGTH + 1):
-        stop = start + length
-        if not far[stop - 1]:
-            return 0  # nor is a stretch up to the end one: the last sample is its own median
-        if _leaves_and_returns(values, start, stop, threshold):
-            return length
-    return 0
 
 
 def _leaves_and_returns(values: Floats, start: int, stop: int, threshold: float) -> bool:
