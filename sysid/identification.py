@@ -107,11 +107,7 @@ class Identification(Shown):
 
     def errors(self) -> dict[str, float]:
         """Return the mean held-out error of each candidate, relative to the no-input baseline."""
-        out: dict[str, list[float]] = {}
-        for row in self.rows:
-            if row.held_out:
-                out.setdefault(row.model, []).append(relative_error(row))
-        return {model: float(np.mean(values)) for model, values in out.items()}
+        return _mean_errors([row for row in self.rows if row.held_out])
 
 
 def identify(
@@ -377,13 +373,8 @@ def cases_of(logs: Sequence[Log], leave_one_out: bool) -> list[Case]:
     if len({log_name(log) for log in logs}) < len(logs):
         raise UserError("two logs have the same name", hint="give each file its own name")
     if leave_one_out:
-        return [
-            Case(
-                [log for log in logs if log is not logs_held_out],
-                [Held(logs_held_out, log_name(logs_held_out), 0.0)],
-            )
-            for logs_held_out in logs
-        ]
+        others = [[other for other in logs if other is not log] for log in logs]
+        return [Case(train, [Held(log, log_name(log), 0.0)]) for train, log in zip(others, logs)]
     case = Case([], [])
     for log in logs:
         time = log["time"].values
@@ -436,6 +427,13 @@ def fold_rows(fit: BlackBoxFit) -> list[Row]:
 def relative_error(row: Row) -> float:
     """Return the error over that of a model without input."""
     return row.rmse / max(row.no_input_rmse, 1e-12)
+
+
+def _mean_errors(rows: Sequence[Row]) -> dict[str, float]:
+    errors: dict[str, list[float]] = {}
+    for row in rows:
+        errors.setdefault(row.model, []).append(relative_error(row))
+    return {model: float(np.mean(each)) for model, each in errors.items()}
 
 
 @dataclass(frozen=True, eq=False)
@@ -559,12 +557,8 @@ def _rms_of_changes(changes: Mapping[str, Array]) -> dict[str, float]:
 
 def choose_model(rows: Sequence[Row], complete: int) -> str | None:
     """Return the candidate of the least mean relative error among those scored on every held-out log."""
-    errors: dict[str, list[float]] = {}
-    scored: dict[str, set[str]] = {}
-    for row in rows:
-        errors.setdefault(row.model, []).append(relative_error(row))
-        scored.setdefault(row.model, set()).add(row.log)
-    mean = {model: float(np.mean(e)) for model, e in errors.items() if len(scored[model]) == complete}
+    scored = {model: len({row.log for row in rows if row.model == model}) for model in _mean_errors(rows)}
+    mean = {model: e for model, e in _mean_errors(rows).items() if scored[model] == complete}
     mean = {model: e for model, e in mean.items() if np.isfinite(e)} or mean
     if not mean:
         return None

@@ -126,8 +126,14 @@ def folds(grid: Grid, *, blocks: int = _CUTS) -> list[Fold]:
     else:
         parts = [*_cut_blocks(grid, blocks), _last_parts(grid)]
     # a model fitted to the others cannot know an input that one part alone moves
-    range_of = np.ptp(np.concatenate([segment.u for segment in grid.segments]), axis=0)
-    excited = [part for part in parts if _moves_all(part, least=MOVED * range_of)]
+    least = MOVED * np.ptp(np.concatenate([segment.u for segment in grid.segments]), axis=0)
+    excited = []
+    for part in parts:
+        if part.train.segments and part.runs:
+            held_out = np.concatenate([run.segment.u[run.scored_from :] for run in part.runs])
+            others = np.concatenate([segment.u for segment in part.train.segments])
+            if np.all((np.ptp(held_out, axis=0) <= least) | (np.ptp(others, axis=0) > least)):
+                excited.append(part)
     return excited if len(excited) >= 2 else parts
 
 
@@ -477,12 +483,3 @@ def smallest_near_the_best(table: Mapping[Structure, Array], most: float) -> Str
     best = min(logs, key=lambda s: float(logs[s].mean()))
     near_best = [s for s in logs if s == best or excess_within_noise(logs[s] - logs[best], most)]
     return min(near_best, key=lambda s: (s.size, float(logs[s].mean())))
-
-
-def _moves_all(fold: Fold, *, least: Array) -> bool:
-    """Return whether the rest moves every input that what is held out moves by more than ``least``."""
-    if not fold.train.segments or not fold.runs:
-        return False
-    held_out_inputs = np.concatenate([run.segment.u[run.scored_from :] for run in fold.runs])
-    others = np.concatenate([segment.u for segment in fold.train.segments])
-    return not np.any((np.ptp(held_out_inputs, axis=0) > least) & (np.ptp(others, axis=0) <= least))

@@ -54,11 +54,7 @@ class Records:
         self.first = [drive[0] for drive in w]
         self.moves = [np.ascontiguousarray((drive - drive[0]).T) for drive in w]
         self.longest = max(map(len, y))
-
-    @property
-    def n_drive(self) -> int:
-        """Number of drives."""
-        return int(self.w[0].shape[1])
+        self.n_drive = int(w[0].shape[1])
 
     def filtered(self, D: Array) -> Records:
         """Return readings and drives filtered by the polynomial D(q), without the rows that lack a past."""

@@ -5,12 +5,9 @@ each output, over the n scored samples,
 
     RMSE = sqrt(mean (y - v)^2),        fit = 100 (1 - |y - v| / |y - mean y|)  percent.
 
-Beside the free run stand
-
-* **one step**: the last reading plus the model's move. Small for every slow plant; it ranks models wrongly.
-* **mean**: the constant that fits the scored samples best (fit 0 percent by definition).
-* **no input**: y = m + (y_first - m) exp(-t/tau), with m the mean of the scored samples and tau chosen in
-  hindsight. A model that does not beat it has learnt nothing from the input.
+Beside it stand one step (the last reading plus the model's move: small for every slow plant, it ranks models
+wrongly), the mean, and the best decay without an input (:func:`no_input_baseline`): a model that does not
+beat that has learnt nothing from the input.
 
 The residual is tested (:mod:`thermogrip.sysid.validation.residual_tests`), the verdict goes by its size
 (:mod:`thermogrip.sysid.validation.stated_errors`).

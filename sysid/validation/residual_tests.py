@@ -299,14 +299,11 @@ def marked_by_holm(
     found: Mapping[str, Mapping[str, CorrelationTest]],
 ) -> dict[str, dict[str, CorrelationTest]]:
     """Return the same tests, marked as significant by Holm's rule."""
-    pairs = sorted((one.p, name, after) for name, row in found.items() for after, one in row.items())
-    names: set[tuple[str, str]] = set()
     # at most one right model in a hundred has any, whatever the correlation time of its errors and the number
     # of pairs
-    for k, (p, name, after) in enumerate(pairs):
-        if not p < LEVEL / (len(pairs) - k):
-            break
-        names.add((name, after))
+    pairs = sorted((one.p, name, after) for name, row in found.items() for after, one in row.items())
+    adjusted = np.maximum.accumulate([p * (len(pairs) - k) for k, (p, _, _) in enumerate(pairs)])
+    names = {(name, after) for (_, name, after), p in zip(pairs, adjusted) if p < LEVEL}
     return {
         name: {after: replace(one, significant=(name, after) in names) for after, one in row.items()}
         for name, row in found.items()

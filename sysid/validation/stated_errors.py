@@ -53,7 +53,6 @@ PRIOR_PARTS = 4  # which that counts as: as many as one log has blocks
 MEDIAN = NormalDist().inv_cdf(0.75)  # of the size of a normal number, in standard deviations
 _RANKS = 199  # quantiles of each part, of which their sum is made
 _DIVERGED = 1e6  # of an output's spread
-_INPUT_CHANGE = 0.05  # change of the inputs by which their effect is found
 _LATER = (1 / 30, 1 / 10, 1 / 3)  # of a run: lags of an effect that comes later; half a decade apart
 _UNLIKE = 0.1  # of the run's error: what a run unlike the fit adds, from which it is reported
 
@@ -184,16 +183,14 @@ def unlike_fit(plant: Plant, log: Log, simulated: Log, warmup: float) -> dict[st
     return out
 
 
-def between_runs(plant: Plant, logs: Sequence[Log], gain: float = RUN_GAIN_SD) -> dict[str, Array]:
-    """Return by output what a gain of the inputs that is off by so much changes at each row of the logs, one
-    after the other; empty for a plant of no log, or of so many that their held-out errors show it."""
-    if not 0 < len(plant.logs) < SEVERAL:
-        return {}
-    return effect_of_inputs(plant, logs, gain)
+def between_runs(plant: Plant, logs: Sequence[Log]) -> dict[str, Array]:
+    """Return by output what a gain that is off as from run to run changes at each row of the logs, one after
+    the other; empty for a plant of no log, or of so many that their held-out errors show it."""
+    return effect_of_inputs(plant, logs) if 0 < len(plant.logs) < SEVERAL else {}
 
 
-def effect_of_inputs(plant: Plant, logs: Sequence[Log], gain: float) -> dict[str, Array]:
-    """Return by output what inputs that do less by so large a share change at each row of the logs."""
+def effect_of_inputs(plant: Plant, logs: Sequence[Log]) -> dict[str, Array]:
+    """Return by output what inputs that do less by :data:`RUN_GAIN_SD` change at each row of the logs."""
     moving = set(plant.inputs) - set(plant.model.switches)
     nearest = {name: np.clip(0.0, *plant.valid.get(name, (0.0, 0.0))) for name in moving}
     changes = []
@@ -204,7 +201,7 @@ def effect_of_inputs(plant: Plant, logs: Sequence[Log], gain: float) -> dict[str
             u = column(log, name)
             # g (u - u_0), u_0 the value nearest to 0 in the logs of the fit: what an input that never was 0
             # does from 0 on is part of the operating point
-            log[name] = log[name].copy(data=u - gain * (u - nearest[name]))
+            log[name] = log[name].copy(data=u - RUN_GAIN_SD * (u - nearest[name]))
         changes.append(change - columns(plant.simulate(log), plant.outputs))
     return dict(zip(plant.outputs, np.concatenate(changes).T))
 
@@ -230,8 +227,8 @@ def effect_of_run(plant: Plant, error: Array, log: Log) -> InputEffect | None:
     """Return what inputs did more in a run than in the fit, at once or later, by least squares on the errors
     (n, n_y) of the free run, NaN where it is not scored, in the spread of each output; None where
     that is too little."""
-    effects = effect_of_inputs(plant, [log], _INPUT_CHANGE)
-    at_once = np.array([effects[name] for name in plant.outputs]).T / _INPUT_CHANGE
+    effects = effect_of_inputs(plant, [log])
+    at_once = np.array([effects[name] for name in plant.outputs]).T / RUN_GAIN_SD
     spread = np.array([np.nanstd(column(log, name)) for name in plant.outputs])
     spread = np.where(spread > 0, spread, 1.0)
     with np.errstate(over="ignore", invalid="ignore"):  # a run that diverged has no gain

@@ -369,7 +369,8 @@ def test_draws_that_cannot_be_made_are_a_note_and_the_fit_is_kept(monkeypatch, k
     monkeypatch.setattr("thermogrip.sysid.greybox.posterior.fit_problem", lambda *_: None)
     for name in ("greybox.posterior.with_draws", "identification.with_refits"):
         monkeypatch.setattr(f"thermogrip.sysid.{name}", fails)
-    network = SimpleNamespace(name="block", inputs=("q",), disturbances=(), outputs=("t",), units={})
+    signals = {"inputs": ("q",), "disturbances": (), "outputs": ("t",), "switches": ()}
+    network = SimpleNamespace(name="block", units={}, **signals)
     found = identify(log, network, models=[kind], average=1.0)
     assert found.plant.samples is None
     assert not found.plant.refits
