@@ -60,9 +60,7 @@ _CHECKS = CheckSettings()
 class Finding:
     """One check of one channel of one log."""
 
-    # ``"quantum"``, ``"noise"``, ``"jitter"``, ``"gaps"``, ``"lost"``, ``"saturation"``, ``"excitation"`` or
-    # ``"feedback"``
-    check: str
+    check: str  # quantum, noise, jitter, gaps, lost, excitation or feedback
     log: str  # where; empty where it concerns all
     channel: str
     value: float  # the measured number
@@ -133,17 +131,14 @@ def check_data(
     u, y = grid.inputs, grid.outputs
     findings: list[Finding] = []
     for log in logs:
-        channels = {
-            name: _Channel(log_name(log), name, str(log[name].attrs.get("units", "1")), column(log, name))
-            for name in (*u, *y)
-        }
         steps = np.diff(log["time"].values)
         usual = float(np.median(steps))
         findings += _step_findings(log_name(log), steps, usual, gaps(log))
+        averaged = grid.dt if grid.dt > 1.5 * usual else None
         for name in y:
-            channel, averaged = channels[name], grid.dt if grid.dt > 1.5 * usual else None
+            unit = str(log[name].attrs.get("units", "1"))
+            channel = _Channel(log_name(log), name, unit, column(log, name))
             findings += [_quantum(channel, averaged), _lost(channel), _sensorless_output(channel)]
-        findings += [_saturation(channels[name]) for name in u if name not in grid.switches]
     findings += _excitation(grid)
     for place, name in enumerate(u):
         findings += _feedback_to(name, place, grid, logs)
@@ -227,19 +222,6 @@ def _lost(channel: _Channel) -> Finding:
     return channel.found(
         "lost", share, "1", verdict, says + ("" if share < 0.02 else ": fits leave these rows out")
     )
-
-
-def _saturation(channel: _Channel) -> Finding:
-    values, name = channel.values, channel.name
-    low, high = values.min(), values.max()
-    room = 1e-6 * (high - low)
-    at_limit = float(np.mean((values >= high - room) | (values <= low + room)))
-    levels = np.unique(np.round(values, 9)).size
-    if levels <= 12:
-        says = f"{name} takes {levels} levels only: curvature between them is not seen"
-        return channel.found("saturation", at_limit, "1", "ok" if levels > 2 else "warn", says)
-    says = f"{name} is at its least or greatest value in {100 * at_limit:.0f} % of the rows"
-    return channel.found("saturation", at_limit, "1", "ok" if at_limit < 0.2 else "warn", says)
 
 
 def _excitation(grid: Grid, most: int = 6) -> list[Finding]:

@@ -239,13 +239,13 @@ FreeRuns = Callable[[GreyModel, Array], list[tuple[str, Array]]]
 class RestWeights:
     """Units and weights of a state at rest: readings are nearly exact, input and level tie-breakers."""
 
-    state: Array  # (n_x,) unit of each state
-    full: Array  # (n_u,) of each input
-    limits: Array  # (n_x, 2) of the states
+    full: Array  # (n_u,) unit of each input
     ranges: Array  # (n_u, 2) of the inputs
-    flow: Array  # (n_x,) weights
-    sensor: Array  # (n_y,)
+    sensor: Array | float  # (n_y,)
     input: float  # of a unit
+    state: Array | float = 1.0  # (n_x,) unit of each state
+    limits: Array | tuple[float, float] = (-np.inf, np.inf)  # (n_x, 2) of the states
+    flow: Array | float = 1.0  # (n_x,)
     level: float = 1e-6  # of what is away from a first guess
 
 
@@ -258,10 +258,6 @@ class Described:
 
     states: tuple[str, ...]
     rest_weights: RestWeights
-
-    def first_guess(self, y: Array) -> Array:
-        """Return a state (n_x,) near which a plant that reads y (n_y,), in part perhaps, is at rest."""
-        return np.full(len(self.states), np.nanmean(y))
 
     def __init__(self, tables: Any) -> None:
         self.tables = tables
@@ -292,9 +288,12 @@ class Described:
             hint = "give a log whose first rows are read"
             raise UserError("no output has a reading to start from", hint=hint)
         moved = [k for k, name in enumerate(self.inputs) if name not in self.switches]
-        scale = np.append(weights.state, weights.full[moved])
-        low, high = (np.vstack([weights.limits, weights.ranges[moved]]) / scale[:, None]).T
-        guess = self.first_guess(y)
+        scale = np.append(np.broadcast_to(weights.state, n_x), weights.full[moved])
+        ends = np.vstack([np.broadcast_to(weights.limits, (n_x, 2)), weights.ranges[moved]])
+        low, high = (ends / scale[:, None]).T
+        # the reading of the output of a state's name, else the mean of all
+        readings = dict(zip(self.outputs, np.where(is_read, y, np.nanmean(y)).tolist()))
+        guess = np.array([readings.get(name, np.nanmean(y)) for name in self.states])
 
         def residuals(z: Array, p: Array) -> Array:
             """Return the residuals (k, B, n_r) at z (k, B, n_z), of parameters p (k, n_p)."""

@@ -238,12 +238,9 @@ class NetworkModel(Described):
         self.spread = np.diag(sd**2)
         inputs = network.inputs.values()
         self.rest_weights = RestWeights(
-            state=np.ones(self.n_x),
             full=np.array([item.full_scale for item in inputs]),
-            limits=np.tile([-np.inf, np.inf], (self.n_x, 1)),
             ranges=np.array([item.range for item in inputs]).reshape(-1, 2),
-            flow=np.ones(self.n_x),
-            sensor=np.full(len(self.outputs), 1e2),
+            sensor=1e2,
             input=1e-3,
         )
 

@@ -464,11 +464,6 @@ class OwnModel(Described):
         flow, read = _balance(self.code)(*whole)
         return flow.full().T.reshape(*rows, -1), read.full().T.reshape(*rows, -1)
 
-    def first_guess(self, y: Array) -> Array:
-        """Return the reading of the output of each state's name, else the mean of all."""
-        readings = dict(zip(self.outputs, np.where(np.isfinite(y), y, np.nanmean(y)).tolist()))
-        return np.array([readings.get(name, np.nanmean(y)) for name in self.states])
-
     def rest_of_each(self, y: ArrayLike, u: ArrayLike, d: ArrayLike, p: ArrayLike) -> Array:
         """Return the states (k, n_x) of a plant at rest: the class's own, or found ones."""
         with np.errstate(all="ignore"):

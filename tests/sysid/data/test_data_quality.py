@@ -145,14 +145,6 @@ def found_in(y, check, *, q=ODD, time=K, average=1.0, channel="t", unit="1"):
     return found.value, found.unit, found.verdict, found.says
 
 
-def dented(n, by):
-    """An input of 15 levels from 5 to 6 with n rows at either end, or ``by`` from it."""
-    q = 5.1 + 0.8 * (K % 13) / 12
-    q[10 : 10 + n], q[100 : 100 + n] = 5.0 + by, 6.0 - by
-    q[0], q[1] = 5.0, 6.0
-    return q
-
-
 RUNS_AWAY = ": time stamps are uncertain, fast dynamics cannot be trusted"
 COARSE = ": coarse, equation-error fits are unreliable at the log's own rate"
 LEAVE = " Leave it out with --outputs"
@@ -201,22 +193,6 @@ def test_an_output_that_rests_in_one_log_has_no_noise_there():
     logs = [make_log(1.0 * K, {"q": (ODD, "1", "input"), "t": (y, "degC", "output")}) for y in (0 * ODD, ODD)]
     says = [f.says for f in check_data(logs, average=1.0).of("noise")]
     assert says == ["t: too few readings to see noise", "t has noise of 2.7 degC"]
-
-
-@pytest.mark.parametrize(
-    ("q", "value", "verdict", "says"),
-    [
-        (K % 12, 33 / 200, "ok", "q takes 12 levels only: curvature between them is not seen"),
-        (K % 13, 31 / 200, "ok", "q is at its least or greatest value in 16 % of the rows"),
-        (0.2 + K % 2, 1.0, "warn", "q takes 2 levels only: curvature between them is not seen"),
-        (0.2 + K % 3, 133 / 200, "ok", "q takes 3 levels only: curvature between them is not seen"),
-        (dented(19, 0.0), 0.2, "warn", "q is at its least or greatest value in 20 % of the rows"),
-        (dented(18, 0.9e-6), 0.19, "ok", "q is at its least or greatest value in 19 % of the rows"),
-        (dented(19, 1.1e-6), 0.01, "ok", "q is at its least or greatest value in 1 % of the rows"),
-    ],
-)
-def test_rows_at_the_ends_of_an_input_are_counted_within_a_millionth_of_its_range(q, value, verdict, says):
-    assert found_in(ODD, "saturation", q=q, channel="q") == (value, "1", verdict, says)
 
 
 @pytest.mark.parametrize(
