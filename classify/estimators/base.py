@@ -25,7 +25,6 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Self, TypeAlias
 import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
-from scipy.special import logsumexp
 from sklearn.base import BaseEstimator, ClassifierMixin
 from sklearn.exceptions import NotFittedError
 
@@ -503,4 +502,4 @@ def two_or_more(labels: Labels, where: str) -> Labels:
 
 def normalised(log_p: Floats) -> Floats:
     """Return log probabilities whose rows sum to 1 from unnormalised ones."""
-    return np.asarray(log_p - logsumexp(log_p, axis=1, keepdims=True))
+    return np.asarray(log_p - np.logaddexp.reduce(log_p, axis=1, keepdims=True))

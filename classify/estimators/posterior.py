@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.special import expit, logit, logsumexp
+from scipy.special import expit, logit
 
 from thermogrip.classify.estimators.base import (
     Answered,
@@ -169,7 +169,7 @@ class PosteriorClassifier(GraspClassifier):
             best = np.arange(single.size) * len(names) + evidence[single].argmax(axis=1)
             if unknown:
                 free = free_evidence(self.device_, data, fitted.mode.u[best], noise)
-                odds[single] = logsumexp(fitted.sure, axis=1) - np.log(len(names)) - free
+                odds[single] = np.logaddexp.reduce(fitted.sure, axis=1) - np.log(len(names)) - free
                 self._explain(answered, single, data, names, fitted, best)
         # touches of one block are one question: they share its temperature
         if single.size < group.size:
@@ -215,7 +215,7 @@ class PosteriorClassifier(GraspClassifier):
             evidence[rows] = fit.log_evidence[k]
             if unknown:
                 free = groups[fit.groups[k]][0].log_evidence
-                odds[rows] = logsumexp(fit.log_evidence[k]) - np.log(len(names)) - free
+                odds[rows] = np.logaddexp.reduce(fit.log_evidence[k]) - np.log(len(names)) - free
 
     def _warn_of_training(self, found: Answered, grasps: Grasps) -> None:
         """Add to the answers what of a record the training did not have."""

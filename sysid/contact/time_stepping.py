@@ -172,7 +172,7 @@ def contacts(
     slope = np.empty((n, N_STEPPED, t.size))
     flux = np.empty((n, t.size))
     grown = conductance(t, contact[:, 2], contact[:, 3], gripper.numbers)
-    room, now = np.zeros((16, modes.shape[2])), np.zeros((7, 5))
+    room, now = np.zeros((18, modes.shape[2])), np.zeros((7, 5))
     step_contacts(repeat, dt, modes, moves, series, grown, wanted, room, now, rise, slope, flux)
     return rise, slope, flux
 
@@ -192,14 +192,11 @@ def step_contacts(
     # One function, in which it is all written out: one that calls others is optimised whole with each of
     # them, and what NumPy does for many contacts at once costs no compilation.
     last = modes.shape[2] - 1
-    # states; 1 - E, a, b, E and E b + a; their derivatives by ln e and ln C
-    x = room[:5]
-    m = room[5]
-    a = room[6]
-    b = room[7]
-    keep = room[8]
-    gain = room[9]
-    moved = room[10:16]
+    # states; 1 - E, a, b, E and E b + a; derivatives of the last two and b by ln e and ln C
+    x, m, a, b, keep, gain = room[:5], room[5], room[6], room[7], room[8], room[9]
+    x0, x1, x2, x3, x4 = x[0], x[1], x[2], x[3], x[4]
+    keep_e, gain_e, b_e, keep_c, gain_c, b_c = room[10], room[11], room[12], room[13], room[14], room[15]
+    per_rate, unit = room[16], room[17]  # 1 / rate and b / weight
     # of each curve: flux, sensor's node and reading, sums of the states at face and sensor, Z, and the sum of
     # a past the alive modes
     q = now[0]
@@ -211,6 +208,7 @@ def step_contacts(
     late = now[6]
     for p in range(modes.shape[0]):
         rate = modes[p, 0]
+        by_block = wanted[p, BY_E] or wanted[p, BY_C]
         weight = modes[p, 1]
         sensor = modes[p, 2]
         for c in range(5):
@@ -218,14 +216,14 @@ def step_contacts(
             for j in range(last):
                 x[c, j] = 0.0
         for j in range(last + 1):
-            m[j] = modes[p, 3, j]
+            m[j], per_rate[j] = modes[p, 3, j], 1.0 / rate[j]
         share = 1.0 / (1.0 + grown[p, 0, 0] * series[p, 0])
         q[0] = grown[p, 0, 0] * share
         q[1], q[3], q[4] = q[0] * share, -q[0] * q[0] * series[p, 1], -q[0] * q[0] * series[p, 2]
         flux[p, 0] = q[0]
         k = low = 0
         for g in range(repeat.size):
-            step = dt[g]
+            step, per_step = dt[g], 1.0 / dt[g]
             high = last
             # a mode that a step damps below rounding keeps no state: only a q is left of it
             while high > N_MODE and rate[high - 1] * step > FADED:
@@ -233,12 +231,11 @@ def step_contacts(
             while low < N_MODE and rate[low] * step > FADED:
                 low += 1
             for j in range(last + 1):
-                y, phi = rate[j] * step, m[j] / rate[j]
-                general_form, small = (step - phi) / y, y < _SERIES_BELOW
-                b[j] = (step * (0.5 - y * (1.0 / 6.0 - y / 24.0)) if small else general_form) * weight[j]
-                a[j] = (step * (0.5 - y * (1.0 / 3.0 - 0.125 * y)) if small else phi - general_form) * weight[
-                    j
-                ]
+                y, phi = rate[j] * step, m[j] * per_rate[j]
+                general_form, small = (step - phi) * per_rate[j] * per_step, y < _SERIES_BELOW
+                unit[j] = step * (0.5 - y * (1.0 / 6.0 - y / 24.0)) if small else general_form
+                late_unit = step * (0.5 - y * (1.0 / 3.0 - 0.125 * y)) if small else phi - general_form
+                a[j], b[j] = late_unit * weight[j], unit[j] * weight[j]
                 keep[j] = 1.0 - m[j]
                 gain[j] = keep[j] * b[j] + a[j]
             z[0], z[1], z[2], late[0], late[1], late[2] = series[p, 0], 0.0, 0.0, 0.0, 0.0, 0.0
@@ -249,23 +246,27 @@ def step_contacts(
                 if j < low or j >= high:
                     late[0] += a[j]
                     seen_late += a[j] * sensor[j]
-            for c in range(3, 5):
-                if wanted[p, c]:
-                    z[c], late[c], row = series[p, c - 2], 0.0, 3 * (c - 3)
-                    for j in range(N_MODE):
-                        by_rate, by_weight = moves[p, 2 * c - 6, j], moves[p, 2 * c - 5, j]
-                        y = rate[j] * step
-                        d_phi = step * keep[j] - m[j] / rate[j]
-                        general_form, small = -d_phi / y - b[j] / weight[j], y < _SERIES_BELOW
-                        d_a = -step * y * (1.0 / 3.0 - 0.25 * y) if small else d_phi - general_form
-                        d_b = -step * y * (1.0 / 6.0 - y / 12.0) if small else general_form
-                        d_a = weight[j] * d_a * by_rate + a[j] * by_weight
-                        d_b = weight[j] * d_b * by_rate + b[j] * by_weight
-                        d_keep = -y * keep[j] * by_rate
-                        moved[row, j], moved[row + 1, j] = d_keep, d_keep * b[j] + keep[j] * d_b + d_a
-                        moved[row + 2, j] = d_b
-                        z[c] += d_b
-                        late[c] += d_a if j < low else 0.0
+            if by_block:
+                z3, z4, late3, late4 = series[p, 1], series[p, 2], 0.0, 0.0
+                for j in range(N_MODE):
+                    y = rate[j] * step
+                    d_phi = step * keep[j] - m[j] * per_rate[j]
+                    general_form, small = -d_phi * per_rate[j] * per_step - unit[j], y < _SERIES_BELOW
+                    d_a = -step * y * (1.0 / 3.0 - 0.25 * y) if small else d_phi - general_form
+                    d_b = -step * y * (1.0 / 6.0 - y / 12.0) if small else general_form
+                    d_a, d_b, d_keep = weight[j] * d_a, weight[j] * d_b, -y * keep[j]
+                    d_gain = d_keep * b[j] + keep[j] * d_b + d_a
+                    by_rate, by_weight = moves[p, 0, j], moves[p, 1, j]
+                    keep_e[j], gain_e[j] = d_keep * by_rate, d_gain * by_rate + gain[j] * by_weight
+                    b_e[j] = d_b * by_rate + b[j] * by_weight
+                    z3 += b_e[j]
+                    late3 += d_a * by_rate + a[j] * by_weight if j < low else 0.0
+                    by_rate, by_weight = moves[p, 2, j], moves[p, 3, j]
+                    keep_c[j], gain_c[j] = d_keep * by_rate, d_gain * by_rate + gain[j] * by_weight
+                    b_c[j] = d_b * by_rate + b[j] * by_weight
+                    z4 += b_c[j]
+                    late4 += d_a * by_rate + a[j] * by_weight if j < low else 0.0
+                z[3], z[4], late[3], late[4] = z3, z4, late3, late4
             # so that a step is one pass over the modes, x <- E x + (E b + a) q
             for c in range(5):  # the state is less b q
                 if wanted[p, c]:
@@ -273,36 +274,39 @@ def step_contacts(
                         x[c, j] -= b[j] * q[c]
                     if c > 2:
                         for j in range(low, N_MODE):
-                            x[c, j] -= moved[3 * c - 7, j] * q[0]
+                            x[c, j] -= room[3 * c + 3, j] * q[0]
             for i in range(k + 1, k + 1 + repeat[g]):
-                for c in range(4, -1, -1):  # the value last, as the others need its state of before
-                    if wanted[p, c]:
-                        qc = q[c]
-                        total = 0.0
-                        at_sensor = 0.0
-                        if c > 2:
-                            # ln e and ln C move the block's modes: the recursion gains dE x + d(E b + a) q
-                            row, q0 = 3 * (c - 3), q[0]
-                            for j in range(low, N_MODE):
-                                v = (
-                                    keep[j] * x[c, j]
-                                    + gain[j] * qc
-                                    + moved[row, j] * x[0, j]
-                                    + moved[row + 1, j] * q0
-                                )
-                                x[c, j] = v
-                                total += v
-                        else:
-                            for j in range(low, N_MODE):
-                                v = keep[j] * x[c, j] + gain[j] * qc
-                                x[c, j] = v
-                                total += v
-                        for j in range(N_MODE, high):
-                            v = keep[j] * x[c, j] + gain[j] * qc
-                            x[c, j] = v
-                            total += v
-                            at_sensor += sensor[j] * v
-                        w[c], s[c] = total, at_sensor
+                q0, q1, q2, q3, q4 = q[0], q[1], q[2], q[3], q[4]
+                w0 = w1 = w2 = w3 = w4 = s0 = s1 = s2 = s3 = s4 = 0.0
+                # Curves share a pass and its loads, wanted or not: a quarter less time than a pass each.
+                # Those of the block, whose modes ln e and ln C move, are first: they gain
+                # dE x + d(E b + a) q of the value's state of before.
+                if by_block:
+                    for j in range(low, N_MODE):
+                        v3 = keep[j] * x3[j] + gain[j] * q3 + keep_e[j] * x0[j] + gain_e[j] * q0
+                        v4 = keep[j] * x4[j] + gain[j] * q4 + keep_c[j] * x0[j] + gain_c[j] * q0
+                        x3[j], x4[j] = v3, v4
+                        w3 += v3
+                        w4 += v4
+                    for j in range(N_MODE, high):
+                        v3, v4 = keep[j] * x3[j] + gain[j] * q3, keep[j] * x4[j] + gain[j] * q4
+                        x3[j], x4[j] = v3, v4
+                        w3 += v3
+                        w4 += v4
+                        s3 += sensor[j] * v3
+                        s4 += sensor[j] * v4
+                for j in range(low, high):
+                    v0, v1 = keep[j] * x0[j] + gain[j] * q0, keep[j] * x1[j] + gain[j] * q1
+                    v2 = keep[j] * x2[j] + gain[j] * q2
+                    x0[j], x1[j], x2[j] = v0, v1, v2
+                    w0 += v0
+                    w1 += v1
+                    w2 += v2
+                    s0 += sensor[j] * v0
+                    s1 += sensor[j] * v1
+                    s2 += sensor[j] * v2
+                w[0], w[1], w[2], w[3], w[4] = w0, w1, w2, w3, w4
+                s[0], s[1], s[2], s[3], s[4] = s0, s1, s2, s3, s4
                 h, q0 = grown[p, 0, i], q[0]
                 # q = h (1 - sum x) / (1 + h Z), Z = sum b + resistances
                 invert = 1.0 / (1.0 + h * z[0])
@@ -327,7 +331,7 @@ def step_contacts(
                         x[c, j] += b[j] * q[c]
                     if c > 2:
                         for j in range(low, N_MODE):
-                            x[c, j] += moved[3 * c - 7, j] * q[0]
+                            x[c, j] += room[3 * c + 3, j] * q[0]
             k += repeat[g]
             for j in range(last + 1):
                 # steps double from group to group, and with them 1 - E, without another exponential

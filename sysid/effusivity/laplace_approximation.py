@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.special import gammaln, logsumexp
+from scipy.special import gammaln
 
 from thermogrip.datasets.arrays import Array, Mask
 from thermogrip.datasets.errors import UserError
@@ -453,7 +453,7 @@ def fit_candidates(
     mode = fit_rivals(gripper, every, row, hypotheses, start=begin, noise=noise, prior=prior)
     place, candidate = np.arange(n)[:, None] * n_grade, np.arange(m)
     first = (place * m + candidate).ravel()
-    sure = logsumexp(over_grades(gripper, mode.log_evidence.reshape(n, n_grade, m)), axis=1)
+    sure = np.logaddexp.reduce(over_grades(gripper, mode.log_evidence.reshape(n, n_grade, m)), axis=1)
     if gripper.uncertainty is not None and gripper.discrepancy is None:
         pairs = data.take(np.repeat(np.arange(n), m))
         every_pair = Hypotheses(*(np.tile(field, n) for field in one))
@@ -462,13 +462,15 @@ def fit_candidates(
         )
     by_grade_and_candidate = over_grades(gripper, mode.log_evidence.reshape(n, n_grade, m))
     best_grade = ((place + by_grade_and_candidate.argmax(axis=1)) * m + candidate).ravel()
-    by_grade = logsumexp(by_grade_and_candidate, axis=2)
+    by_grade = np.logaddexp.reduce(by_grade_and_candidate, axis=2)
     return Fitted(
-        mode.take(best_grade)._replace(log_evidence=logsumexp(by_grade_and_candidate, axis=1).ravel()),
+        mode.take(best_grade)._replace(
+            log_evidence=np.logaddexp.reduce(by_grade_and_candidate, axis=1).ravel()
+        ),
         np.repeat(np.arange(n), m),
         mode.take(first),
         prior.take(first),
-        -np.expm1(by_grade[:, 0] - logsumexp(by_grade, axis=1)),
+        -np.expm1(by_grade[:, 0] - np.logaddexp.reduce(by_grade, axis=1)),
         sure,
     )
 

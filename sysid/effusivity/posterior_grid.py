@@ -17,7 +17,6 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.special import logsumexp
 
 from thermogrip.datasets.arrays import Array
 from thermogrip.sysid.contact.materials import load_materials
@@ -80,7 +79,7 @@ def grid_posteriors(gripper: GripperModel, data: Touches) -> list[GridPosterior]
     by_grade = _posteriors(gripper, graded(data, gripper.grades))
     evidence = np.array([one.log_evidence for one in by_grade]).reshape(n, n_grade)
     weight = over_grades(gripper, evidence)
-    likely = weight > logsumexp(weight, axis=1, keepdims=True) + np.log(GRID.least_grade)
+    likely = weight > np.logaddexp.reduce(weight, axis=1, keepdims=True) + np.log(GRID.least_grade)
     return [
         mixed([by_grade[i * n_grade + k] for k in np.flatnonzero(likely[i])], weight[i, likely[i]])
         for i in range(n)
@@ -138,7 +137,7 @@ def free_evidence(gripper: GripperModel, data: Touches, near: Array, noise: Whit
     out = np.full(data.level.size, -np.inf)
     some_noise = noise[0][likely], noise[1][likely]
     out[likely] = _evidence_about(gripper, data.take(likely), some_noise, mode.take(likely))
-    return np.asarray(logsumexp(over_grades(gripper, out.reshape(-1, n_grade)), axis=1))
+    return np.asarray(np.logaddexp.reduce(over_grades(gripper, out.reshape(-1, n_grade)), axis=1))
 
 
 def _evidence_about(gripper: GripperModel, data: Touches, noise: Whitened, mode: Mode) -> Array:
@@ -155,7 +154,7 @@ def _evidence_about(gripper: GripperModel, data: Touches, noise: Whitened, mode:
     value = _modes_at(gripper, data, noise, x, start).log_evidence
     value += log_listed(x - gripper.effusivity_scale(x)[0])
     value[:, [0, -1]] -= np.log(2.0)
-    return np.asarray(logsumexp(value, axis=1) + np.log((x[:, 1] - x[:, 0]) / (highest - lowest)))
+    return np.asarray(np.logaddexp.reduce(value, axis=1) + np.log((x[:, 1] - x[:, 0]) / (highest - lowest)))
 
 
 def log_listed(ln_e: Array) -> Array:
@@ -171,7 +170,7 @@ def log_listed(ln_e: Array) -> Array:
 def mixed(parts: Sequence[GridPosterior], log_weight: Array) -> GridPosterior:
     """Return the mixture of posteriors of one grasp whose prior odds times evidence are ``log_weight``
     (n_part,)."""
-    total = float(logsumexp(log_weight))
+    total = float(np.logaddexp.reduce(log_weight))
     share = np.exp(log_weight - total)
     x = np.concatenate([posterior.x for posterior in parts])
     mass = np.concatenate([s * posterior.mass for s, posterior in zip(share, parts)])
@@ -219,7 +218,7 @@ def posterior_of(x: Array, value: Array, t_object: Array, sd: Array, ln_h: Array
     # 30 nats below the best nothing counts, and a cubic beside would swing
     log_density = Akima1DInterpolator(x, np.maximum(value, value.max() - 30.0))(fine)
     log_density[[0, -1]] -= np.log(2.0)  # by the trapezoidal rule
-    total = float(logsumexp(log_density))
+    total = float(np.logaddexp.reduce(log_density))
     evidence = total + float(np.log((fine[1] - fine[0]) / (LN_E_RANGE[1] - LN_E_RANGE[0])))
     weight = np.exp(value - value.max()) * np.gradient(x)
     counts = weight > 1e-9 * weight.max()  # tails without mass need no part in the mixtures

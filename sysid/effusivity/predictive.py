@@ -22,7 +22,6 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.special import logsumexp
 
 from thermogrip.datasets.arrays import Array
 from thermogrip.sysid.contact.materials import Material
@@ -90,7 +89,7 @@ def next_touch(
     excursion = np.abs(y[:, 1:] - data.level[:, None]).max(axis=1)
     noise = noise_covariance(replace(data, excursion=excursion), gripper.noise)
     covariance = slopes @ spread @ slopes.transpose(0, 2, 1) + noise
-    log_p = np.tile(evidence - logsumexp(evidence), (n, 1))
+    log_p = np.tile(evidence - np.logaddexp.reduce(evidence), (n, 1))
     return PosteriorPredictive(log_p, y.reshape(n, m, -1), covariance.reshape(n, m, *covariance.shape[1:]))
 
 
