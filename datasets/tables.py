@@ -456,14 +456,9 @@ def _open_marks(cells_of: Mapping[str, Sequence[str]]) -> list[str]:
     column shows which mark is the one of decimals."""
     if not any("," in cells[0] + cells[-1] for cells in cells_of.values()):
         return []
-    opened: dict[str, str] = {}
-    decimal: set[str] = set()
-    for name, cells in cells_of.items():
-        marked = [cell for cell in cells if "," in cell or "." in cell]
-        if marked and all(map(_OPEN.fullmatch, map(str.strip, marked))):
-            opened[name] = marked[0].strip()
-        else:
-            decimal |= {max(cell, key=lambda sign: cell.rfind(sign) * (sign in ",.")) for cell in marked}
+    marked = {name: [c.strip() for c in cells if "," in c or "." in c] for name, cells in cells_of.items()}
+    opened = {name: cells[0] for name, cells in marked.items() if cells and all(map(_OPEN.fullmatch, cells))}
+    decimal = {re.sub(r"[^,.]", "", cell)[-1] for name in marked.keys() - opened for cell in marked[name]}
     return [
         Doubt(f"{name}: is {cell} a number of thousands? It is read as {cell.replace(',', '.')}")
         for name, cell in opened.items()
