@@ -9,14 +9,13 @@ one network alone would have fitted so, a black box was kept, after up to 1.6 ti
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from thermogrip.datasets.roles import guess_role, is_room_temperature
 from thermogrip.datasets.schema import Log, column
 from thermogrip.sysid.data.preparation import moves
-from thermogrip.sysid.models.network import NetworkModel
 from thermogrip.sysid.models.network_spec import (
     SHARES,
     Disturbance,
@@ -27,6 +26,9 @@ from thermogrip.sysid.models.network_spec import (
     network_from_dict,
 )
 from thermogrip.sysid.plant.log_grid import misfit
+
+if TYPE_CHECKING:
+    from thermogrip.sysid.models.network import NetworkModel
 
 # keys of elements that name signals or places
 _NAMING = ("between", "from", "to", "surroundings", "node", "face", "sink", "switch", "input")
@@ -39,6 +41,8 @@ def shipped_network(logs: Sequence[Log]) -> NetworkModel | None:
         columns = _by_name(network, logs[0])
         if columns is None:
             continue
+        from thermogrip.sysid.models.network import NetworkModel  # only where it is one
+
         model = NetworkModel(renamed(network, columns))
         moved = [name for name in model.inputs if name not in model.switches]
         if all(misfit(model, log) is None for log in logs) and all(moves(logs, name) for name in moved):
@@ -51,7 +55,7 @@ def in_columns(model: NetworkModel, log: Log) -> NetworkModel:
     columns = _by_name(model.network, log, needs_inputs=False)
     if columns is None or all(old == new for old, new in columns.items()):
         return model
-    return NetworkModel(renamed(model.network, columns))
+    return type(model)(renamed(model.network, columns))
 
 
 def in_log_units(model: NetworkModel, logs: Sequence[Log]) -> NetworkModel:
@@ -78,7 +82,7 @@ def in_log_units(model: NetworkModel, logs: Sequence[Log]) -> NetworkModel:
                 scaled["step"] = None if item.step is None else item.step * theirs / own
             table[name] = item.model_copy(update=scaled)
             changed = True
-    return NetworkModel(model.network.model_copy(update=tables)) if changed else model
+    return type(model)(model.network.model_copy(update=tables)) if changed else model
 
 
 def in_logged_room(model: NetworkModel, logs: Sequence[Log]) -> tuple[NetworkModel, list[str]]:
@@ -102,7 +106,7 @@ def in_logged_room(model: NetworkModel, logs: Sequence[Log]) -> tuple[NetworkMod
     )
     parameters = dict(network.parameters) | {room: prior_of_logs}
     note = f"{room} of the network: {value:.1f} degC, within {sd:.1f}, as {name} of the logs reads"
-    return NetworkModel(network.model_copy(update={"parameters": parameters})), [note]
+    return type(model)(network.model_copy(update={"parameters": parameters})), [note]
 
 
 def _is_room(name: str, unit: str) -> bool:

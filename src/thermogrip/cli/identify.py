@@ -208,15 +208,16 @@ def _read(
     if network is None and not shipped:
         return read(), None
     from thermogrip.sysid.data.shipped_networks import in_columns, shipped_network
-    from thermogrip.sysid.models.network import NetworkModel
     from thermogrip.sysid.plant.log_grid import roles_of
 
-    logs = read() if network is None else read(known=roles_of(network))
-    matching = network
     if network is None:
-        matching = shipped_network(logs)
-    elif isinstance(network, NetworkModel):
-        matching = in_columns(network, logs[0])
+        logs = read()
+        matching: GreyModel | None = shipped_network(logs)
+    else:
+        from thermogrip.sysid.models.network import NetworkModel
+
+        logs = read(known=roles_of(network))
+        matching = in_columns(network, logs[0]) if isinstance(network, NetworkModel) else network
     # what a network calls its own has the role that it has there
     return (logs if matching is network or matching is None else read(known=roles_of(matching))), matching
 
