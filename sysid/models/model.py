@@ -20,7 +20,7 @@ from dataclasses import dataclass, fields
 from typing import Any, ClassVar, NamedTuple, Protocol, Self, runtime_checkable
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from thermogrip.datasets.arrays import Array, Run, Values
 from thermogrip.datasets.errors import UserError, reading
@@ -295,14 +295,13 @@ class Described:
         readings = dict(zip(self.outputs, np.where(is_read, y, np.nanmean(y)).tolist()))
         guess = np.array([readings.get(name, np.nanmean(y)) for name in self.states])
 
-        def residuals(z: Array, p: Array) -> Array:
-            """Return the residuals (k, B, n_r) at z (k, B, n_z), of parameters p (k, n_p)."""
+        def residuals(z: Array, which: NDArray[np.int_]) -> Array:
             z = z * scale
             inputs: list[Any] = list(u)
             for column, k in enumerate(moved, n_x):
                 inputs[k] = z[..., column]
             x = list(np.moveaxis(z[..., :n_x], -1, 0))
-            flow, read = self.balance(x, inputs, list(d), list(p.T[:, :, None]))
+            flow, read = self.balance(x, inputs, list(d), list(p[which].T[:, :, None]))
             away = [weights.flow * flow, (weights.sensor * (read - y))[..., is_read]]
             away.append((weights.input * (z[..., n_x:] - u[moved])) / scale[n_x:])
             return np.concatenate([*away, weights.level * (z[..., :n_x] - guess)], axis=-1)
@@ -310,23 +309,33 @@ class Described:
         # a plant at rest was held by some input v inside its range, not necessarily that of the first row:
         # min |flow(x, v)|^2 + w_y |y - output(x)|^2 + w_u |v - u|^2
         z = np.tile(np.clip(np.append(guess, u[moved]) / scale, low, high), (len(p), 1))
-        unsettled = np.arange(len(p))  # each until it has settled by itself, whoever is beside it
-        for _ in range(REST_STEPS):
-            around = z[unsettled][:, None] + np.vstack([np.zeros(scale.size), 1e-4 * np.eye(scale.size)])
-            rows = residuals(around, p[unsettled])
-            slopes = np.nan_to_num((rows[:, 1:] - rows[:, :1]).transpose(0, 2, 1) / 1e-4)
-            move = _bounded_moves(slopes, rows[:, 0], z[unsettled], low, high)
-            before = np.sum(rows[:, 0] ** 2, axis=1) * (1 + 1e-9)
-            for _ in range(10):  # halved where the residuals would grow
-                after = np.sum(residuals((z[unsettled] + move)[:, None], p[unsettled])[:, 0] ** 2, axis=1)
-                if (after <= before).all():
-                    break
-                move[~(after <= before)] *= 0.5
-            z[unsettled] += move
-            unsettled = unsettled[~(np.abs(move).max(axis=1) < 1e-6)]
-            if not unsettled.size:
+        return np.asarray(gauss_newton(residuals, z, low, high)[:, :n_x] * scale[:n_x])
+
+
+def gauss_newton(
+    residuals: Callable[[Array, NDArray[np.int_]], Array], z: Array, low: Array, high: Array
+) -> Array:
+    """Return the z (k, n) of least squares of each member's residuals, within the bounds; ``residuals(z (k,
+    B, n), which)`` are (k, B, m), of the members ``which`` (k,)."""
+    unsettled = np.arange(
+        len(z) if z.size else 0
+    )  # each until it has settled by itself, whoever is beside it
+    for _ in range(REST_STEPS):
+        if not unsettled.size:
+            break
+        around = z[unsettled][:, None] + np.vstack([np.zeros(len(low)), 1e-5 * np.eye(len(low))])
+        rows = residuals(around, unsettled)
+        slopes = np.nan_to_num((rows[:, 1:] - rows[:, :1]).transpose(0, 2, 1) / 1e-5)
+        move = _bounded_moves(slopes, rows[:, 0], z[unsettled], low, high)
+        before = np.sum(rows[:, 0] ** 2, axis=1) * (1 + 1e-9)
+        for _ in range(10):  # halved where the residuals would grow
+            after = np.sum(residuals((z[unsettled] + move)[:, None], unsettled)[:, 0] ** 2, axis=1)
+            if (after <= before).all():
                 break
-        return np.asarray(z[:, :n_x] * scale[:n_x])
+            move[~(after <= before)] *= 0.5
+        z[unsettled] += move
+        unsettled = unsettled[~(np.abs(move).max(axis=1) < 1e-6)]
+    return z
 
 
 def _bounded_moves(jacobian: Array, residual: Array, z: Array, low: Array, high: Array) -> Array:

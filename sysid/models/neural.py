@@ -23,10 +23,10 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from thermogrip.datasets.arrays import Array, Values
-from thermogrip.sysid.models.model import BlackBox
+from thermogrip.sysid.models.model import BlackBox, gauss_newton
 from thermogrip.sysid.models.state_space import dot, join_columns
 
 _RAILS = ("low", "high")
@@ -123,22 +123,16 @@ class NeuralModel(BlackBox):
         z[:, is_read] = y[is_read]
         weight = np.where(np.array(free) < n, 1e-4, 1e-2)
 
-        def misfit(z: Array) -> Array:
-            x, w = z[:, :n], z[:, n:]
-            t = np.tanh(_batched_product(self.W, x) + _batched_product(self.U, w) + self.b)
-            moves = _batched_product(self.B, w) + self.c + _batched_product(self.V, t)
-            return np.hstack([_batched_product(self.A, x) + moves - x, weight * (z[:, free] - z0)])
+        def misfit(move: Array, of: NDArray[np.int_]) -> Array:
+            moved_z = np.repeat(z[of][:, None], move.shape[1], axis=1)
+            moved_z[..., free] += move
+            x, w = moved_z[..., :n], moved_z[..., n:]
+            t = np.tanh(_products(self.W[of], x) + _products(self.U[of], w) + self.b[of][:, None])
+            steps = _products(self.B[of], w) + self.c[of][:, None] + _products(self.V[of], t)
+            return np.concatenate([_products(self.A[of], x) + steps - x, weight * move], axis=-1)
 
-        z0 = z[:, free]
-        for _ in range(12 if free else 0):
-            miss = misfit(z)
-            slopes = np.empty((*miss.shape, len(free)))
-            for slope, column in enumerate(free):
-                beside = z.copy()
-                beside[:, column] += 1e-5
-                slopes[:, :, slope] = (misfit(beside) - miss) / 1e-5
-            step = np.stack([np.linalg.lstsq(J, -r, rcond=None)[0] for J, r in zip(slopes, miss)])
-            z[:, free] += np.clip(step, -1.0, 1.0)
+        ends = np.full(len(free), np.inf)
+        z[:, free] += gauss_newton(misfit, np.zeros((members, len(free))), -ends, ends)
         return np.asarray(z[:, :n]).ravel()
 
     def states(self, x0: Array, u: Array, d: Array, times: int = 1) -> Array:
@@ -183,8 +177,8 @@ class NeuralModel(BlackBox):
         return after
 
 
-def _batched_product(matrices: Array, vectors: Array) -> Array:
-    return np.asarray(np.einsum("kij,kj->ki", matrices, vectors))
+def _products(matrices: Array, vectors: Array) -> Array:
+    return np.asarray(np.einsum("kij,kbj->kbi", matrices, vectors))
 
 
 def _tanh(value: Any) -> Any:
