@@ -75,6 +75,7 @@ class ArmaxSearch(Search):
 
     origin = "armax"
     noise_per_pole = 1  # C
+    solve = staticmethod(solve_armax)
 
     def starts(self, records: Records, na: int) -> list[Array]:
         """Return where the search for C begins: at that of ARX, and where that for A would."""
@@ -82,7 +83,7 @@ class ArmaxSearch(Search):
 
     def __call__(self, records: Records, na: int, nb: int, delay: int) -> Filter | None:
         """Return the best stable filter of this structure, None where no start leads to one."""
-        best = self._search(records, na, nb, delay, partial(solve_armax, records=records, nb=nb, delay=delay))
+        best = self._search(records, na, nb, delay)
         if best is None or not is_stable(best.shared[:na]):
             return None
         # constant and initial conditions are fitted to the free run

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import product
 from operator import attrgetter
 
@@ -294,26 +295,26 @@ class Search:
 
     origin = "oe"
     noise_numbers, noise_per_pole = 0, 0  # of the model of the noise
+    solve: Callable[..., Solution | None] = staticmethod(solve)  # at a denominator
 
     def __init__(self) -> None:
         self._found: dict[int, list[Array]] = {}
 
     def __call__(self, records: Records, na: int, nb: int, delay: int) -> Filter | None:
         """Return the best stable filter of this structure, None where no start leads to one."""
-        best = self._search(records, na, nb, delay, lambda a: solve(a, records, nb, delay))
+        best = self._search(records, na, nb, delay)
         return None if best is None else best.filter(records, nb, delay)
 
     def starts(self, records: Records, na: int) -> list[Array]:
         """Return denominators where the search begins, beside that of ARX."""
         return [*real_pole_starts(records, na), *map(with_pole, self._found.get(na - 1, [])[:1])]
 
-    def _search(
-        self, records: Records, na: int, nb: int, delay: int, at: Callable[[Array], Solution | None]
-    ) -> Solution | None:
+    def _search(self, records: Records, na: int, nb: int, delay: int) -> Solution | None:
         # The first structure of an order starts from ARX, from real poles at several time constants and from
         # the order below with one fast pole more; all go a few steps, the best two to the end.  Every other
         # starts from its own ARX fit and from denominators found so far: one that suits one delay is a few
         # steps from that of another.
+        at = partial(self.solve, records=records, nb=nb, delay=delay)
         denominators = self._found.get(na, [])
         starts = denominators or self.starts(records, na)
         regressed = arx_start(records, na, nb, delay)

@@ -20,10 +20,6 @@ explain of the error of parts held out.
 
 **Good** (`identify`).  Over all parts held out, and over the logs of the fit, each output errs by less than
 half of the error without input, and so does it on another run.
-
-**A free run** (`validate`) is judged by size (``docs/explanation/validation.md``). By its error e, that of
-the best decay without input b, and the stated error X with its ends it is better, as stated, worse, of
-another plant or no test.
 """
 
 from __future__ import annotations
