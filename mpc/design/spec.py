@@ -60,6 +60,10 @@ def _both_ends(value: Any) -> Any:
 Ends = Annotated[Range, BeforeValidator(_both_ends)]
 
 
+_SETTLED_BY = 0.75  # of a step that is simulated
+_LONGEST_S = 36000.0  # of one
+
+
 class Spec(BaseModel):
     """What is wanted of a controller; the defaults are those of :data:`SPEC_TEMPLATE`."""
 
@@ -75,7 +79,7 @@ class Spec(BaseModel):
     band_degC: Positive = 0.25  # half width of the settling band
     overshoot_degC: Positive = 0.3  # largest
     bias_degC: Positive = 0.05  # largest mean error at the end
-    hold_s: Annotated[float, Field(ge=10, le=36000)] = 600.0  # how long a step is simulated
+    hold_s: Annotated[float, Field(ge=10, le=_LONGEST_S)] = 600.0  # how long a step is simulated
     energy_weight: NotNegative = 0.0  # seconds of settling that are worth one second at full drive
     moves_weight: NotNegative = 0.002  # share of the minimum time that is worth one move by a full drive less
     # times the moves of the default design, beyond which moves are charged as overshoot is; 0: no limit
@@ -119,13 +123,25 @@ class Spec(BaseModel):
         if "settle_within_s" in self.model_fields_set and self.settle_within_s > self.hold_s:
             too_long = f"longer than each step is simulated (hold_s, {self.hold_s:g} s)"
             raise ValueError(f"settle_within_s: {self.settle_within_s:g} s is {too_long}")
-        for name, relay in (self.relays or {}).items():
-            least = relay.on_s + relay.off_s + relay.dead_s
-            if least > self.settle_within_s:
-                raise ValueError(
-                    f"relays: {name} goes on and off in {least:g} s, longer than settle_within_s"
-                )
         return self
+
+    @model_validator(mode="before")
+    @classmethod
+    def _held_until_settled(cls, content: Any) -> Any:
+        settle_s = content.get("settle_within_s") if isinstance(content, Mapping) else None
+        if not isinstance(settle_s, int | float) or "hold_s" in content:
+            return content
+        held_s = max(settle_s / _SETTLED_BY, cls.model_fields["hold_s"].default)
+        return {"hold_s": min(held_s, _LONGEST_S), **content}
+
+    def completed(self, plant: Plant) -> Spec:
+        """Return the spec with what is wanted of this plant (:meth:`of`) in place of what nobody said."""
+        usual = Spec.of(plant)
+        content = {key: getattr(usual, key) for key in usual.model_fields_set}
+        given = {key: getattr(self, key) for key in self.model_fields_set}
+        if "hold_s" in given:
+            content["settle_within_s"] = min(usual.settle_within_s, _SETTLED_BY * self.hold_s)
+        return Spec(**content | given)
 
     @classmethod
     def of(cls, plant: Plant) -> Spec:
@@ -151,14 +167,14 @@ class Spec(BaseModel):
             least = cls.model_fields[key].default
             wanted[key] = float(f"{max(least, share * (above - below)):.2g}")
         wanted["settle_within_s"] = float(f"{np.clip(3 * max(times.values()), 7.5, 27000):.2g}")
-        wanted["hold_s"] = float(f"{wanted['settle_within_s'] / 0.75:.2g}")
+        wanted["hold_s"] = float(f"{wanted['settle_within_s'] / _SETTLED_BY:.2g}")
         if plant.room is not None:
             wanted["ambient_degC"] = round(min(max(plant.room, -20.0), 150.0), 1)
         return cls(**wanted)
 
     def in_toml(self) -> str:
         """Return the template with these values."""
-        text = SPEC_TEMPLATE.replace("are the defaults", "are what tune takes for the plant")
+        text = SPEC_TEMPLATE
         for key in sorted(self.model_fields_set):
             line = f"{key} = {json.dumps(getattr(self, key))} ".ljust(27)
             text = re.sub(rf"(?m)^(?:# )?{key} = [^#\n]*", line, text)
@@ -221,6 +237,11 @@ class Spec(BaseModel):
         counted = {name: weights.get(name, 1.0) * design.weights.get(name, 1.0) for name in design.controlled}
         values["weights"] = {name: weight for name, weight in counted.items() if weight != 1.0}
         values |= {"zones": dict(self.zones or {}), "hard": tuple(self.hard or ())}
+        for name, relay in (self.relays or {}).items():
+            least = relay.on_s + relay.off_s + relay.dead_s
+            if least > self.settle_within_s:
+                slow = f"relays: {name} goes on and off in {least:g} s, longer than settle_within_s"
+                raise UserError(slow, hint="ask for less, or for shorter times")
         values |= {"iterations": self.iterations, "relays": dict(self.relays or {})}
         values["energy_price"] = _by_drive("energy_price", self.energy_price, drives)
         values["safe_drive"] = _by_drive("safe_drive", self.safe_drive, drives)

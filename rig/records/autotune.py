@@ -281,12 +281,12 @@ class Autotune:
         from thermogrip.mpc.tuning.tune import tune
 
         plant = self.found.plant
-        targets, spec = self._targets(plant), self.spec
-        if spec is None:
-            begin = [self.known["start"].get(name, goal) for name, goal in targets.items()]
-            step = float(np.mean(begin)), float(np.mean(list(targets.values())))
-            wanted = Spec.of(plant).model_dump(exclude_unset=True)
-            spec = Spec(**(wanted | {"steps": [step], "output": list(targets)}))
+        targets, spec = self._targets(plant), self.spec or Spec()
+        begin = [self.known["start"].get(name, goal) for name, goal in targets.items()]
+        step = float(np.mean(begin)), float(np.mean(list(targets.values())))
+        wanted: dict[str, Any] = {"steps": [step], "output": list(targets)}
+        wanted |= spec.model_dump(exclude_unset=True)
+        spec = Spec(**wanted).completed(plant)
         switched = {name: relay for name, relay in self.relays.items() if name in plant.inputs}
         spec = spec.model_copy(update={"relays": switched or None})
         self.tuning = tune(plant, spec, progress=self._part(0.5, 0.9), seed=self.seed)

@@ -47,7 +47,7 @@ def tune(
     from thermogrip.mpc.tuning.tune import tune as search
 
     loaded = cli.load_plant(plant, network)
-    wanted = Spec.of(loaded) if spec is None else read_spec(spec)
+    wanted = (Spec() if spec is None else read_spec(spec)).completed(loaded)
     console = Console(as_json)
     if spec is None:
         regulated = " and ".join(wanted.design(loaded).controlled)

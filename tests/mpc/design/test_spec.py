@@ -76,7 +76,7 @@ def test_every_line_of_the_template_that_is_commented_out_is_valid_too():
         ("evaluations = 10001", "evaluations: input should be less than or equal to 10000"),
         ("drive_limits = { q = [5, 5] }", "drive_limits.q: 5 to 5 is empty"),
         ("drive_limits = [-2e12, 1]", "greater than or equal to -1000000000000"),
-        ("settle_within_s = 900", "settle_within_s: 900 s is longer than each step is simulated"),
+        ("settle_within_s = 900\nhold_s = 600", "settle_within_s: 900 s is longer than each step is"),
     ],
 )
 def test_a_mistake_in_the_spec_is_one_line_that_names_file_and_key(tmp_path, text, key):
@@ -206,6 +206,20 @@ def test_a_plant_without_a_skin_gets_steps_inside_its_logs():
     assert (spec.band_degC, spec.overshoot_degC, spec.bias_degC, spec.output) == (0.3, 0.6, 0.12, None)
     spec.design(board)  # fits
     assert spec_from_dict(tomllib.loads(spec.in_toml())) == spec
+
+
+def test_what_a_file_does_not_say_is_taken_for_the_plant():
+    board = network_plant("tclab", t1=(20.0, 60.0), t2=(30.0, 70.0))
+    usual = Spec.of(board)
+    assert Spec().completed(board) == usual
+    slow = spec_from_dict({"settle_within_s": 7200, "relays": {"q1": {"on_s": 300.0, "off_s": 300.0}}})
+    completed = slow.completed(board)
+    assert (completed.steps, completed.band_degC) == (usual.steps, usual.band_degC)
+    assert (completed.settle_within_s, completed.hold_s) == (7200.0, 9600.0)
+    assert completed.design(board).relays["q1"].on_s == 300.0
+    assert spec_from_dict({"hold_s": 100.0}).completed(board).settle_within_s == 75.0
+    with pytest.raises(UserError, match="q1 goes on and off in 600 s, longer than settle_within_s"):
+        spec_from_dict({"relays": slow.relays}).completed(board).design(board)
 
 
 def test_a_spec_of_a_plant_asks_for_three_times_what_its_slowest_output_takes_by_itself():
