@@ -2,7 +2,7 @@
 
 A name is half of the evidence of a role, the course of the column is the other half:
 
-* an output responds to an input, or to another output that does;
+* an output responds to an input;
 * an input makes an output respond; it is no reading of another input, no total, not computed from readings;
 * a disturbance does not respond to an input;
 * what is left out never moves, counts, is one signal with another column or computed from some, is a set
@@ -216,8 +216,6 @@ def role_doubts(
     }
     guessed = [name for name in moving if name in reasons and not reasons[name].startswith(tuple(sound))]
     moved = [name for name in outputs if is_moved(columns, name, inputs)]
-    while more := [n for n in outputs if n not in moved and is_moved(columns, n, moved)]:
-        moved += more
     read = [*outputs, *disturbances]
     for name in [name for name in inputs if name in guessed]:
         what = _unlike_an_input(name, columns, [n for n in inputs if n != name], outputs, read)
@@ -231,11 +229,9 @@ def role_doubts(
         if is_moved(columns, name, inputs, at_lags=all):
             yield f"{name} is taken as disturbance ({reasons[name]}), but responds to {', '.join(inputs)}"
     for name in [name for name in others if name in guessed and not only_rises(columns[name])]:
-        if name in goals and is_held(columns[name]):
-            # a reading comes to it, or a drive responds to it
-            followed = any(comes_to(columns[n], columns[name]) for n in outputs)
-            if followed or any(is_moved(columns, n, [name]) for n in inputs):
-                continue
+        is_goal = name in goals and is_held(columns[name])
+        if is_goal and any(comes_to(columns[n], columns[name]) for n in outputs):
+            continue
         # what is held like a drive may be the drive, and the input with a name its reading
         beside = [] if is_held(columns[name]) else inputs
         helped = next((n for n in outputs if helps_beside(columns, name, n, beside)), None)

@@ -477,7 +477,7 @@ def _reading_doubts(roles: Mapping[str, str], log: _Repaired) -> list[str]:
     for name, values in drives.items():
         doubts += [repair.doubt_levels(name, values), repair.doubt_moves(name, values)]
     for name in [name for name in readings if roles[name] == "output"]:
-        doubts.append(repair.doubt_rows(name, readings[name], inputs))
+        doubts.append(repair.doubt_rows(name, readings[name]))
         doubts += [repair.doubt_lead(name, readings[name], *drive, log.time) for drive in drives.items()]
     of_role = ([n for n in log.columns if roles[n] == role] for role in ("input", "output", "disturbance"))
     doubts += effect_doubts(log.columns, *of_role)

@@ -34,7 +34,6 @@ _CODE_JUMP, _STUCK_CHANCE = 5.0, 1e-3  # times what other rows rarely move; of a
 SPIKE_FLOOR_K = 0.6  # the least deviation of a temperature that can be a spike
 SPIKE_WINDOW = 21  # samples of the running median
 SPIKE_LENGTH = 3  # samples at most of a spike
-_SLOW_ROWS = 60.0  # s
 GAP_SECONDS = 10.0  # of the least gap
 GAP_STEPS = 5.0  # median steps of the rows, of the least gap
 _REPEATED = 32  # rows with moves in most of them, that are not alike by chance
@@ -134,20 +133,16 @@ def describe_gaps(time: Floats, inputs: dict[str, Floats]) -> list[str]:
     """Return a line a gap, with the inputs before and after it."""
     repairs = []
     for row in gap_rows(time):
-        moved = ", ".join(
-            f"{name} {values[row]:g} before, {values[row + 1]:g} after" for name, values in inputs.items()
-        )
-        length = time[row + 1] - time[row]
-        repairs.append(
-            f"gap of {length:.2f} s from {time[row]:.2f} to {time[row + 1]:.2f} s"
-            + (f" ({moved})" if moved else "")
-        )
+        before, after = time[row : row + 2]
+        moved = ", ".join(f"{name} {u[row]:g} before, {u[row + 1]:g} after" for name, u in inputs.items())
+        says = f"gap of {after - before:.2f} s from {before:.2f} to {after:.2f} s"
+        repairs.append(f"{says} ({moved})" if moved else says)
     return repairs
 
 
-def find_spikes(values: Floats, *, floor: float | None, step: float = 0.0) -> NDArray[np.bool_]:
+def find_spikes(values: Floats, *, floor: float | None) -> NDArray[np.bool_]:
     """Return which samples (n,) of a channel are spikes; NaN is skipped.  ``floor`` is the
-    least deviation that can be one, None to derive it from the channel; ``step`` is that of the rows [s]."""
+    least deviation that can be one, None to derive it from the channel."""
     spikes = np.zeros(values.shape, dtype=bool)
     finite_rows = np.flatnonzero(np.isfinite(values))
     if finite_rows.size < SPIKE_WINDOW:
@@ -167,12 +162,6 @@ def find_spikes(values: Floats, *, floor: float | None, step: float = 0.0) -> ND
         stops = takewhile(lambda stop: is_far[stop - 1], range(start + 1, start + SPIKE_LENGTH + 1))
         stop = next((stop for stop in stops if _leaves_and_returns(good, start, stop, threshold)), start)
         spikes[finite_rows[start:stop]] = True
-    # in rows of a minute or more a plant moves and comes back by itself: there a spike is beyond all other
-    # samples by more than their range
-    if step >= _SLOW_ROWS and spikes.any():
-        others = good[~spikes[finite_rows]]
-        low, high = float(others.min()), float(others.max())
-        spikes[finite_rows] &= (good < low - (high - low)) | (good > high + (high - low))
     return spikes
 
 
@@ -204,9 +193,7 @@ def doubt_readings(name: str, values: Floats, inputs: Sequence[Floats], time: Fl
             return f"{says}: if that is a sensor's code, leave those cells empty"
     value, held = _longest_standstill(values, moves)
     if held >= SPIKE_WINDOW:
-        return (
-            f"{name} is held at {value:g} for {held} rows, as where its sensor ends: leave those cells empty"
-        )
+        return f"{name} is held at {value:g} for {held} rows, as where a sensor ends: leave those cells empty"
     row = int(np.nanargmax(moves))
     before, after = values[max(row - SPIKE_WINDOW, 0) : row + 1], values[row + 1 : row + 1 + SPIKE_WINDOW]
     stays = np.abs(np.nanmedian(after) - np.nanmedian(before)) > moves[row] / 2
@@ -308,18 +295,15 @@ def doubt_lead(name: str, values: Floats, drive: str, moved: Floats, time: Float
     return f"{name} moves {ahead:g} s before {drive} does: are their clocks alike?"
 
 
-def doubt_rows(name: str, values: Floats, inputs: Sequence[Floats]) -> str:
+def doubt_rows(name: str, values: Floats) -> str:
     """Return the doubt on an output that is read in n-th rows only, held or drawn straight between."""
-    finite = values[np.isfinite(values)]
-    if finite.size < values.size or not finite.size:
+    if np.isnan(values).any():
         return ""
-    driven = np.concatenate([np.flatnonzero(np.diff(u)) for u in inputs]) if inputs else np.empty(0)
     for between, goes_on in _goes_on(values).items():
         rows = np.flatnonzero(~goes_on)
         if rows.size < SPIKE_WINDOW or (n := int(np.median(np.diff(rows)))) < 2:
             continue
-        by_inputs = np.isin(rows, np.concatenate([driven - 1, driven, driven + 1])).mean() > 0.5
-        if np.bincount(rows % n).max() > (1 - _FEW) * rows.size and not by_inputs:
+        if np.bincount(rows % n).max() > (1 - _FEW) * rows.size:
             return f"{name} is read in every {n}th row only, {between} in those between: average the log"
     return ""
 
@@ -401,7 +385,7 @@ def reject_spikes(
     name: str, values: Floats, time: Floats, *, floor: float | None
 ) -> tuple[Floats, list[str]]:
     """Return the channel with its spikes as NaN, and what was found."""
-    spikes = find_spikes(values, floor=floor, step=float(np.median(np.diff(time))))
+    spikes = find_spikes(values, floor=floor)
     if not spikes.any():
         return values, []
     worst = ", ".join(f"{values[row]:g} at {time[row]:.2f} s" for row in np.flatnonzero(spikes)[:5])

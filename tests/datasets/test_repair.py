@@ -75,21 +75,6 @@ def test_what_is_a_spike_and_what_is_not(values, floor, spikes):
 
 
 @pytest.mark.parametrize(
-    ("value", "step", "spike"),
-    [(29.9, 59.9, True), (29.9, 60.0, False), (30.1, 60.0, True), (14.9, 60.0, True), (15.1, 60.0, False),
-     (-127.0, 3600.0, True)],
-)  # fmt: skip
-def test_in_slow_rows_a_spike_lies_outside_of_all_other_samples_by_more_than_their_range(value, step, spike):
-    hours = np.repeat([20.0, 25.0, 20.0, 22.0], 25)  # of 20 to 25, beyond by more than 5
-    hours[60] = value
-    spikes = find_spikes(hours, floor=0.6, step=step)
-    assert spikes[60] == spike
-    assert spikes.sum() == spike
-    rejected, _ = reject_spikes("t", hours, step * np.arange(100.0), floor=0.6)
-    assert np.isnan(rejected).sum() == spike
-
-
-@pytest.mark.parametrize(
     ("celsius", "words"),
     [
         (25.0, ""),
