@@ -92,8 +92,8 @@ class Grade(NamedTuple):
 # be.  Evidence differs by some ten nats between grades, so that their odds barely count.  Log loss of
 # disturbed grasps (two finite-volume fingers; the rig): .66, .47; without the last three .74, .51.
 # Of an object one thing is likelier to be otherwise than all: a sheet in place of a block stores less and is
-# else a block, and two sds are one of 0.4 mm.  Sheets of 1.5 mm have intervals of 2.4 in ln e (without 3.1)
-# and a log loss of .33 (.68); without all at once that of a second time constant is 1.36 (.67).
+# else a block, and two sds are one of 0.4 mm.  Sheets of 1.5 mm have intervals of 2.4 in ln e (without 3.1),
+# on the rig a log loss of .33 (.68); without all at once that of a second time constant is 1.36 (.67).
 # An outsider may be a known material at another temperature than was stated.  With one misstatement in a
 # hundred, of 3 K, grasps of the examples that are stated 5 K off have a log loss of .05 (without .35), and
 # cork's p_unknown stays .98; one in twenty, of anything within 20 K, takes it to .21.
@@ -239,9 +239,15 @@ def graded(data: Touches, grades: Sequence[Grade]) -> Touches:
     def of_grade(one: Touches, second: Touches | None) -> Touches:
         t_object_sd = np.where(misstated_K > 0, np.fmax(one.t_object_sd, misstated_K), one.t_object_sd)
         return replace(
-            one, second=second, share=share, unlike=unlike, since=since, thin=thin, t_object_sd=t_object_sd,
+            one,
+            second=second,
+            share=share,
+            unlike=unlike,
+            since=since,
+            thin=thin,
+            t_object_sd=t_object_sd,
             question=question,
-        )  # fmt: skip
+        )
 
     return of_grade(every, None if every.second is None else of_grade(every.second, None))
 
