@@ -249,10 +249,11 @@ class RestWeights:
     level: float = 1e-6  # of what is away from a first guess
 
 
-REST_STEPS = 50  # at most; what is bilinear settles in three or four
+_REST_STEPS = 50  # at most; what is bilinear settles in three or four
+_AHEAD = 1e-5  # of a unit: the difference of slopes
 
 
-class Described:
+class Described(ABC):
     """The part of a :class:`GreyModel` that its tables answer: ``inputs``, ``disturbances``, ``outputs`` and
     ``parameters`` by name, ``name`` and ``dt``; and the state at rest, by what a model says of it."""
 
@@ -271,9 +272,9 @@ class Described:
         self.nuisance: dict[str, float] = {name: item.log_sd for name, item in sensors}
         self.prior = np.array([item.value for item in self.specs.values()])  # (n_p,), median or mean
 
+    @abstractmethod
     def balance(self, x: list[Any], u: list[Any], d: list[Any], p: list[Any]) -> tuple[Array, Array]:
         """Return what flows to each state (..., n_x) and what the outputs read (..., n_y), at rows."""
-        raise NotImplementedError
 
     def rest(self, y: ArrayLike, u: ArrayLike, d: ArrayLike, p: ArrayLike) -> Array:
         """Return the state (n_x,) of a plant at rest whose sensors read y."""
@@ -302,9 +303,13 @@ class Described:
                 inputs[k] = z[..., column]
             x = list(np.moveaxis(z[..., :n_x], -1, 0))
             flow, read = self.balance(x, inputs, list(d), list(p[which].T[:, :, None]))
-            away = [weights.flow * flow, (weights.sensor * (read - y))[..., is_read]]
-            away.append((weights.input * (z[..., n_x:] - u[moved])) / scale[n_x:])
-            return np.concatenate([*away, weights.level * (z[..., :n_x] - guess)], axis=-1)
+            misses = [
+                weights.flow * flow,
+                (weights.sensor * (read - y))[..., is_read],
+                weights.input * (z[..., n_x:] - u[moved]) / scale[n_x:],
+                weights.level * (z[..., :n_x] - guess),
+            ]
+            return np.concatenate(misses, axis=-1)
 
         # a plant at rest was held by some input v inside its range, not necessarily that of the first row:
         # min |flow(x, v)|^2 + w_y |y - output(x)|^2 + w_u |v - u|^2
@@ -317,18 +322,16 @@ def gauss_newton(
 ) -> Array:
     """Return the z (k, n) of least squares of each member's residuals, within the bounds; ``residuals(z (k,
     B, n), which)`` are (k, B, m), of the members ``which`` (k,)."""
-    unsettled = np.arange(
-        len(z) if z.size else 0
-    )  # each until it has settled by itself, whoever is beside it
-    for _ in range(REST_STEPS):
+    unsettled = np.arange(len(z) if z.size else 0)  # each until it has settled, whoever is beside it
+    ahead = np.vstack([np.zeros(len(low)), _AHEAD * np.eye(len(low))])
+    for _ in range(_REST_STEPS):
         if not unsettled.size:
             break
-        around = z[unsettled][:, None] + np.vstack([np.zeros(len(low)), 1e-5 * np.eye(len(low))])
-        rows = residuals(around, unsettled)
-        slopes = np.nan_to_num((rows[:, 1:] - rows[:, :1]).transpose(0, 2, 1) / 1e-5)
+        rows = residuals(z[unsettled][:, None] + ahead, unsettled)
+        slopes = np.nan_to_num((rows[:, 1:] - rows[:, :1]).transpose(0, 2, 1) / _AHEAD)
         move = _bounded_moves(slopes, rows[:, 0], z[unsettled], low, high)
-        before = np.sum(rows[:, 0] ** 2, axis=1) * (1 + 1e-9)
-        for _ in range(10):  # halved where the residuals would grow
+        before = np.sum(rows[:, 0] ** 2, axis=1) * (1 + 1e-9)  # rounding is no growth
+        for _ in range(10):  # halved where the residuals would grow, to a thousandth
             after = np.sum(residuals((z[unsettled] + move)[:, None], unsettled)[:, 0] ** 2, axis=1)
             if (after <= before).all():
                 break
