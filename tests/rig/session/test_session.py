@@ -237,7 +237,8 @@ def test_of_several_targets_the_worst_figures_are_the_sessions() -> None:
         target={"a": 30.0, "b": 20.0},
         column=columns.__getitem__,
         events=[],
-        trip=None, cycle_s=0.0,
+        trip=None,
+        cycle_s=0.0,
         log=lambda: None,
     )
     found = _session_of(run, "not settled", None, 0.25)
