@@ -17,7 +17,6 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from functools import cache
 from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
@@ -212,14 +211,9 @@ def _check_relays(design: Design, plant: Plant) -> None:
 def _validated(content: Mapping[str, Any]) -> Design:
     """Return the design of plain values; a missing or wrong field is a :class:`UserError` that names it."""
     try:
-        return _adapter().validate_python(content)
+        return TypeAdapter(Design).validate_python(content)
     except ValidationError as error:
         raise UserError(problem_of(error), hint="correct the spec or tune again") from error
-
-
-@cache
-def _adapter() -> TypeAdapter[Design]:
-    return TypeAdapter(Design)
 
 
 def problem_of(error: ValidationError) -> str:

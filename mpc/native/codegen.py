@@ -18,7 +18,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from thermogrip.mpc.plant.prediction import symbolic_slope, symbolic_step
+from thermogrip.mpc.plant.prediction import symbolic_step
 
 if TYPE_CHECKING:
     from thermogrip.sysid.models.model import Model
@@ -201,14 +201,12 @@ def _graph(model: Model, drives: Sequence[int], h: float) -> Any:
     sizes = (len(model.parameters), model.n_x, len(drives), n_d)
     p, x, u, d = (ca.SX.sym(letter, n) for letter, n in zip("pxud", sizes))
     sx, su, sd = (ca.SX.sym("s" + letter, n) for letter, n in zip("xud", sizes[1:]))
-    point = (x, u, d)
-    about = model, drives, point, ca.vertsplit(p) if p.numel() else [], h
     # a dense Jacobian of an implicit step takes ten times the work of the step for every sample; a dozen
     # tangents that share their partial derivatives take two or three
     directions = [(sx, 0 * su, 0 * sd), (sx, su, 0 * sd), (sx, su, sd)]
-    after, tangents = symbolic_step(*about), [symbolic_slope(*about, along) for along in directions]
-    results = ca.cse([ca.densify(item) for item in (after, *tangents)])
-    return ca.Function("model", [p, *point, sx, su, sd], results)
+    parameters = ca.vertsplit(p) if p.numel() else []
+    results = ca.cse(symbolic_step(model, drives, (x, u, d), parameters, h, *directions))
+    return ca.Function("model", [p, x, u, d, sx, su, sd], results)
 
 
 def _straight(function: Any) -> _Line:

@@ -32,10 +32,6 @@ def shared_constants() -> dict[str, float | tuple[float, ...]]:
 
 def shared_definitions() -> list[str]:
     """Return the lines that define the shared constants in C."""
-    return [f"#define TG_{name} {_c_literal(value)}" for name, value in sorted(shared_constants().items())]
-
-
-def _c_literal(value: float | tuple[float, ...]) -> str:
-    if isinstance(value, tuple):
-        return "{" + ", ".join(repr(float(v)) for v in value) + "}"
-    return f"({value!r})" if value < 0 else repr(value)
+    braces = str.maketrans("()", "{}")  # of a tuple
+    values = sorted(shared_constants().items())
+    return [f"#define TG_{name} {repr(value).translate(braces)}" for name, value in values]

@@ -229,15 +229,14 @@ class PredictionModel:
         """One sample from zero without drives and disturbances, where the step is linear; else None."""
         import casadi as ca
 
-        symbols = _symbols(self)
-        of_model = self.model, self.drive_index
+        symbols = [ca.SX.sym(name, n) for name, n in zip("xud", (self.n_x, self.n_u, self.n_d))]
         numbers = self.p.tolist(), self.dt / self.sub
-        after = symbolic_step(*of_model, symbols, *numbers)
+        (after,) = symbolic_step(self.model, self.drive_index, symbols, *numbers)
         if any(ca.which_depends(after, ca.vertcat(*symbols), 2, True)):
             return None
         # CasADi's own: once, which is not worth a compiled step
         for _ in range(1, self.sub):
-            after = symbolic_step(*of_model, [after, *symbols[1:]], *numbers)
+            (after,) = symbolic_step(self.model, self.drive_index, [after, *symbols[1:]], *numbers)
         blocks = [after, *(ca.densify(ca.jacobian(after, of)) for of in symbols)]
         from_zero = ca.Function("sample", symbols, blocks)(*(np.zeros(of.numel()) for of in symbols))
         at_zero, *derivatives = (np.asarray(value.full()) for value in from_zero)
@@ -245,8 +244,26 @@ class PredictionModel:
 
     @cached_property
     def _kernel(self) -> Kernel:
-        """The compiled step with its derivative in one direction."""
-        return _tangent_kernel(self)
+        """The compiled step with its derivative in one direction: of x, u, d, each with its direction."""
+        import casadi as ca
+
+        from thermogrip.sysid.models.jit_rollout import Kernel
+
+        C, level, n_x = self.C, self.output(np.zeros(self.n_x)), self.n_x
+
+        def step(x: Values, u: Values, d: Values, p: Values, h: Any) -> list[Any]:
+            halves = [(v[: len(v) // 2], v[len(v) // 2 :]) for v in (x, u, d)]
+            point, along = ([ca.vertcat(*half) for half in each] for each in zip(*halves))
+            numbers = self.p.tolist(), self.dt / self.sub
+            after, slope = symbolic_step(self.model, self.drive_index, list(point), *numbers, list(along))
+            return [*ca.vertsplit(after), *ca.vertsplit(slope)]
+
+        def output(x: Values, p: Values) -> list[Any]:
+            point, along = ca.vertcat(*x[:n_x]), ca.vertcat(*x[n_x:])
+            return [*ca.vertsplit(C @ point + level), *ca.vertsplit(C @ along)]
+
+        # parameters are numbers in the step, switches stay on
+        return Kernel(step, output, Sizes(2 * n_x, 2 * self.n_u, 2 * self.n_d, 0))
 
     @cached_property
     def _sample_directions(self) -> list[Array]:
@@ -342,32 +359,19 @@ class PredictionModel:
         return float(room_read[0]) if np.isfinite(room_read).any() else ROOM
 
 
-def _symbols(model: PredictionModel, prefix: str = "") -> list[Any]:
-    """Return CasADi's symbols for x, u, d."""
+def symbolic_step(
+    model: Model, drives: Sequence[int], point: Sequence[Any], p: Values, h: float, *directions: Sequence[Any]
+) -> list[Any]:
+    """Return the state after a step, inputs that are no ``drives`` on, and its derivatives, as symbols."""
     import casadi as ca
 
-    return [ca.SX.sym(prefix + name, n) for name, n in zip("xud", (model.n_x, model.n_u, model.n_d))]
-
-
-def symbolic_step(model: Model, drives: Sequence[int], point: Sequence[Any], p: Values, h: float) -> Any:
-    """Return the state after a step from x under u, d, inputs that are no ``drives`` on, of CasADi's
-    symbols."""
-    import casadi as ca
-
-    return ca.densify(ca.vertcat(*model.step(*_all_inputs(model, drives, point, 1.0), p, h)))
-
-
-def symbolic_slope(
-    model: Model, drives: Sequence[int], point: Sequence[Any], p: Values, h: float, along: Sequence[Any]
-) -> Any:
-    """Return the derivative of :func:`symbolic_step` along directions of x, of u, and of d."""
-    import casadi as ca
-
+    arguments = (*_all_inputs(model, drives, point, 1.0), p, h)
+    after = ca.densify(ca.vertcat(*model.step(*arguments)))
     if isinstance(model, OwnModel):
-        directions = _all_inputs(model, drives, along, 0.0)
-        return model.slope(*_all_inputs(model, drives, point, 1.0), p, h, directions)
-    after = symbolic_step(model, drives, point, p, h)
-    return ca.densify(ca.jtimes(after, ca.vertcat(*point), ca.vertcat(*along)))
+        slopes = [model.slope(*arguments, _all_inputs(model, drives, along, 0.0)) for along in directions]
+    else:
+        slopes = [ca.jtimes(after, ca.vertcat(*point), ca.vertcat(*along)) for along in directions]
+    return [after, *map(ca.densify, slopes)]
 
 
 def _all_inputs(
@@ -381,30 +385,6 @@ def _all_inputs(
     for place, value in zip(drives, u, strict=True):
         full[place] = value
     return x, full, d
-
-
-def _tangent_kernel(model: PredictionModel) -> Kernel:
-    """Return a step and its derivative in one direction, compiled: of x, u, d, each with its direction."""
-    import casadi as ca
-
-    from thermogrip.sysid.models.jit_rollout import Kernel
-
-    C, level = model.C, model.output(np.zeros(model.n_x))
-
-    def step(x: Values, u: Values, d: Values, p: Values, h: Any) -> list[Any]:
-        point, along = zip(
-            *((ca.vertcat(*v[: len(v) // 2]), ca.vertcat(*v[len(v) // 2 :])) for v in (x, u, d))
-        )
-        about = model.model, model.drive_index, point, model.p.tolist(), model.dt / model.sub
-        after, slope = symbolic_step(*about), symbolic_slope(*about, along)
-        return [*ca.vertsplit(after), *ca.vertsplit(slope)]
-
-    def output(x: Values, p: Values) -> list[Any]:
-        point, along = ca.vertcat(*x[: model.n_x]), ca.vertcat(*x[model.n_x :])
-        return [*ca.vertsplit(C @ point + level), *ca.vertsplit(C @ along)]
-
-    # parameters are numbers in the step, switches stay on
-    return Kernel(step, output, Sizes(2 * model.n_x, 2 * model.n_u, 2 * model.n_d, 0))
 
 
 @lru_cache(maxsize=64)

@@ -311,6 +311,7 @@ class OwnSettings:
     sensor_sd: float = 0.02  # of an output's spread in the logs, where the class states no sd
     # argument of a root, below which its slope is that of the chord: the difference of ``linearise_plant``
     chord: float = 1e-3
+    tie: float = 1e-9  # difference of two values that are one but for rounding
     # of a rate times a step: from where on the Runge-Kutta rule grows, and where it damps most, the root of
     # 1 + z + z^2 / 2 + z^3 / 6
     unstable: float = 2.785
@@ -381,6 +382,11 @@ def _without_infinite_slopes(values: Any, symbols: Sequence[Any]) -> Any:
             base, power = (*arguments, ca.SX(0.5))[:2]
             is_root = ca.logic_and(base < OWN.chord, ca.logic_and(power > 0, power < 1))
             work[into[0]] = ca.if_else(is_root, base * OWN.chord ** (power - 1), base**power)
+        elif operation in (ca.OP_FMAX, ca.OP_FMIN):
+            # at a valve's closed end rounding would say whether np.maximum(u, 0) moves
+            a, b = (work[place] for place in of)
+            is_tie = ca.fabs(a - b) < OWN.tie
+            work[into[0]] = ca.if_else(is_tie, 0.5 * (a + b), ca.SX.binary(operation, a, b))
         else:
             operate = ca.SX.unary if len(of) == 1 else ca.SX.binary
             work[into[0]] = operate(operation, *arguments)
