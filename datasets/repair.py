@@ -265,9 +265,37 @@ def _goes_on(values: Floats) -> dict[str, NDArray[np.bool_]]:
     """Return which rows but the last go on as before: held at one value, or drawn straight within the steps
     of the column's numbers."""
     moves = np.diff(values)
-    step = float(np.abs(moves[moves != 0]).min(initial=np.inf))
     turns = np.abs(np.diff(moves, prepend=np.nan))
-    return {"held": moves == 0, "drawn straight": turns < 1.5 * step}  # half a step is for rounding
+    way = np.sign(moves)
+    way = way[np.maximum.accumulate(np.where(way != 0, np.arange(way.size), 0))]  # of the last move
+    turns_back = way * np.append(0, way[:-1]) < 0  # as no line does, and a coarse reading at rest
+    straight = (turns < 1.5 * _smallest_step(values)) & ~turns_back  # half a step is for rounding
+    return {"held": moves == 0, "drawn straight": straight}
+
+
+def _smallest_step(values: Floats) -> float:
+    moves = np.abs(np.diff(values))
+    return float(moves[moves > 0].min(initial=np.inf))
+
+
+def _cut_into_lines(
+    values: Floats, starts: NDArray[np.int64], ends: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return first and last row of the lines that runs consist of: a slow reading in coarse steps bends by
+    little from row to row, and leaves its chord all the same (Douglas and Peucker 1973)."""
+    most, bends = 1.5 * _smallest_step(values), ends - starts > 3  # fewer rows cannot bend by more
+    lines = np.column_stack([starts, ends])[~bends].tolist()
+    left = np.column_stack([starts, ends])[bends].tolist()
+    while left:
+        start, end = left.pop()
+        off = np.abs(values[start : end + 1] - np.linspace(values[start], values[end], end - start + 1))
+        farthest = start + int(off.argmax())
+        if off.max() > most:
+            left += [[start, farthest], [farthest, end]]
+        else:
+            lines.append([start, end])
+    first, last = np.array(lines).T
+    return first, last
 
 
 def doubt_lead(name: str, values: Floats, drive: str, moved: Floats, time: Floats) -> str:
@@ -360,6 +388,8 @@ def drop_stuck(name: str, values: Floats, inputs: Sequence[Floats]) -> tuple[Flo
         trials = travel if how == "held" else np.arange(values.size)
         ends = np.flatnonzero(np.append(~goes_on, True))
         starts = np.append(0, ends[:-1] + 1)
+        if how != "held":
+            starts, ends = _cut_into_lines(values, starts, ends)
         passed = trials[ends] - trials[starts]
         longest = int(np.argmax(passed))
         run, most = slice(int(starts[longest]), int(ends[longest]) + 1), float(passed[longest])

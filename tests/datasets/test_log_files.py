@@ -967,3 +967,7 @@ def test_a_gap_that_was_drawn_straight_is_left_out(write):
         log = read_log(write("".join(["time_s,heater,plate_degC\n", *rows])))
         assert said in log.attrs["repairs"]
         assert np.isnan(column(log, "plate")).sum() == pytest.approx(plate[filled].size, abs=2)
+    noise = 0.05 * np.random.default_rng(0).standard_normal(600)
+    coarse = np.floor(lfilter([0.01], [1, -0.99], HEATER) * 2 + noise * 2) / 2  # slow, in steps of .5 degC
+    rows = [f"{k},{u},{y}\n" for k, u, y in zip(PLACES, HEATER, coarse)]
+    assert np.isfinite(column(read_log(write("".join(["time_s,heater,plate_degC\n", *rows]))), "plate")).all()
