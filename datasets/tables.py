@@ -687,8 +687,10 @@ def _matlab_table(path: Path, columns: Sequence[str] | None) -> Table:
         names = _new_names(columns, len(numbers), path)
         numbers = {k: v for k, v in zip(names, numbers.values()) if not k.startswith(_LEFT_OUT)}
     scalars = {name.lower(): value for name, value in members if isinstance(value, int | float) and value > 0}
-    step = scalars.get("ts") or scalars.get("dt") or 1 / scalars.get("fs", 1.0)
-    meta = {"dt": repr(float(step))}
+    if "fs" in scalars:
+        scalars.setdefault("dt", 1 / scalars["fs"])
+    step = scalars.get("ts", scalars.get("dt"))
+    meta = {} if step is None else {"dt": repr(float(step))}
     return Table(str(path), numbers, {}, np.arange(1, n + 1), meta=meta, notes=tuple(notes))
 
 

@@ -635,6 +635,9 @@ def test_a_matlab_file_is_a_log_of_its_columns_and_its_step(tmp_path):
     log = read_log(matlab(tmp_path, u=rows[:, 1], y=rows[::-1, 2], Ts=0.25))
     assert (list(log), log["time"].values[1]) == (["u", "y"], 0.25)
     assert "rows are taken 0.25 s apart; --dt" in log.attrs["repairs"]
+    assert log.attrs["clock_doubts"] == ""
+    log = read_log(matlab(tmp_path, u=rows[:, 1], y=rows[::-1, 2]))
+    assert log.attrs["clock_doubts"] == "no column is a clock: rows are taken 1 s apart"
     assert "has no columns of numbers" in refused(matlab(tmp_path, name="words.mat", s="text"))
 
 
