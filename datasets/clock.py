@@ -77,6 +77,7 @@ _DATES = (
     _Counts(86400.0, -719529 * 86400.0, "MATLAB"),  # datenum
     _Counts(86400.0, -2440587.5 * 86400.0, "astronomers"),  # Julian
 )
+_SINCE_1970 = _DATES[:4]
 
 
 @dataclass(frozen=True)
@@ -122,7 +123,8 @@ def clock_of(table: Table, read: Mapping[str, Header], dt: float | None) -> Cloc
                 steps = f"{_seconds_a_row(clock):.4g} s a row, not {usual:.4g}"
                 doubt = "{} is taken as the time of all columns, and {} goes ".format(*names) + steps
                 return replace(first, doubt=doubt)
-        return first
+        same = frozenset[str]().union(*(clock.columns for clock in known))
+        return replace(first, columns=same)
     return _of_rows(table, read)
 
 
@@ -137,7 +139,12 @@ def _behaves_as_clock(header: str, read: Header, values: Floats) -> bool:
     values = values[np.isfinite(values)]  # a table beside may end earlier
     steps = np.diff(_unwrapped(values, np.arange(values.size))[0])
     enough = 4 if re.fullmatch(r"c1", header) or _COUNTER.fullmatch(header) else CLOCK.piece_rows
-    if read.unit not in _TIME_UNITS or steps.size < enough or not np.all(steps > 0):
+    if read.unit not in _TIME_UNITS or steps.size < enough or not np.all(steps >= 0):
+        return False
+    # however uneven: nothing else is so large, and rises; of those in seconds a counter may be
+    if any(date.has(values[0]) and date.has(values[-1]) for date in _SINCE_1970[1:]):
+        return bool(values[-1] > values[0])
+    if not np.all(steps > 0):
         return False
     usual = float(np.median(steps))
     return bool(np.mean(np.abs(steps - usual) <= CLOCK.evenness * usual) >= CLOCK.monotone_share)
@@ -178,8 +185,8 @@ def _of_numbers(header: str, table: Table, read: Header) -> Clock | None:
         return Clock(seconds, frozenset([header]), (*converted, *notes, *restarts), 0.0)
     taken = f"{header} is taken as the time in {unit if unit != '1' else 's'}"
     factor = "" if scale == 1 else f", times {scale:g}"
-    if _TIME_NAME.fullmatch(name) is None and unit == "1" and not doubt:
-        step = float(np.median(np.diff(finite)))
+    if _TIME_NAME.fullmatch(name) is None and unit == "1" and not doubt and meant not in _SINCE_1970:
+        step = scale * float(np.median(np.diff(finite)))
         doubt = f"{header} is taken as the time, its rows {step:g} s apart"
     note = f"time: {taken}{factor}" + ("; --dt S sets another step" if doubt else "")
     return Clock(seconds, frozenset([header]), (note, *notes, *restarts), 0.0, doubt)

@@ -45,6 +45,8 @@ def jittered(step, first=0):
         ("uptime", jittered(1000), 1.0, "taken as milliseconds"),
         ("c1", jittered(500), 0.5, "taken as milliseconds"),
         ("row", np.arange(ROWS), 1.0, "rows are 1 s apart"),
+        ("Ticks", 638_000_000_000_000_000 + 2 * 10**7 * np.arange(ROWS), 2.0, "rows 2 s apart"),  # of .NET
+        ("c1", 1_700_000_000_000 + np.cumsum(np.tile([150, 400, 400, 2000], ROWS // 4)), 0.4, ""),
     ],
 )
 def test_a_clock_is_known_by_its_name_or_its_behaviour_and_a_guess_is_a_doubt(
