@@ -193,6 +193,9 @@ def test_one_column_beside_the_weather_is_the_output():
     columns = {"oat": ROOM, "meter": 2 * NOISY}
     roles = assign_roles({"oat": "1", "meter": "W"}, columns=columns).of
     assert roles == {"oat": "disturbance", "meter": "output"}
+    late = np.maximum(np.arange(300.0) - 2, 0)  # a step test whose step is at its start
+    columns = {"c2": 20.0 * (late > 0), "c4": np.round(24.7 + 6 * (1 - np.exp(-late / 60)), 1)}
+    assert assign_roles(dict.fromkeys(columns, "1"), columns=columns).of == {"c2": "input", "c4": "output"}
 
 
 def test_one_column_alone_is_read_and_not_moved():
