@@ -6,7 +6,6 @@ lost disturbance is interpolated.
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Sequence
 from itertools import pairwise, takewhile
 from typing import NamedTuple
@@ -239,25 +238,26 @@ def doubt_moves(name: str, values: Floats) -> str:
     """Return the doubt on an input that goes from one level to another as no drive does."""
     bounds = np.concatenate([[0], np.flatnonzero(np.diff(values)) + 1, [values.size]])
     holds = np.flatnonzero(np.diff(bounds) > _FEWEST_HELD)
-    count, to_and_fro, ramps = 0, 0, []
+    count, to_and_fro = 0, 0
+    ramps: dict[int, list[float]] = {}  # size of those of as many rows
     for before, after in pairwise(holds.tolist()):
         move = values[bounds[before + 1] - 1 : bounds[after] + 1]
         if move[0] == move[-1]:
             continue
         count += 1
-        rows = move.size - 1
+        rows, size = move.size - 1, float(abs(move[-1] - move[0]))
         if 1 < rows <= 2 * _FEWEST_HELD and np.isin(move, move[[0, -1]]).all():
             to_and_fro += 1
         straight = np.linspace(move[0], move[-1], move.size)
-        if rows >= _FEWEST_HELD and np.abs(move - straight).max() <= _FEW * abs(move[-1] - move[0]):
-            ramps.append(rows)
+        if rows >= _FEWEST_HELD and np.abs(move - straight).max() <= _FEW * size:
+            ramps.setdefault(rows, []).append(size)
     # of 150 drives of sound logs a quarter of the moves at most, of rows shuffled in fives half and more
     if to_and_fro > max(_MOST_TO_AND_FRO * count, _FEWEST_ALIKE):
         return f"{name} goes to and fro in {to_and_fro} of its {count} moves: are its rows in order?"
-    # of those drives none did so once
-    rows, alike = Counter(ramps).most_common(1)[0] if ramps else (0, 0)
-    if alike >= _FEWEST_ALIKE:
-        return f"{name} goes straight from level to level in {rows} rows, {alike} times: is it an average?"
+    # of those drives none did so once; one of a limited rate takes longer for a longer way
+    rows, sizes = max(ramps.items(), key=lambda ramp: len(ramp[1]), default=(0, [0.0]))
+    if len(sizes) >= _FEWEST_ALIKE and np.ptp(sizes) > _FEW * max(sizes):
+        return f"{name} goes straight between levels in {rows} rows, {len(sizes)} times: is it an average?"
     return ""
 
 

@@ -854,6 +854,7 @@ SHUFFLED_IN_FIVES = np.random.default_rng(0).permuted(PLACES[2:597].reshape(-1, 
         (PLACES, np.where((PLACES > 200) & (PLACES < 360), 90, HEATER), SLOW, "with heater held"),
         (np.r_[:2, SHUFFLED_IN_FIVES, 597:600], HEATER, PLATE, "to and fro in 18 of its 18 moves"),
         (PLACES, np.interp(PLACES, PLACES[::5], HEATER[::5]), PLATE, "in 5 rows, 18 times: is it an average"),
+        (PLACES, np.interp(PLACES, PLACES[::5], 1.0 * (HEATER[::5] > 30)), PLATE, ""),  # of a limited rate
     ],
 )
 def test_columns_that_are_not_one_course_of_one_unit_are_doubts(write, order, heater, plate, doubt):
