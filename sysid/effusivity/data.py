@@ -232,22 +232,13 @@ def graded(data: Touches, grades: Sequence[Grade]) -> Touches:
     n = data.level.size
     share, unlike, _, since, misstated_K, thin = (np.tile(column, n) for column in np.array(grades).T)
     of = np.repeat(np.arange(n), len(grades))
-    every = data.take(of)
     # what the first grade says of a grasp is reported, however much likelier others are
-    question = 2 * of + (np.arange(of.size) % len(grades) > 0)
+    every = replace(data.take(of), question=2 * of + (np.arange(of.size) % len(grades) > 0))
 
     def of_grade(one: Touches, second: Touches | None) -> Touches:
         t_object_sd = np.where(misstated_K > 0, np.fmax(one.t_object_sd, misstated_K), one.t_object_sd)
-        return replace(
-            one,
-            second=second,
-            share=share,
-            unlike=unlike,
-            since=since,
-            thin=thin,
-            t_object_sd=t_object_sd,
-            question=question,
-        )
+        changed = {"share": share, "unlike": unlike, "since": since, "thin": thin, "t_object_sd": t_object_sd}
+        return replace(one, second=second, **changed)
 
     return of_grade(every, None if every.second is None else of_grade(every.second, None))
 
@@ -314,7 +305,7 @@ def noise_fit(data: Touches, noise: Noise, extra: Array, left: Array) -> tuple[f
     # with C^-1 - C^-1 r r' C^-1 = G the slopes are 1/2 tr(G dC)
     parts = _noise_parts(data, noise)
     chol = np.linalg.cholesky(parts.total() + extra)
-    root = _inverse(chol)
+    root = np.linalg.inv(chol)
     z = np.einsum("nij,nj->ni", root, left)
     cost = 0.5 * (z**2).sum() + np.log(np.diagonal(chol, axis1=1, axis2=2)).sum()
     a = np.einsum("nij,ni->nj", root, z)
@@ -388,16 +379,6 @@ def _axes(data: Touches) -> tuple[Array, NDArray[np.int64]]:
     return axes, which.ravel()
 
 
-def _inverse(chol: NDArray[np.floating[Any]]) -> Array:
-    """Return the inverses of lower triangular matrices (n, n_bin, n_bin), row after row of all at once."""
-    out = np.zeros(chol.shape)
-    for i, pivot in enumerate(np.moveaxis(np.diagonal(chol, axis1=1, axis2=2), 1, 0)):
-        out[:, i, i] = 1.0 / pivot
-        # by L L^-1 = 1 a row follows from those above it
-        out[:, i, :i] = -(chol[:, None, i, :i] @ out[:, :i, :i])[:, 0] / pivot[:, None]
-    return out
-
-
 #: What :func:`whiten` returns.
 Whitened: TypeAlias = tuple[Array, Array]
 
@@ -407,6 +388,6 @@ def whiten(data: Touches, noise: Noise, extra: Array | float = 0.0) -> tuple[Arr
     is what else C holds."""
     chol = np.linalg.cholesky(noise_covariance(data, noise) + extra)
     has_samples = data.count > 0
-    w = np.ascontiguousarray(_inverse(chol) * has_samples[:, None, :] * has_samples[:, :, None])
+    w = np.ascontiguousarray(np.linalg.inv(chol) * has_samples[:, None, :] * has_samples[:, :, None])
     diagonal = np.diagonal(chol, axis1=1, axis2=2)
     return w, (2 * np.log(diagonal)).sum(axis=1) + has_samples.sum(axis=1) * np.log(2 * np.pi)

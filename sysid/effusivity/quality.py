@@ -110,8 +110,9 @@ class GraspQuality:
         """Return the usable grasps as an answer reads them: masked samples lost (NaN), and cut."""
         if self.masked.any():
             grasps = grasps.assign(t_surface=grasps["t_surface"].where(~self.masked))
-        cut = grasps.sel(time=slice(None, self.until + 1e-9)).assign_attrs({CHECKED: True})
-        return self.usable_grasps(cut)
+        if self.until < grasps["time"].values[-1]:
+            grasps = grasps.sel(time=slice(None, self.until + 1e-9))
+        return self.usable_grasps(grasps.assign_attrs({CHECKED: True}))
 
 
 def check_grasps(grasps: Grasps, *, longest: float = np.inf, whole_traces: bool = False) -> GraspQuality:
