@@ -124,6 +124,29 @@ def test_a_candidate_far_behind_is_left_and_changes_no_other():
     assert (alone.log_evidence.reshape(3, 3)[:, 2] < found[:, 0] - 25).all()
 
 
+def test_what_no_grade_of_a_disturbed_grasp_can_make_up_for_is_left_and_changes_no_evidence(monkeypatch):
+    gripper, record = load_default_gripper(), load_example_grasps()["exp1A_obj43_grip23"].isel(grasp=[0])
+    swings = 1.5 * np.sin(record["time"]).where(record["time"] > 1.0, 0.0)
+    data, products, asked = (
+        touches(record.assign(t_surface=record["t_surface"] + swings)),
+        kernel.products,
+        [],
+    )
+
+    def counted(pairs, *rest):
+        asked[-1] += pairs.row.size
+        return products(pairs, *rest)
+
+    monkeypatch.setattr(kernel, "products", counted)
+    evidence = []
+    for no_part in (kernel.SEARCH.no_part, np.inf):
+        monkeypatch.setattr(kernel, "SEARCH", kernel.SEARCH._replace(no_part=no_part))
+        asked.append(0)
+        evidence.append(fit_candidates(gripper, data, ["copper", "iron", "wood"]).mode.log_evidence)
+    np.testing.assert_allclose(*evidence, atol=1e-9)
+    assert asked[0] < 0.7 * asked[1]
+
+
 def test_kernels_are_compiled_for_one_kind_of_arguments():
     """An array that must not be written to, or lies in memory in another order, is another kind: 2 s more."""
     gripper, record = load_default_gripper(), load_example_grasps()["exp1A_obj43_grip23"]
