@@ -303,10 +303,11 @@ def _notes(run: FreeRun, by_inputs: InputEffect | None) -> list[str]:
         for _, before, after in gaps(log)
     ]
     if verdict is None or verdict.standing != "no test":
-        notes += [
-            f"{name}: barely better than a model without input: the fit cannot be relied on for control"
-            for name in run.no_better
-        ]
+        for name in run.no_better:
+            beside = "worse" if run.scores[name].rmse > run.naive["no_input"][name].rmse else "barely better"
+            notes.append(
+                f"{name}: {beside} than a model without input: the fit cannot be relied on for control"
+            )
     outside = _outside(plant, {name: column(log, name) for name in plant.valid if name in log})
     unseen = [name for name in outside if name not in plant.outputs]
     units = {name: each.unit for name, each in run.scores.items()}

@@ -234,6 +234,7 @@ def effect_of_run(plant: Plant, error: Array, log: Log) -> InputEffect | None:
     scaled_error = np.where(is_finite, error / spread, 0.0)
     step, seconds = float(log["time"].diff("time").median()), float(log["time"][-1] - log["time"][0])
     best: tuple[float, float, float, Array] | None = None
+    by_surroundings = np.inf
     # a gain alone would be taken for what a mass that soaks for longer than the fit does
     for lag_s in (0.0, *(seconds * share for share in _LATER)):
         keep = np.exp(-step / lag_s) if lag_s else 0.0
@@ -241,12 +242,18 @@ def effect_of_run(plant: Plant, error: Array, log: Log) -> InputEffect | None:
         size = np.where(is_finite, effect / spread, 0.0)
         gain = float(np.sum(size * scaled_error) / max(np.sum(size**2), 1e-300))
         squares = float(np.sum((scaled_error - gain * size) ** 2))
+        # what surroundings that differ all along do, of each output
+        rise = np.where(is_finite, lfilter([1 - keep], [1, -keep], np.ones(len(error)))[:, None], 0.0)
+        rises = rise * np.sum(rise * scaled_error, axis=0) / np.maximum(np.sum(rise**2, axis=0), 1e-300)
+        by_surroundings = min(by_surroundings, float(np.sum((scaled_error - rises) ** 2)))
         if best is None or squares < best[0]:
             best = squares, gain, lag_s, np.where(is_finite, error - gain * effect, np.nan)
     assert best is not None
     squares, gain, lag_s, remaining = best
-    # within two standard deviations of what differs from run to run, or half of the squared error remains
-    if abs(gain) <= 2 * RUN_GAIN_SD or squares > 0.5 * np.sum(scaled_error**2):
+    # within two standard deviations of what differs from run to run, or half of the squared error remains, or
+    # other surroundings leave less: they are what differs most from day to day
+    least = min(0.5 * float(np.sum(scaled_error**2)), by_surroundings)
+    if abs(gain) <= 2 * RUN_GAIN_SD or squares > least:
         return None
     rms = np.sqrt(np.nanmean(remaining**2, axis=0))
     return InputEffect(gain, lag_s, dict(zip(plant.outputs, rms.tolist())))

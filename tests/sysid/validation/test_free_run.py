@@ -223,6 +223,15 @@ def test_one_gain_that_explains_most_of_the_error_is_said_and_a_lag_is_not_taken
         assert said[0].endswith("which would leave t 0.1 degC, r 1 degC")
 
 
+def test_a_run_in_other_surroundings_has_an_offset_and_no_inputs_that_do_more():
+    log = lag_log(4000, noise=0.1, seed=1)
+    log = log.assign(t=log["t"] + 20 * (1 - 0.99 ** np.arange(4000.0)))  # comes slowly, and stays
+    notes = " ".join(free_run(lag_plant(), log).notes)
+    assert "most of it is a constant offset" in notes
+    assert "inputs do" not in notes
+    assert "t: worse than a model without input" in notes
+
+
 @pytest.mark.parametrize(
     ("far", "rows", "share"),
     [(-0.11, 2, 2), (2.11, 2, 2), (2.11, 1, None), (-0.1, 9, None), (2.1, 9, None), (-0.101, 25, 25)],
