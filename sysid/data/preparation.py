@@ -128,16 +128,7 @@ def with_rest(
     logs: Sequence[Log], inputs: Sequence[str], outputs: Sequence[str]
 ) -> tuple[list[Log], list[str]]:
     """Return the logs, and a line for each to which rows of rest were added at its start: of logs whose
-    inputs move in their first ten rows alone, those with flat readings up to the move.
-
-    >>> from thermogrip.datasets.schema import make_log
-    >>> t = np.arange(300.0)
-    >>> y = 21 + 20 * (1 - np.exp(-np.maximum(t - 1, 0) / 80))
-    >>> log = make_log(t, {"q": (40.0 * (t > 0), "percent", "input"), "t": (y, "degC", "output")})
-    >>> rested, said = with_rest([log], ["q"], ["t"])
-    >>> rested[0].sizes["time"], float(rested[0].time[0]), float(rested[0].t[0]), len(said)
-    (350, -50.0, 21.0, 1)
-    """
+    inputs move in their first ten rows alone, those with flat readings up to the move."""
     moved = _moved_rows(logs, inputs)
     if not _moved_early_alone(moved):
         return list(logs), []

@@ -60,14 +60,16 @@ Signed = Annotated[Name | None, Quantity("1", "any")]
 Slope = Annotated[Name | None, Quantity("1/K", "any")]
 
 
-class _Table(BaseModel):
+class Table(BaseModel):
+    """What allows no key that is not its own."""
+
     model_config = ConfigDict(extra="forbid", frozen=True, populate_by_name=True)
 
 
 _DriveUnit = Literal["1", "percent", "0_255", "A", "V", "W"]
 
 
-class _Scaled(_Table):
+class _Scaled(Table):
     """A signal that heaters see as a share of ``full_scale``."""
 
     full_scale: Positive = 0.0  # 0 until the validator has set it
@@ -109,7 +111,7 @@ class Disturbance(_Scaled):
     log_sd: NotNegative = 0.0
 
 
-class Output(_Table):
+class Output(Table):
     """A sensor on a node."""
 
     node: OfNode
@@ -120,20 +122,20 @@ class Output(_Table):
     reference: bool = False
 
 
-class Node(_Table):
+class Node(Table):
     """A heat capacity; ``start_sd`` is how unsure its temperature is where a log begins."""
 
     capacity: Annotated[Name, Quantity("J/K")]
     start_sd: Positive = 1.0
 
 
-class Boundary(_Table):
+class Boundary(Table):
     """A temperature that nothing moves and nobody measures: a parameter."""
 
     temperature: Annotated[Name, Quantity("degC", "any")]
 
 
-class Link(_Table):
+class Link(Table):
     """A conductance between two nodes."""
 
     between: Two
@@ -143,7 +145,7 @@ class Link(_Table):
     bend: Signed = None  # by which share it grows per 10 K of difference, as natural convection does
 
 
-class Pipe(_Table):
+class Pipe(Table):
     """Water that moves from one node to another: cells in a row, each with a piece of wall."""
 
     source: Annotated[Name, Field(alias="from"), Refers("place")]
@@ -168,7 +170,7 @@ class Pipe(_Table):
         return self
 
 
-class Radiation(_Table):
+class Radiation(Table):
     """Grey radiation between two nodes."""
 
     between: Two
@@ -176,7 +178,7 @@ class Radiation(_Table):
     emissivity: Annotated[Name, Quantity("1")]
 
 
-class Heater(_Table):
+class Heater(Table):
     """What brings heat, or a load that takes it, of a power below 0; ``power`` at the ``full_scale`` of its
     input or disturbance."""
 
@@ -185,7 +187,7 @@ class Heater(_Table):
     power: Annotated[Name, Quantity("W", "any")]
 
 
-class Peltier(_Table):
+class Peltier(Table):
     """A Peltier element that warms ``face`` at positive command and takes the heat from ``sink``."""
 
     face: OfNode
@@ -205,7 +207,7 @@ class Peltier(_Table):
     driver: Literal["current", "duty"] = "current"
 
 
-class Parameter(_Table):
+class Parameter(Table):
     """One number: unit, prior, bounds.
 
     The prior is log-normal about ``value`` with ``sd_log``, or normal with ``sd``; ``fixed`` keeps the value.
@@ -255,7 +257,7 @@ class Parameter(_Table):
         return (low if self.low is None else self.low, high if self.high is None else self.high)
 
 
-class Network(_Table):
+class Network(Table):
     """A whole network file, checked."""
 
     schema_: Literal["thermogrip.network"] = Field(alias="schema")

@@ -89,8 +89,6 @@ class NeuralModel(BlackBox):
         """Number of states of all members together."""
         return int(self.A.shape[0] * self.A.shape[1])
 
-    # ---- the Model protocol ----
-
     def one_step(self, x: Values, u: Values, d: Values) -> list[Any]:
         """Return the state one step of the model later."""
         scaled = [(v - float(a)) / float(s) for v, a, s in zip([*u, *d], self.w_middle, self.w_size)]

@@ -79,8 +79,6 @@ class StateSpaceModel(BlackBox):
         """Number of states."""
         return int(self.A.shape[0])
 
-    # ---- the Model protocol ----
-
     def one_step(self, x: Values, u: Values, d: Values) -> list[Any]:
         """Return the state one step of the model later."""
         phi = products(self.terms, self.inputs + self.disturbances, [*u, *d])
@@ -133,8 +131,6 @@ class StateSpaceModel(BlackBox):
         """Return the fields that are neither names nor plain arrays."""
         switched = {str(key): array_within(data["A_switch"], key) for key in data["A_switch"]}
         return {"A_switch": switched, "origin": str(data["origin"])}
-
-    # ---- what only a linear model can do ----
 
     def push(self, u: Array, d: Array) -> Array:
         """Return B u + E d + F phi(u, d) + c for rows of inputs, shape (..., n_x)."""

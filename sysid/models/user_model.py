@@ -38,20 +38,12 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Self
 import numpy as np
 from numpy.lib.mixins import NDArrayOperatorsMixin
 from numpy.typing import ArrayLike
-from pydantic import (
-    AfterValidator,
-    BaseModel,
-    BeforeValidator,
-    ConfigDict,
-    Field,
-    ValidationError,
-    model_validator,
-)
+from pydantic import AfterValidator, BeforeValidator, Field, ValidationError, model_validator
 
 from thermogrip.datasets.arrays import Array, Run, Values
 from thermogrip.datasets.errors import UserError, known_names, reading
 from thermogrip.sysid.models.model import Described, FreeRuns, RestWeights, Sizes
-from thermogrip.sysid.models.network_spec import OpenHigh, OpenLow, Parameter
+from thermogrip.sysid.models.network_spec import OpenHigh, OpenLow, Parameter, Table
 
 if TYPE_CHECKING:
     from thermogrip.sysid.models.jit_rollout import Kernel
@@ -85,11 +77,7 @@ _Positive = Annotated[float, Field(gt=0, allow_inf_nan=False, strict=True)]
 _Some = Field(min_length=1)
 
 
-class _Table(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class Input(_Table):
+class Input(Table):
     """Something that is moved; ``switch`` marks a pump or valve that is on or off."""
 
     unit: _Unit
@@ -97,7 +85,7 @@ class Input(_Table):
     switch: bool = False
 
 
-class Output(_Table):
+class Output(Table):
     """A sensor: ``sd`` of a bin's mean about the model, ``log_sd`` of its offset from log to log."""
 
     unit: _Unit
@@ -105,7 +93,7 @@ class Output(_Table):
     log_sd: Annotated[float, Field(ge=0)] = 0.0
 
 
-class Disturbance(_Table):
+class Disturbance(Table):
     """Something measured and not moved; ``log_sd`` of its sensor's offset from log to log."""
 
     unit: _Unit
@@ -116,7 +104,7 @@ class _OwnParameter(Parameter):
     unit: str = "1"
 
 
-class _Attributes(_Table):
+class _Attributes(Table):
     """What a class states beside its functions."""
 
     inputs: dict[_Name, Annotated[Input, _bare("unit")]]
@@ -124,8 +112,8 @@ class _Attributes(_Table):
     states: Annotated[dict[_Name, _Positive], _Some]
     parameters: Annotated[dict[_Name, Annotated[_OwnParameter, _bare("value", fixed=True)]], _Some]
     dt: _Positive
-    disturbances: dict[_Name, Annotated[Disturbance, _bare("unit")]] = {}
-    limits: dict[_Name, tuple[OpenLow, OpenHigh]] = {}
+    disturbances: dict[_Name, Annotated[Disturbance, _bare("unit")]] = Field({})
+    limits: dict[_Name, tuple[OpenLow, OpenHigh]] = Field({})
     average: _Positive | None = None
     warmup: _Positive | None = None
 
@@ -167,6 +155,8 @@ class OwnCode:
         self.parameters = tables.parameters
         self.states = tables.states
         self.dt = tables.dt
+        lists: list[Sized] = [self.states, self.inputs, self.disturbances, self.parameters]
+        self.sizes = Sizes(*map(len, lists))
         self.average, self.warmup = tables.average or 5 * self.dt, tables.warmup or 50 * self.dt
         self.limits = np.array([tables.limits.get(name, (-np.inf, np.inf)) for name in self.states])
         groups = ("states", "inputs", "disturbances", "parameters", "outputs")
@@ -326,17 +316,21 @@ def _kernel(code: OwnCode) -> Kernel:
     """Return the compiled steps of a class."""
     from thermogrip.sysid.models.jit_rollout import Kernel  # pulls in llvmlite
 
-    sizes = (len(group) for group in (code.states, code.inputs, code.disturbances, code.parameters))
-    return Kernel(code.step, code.output, Sizes(*sizes))
+    return Kernel(code.step, code.output, code.sizes)
+
+
+def _symbols(code: OwnCode) -> tuple[list[Any], list[list[Any]]]:
+    """Return columns x, u, d, p of CasADi's, and their entries as a class takes them."""
+    casadi: Any = import_module("casadi")
+    columns = [casadi.SX.sym(letter, n) for letter, n in zip("xudp", code.sizes)]
+    return columns, [_for_numpy(casadi.vertsplit(item) if item.numel() else []) for item in columns]
 
 
 @lru_cache(maxsize=32)
 def _balance(code: OwnCode) -> Any:
     """Return a CasADi function of (x, u, d, p) to dx/dt and what the outputs read."""
     casadi: Any = import_module("casadi")
-    groups: list[Sized] = [code.states, code.inputs, code.disturbances, code.parameters]
-    symbols = [casadi.SX.sym(letter, len(group)) for letter, group in zip("xudp", groups)]
-    x, u, d, p = (_for_numpy(casadi.vertsplit(item) if item.numel() else []) for item in symbols)
+    symbols, (x, u, d, p) = _symbols(code)
     both = _plain([*code.rhs(x, u, d, p)]), code.output(_plain(x), _plain(p))
     return casadi.Function("balance", symbols, [casadi.densify(casadi.vertcat(*values)) for values in both])
 
@@ -345,13 +339,11 @@ def _balance(code: OwnCode) -> Any:
 def _rate(code: OwnCode, h: float) -> Any:
     """Return a function (x, u, d, p, su, sd) of CasADi's: dx/dt, its derivative by x, and along su and sd."""
     ca: Any = import_module("casadi")
-    groups: list[Sized] = [code.states, code.inputs, code.disturbances, code.parameters]
-    sizes = [len(group) for group in groups]
-    x, u, d, p = (ca.SX.sym(letter, n) for letter, n in zip("xudp", sizes))
-    su, sd = (ca.SX.sym("s" + letter, n) for letter, n in zip("ud", sizes[1:]))
-    lists = [_for_numpy(ca.vertsplit(item) if item.numel() else []) for item in (x, u, d, p)]
+    symbols, lists = _symbols(code)
+    x, u, d, p = symbols
+    su, sd = (ca.SX.sym("s" + letter, item.numel()) for letter, item in (("u", u), ("d", d)))
     rate = ca.vertcat(*_plain(code.rhs(*lists)))
-    blunt = _without_infinite_slopes(rate, [x, u, d, p])
+    blunt = _without_infinite_slopes(rate, symbols)
     by_x = ca.densify(ca.jacobian(blunt, x))
     # a tank that runs empty has a rate that no step follows: the true answer of a sample dies out, that of
     # the rule would grow without bound.  All that the state does is scaled, for what leaves one tank enters
@@ -688,8 +680,7 @@ def own_model(kind: Any) -> OwnModel:
         raise UserError(problem, file=where, hint="give its arguments defaults") from error
     code = OwnCode(made)
     model = OwnModel(code)
-    groups = (code.states, code.inputs, code.disturbances, code.parameters)
-    x, u, d, p = ([import_module("casadi").SX.sym(name) for name in group] for group in groups)
+    x, u, d, p = map(_plain, _symbols(code)[1])
     # finds out an if, what symbols cannot say, and what is another each time
     if str(code.step(x, u, d, p, code.dt)) != str(code.step(x, u, d, p, code.dt)):
         problem = "gives another rhs each time it is called with the same arguments"

@@ -10,7 +10,6 @@ in a second, makes innovations e of covariance S; those q and b are kept whose l
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
@@ -56,19 +55,28 @@ def innovation_noise(plant: PlantData, logs: Sequence[Log]) -> InnovationNoise |
         return None
 
 
-@dataclass(frozen=True, eq=False)
 class _Filter:
-    """A plant with a bias for each graded input, linear amid its logs."""
+    """A plant with a bias for each graded input, linearised once, amid the logs."""
 
-    plant: PlantData
-    graded: list[int]  # which inputs
-    F: Array  # transition of states and biases
-    H: Array  # readings of states and biases
-    level: Array  # (n_y,) readings at states of 0
-    offset: Array  # (n_y,) of the sensors
-    middle: Array  # (n_y,) mean readings
-    state_covariance: Array  # (n_x, n_x) over the outputs' largest
-    input_range: Array  # (n,) of the graded inputs in the logs
+    def __init__(self, plant: PlantData, stretches: Sequence[Stretch], graded: list[int]) -> None:
+        self.plant, self.graded = plant, graded
+        model, n_x, n_w = plant.model, plant.model.n_x, len(graded)
+        self.offset = np.array([plant.offsets.get(name, 0.0) for name in plant.outputs])
+        C, self.level = output_matrix(plant)
+        spread = np.atleast_2d(model.spread)
+        # s_x s_x', the covariance of the states in the data of the fit over that of the outputs
+        self.state_covariance = spread / np.einsum("ij,jk,ik->i", C, spread, C).max()
+        u, d, y = (np.concatenate([getattr(stretch, key) for stretch in stretches]) for key in "udy")
+        # s_u
+        self.input_range = np.ptp(u, axis=0)[graded]
+        self.middle = np.nanmean(y, axis=0)
+        u0 = u.mean(axis=0)
+        d0 = d.mean(axis=0)
+        x0 = np.asarray(model.rest(self.middle - self.offset, u0, d0, plant.p), dtype=float)
+        A, B = discrete_matrices(plant, x0, u0, d0, graded)
+        # transition and readings of states and biases
+        self.F = np.block([[A, B[:, :n_w]], [np.zeros((n_w, n_x)), np.eye(n_w)]])
+        self.H = np.hstack([C, np.zeros((len(C), n_w))])
 
     def gains(self, sd: Array, ratios: Sequence[tuple[float, float]]) -> tuple[Array, Array]:
         """Return the gains and the covariances of innovations that the filter settles at, by ratio; NaN where
@@ -116,34 +124,11 @@ class _Filter:
         return squares, count
 
 
-def _filter_of(plant: PlantData, stretches: Sequence[Stretch], graded: list[int]) -> _Filter | None:
-    """Return the plant linearised once, amid the logs; None where it diverges there."""
-    model, p, n_x, n_w = plant.model, plant.p, plant.model.n_x, len(graded)
-    offset = np.array([plant.offsets.get(name, 0.0) for name in plant.outputs])
-    C, level = output_matrix(plant)
-    spread = np.atleast_2d(model.spread)
-    # s_x s_x', the covariance of the states in the data of the fit over that of the outputs
-    covariance = spread / np.einsum("ij,jk,ik->i", C, spread, C).max()
-    u, d, y = (np.concatenate([getattr(stretch, key) for stretch in stretches]) for key in "udy")
-    # s_u
-    size = np.ptp(u, axis=0)[graded]
-    middle = np.nanmean(y, axis=0)
-    u0 = u.mean(axis=0)
-    d0 = d.mean(axis=0)
-    x0 = np.asarray(model.rest(middle - offset, u0, d0, p), dtype=float)
-    A, B = discrete_matrices(plant, x0, u0, d0, graded)
-    if not (np.isfinite(A).all() and np.isfinite(B).all()):
-        return None
-    F = np.block([[A, B[:, :n_w]], [np.zeros((n_w, n_x)), np.eye(n_w)]])
-    H = np.hstack([C, np.zeros((len(C), n_w))])
-    return _Filter(plant, graded, F, H, level, offset, middle, covariance, size)
-
-
 def _most_likely(
     plant: PlantData, stretches: Sequence[Stretch], sd: Array, graded: list[int], fastest: dict[str, float]
 ) -> InnovationNoise | None:
-    filtered = _filter_of(plant, stretches, graded)
-    if filtered is None:
+    filtered = _Filter(plant, stretches, graded)
+    if not np.isfinite(filtered.F).all():  # the plant diverges there
         return None
     gains, spreads = filtered.gains(sd, list(product(_STATE_RATIOS, _INPUT_RATIOS)))
     squares, count = filtered.squares(stretches, gains, spreads)

@@ -274,20 +274,3 @@ def control_system(labels: Any, numbers: Sequence[Any], name: str) -> Any:
         name=name,
         remove_useless_states=False,
     )
-
-
-def to_casadi(plant: PlantData, *, dt: float | None = None) -> Any:
-    """Return a step for CasADi; see :meth:`thermogrip.sysid.plant.plant.Plant.to_casadi`."""
-    import casadi as ca
-
-    model = plant.model
-    n = 1 if dt is None else whole_steps(dt, plant.dt)
-    sizes = (model.n_x, len(model.inputs), len(model.disturbances), len(model.parameters))
-    x, u, d, p = (ca.SX.sym(name, size) for name, size in zip(("x", "u", "d", "p"), sizes))
-    state = ca.vertsplit(x)
-    inputs, disturbances, parameters = (ca.vertsplit(v) if v.numel() else [] for v in (u, d, p))
-    y = model.output(state, parameters)
-    for _ in range(n):
-        state = model.step(state, inputs, disturbances, parameters, plant.dt)
-    ports = [x, u, d, p], [ca.vertcat(*state), ca.vertcat(*y)]
-    return ca.Function("step", *ports, ["x", "u", "d", "p"], ["x_next", "y"])

@@ -39,15 +39,26 @@ _GRIDS = 4  # arrays of a run's size that are held at a time
 
 
 @dataclass(frozen=True, eq=False)
-class Rows:
-    """The signals of a model in a log, row by row."""
+class Segment:
+    """The signals of a model in a log, on an even grid where it is part of a :class:`Grid`."""
 
-    time: Array  # (n,) [s]
+    time: Array  # (n,) times of the rows [s]
     y: Array  # (n, n_y) readings, NaN where lost
-    u: Array  # (n, n_u) inputs
-    d: Array  # (n, n_d) disturbances
-    after: tuple[int, ...]  # which rows follow a gap
+    u: Array  # (n, n_u) inputs, of a grid their means over the row
+    d: Array  # (n, n_d) disturbances, likewise
     log: str  # name of the log
+
+    def part(self, begin: int, end: int) -> Segment:
+        """Return the rows begin to end (not included)."""
+        rows = slice(begin, end)
+        return replace(self, time=self.time[rows], y=self.y[rows], u=self.u[rows], d=self.d[rows])
+
+
+@dataclass(frozen=True, eq=False)
+class Rows(Segment):
+    """The signals of a model in a whole log, row by row."""
+
+    after: tuple[int, ...]  # which rows follow a gap
 
     @property
     def step(self) -> float:
@@ -63,36 +74,16 @@ def rows_of(log: Log, inputs: Sequence[str], outputs: Sequence[str], disturbance
     """Return the columns of a log by role."""
     u, d, y = (columns(log, group) for group in (inputs, disturbances, outputs))
     after = tuple(row + 1 for row, _, _ in gaps_of(log, GAP))
-    return Rows(np.asarray(log["time"].values, dtype=float), y, u, d, after, log_name(log))
+    return Rows(np.asarray(log["time"].values, dtype=float), y, u, d, log_name(log), after)
 
 
 @dataclass(frozen=True, eq=False)
-class Stretch:
-    """A part of a log without a gap, its inputs and disturbances on an even grid from its first row on."""
+class Stretch(Segment):
+    """A part of a log without a gap: readings at times (n,) since its first row, inputs (N, n_u) and
+    disturbances (N, n_d) on an even grid from there on."""
 
     rows: slice  # its rows in the log
-    time: Array  # (n,) times of the readings since the first step [s]
-    y: Array  # (n, n_y) readings, NaN where lost
-    u: Array  # (N, n_u) means of the inputs over each step
-    d: Array  # (N, n_d) of the disturbances
     gap: float  # seconds between the row before and the first row, at most _LONGEST_GAP steps; 0 at the start
-    log: str  # name of the log
-
-
-@dataclass(frozen=True, eq=False)
-class Segment:
-    """A stretch whose readings are on the grid as well."""
-
-    time: Array  # (n,) times of the rows [s]
-    y: Array  # (n, n_y) readings, NaN where lost
-    u: Array  # (n, n_u) means of the inputs over the row
-    d: Array  # (n, n_d) of the disturbances
-    log: str  # the log that it was cut from
-
-    def part(self, begin: int, end: int) -> Segment:
-        """Return the rows begin to end (not included)."""
-        rows = slice(begin, end)
-        return replace(self, time=self.time[rows], y=self.y[rows], u=self.u[rows], d=self.d[rows])
 
 
 @dataclass(frozen=True, eq=False)
@@ -228,7 +219,8 @@ def _stretches(
             if seconds > step:
                 disturbance_means[:, k] = _smooth(t, rows.d[in_stretch, k : k + 1], edges, seconds)[:, 0]
         gap = min(float(t[0] - rows.time[begin - 1]), _LONGEST_GAP * step) if begin else 0.0
-        yield Stretch(in_stretch, t - t[0], rows.y[in_stretch], input_means, disturbance_means, gap, rows.log)
+        y = rows.y[in_stretch]
+        yield Stretch(t - t[0], y, input_means, disturbance_means, rows.log, in_stretch, gap)
 
 
 def at_rows(stretch: Stretch, run: Array, dt: float) -> Array:

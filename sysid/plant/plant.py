@@ -19,7 +19,7 @@ from thermogrip.datasets.errors import UserError, known_names, reading
 from thermogrip.datasets.files import check_json, read_json, write_json
 from thermogrip.datasets.media import Shown
 from thermogrip.datasets.schema import Log, column, log_name, make_log
-from thermogrip.sysid.models.model import Model
+from thermogrip.sysid.models.model import Model, whole_steps
 from thermogrip.sysid.plant import plant_data
 from thermogrip.sysid.plant.log_grid import Stretch, at_rows, cut_stretches, match_logs
 from thermogrip.sysid.plant.simulation import AFTER_GAP, Start, find_starts, predict
@@ -323,9 +323,16 @@ class Plant(Shown, plant_data.PlantData):
         >>> prior_plant(load_network("tclab")).to_casadi()
         Function(step:(x[4],u[2],d[0],p[11])->(x_next[4],y[2]) SXFunction)
         """
-        from thermogrip.sysid.plant.linearise import to_casadi
+        import casadi as ca
 
-        return to_casadi(self, dt=dt)
+        model, n = self.model, 1 if dt is None else whole_steps(dt, self.dt)
+        sizes = (model.n_x, len(self.inputs), len(self.disturbances), len(model.parameters))
+        symbols = [ca.SX.sym(name, size) for name, size in zip("xudp", sizes)]
+        state, inputs, disturbances, parameters = (ca.vertsplit(v) if v.numel() else [] for v in symbols)
+        y = model.output(state, parameters)
+        for _ in range(n):
+            state = model.step(state, inputs, disturbances, parameters, self.dt)
+        return ca.Function("step", symbols, [ca.vertcat(*state), ca.vertcat(*y)], [*"xudp"], ["x_next", "y"])
 
 
 def _load_model(content: Mapping[str, Any], *, code: Model | None = None) -> Model:

@@ -166,11 +166,7 @@ class InnovationNoise:
 
 @dataclass(frozen=True)
 class PlantScores:
-    """Numbers of a fit for tables, bands and later fits; what a kind of fit does not know keeps its default.
-
-    >>> PlantScores(average_s=2.0, structure="na 1").to_json()
-    {'structure': 'na 1', 'average_s': 2.0}
-    """
+    """Numbers of a fit for tables, bands and later fits; what a fit does not know keeps its default."""
 
     identifiability: Identifiability | None = None
     structure: str = ""  # of a black box: its orders

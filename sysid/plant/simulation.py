@@ -191,9 +191,8 @@ def _corrected(
     along = np.divide(root, size**2, out=np.zeros_like(root), where=size > START.rounding * size.max())
     # readings of the warm-up are linear in (s, o) to first order: a ridge regression, done twice
     for _ in range(2):
-        residual, response = _warm(plant, p, stretch, start, warmup)
-        offsets_of_bin = np.diag(free / _reading_sd(plant, stretch, warmup))
-        blocks = [response @ root, np.tile(offsets_of_bin, (len(response) // free.size, 1))]
+        residual, response, sd = _warm(plant, p, stretch, start, warmup)
+        blocks = [response @ root, np.tile(np.diag(free / sd), (len(response) // free.size, 1))]
         is_read = np.isfinite(residual)
         A, r = np.hstack(blocks)[is_read], residual[is_read]
         # the prior is about the first guess, so what was moved before counts
@@ -244,17 +243,21 @@ def _through_gap(before: Stretch, after: Stretch, start: Start, dt: float) -> _G
     return _GapInputs(u, d, max(length, 1e-3) / n)
 
 
-def _warm(plant: PlantData, p: Array, stretch: Stretch, start: Start, warmup: float) -> tuple[Array, Array]:
-    """Return the residuals (n_r,) of the warm-up and their response (n_r, n_x) to the start [sd]."""
+def _warm(
+    plant: PlantData, p: Array, stretch: Stretch, start: Start, warmup: float
+) -> tuple[Array, Array, Array]:
+    """Return residuals (n_r,) of the warm-up, their response (n_r, n_x) to the start [sd], and sd (n_y,)."""
     n = min(len(stretch.u), max(1, int(np.ceil(warmup / plant.dt - 1e-9))))
     y = _binned(stretch, plant.dt, n, warmup) - start.offset(plant.dt * np.arange(n + 1, dtype=np.float64))
     size = 1e-3 * np.sqrt(np.diag(plant.model.spread))
     around = np.vstack([start.x0, start.x0 + np.diag(size)])
     u, d = stretch.u[None, :n], stretch.d[None, :n] - start.d_offset
     run = plant.model.rollout(around, u, d, p[None], plant.dt)[0]
-    sd = _reading_sd(plant, stretch, warmup)
+    # of each bin of the warm-up: together one reading per 10 s
+    noise = np.array([max(plant.noise.get(name, 0.1), START.least_noise) for name in plant.outputs])
+    sd = noise * np.sqrt((n + 1) / min(1 + n * plant.dt / READING_EVERY, n + 1))
     response = ((run[1:] - run[0]) / sd).reshape(len(size), -1).T / size
-    return ((y - run[0]) / sd).ravel(), response
+    return ((y - run[0]) / sd).ravel(), response, sd
 
 
 def _binned(stretch: Stretch, dt: float, n: int, warmup: float) -> Array:
@@ -268,11 +271,3 @@ def _binned(stretch: Stretch, dt: float, n: int, warmup: float) -> Array:
         total = np.bincount(cell[is_read], weights=stretch.y[early, k][is_read], minlength=n + 1)
         out[count > 0, k] = total[count > 0] / count[count > 0]
     return out
-
-
-def _reading_sd(plant: PlantData, stretch: Stretch, warmup: float) -> Array:
-    """Return the sd (n_y,) to give each bin of the warm-up: together one reading per 10 s."""
-    n = min(len(stretch.u), max(1, int(np.ceil(warmup / plant.dt - 1e-9))))
-    sd = np.array([max(plant.noise.get(name, 0.1), START.least_noise) for name in plant.outputs])
-    readings = 1 + n * plant.dt / READING_EVERY
-    return np.asarray(sd * np.sqrt((n + 1) / min(readings, n + 1)))

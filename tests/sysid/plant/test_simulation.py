@@ -191,7 +191,7 @@ def test_the_rooms_offset_at_rest_is_the_mean_over_the_steps_of_the_first_second
 def test_a_reading_counts_for_the_step_that_is_nearest():
     time = np.array([0.0, 0.9, 1.1, 2.0, 2.9, 3.2, 4.9, 9.0])
     y = np.column_stack([np.arange(8.0), np.where(np.arange(8) == 3, np.nan, 10.0)])
-    stretch = Stretch(slice(0, 8), time, y, np.zeros((5, 1)), np.zeros((5, 0)), 0.0, "a")
+    stretch = Stretch(time, y, np.zeros((5, 1)), np.zeros((5, 0)), "a", slice(0, 8), 0.0)
     found = _binned(stretch, 2.0, 3, 6.0)
     np.testing.assert_allclose(found, [[0.5, 10.0], [3.0, 10.0], [5.5, 10.0], [np.nan, np.nan]])
 
@@ -225,7 +225,8 @@ def test_a_fit_sees_the_errors_that_its_plant_makes_also_where_a_warm_log_shows_
 def stretch_of(time: Any, y: Any = None, steps: int = 5, gap: float = 0.0, **held: float) -> Stretch:
     time = np.asarray(time, float)
     u, d = (np.full((steps, 1), held.get(name, 0.0)) for name in ("u", "d"))
-    return Stretch(slice(0, time.size), time, np.zeros((time.size, 2)) if y is None else y, u, d, gap, "a")
+    y = np.zeros((time.size, 2)) if y is None else y
+    return Stretch(time, y, u, d, "a", slice(0, time.size), gap)
 
 
 def test_a_first_reading_is_of_two_seconds_or_else_of_the_first_minute():
