@@ -179,7 +179,8 @@ def _of_numbers(header: str, table: Table, read: Header) -> Clock | None:
     meant = _what_counts_mean(name, finite, wrapped=bool(notes)) if unit == "1" else _Counts(scale)
     scale, doubt = meant.seconds, meant.doubt
     seconds = to_record_unit(counts if scale == 1 else counts * scale, unit)[0] + meant.zero
-    seconds, restarts = _in_pieces(seconds, table.lines)
+    of_start = name.lower() in ("x_value", "uptime")  # of LabVIEW and Klipper: each start is a part
+    seconds, restarts = _in_pieces(seconds, table.lines, 2 if of_start else CLOCK.piece_rows)
     if stated and scale == 1:
         converted = [f"time: converted from {unit} to s"] if unit != "s" else []
         return Clock(seconds, frozenset([header]), (*converted, *notes, *restarts), 0.0)
@@ -255,14 +256,14 @@ def _unwrapped(counts: Floats, lines: NDArray[np.int64]) -> tuple[Floats, list[s
     return counts, notes
 
 
-def _in_pieces(seconds: Floats, lines: NDArray[np.int64]) -> tuple[Floats, list[str]]:
+def _in_pieces(seconds: Floats, lines: NDArray[np.int64], fewest_rows: int) -> tuple[Floats, list[str]]:
     """Return times that go on after a gap where the clock started again, and a line for each restart."""
     back = np.flatnonzero(np.diff(seconds) < 0) + 1
     pieces = np.split(seconds, back)
     if not back.size:
         return seconds, []
     usual = float(np.nanmedian(np.diff(seconds)))
-    whole = [piece.size >= CLOCK.piece_rows and piece[1] - piece[0] <= GAP_STEPS * usual for piece in pieces]
+    whole = [piece.size >= fewest_rows and piece[1] - piece[0] <= GAP_STEPS * usual for piece in pieces]
     if not all(whole):
         return seconds, []  # a stamp that is wrong begins no part that goes on as a clock does
     # both parts rise on their own: a board was reset, and for how long it was off is not known

@@ -58,8 +58,9 @@ STAMP = re.compile(
     r"(?:(\d{1,2}):(\d{2})(?::(\d{2}(?:[.,:]\d+)?))?)?\s*([AaPp][Mm])?\s*(Z|UTC|[+-]\d{2}:?\d{2})?$"
 )
 _TIME_OF_DAY = r"((?:\d{1,4}[-/.]\d{1,2}[-/.]\d{1,4}[ T]+)?\d{1,2}:\d{2}:\d{2}(?:[.,:]\d+)?)"
+_KLIPPER = "Stats "  # then seconds, and sections of the board, the host and heaters
 _LINE_STAMP = re.compile(
-    r"\W{0,2}" + _TIME_OF_DAY + r"|Stats (\d+\.\d+):"
+    r"\W{0,2}" + _TIME_OF_DAY + rf"|{_KLIPPER}(\d+\.\d+):"
 )  # how a line of a program's log begins: a stamp, or Klipper's seconds
 _TERMINAL = re.compile(r"(?m)^\[?" + _TIME_OF_DAY + r"(?:\]|\s+->)[ \t]*")  # PuTTY, Arduino's monitor
 _ESPHOME = re.compile(r"\[(\d{2}:\d{2}:\d{2}[.\d]*)\].*?: '([^',]+)': Sending state ([-+.\d]+|ON|OFF)\b")
@@ -141,6 +142,7 @@ def read_text_table(path: str | Path, columns: Sequence[str] | None = None) -> T
 def parse_text(data: bytes, file: str, columns: Sequence[str] | None = None) -> Table:
     """Return the table in the text of a file; see :func:`read_text_table`."""
     text, coded = _decoded(data, file)
+    head = ""
     if text.startswith("LabVIEW Measurement"):
         head, _, rows = text.rpartition("***End_of_Header***")
         text = "\n" * head.count("\n") + rows.lstrip("\t\r")
@@ -148,6 +150,8 @@ def parse_text(data: bytes, file: str, columns: Sequence[str] | None = None) -> 
     if not labelled:
         text = _stamps_as_column(text)
     layout = find_layout(text, file, named=columns is not None)
+    if layout.names[0] == "c1" and re.search(r"(?m)^X_Columns\W(One|Multi)", head):
+        layout = replace(layout, names=["X_Value", *layout.names[1:]])
     notes = (*coded, *labelled, *layout.notes)
     if columns is not None:
         named = [name for name in layout.names if not name.startswith(_LEFT_OUT)]
@@ -183,10 +187,13 @@ def find_layout(text: str, file: str, *, named: bool = False) -> Layout:
     n = len(rows[0])
     if n > MOST_COLUMNS:
         raise UserError(f"has {n} columns, more than {MOST_COLUMNS}", file=file, hint="leave some out")
-    header, used = _names_above([line for _, line in head[:first]], n, separator)
+    header, used = _names_above([line for _, line in head[:first]], rows[0], separator)
+    if not any(header) and len(rows) > 1:  # numbers of channels beside words are names too
+        of_channels, used = _names_above([head[first][1]], rows[1], separator)
+        header, first, rows = (of_channels, first + 1, rows[1:]) if used else (header, first, rows)
     hollow = not header[-1] and all(row[-1] == "" for row in rows)  # every line ends with a separator
     nameless = [f"c{place}" for place, name in enumerate(header[: n - hollow], 1) if not name]
-    above = _split_cells(head[first - 1][1].lstrip("#%/ "), separator) if first else []
+    above = _cells_of_names(head[first - 1][1], n, separator) if first else []
     if 1 < len(above) == n - 1 and _number_share(above) < 0.5 and not (hollow or named):
         # commas may be decimals, or the first column be without a name: each name would be another column's
         hint = f"name all with --columns {','.join(['NAME'] * n)}, or write decimals with a point"
@@ -208,7 +215,7 @@ def find_layout(text: str, file: str, *, named: bool = False) -> Layout:
     if passed:
         notes.append(f"{passed} line(s) before the table passed over")
     for place, line in head[:first]:
-        if _SCALES.search(line) and not {*_split_cells(line, separator)} & {*header}:
+        if _SCALES.search(line) and not {*_cells_of_names(line, n, separator)} & {*header}:
             notes.append(Doubt(f"line {place} may change the numbers under it: {_quoted_cell(line)}"))
     return Layout(names, head[first][0] - 1, separator, tuple(notes), header)
 
@@ -273,19 +280,48 @@ def _number_share(row: Sequence[str]) -> float:
     return sum(_is_value(cell) for cell in row) / max(len(row), 1)
 
 
-def _names_above(lines: Sequence[str], n: int, separator: str) -> tuple[list[str], int]:
-    """Return the names of n columns, empty where the file has none, and the number of their lines."""
+def _cells_of_names(line: str, n: int, separator: str) -> list[str]:
+    """Return the cells of a line as the names of n columns: split by any separator that gives so many, once
+    empty ones at its ends fall away; else as a row is."""
+    line = line.lstrip("#%/ ") if line.startswith(_COMMENT) else line
+    if line.rstrip().endswith(("[", "{")):  # a matrix begins, as MATLAB writes it
+        return []
+    as_rows, *by_others = (_split_cells(line, sign) for sign in (separator, *",;\t"))
+    for cells in (as_rows, *by_others, re.split(r"\s{2,}|\t|,|;", line.strip())):
+        within = "\0".join(map(str.strip, cells)).strip("\0").split("\0")
+        if n in (len(cells), len(within)):
+            return cells if len(cells) == n else within
+    return as_rows
+
+
+def _are_channels(cells: Sequence[str], below: Sequence[str]) -> bool:
+    """Tell whether cells are names although most are numbers: those of channels (whole, each once, none of
+    them again in the row below), beside words above numbers."""
+    channels = [cell for cell in cells if cell.isdigit()]
+    under_words = [under for cell, under in zip(cells, below) if not _is_value(cell)]
+    return (
+        0 < len(under_words) == len(below) - len({*channels}) == len(cells) - len(channels)
+        and all(map(_is_value, under_words))
+        and all(cell != under for cell, under in zip(cells, below))
+    )
+
+
+def _names_above(lines: Sequence[str], row: Sequence[str], separator: str) -> tuple[list[str], int]:
+    """Return the names of the columns of a row, empty where the file has none, and the number of their
+    lines."""
+    n = len(row)
     headers: list[list[str]] = []  # the nearest first
     counted: list[bool] = []  # those that are no comments
     units = [""] * n
     for line in reversed(lines):
-        comment = line.startswith(_COMMENT)
+        comment, nearest = line.startswith(_COMMENT), line is lines[-1]
         cells = _split_cells(line.lstrip("#%/ ") if comment else line, separator)
-        if separator == " " and len(cells) != n:
-            cells = [cell.strip() for cell in re.split(r"\s{2,}|\t|,|;", line.strip("#%/ "))]
+        if nearest or separator == " ":
+            cells = _cells_of_names(line, n, separator)
         words = [*filter(None, cells)]
         fits = len(cells) == n or len(cells) == n - 1 > 1
-        if fits and words and _number_share(words) < 0.5 and not (comment and headers):
+        are_names = _number_share(words) < 0.5 or (nearest and _are_channels(cells, row))
+        if fits and words and are_names and not (comment and headers):
             headers.append([*cells, ""][:n])
             counted.append(not comment)
     if not headers:
@@ -332,16 +368,22 @@ def _without_labels(text: str) -> tuple[str, tuple[str, ...]]:
         return "\n".join(["time,name,state", *readings]), ("lines of an ESPHome log",)
     # so write serial plotters (T1:23.5,T2:24.0), printer hosts (T:22.1 /200.0 @:127, a target behind its
     # reading) and Klipper (extruder: target=200 temp=22.1 pwm=0.9); lines without them are passed over
-    labels = Counter(tuple(_labelled_cells(line)) for line in head)
-    del labels[()]
-    names, lines_of_names = max(labels.items(), key=lambda item: (item[1], len(item[0])), default=((), 0))
-    if not names or lines_of_names < min(_LABELLED_LINES, max(2, _MOST * sum(map(bool, head)))):
-        return text, ()
+    stats = [line for line in _iterate_lines(text) if line.startswith(_KLIPPER)] if _KLIPPER in text else []
+    found = dict.fromkeys(chain.from_iterable(map(_labelled_cells, stats)))
+    names = ("uptime_s", *(name for name in found if name.rpartition("_")[2] in _OF_HEATERS))
+    needed = {"uptime_s"}  # a heater may be in some lines only, behind a printer's settings
+    if len(names) == 1:
+        labels = Counter(tuple(_labelled_cells(line)) for line in head)
+        del labels[()]
+        names, count = max(labels.items(), key=lambda item: (item[1], len(item[0])), default=((), 0))
+        if not names or count < min(_LABELLED_LINES, max(2, _MOST * sum(map(bool, head)))):
+            return text, ()
+        needed = {*names}
     rows: list[str] = []
     passed = 0
     for line in _iterate_lines(text):
         cells = _labelled_cells(line)
-        rows.append(",".join(cells[name] for name in names) if cells.keys() >= {*names} else "")
+        rows.append(",".join(cells.get(name, "") for name in names) if cells.keys() >= needed else "")
         passed += not rows[-1] and bool(line.strip())
     first = next((place for place, row in enumerate(rows) if row), 0)
     rows[max(first - 1, 0) : first] = [",".join(names)]  # in place of a line before, if there is one
@@ -375,7 +417,7 @@ def _labelled_cells(line: str) -> dict[str, str]:
     if line.startswith("{"):  # JSON, an object a line
         line = re.sub(r'[{}"]', "", line)
     if stamp is not None:
-        cells["time" if stamp[1] else "time_s"] = (stamp[1] or stamp[2]).replace(",", ".")
+        cells["time" if stamp[1] else "uptime_s"] = (stamp[1] or stamp[2]).replace(",", ".")
         line = line[stamp.end() :]
     words: list[str] = []
     for piece in re.split(r"[,;\t]", line.replace("/", " /")):

@@ -165,7 +165,7 @@ LABVIEW = (
         ("esphome.log", "[06:00:00][I][app:102]: ESPHome version 2024.2\n",
          lambda k: f"[06:00:{k:02}][D][sensor:094]: 'plate_temp': Sending state {PLATE[k]:.2f} \u00b0C with\n"
                    f"[06:00:{k:02}][D][number:012]: 'heater': Sending state {HEATER[k]:.1f}\n", 1.0),
-        ("klippy.log", "Loaded MCU 'mcu' 100 commands\n",
+        ("klippy.log", "Loaded MCU 'mcu'\n" + "[gcode_macro PRIME]\ngcode: M104 S200\n" * 750,
          lambda k: f"Stats {1200 + 2 * k}.3: heater: target=0 temp={PLATE[k]:.2f} pwm={HEATER[k]:g} "
                    f"sysload=0.3{k % 7} cputime={k / 20:.3f}\n", 2.0),
     ],
@@ -179,7 +179,17 @@ def test_logs_of_programs_are_read_with_their_clocks(tmp_path, name, head, line,
         str(n): v.attrs["role"] for n, v in log.items() if v.attrs["role"] not in ("other", "disturbance")
     }
     assert roles == {reading: "output", drive: "input"}
+    assert not {"sysload", "cputime"} & {*log}
     np.testing.assert_allclose(column(log, reading), np.round(PLATE[: log.sizes["time"]], 2))
+
+
+def test_each_start_of_labview_s_first_column_is_a_part(tmp_path):
+    starts = [*range(12), *range(36), *range(12)]
+    rows = "".join(f"{t}\t{HEATER[k]:g}\t{PLATE[k]:.2f}\n" for k, t in enumerate(starts))
+    head = "LabVIEW Measurement\t\nX_Columns\tOne\n***End_of_Header***\t\n"
+    (tmp_path / "pulses.lvm").write_text(head + rows)
+    log = read_log(tmp_path / "pulses.lvm")
+    assert (list(log), np.flatnonzero(np.diff(log["time"]) > 10).tolist()) == (["c2", "c3"], [11, 47])
 
 
 def test_a_kiln_s_log_keeps_the_reading_that_has_a_blank_before_its_sign(tmp_path):

@@ -104,6 +104,13 @@ def test_the_ending_is_the_format_and_the_rest_is_the_name(name, kind, stem):
         ("Log\nversion\t2\nby\tme\n\nTime\tU\tT (C)\n" + "0\t1\t2\n" * 40, "Time|U|T (C)", 5, "\t",
          "3 line(s) before the table passed over"),
         ("a,b\n1,2\n", "a|b", 1, ",", ""),  # a row alone stands beside the header
+        ("Time (s),Set,I (A)\n0\t1\t2\n1\t2\t3\n", "Time (s)|Set|I (A)", 1, "\t", ""),
+        ("\t\t\tt\tU\tT\n0\t1\t2\n1\t2\t3\n", "t|U|T", 1, "\t", ""),
+        ("data7 = [\n.1 2 3 4\n.2 2 3 4\n", "c1|c2|c3|c4", 1, " ",
+         BY_POSITION.format(4) + "; 1 line(s) before the table passed over"),
+        ("1,2,3,Oven,Time_(s)\n20,21,22,23,0\n20,21,22,23,12\n", "1|2|3|Oven|Time_(s)", 1, ",", ""),
+        ("1,2,Oven,Time_(s)\n20,21,23,0\n20,21,23,12\n", "1|2|Oven|Time_(s)", 1, ",", ""),
+        ("0,100,ERR,22\n1,100,23,22\n2,100,24,25\n", "c1|c2|c3|c4", 0, ",", BY_POSITION.format(4)),
         *((("x\n" * (198 + more) + "a,b\n0,1\n0,2\n"), *found, ",", note) for more, found, note in [
             (0, ("a|b", 199), "198 line(s) before the table passed over"), (1, ("x", 1), "")]),
     ],
