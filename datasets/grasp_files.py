@@ -1,7 +1,7 @@
 """Grasps to and from disk; ``docs/reference/files.md`` has their columns.
 
 As CSV a condition is two files, ``NAME.csv``, long, one row a sample, and ``NAME_meta.csv``, one row a grasp;
-in a Parquet file or a DataFrame each row repeats what is known of its grasp.  A missing ``session`` is the
+in a Parquet file each row repeats what is known of its grasp.  A missing ``session`` is the
 file, a missing ``block`` the material: so no block is split between training and test by accident.
 
 The grasps of one file share one time axis.
@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 from thermogrip.datasets.errors import UserError, reading
 from thermogrip.datasets.files import file_format, file_stem, write_atomic
 from thermogrip.datasets.media import csv_cell
-from thermogrip.datasets.netcdf import open_netcdf, record_unit, write_netcdf
+from thermogrip.datasets.netcdf import numbers_and_unit, open_netcdf, write_netcdf
 from thermogrip.datasets.schema import GRASP_LABELS, GRASP_NUMBERS, check_grasps, make_grasps, with_lead_in
-from thermogrip.datasets.tables import Table, frame_table, read_csv_table, read_parquet_table
+from thermogrip.datasets.tables import Table, read_csv_table, read_parquet_table
 from thermogrip.datasets.units import rename_hint, split_header, to_record_unit
 
 if TYPE_CHECKING:
@@ -32,8 +32,8 @@ if TYPE_CHECKING:
     from thermogrip.datasets.schema import Grasps
 
 Floats = NDArray[np.float64]
-#: What is taken for grasps: themselves, long DataFrames, paths of files; one or several.
-Records: TypeAlias = "Grasps | DataFrame | str | Path | Sequence[Grasps | DataFrame | str | Path]"
+#: What is taken for grasps: themselves, paths of files; one or several.
+Records: TypeAlias = "Grasps | str | Path | Sequence[Grasps | str | Path]"
 
 # name in the meta file (without unit) -> name in the record
 _FROM_META = {"t_object_nominal": "t_object", "t_gripper_set": "t_gripper"}
@@ -41,6 +41,7 @@ _FROM_META = {"t_object_nominal": "t_object", "t_gripper_set": "t_gripper"}
 META_NAMES = {ours: theirs for theirs, ours in _FROM_META.items()}
 _ENDINGS = (".csv", ".csv.gz", ".csv.xz")
 _SAMPLES = {"time": "s", "t_surface": "degC", "t_surface_2": "degC"}  # what a sample has, and its unit
+_NUMBERS = _SAMPLES | GRASP_NUMBERS
 _SAMPLE_PREFIXES = ("grasp_id", "time", "t_surface")
 
 
@@ -86,20 +87,9 @@ def read_grasps(path: str | Path, *, name: str | None = None) -> Grasps:
 
 
 def as_grasps(grasps: Records) -> list[Grasps]:
-    """Return records as they are, those of files as they are read, and those of DataFrames, whose columns are
-    the ones of a Parquet file, with their rows counted from 1."""
-    from pandas import DataFrame
-
+    """Return records as they are, and those of files as they are read."""
     records = list(grasps) if isinstance(grasps, Sequence) and not isinstance(grasps, str) else [grasps]
-    read: list[Any] = []
-    for record in records:
-        if isinstance(record, DataFrame):
-            rows = record.reset_index(drop=True)
-            table = frame_table(rows, "DataFrame", text=_is_text, tolerated=0.0)
-            read.append(_of_tables(table, None, "DataFrame"))
-        else:
-            read.append(read_grasps(record) if isinstance(record, str | Path) else record)
-    return read
+    return [read_grasps(record) if isinstance(record, str | Path) else record for record in records]
 
 
 def write_grasps(grasps: Grasps, path: str | Path) -> Path:
@@ -156,32 +146,35 @@ def _name_and_unit(header: str, file: str | None = None) -> tuple[str, str]:
     return name.lower() if name.lower() in GRASP_LABELS else _FROM_META.get(name, name), unit  # "Material"
 
 
+def _in_record_unit(name: str, values: Floats, unit: str, file: str | Path, column: str) -> Floats:
+    """Return the numbers of a variable in the unit that a record has it in; UserError where theirs is of
+    another kind."""
+    numbers, unit_after = to_record_unit(values, unit)
+    if unit_after != (wanted := _NUMBERS[name]):
+        problem = "has no unit" if unit in ("", "1") else f"unit {unit!r} does not fit"
+        hint = f"give it in {wanted}, in a table as {name}_{wanted}"
+        raise UserError(problem, file=file, column=column, hint=hint)
+    return numbers
+
+
 def _columns(table: Table, wanted: Collection[str]) -> tuple[dict[str, Any], list[str]]:
-    """Return the columns of these names in a record, in its units, and what was converted."""
-    columns: dict[str, Any] = {}
+    """Return ``grasp_id`` and columns of these names in a record, in its units, and what was converted."""
+    if "grasp_id" not in table.text:
+        hint = "a grasp file has grasp_id,time_s,t_surface_degC, its meta file grasp_id,material,..."
+        raise UserError("no column grasp_id", file=table.file, hint=hint)
+    columns: dict[str, Any] = {"grasp_id": np.asarray(table.text["grasp_id"])}
     converted = []
-    for header in (*table.text, *table.numbers):
+    for header in [header for header in (*table.text, *table.numbers) if header != "grasp_id"]:
         name, unit = _name_and_unit(header, table.file)
         if name in columns:
             raise UserError(f"gives {name} a second time", file=table.file, column=header, hint="keep one")
         if name in GRASP_LABELS and name in wanted:
             columns[name] = np.asarray(table.text[header])
         elif name in wanted:
-            columns[name], unit_after = to_record_unit(table.numbers[header], unit)
-            wanted_unit = (_SAMPLES | GRASP_NUMBERS)[name]
-            if unit_after != wanted_unit:
-                problem = "has no unit" if unit == "1" else f"unit {unit!r} does not fit"
-                hint = f"it is in {wanted_unit}: write {name}_{wanted_unit}"
-                raise UserError(problem, file=table.file, column=header, hint=hint)
-            if unit_after != unit:
-                converted.append(f"{name}: converted from {unit} to {unit_after}")
+            columns[name] = _in_record_unit(name, table.numbers[header], unit, table.file, header)
+            if (wanted_unit := _NUMBERS[name]) != unit:
+                converted.append(f"{name}: converted from {unit} to {wanted_unit}")
     return columns, converted
-
-
-def _grasp_ids(table: Table, hint: str) -> NDArray[np.str_]:
-    if "grasp_id" not in table.text:
-        raise UserError("no column grasp_id", file=table.file, hint=hint)
-    return np.asarray(table.text["grasp_id"])
 
 
 def _samples_of(table: Table) -> tuple[DataFrame, list[str]]:
@@ -189,20 +182,19 @@ def _samples_of(table: Table) -> tuple[DataFrame, list[str]]:
     columns ``grasp_id``, ``time`` [s] and those of the sensors [degC]."""
     import pandas as pd
 
-    file = table.file
-    ids = _grasp_ids(table, "a grasp file has grasp_id,time_s,t_surface_degC")
     columns, converted = _columns(table, _SAMPLES)
     for need, header in (("time", "time_s"), ("t_surface", "t_surface_degC")):
         if need not in columns:
             hint = rename_hint(need, [*table.text, *table.numbers])
-            raise UserError(f"no column {header}", file=file, hint=hint)
-    if (lost := ~np.isfinite(columns["time"])).any():
-        raise UserError("has no time", file=file, row=int(table.lines[lost.argmax()]), hint="remove the row")
-    if (empty := ids == "").any():
-        row = int(table.lines[empty.argmax()])
-        raise UserError("is empty", file=file, row=row, column="grasp_id", hint="name the grasp")
+            raise UserError(f"no column {header}", file=table.file, hint=hint)
+    for lost, problem, where, hint in (
+        (~np.isfinite(columns["time"]), "has no time", None, "remove the row"),
+        (columns["grasp_id"] == "", "is empty", "grasp_id", "name the grasp"),
+    ):
+        for line in table.lines[lost][:1]:
+            raise UserError(problem, file=table.file, row=int(line), column=where, hint=hint)
     columns["time"] = np.round(columns["time"], 6)
-    return pd.DataFrame({"grasp_id": ids} | columns), [*table.notes, *converted]
+    return pd.DataFrame(columns), [*table.notes, *converted]
 
 
 def _onto_one_axis(samples: DataFrame, file: str, repairs: list[str]) -> tuple[Floats, dict[str, Floats]]:
@@ -296,11 +288,8 @@ def _unused(table: Table, known: Collection[str]) -> list[str]:
     return [f"{Path(table.file).name}: not used: {', '.join(unused)}; {hint}"] if unused else []
 
 
-def _rows_of_meta(meta: Table, order: Index[str], file: str) -> NDArray[np.intp]:
+def _rows_of_meta(meta: Table, ids: Index[str], order: Index[str], file: str) -> NDArray[np.intp]:
     """Return for each grasp its row in the meta file; both files must name the same grasps, each once."""
-    import pandas as pd
-
-    ids = pd.Index(_grasp_ids(meta, "give each grasp's name as in the sample file"))
     without = f"grasp {{!r}} has no samples in {Path(file).name}"
     for wrong, problem, hint in (
         (ids.duplicated(), "grasp_id {!r} occurs twice", "give each its own"),
@@ -315,20 +304,20 @@ def _rows_of_meta(meta: Table, order: Index[str], file: str) -> NDArray[np.intp]
 
 def _first_rows(table: Table) -> NDArray[np.intp]:
     """Return the first row of each grasp in a table that repeats its facts; UserError where they differ."""
-    ids = np.asarray(table.text["grasp_id"])
-    _, first_rows, grasps = np.unique(ids, return_index=True, return_inverse=True)
-    for header, column in {**table.text, **table.numbers}.items():
-        if _name_and_unit(header)[0] not in (*GRASP_LABELS, *GRASP_NUMBERS):
-            continue
-        cells = np.asarray(column)
-        first = cells[first_rows][grasps]
-        differs = (cells != first) & ~((cells != cells) & (first != first))  # NaN is as good as NaN
-        for row in np.flatnonzero(differs)[:1]:
-            earlier = f"was {first[row]!s} in row {table.lines[first_rows[grasps[row]]]}"
-            problem = f"{cells[row]!s} of grasp {str(ids[row])!r} {earlier}"
-            hint, line = "repeat in each row what is known of its grasp", int(table.lines[row])
-            raise UserError(problem, file=table.file, row=line, column=header, hint=hint)
-    return np.sort(first_rows)
+    import pandas as pd
+
+    known = ("grasp_id", *GRASP_LABELS, *GRASP_NUMBERS)
+    columns = {**table.text, **table.numbers}
+    facts = pd.DataFrame({h: cells for h, cells in columns.items() if _name_and_unit(h)[0] in known})
+    facts = facts.drop_duplicates()  # NaN is as good as NaN
+    for grasp in facts["grasp_id"][facts["grasp_id"].duplicated()][:1]:
+        two_rows = facts[facts["grasp_id"] == grasp][:2]
+        header = two_rows.nunique(dropna=False).idxmax()
+        (earlier, cell), (first, line) = two_rows[header], table.lines[two_rows.index]
+        problem = f"{cell} of grasp {grasp!r} was {earlier} in row {first}"
+        hint = "repeat in each row what is known of its grasp"
+        raise UserError(problem, file=table.file, row=int(line), column=header, hint=hint)
+    return facts.index.to_numpy()
 
 
 def _of_tables(table: Table, meta: Table | None, name: str) -> Grasps:
@@ -337,10 +326,12 @@ def _of_tables(table: Table, meta: Table | None, name: str) -> Grasps:
 
     samples, repairs = _samples_of(table)
     order = pd.Index(samples["grasp_id"].unique())
-    rows = _first_rows(table) if meta is None else _rows_of_meta(meta, order, table.file)
-    axis, channels = _onto_one_axis(samples, table.file, repairs)
     known = (*GRASP_NUMBERS, *GRASP_LABELS)
-    facts = {name: column[rows] for name, column in _columns(meta or table, known)[0].items()}
+    facts, _ = _columns(meta or table, known)
+    ids = pd.Index(facts.pop("grasp_id"))
+    rows = _first_rows(table) if meta is None else _rows_of_meta(meta, ids, order, table.file)
+    axis, channels = _onto_one_axis(samples, table.file, repairs)
+    facts = {name: column[rows] for name, column in facts.items()}
     unused = _unused(table, known) if meta is None else [*_unused(table, ()), *_unused(meta, known)]
     attrs = {"name": name, "repairs": "\n".join([*repairs, *unused])}
     return _record(table.file, name, order.tolist(), axis, channels | facts, attrs)
@@ -354,13 +345,10 @@ def _of_dataset(data: xr.Dataset, path: str | Path, called: str | None = None) -
     for need in ("grasp", "time", "t_surface"):
         if need not in data.variables:
             raise UserError(f"no {need}", file=path, hint="give a file of grasps")
-    expected = _SAMPLES | GRASP_NUMBERS
     numbers: dict[str, Any] = {}
-    for name in [name for name in expected if name in data.variables]:
-        numbers[name], unit = record_unit(data[name], name, str(path))
-        if unit != expected[name]:
-            hint = f"it must be in {expected[name]}"
-            raise UserError(f"unit {unit!r} does not fit", file=path, column=name, hint=hint)
+    for name in [name for name in _NUMBERS if name in data.variables]:
+        values, unit = numbers_and_unit(data[name], name, str(path))
+        numbers[name] = _in_record_unit(name, values, unit, path, name)
     labels = {name: data[name].values.tolist() for name in GRASP_LABELS if name in data}
     axis, ids = numbers.pop("time"), data["grasp"].values.astype(str).tolist()
     stem = called or file_stem(path)

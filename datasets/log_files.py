@@ -140,7 +140,7 @@ def read_log(
     roles = assign_roles(read.units, given=stated, columns=read.values, file=str(file), **lists)
     if table.meta.get("schema") == "thermogrip.log":
         repairs = [line for line in table.meta.get("repairs", "").splitlines() if line]
-        log = _made(read.clock.seconds, read.values, repairs, read, roles, file)
+        log = _made(_Repaired(read.clock.seconds, read.values, repairs), read, roles, file)
         log.attrs.update({k: v for k, v in table.meta.items() if k not in ("schema", "version")})
     else:
         repaired = _repair(read.clock.seconds, read.values, read.units, roles.of, table)
@@ -148,7 +148,7 @@ def read_log(
         if outputs is None:
             roles = _without_half_lost(roles, repaired.time, repaired.columns)
         repairs = [*read.repairs, *repaired.repairs]
-        log = _made(repaired.time, repaired.columns, repairs, read, roles, file)
+        log = _made(repaired._replace(repairs=repairs), read, roles, file)
         of_clock = [line for line in repairs if isinstance(line, repair.ClockDoubt)]
         others = [line for line in repairs if isinstance(line, repair.Doubt) and line not in of_clock]
         log.attrs["clock_doubts"] = "\n".join(filter(None, [read.clock.doubt, *of_clock]))
@@ -159,17 +159,11 @@ def read_log(
     return _cut(log, start, stop) if (start, stop) != (-np.inf, np.inf) else log
 
 
-def _made(
-    time: Floats,
-    values: Mapping[str, Floats],
-    repairs: Sequence[str],
-    read: _Columns,
-    roles: Roles,
-    file: Path,
-) -> Log:
+def _made(repaired: _Repaired, read: _Columns, roles: Roles, file: Path) -> Log:
     """Return the log with what is known of its file: the hash of its data, its date, and why roles are so."""
-    variables = {name: (cells, read.units[name], roles.of[name]) for name, cells in values.items()}
-    log = make_log(time, variables, name=str(file), repairs=repairs)  # a fault found here names the file
+    variables = {name: (cells, read.units[name], roles.of[name]) for name, cells in repaired.columns.items()}
+    # a fault found here names the file
+    log = make_log(repaired.time, variables, name=str(file), repairs=repaired.repairs)
     log.attrs["name"] = file_stem(file)
     log.attrs["sha256"] = hash_columns({"time": read.clock.seconds, **read.values})
     finite = read.clock.seconds[np.isfinite(read.clock.seconds)]
@@ -238,7 +232,7 @@ def check_written(path: str | Path) -> str:
 
 def _read_netcdf_table(path: str | Path) -> Table:
     """Return the variables over ``time`` of a NetCDF file as a table."""
-    from thermogrip.datasets.netcdf import convention_unit, open_netcdf
+    from thermogrip.datasets.netcdf import numbers_and_unit, open_netcdf
 
     data = open_netcdf(path)
     if "time" not in data.dims or "time" not in data.variables:
@@ -248,14 +242,9 @@ def _read_netcdf_table(path: str | Path) -> Table:
     numbers: dict[str, Floats] = {}
     attrs: dict[str, dict[str, str]] = {}
     for name in ["time", *map(str, data.drop_vars(not_over_time).data_vars)]:
-        values, in_file = data[name].values, data[name].attrs
-        if values.dtype.kind not in "fiub":
-            problem = f"holds {values.dtype}, not numbers"
-            raise UserError(problem, file=path, column=name, hint="leave it out")
-        numbers[name] = np.asarray(values, dtype=float)
-        attrs[name] = {key: str(in_file[key]) for key in ("role", "flag_meanings") if key in in_file}
-        if "units" in in_file:
-            attrs[name]["units"] = convention_unit(str(in_file["units"]), name, str(path))
+        numbers[name], unit = numbers_and_unit(data[name], name, str(path))
+        in_file = {str(key): str(value) for key, value in data[name].attrs.items()} | {"units": unit}
+        attrs[name] = {key: in_file[key] for key in ("units", "role", "flag_meanings") if in_file.get(key)}
     meta = {str(key): str(value) for key, value in data.attrs.items()}
     notes = (f"left out, not over time alone: {', '.join(not_over_time)}",) if not_over_time else ()
     return Table(str(path), numbers, {}, np.arange(1, data.sizes["time"] + 1), attrs, meta, notes)

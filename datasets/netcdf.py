@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from thermogrip.datasets.errors import UserError, os_faults, reading
 from thermogrip.datasets.files import atomic_path, check_source
 from thermogrip.datasets.limits import MOST_BYTES, check_unpacked, in_own_process, most_unpacked
-from thermogrip.datasets.units import UNITS, any_unit, to_record_unit
+from thermogrip.datasets.units import UNITS, any_unit
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -120,14 +120,14 @@ def write_netcdf(data: xr.Dataset, path: str | Path) -> Path:
     return Path(path)
 
 
-def record_unit(variable: xr.DataArray, name: str, file: str) -> tuple[NDArray[np.float64], str]:
-    """Return a variable's numbers and unit as records have them; UserError where it has none."""
+def numbers_and_unit(variable: xr.DataArray, name: str, file: str) -> tuple[NDArray[np.float64], str]:
+    """Return a variable's numbers and its unit, "" where it states none; UserError where it holds no numbers
+    or an unknown unit."""
     if variable.dtype.kind not in "fiub":
         raise UserError(f"holds {variable.dtype}, not numbers", file=file, column=name, hint="leave it out")
-    if "units" not in variable.attrs:
-        raise UserError("has no unit", file=file, column=name, hint="set its attribute units")
-    unit = convention_unit(str(variable.attrs["units"]), name, file)
-    return to_record_unit(np.asarray(variable.values, dtype=float), unit)
+    stated = variable.attrs.get("units")
+    unit = "" if stated is None else convention_unit(str(stated), name, file)
+    return np.asarray(variable.values, dtype=float), unit
 
 
 def convention_unit(unit: str, name: str, file: str) -> str:

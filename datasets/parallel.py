@@ -8,12 +8,12 @@ unpickle functions and items: those that this one started, or those of the clust
 
 from __future__ import annotations
 
-import atexit
 import os
 import signal
 import threading
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures.process import BrokenProcessPool
+from importlib import import_module
 from importlib.util import find_spec
 from typing import Any, TypeAlias, TypeVar
 from warnings import catch_warnings, simplefilter
@@ -31,8 +31,7 @@ _SAME_VERSIONS = ("thermogrip", "numba", "numpy", "scipy")  # on which the last 
 #: Who sets one of these wants as many threads of linear algebra.
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
-_clients: dict[str, Any] = {}  # by the address of a scheduler
-_lock = threading.Lock()  # of these, and of the environment in which processes are started
+_lock = threading.Lock()  # of the environment in which processes are started
 _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
 
@@ -131,27 +130,20 @@ def _processes(n: int) -> Any:
 
 
 def _client_of(address: str) -> Any:
-    """Return the client of a scheduler, the same one until the program ends."""
-    import distributed
-
-    dask: Any = distributed  # its functions have no types
-    with _lock:
-        if address in _clients and _clients[address].status == "running":
-            return _clients[address]
-        hint = "start one with 'dask scheduler', or check the address"
-        lost = as_user_error((OSError, ValueError), f"no scheduler answers at {address}", hint=hint)
-        with catch_warnings(), lost:
-            # its own words about versions are a table; _check_cluster says it in one line
-            simplefilter("ignore", dask.versions.VersionMismatchWarning)
-            client = dask.Client(address, timeout=_CONNECT_S, set_as_default=False)
-        atexit.register(client.close)
-        try:
-            _check_cluster(client, address)
-        except UserError:
-            client.close()
-            raise
-        _clients[address] = client
-        return client
+    """Return the client of a scheduler: the current one of the program where it is of that address."""
+    distributed: Any = import_module("distributed")  # its functions have no types
+    hint = "start one with 'dask scheduler', or check the address"
+    lost = as_user_error((OSError, ValueError), f"no scheduler answers at {address}", hint=hint)
+    with catch_warnings(), lost:
+        # its own words about versions are a table; _check_cluster says it in one line
+        simplefilter("ignore", distributed.versions.VersionMismatchWarning)
+        client = distributed.get_client(address, timeout=_CONNECT_S)
+    try:
+        _check_cluster(client, address)
+    except UserError:
+        client.close()
+        raise
+    return client
 
 
 def _check_cluster(client: Any, address: str) -> None:

@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from thermogrip.datasets.errors import UserError, known_names, os_faults, reading
+from thermogrip.datasets.errors import UserError, as_user_error, known_names, os_faults, reading
 from thermogrip.datasets.files import check_source, file_stem, read_bytes, read_toml
 from thermogrip.datasets.limits import Unpacker, check_size
 from thermogrip.datasets.roles import guess_role
@@ -44,8 +44,8 @@ class Column:
     its messages, which a bag says itself and a node does not."""
 
     topic: str
-    field: str
-    unit: str
+    field: str = "data"
+    unit: str = "1"
     role: str = ""
     type: str = ""
 
@@ -88,25 +88,25 @@ def read_topic_map(path: str | Path) -> TopicMap:
 
 
 def _column(name: str, entry: Any, path: str | Path) -> Column:
-    keys = {"topic", "field", "unit", "role", "type"}
-    if not isinstance(entry, dict) or set(entry) - keys or "topic" not in entry:
-        raise UserError("needs topic, field, unit, role", file=path, column=name, hint="name its topic")
-    unit, role = str(entry.get("unit", "1")), str(entry.get("role", ""))
-    if unit not in (*UNITS, "1"):
-        problem = f"unit {unit!r} is unknown"
-        raise UserError(problem, file=path, column=name, hint=f"use {' '.join(UNITS)} or 1")
-    if role not in (*ROLES, ""):
-        raise UserError(f"role {role!r} is unknown", file=path, column=name, hint=known_names(role, ROLES))
-    field, kind = str(entry.get("field", "data")), str(entry.get("type", ""))
-    return Column(str(entry["topic"]), field, unit, role, kind)
+    place: dict[str, Any] = {"file": path, "column": name}
+    no_column = (AttributeError, TypeError)  # no table, another key, or no topic
+    with as_user_error(no_column, "needs topic, field, unit, role", **place, hint="name its topic"):
+        column = Column(**{key: str(value) for key, value in entry.items()})
+    for kind, word, known in (("unit", column.unit, (*UNITS, "1")), ("role", column.role or "other", ROLES)):
+        if word not in known:
+            raise UserError(f"{kind} {word!r} is unknown", **place, hint=known_names(word, known))
+    return column
 
 
 def read_rosbag_table(path: str | Path, topics: TopicMap | None = None) -> Table:
     """Return the columns of a bag on one time axis, by this map, the TOML file beside the bag, or guessed."""
     file = Path(path)
-    topic_map = topics or _map_beside(file) or TopicMap({})
+    inside = (file / f"{file.name}.topics.toml", file / "topics.toml") if os.path.isdir(file) else ()
+    maps = (*inside, file.parent / f"{file_stem(file)}.topics.toml", file.parent / "topics.toml")
+    map_beside = next((path for path in maps if path.is_file()), None)
+    topic_map = topics or (read_topic_map(map_beside) if map_beside else TopicMap({}))
     notes: list[str] = []
-    series: dict[str, tuple[list[float], list[float]]] = {}
+    readings: dict[str, list[tuple[float, float]]] = {}  # time and value, by column
     columns = dict(topic_map.columns)
     has_map = bool(columns)
     type_of_topic: dict[str, str] = {}
@@ -116,18 +116,17 @@ def read_rosbag_table(path: str | Path, topics: TopicMap | None = None) -> Table
             _guess_column(message, columns, file)
         for name, column in columns.items():
             if column.topic == message.topic:
-                times, values = series.setdefault(name, ([], []))
-                times.append(message.time)
-                values.append(_message_number(message, column, name, file))
+                value = _message_number(message, column, name, file)
+                readings.setdefault(name, []).append((message.time, value))
     have = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(type_of_topic.items())) or "none"
     for name, column in columns.items():
-        if name not in series:
+        if name not in readings:
             problem = f"topic {column.topic} has no message"
             raise UserError(problem, file=file, column=name, hint=f"it has {have}")
     if not columns:
         problem = f"has no topic with a single number (topics: {have})"
         raise UserError(problem, file=file, hint="write a topic map (`thermogrip init topics`)")
-    return _bag_table(file, columns, series, topic_map.clock, notes)
+    return _bag_table(file, columns, readings, topic_map.clock, notes)
 
 
 def bag_messages(path: str | Path) -> list[Message]:
@@ -187,14 +186,6 @@ def bag_parts(folder: str | Path) -> list[Path]:
     return bag_files
 
 
-def _map_beside(file: Path) -> TopicMap | None:
-    inside = (file / f"{file.name}.topics.toml", file / "topics.toml") if os.path.isdir(file) else ()
-    for path in (*inside, file.parent / f"{file_stem(file)}.topics.toml", file.parent / "topics.toml"):
-        if path.is_file():
-            return read_topic_map(path)
-    return None
-
-
 def _guess_column(message: Message, columns: dict[str, Column], file: Path) -> None:
     """Add a column for a topic that is seen for the first time and has one number."""
     if any(column.topic == message.topic for column in columns.values()):
@@ -240,15 +231,15 @@ def _message_number(message: Message, column: Column, name: str, file: Path) -> 
 def _bag_table(
     file: Path,
     columns: Mapping[str, Column],
-    series: Mapping[str, tuple[list[float], list[float]]],
+    readings: Mapping[str, list[tuple[float, float]]],
     clock: str,
     notes: list[str],
 ) -> Table:
     import pandas as pd
 
     frames = {
-        name: pd.DataFrame({"time": times, "value": values}).sort_values("time", kind="stable")
-        for name, (times, values) in series.items()
+        name: pd.DataFrame(rows, columns=["time", "value"]).sort_values("time", kind="stable")
+        for name, rows in readings.items()
     }
     units = {name: to_record_unit(np.zeros(1), column.unit)[1] for name, column in columns.items()}
     roles = {name: column.role or guess_role(name, units[name]) for name, column in columns.items()}

@@ -14,7 +14,8 @@ and the variable ``t_surface``; per grasp it may have a material, temperatures, 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
@@ -97,35 +98,31 @@ def make_log(
 
 def check_log(log: Log) -> None:
     """Raise :class:`UserError` naming the variable of a log and the rule it breaks."""
-    for column, problem, hint in _log_faults(log):
-        raise UserError(problem, file=log_name(log), column=column, hint=hint)
-
-
-def _log_faults(log: Log) -> Iterator[tuple[str | None, str, str | None]]:
-    """Yield (variable, problem, hint) of a log; each check needs those before it."""
+    fault = partial(UserError, file=log_name(log))
     if "time" not in log.coords or log["time"].dims != ("time",):
-        yield None, "no time axis", "give the record a dimension 'time' in seconds"
+        raise fault("no time axis", hint="give the record a dimension 'time' in seconds")
     time = log["time"].values
     if time.size < 2:
-        yield None, f"{time.size} row(s) are not a log", "give at least two rows"
+        raise fault(f"{time.size} row(s) are not a log", hint="give at least two rows")
     if not np.all(np.isfinite(time)):
-        yield None, "time is not finite everywhere", "remove the rows without a time"
+        raise fault("time is not finite everywhere", hint="remove the rows without a time")
     if np.any(np.diff(time) <= 0):
         row = int(np.argmax(np.diff(time) <= 0))
-        yield None, f"time does not increase after {time[row]:g} s", "sort the rows by time"
+        raise fault(f"time does not increase after {time[row]:g} s", hint="sort the rows by time")
     for name, variable in ((str(key), variable) for key, variable in log.data_vars.items()):
         if variable.dims != ("time",):
-            yield name, f"dims are {variable.dims}, not ('time',)", None
+            raise fault(f"dims are {variable.dims}, not ('time',)", column=name)
         if "units" not in variable.attrs:
-            yield name, "no unit", "set attrs['units'], '1' if dimensionless"
+            raise fault("no unit", column=name, hint="set attrs['units'], '1' if dimensionless")
         role = variable.attrs.get("role")
         if role not in ROLES:
-            yield name, f"role {role!r} is unknown", f"use one of {ROLES}"
+            raise fault(f"role {role!r} is unknown", column=name, hint=f"use one of {ROLES}")
         finite = np.isfinite(variable.values)
         if not finite.any():
-            yield name, "has no finite value", "leave the column out"
+            raise fault("has no finite value", column=name, hint="leave the column out")
         if role in ("input", "disturbance") and not finite.all():
-            yield name, f"{role} is unknown in {int((~finite).sum())} row(s)", "fill or cut them"
+            problem = f"{role} is unknown in {int((~finite).sum())} row(s)"
+            raise fault(problem, column=name, hint="fill or cut them")
 
 
 def names(log: Log, role: str) -> tuple[str, ...]:
@@ -323,49 +320,45 @@ def with_lead_in(grasps: Grasps) -> Grasps:
 
 
 def check_grasps(grasps: xr.Dataset) -> None:
-    """Raise :class:`UserError` naming the grasp of a record and the rule it breaks."""
-    for problem, hint in _grasp_faults(grasps):
-        raise UserError(problem, file=log_name(grasps), hint=hint)
-
-
-def _grasp_faults(grasps: xr.Dataset) -> Iterator[tuple[str, str | None]]:
-    """Yield (problem, hint) of axes and labels, of temperatures that no gripper and no object has [degC], and
-    of touches; each check needs those before it."""
+    """Raise :class:`UserError` naming the grasp of a record and the rule it breaks: of axes and labels, of
+    temperatures that no gripper and no object has [degC], and of touches."""
+    fault = partial(UserError, file=log_name(grasps))
     for need in ("grasp", "time"):
         if need not in grasps.coords:
-            yield f"no {need} axis", "give the record dims 'grasp' and 'time'"
+            raise fault(f"no {need} axis", hint="give the record dims 'grasp' and 'time'")
     variables = grasps.variables  # a DataArray made of one costs more than to check it
     if "t_surface" not in grasps or variables["t_surface"].dims != ("grasp", "time"):
-        yield "no t_surface of dims (grasp, time)", None
+        raise fault("no t_surface of dims (grasp, time)")
     time, ids = variables["time"].values, variables["grasp"].values
     if ids.size == 0:
-        yield "holds no grasp", "give at least one"
+        raise fault("holds no grasp", hint="give at least one")
     if time.size < 2 or not np.all(np.isfinite(time)) or np.any(np.diff(time) <= 0):
-        yield "time does not increase", "sort the samples of each grasp by time"
+        raise fault("time does not increase", hint="sort the samples of each grasp by time")
     if time[-1] - time[0] > _SLOWEST * (time.size - 1):
         hint = "give times in seconds since the closed message"
-        yield f"samples are {np.mean(np.diff(time)):g} s apart", hint
+        raise fault(f"samples are {np.mean(np.diff(time)):g} s apart", hint=hint)
     unique, counts = np.unique(ids, return_counts=True)
     if np.any(counts > 1):
-        yield f"grasp_id {str(unique[counts > 1][0])!r} occurs twice", "give each its own"
+        raise fault(f"grasp_id {str(unique[counts > 1][0])!r} occurs twice", hint="give each its own")
     lost = ~np.isfinite(variables["t_surface"].values).any(axis=1)
     if lost.any():
-        yield f"grasp {str(ids[lost][0])!r} has no temperature", "remove it"
+        raise fault(f"grasp {str(ids[lost][0])!r} has no temperature", hint="remove it")
     for label in np.unique(variables["split"].values.astype(str)) if "split" in grasps else ():
         plain = label.strip().lower()
         if plain != label and plain in ("train", "test"):  # it would be left out of both without a word
-            yield f"split {label!r} is neither train nor test", f"write {plain!r}"
+            raise fault(f"split {label!r} is neither train nor test", hint=f"write {plain!r}")
     for name in ("t_surface", "t_surface_2", "t_object", "t_gripper", "t_ambient"):
         if name in grasps:
             values = grasps.variables[name].values
             values = values[:, None] if values.ndim == 1 else values
             for i, k in np.argwhere(np.abs(values) > HOTTEST)[:1]:  # NaN compares false
                 problem = f"grasp {str(grasps['grasp'].values[i])!r} has a {name} of {values[i, k]:g} degC"
-                yield problem, "give degrees Celsius, or end the column's name in _K if it is kelvin"
+                hint = "give degrees Celsius, or end the column's name in _K if it is kelvin"
+                raise fault(problem, hint=hint)
     rests = grasps.variables["rest"].values if "rest" in grasps else np.zeros(len(ids))
     for k in np.flatnonzero(rests < 0):  # NaN compares false
         hint = "give the seconds since the touch before, or leave it empty"
-        yield f"grasp {str(ids[k])!r} has a rest of {float(rests[k]):g} s", hint
+        raise fault(f"grasp {str(ids[k])!r} has a rest of {float(rests[k]):g} s", hint=hint)
     if "touch" not in grasps or "touch_group" not in grasps:
         return
     group = label_values(grasps, "touch_group")
@@ -377,10 +370,11 @@ def _grasp_faults(grasps: xr.Dataset) -> Iterator[tuple[str, str | None]]:
         if is_numbered.any() and not is_numbered.all():
             unnumbered = str(ids[grasps_of_group[~is_numbered][0]])
             problem = f"grasp {unnumbered!r} of touch_group {str(name)!r} has no touch, others of it have"
-            yield problem, "number all touches of a block, or none"
+            raise fault(problem, hint="number all touches of a block, or none")
         if (counts > 1).any():
             hint = "number its touches 1, 2, ..., and give a block that is touched anew another touch_group"
-            yield f"touch {numbers[counts > 1][0]:g} of touch_group {str(name)!r} occurs twice", hint
+            problem = f"touch {numbers[counts > 1][0]:g} of touch_group {str(name)!r} occurs twice"
+            raise fault(problem, hint=hint)
 
 
 def label_values(grasps: xr.Dataset, name: str) -> NDArray[np.str_]:

@@ -13,7 +13,7 @@
 #
 # A finger touches a block of another temperature; what its skin then reads says what the block is made
 # of. The grasps are the simulated examples that come with the package; `read_grasps("mine.csv")` reads
-# yours, and DataFrames go in too.
+# yours.
 
 # %%
 import matplotlib.pyplot as plt

@@ -112,7 +112,7 @@ def evaluate(
         Names as for :func:`~thermogrip.classify.estimators.registry.make_classifier`, or unfitted estimators:
         of thermogrip, or any classifier or pipeline of scikit-learn's kind, which gets the traces as rows
         (:class:`~thermogrip.classify.estimators.lda.ArrayClassifier`).
-    conditions : Grasps, DataFrame, str, Path, or sequence of them
+    conditions : Grasps, str, Path, or sequence of them
         One record a condition, each under its own name.
     split : {"shipped", "random", "session", "block"}, optional
         By the records' ``split`` column, ``repeats`` random splits by grasp, or one session, one block of

@@ -455,7 +455,7 @@ def calibrate_gripper(
 
     Parameters
     ----------
-    grasps : Grasps, DataFrame, str, Path, or sequence of them
+    grasps : Grasps, str, Path, or sequence of them
         Training grasps of all conditions, every one with a ``material``.
     materials : mapping of label to Material, optional
         Library rows of the labels; default the project's table.  A label without a row is learnt from its

@@ -103,15 +103,15 @@ def test_text_of_any_kind_is_text_and_units_are_those_of_the_conventions(tmp_pat
     assert [(v.dtype.kind, v.values.tolist()) for v in found.values()] == [("U", [["p", "qq"]]), ("U", ["r"])]
     ours = [netcdf.convention_unit(unit, "a", "f") for unit in ("degrees_C", "%", "", repr(1 / 255), "V")]
     assert ours == ["degC", "percent", "1", "0_255", "V"]
-    values, unit = netcdf.record_unit(xr.DataArray([300, 301], attrs={"units": "kelvin"}), "a", "f")
-    assert (values.round(9).tolist(), unit) == ([26.85, 27.85], "degC")
+    for stated, wanted in (({"units": "kelvin"}, "K"), ({}, "")):
+        values, unit = netcdf.numbers_and_unit(xr.DataArray([300, 301], attrs=stated), "a", "f")
+        assert (values.tolist(), unit) == ([300.0, 301.0], wanted)
     for array, words in (
         (xr.DataArray(["x"]), "f, column a: holds <U1, not numbers; leave it out"),
-        (xr.DataArray([1.0]), "f, column a: has no unit; set its attribute units"),
         (xr.DataArray([1.0], attrs={"units": "bar"}), "f, column a: unit 'bar' is unknown; use one of"),
     ):
         with pytest.raises(UserError, match=re.escape(words)):
-            netcdf.record_unit(array, "a", "f")
+            netcdf.numbers_and_unit(array, "a", "f")
 
 
 def test_times_with_a_date_and_lapses_stay_numbers(tmp_path: Path) -> None:

@@ -131,8 +131,7 @@ def cluster():
         dashboard_address=":0",
     )
     yield made.scheduler_address
-    for client in parallel._clients.values():
-        client.close()
+    distributed.get_client(made.scheduler_address).close()
     made.close()
 
 
@@ -188,7 +187,6 @@ def test_a_cluster_of_another_version_is_refused(cluster, monkeypatch, there):
         found["scheduler"]["packages"]["thermogrip"] = there
         return found
 
-    monkeypatch.setattr(parallel, "_clients", {})
     monkeypatch.setattr(distributed_client(), "get_versions", of_another_time)
     with pytest.raises(UserError, match=rf"has thermogrip {there or 'missing'} for {__version__}; install"):
         run_parallel(abs, [1], cluster)
@@ -259,7 +257,6 @@ list(in_order(eval, ["__import__('time').sleep(300)"] * 2, 2))
 
 def test_the_client_of_a_scheduler_is_the_same_one_for_every_call(cluster, monkeypatch) -> None:
     made, make = [], distributed_client().__init__
-    monkeypatch.setattr(parallel, "_clients", {})
     monkeypatch.setattr(
         distributed_client(), "__init__", lambda self, *a, **k: made.append(self) or make(self, *a, **k)
     )

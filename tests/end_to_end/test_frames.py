@@ -1,4 +1,4 @@
-"""Whatever takes a Log or Grasps from Python takes the path of a file and a DataFrame as well."""
+"""Whatever takes a Log or Grasps from Python takes the path of a file as well, of a log a DataFrame too."""
 
 from __future__ import annotations
 
@@ -60,8 +60,5 @@ GRASPS: list[Callable[[Any], Any]] = [
 
 
 @pytest.mark.parametrize("use", GRASPS)
-def test_grasps_are_a_record_a_path_or_a_frame(use: Callable[[Any], Any], grasps_file: Path) -> None:
-    meta = pd.read_csv(grasps_file.with_name("grasps_meta.csv"))
-    ours = use(read_grasps(grasps_file))
-    for other in (grasps_file, pd.read_csv(grasps_file).merge(meta, on="grasp_id")):
-        np.testing.assert_allclose(use(other), ours, rtol=1e-9, strict=True)
+def test_grasps_are_a_record_or_a_path(use: Callable[[Any], Any], grasps_file: Path) -> None:
+    np.testing.assert_allclose(use(grasps_file), use(read_grasps(grasps_file)), rtol=1e-9, strict=True)
