@@ -27,7 +27,9 @@ COMPILED |= {"no_rewrites": True, "no_cfunc_wrapper": True}
 _N_EXACT, _N_GROUPED = 12, 24
 # which serve copper (diffusion time C^2/e^2 of 4 s) and wood (over an hour) alike
 N_MODE = _N_EXACT + _N_GROUPED + 1
-FADED = 34.0  # lam dt past which exp(-lam dt) is nothing beside 1
+# as they are stepped, some of no weight, so that vector registers of eight leave no rest, which costs most;
+# of loops of known length the compiler makes these alone
+_N_BLOCK = 40
 _FASTEST = 2e3  # 1/s: modes beyond it are a series resistance
 _NODE_PLACE, _NODE_WEIGHT = (
     np.ascontiguousarray(v[::-1]) for v in np.polynomial.legendre.leggauss(_N_GROUPED)
@@ -164,15 +166,15 @@ def contacts(
     (n, 5), the value and its derivatives by ln h, ln tau_b, ln e, ln C, only the ``wanted`` are filled.
     """
     (dt, repeat, t), n, gripper_rows = nodes, len(contact), gripper.modes
-    modes, series = np.zeros((n, 4, N_MODE + gripper_rows.shape[2])), np.empty((n, 3))
-    moves = np.empty((n if wanted[:, BY_E:].any() else 0, 4, N_MODE))
-    modes[:, :3, N_MODE:], modes[:, 3, N_MODE:] = gripper_rows, -np.expm1(-gripper_rows[:, 0] * dt[0])
+    modes, series = np.zeros((n, 4, _N_BLOCK + gripper_rows.shape[2])), np.empty((n, 3))
+    moves = np.zeros((n if wanted[:, BY_E:].any() else 0, 4, _N_BLOCK))
+    modes[:, :3, _N_BLOCK:], modes[:, 3, _N_BLOCK:] = gripper_rows, -np.expm1(-gripper_rows[:, 0] * dt[0])
     slab_modes(contact, gripper.numbers, dt[0], _NODE_PLACE, _NODE_WEIGHT, modes, moves, series)
     rise = np.empty((n, N_STEPPED, t.size))
     slope = np.empty((n, N_STEPPED, t.size))
     flux = np.empty((n, t.size))
     grown = conductance(t, contact[:, 2], contact[:, 3], gripper.numbers)
-    room, now = np.zeros((18, modes.shape[2])), np.zeros((7, 5))
+    room, now = np.zeros((18, modes.shape[2])), np.zeros((6, 5))
     step_contacts(repeat, dt, modes, moves, series, grown, wanted, room, now, rise, slope, flux)
     return rise, slope, flux
 
@@ -185,8 +187,7 @@ def step_contacts(
     """Fill ``rise``, ``slope`` and ``flux`` of :func:`contacts`, curve by curve.
 
     ``modes`` (n, 4, n_mode + 1) are rate, weight at face and sensor and 1 - E of the first step: the slab's
-    from fast to slow, the gripper's from slow to fast, so that those that keep a state are neighbours, and
-    the sensor's lag; ``moves`` are those of :func:`slab_modes`; ``series`` (n, 3) is the resistance, and its
+    from fast to slow, some of no weight, the gripper's and the sensor's lag; ``moves`` are those of :func:`slab_modes`; ``series`` (n, 3) is the resistance, and its
     derivatives by ln e and ln C.
     """
     # One function, in which it is all written out: one that calls others is optimised whole with each of
@@ -197,15 +198,13 @@ def step_contacts(
     x0, x1, x2, x3, x4 = x[0], x[1], x[2], x[3], x[4]
     keep_e, gain_e, b_e, keep_c, gain_c, b_c = room[10], room[11], room[12], room[13], room[14], room[15]
     per_rate, unit = room[16], room[17]  # 1 / rate and b / weight
-    # of each curve: flux, sensor's node and reading, sums of the states at face and sensor, Z, and the sum of
-    # a past the alive modes
+    # of each curve: flux, sensor's node and reading, sums of the states at face and sensor, and Z
     q = now[0]
     node = now[1]
     read = now[2]
     w = now[3]
     s = now[4]
     z = now[5]
-    late = now[6]
     for p in range(modes.shape[0]):
         rate = modes[p, 0]
         by_block = wanted[p, BY_E] or wanted[p, BY_C]
@@ -221,15 +220,9 @@ def step_contacts(
         q[0] = grown[p, 0, 0] * share
         q[1], q[3], q[4] = q[0] * share, -q[0] * q[0] * series[p, 1], -q[0] * q[0] * series[p, 2]
         flux[p, 0] = q[0]
-        k = low = 0
+        k = 0
         for g in range(repeat.size):
             step, per_step = dt[g], 1.0 / dt[g]
-            high = last
-            # a mode that a step damps below rounding keeps no state: only a q is left of it
-            while high > N_MODE and rate[high - 1] * step > FADED:
-                high -= 1
-            while low < N_MODE and rate[low] * step > FADED:
-                low += 1
             for j in range(last + 1):
                 y, phi = rate[j] * step, m[j] * per_rate[j]
                 general_form, small = (step - phi) * per_rate[j] * per_step, y < _SERIES_BELOW
@@ -238,17 +231,13 @@ def step_contacts(
                 a[j], b[j] = late_unit * weight[j], unit[j] * weight[j]
                 keep[j] = 1.0 - m[j]
                 gain[j] = keep[j] * b[j] + a[j]
-            z[0], z[1], z[2], late[0], late[1], late[2] = series[p, 0], 0.0, 0.0, 0.0, 0.0, 0.0
-            sensor_sum = seen_late = 0.0
+            z[0], z[1], z[2], sensor_sum = series[p, 0], 0.0, 0.0, 0.0
             for j in range(last):
                 z[0] += b[j]
                 sensor_sum += b[j] * sensor[j]
-                if j < low or j >= high:
-                    late[0] += a[j]
-                    seen_late += a[j] * sensor[j]
             if by_block:
-                z3, z4, late3, late4 = series[p, 1], series[p, 2], 0.0, 0.0
-                for j in range(N_MODE):
+                z3, z4 = series[p, 1], series[p, 2]
+                for j in range(_N_BLOCK):
                     y = rate[j] * step
                     d_phi = step * keep[j] - m[j] * per_rate[j]
                     general_form, small = -d_phi * per_rate[j] * per_step - unit[j], y < _SERIES_BELOW
@@ -260,20 +249,18 @@ def step_contacts(
                     keep_e[j], gain_e[j] = d_keep * by_rate, d_gain * by_rate + gain[j] * by_weight
                     b_e[j] = d_b * by_rate + b[j] * by_weight
                     z3 += b_e[j]
-                    late3 += d_a * by_rate + a[j] * by_weight if j < low else 0.0
                     by_rate, by_weight = moves[p, 2, j], moves[p, 3, j]
                     keep_c[j], gain_c[j] = d_keep * by_rate, d_gain * by_rate + gain[j] * by_weight
                     b_c[j] = d_b * by_rate + b[j] * by_weight
                     z4 += b_c[j]
-                    late4 += d_a * by_rate + a[j] * by_weight if j < low else 0.0
-                z[3], z[4], late[3], late[4] = z3, z4, late3, late4
+                z[3], z[4] = z3, z4
             # so that a step is one pass over the modes, x <- E x + (E b + a) q
             for c in range(5):  # the state is less b q
                 if wanted[p, c]:
-                    for j in range(low, high):
+                    for j in range(last):
                         x[c, j] -= b[j] * q[c]
                     if c > 2:
-                        for j in range(low, N_MODE):
+                        for j in range(_N_BLOCK):
                             x[c, j] -= room[3 * c + 3, j] * q[0]
             for i in range(k + 1, k + 1 + repeat[g]):
                 q0, q1, q2, q3, q4 = q[0], q[1], q[2], q[3], q[4]
@@ -282,20 +269,20 @@ def step_contacts(
                 # Those of the block, whose modes ln e and ln C move, are first: they gain
                 # dE x + d(E b + a) q of the value's state of before.
                 if by_block:
-                    for j in range(low, N_MODE):
+                    for j in range(_N_BLOCK):
                         v3 = keep[j] * x3[j] + gain[j] * q3 + keep_e[j] * x0[j] + gain_e[j] * q0
                         v4 = keep[j] * x4[j] + gain[j] * q4 + keep_c[j] * x0[j] + gain_c[j] * q0
                         x3[j], x4[j] = v3, v4
                         w3 += v3
                         w4 += v4
-                    for j in range(N_MODE, high):
+                    for j in range(_N_BLOCK, last):
                         v3, v4 = keep[j] * x3[j] + gain[j] * q3, keep[j] * x4[j] + gain[j] * q4
                         x3[j], x4[j] = v3, v4
                         w3 += v3
                         w4 += v4
                         s3 += sensor[j] * v3
                         s4 += sensor[j] * v4
-                for j in range(low, high):
+                for j in range(last):
                     v0, v1 = keep[j] * x0[j] + gain[j] * q0, keep[j] * x1[j] + gain[j] * q1
                     v2 = keep[j] * x2[j] + gain[j] * q2
                     x0[j], x1[j], x2[j] = v0, v1, v2
@@ -307,10 +294,10 @@ def step_contacts(
                     s2 += sensor[j] * v2
                 w[0], w[1], w[2], w[3], w[4] = w0, w1, w2, w3, w4
                 s[0], s[1], s[2], s[3], s[4] = s0, s1, s2, s3, s4
-                h, q0 = grown[p, 0, i], q[0]
+                h = grown[p, 0, i]
                 # q = h (1 - sum x) / (1 + h Z), Z = sum b + resistances
                 invert = 1.0 / (1.0 + h * z[0])
-                gap = (1.0 - w[0] - late[0] * q0) * invert
+                gap = (1.0 - w[0]) * invert
                 flux[p, i] = h * gap
                 for c in range(5):
                     if wanted[p, c]:
@@ -318,19 +305,17 @@ def step_contacts(
                         if c > 0:
                             # dq = [dh gap - h (d sum x + q dZ)] / (1 + h Z), gap = (1 - sum x) / (1 + h Z)
                             driven = h * gap if c == 1 else (grown[p, 1, i] * gap if c == 2 else 0.0)
-                            new = (
-                                driven - h * (w[c] + late[0] * q[c] + late[c] * q0 + z[c] * h * gap)
-                            ) * invert
-                        v = s[c] + sensor_sum * new + seen_late * q[c]
+                            new = (driven - h * (w[c] + z[c] * h * gap)) * invert
+                        v = s[c] + sensor_sum * new
                         read[c] = keep[last] * read[c] + a[last] * node[c] + b[last] * v
                         q[c], node[c] = new, v
                         rise[p, c, i], slope[p, c, i] = read[c], (v - read[c]) * rate[last]
             for c in range(5):
                 if wanted[p, c]:
-                    for j in range(low, high):
+                    for j in range(last):
                         x[c, j] += b[j] * q[c]
                     if c > 2:
-                        for j in range(low, N_MODE):
+                        for j in range(_N_BLOCK):
                             x[c, j] += room[3 * c + 3, j] * q[0]
             k += repeat[g]
             for j in range(last + 1):

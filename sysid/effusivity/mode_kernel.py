@@ -22,7 +22,7 @@ from thermogrip.sysid.contact.time_stepping import COMPILED, N_STEPPED, VALUE, G
 class SearchSettings(NamedTuple):  # which kernels take
     """How the search for a mode steps, and when it ends."""
 
-    pairs_at_once: int = 1024  # whose arrays stay in the processor's cache
+    pairs_at_once: int = 128  # whose arrays stay in the processor's cache
     most_steps: int = 20  # a pair that has not settled by then is hopeless in practice
     longest_step: float = 1.5  # of a logarithm of the contact
     # what even the best leaves unexplained counts more: where none explains the readings yet, as of a
