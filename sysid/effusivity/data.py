@@ -143,6 +143,7 @@ class Touches:
     since: Array  # (n,), when the discrepancy of the trace begins [s]
     thin: Array  # (n,), sd by which the logarithm of its heat capacity alone is farther
     question: NDArray[np.int64]  # (n,), the same of rows of which only the likeliest count
+    trace: NDArray[np.int64]  # (n,), the same of rows of the same readings
     second: Touches | None = None  # what a second sensor of the finger read of the same grasps
 
     def take(self, index: NDArray[np.int64]) -> Touches:
@@ -223,7 +224,7 @@ def touches(
         count=count, ramp=mean(np.broadcast_to(np.maximum(time - PUMP_OFF, 0.0), data.shape)), level=level,
         t_object=t_object, t_object_sd=sd, t_ambient=t_ambient, excursion=np.abs(away).max(axis=1),
         share=np.zeros(level.size), unlike=np.zeros(level.size), since=np.full(level.size, -np.inf),
-        thin=np.zeros(level.size), question=np.arange(level.size), second=second,
+        thin=np.zeros(level.size), question=np.arange(level.size), trace=np.arange(level.size), second=second,
     )  # fmt: skip
 
 
@@ -281,6 +282,8 @@ def stack_touches(parts: list[Touches]) -> Touches:
     n_bin = max(p.y.shape[1] for p in parts)
 
     def joined(name: str) -> Any:
+        if name in ("question", "trace"):
+            return np.arange(sum(p.level.size for p in parts))
         columns = [getattr(p, name) for p in parts]
         if columns[0].ndim == 1:
             return np.concatenate(columns)

@@ -253,14 +253,23 @@ def predicted(
                 derivatives[nuisance, m] = scale * curves[c, m] + passed * extra
 
 
-def products(pairs: Pairs, whitener: Array, u: Array, sd: Array) -> Array:
+def products(pairs: Pairs, whitener: Array, u: Array, sd: Array, *, alike: bool) -> Array:
     """Return J' J, and J' r and r' r in the last row and column, (n, 8, 8): J in units of ``sd`` (n, 7), r
-    the readings less those that ``u`` predicts, both whitened."""
+    the readings less those that ``u`` predicts, both whitened.  Where pairs may be ``alike``, of one trace
+    and one u, as the grades of a candidate are at first, their readings are predicted once."""
     blocks = []
     for begin in range(0, len(u), SEARCH.pairs_at_once):
         chunk = slice(begin, begin + SEARCH.pairs_at_once)
         some = pairs.take(chunk)
-        columns = readings(some, u[chunk], sd[chunk] > 0.0)[1]
+        if alike:
+            numbers = [pairs.data.trace[some.row], u[chunk], some.beyond.reshape(some.row.size, -1)]
+            place: dict[bytes, int] = {}
+            same = [place.setdefault(row.tobytes(), len(place)) for row in np.column_stack(numbers)]
+            first = np.unique(same, return_index=True)[1]
+            vary = np.tile((sd[chunk] > 0.0).any(axis=0), (first.size, 1))
+            columns = readings(some.take(first), u[chunk][first], vary)[1][same]
+        else:
+            columns = readings(some, u[chunk], sd[chunk] > 0.0)[1]
         blocks.append(squares(whitener, some.row, columns))
     matrix = blocks[0] if len(blocks) == 1 else np.concatenate(blocks)
     scale = np.ones((len(u), _LEFT + 1))
@@ -365,7 +374,7 @@ def search(pairs: Pairs, noise: tuple[Array, Array], law: Law, start: Array, *, 
     # room, as loops: arrays made and copied whole in a kernel take four times as long to compile
     at, room = np.arange(n), np.empty((2 * m + 6, m + 1))
     for step in range(SEARCH.most_steps + 1):
-        tried = products(pairs.take(at), noise[0], state.trial[at], law.sd[at])
+        tried = products(pairs.take(at), noise[0], state.trial[at], law.sd[at], alike=step == 0)
         advance(at, tried, law, state, room, step, SEARCH)
         if rivals:
             state.going_on[at] &= _hopeful(pairs, noise[1][pairs.row], state, step)[at]

@@ -113,5 +113,5 @@ def _coming(level: Array, room: float, end: float, dt: float) -> Touches:
         t=each(bin_times), count=each(count), ramp=each(np.maximum(bin_times - PUMP_OFF, 0.0)), level=level,
         t_object=unknown, t_object_sd=unknown, t_ambient=np.full(n, room), excursion=np.zeros(n),
         share=np.zeros(n), unlike=np.zeros(n), since=np.full(n, -np.inf), thin=np.zeros(n),
-        question=np.arange(n),
+        question=np.arange(n), trace=np.arange(n),
     )  # fmt: skip

@@ -135,7 +135,7 @@ def test_what_no_grade_of_a_disturbed_grasp_can_make_up_for_is_left_and_changes_
 
     def counted(pairs, *rest):
         asked[-1] += pairs.row.size
-        return products(pairs, *rest)
+        return products(pairs, *rest, **how)
 
     monkeypatch.setattr(kernel, "products", counted)
     evidence = []
