@@ -27,8 +27,8 @@ COMPILED |= {"no_rewrites": True, "no_cfunc_wrapper": True}
 _N_EXACT, _N_GROUPED = 12, 24
 # which serve copper (diffusion time C^2/e^2 of 4 s) and wood (over an hour) alike
 N_MODE = _N_EXACT + _N_GROUPED + 1
-# as they are stepped, some of no weight, so that vector registers of eight leave no rest, which costs most;
-# of loops of known length the compiler makes these alone
+# Stepped with some of no weight: what vector registers of eight leave of a loop costs most, and a mode that a
+# step damps away is not left out either (12 -> 8 us a contact).
 _N_BLOCK = 40
 _FASTEST = 2e3  # 1/s: modes beyond it are a series resistance
 _NODE_PLACE, _NODE_WEIGHT = (
@@ -187,8 +187,8 @@ def step_contacts(
     """Fill ``rise``, ``slope`` and ``flux`` of :func:`contacts`, curve by curve.
 
     ``modes`` (n, 4, n_mode + 1) are rate, weight at face and sensor and 1 - E of the first step: the slab's
-    from fast to slow, some of no weight, the gripper's and the sensor's lag; ``moves`` are those of :func:`slab_modes`; ``series`` (n, 3) is the resistance, and its
-    derivatives by ln e and ln C.
+    with some of no weight, the gripper's and the sensor's lag; ``moves`` are those of :func:`slab_modes`;
+    ``series`` (n, 3) is the resistance, and its derivatives by ln e and ln C.
     """
     # One function, in which it is all written out: one that calls others is optimised whole with each of
     # them, and what NumPy does for many contacts at once costs no compilation.

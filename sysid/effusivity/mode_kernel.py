@@ -99,17 +99,14 @@ def _bin_means(pairs: Pairs, numbers: Array, onset: Array, wanted: Mask) -> Arra
     out = np.empty((row.size, RATE + 1, data.y.shape[1]))
     stepped = wanted[:, :N_STEPPED].copy()  # for arrays of another layout kernels are compiled anew
     rise, slope, _ = contacts(nodes, gripper, np.exp(numbers), stepped)
-    room = np.empty((7, data.sample_t.shape[1]))
-    bin_means(
-        nodes[2], rise, slope, wanted, onset, row, data.sample_t, data.sample_bin, data.count, room, out
-    )
+    bin_means(nodes[2], rise, slope, wanted, onset, row, data.sample_t, data.sample_bin, data.count, out)
     return out
 
 
 @numba.njit(**COMPILED)  # type: ignore[untyped-decorator]
 def bin_means(
     nodes: Array, rise: Array, slope: Array, wanted: Mask, onset: Array, row: NDArray[np.int64],
-    times: Array, bins: NDArray[np.int64], count: Array, scratch: Array, means: Array,
+    times: Array, bins: NDArray[np.int64], count: Array, means: Array,
 ) -> None:  # fmt: skip
     """Fill ``means`` (n, 6, n_bin) of the ``wanted`` curves, the last of them the slope of the first."""
     last = nodes.size - 1
@@ -118,39 +115,36 @@ def bin_means(
     for p in range(row.size):
         i = row[p]
         k = 0
-        begin = times.shape[1]
         means[p] = 0.0
-        # the node before each sample, -1 before contact, and the weights of values and slopes there and at
-        # the next value, by cubic Hermite interpolation
+        value, rate = rise[p], slope[p]
         for j in range(times.shape[1]):
             since = times[i, j] - onset[p]
-            scratch[0, j] = -1.0
-            if bins[i, j] >= 0 and since > 0.0:
-                begin = min(begin, j)
-                while k < last - 1 and nodes[k + 1] < since:
-                    k += 1
-                while k > 0 and nodes[k] > since:
-                    k -= 1
-                dt = nodes[k + 1] - nodes[k]
-                s = min((since - nodes[k]) / dt, 1.0)
-                scratch[0, j], scratch[1, j] = k, s * s * (3.0 - 2.0 * s)
-                scratch[2, j], scratch[3, j] = s * (1.0 - s) * (1.0 - s) * dt, -s * s * (1.0 - s) * dt
-                scratch[4, j], scratch[5, j] = 6.0 * s * (1.0 - s) / dt, (1.0 - s) * (1.0 - 3.0 * s)
-                scratch[6, j] = s * (3.0 * s - 2.0)
-        for c in range(n_curve):
-            if not wanted[p, c]:
+            b = bins[i, j]
+            if b < 0 or since <= 0.0:  # a sample that is lost, or before contact
                 continue
-            rates, values = c == n_curve - 1, 0 if c == n_curve - 1 else c
-            r, v = rise[p, values], slope[p, values]
-            for j in range(begin, times.shape[1]):
-                if scratch[0, j] >= 0.0:
-                    k = int(scratch[0, j])
-                    high = r[k + 1] - r[k]
-                    if rates:
-                        value = scratch[4, j] * high + scratch[5, j] * v[k] + scratch[6, j] * v[k + 1]
-                    else:
-                        value = r[k] + scratch[1, j] * high + scratch[2, j] * v[k] + scratch[3, j] * v[k + 1]
-                    means[p, c, bins[i, j]] += value
+            while k < last - 1 and nodes[k + 1] < since:
+                k += 1
+            while k > 0 and nodes[k] > since:
+                k -= 1
+            # cubic Hermite interpolation: the weights of the next value, and of the slopes there and here
+            dt = nodes[k + 1] - nodes[k]
+            s = min((since - nodes[k]) / dt, 1.0)
+            to_next = s * s * (3.0 - 2.0 * s)
+            bend, next_bend = s * (1.0 - s) * (1.0 - s) * dt, -s * s * (1.0 - s) * dt
+            for c in range(n_curve - 1):
+                if wanted[p, c]:
+                    high = value[c, k + 1] - value[c, k]
+                    means[p, c, b] += (
+                        value[c, k] + to_next * high + bend * rate[c, k] + next_bend * rate[c, k + 1]
+                    )
+            if wanted[p, n_curve - 1]:
+                high = (value[VALUE, k + 1] - value[VALUE, k]) / dt
+                means[p, n_curve - 1, b] += (
+                    6.0 * s * (1.0 - s) * high
+                    + (1.0 - s) * (1.0 - 3.0 * s) * rate[VALUE, k]
+                    + s * (3.0 * s - 2.0) * rate[VALUE, k + 1]
+                )
+        for c in range(n_curve):
             for m in range(n_bin):
                 if count[i, m] > 0.0:
                     means[p, c, m] /= count[i, m]
@@ -253,7 +247,7 @@ def predicted(
                 derivatives[nuisance, m] = scale * curves[c, m] + passed * extra
 
 
-def products(pairs: Pairs, whitener: Array, u: Array, sd: Array, *, alike: bool) -> Array:
+def products(pairs: Pairs, whitener: Array, u: Array, sd: Array, *, alike: bool = False) -> Array:
     """Return J' J, and J' r and r' r in the last row and column, (n, 8, 8): J in units of ``sd`` (n, 7), r
     the readings less those that ``u`` predicts, both whitened.  Where pairs may be ``alike``, of one trace
     and one u, as the grades of a candidate are at first, their readings are predicted once."""
@@ -262,9 +256,11 @@ def products(pairs: Pairs, whitener: Array, u: Array, sd: Array, *, alike: bool)
         chunk = slice(begin, begin + SEARCH.pairs_at_once)
         some = pairs.take(chunk)
         if alike:
-            numbers = [pairs.data.trace[some.row], u[chunk], some.beyond.reshape(some.row.size, -1)]
+            asked = [pairs.data.trace[some.row], u[chunk], some.beyond.reshape(some.row.size, -1)]
+            numbers = np.column_stack(asked)
+            keys = numbers.view(f"V{numbers.itemsize * numbers.shape[1]}").ravel().tolist()
             place: dict[bytes, int] = {}
-            same = [place.setdefault(row.tobytes(), len(place)) for row in np.column_stack(numbers)]
+            same = [place.setdefault(key, len(place)) for key in keys]
             first = np.unique(same, return_index=True)[1]
             vary = np.tile((sd[chunk] > 0.0).any(axis=0), (first.size, 1))
             columns = readings(some.take(first), u[chunk][first], vary)[1][same]

@@ -69,7 +69,7 @@ def means_of(nodes, rise, slope, times, bins, *, onset=0.0, late=-1.0):
     wanted, at = np.array([[True, False, False, False, False, True]]), np.array([0])
     kernel.bin_means.py_func(
         np.array(nodes, dtype=float), curves, bent, wanted, np.array([onset]), at, times, bins, count,
-        np.empty((7, n)), means,
+        means,
     )  # fmt: skip
     u, numbers = np.zeros((1, 7)), np.zeros((1, 7))
     if late >= 0:  # (C / e)^2 / 6, by a block that loses heat to its room
@@ -133,7 +133,7 @@ def test_what_no_grade_of_a_disturbed_grasp_can_make_up_for_is_left_and_changes_
         [],
     )
 
-    def counted(pairs, *rest):
+    def counted(pairs, *rest, **how):
         asked[-1] += pairs.row.size
         return products(pairs, *rest, **how)
 
