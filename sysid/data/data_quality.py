@@ -6,9 +6,6 @@ order n up to which an input is persistently exciting, the rank of the covarianc
 which only rows count at which the input moves.  A relay is asked whether it is switched at the same readings;
 of one that is on for a share of even windows the shares are tested.  In closed loop the noise is in the input
 too, and equation-error fits are biased.
-
-:func:`evidence` says what a plant rests on: between which temperatures, and the minutes of each kind of
-drive, for what is rare weighs little in its errors.
 """
 
 from __future__ import annotations
@@ -437,7 +434,7 @@ class Evidence:
 
 
 def evidence(plant: Plant, logs: Sequence[Rows]) -> Evidence:
-    """Return what ``logs``, in the plant's signals, cover of its inputs and outputs."""
+    """Return what ``logs``, in the plant's signals, cover: what is rare weighs little in its errors."""
     spent = []  # seconds that each row's input was held; beyond a gap it is unknown
     for rows in logs:
         until_next = np.append(np.diff(rows.time), rows.step)

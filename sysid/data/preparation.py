@@ -137,7 +137,13 @@ def with_rest(
         if not len(rows) or not (at_rest := _first_readings(log, outputs, int(rows[0]) + 1)):
             out.append(log)
             continue
-        out.append(_begun_earlier(log, at_rest))
+        time = np.asarray(log["time"].values, dtype=float)
+        before = time[0] - float(np.median(np.diff(time))) * np.arange(_ADDED, 0, -1)
+        longer = log.isel(time=np.r_[np.zeros(_ADDED, dtype=int), : len(time)])
+        longer = longer.assign_coords(time=("time", np.r_[before, time], log["time"].attrs))
+        for name, value in at_rest.items():
+            longer[name] = longer[name].copy(data=np.r_[np.full(_ADDED, value), log[name].values])
+        out.append(longer.assign_attrs(sha256=fit_logs([log])[0].sha256))
         notes.append(
             f"{log_name(log)}: begins with the only move of an input; taken to have rested at its first "
             f"readings before ({_ADDED} rows of that are in the fit): record a minute of rest to make sure"
@@ -179,14 +185,3 @@ def _first_readings(log: Log, outputs: Sequence[str], n: int) -> dict[str, float
             return {}
         means[name] = float(first.mean())
     return means
-
-
-def _begun_earlier(log: Log, readings: dict[str, float]) -> Log:
-    time = np.asarray(log["time"].values, dtype=float)
-    step = float(np.median(np.diff(time)))
-    longer = log.isel(time=np.r_[np.zeros(_ADDED, dtype=int), : len(time)])
-    before = time[0] - step * np.arange(_ADDED, 0, -1)
-    longer = longer.assign_coords(time=("time", np.r_[before, time], log["time"].attrs))
-    for name, value in readings.items():
-        longer[name] = longer[name].copy(data=np.r_[np.full(_ADDED, value), log[name].values])
-    return longer.assign_attrs(sha256=fit_logs([log])[0].sha256)

@@ -158,7 +158,10 @@ class Dynamics:
         out = []
         for (j, name), (i, output) in product(enumerate(self.linear.inputs), enumerate(self.linear.outputs)):
             value, low, high, late, risen = (v if np.isfinite(v) else None for v in table[:, i, j].tolist())
-            unit = _per(self.units.get(output, "1"), self.units.get(name, "1"))
+            # a change of the output for one unit of the input
+            units = (self.units.get(key, "1") for key in (output, name))
+            of, by = ("K" if of_signal == "degC" else of_signal for of_signal in units)
+            unit = "1" if of == by else of if by == "1" else f"{of}/{by}"
             pair = {"input": name, "output": output, "gain": value, "low": low, "high": high, "unit": unit}
             out.append(pair | {"dead_time_s": late, "rise_time_s": risen})
         return out
@@ -298,10 +301,3 @@ def usual_point(
 def _middle(plant: Plant, name: str) -> float:
     low, high = plant.valid.get(name, (0.0, 0.0))
     return (max(low, 0.0) if high > 0 else low) / 2 + high / 2
-
-
-def _per(output: str, name: str) -> str:
-    """Return the unit of a gain: a change of the output for one unit of the input."""
-    of = "K" if output == "degC" else output
-    by = "K" if name == "degC" else name
-    return "1" if of == by else of if by == "1" else f"{of}/{by}"

@@ -193,11 +193,6 @@ def _descend(problem: Problem, z0: Array, report: Progress, part: tuple[float, f
     return bounded_least_squares(problem.residual, jacobian, z0, low=low, high=high)
 
 
-def _rms(parts: Sequence[Array]) -> float:
-    joined = np.concatenate(parts) if parts else np.zeros(1)
-    return float(np.sqrt(np.mean(joined**2))) if joined.size else 0.0
-
-
 def _as_plant(problem: Problem, solution: OptimizeResult) -> Plant:
     model, z = problem.model, np.asarray(solution.x)
     names = tuple(model.parameters[i] for i in problem.free)
@@ -210,7 +205,8 @@ def _as_plant(problem: Problem, solution: OptimizeResult) -> Plant:
     identifiability = describe(names, data, spread.covariance, on_bound, shift=z)
     p = problem.parameters(z[None])[0]
     errors, starts = problem.errors(z), problem.start(z)
-    noise = {name: _rms([s[k] for log in errors for s in log]) for k, name in enumerate(model.outputs)}
+    by_output = [np.concatenate(parts) for parts in zip(*(stretch for log in errors for stretch in log))]
+    rms = [float(np.sqrt(np.mean(error**2))) if error.size else 0.0 for error in by_output]
     first = [begin[0] for begin in starts]
     offsets = dict(zip(model.outputs, np.mean([s.y_offset for s in first], axis=0).tolist()))
     offsets |= dict(zip(model.disturbances, np.mean([s.d_offset for s in first], axis=0).tolist()))
@@ -229,27 +225,25 @@ def _as_plant(problem: Problem, solution: OptimizeResult) -> Plant:
         values=dict(zip(model.parameters, p.tolist())),
         free=names,
         covariance=spread.covariance * np.outer(problem.width, problem.width),
-        noise=noise,
+        noise=dict(zip(model.outputs, rms)),
         offsets=offsets,
         logs=problem.names,
         scores=scores,
-        verdict=_fit_verdict(problem, solution, identifiability),
+        verdict=_fit_verdict(problem, rms, identifiability, finished=bool(solution.success)),
     )
 
 
 def _fit_verdict(
-    problem: Problem, solution: OptimizeResult, identifiability: plant_data.Identifiability
+    problem: Problem, rms: Sequence[float], identifiability: plant_data.Identifiability, *, finished: bool
 ) -> str:
-    by_log = problem.errors(solution.x)
-    rms = [_rms([s[k] for log in by_log for s in log]) / sd for k, sd in enumerate(problem.sd)]
+    units = [problem.plant.units.get(name, "degC") for name in problem.model.outputs]
     errors = ", ".join(
-        f"{name} {r * sd:.2f} {problem.plant.units.get(name, 'degC')}"
-        for name, r, sd in zip(problem.model.outputs, rms, problem.sd)
+        f"{name} {error:.2f} {unit}" for name, error, unit in zip(problem.model.outputs, rms, units)
     )
     clauses = [f"in-sample error {errors}"]
-    if not solution.success:
+    if not finished:
         clauses.append("the fit ran out of iterations")
-    if max(rms) > _STUCK:
+    if np.max(rms / problem.sd) > _STUCK:
         clauses.append("it does not explain the logs, do not use it")
     if not identifiability.identifiable:
         clauses.append(f"not practically identifiable: {identifiability.flat[0]}")

@@ -135,9 +135,12 @@ def linearise_logs(problem: Problem, z: Array, by_log: Sequence[tuple[Array, Arr
         effects = _log_effects(problem, log_index, p, starts[log_index], jacobian)
         alike = [moves[log_index] for _, moves in discrepancy]
         columns = np.column_stack([jacobian, *alike, *(effect.moves for effect in effects), -r])
-        blocks = []
-        for k, by_output in enumerate(_by_stretch(problem, log_index, columns)):
+        blocks, begin = [], 0
+        for k, cells in enumerate(problem.logs[log_index][1]):
+            ends = begin + np.cumsum([mean.size for mean in cells.means])
+            by_output = np.split(columns[begin : ends[-1]], ends[:-1] - begin)
             blocks += _binned_block(problem, log_index, k, merge, by_output)
+            begin = int(ends[-1])
         if blocks:
             kind = np.array(shared + [-1] * len(effects), dtype=np.int64)
             effects_of_logs.append(effects)
@@ -220,16 +223,6 @@ def _of_start(problem: Problem, at: int, k: int, p: Array, start: Start) -> list
     for mode in modes.T:
         moves = [bins_of_output * sd for bins_of_output, sd in zip(np.split(mode, ends), problem.sd)]
         out.append(_Column("", _residuals(problem, [*nothing[:k], moves, *nothing[k + 1 :]])))
-    return out
-
-
-def _by_stretch(problem: Problem, at: int, rows: Array) -> list[list[Array]]:
-    """Cut rows (m_log, ...) of a log by stretch and output."""
-    out, begin = [], 0
-    for cells in problem.logs[at][1]:
-        ends = begin + np.cumsum([mean.size for mean in cells.means])
-        out.append(np.split(rows[begin : ends[-1]], ends[:-1] - begin))
-        begin = int(ends[-1])
     return out
 
 

@@ -188,13 +188,10 @@ def run_with_slopes(
     t = np.empty(h)
     s = np.empty(h)
     S, S_after = np.zeros((n, n_p + n)), np.empty((n, n_p + n))
-    for i in range(n):
-        S[i, n_p + i] = 1.0
+    S[:, n_p:] = np.eye(n)
     for row in range(rows):
-        for i in range(n_y):
-            y[row, i] = x[i]
-            for q in range(n_p + n):
-                slopes[row, i, q] = S[i, q]
+        y[row] = x[:n_y]
+        slopes[row] = S[:n_y]
         _units(p, x, w[row], t)
         # the sensitivity S = dx/dtheta beside the state: S+ = (A + V diag(s) W) S + E with s = 1 - t^2, E
         # sparse
@@ -207,8 +204,8 @@ def run_with_slopes(
             if not low[i] < after[i] < high[i]:  # a clipped state has no slope
                 after[i] = min(max(after[i], low[i]), high[i])
                 S_after[i].fill(0.0)
+        x[:] = after
         for i in range(n):
-            x[i] = after[i]
             for q in range(n_p + n):
                 # what has faded away would become numbers too small for fast arithmetic
                 S[i, q] = S_after[i, q] if abs(S_after[i, q]) > 1e-60 else 0.0

@@ -88,25 +88,13 @@ def predict(
         if index == 0:
             x0 = np.repeat(start.x0[None], len(p), axis=0)
             if start.level is None and len(p) > 1:
-                y, u, d_rest = _about_start(stretch, start)
-                if hasattr(model, "rest_of_each"):  # a fit asks for hundreds
-                    x0 = model.rest_of_each(y, u, d_rest, p) + start.shift
-                else:
-                    x0 = np.array([model.rest(y, u, d_rest, row) for row in p]) + start.shift
+                x0 = _at_rest(model, p, stretch, start) + start.shift
         else:
             u_gap, d_gap, dt_gap = _through_gap(stretches[index - 1], stretch, start, dt)
             x0 = model.rollout(x_end, u_gap[None], d_gap[None], p, dt_gap)[1] + start.shift
         y, x_end = model.rollout(x0, stretch.u[None], d[None], p, dt)
         out.append(y + start.offset(dt * np.arange(y.shape[1], dtype=np.float64)))
     return out
-
-
-class _RestPoint(NamedTuple):
-    """What a state at rest refers to."""
-
-    y: Array  # readings without offsets
-    u: Array
-    d: Array  # ambients without biases
 
 
 class _LevelStart(NamedTuple):
@@ -125,18 +113,21 @@ class _GapInputs(NamedTuple):
     dt: float
 
 
-def _about_start(stretch: Stretch, start: Start) -> _RestPoint:
-    """Return readings without offsets, inputs and ambients that the state at rest refers to."""
-    return _RestPoint(_first_reading(stretch) - start.y_offset, stretch.u[0], stretch.d[0] - start.d_offset)
+def _at_rest(model: Model, p: Array, stretch: Stretch, start: Start) -> Array:
+    """Return the states (k, n_x) at rest of the first readings and ambients without their offsets."""
+    y, d = _first_reading(stretch) - start.y_offset, stretch.d[0] - start.d_offset
+    if hasattr(model, "rest_of_each"):  # a fit asks for hundreds
+        return np.asarray(model.rest_of_each(y, stretch.u[0], d, p))
+    return np.array([model.rest(y, stretch.u[0], d, row) for row in p])
 
 
-def _first_reading(stretch: Stretch, seconds: float = 2.0) -> Array:
-    """Return the mean reading of the first seconds, and of the first row that is read where all are lost."""
+def _first_reading(stretch: Stretch) -> Array:
+    """Return the mean reading of the first 2 s, and of the first row that is read where all are lost."""
     out = np.full(stretch.y.shape[1], np.nan)
     for k, y in enumerate(stretch.y.T):
         is_read = np.isfinite(y) & (stretch.time < 60)
         if is_read.any():
-            early = y[is_read & (stretch.time <= seconds)]
+            early = y[is_read & (stretch.time <= 2.0)]
             out[k] = early.mean() if early.size else y[is_read][0]
     return out
 
@@ -148,10 +139,10 @@ def _first_start(plant: PlantData, p: Array, stretch: Stretch, warmup: float) ->
     zero = np.zeros(plant.model.n_x)
     if level is None:
         start = Start(zero, zero, y_offset, d_offset, None, "started from its warm-up")
-        x0 = plant.model.rest(*_about_start(stretch, start), p)
+        x0 = _at_rest(plant.model, p[None], stretch, start)[0]
         start = _corrected(plant, p, stretch, replace(start, x0=x0), warmup, offsets=True)
         # the state at rest for other parameters is that of readings without the offsets that were found
-        start = replace(start, shift=start.x0 - plant.model.rest(*_about_start(stretch, start), p))
+        start = replace(start, shift=start.x0 - _at_rest(plant.model, p[None], stretch, start)[0])
         return replace(start, fading=start.y_offset - y_offset, memory=plant.offset_memory, warm=warmup / 2)
     T0, y_mean, d_mean = level
     y_own = np.array([plant.nuisance.get(name, 0.0) > 0 for name in plant.outputs], dtype=bool)
