@@ -218,15 +218,6 @@ class _Task:
     leave_one_out: bool
 
 
-@dataclass(frozen=True, eq=False)
-class _MatchedLogs:
-    """Logs in the roles and units of a network, or as they were where there is none."""
-
-    network: GreyModel | None
-    logs: list[Log]
-    converted: list[str]
-
-
 def _read_logs(
     logs: list[Log],
     network: GreyModel | str | Path | None,
@@ -236,9 +227,14 @@ def _read_logs(
     leave_one_out: bool,
 ) -> _Task:
     """Return the logs in the roles and units of all candidates, checked; each is matched once."""
-    matched = _for_network(network, logs)
-    model = matched.network
-    logs = without_still(logs) if model is None else matched.logs
+    model: GreyModel | None = None
+    converted: list[str] = []
+    if network is None:
+        logs = without_still(logs)
+    else:
+        model, of_room = _for_logs(network, logs)
+        logs, converted = match_logs(model, logs, keep_others=True)
+        converted = [*of_room, *converted]
     u, y, d = signals(logs, **named)
     # a network has a prior of what never moves, others nothing
     still = still_inputs(model, logs, u)
@@ -251,7 +247,7 @@ def _read_logs(
     roles, unused = signal_roles(logs, ([*u, *still], d, y), named, model, still)
     all_named = named["inputs"] is not None and named["outputs"] is not None
     doubts = (*role_doubts(logs, named_all=all_named), *doubt_of_gains(logs, u))
-    notes = (*matched.converted, *rested, *unused)
+    notes = (*converted, *rested, *unused)
     fit_box = partial(fit_black_box, inputs=u, outputs=y, disturbances=d, average=average)
     return _Task(logs, model, fit_box, checked, roles, doubts, notes, leave_one_out)
 
@@ -267,10 +263,8 @@ def _ask_for_excitation(checked: DataCheck, inputs: Sequence[str], log: Log) -> 
     raise UserError(says, file=log_name(log), column=failed[0].channel, hint=hint + moved_before(log))
 
 
-def _for_network(network: GreyModel | str | Path | None, logs: list[Log]) -> _MatchedLogs:
-    """Return the network with the logs in its roles and units; refuse a misfit."""
-    if network is None:
-        return _MatchedLogs(None, logs, [])
+def _for_logs(network: GreyModel | str | Path, logs: list[Log]) -> tuple[GreyModel, list[str]]:
+    """Return the network in the units of the logs, and what they say of its room; refuse a misfit."""
     if isinstance(network, (str, Path)):
         from thermogrip.sysid.models.network import load_network
 
@@ -291,8 +285,7 @@ def _for_network(network: GreyModel | str | Path | None, logs: list[Log]) -> _Ma
                 file=reason.file,
                 hint=f"{reason.hint}; rename columns, or name another network (or none)",
             )
-    matched, converted = match_logs(network, logs, keep_others=True)
-    return _MatchedLogs(network, matched, [*notes, *converted])
+    return network, notes
 
 
 def _candidate_kinds(models: Sequence[str], network: GreyModel | None) -> list[str]:

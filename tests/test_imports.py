@@ -13,7 +13,7 @@ FOLDERS |= {f"thermogrip.{room}": ROOT / room for room in ("datasets", "sysid", 
 DOORS = {
     "arviz": {"sysid.greybox.posterior"},
     "casadi": {
-        "sysid.models.jit_rollout", "sysid.greybox.fit", "sysid.plant.linearise", "mpc.plant.prediction",
+        "sysid.models.jit_rollout", "sysid.greybox.fit", "sysid.plant.plant", "mpc.plant.prediction",
         "mpc.native.codegen",
     },
     "daqp": {"mpc.optimiser.qp"},

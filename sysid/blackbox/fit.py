@@ -96,16 +96,6 @@ def fit_black_box(
     Where absent, signals are known by role and two steps ``average`` [s] are tried (the chosen one and the
     logs' own, or means over five rows). ``grid`` has the logs at a step that is known already. A UserError
     where there is no such kind, the data are too short, or no structure survives the held-out free run.
-
-    >>> from scipy.signal import lfilter
-    >>> from thermogrip.datasets.schema import make_log
-    >>> rng = np.random.default_rng(0)
-    >>> q = np.repeat(rng.random(60), 20)
-    >>> y = 25 + lfilter([0, 0.5], [1, -0.95], q) + 0.01 * rng.standard_normal(1200)
-    >>> log = make_log(np.arange(1200.0), {"q": (q, "1", "input"), "t": (y, "degC", "output")})
-    >>> fit = fit_black_box("oe", [log], average=1.0)
-    >>> fit.choice.structure.label, float(np.abs(fit.plant.model.poles()).max().round(2))
-    ('na 1, nb 1, delay 1', 0.95)
     """
     if kind not in BLACK_BOXES:
         raise UserError(f"no model of kind {kind!r}", hint=known_names(kind, BLACK_BOXES))
@@ -224,9 +214,8 @@ def with_refits(
     while len(refits) < n and tried < _TRIES * n and (refits or tried < _HOPELESS):
         if progress is not None:
             progress(len(refits) / n, f"{fit.kind}, refits to resampled errors")
-        drawn = fit.grid.having(
-            _resampled(fit.grid.segments, misses, max(_MEMORY_ROWS, rows // _MEMORIES), rng)
-        )
+        memory = max(_MEMORY_ROWS, rows // _MEMORIES)
+        drawn = replace(fit.grid, segments=_resampled(fit.grid.segments, misses, memory, rng))
         model, tried = family(drawn, only=(fit.choice.structure,)).get(fit.choice.structure), tried + 1
         # the structure is not chosen again, for held-out runs show how good it is; a refit that errs far more
         # over the logs than the fit does not agree with them
@@ -242,7 +231,7 @@ def with_refits(
 
 def _resampled(
     segments: Sequence[Segment], misses: Sequence[Array], memory: float, rng: np.random.Generator
-) -> list[Segment]:
+) -> tuple[Segment, ...]:
     """Return the segments with resampled readings, one course w for all outputs, l so many rows."""
     from scipy.signal import oaconvolve  # half a second
 
@@ -259,7 +248,7 @@ def _resampled(
         # the free run of the fit plus its error times a random course w of mean 0, variance 1 and the
         # correlation exp(-(t - s)^2 / l^2), l longer than the errors are correlated
         out.append(replace(segment, y=segment.y + miss - miss * w[:, None]))
-    return out
+    return tuple(out)
 
 
 def _error(fit: BlackBoxFit, model: Model) -> float:

@@ -119,8 +119,9 @@ def folds(grid: Grid, *, blocks: int = _CUTS) -> list[Fold]:
     where these are fewer than two."""
     if len(grid.logs) >= SEVERAL:
         by_log = {name: [s for s in grid.segments if s.log == name] for name in grid.logs}
+        others_of = {name: tuple(s for s in grid.segments if s.log != name) for name in grid.logs}
         parts = [
-            Fold(name, grid.having([s for s in grid.segments if s.log != name]), tuple(map(Run, held_out)))
+            Fold(name, replace(grid, segments=others_of[name]), tuple(map(Run, held_out)))
             for name, held_out in by_log.items()
         ]
     else:
@@ -182,7 +183,7 @@ def _split_segments(
         held_out += [(segment, (first, last))] if rows.size else []
         outside = [segment.part(i, j) for i, j in ((0, first), (last, n))]
         rest += [part for part in outside if len(part.time) >= FEWEST_HELD_OUT_ROWS]
-    return held_out, grid.having(rest)
+    return held_out, replace(grid, segments=tuple(rest))
 
 
 @dataclass(frozen=True)

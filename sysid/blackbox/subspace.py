@@ -89,11 +89,9 @@ def extended_observability(L32: Array, L33: Array, *, weighting: str) -> Array:
         size, vectors = np.linalg.eigh(L32 @ L32.T + L33 @ L33.T)
         size = np.maximum(size, 1e-10 * size.max())
         weight, back = (vectors * size**-0.5) @ vectors.T, (vectors * size**0.5) @ vectors.T
-    elif weighting == "moesp":
+    else:
         # S = 1, PO-MOESP (Verhaegen)
         weight = back = np.eye(L32.shape[0])
-    else:
-        raise ValueError(f"weighting must be 'moesp' or 'cva', got {weighting!r}")
     left_vectors, values, _ = np.linalg.svd(weight @ L32, full_matrices=False)
     return np.asarray(back @ (left_vectors * np.sqrt(values)))
 

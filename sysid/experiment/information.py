@@ -151,8 +151,7 @@ def plant_from_prior(model: GreyModel) -> Plant:
     plant = prior_plant(model)
     width = [model.specs[name].sd_log or model.specs[name].sd or 0.0 for name in plant.free]
     tables = model.network.inputs if isinstance(model, NetworkModel) else {}
-    ranges = {name: item.range for name, item in tables.items()}
-    valid = {name: (float(low), float(high)) for name, (low, high) in ranges.items()}
+    valid = {name: item.range for name, item in tables.items()}
     return replace(plant, covariance=np.diag(np.square(width)), valid=valid)
 
 

@@ -1,7 +1,5 @@
 """Posterior of a grey-box fit: whole parameter vectors from emcee, or a few draws for bands.
 
-What the samples are for is in ``docs/explanation/uncertainty.md``.
-
 **Density.** What a fit leaves open is how far its simulations may move, d(z) = r(z) - r(z_fit), all logs
 together:
 
@@ -484,7 +482,7 @@ def _record(
     steps = problem.parameters(full.reshape(-1, z.size))[:, [problem.free[i] for i in sampled]]
     drawn = replace(chain, steps=steps.reshape(chain.steps.shape))
     samples = problem.parameters(whole)[:, list(problem.free)]
-    low, mid, high = np.quantile(samples, [0.05, 0.5, 0.95], axis=0)
+    quantiles = np.quantile(samples, [0.05, 0.5, 0.95], axis=0).T.tolist()
     length = len(chain.steps) / float(np.max(chain.tau))
     verdict = f"{'converged' if chain.converged else 'not converged'}: {length:.0f} autocorrelation times"
     units = [
@@ -509,7 +507,7 @@ def _record(
         n_steps=len(chain.steps),
         converged=chain.converged,
         acceptance=chain.acceptance,
-        quantiles={name: (float(a), float(b), float(c)) for name, a, b, c in zip(plant.free, low, mid, high)},
+        quantiles={name: (low, mid, high) for name, (low, mid, high) in zip(plant.free, quantiles)},
         likelihood=about,
         off_centre=float(np.max(np.abs(np.median(whole, axis=0) - z) / whole.std(axis=0))),
         verdict=verdict,

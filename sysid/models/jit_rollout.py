@@ -17,6 +17,7 @@ from functools import cache, partial
 from itertools import islice
 from typing import Any
 
+import casadi as ca
 import numpy as np
 from llvmlite import binding, ir
 from numpy.typing import ArrayLike
@@ -120,19 +121,14 @@ _OPERATIONS |= {
 }
 
 
-@cache
-def _names() -> dict[int, str]:
-    """Return what CasADi calls its operations."""
-    import casadi as ca
-
-    return {getattr(ca, key): key.removeprefix("OP_") for key in dir(ca) if key.startswith("OP_")}
+_NAMES = {getattr(ca, key): key.removeprefix("OP_") for key in dir(ca) if key.startswith("OP_")}
 
 
 def _instructions(function: Any, inputs: Sequence[Values], at: ir.IRBuilder) -> list[Any]:
     """Write the instructions of a CasADi function of registers, and return the registers of its output."""
     work, results = dict[int, Any](), [_ZERO] * function.numel_out(0)
     for k in range(function.n_instructions()):
-        name = _names()[function.instruction_id(k)]
+        name = _NAMES[function.instruction_id(k)]
         into, of = function.instruction_output(k), function.instruction_input(k)
         if name == "OUTPUT":
             results[into[1]] = work[of[0]]
@@ -243,8 +239,6 @@ class _Writer:
     """Writes the function ``rollout``: a block of members through all rows."""
 
     def __init__(self, step: Step, output: Output, sizes: Sizes, switches: Sequence[int]) -> None:
-        import casadi as ca
-
         symbols = [ca.SX.sym(letter, n) for letter, n in zip("xudph", (*sizes, 1))]
         x, u, d, p, h = (ca.vertsplit(item) if item.numel() else [] for item in symbols)
         after = ca.densify(ca.vertcat(*step(x, u, d, p, h[0])))

@@ -111,23 +111,15 @@ class Grid:
         u, y, d = self.inputs, self.outputs, self.disturbances
         return make_grid(logs, inputs=u, outputs=y, disturbances=d, average=average or self.dt, ends=ends)
 
-    def having(self, segments: Sequence[Segment]) -> Grid:
-        """Return the same grid with other segments."""
-        return replace(self, segments=tuple(segments))
-
     def output_spread(self) -> Array:
         """Return the standard deviation (n_y,) of the readings over all segments."""
         return np.asarray(np.nanstd(np.concatenate([segment.y for segment in self.segments]), axis=0))
 
     def ranges(self) -> dict[str, tuple[float, float]]:
         """Return the least and greatest value of each signal."""
-        out: dict[str, tuple[float, float]] = {}
-        for field_name, labels in (("u", self.inputs), ("d", self.disturbances), ("y", self.outputs)):
-            rows = np.concatenate([getattr(segment, field_name) for segment in self.segments])
-            out |= {
-                n: (float(np.nanmin(rows[:, i])), float(np.nanmax(rows[:, i]))) for i, n in enumerate(labels)
-            }
-        return out
+        rows = np.concatenate([np.hstack([segment.u, segment.d, segment.y]) for segment in self.segments])
+        ends = zip(np.nanmin(rows, axis=0).tolist(), np.nanmax(rows, axis=0).tolist())
+        return dict(zip((*self.inputs, *self.disturbances, *self.outputs), ends))
 
 
 def make_grid(
@@ -495,16 +487,15 @@ def moved_beside(model: Signals, log: Log) -> list[str]:
 def match_logs(model: Signals, logs: Logs, *, keep_others: bool = False) -> tuple[list[Log], list[str]]:
     """Return logs in the model's roles and units (one that fits is returned itself), and what was converted
     or taken as 0, a line a column."""
-    role_of, conversions = roles_of(model), dict[str, None]()
+    role_of, conversions = roles_of(model), list[str]()
     logs = as_logs(logs, known=role_of)
     for index, log in enumerate(logs):
         for name in inputs_off(model, log):
             unit = model.units.get(name, "1")
             attrs = {"units": unit, "role": "input"}
             logs[index] = logs[index].assign({name: ("time", np.zeros(log.sizes["time"]), attrs)})
-            conversions[
-                f"{name}: no such column, taken as 0{'' if unit == '1' else f' {unit}'} throughout"
-            ] = None
+            shown = "" if unit == "1" else f" {unit}"
+            conversions.append(f"{name}: no such column, taken as 0{shown} throughout")
     matched = list(logs)
     largest = {
         name: max((float(np.nanmax(np.abs(column(log, name)), initial=0.0)) for log in logs), default=0.0)
@@ -518,7 +509,7 @@ def match_logs(model: Signals, logs: Logs, *, keep_others: bool = False) -> tupl
             )
             if conversion is not None:
                 changed[name] = column(log, name) * conversion[0]
-                conversions[conversion[1]] = None
+                conversions.append(conversion[1])
         roles = {str(n): str(item.attrs.get("role")) if keep_others else "other" for n, item in log.items()}
         roles |= role_of
         if changed or any(item.attrs.get("role") != roles[str(n)] for n, item in log.items()):
@@ -527,7 +518,7 @@ def match_logs(model: Signals, logs: Logs, *, keep_others: bool = False) -> tupl
                 attrs = log[name].attrs | {"role": role}
                 attrs |= {"units": model.units[name]} if name in changed else {}
                 matched[index][name] = ("time", changed.get(name, log[name].values), attrs)
-    return matched, list(conversions)
+    return matched, list(dict.fromkeys(conversions))
 
 
 def _converted(model: Signals, name: str, unit: str, largest: float, log: str) -> tuple[float, str] | None:

@@ -4,8 +4,6 @@
 ``theta`` equal to itself.  Covariance and Laplace draws live in theta; values, samples and intervals are in
 natural units.
 
-``nuisance`` is the sd of each sensor's offset from log to log.
-
 **Its fit.**  A free run over a log of the fit says how well the plant is fitted, not how well it predicts.  A
 log's name may change, so a plant keeps the hash of each log's data
 (:func:`thermogrip.datasets.schema.hash_columns`) beside the seconds of it that were used.

@@ -108,7 +108,7 @@ def test_every_signal_has_the_range_and_spread_of_its_own_readings():
     part = grid.segments[0].part(3, 6)
     assert part.time.tolist() == [3.0, 4.0, 5.0]
     assert part.d.shape == (3, 1)
-    less = grid.having([part])
+    less = replace(grid, segments=(part,))
     assert (less.segments, less.inputs) == ((part,), grid.inputs)
     bare = Grid(("q",), (), ("t",), (), 1.0, (part,), 1.0, {})
     assert (bare.why, bare.ends) == ("", False)
