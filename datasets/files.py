@@ -272,14 +272,13 @@ def parse_json(text: str, **options: Any) -> Any:
 
 def check_json(content: Any, schema: str, version: int, *, file: str | Path | None = None) -> None:
     """Raise :class:`UserError` where content is no JSON object of the schema, or newer than ``version``."""
-    if not isinstance(content, dict) or content.get("schema") != schema:
-        stated = content.get("schema") if isinstance(content, dict) else type(content).__name__
-        raise UserError(
-            f"schema is {stated!r}, not {schema!r}", file=file, hint="give the file of that stage"
-        )
-    stated = content.get("version")
-    if not isinstance(stated, int) or isinstance(stated, bool) or not 1 <= stated <= version:
-        problem = f"version {repr(stated)[:20]} is not between 1 and {version}"
+    stated = content if isinstance(content, dict) else {"schema": type(content).__name__}
+    if stated.get("schema") != schema:
+        problem = f"schema is {stated.get('schema')!r}, not {schema!r}"
+        raise UserError(problem, file=file, hint="give the file of that stage")
+    number = stated.get("version")
+    if not isinstance(number, int) or isinstance(number, bool) or not 1 <= number <= version:
+        problem = f"version {repr(number)[:20]} is not between 1 and {version}"
         raise UserError(problem, file=file, hint="update thermogrip or write the file anew")
 
 

@@ -23,7 +23,7 @@ from thermogrip.datasets.media import csv_cell
 from thermogrip.datasets.netcdf import numbers_and_unit, open_netcdf, write_netcdf
 from thermogrip.datasets.schema import GRASP_LABELS, GRASP_NUMBERS, check_grasps, make_grasps, with_lead_in
 from thermogrip.datasets.tables import Table, read_csv_table, read_parquet_table
-from thermogrip.datasets.units import rename_hint, split_header, to_record_unit
+from thermogrip.datasets.units import join_header, rename_hint, split_header, to_record_unit
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -39,6 +39,7 @@ Records: TypeAlias = "Grasps | str | Path | Sequence[Grasps | str | Path]"
 _FROM_META = {"t_object_nominal": "t_object", "t_gripper_set": "t_gripper"}
 #: Names in the meta file of what a record calls otherwise.
 META_NAMES = {ours: theirs for theirs, ours in _FROM_META.items()}
+_META_HEADERS = {name: join_header(META_NAMES.get(name, name), unit) for name, unit in GRASP_NUMBERS.items()}
 _ENDINGS = (".csv", ".csv.gz", ".csv.xz")
 _SAMPLES = {"time": "s", "t_surface": "degC", "t_surface_2": "degC"}  # what a sample has, and its unit
 _NUMBERS = _SAMPLES | GRASP_NUMBERS
@@ -121,8 +122,7 @@ def write_grasps(grasps: Grasps, path: str | Path) -> Path:
     if file_format(path) != "csv" or Path(path).suffix.lower() != ".csv":
         raise UserError("grasps are written as .csv or .nc", file=path, hint="use one of the two")
     facts = grasps.drop_dims("time").to_dataframe().reset_index().map(csv_cell)
-    units = {name: "" if unit == "1" else f"_{unit}" for name, unit in GRASP_NUMBERS.items()}
-    header = ["grasp_id", *(META_NAMES.get(name, name) + units.get(name, "") for name in facts.columns[1:])]
+    header = ["grasp_id", *(_META_HEADERS.get(name, name) for name in facts.columns[1:])]
     meta_path = Path(path).with_name(f"{file_stem(path)}_meta.csv")
     write_atomic(meta_path, facts.to_csv(index=False, header=header, lineterminator="\n"))
     channels = [name for name in ("t_surface", "t_surface_2") if name in grasps]
@@ -283,8 +283,7 @@ def _unused(table: Table, known: Collection[str]) -> list[str]:
     used = ("pump", *_SAMPLE_PREFIXES)
     columns = [header for header in (*table.text, *table.numbers) if not header.startswith(used)]
     unused = [header for header in columns if _name_and_unit(header)[0] not in known]
-    numbers = (f"{META_NAMES.get(name, name)}_{unit}" for name, unit in GRASP_NUMBERS.items())
-    hint = f"known are {', '.join([*numbers, *GRASP_LABELS])}"
+    hint = f"known are {', '.join([*_META_HEADERS.values(), *GRASP_LABELS])}"
     return [f"{Path(table.file).name}: not used: {', '.join(unused)}; {hint}"] if unused else []
 
 

@@ -127,10 +127,6 @@ class Unpacker:
         check_unpacked(self._packed, self._found, file=self._file)
         return unpacked
 
-    def declare(self, size: int) -> None:
-        """Refuse a chunk that declares too much."""
-        check_unpacked(self._packed, self._found + size, file=self._file, what="declares")
-
 
 def check_content(
     content: dict[str, Any] | list[Any], *, file: str | Path | None = None, place: tuple[object, ...] = ()

@@ -336,7 +336,6 @@ def _mcap_records(data: bytes, file: Path) -> Iterator[Any]:
         if not isinstance(record, Chunk):
             yield record
             continue
-        unpack.declare(record.uncompressed_size)
         if record.compression:
             try:
                 whole = unpack(record.compression, record.data)

@@ -307,12 +307,9 @@ def with_lead_in(grasps: Grasps) -> Grasps:
     step = float(np.median(np.diff(time)))  # on the grid of the others
     # from 3 to 2 s before the message, so that contact may have been before it
     lead = time[0] - step * np.unique(np.round(np.linspace(3.0, 2.0, 5) / step))[::-1]
-    level = np.repeat(grasps["t_gripper"].values[:, None], lead.size, axis=1)
-    out = grasps.drop_dims("time").assign_coords(time=("time", np.concatenate([lead, time]), {"units": "s"}))
-    for key, before in (("t_surface", level), ("t_surface_2", np.full(level.shape, np.nan))):
-        if key in grasps:
-            values = np.hstack([before, grasps[key].values])
-            out[key] = (("grasp", "time"), values, grasps[key].attrs)
+    out = grasps.pad(time=(lead.size, 0))  # NaN before it
+    out = out.assign_coords(time=("time", np.concatenate([lead, time]), {"units": "s"}))
+    out["t_surface"] = out["t_surface"].where(out["time"] >= time[0], out["t_gripper"])
     note = "begins at contact: the level before it is t_gripper"
     out.attrs["repairs"] = "\n".join(filter(None, [grasps.attrs.get("repairs", ""), note]))
     check_grasps(out)
@@ -350,9 +347,8 @@ def check_grasps(grasps: xr.Dataset) -> None:
     for name in ("t_surface", "t_surface_2", "t_object", "t_gripper", "t_ambient"):
         if name in grasps:
             values = grasps.variables[name].values
-            values = values[:, None] if values.ndim == 1 else values
-            for i, k in np.argwhere(np.abs(values) > HOTTEST)[:1]:  # NaN compares false
-                problem = f"grasp {str(grasps['grasp'].values[i])!r} has a {name} of {values[i, k]:g} degC"
+            for place in np.argwhere(np.abs(values) > HOTTEST)[:1]:  # NaN compares false
+                problem = f"grasp {str(ids[place[0]])!r} has a {name} of {values[tuple(place)]:g} degC"
                 hint = "give degrees Celsius, or end the column's name in _K if it is kelvin"
                 raise fault(problem, hint=hint)
     rests = grasps.variables["rest"].values if "rest" in grasps else np.zeros(len(ids))

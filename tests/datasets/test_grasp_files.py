@@ -266,6 +266,7 @@ def test_columns_of_the_meta_file_that_mean_nothing_are_left_out_and_reported(pa
     assert line.startswith("g_meta.csv: not used: object temp, t_room_degC; known are ")
     assert "t_ambient_degC" in line
     assert "t_object_nominal_degC" in line
+    assert " repeat, touch, rest_s, " in line
 
 
 def test_a_spreadsheet_s_semicolons_decimal_commas_and_utf_16_are_the_same_grasps(pair, tmp_path):
