@@ -286,7 +286,13 @@ def _of_rows(table: Table, read: Mapping[str, Header]) -> Clock:
     beside = "dt" in table.meta  # a file may have it beside its columns
     step = next(iter(stated.values()), float(table.meta.get("dt", 1.0)))
     note = f"no time column: rows are taken {step:g} s apart; --dt S sets another step"
-    doubt = "" if stated or beside else "no column is a clock: rows are taken 1 s apart"
+    moves = {h: np.diff(v) for h, v in table.numbers.items() if v.size > 1}
+    rising = [h for h, m in moves.items() if np.median(m) / 3 < m.min() <= m.max() < 3 * np.median(m)]
+    doubt = "no column is a clock: rows are taken 1 s apart"
+    if len(rising) == 1:  # an uneven clock may be
+        doubt = f"rows are taken 1 s apart, but {rising[0]} rises in every row: is it the clock? "
+        doubt += "--columns time_s,... names it so"
+    doubt = "" if stated or beside else doubt
     return Clock(step * np.arange(len(table.lines), dtype=float), frozenset(stated), (note,), np.nan, doubt)
 
 

@@ -81,7 +81,20 @@ def is_held(values: Floats) -> bool:
     finite = values[np.isfinite(values)]
     moves = np.abs(np.diff(finite))
     rarely_moves = 0 < np.count_nonzero(moves) <= EVIDENCE.held_share * finite.size
-    return bool(rarely_moves and np.median(moves[moves > 0]) >= EVIDENCE.held_size * np.ptp(finite))
+    far = rarely_moves and np.median(moves[moves > 0]) >= EVIDENCE.held_size * np.ptp(finite)
+    return bool(far and not _flickers(finite))
+
+
+def _flickers(values: Floats) -> bool:
+    """Tell whether a column goes to and fro between neighbours of its levels, three or more, as the steps of
+    a converter do: a relay has two, a staircase goes on, set levels skip some."""
+    levels, places = np.unique(values, return_inverse=True)
+    ways = np.diff(places.ravel())
+    ways = ways[ways != 0]
+    back = ways[1:] == -ways[:-1]
+    enough = levels.size > 2 and ways.size >= EVIDENCE.fewest_rows
+    # of 75 drives that are held .82 of the moves and .33 are so at most, of 14 coarse readings .93 and .59
+    return bool(enough and np.mean(np.abs(ways) == 1) > 0.9 and np.mean(back[1:] & back[:-1]) > 0.5)
 
 
 def one_signal(one: Floats, other: Floats) -> bool:

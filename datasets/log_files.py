@@ -24,7 +24,6 @@ from thermogrip.datasets.clock import CLOCK, EPOCH, Clock, clock_of, read_clock,
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.evidence import effect_doubts
 from thermogrip.datasets.files import atomic_path, file_format, file_stem, split_cut, write_atomic
-from thermogrip.datasets.limits import MOST_NUMBER
 from thermogrip.datasets.media import csv_cell
 from thermogrip.datasets.roles import Roles, assign_roles, guess_role
 from thermogrip.datasets.schema import check_log, cut, hash_columns, make_log
@@ -52,6 +51,7 @@ Logs: TypeAlias = "Log | DataFrame | str | Path | Sequence[Log | DataFrame | str
 MOST_SIGNALS = 40  # of a table with a reading of one of them in a row
 LOST_SHARE = 0.25  # of an output: one of the four blocks of a log that are held out would have no reading
 NO_NUMBERS = "is left out: its cells are no numbers"
+_MOST_READ = 9e37  # instruments write 9.9e37 for an overload (SCPI-99), loggers a float's largest, 3.4e38
 MOST_STATES = 12  # words of a column that may be the states of a program
 
 
@@ -291,10 +291,10 @@ def _convert(table: Table, dt: float | None) -> _Columns:
             repairs.append(f"{header}: has no number in any row, left out")
             continue
         names_of[header] = name = unused(name or "c", ["time", *columns])
-        beyond = np.isfinite(values) & (np.abs(values) > MOST_NUMBER)
+        beyond = np.isfinite(values) & (np.abs(values) > _MOST_READ)
         if beyond.any():
             values = np.where(beyond, np.nan, values)
-            repairs.append(f"{name}: {beyond.sum()} reading(s) beyond {MOST_NUMBER:g} taken as lost")
+            repairs.append(f"{name}: {beyond.sum()} reading(s) beyond {_MOST_READ:g} taken as lost")
         columns[name], units[name] = to_record_unit(values if scale == 1 else values * scale, unit)
         if header not in (name, f"{name}_{unit}"):
             renamed.append(f"{header!r} as {name}" + ("" if unit == "1" else f" [{unit}]"))

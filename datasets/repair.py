@@ -181,7 +181,9 @@ def doubt_readings(name: str, values: Floats, inputs: Sequence[Floats], time: Fl
     moves = np.abs(np.diff(values))
     if values.size < SPIKE_WINDOW or not np.nansum(moves):
         return ""
-    if np.nanmean(moves) > 2 * np.nanmean(np.abs(values[2:] - values[:-2])):  # alike where all is noise
+    # alike where all is noise; a coarse reading goes to and fro by one step
+    to_and_fro = np.nanmean(moves) > 2 * np.nanmean(np.abs(values[2:] - values[:-2]))
+    if to_and_fro and np.nanmean(moves) > 1.5 * _smallest_step(values):
         return f"{name} goes to and fro from row to row: are its rows of two logs?"
     for end in (np.nanmin(values), np.nanmax(values)):
         rows = _rows_beyond_jumps(values, values == end)

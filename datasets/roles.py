@@ -26,16 +26,16 @@ from thermogrip.datasets.evidence import (
     predictive_gain,
     role_doubts,
 )
-from thermogrip.datasets.limits import MOST_NUMBER
 from thermogrip.datasets.units import DRIVE, find_column
 
 Floats = NDArray[np.float64]
 
 _SETPOINT = re.compile(
     r"^(t_?)?(setpoint|set_point|target|sp|set)(_?\d+)?(_.*)?$|^reference(_.*|\d*)$"
-    r"|_(setpoint|set_point|target|sp|set|goal)(_?\d+)?$|^(goal|desired)(_.*|\d*)$"
+    r"|_(setpoint|set_point|target|sp|set|goal|soll(wert)?)(_?\d+)?$|^(goal|desired)(_.*|\d*)$"
+    r"|^(soll(wert)?|ziel(wert|temperatur)?|consign[ae])(_.*|\d*)$"
 )
-_SET_DRIVE = re.compile(r"^set(_.*|\d*)$|_set$|^(goal|desired)")  # set_percent is what a drive is set to
+_SET_DRIVE = re.compile(r"^(set|soll)(_.*|\d*)$|_(set|soll)$|^(goal|desired)")  # set_percent is of a drive
 _OF_DRIVES = ("percent", "V", "A", "W", "0_255")
 _OUTDOORS = re.compile(
     r"(^|_)(outside|outdoors?|weather|wind|cloud|rain|dew|sol)(_|$)|solar|irradia|^(to|te|text|toa|oat|ghi)$"
@@ -136,8 +136,7 @@ def assign_roles(
     requests = {f"asked_{n}": n for n in units}
     guesses |= {n: ("other", f"it is what was asked of {requests[n]}") for n in guesses if n in requests}
     evidence: dict[str, tuple[str, str]] = {}  # of the data alone
-    if columns is not None:  # what is beyond all use is no reading, and its squares are none either
-        columns = {n: np.where(np.abs(v) <= MOST_NUMBER, v, np.nan) for n, v in columns.items()}
+    if columns is not None:
         if all(len(values) >= EVIDENCE.fewest_rows for values in columns.values()):
             guesses |= _copied_columns(columns, guesses, units)
         guesses |= _controllers(guesses, units)
@@ -212,6 +211,10 @@ def roles_of_data(
         # held between few large moves
         elif is_held(values):
             out[name] = "input", f"it is held between {np.count_nonzero(steps)} moves in {rows} rows"
+    at_ends = [n for n, (role, _) in out.items() if role == "input" and not np.diff(columns[n])[1:-1].any()]
+    likely = columns.keys() - {*fixed, *at_ends, *(n for n, (role, _) in out.items() if role == "other")}
+    if len(likely) > 1:  # beside one alone it is all that can have moved it
+        out |= dict.fromkeys(at_ends, ("other", f"{_NEVER_MOVES} but in its first or last row"))
     roles = {**fixed, **{name: role for name, (role, _) in out.items()}}
     names = [n for n in columns if roles.get(n) != "other" and np.nanmax(columns[n]) > np.nanmin(columns[n])]
     gain = predictive_gain([columns[name] for name in names])

@@ -361,7 +361,7 @@ def test_of_two_times_the_one_that_starts_again_with_each_cycle_is_not_taken(wri
 ENDINGS = [".csv", ".csv.gz", ".csv.xz", ".nc", ".parquet"]
 SLOW = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
-FLOATS = st.floats(-1e100, 1e100, width=64)
+FLOATS = st.floats(-9e37, 9e37, width=64)
 
 
 @st.composite
@@ -855,6 +855,7 @@ SHUFFLED_IN_FIVES = np.random.default_rng(0).permuted(PLACES[2:597].reshape(-1, 
         (np.r_[:2, SHUFFLED_IN_FIVES, 597:600], HEATER, PLATE, "to and fro in 18 of its 18 moves"),
         (PLACES, np.interp(PLACES, PLACES[::5], HEATER[::5]), PLATE, "in 5 rows, 18 times: is it an average"),
         (PLACES, np.interp(PLACES, PLACES[::5], 1.0 * (HEATER[::5] > 30)), PLATE, ""),  # of a limited rate
+        (PLACES, HEATER, np.floor(PLATE / 4 + 0.9 * (PLACES % 2)), ""),  # a coarse reading that flickers
     ],
 )
 def test_columns_that_are_not_one_course_of_one_unit_are_doubts(write, order, heater, plate, doubt):
