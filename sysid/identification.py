@@ -50,7 +50,7 @@ from thermogrip.sysid.plant.innovations import innovation_noise
 from thermogrip.sysid.plant.log_grid import match_logs, misfit, moved_before, signals
 from thermogrip.sysid.plant.log_grid import rows_of as log_rows
 from thermogrip.sysid.plant.plant import Plant
-from thermogrip.sysid.plant.plant_data import HELD_OUT_SHARE, TAIL, ExpectedError, HeldOut
+from thermogrip.sysid.plant.plant_data import HELD_OUT_SHARE, RUN_GAIN_SD, TAIL, ExpectedError, HeldOut
 from thermogrip.sysid.validation.free_run import FreeRun, free_run, no_input_baseline, warm_up_of
 from thermogrip.sysid.validation.stated_errors import (
     Row,
@@ -61,6 +61,7 @@ from thermogrip.sysid.validation.stated_errors import (
     network_name,
     part_errors,
     verdict_of,
+    with_gain_spreads,
 )
 
 if TYPE_CHECKING:
@@ -539,7 +540,7 @@ def _run_error(fits: Sequence[BlackBoxFit], logs: Sequence[Log]) -> float:
     """Return what a gain that differs from run to run adds, in units of the outputs' spread, by the best
     linear fit (else any); 0 where the logs show it."""
     best = min([fit for fit in fits if fit.kind in LINEAR] or fits, key=lambda fit: fit.choice.error)
-    changes = _rms_of_changes(between_runs(best.plant, logs))
+    changes = _rms_of_changes(between_runs(best.plant, logs, RUN_GAIN_SD))
     added = [changes.get(name, 0.0) / s for name, s in zip(best.grid.outputs, best.grid.output_spread())]
     return float(np.sqrt(np.mean(np.square(added))))
 
@@ -638,7 +639,7 @@ def _with_expected(plant: Plant, kind: str, rows: Sequence[Row], logs: Sequence[
         for row in rows
         if row.held_out and row.model == kind
     ]
-    plant = replace(plant, scores=replace(plant.scores, held_out=held_out))
+    plant = with_gain_spreads(replace(plant, scores=replace(plant.scores, held_out=held_out)))
     differs = _rms_of_changes(between_runs(plant, logs))
     expected = {
         name: expected_error(part_errors(plant, name), differs.get(name, 0.0)) for name in plant.outputs

@@ -25,6 +25,7 @@ from thermogrip.sysid.blackbox.order_selection import (
     ORDER_MARGIN,
     Choice,
     Family,
+    Fold,
     Model,
     Run,
     choose,
@@ -34,7 +35,7 @@ from thermogrip.sysid.blackbox.order_selection import (
     free_run_misses,
 )
 from thermogrip.sysid.data.data_quality import reading_excess
-from thermogrip.sysid.plant.log_grid import Grid, Segment, make_grid, rows_of
+from thermogrip.sysid.plant.log_grid import MOVED, Grid, Segment, make_grid, rows_of
 from thermogrip.sysid.plant.plant import Plant
 from thermogrip.sysid.plant.plant_data import SEVERAL, PlantScores, fit_logs
 from thermogrip.sysid.plant.simulation import READING_EVERY
@@ -283,6 +284,23 @@ def _warmup_rows(grid: Grid) -> int:
     return max(2, min(round(seconds / grid.dt), most))
 
 
+def _untested(grid: Grid, parts: Sequence[Fold]) -> dict[str, float]:
+    """Return the inputs that move in no part held out of a rest that moves them: 0 where one has its value of
+    98 percent of the rows, which is part of the operating point, else 1."""
+    u = np.concatenate([segment.u for segment in grid.segments])
+    least, tested = MOVED * np.ptp(u, axis=0), np.zeros(u.shape[1], dtype=bool)
+    for part in parts:
+        if part.runs and part.train.segments:
+            tested |= np.all(part.moves(least), axis=0)
+    moved = np.ptp(np.percentile(u, (1, 99), axis=0), axis=0) > least
+    unsure = moved | (not moved.any())  # what the readings show are then these few rows
+    return {
+        name: float(unsure[k])
+        for k, name in enumerate(grid.inputs)
+        if not tested[k] and name not in grid.switches
+    }
+
+
 def _plant(grid: Grid, choice: Choice, logs: Sequence[Log]) -> Plant:
     scale = np.maximum(grid.output_spread(), 1e-9)
     rows, prior = choice.warmup, choice.prior
@@ -299,6 +317,7 @@ def _plant(grid: Grid, choice: Choice, logs: Sequence[Log]) -> Plant:
         reading_excess=excess,
         reading_sd=reading_excess(log_rows, grid.outputs, np.inf),
         held_out_by_part={name: errors.tolist() for name, errors in zip(grid.outputs, by_part.T)},
+        untested=_untested(grid, choice.folds),
     )
     plant = Plant(
         choice.model,

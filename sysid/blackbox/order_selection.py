@@ -113,6 +113,12 @@ class Fold(NamedTuple):
     train: Grid
     runs: tuple[Run, ...]
 
+    def moves(self, least: Array) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+        """Return which inputs move by more than ``least`` in the part, and which in its rest."""
+        held_out = np.concatenate([run.segment.u[run.scored_from :] for run in self.runs])
+        rest = np.concatenate([segment.u for segment in self.train.segments])
+        return np.ptp(held_out, axis=0) > least, np.ptp(rest, axis=0) > least
+
 
 def folds(grid: Grid, *, blocks: int = _CUTS) -> list[Fold]:
     """Return the parts that are held out in turn: those whose rest moves each input that they move, or all
@@ -131,9 +137,8 @@ def folds(grid: Grid, *, blocks: int = _CUTS) -> list[Fold]:
     excited = []
     for part in parts:
         if part.train.segments and part.runs:
-            held_out = np.concatenate([run.segment.u[run.scored_from :] for run in part.runs])
-            others = np.concatenate([segment.u for segment in part.train.segments])
-            if np.all((np.ptp(held_out, axis=0) <= least) | (np.ptp(others, axis=0) > least)):
+            in_part, in_rest = part.moves(least)
+            if np.all(~in_part | in_rest):
                 excited.append(part)
     return excited if len(excited) >= 2 else parts
 

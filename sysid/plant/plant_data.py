@@ -174,6 +174,8 @@ class PlantScores:
     reading_sd: dict[str, float] = field(default_factory=dict)  # of a black box: white noise of one reading
     # of a black box, by output: errors over the parts held out in turn
     held_out_by_part: dict[str, list[float]] = field(default_factory=dict)
+    # of a black box, sd of the gain over the gain of inputs that move in no part held out; 0: nor in the logs
+    untested: dict[str, float] = field(default_factory=dict)
     # between independent residuals, as the fit weighted them
     weight_s: dict[str, float] = field(default_factory=dict)
     intervals: Intervals | None = None

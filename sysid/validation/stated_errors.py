@@ -25,7 +25,8 @@ half of the error without input, and so does it on another run.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
 from statistics import NormalDist
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
@@ -47,6 +48,7 @@ if TYPE_CHECKING:
 PRIOR_SPREAD = 0.5  # sd of ln e of the parts of a log: the median over 22 series of 14 public logs is 0.51
 PRIOR_PARTS = 4  # which that counts as: as many as one log has blocks
 MEDIAN = NormalDist().inv_cdf(0.75)  # of the size of a normal number, in standard deviations
+INTERVAL = NormalDist().inv_cdf(0.95)  # half of a 90 % interval, in standard deviations
 _RANKS = 199  # quantiles of each part, of which their sum is made
 _DIVERGED = 1e6  # of an output's spread
 _LATER = (1 / 30, 1 / 10, 1 / 3)  # of a run: lags of an effect that comes later; half a decade apart
@@ -179,14 +181,30 @@ def unlike_fit(plant: Plant, log: Log, simulated: Log, warmup: float) -> dict[st
     return out
 
 
-def between_runs(plant: Plant, logs: Sequence[Log]) -> dict[str, Array]:
+def between_runs(plant: Plant, logs: Sequence[Log], most: float = 1.0) -> dict[str, Array]:
     """Return by output what a gain that is off as from run to run changes at each row of the logs, one after
     the other; empty for a plant of no log, or of so many that their held-out errors show it."""
-    return effect_of_inputs(plant, logs) if 0 < len(plant.logs) < SEVERAL else {}
+    return effect_of_inputs(plant, logs, most) if 0 < len(plant.logs) < SEVERAL else {}
 
 
-def effect_of_inputs(plant: Plant, logs: Sequence[Log]) -> dict[str, Array]:
-    """Return by output what inputs that do less by :data:`RUN_GAIN_SD` change at each row of the logs."""
+def with_gain_spreads(plant: Plant) -> Plant:
+    """Return the plant with the spread that its draws show of gains that no part held out tests."""
+    spreads, shown = dict(plant.scores.untested), []
+    if any(spreads.values()) and plant.uncertain:
+        from thermogrip.sysid.export.dynamics import plant_dynamics
+
+        with suppress(UserError):  # it does not settle
+            shown = [row for row in plant_dynamics(plant).rows() if row["gain"] and row["high"] is not None]
+    for row in shown:
+        by_draws = (row["high"] - row["low"]) / (2 * INTERVAL) / abs(row["gain"])
+        if by_draws < spreads.get(row["input"], 0.0):  # at 1 the input may as well do nothing
+            spreads[row["input"]] = by_draws
+    return replace(plant, scores=replace(plant.scores, untested=spreads))
+
+
+def effect_of_inputs(plant: Plant, logs: Sequence[Log], most: float) -> dict[str, Array]:
+    """Return by output what inputs that do less by :data:`RUN_GAIN_SD`, those that no part held out tests by
+    the spread of their gain, ``most`` at most, change at each row of the logs."""
     moving = set(plant.inputs) - set(plant.model.switches)
     nearest = {name: np.clip(0.0, *plant.valid.get(name, (0.0, 0.0))) for name in moving}
     changes = []
@@ -197,7 +215,8 @@ def effect_of_inputs(plant: Plant, logs: Sequence[Log]) -> dict[str, Array]:
             u = column(log, name)
             # g (u - u_0), u_0 the value nearest to 0 in the logs of the fit: what an input that never was 0
             # does from 0 on is part of the operating point
-            log[name] = log[name].copy(data=u - RUN_GAIN_SD * (u - nearest[name]))
+            gain_sd = min(plant.scores.untested.get(name, RUN_GAIN_SD), most)
+            log[name] = log[name].copy(data=u - gain_sd * (u - nearest[name]))
         changes.append(change - columns(plant.simulate(log), plant.outputs))
     return dict(zip(plant.outputs, np.concatenate(changes).T))
 
@@ -223,7 +242,7 @@ def effect_of_run(plant: Plant, error: Array, log: Log) -> InputEffect | None:
     """Return what inputs did more in a run than in the fit, at once or later, by least squares on the errors
     (n, n_y) of the free run, NaN where it is not scored, in the spread of each output; None where
     that is too little."""
-    effects = effect_of_inputs(plant, [log])
+    effects = effect_of_inputs(plant, [log], RUN_GAIN_SD)
     at_once = np.array([effects[name] for name in plant.outputs]).T / RUN_GAIN_SD
     spread = np.array([np.nanstd(column(log, name)) for name in plant.outputs])
     spread = np.where(spread > 0, spread, 1.0)
@@ -410,13 +429,18 @@ def verdict_of(
     label = f"network {named}" if named else model
     errors = ", ".join(f"{name} {each.words(plant.units.get(name, '1'))}" for name, each in expected.items())
     another = f"Expected error of another run like these: {errors}."
+    untested = ", ".join(name for name, gain_sd in plant.scores.untested.items() if gain_sd)
     without = {name: each.same_gain for name, each in expected.items() if each.same_gain is not None}
     if without:
         sizes = ", ".join(
             f"{n} {e:.2g} {plant.units.get(n, '1')}".removesuffix(" 1") for n, e in without.items()
         )
-        another += f" It would be {sizes}, were gains the same from run to run: that they vary by "
-        another += f"{100 * RUN_GAIN_SD:.0f} % is assumed; {SEVERAL} logs would show it."
+        another += f" It would be {sizes}, were gains the same from run to run: "
+        assumed = f"that they vary by {100 * RUN_GAIN_SD:.0f} % is assumed; {SEVERAL} logs would show it."
+        another += f"that of {untested} may be another." if untested else assumed
+    if untested:
+        why = f"{untested} moves in no part held out whose rest moves it, so what it does is tested nowhere"
+        return False, f"Not good ({label}): {why}; another move of it in the log would test it. {another}"
     own_rows = [row for row in rows if row.model == model]
     for name, error in expected.items():
         part_error, parts_idle = _pooled([row for row in own_rows if row.output == name and row.held_out])

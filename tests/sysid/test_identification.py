@@ -23,10 +23,10 @@ from thermogrip.sysid.greybox.problem import prior_plant
 from thermogrip.sysid.identification import Held, beyond_reach, choose_black_box
 from thermogrip.sysid.models.network import load_network
 from thermogrip.sysid.models.state_space import StateSpaceModel
-from thermogrip.sysid.plant.plant_data import ExpectedError, HeldOut, fit_logs
+from thermogrip.sysid.plant.plant_data import ExpectedError, HeldOut, PlantScores, fit_logs
 from thermogrip.sysid.validation import stated_errors
 from thermogrip.sysid.validation.free_run import free_run, usual_warmup
-from thermogrip.sysid.validation.stated_errors import between_runs, expected_error
+from thermogrip.sysid.validation.stated_errors import between_runs, effect_of_inputs, expected_error
 
 REAL = Path(os.environ.get("THERMOGRIP_REAL_DATA", Path(__file__).parents[3] / "shared" / "data" / "real"))
 needs_real = pytest.mark.skipif(
@@ -433,6 +433,7 @@ def test_an_input_that_never_moves_has_no_gain(kind):
         (0.5, 1.9, 1.01, 0.9, "ok", (), "Not good (arx): on parts held out t errs by 0.71"),
         (0.5, 1.9, 0.9, 1.01, "ok", (), "Not good (arx): on the logs of its own fit t errs by 1"),
         (0.5, 1.9, 0.9, 0.9, "fail", (), "Not good (arx): q never moves"),
+        (0.5, 1.9, 0.9, 0.9, "untested", (), "Not good (arx): q moves in no part held out whose rest moves"),
         (0.5, 1.9, 0.9, 0.9, "ok", ("a guess", "b"), "Not good (arx) as long as this is in doubt: a guess"),
     ],
 )
@@ -444,12 +445,27 @@ def test_a_plant_is_good_where_it_errs_by_less_than_half_of_no_input_on_parts_in
     # where nothing moves a model without input errs by nothing: such a part condemns no plant
     rows[1] = replace(rows[1], rmse=0.01, no_input_rmse=1e-4)
     quality: Any = SimpleNamespace(findings=[SimpleNamespace(verdict=checked, says="q never moves")])
-    scores = SimpleNamespace(expected={"t": ExpectedError(rmse, 0.1, high)})
+    untested = {"fan": 0.0, "q": 0.3} if checked == "untested" else {"fan": 0.0}
+    scores = PlantScores(expected={"t": ExpectedError(rmse, 0.1, high)}, untested=untested)
     plant: Any = SimpleNamespace(scores=scores, units={"t": "K"}, logs=("a", "b", "c"), model=None)
     found, words = stated_errors.verdict_of("arx", plant, rows, quality, doubts)
     assert found == said.startswith("Good")
     assert words.startswith(said)
     assert words.endswith(f" Expected error of another run like these: t {rmse:.2g} K (0.1 to {high:.2g}).")
+
+
+def test_no_part_held_out_tests_an_input_of_one_pulse_and_one_that_stays_on_is_of_the_operating_point():
+    rng, t = np.random.default_rng(0), np.arange(800.0)
+    pulse, steps, fan = np.clip((t - 30) // 9, 0, 3) * (t < 60), np.repeat(rng.random(40), 20), 2.0 * (t > 5)
+    for q, spreads in ((pulse, {"q": pytest.approx(0.1, abs=0.06), "fan": 0.0}), (steps, {"fan": 0.0})):
+        y = 20 + lfilter([0, 0.2], [1, -0.98], q) - 1e-4 * t + 0.01 * rng.standard_normal(800)
+        columns = {"q": (q, "1", "input"), "fan": (fan, "1", "input"), "t": (y, "degC", "output")}
+        found = identify(make_log(t, columns), models=["arx"], average=1.0)
+        assert found.plant.scores.untested == spreads  # by draws; 0: no part of what is stated
+        assert found.good is ("q" not in spreads)
+        assert ("q moves in no part held out" in found.verdict) is ("q" in spreads)
+        only_fan = make_log(t, columns | {"q": (0 * t + q.min(), "1", "input")})
+        assert np.abs(effect_of_inputs(found.plant, [only_fan], 1.0)["t"]).max() < 1e-9
 
 
 def table(shares, held=True):
