@@ -33,6 +33,7 @@ _CODE_JUMP, _STUCK_CHANCE = 5.0, 1e-3  # times what other rows rarely move; of a
 SPIKE_FLOOR_K = 0.6  # the least deviation of a temperature that can be a spike
 SPIKE_WINDOW = 21  # samples of the running median
 SPIKE_LENGTH = 3  # samples at most of a spike
+_SLOW_ROWS = 60.0  # s, in which a plant moves and comes back by itself
 GAP_SECONDS = 10.0  # of the least gap
 GAP_STEPS = 5.0  # median steps of the rows, of the least gap
 _REPEATED = 32  # rows with moves in most of them, that are not alike by chance
@@ -418,6 +419,9 @@ def reject_spikes(
 ) -> tuple[Floats, list[str]]:
     """Return the channel with its spikes as NaN, and what was found."""
     spikes = find_spikes(values, floor=floor)
+    if spikes.any() and np.median(np.diff(time)) >= _SLOW_ROWS:  # spikes are beyond others by their range
+        low, high = np.nanmin(values[~spikes]), np.nanmax(values[~spikes])
+        spikes &= np.abs(values - (low + high) / 2) > 1.5 * (high - low)
     if not spikes.any():
         return values, []
     worst = ", ".join(f"{values[row]:g} at {time[row]:.2f} s" for row in np.flatnonzero(spikes)[:5])

@@ -74,6 +74,14 @@ def test_what_is_a_spike_and_what_is_not(values, floor, spikes):
     assert np.flatnonzero(find_spikes(values, floor=floor)).tolist() == spikes
 
 
+@pytest.mark.parametrize(("value", "step", "lost"), [(29.9, 59, 1), (29.9, 60, 0), (30.1, 60, 1)])
+def test_in_slow_rows_a_spike_lies_beyond_all_others_by_more_than_their_range(value, step, lost):
+    hours = np.repeat([20.0, 25.0, 20.0, 22.0], 25)
+    hours[60] = value
+    rejected, _ = reject_spikes("t", hours, step * np.arange(100.0), floor=0.6)
+    assert np.isnan(rejected).sum() == lost
+
+
 @pytest.mark.parametrize(
     ("celsius", "words"),
     [
