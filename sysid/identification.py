@@ -244,24 +244,18 @@ def _read_logs(
     if leave_one_out and len(logs) < 2:
         raise UserError("leaving one log out needs at least two logs", hint="give another log")
     checked = check_data(logs, inputs=u, outputs=y, disturbances=d, average=average)
-    _ask_for_excitation(checked, u, logs[0])
+    if failed := [finding for finding in checked.of("excitation") if finding.verdict == "fail"]:
+        moved_inputs = [name for name in u if name not in {finding.channel for finding in failed}]
+        hint = "move it in the experiment, or leave it out"
+        hint += f" with --inputs {','.join(moved_inputs)}" if 0 < len(moved_inputs) < len(u) else ""
+        says, log = "; ".join(finding.says for finding in failed), logs[0]
+        raise UserError(says, file=log_name(log), column=failed[0].channel, hint=hint + moved_before(log))
     roles, unused = signal_roles(logs, ([*u, *still], d, y), named, model, still)
     all_named = named["inputs"] is not None and named["outputs"] is not None
     doubts = (*role_doubts(logs, named_all=all_named), *doubt_of_gains(logs, u))
     notes = (*converted, *rested, *unused)
     fit_box = partial(fit_black_box, inputs=u, outputs=y, disturbances=d, average=average)
     return _Task(logs, model, fit_box, checked, roles, doubts, notes, leave_one_out)
-
-
-def _ask_for_excitation(checked: DataCheck, inputs: Sequence[str], log: Log) -> None:
-    failed = [finding for finding in checked.of("excitation") if finding.verdict == "fail"]
-    if not failed:
-        return
-    moved_inputs = [name for name in inputs if name not in {finding.channel for finding in failed}]
-    hint = "move it in the experiment, or leave it out"
-    hint += f" with --inputs {','.join(moved_inputs)}" if 0 < len(moved_inputs) < len(inputs) else ""
-    says = "; ".join(finding.says for finding in failed)
-    raise UserError(says, file=log_name(log), column=failed[0].channel, hint=hint + moved_before(log))
 
 
 def _for_logs(network: GreyModel | str | Path, logs: list[Log]) -> tuple[GreyModel, list[str]]:

@@ -47,10 +47,8 @@ _CUTS = 4  # of one or two logs
 MANY_ROWS = 8000  # beyond it a fit to all structures and steps takes minutes, and two parts tell them apart
 FEWEST_HELD_OUT_ROWS = 20  # rows of a block that is held out
 
-_LINEAR_CORRELATION = (
-    0.98  # correlation of an input with its square: a line leaves a fifth of the square's spread
-)
-
+# of an input with its square: a line leaves a fifth of the square's spread
+_LINEAR_CORRELATION = 0.98
 _FADING_SHARE = 0.25  # of a held-out part: the memory of an offset that fades; a longer one looks lasting
 
 _Fitted = TypeVar("_Fitted", bound=BlackBox)

@@ -117,10 +117,13 @@ def _fit_terms(grid: Grid, terms: _Features, threshold: float) -> SindyModel | N
         if threshold:
             relative = threshold * float(np.abs(scaled).max())
             scaled = pysindy.STLSQ(threshold=relative, alpha=1e-6).fit(theta, move / weight).coef_
-    natural = _natural(terms, np.asarray(scaled, dtype=float) * weight[:, None])
+    # the coefficients of polynomials of v, of those of (v - middle) / size
+    powers, fewer = terms.powers, terms.powers[:, None]
+    expanded = comb(powers, fewer) * (-terms.middle) ** np.maximum(powers - fewer, 0) / terms.size**powers
+    natural = (np.asarray(scaled, dtype=float) * weight[:, None]) @ np.prod(expanded, axis=2).T
     # the increment was fitted
-    natural += (terms.powers[:, : len(natural)].T == 1) & (terms.powers.sum(axis=1) == 1)
-    return _bounded_model(grid, terms.powers, natural, terms.memory)
+    natural += (powers[:, : len(natural)].T == 1) & (powers.sum(axis=1) == 1)
+    return _bounded_model(grid, powers, natural, terms.memory)
 
 
 def _bounded_model(grid: Grid, exponents: NDArray[np.int_], natural: Array, memory: int) -> SindyModel | None:
@@ -135,10 +138,3 @@ def _bounded_model(grid: Grid, exponents: NDArray[np.int_], natural: Array, memo
     runs = [model.states(x0, s.u[None], s.d[None])[0] for x0, s in zip(starts, grid.segments)]
     x = np.concatenate([run[memory - 1 :] for run in runs])
     return replace(model, spread=state_spread(x)) if np.isfinite(x).all() else None
-
-
-def _natural(terms: _Features, coefficients: Array) -> Array:
-    """Return the coefficients of polynomials of v, of those of (v - middle) / size."""
-    powers, fewer = terms.powers, terms.powers[:, None]
-    expanded = comb(powers, fewer) * (-terms.middle) ** np.maximum(powers - fewer, 0) / terms.size**powers
-    return np.asarray(coefficients @ np.prod(expanded, axis=2).T)

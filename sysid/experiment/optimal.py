@@ -94,8 +94,6 @@ def optimal_schedule(
     the outputs' ``lowest`` and ``highest``, of the plant and of eight draws, are hard. Inputs on ``hold``
     stay as at the start, in a room of 25 degC: a switch on, any other at 0 or what is nearest to it.
     """
-    if not set(plant.inputs) - set(plant.model.switches) <= set(ranges):
-        raise ValueError("ranges must name every input that is not a switch")
     if set(plant.inputs) <= set(hold) or not set(hold) <= set(plant.inputs):
         raise UserError(
             f"cannot hold {', '.join(hold)}", hint=f"leave one of {', '.join(plant.inputs)} to move"
@@ -106,13 +104,11 @@ def optimal_schedule(
     coarse = ExperimentForecast(plant, lowest=lowest, highest=highest, dt=frame.dt)
     cells = _search_cells(frame, coarse, seed, evaluations or EVALUATIONS, report)
     report(0.97, "checking the limits")
-
-    def bits(cells: Array) -> float:
-        return fine.evaluate(frame.inputs(cells, coarse=False))
-
     # limits kept at the search's step are checked at the plant's own: shrunk towards the start's level until
     # they are
-    within, _ = _shrunk(frame, bits, cells, SEARCH.halvings)
+    within, _ = _shrunk(
+        frame, lambda cells: fine.evaluate(frame.inputs(cells, coarse=False)), cells, SEARCH.halvings
+    )
     best = frame.inputs(within, coarse=False)
     if not fine.stays(best):
         raise UserError(

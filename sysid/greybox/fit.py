@@ -36,6 +36,7 @@ from thermogrip.sysid.plant.plant import Plant
 from thermogrip.sysid.plant.simulation import find_starts, predict
 
 _HUGE = 1e150  # residuals beyond it would overflow when squared
+_STUCK = 5.0  # rms residual in sensor sd from which a fit does not explain the logs
 
 
 def bounded_least_squares(
@@ -69,9 +70,6 @@ def bounded_least_squares(
         ftol=tolerance,
         max_nfev=evaluations,
     )
-
-
-_STUCK = 5.0  # rms residual in sensor sd from which a fit does not explain the logs
 
 
 def fit_network(
@@ -144,13 +142,12 @@ def fit_network(
     # to the priors
     whiter = tau < 0.8 * problem.tau
     if whiter.any():
-        problem = problem.with_tau(np.where(whiter, tau, problem.tau))
+        problem = replace(problem, tau=np.where(whiter, tau, problem.tau))
         solution = _descend(problem, solution.x, report, (0.8, 0.95))
     finer = model.prepared(runs, spread, problem.parameters(solution.x[None])[0])
     if finer is not model:  # its step was short enough at the prior, and is not where the fit ended
-        problem = make_problem(finer, logs, average=average, independent=model.independent).with_tau(
-            problem.tau
-        )
+        refined = make_problem(finer, logs, average=average, independent=model.independent)
+        problem = replace(refined, tau=problem.tau)
         solution = _descend(problem, solution.x, report, (0.9, 0.95))
     report(0.95, "covariance")
     plant = _as_plant(problem, solution)

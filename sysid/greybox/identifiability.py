@@ -35,18 +35,10 @@ class ReportSettings:
     n_pairs: int = 6  # that are reported, the closest first
     many_on_bounds: int = 3  # parameters, which have one cause
     odd_reach: float = 20.0  # times full scale, or a share of it: an input that is logged in another unit
-    prior_only_sd: float = (
-        0.9  # posterior sd over prior sd from which a parameter is known from the prior only
-    )
+    prior_only_sd: float = 0.9  # over prior sd, from which a parameter is known from the prior only
 
 
 REPORT = ReportSettings()
-
-
-def _in_words(axis: Array, names: Sequence[str]) -> str:
-    """Return which parameters a direction moves, and which way."""
-    axis = axis * np.sign(axis[np.argmax(np.abs(axis))])
-    return ", ".join(f"{n} {'up' if a > 0 else 'down'}" for n, a in zip(names, axis) if abs(a) > 0.3)
 
 
 class TradeOff(NamedTuple):
@@ -144,12 +136,14 @@ def describe(
     scaled = jacobian / np.where(size > 0, size, 1.0)
     values, axes = np.linalg.eigh(scaled.T @ scaled)  # rising
     least = max(float(values[0]), 0.0)
-    sd = np.sqrt(np.diag(covariance))
+    sd, flat = np.sqrt(np.diag(covariance)), []
+    for axis in axes.T[values < REPORT.flat_eigenvalue]:
+        axis = axis * np.sign(axis[np.argmax(np.abs(axis))])
+        moved = [f"{n} {'up' if a > 0 else 'down'}" for n, a in zip(names, axis) if abs(a) > 0.3]
+        flat.append(", ".join(moved))
     return Identifiability(
         condition=float(values[-1] / max(least, 1e-18)),
-        flat=[
-            _in_words(axis, names) for value, axis in zip(values, axes.T) if value < REPORT.flat_eigenvalue
-        ],
+        flat=flat,
         identifiable=bool(least > REPORT.unmoved_eigenvalue),
         # Data that narrow a prior to a share s of its sd move it by sqrt(1 - s^2) of that: what is twice as
         # far off was moved, by data or by what the model lacks.

@@ -65,7 +65,6 @@ class Block:
 class LogData:
     """The blocks of one log."""
 
-    name: str
     blocks: tuple[Block, ...]
     # of each column (parameters, then effects) the index of its sd; -1: a parameter, or an effect of known sd
     kind: NDArray[np.int64]

@@ -22,6 +22,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -388,10 +389,13 @@ def sample_posterior(
     n_walkers = 2 * len(sampled) + 4
     draws = rng.multivariate_normal(z[sampled], spread[np.ix_(sampled, sampled)], size=8 * n_walkers)
 
-    def log_posterior(points: Array) -> Array:
-        return target.log_profile(points, sampled)
-
-    start = _inside(draws, log_posterior, n_walkers)
+    log_posterior = partial(target.log_profile, columns=sampled)
+    start = draws[np.isfinite(log_posterior(draws))][:n_walkers]
+    if len(start) < n_walkers:
+        raise UserError(
+            "the fit lies at a bound of its parameters, so their posterior cannot be sampled",
+            hint="widen the bounds and fit again",
+        )
     chain = run_chain(
         log_posterior,
         start,
@@ -440,7 +444,7 @@ def fit_problem(plant: Plant, logs: Sequence[Log]) -> Problem:
     problem = make_problem(model, logs, average=bin_s, independent=model.independent)
     weights, bin_s = plant.scores.weight_s, problem.average
     tau = [weights.get(name, t * bin_s) / bin_s for name, t in zip(model.outputs, problem.tau)]
-    return problem.with_tau(np.maximum(tau, 1.0))
+    return replace(problem, tau=np.maximum(tau, 1.0))
 
 
 def _choose(plant: Plant, free: Sequence[str] | None, spread: Array) -> list[int]:
@@ -453,17 +457,6 @@ def _choose(plant: Plant, free: Sequence[str] | None, spread: Array) -> list[int
     if not free:
         raise UserError("no parameter to sample", hint=f"choose from {', '.join(plant.free)}")
     return [plant.free.index(name) for name in dict.fromkeys(free)]
-
-
-def _inside(candidates: Array, log_posterior: Callable[[Array], Array], n: int) -> Array:
-    """Return n starts with a finite posterior."""
-    ok = candidates[np.isfinite(log_posterior(candidates))]
-    if len(ok) < n:
-        raise UserError(
-            "the fit lies at a bound of its parameters, so their posterior cannot be sampled",
-            hint="widen the bounds and fit again",
-        )
-    return np.asarray(ok[:n])
 
 
 def _record(

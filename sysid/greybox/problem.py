@@ -14,7 +14,7 @@ held while the sensitivities are taken: differences over all parameters in one b
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import cast
 
 import numpy as np
@@ -128,9 +128,8 @@ class Problem:
     def by_log(self, z: Array, *, central: bool = False) -> list[tuple[Array, Array]]:
         """Return residual (m,) and Jacobian (m, n) of each log, without the prior, by ``central`` differences
         (twice the cost) where a null direction is looked for."""
-        sign = np.where(
-            z + _DIFFERENCE_STEP > self.box[1], -1.0, 1.0
-        )  # a step outside the box may not be simulated
+        # a step outside the box may not be simulated
+        sign = np.where(z + _DIFFERENCE_STEP > self.box[1], -1.0, 1.0)
         ahead = _DIFFERENCE_STEP * np.diag(sign)
         around = np.vstack([z, z + ahead, z - ahead] if central else [z, z + ahead])
         out = []
@@ -138,10 +137,6 @@ class Problem:
             rise = (r[1 : len(z) + 1] - r[len(z) + 1 :]) / 2 if central else r[1:] - r[0]
             out.append((r[0], (rise / (_DIFFERENCE_STEP * sign[:, None])).T))
         return out
-
-    def with_tau(self, tau: Array) -> Problem:
-        """Return the problem with another autocorrelation."""
-        return replace(self, tau=tau)
 
     @property
     def width(self) -> Array:
@@ -201,7 +196,7 @@ def _bins(stretch: Stretch, dt: float, steps: int) -> _Bins:
     n_grid = len(stretch.u) + 1
     place = np.clip(stretch.time / dt, 0.0, n_grid - 1)
     cell_before = np.minimum(place.astype(int), n_grid - 2)
-    share, cell = place - cell_before, np.minimum(place.astype(int), n_grid - 2) // steps
+    share, cell = place - cell_before, cell_before // steps
     operators: list[sparse.csr_matrix] = []
     means: list[Array] = []
     places: list[NDArray[np.int64]] = []
@@ -210,11 +205,9 @@ def _bins(stretch: Stretch, dt: float, steps: int) -> _Bins:
         filled, where, count = np.unique(cell[read_rows], return_inverse=True, return_counts=True)
         weight = 1.0 / count[where]
         entries = np.concatenate([weight * (1 - share[read_rows]), weight * share[read_rows]])
-        row_and_column = (
-            np.tile(where, 2),
-            np.concatenate([cell_before[read_rows], cell_before[read_rows] + 1]),
-        )
-        operators.append(sparse.csr_matrix((entries, row_and_column), shape=(filled.size, n_grid)))
+        columns = np.concatenate([cell_before[read_rows], cell_before[read_rows] + 1])
+        places_in_it = np.tile(where, 2), columns
+        operators.append(sparse.csr_matrix((entries, places_in_it), shape=(filled.size, n_grid)))
         means.append(np.bincount(where, weight * stretch.y[read_rows, k], filled.size).astype(float))
         places.append(filled)
     return _Bins(tuple(operators), tuple(means), tuple(places))

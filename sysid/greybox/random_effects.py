@@ -144,7 +144,7 @@ def linearise_logs(problem: Problem, z: Array, by_log: Sequence[tuple[Array, Arr
         if blocks:
             kind = np.array(shared + [-1] * len(effects), dtype=np.int64)
             effects_of_logs.append(effects)
-            logs.append(LogData(problem.names[log_index], tuple(blocks), kind, len(effects)))
+            logs.append(LogData(tuple(blocks), kind, len(effects)))
     kinds = [*signals_of, *dict.fromkeys(c.name for log in effects_of_logs for c in log if c.name)]
     for log, effects in zip(logs, effects_of_logs):
         log.kind[len(shared) :] = [kinds.index(c.name) if c.name else -1 for c in effects]

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from thermogrip.datasets.arrays import Array, Run, Values
-from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.errors import UserError, reading
 from thermogrip.sysid.models.model import SMOOTH, Described, FreeRuns, RestWeights, Sizes
 from thermogrip.sysid.models.network_spec import (
     Network,
@@ -345,14 +345,13 @@ def _as_it_was_fitted(content: Mapping[str, Any]) -> dict[str, Any]:
     """Return a plant's network; 0.1.0 wrote no ``full_scale`` and took 1 for that of V, A, W and 1, and until
     0.2.0 the slow error of a sensor was a ``wander`` of the file."""
     out = deepcopy(dict(content))
-    tables = {key: out[key] for key in ("inputs", "outputs") if isinstance(out.get(key), dict)}
-    for key, table in tables.items():
-        for item in (item for item in table.values() if isinstance(item, dict)):
-            if key == "inputs" and item.get("unit") in ("1", "A", "V", "W"):
+    with reading("its network is not whole", hint="save the plant again"):
+        for item in out["inputs"].values():
+            if item.get("unit") in ("1", "A", "V", "W"):
                 item.setdefault("full_scale", 1.0)
-            elif key == "outputs":
-                item.pop("wander", None)
-                item.pop("wander_time", None)
+        for item in out["outputs"].values():
+            item.pop("wander", None)
+            item.pop("wander_time", None)
     return out
 
 

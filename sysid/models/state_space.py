@@ -56,13 +56,12 @@ class StateSpaceModel(BlackBox):
             "c": (n_x,),
             "y0": (n_y,),
             "F": (n_x, len(self.terms)),
+            "spread": (n_x, n_x),
         }
+        if not np.size(self.spread):
+            object.__setattr__(self, "spread", np.eye(n_x))
         for name, shape in shapes.items():
             object.__setattr__(self, name, _shaped(name, getattr(self, name), shape))
-        spread = np.asarray(self.spread, dtype=float)
-        object.__setattr__(
-            self, "spread", np.eye(n_x) if spread.size == 0 else _shaped("spread", spread, (n_x, n_x))
-        )
         switched = {
             key: _shaped(f"A_switch {key}", value, (n_x, n_x)) for key, value in self.A_switch.items()
         }

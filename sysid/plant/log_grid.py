@@ -36,6 +36,7 @@ BRIDGED = 5  # rows
 MOVED = 0.01  # of an input's range: less is noise of its reading
 _LONGEST_GAP = 1_000_000  # steps, behind which a plant is long at rest; a damaged clock may have centuries
 _GRIDS = 4  # arrays of a run's size that are held at a time
+_SLACK = 1e-9  # of a share of full scale beyond 1, by rounding
 
 
 @dataclass(frozen=True, eq=False)
@@ -440,9 +441,6 @@ def _first_order_times(part: Segment, step: float) -> list[float]:
         if 0.02 < pole < 0.9999:
             out.append(-step / np.log(pole))
     return out
-
-
-_SLACK = 1e-9  # beyond 1, by rounding
 
 
 def roles_of(model: Signals) -> dict[str, str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -86,7 +87,7 @@ Array = np.ndarray
 def problem_of(model: Any, logs: Sequence[Log], plant: Plant) -> tuple[Problem, Array]:
     problem = make_problem(model, logs, average=model.average, independent=model.independent)
     weights = [plant.scores.weight_s[name] / problem.average for name in model.outputs]
-    problem = problem.with_tau(np.array(weights))
+    problem = replace(problem, tau=np.array(weights))
     return problem, problem.standard(plant.values)
 
 

@@ -27,7 +27,7 @@ def log_of(y: Array, outputs: tuple[int, ...], *, parts: int = 1, effect: Array 
     whole = np.concatenate([*columns, y[:, :, None]], axis=2)
     blocks = tuple(Block.of(part, outputs) for part in np.array_split(whole, parts))
     kind = NONE if effect is None else np.array([-1, 0])
-    return LogData("a", blocks, kind, 0 if effect is None else 1)
+    return LogData(blocks, kind, 0 if effect is None else 1)
 
 
 def test_correlation_times_and_noise_of_two_outputs_are_found_again():
@@ -78,7 +78,7 @@ def test_effects_go_with_the_parameters_that_explain_them_too():
     """A dense posterior of a parameter that all logs share and an effect of each, by normal equations."""
     rng = np.random.default_rng(2)
     raw = rng.normal(size=(3, 80, 1, 3))  # a parameter, an effect, the residual
-    logs = [LogData(str(k), (Block.of(x, (0,)),), np.array([-1, 0]), 1) for k, x in enumerate(raw)]
+    logs = [LogData((Block.of(x, (0,)),), np.array([-1, 0]), 1) for x in raw]
     numbers = ErrorModel((0.5,), (1e-3, 1e-3), ((1e-9,), (1e-9,)), (0.0, 0.0), (1.7,))
     ref = np.array([0.4])
     X, y = np.zeros((240, 4)), np.zeros(240)

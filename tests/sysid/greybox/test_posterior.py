@@ -42,7 +42,7 @@ Array = NDArray[np.float64]
 def density(plant: Plant, logs: Sequence[Log]) -> tuple[RandomizedMap, Array, Array]:
     """Return the density, its mode and its covariance, which is exactly normal for a linear plant."""
     problem = make_problem(plant.model, logs, average=4.0, independent=60.0)
-    problem = problem.with_tau(np.array([plant.scores.weight_s["t"] / 4.0]))
+    problem = replace(problem, tau=np.array([plant.scores.weight_s["t"] / 4.0]))
     z = problem.standard(plant.values)
     target = RandomizedMap(problem, z, score_covariance(problem, z))
     return target, z, target.covariance

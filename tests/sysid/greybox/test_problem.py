@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -42,7 +43,7 @@ def test_a_residual_is_an_error_in_sensor_sd_divided_by_the_root_of_tau():
     problem = problem_of(Mixed(), a_log(1), a_log(2))
     assert problem.tau.tolist() == [15.0]  # bins of 4 s in a minute
     z = np.array([0.2, -0.3])
-    for tau, scaled in ((15.0, problem), (2.0, problem.with_tau(np.array([2.0])))):
+    for tau, scaled in ((15.0, problem), (2.0, replace(problem, tau=np.array([2.0])))):
         residual, jacobian = scaled.residual(z), scaled.jacobian(z)
         errors = np.concatenate([stretch[0] for log in scaled.errors(z) for stretch in log])
         np.testing.assert_allclose(residual[:-2], errors / (0.1 * np.sqrt(tau)))

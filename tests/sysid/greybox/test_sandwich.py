@@ -38,7 +38,7 @@ def some_logs() -> tuple[list[np.ndarray], list[LogData]]:
     rng = np.random.default_rng(0)
     raw = [0.1 * rng.normal(size=(N, len(o), N_Z + N_TERM + N_OWN + 1)).cumsum(axis=0) for o in OUTPUTS]
     kind = np.array([-1, -1, -1, 0, 0, 1, -1])
-    logs = [LogData("a", (Block.of(x, o),), kind, N_OWN) for x, o in zip(raw, OUTPUTS)]
+    logs = [LogData((Block.of(x, o),), kind, N_OWN) for x, o in zip(raw, OUTPUTS)]
     return raw, logs
 
 
