@@ -29,6 +29,7 @@ from thermogrip.datasets.roles import Roles, assign_roles, guess_role
 from thermogrip.datasets.schema import check_log, cut, hash_columns, make_log
 from thermogrip.datasets.tables import (
     Table,
+    check_header,
     frame_table,
     read_excel_table,
     read_matlab_table,
@@ -127,6 +128,9 @@ def read_log(
     else:
         file, start, stop = split_cut(path)
         table = _one_column_a_signal(_read_table(file, columns))
+    of_model = [name for name, role in (known or {}).items() if role != "other"]
+    named = [*(inputs or ()), *(outputs or ()), *(disturbances or ()), *of_model]
+    check_header([*table.numbers, *table.text], named, str(file))
     if table.meta.get("schema") not in (None, "thermogrip.log"):
         raise UserError(f"holds a {table.meta['schema']}, not a log", file=file, hint="give a log")
     read = _convert(table, dt)

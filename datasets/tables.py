@@ -175,6 +175,18 @@ def _new_names(columns: Sequence[str], n: int, file: str | Path) -> list[str]:
     return names
 
 
+def check_header(headers: Sequence[str], names: Sequence[str], file: str) -> None:
+    """Refuse names where a table has no header, with the ``--columns`` that would give them to it."""
+    header_words = {header.lower() for header in headers}
+    spare = len(headers) - len(names)
+    if not names or spare < 0 or header_words != {f"c{place + 1}" for place in range(len(headers))}:
+        return
+    if not header_words & {name.strip().lower() for name in names}:
+        words = [*["time_s"][:spare], *names, *["-"] * (spare - 1)]
+        hint = f"name its columns in their order, such as --columns {','.join(words)} (-: left out)"
+        raise UserError("has no header", file=file, hint=hint)
+
+
 def find_layout(text: str, file: str, *, named: bool = False) -> Layout:
     """Return how a text is a table, from its first lines; a header of fewer names than cells is refused, but
     where the columns are ``named`` otherwise."""
