@@ -221,6 +221,9 @@ def _lost(channel: _Channel) -> Finding:
     )
 
 
+_MOST_ALIKE = 1e4  # condition of the inputs' correlation
+
+
 def _excitation(grid: Grid, most: int = 6) -> list[Finding]:
     """Rank of the covariance of successive input values: each input alone, then all together."""
     out = []
@@ -242,9 +245,14 @@ def _excitation(grid: Grid, most: int = 6) -> list[Finding]:
         out.append(Finding("excitation", "", name, float(order), "orders", "ok" if good else "warn", says))
     moving = np.flatnonzero(moves).tolist()
     if len(moving) > 1:
-        condition = float(np.linalg.cond(np.corrcoef(rows[:, moving].T)))
-        alike = condition > 1e4
-        says = "the inputs move together: their effects cannot be separated" if alike else "inputs move apart"
+        correlation = np.corrcoef(rows[:, moving].T)
+        condition = float(np.linalg.cond(correlation))
+        alike, says = condition > _MOST_ALIKE, "inputs move apart"
+        if alike:  # any one of these, left out, lets the others be told apart; else all
+            without = [np.delete(np.delete(correlation, k, 0), k, 1) for k in range(len(moving))]
+            among = [place for place, rest in zip(moving, without) if np.linalg.cond(rest) <= _MOST_ALIKE]
+            names = " and ".join(grid.inputs[place] for place in among or moving)
+            says = f"{names} move together: their effects cannot be separated"
         out.append(Finding("excitation", "", "all inputs", condition, "1", "fail" if alike else "ok", says))
     return out
 

@@ -314,7 +314,9 @@ def _notes(run: FreeRun, by_inputs: InputEffect | None) -> list[str]:
     small = verdict is not None and verdict.standing not in ("worse", "another plant")
     notes += _residual_notes(run, units, unseen, small=small)
     if by_inputs is not None:
-        remaining = ", ".join(f"{name} {rms:.2g} {units[name]}" for name, rms in by_inputs.remaining.items())
+        remaining = ", ".join(
+            f"{name} {rms:.2g} {units[name]}".removesuffix(" 1") for name, rms in by_inputs.remaining.items()
+        )
         notes.append(f"most of the error is {by_inputs.words()}, which would leave {remaining}")
     for name, share in outside.items():
         low, high = plant.valid[name]

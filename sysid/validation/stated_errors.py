@@ -445,6 +445,13 @@ def verdict_of(
     for name, error in expected.items():
         part_error, parts_idle = _pooled([row for row in own_rows if row.output == name and row.held_out])
         whole, whole_idle = _pooled([row for row in own_rows if row.output == name and not row.held_out])
+        tail, tail_idle = _pooled(
+            [row for row in own_rows if row.output == name and row.held_out and row.log.startswith(TAIL)]
+        )
+        # it alone is forecast from what was before it, and judged as another run is
+        if error.rmse < NO_BETTER * tail_idle <= tail:
+            errs = f"on the last part held out {name} errs by {tail:.2g}, without input by {tail_idle:.2g}"
+            return False, f"Not good ({label}): {errs}; try other models, or longer logs. {another}"
         # a single part that was much worse, of moves that no other part has, widens the stated range and
         # condemns no plant: the fit has seen that part in the end
         for size, idle, where, advice in (

@@ -433,6 +433,7 @@ def test_an_input_that_never_moves_has_no_gain(kind):
         (0.5, 1.9, 1.01, 0.9, "ok", (), "Not good (arx): on parts held out t errs by 0.71"),
         (0.5, 1.9, 0.9, 1.01, "ok", (), "Not good (arx): on the logs of its own fit t errs by 1"),
         (0.5, 1.9, 0.9, 0.9, "fail", (), "Not good (arx): q never moves"),
+        (0.5, 1.9, 0.9, 0.9, "tail", (), "Not good (arx): on the last part held out t errs by 1.8"),
         (0.5, 1.9, 0.9, 0.9, "untested", (), "Not good (arx): q moves in no part held out whose rest moves"),
         (0.5, 1.9, 0.9, 0.9, "ok", ("a guess", "b"), "Not good (arx) as long as this is in doubt: a guess"),
     ],
@@ -442,6 +443,8 @@ def test_a_plant_is_good_where_it_errs_by_less_than_half_of_no_input_on_parts_in
 ) -> None:
     rows = table({"arx": {"moves": held / 2, "still": 0.0}, "other": {"a": 0.9}})
     rows += table({"arx": {"own": own / 2}}, False)
+    if checked == "tail":
+        rows += table({"arx": {**{f"block {k}": 0.1 for k in range(9)}, "last 30 % of a": 0.9}})
     # where nothing moves a model without input errs by nothing: such a part condemns no plant
     rows[1] = replace(rows[1], rmse=0.01, no_input_rmse=1e-4)
     quality: Any = SimpleNamespace(findings=[SimpleNamespace(verdict=checked, says="q never moves")])

@@ -266,7 +266,7 @@ def test_a_switch_beside_a_drive_may_rest_or_move_once(pump, value, verdict, say
     ("condition", "verdict", "says"),
     [
         (9e3, "ok", "inputs move apart"),
-        (1.5e4, "fail", "the inputs move together: their effects cannot be separated"),
+        (1.5e4, "fail", "p and q move together: their effects cannot be separated"),
     ],
 )
 def test_the_condition_of_two_inputs_is_that_of_their_correlation(condition, verdict, says):
