@@ -251,9 +251,13 @@ def role_doubts(
         if helped is not None:
             yield f"{name} is left out ({reasons[name]}), and helps to predict {helped}"
             continue
-        if is_moved(columns, name, inputs, at_lags=all):
-            says = f"responds to {', '.join(inputs)}: is it an output?"
-            yield f"{name} is left out ({reasons[name]}), but {says}"
+        # what is left out may be an output with an input of its own, which is left out with it
+        idle = [] if is_held(columns[name]) else [n for n in others if n in guessed and is_held(columns[n])]
+        for drives in (inputs, [n for n in idle if n not in goals]):
+            if is_moved(columns, name, drives, at_lags=all):
+                says = f"responds to {', '.join(drives)}: is it an output?"
+                yield f"{name} is left out ({reasons[name]}), but {says}"
+                break
 
 
 def effect_doubts(

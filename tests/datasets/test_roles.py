@@ -453,6 +453,13 @@ def test_a_name_that_the_course_of_the_column_denies_is_a_doubt(name, values, do
     assert not assign_roles({"heater": "percent", "t_plate": "degC"}, columns=columns).doubts
 
 
+def test_an_output_with_an_input_of_its_own_is_not_left_out_in_silence():
+    mist = np.repeat(np.random.default_rng(5).choice([0.0, 1.0], 50), 20)
+    columns = {"heater": STEPS, "t_plate": SLOW, "mist": mist, "wet": plant_of(25 * mist, seed=8)}
+    roles = assign_roles({"heater": "percent", "t_plate": "degC", "mist": "1", "wet": "1"}, columns=columns)
+    assert [line for line in roles.doubts if "wet is left out" in line and "responds to mist" in line]
+
+
 def test_a_spike_hides_no_response():
     spiked = np.where(np.arange(STEPS.size) == 300, 9e3, SLOW + SMOOTH)
     columns = {"heater": STEPS, "t_plate": spiked}
