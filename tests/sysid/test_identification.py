@@ -177,13 +177,6 @@ def test_neural_models_that_could_not_be_kept_are_left_out_with_the_reason():
     assert not any(what.startswith("neural") for what in said)
 
 
-def test_neural_models_are_left_out_where_linear_ones_err_by_white_noise():
-    logs = [plant_log(300, seed=s, name=name, noise=0.2) for s, name in enumerate("abc")]
-    found = identify(logs, models=["neural", "oe"], average=1.0, draws=0)
-    (note,) = [note for note in found.notes if note.startswith("neural: ")]
-    assert "little more than noise" in note
-
-
 def test_inputs_of_the_row_are_said_and_the_warm_up_of_a_fit_is_that_of_its_logs():
     rng = np.random.default_rng(3)
     q = rng.random(600)
