@@ -803,14 +803,14 @@ def _least(
         value, slopes = cost(z * _NOISE_STEPS)
         return value, slopes * _NOISE_STEPS
 
-    # ftol 0: the slopes alone say when it is over
+    # the slopes say when it is over, or where a step gains less than the sum's rounding (4e-6 of 24,000 nats)
     best = minimize(
         scaled,
         first / _NOISE_STEPS,
         jac=True,
         method="L-BFGS-B",
         bounds=_NOISE_RANGE / _NOISE_STEPS[:, None],
-        options={"maxiter": SETTINGS.noise_steps, "ftol": 0.0, "gtol": slope},
+        options={"maxiter": SETTINGS.noise_steps, "ftol": 1e-9, "gtol": slope},
     )
     if not best.success:
         warnings.warn(

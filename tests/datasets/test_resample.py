@@ -48,11 +48,6 @@ def test_a_held_mean_is_the_integral_of_the_staircase(log, start, cells):
         assert got[cell, 0] == pytest.approx(want, abs=2 * 26 / 20_001)
 
 
-def test_an_input_switched_inside_a_cell_counts_by_its_time():
-    log = made([0.0, 0.25, 10.0], [0.0, 1.0, 0.0])
-    np.testing.assert_allclose(means_of_drive(log, np.array([0.0, 1.0, 2.0])).ravel(), [0.75, 1.0])
-
-
 def test_a_cut_keeps_the_times_and_the_facts(small_log):
     part = cut(small_log, 1.0, 3.0)
     assert (part["time"].values >= 1.0).all()

@@ -110,6 +110,7 @@ def test_the_ending_is_the_format_and_the_rest_is_the_name(name, kind, stem):
          BY_POSITION.format(4) + "; 1 line(s) before the table passed over"),
         ("1,2,3,Oven,Time_(s)\n20,21,22,23,0\n20,21,22,23,12\n", "1|2|3|Oven|Time_(s)", 1, ",", ""),
         ("1,2,Oven,Time_(s)\n20,21,23,0\n20,21,23,12\n", "1|2|Oven|Time_(s)", 1, ",", ""),
+        ("t,Heating,Cooling,T\n0,ON,OFF,22\n1,OFF,ON,22\n", "t|Heating|Cooling|T", 1, ",", ""),
         ("0,100,ERR,22\n1,100,23,22\n2,100,24,25\n", "c1|c2|c3|c4", 0, ",", BY_POSITION.format(4)),
         *((("x\n" * (198 + more) + "a,b\n0,1\n0,2\n"), *found, ",", note) for more, found, note in [
             (0, ("a|b", 199), "198 line(s) before the table passed over"), (1, ("x", 1), "")]),

@@ -570,11 +570,6 @@ def test_the_folder_of_an_earlier_demo_takes_the_next_one(tmp_path: Path) -> Non
     assert sums_agree(tmp_path / "run") == []
 
 
-def test_what_is_no_run_folder_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(UserError, match="is no run folder"):
-        read_run(tmp_path)
-
-
 def test_a_run_without_two_rows_is_not_exported(tmp_path: Path) -> None:
     write(tmp_path / "run", 1).close()
     with pytest.raises(UserError, match="fewer than two rows"):

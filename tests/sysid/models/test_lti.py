@@ -181,12 +181,6 @@ def test_poles_that_turn_by_more_than_a_right_angle_have_a_continuous_equal():
     np.testing.assert_allclose(near.gain(), model.gain(), rtol=1e-6)
 
 
-@pytest.mark.parametrize("dt", [4.05, 3.9, 1.9, 0.0, -2.0])
-def test_a_step_that_is_no_whole_multiple_is_refused(dt: float):
-    with pytest.raises(UserError, match="no whole multiple"):
-        linearise_plant(box(), dt=dt)
-
-
 def test_a_plant_that_grows_says_how_fast():
     unstable = replace(box().model, A=np.array([[1.01]]))
     plant = replace(box(), model=unstable)

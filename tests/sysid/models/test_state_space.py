@@ -164,13 +164,6 @@ def test_the_gain_is_of_the_matrices_as_they_stand():
     )  # fmt: skip
 
 
-def test_poles_and_gain_are_those_of_the_block():
-    model = block(tau=80.0)
-    np.testing.assert_allclose(np.abs(model.poles()).max(), np.exp(-10 / 80.0))
-    np.testing.assert_allclose(model.gain(), [[40.0]])
-    assert model.stable
-
-
 def test_an_unstable_model_reports_it_and_overflows_quietly():
     model = StateSpaceModel(("q",), (), ("t",), A=[[1.5]], B=[[1.0]], C=[[1.0]], dt=1.0)
     assert not model.stable
