@@ -332,8 +332,8 @@ def _names_above(lines: Sequence[str], row: Sequence[str], separator: str) -> tu
             cells = _cells_of_names(line, n, separator)
         words = [*filter(None, cells)]
         fits = len(cells) == n or len(cells) == n - 1 > 1
-        numbers = _number_share([word for word in words if word.lower() not in _SWITCH])  # `Heating` is a name
-        are_names = numbers < 0.5 or (nearest and _are_channels(cells, row))
+        no_states = [word for word in words if word.lower() not in _SWITCH]  # a name may be Heating
+        are_names = _number_share(no_states) < 0.5 or (nearest and _are_channels(cells, row))
         if fits and words and are_names and not (comment and headers):
             headers.append([*cells, ""][:n])
             counted.append(not comment)
