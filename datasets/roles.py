@@ -25,6 +25,7 @@ from thermogrip.datasets.evidence import (
     one_signal,
     predictive_gain,
     role_doubts,
+    some_rows,
 )
 from thermogrip.datasets.units import DRIVE, find_column
 
@@ -320,7 +321,7 @@ def _copied_columns(
     columns: Mapping[str, Floats], guesses: Mapping[str, tuple[str, str]], units: Mapping[str, str]
 ) -> dict[str, tuple[str, str]]:
     """Return the columns that are one signal with another, or a set point less a reading, and of what."""
-    moving = {n: v[: EVIDENCE.most_rows] for n, v in columns.items() if np.ptp(v) > 0}  # of lost values none
+    moving = {n: some_rows(v) for n, v in columns.items() if np.ptp(v) > 0}  # of lost values none
     out: dict[str, tuple[str, str]] = {}
     # of two copies the one with a clue, else the first, stays
     order = sorted(moving, key=lambda n: (n in guesses) + (guesses.get(n, ("", ""))[1] == NO_CLUE))

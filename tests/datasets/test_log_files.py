@@ -839,12 +839,7 @@ SHUFFLED_IN_FIVES = np.random.default_rng(0).permuted(PLACES[2:597].reshape(-1, 
         (np.r_[:300, 200:500], HEATER, PLATE, "rows 302 to 401 repeat those from 202 on"),
         (np.c_[:300, 300:600].ravel(), HEATER, PLATE, "goes to and fro from row to row"),
         (PLACES, HEATER, np.repeat(PLATE[::10], 10), "read in every 10th row only, held"),
-        (
-            PLACES,
-            HEATER,
-            np.interp(PLACES, PLACES[::10], PLATE[::10]),
-            "read in every 10th row only, drawn straight",
-        ),
+        (PLACES, HEATER, np.interp(PLACES, PLACES[::10], PLATE[::10]), "10th row only, drawn straight"),
         (PLACES, HEATER, np.where((PLACES > 300) & (PLACES < 340), PLATE[300], PLATE), "is held at"),
         (PLACES, HEATER, PLATE[np.minimum(PLACES + 10, 599)], "plate moves 11 s before heater does"),
         (PLACES, HEATER, PLATE + LATER * (32 + 0.8 * PLATE), "stays there, as nowhere else"),
@@ -864,6 +859,13 @@ def test_columns_that_are_not_one_course_of_one_unit_are_doubts(write, order, he
     doubts = read_log(write(text)).attrs["role_doubts"]
     assert doubt in doubts
     assert bool(doubts) == bool(doubt)
+
+
+def test_what_comes_late_in_a_long_log_counts_as_what_comes_first(write):
+    heater, late = np.tile(HEATER, 50), np.arange(30_000) > 21_000
+    plate = lfilter([0.03], [1, -0.97], np.where(late, 110 - heater, heater))
+    rows = "".join(f"{k},{u:g},{y:.3f}\n" for k, (u, y) in enumerate(zip(heater, plate)))
+    assert "its sign change" in read_log(write("time_s,heater,plate_degC\n" + rows)).attrs["role_doubts"]
 
 
 @pytest.mark.parametrize(
