@@ -455,9 +455,11 @@ def check_plausible(name: str, celsius: Floats, file: str) -> list[str]:
     if median < -273.15:
         problem = f"median of {median:g} degC is below absolute zero"
         raise UserError(problem, file=file, column=name, hint="check the unit in the header")
-    if -150 <= median <= 250 or median >= 350:
-        return []
-    return [f"{name}: median of {median:.1f} degC; name the column {name}_K if this is kelvin"]
+    if 250 < median < 350:
+        return [f"{name}: median of {median:.1f} degC; name the column {name}_K if this is kelvin"]
+    if median < -150:  # it was converted
+        return [f"{name}: median of {median:.1f} degC; is the column really in kelvin?"]
+    return []
 
 
 def _floor(values: Floats) -> float:

@@ -325,8 +325,8 @@ def _names_above(lines: Sequence[str], row: Sequence[str], separator: str) -> tu
     headers: list[list[str]] = []  # the nearest first
     counted: list[bool] = []  # those that are no comments
     units = [""] * n
-    for line in reversed(lines):
-        comment, nearest = line.startswith(_COMMENT), line is lines[-1]
+    for below, line in enumerate(reversed(lines)):
+        comment, nearest = line.startswith(_COMMENT), below == 0
         cells = _split_cells(line.lstrip("#%/ ") if comment else line, separator)
         if nearest or separator == " ":
             cells = _cells_of_names(line, n, separator)

@@ -248,7 +248,7 @@ def _excitation(grid: Grid, most: int = 6) -> list[Finding]:
         correlation = np.corrcoef(rows[:, moving].T)
         condition = float(np.linalg.cond(correlation))
         alike, says = condition > _MOST_ALIKE, "inputs move apart"
-        if alike:  # any one of these, left out, lets the others be told apart; else all
+        if alike:  # any one of these, left out, lets the effects of the others be estimated; else all
             without = [np.delete(np.delete(correlation, k, 0), k, 1) for k in range(len(moving))]
             among = [place for place, rest in zip(moving, without) if np.linalg.cond(rest) <= _MOST_ALIKE]
             names = " and ".join(grid.inputs[place] for place in among or moving)

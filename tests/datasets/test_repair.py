@@ -92,7 +92,7 @@ def test_in_slow_rows_a_spike_lies_beyond_all_others_by_more_than_their_range(va
         (400.0, ""),
         (298.0, "name the column t_tank_K if this is kelvin"),
     ]
-    + [(room + shift, "is kelvin") for room in (0.0, 25.0, 60.0) for shift in (273.15, -273.15)],
+    + [(room + k, says) for room in (0.0, 25.0, 60.0) for k, says in ((273.15, "is k"), (-273.15, "in k"))],
 )
 def test_a_temperature_in_the_wrong_unit_is_noticed_and_a_freezer_or_an_oven_is_not(celsius, words):
     found = check_plausible("t_tank", np.full(3, celsius), "a.csv")
