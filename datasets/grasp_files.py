@@ -19,11 +19,11 @@ from numpy.typing import NDArray
 
 from thermogrip.datasets.errors import UserError, reading
 from thermogrip.datasets.files import file_format, file_stem, write_atomic
-from thermogrip.datasets.media import csv_cell
 from thermogrip.datasets.netcdf import numbers_and_unit, open_netcdf, write_netcdf
 from thermogrip.datasets.schema import GRASP_LABELS, GRASP_NUMBERS, check_grasps, make_grasps, with_lead_in
 from thermogrip.datasets.tables import Table, read_csv_table, read_parquet_table
 from thermogrip.datasets.units import join_header, rename_hint, split_header, to_record_unit
+from thermogrip.media import csv_cell
 
 if TYPE_CHECKING:
     import xarray as xr

@@ -24,7 +24,6 @@ from thermogrip.datasets.clock import CLOCK, EPOCH, Clock, clock_of, read_clock,
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.evidence import effect_doubts
 from thermogrip.datasets.files import atomic_path, file_format, file_stem, split_cut, write_atomic
-from thermogrip.datasets.media import csv_cell
 from thermogrip.datasets.roles import Roles, assign_roles, guess_role
 from thermogrip.datasets.schema import check_log, cut, hash_columns, make_log
 from thermogrip.datasets.tables import (
@@ -39,6 +38,7 @@ from thermogrip.datasets.tables import (
     unused,
 )
 from thermogrip.datasets.units import Header, join_header, read_header, to_record_unit
+from thermogrip.media import csv_cell
 
 if TYPE_CHECKING:
     from pandas import DataFrame

@@ -23,9 +23,9 @@ import numpy as np
 from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.errors import UserError, known_names
 from thermogrip.datasets.log_files import Logs, as_logs
-from thermogrip.datasets.media import Shown
 from thermogrip.datasets.parallel import Workers, in_order, sub_progress
 from thermogrip.datasets.schema import Log, log_name
+from thermogrip.media import Shown
 from thermogrip.sysid.blackbox.fit import (
     BLACK_BOXES,
     RESAMPLED,
