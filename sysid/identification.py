@@ -23,7 +23,7 @@ import numpy as np
 from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.errors import UserError, known_names
 from thermogrip.datasets.log_files import Logs, as_logs
-from thermogrip.datasets.parallel import Workers, in_order, sub_progress
+from thermogrip.datasets.parallel import Progress, Workers, in_order, sub_progress
 from thermogrip.datasets.schema import Log, log_name
 from thermogrip.media import Shown
 from thermogrip.sysid.blackbox.fit import (
@@ -74,8 +74,6 @@ ON_REQUEST = ("armax", "bj", "parsim", "sindy")
 USUAL_MODELS = tuple(model for model in MODELS if model not in ON_REQUEST)
 LINEAR = ("arx", "oe", "armax", "bj", "subspace", "parsim")
 NO_DRAWS = (UserError, np.linalg.LinAlgError)  # what draws of a fit may fail with; the fit itself is sound
-
-Progress = Callable[[float, str], None]
 
 
 @dataclass(frozen=True, eq=False, repr=False)

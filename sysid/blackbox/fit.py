@@ -9,7 +9,7 @@ been logged again.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from importlib import import_module
@@ -19,6 +19,7 @@ import numpy as np
 
 from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.errors import UserError, known_names
+from thermogrip.datasets.parallel import Progress
 from thermogrip.datasets.schema import Log
 from thermogrip.sysid.blackbox.order_selection import (
     MANY_ROWS,
@@ -26,7 +27,6 @@ from thermogrip.sysid.blackbox.order_selection import (
     Choice,
     Family,
     Fold,
-    Model,
     Run,
     choose,
     excess_within_noise,
@@ -35,6 +35,7 @@ from thermogrip.sysid.blackbox.order_selection import (
     free_run_misses,
 )
 from thermogrip.sysid.data.data_quality import reading_excess
+from thermogrip.sysid.models.model import BlackBox
 from thermogrip.sysid.plant.log_grid import MOVED, Grid, Segment, make_grid, rows_of
 from thermogrip.sysid.plant.plant import Plant
 from thermogrip.sysid.plant.plant_data import SEVERAL, PlantScores, fit_logs
@@ -90,7 +91,7 @@ def fit_black_box(
     disturbances: Sequence[str] | None = None,
     average: float | None = None,
     grid: Grid | None = None,
-    progress: Callable[[float, str], None] | None = None,
+    progress: Progress | None = None,
 ) -> BlackBoxFit:
     """Fit one kind of :data:`BLACK_BOXES` to one or several logs.
 
@@ -196,9 +197,7 @@ def _with_convention(
     return moved, other
 
 
-def with_refits(
-    fit: BlackBoxFit, n: int = 24, *, seed: int = 0, progress: Callable[[float, str], None] | None = None
-) -> Plant:
+def with_refits(fit: BlackBoxFit, n: int = 24, *, seed: int = 0, progress: Progress | None = None) -> Plant:
     """Return the plant with ``n`` refits to resampled errors, for :meth:`Plant.draw`."""
     if fit.kind not in RESAMPLED:
         raise ValueError(f"{fit.kind} is not refitted; choose from {', '.join(RESAMPLED)}")
@@ -210,7 +209,7 @@ def with_refits(
     rng = np.random.default_rng(seed)
     most = _AGREES * _error(fit, fit.choice.model)
     misses = _misses(fit)
-    refits: list[Model] = []
+    refits: list[BlackBox] = []
     tried = 0
     while len(refits) < n and tried < _TRIES * n and (refits or tried < _HOPELESS):
         if progress is not None:
@@ -252,7 +251,7 @@ def _resampled(
     return tuple(out)
 
 
-def _error(fit: BlackBoxFit, model: Model) -> float:
+def _error(fit: BlackBoxFit, model: BlackBox) -> float:
     """Return the free-run error over all logs, the worst output's, in units of its spread."""
     return float(np.max(free_run_errors(model, [Run(s) for s in fit.grid.segments], **_run_settings(fit))))
 

@@ -107,7 +107,7 @@ def with_noise(found: Filter, records: Records) -> Filter:
         if start is None:
             break
         solve_at = partial(solve, records=white, nb=nb, delay=found.delay)
-        better = refine(start, white, solve_at).filter(white, nb, found.delay)
+        better = refine(start, white, solve_at).filter(nb, found.delay)
         # D nearly removes c and the initial conditions where the noise is slow: the readings give them
         found, misses = fit_rest(better, records)
     return found

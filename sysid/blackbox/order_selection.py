@@ -15,19 +15,19 @@ nonlinear kind) is taken only where the best of it wins by more than the standar
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from itertools import pairwise, product
-from typing import Any, NamedTuple, Protocol, TypeVar
+from typing import Any, NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.parallel import Progress
 from thermogrip.sysid.models.model import BlackBox
-from thermogrip.sysid.models.model import Model as PlantModel
 from thermogrip.sysid.models.state_space import (
     StateSpaceModel,
     evaluate_terms,
@@ -54,15 +54,6 @@ _FADING_SHARE = 0.25  # of a held-out part: the memory of an offset that fades; 
 _Fitted = TypeVar("_Fitted", bound=BlackBox)
 
 
-class Model(PlantModel, Protocol):
-    """What a family returns: a model of a plant that knows whether it is stable."""
-
-    @property
-    def stable(self) -> bool:
-        """Whether a bounded input keeps the state bounded."""
-        ...
-
-
 class Structure(NamedTuple):
     """Orders and delays of a model, and its count of numbers; the same whatever data it is fitted to."""
 
@@ -71,12 +62,8 @@ class Structure(NamedTuple):
     products: tuple[str, ...] = ()  # of inputs, beside these
 
 
-class Family(Protocol):
-    """A kind of models: fits every structure that it has, or ``only`` some, and returns the stable models."""
-
-    def __call__(self, grid: Grid, *, only: Collection[Structure] | None = None) -> Mapping[Structure, Model]:
-        """Return a model for each structure that could be fitted to the grid."""
-        ...
+# (grid, only=structures or None for all that a kind of models has) -> the stable models that could be fitted
+Family: TypeAlias = Callable[..., Mapping[Structure, BlackBox]]
 
 
 @dataclass(frozen=True)
@@ -89,7 +76,7 @@ class Choice:
     folds: tuple[Fold, ...]  # what was held out
     rmse: Array  # (n_fold, n_y), free-run RMSE of the chosen structure, in the outputs' units
     warmup: int  # rows at the start of each run that set its state and are not scored
-    model: Model  # the structure fitted to all data
+    model: BlackBox  # the structure fitted to all data
 
     @property
     def error(self) -> float:
@@ -118,7 +105,7 @@ class Fold(NamedTuple):
         return np.ptp(held_out, axis=0) > least, np.ptp(rest, axis=0) > least
 
 
-def folds(grid: Grid, *, blocks: int = _CUTS) -> list[Fold]:
+def folds(grid: Grid) -> list[Fold]:
     """Return the parts that are held out in turn: those whose rest moves each input that they move, or all
     where these are fewer than two."""
     if len(grid.logs) >= SEVERAL:
@@ -129,7 +116,7 @@ def folds(grid: Grid, *, blocks: int = _CUTS) -> list[Fold]:
             for name, held_out in by_log.items()
         ]
     else:
-        parts = [*_cut_blocks(grid, blocks), _last_parts(grid)]
+        parts = [*_cut_blocks(grid, _CUTS), _last_parts(grid)]
     # a model fitted to the others cannot know an input that one part alone moves
     least = MOVED * np.ptp(np.concatenate([segment.u for segment in grid.segments]), axis=0)
     excited = []
@@ -199,7 +186,7 @@ class StartPrior:
 
 
 def estimate_starts(
-    model: Model, y: Array, u: Array, d: Array, *, dt: float, scale: Array, priors: Sequence[StartPrior]
+    model: BlackBox, y: Array, u: Array, d: Array, *, dt: float, scale: Array, priors: Sequence[StartPrior]
 ) -> tuple[Array, Array]:
     """Return the start and the sensors' offsets for each prior."""
     # With x0 = x_rest + s, s ~ N(0, P), offsets o ~ N(0, q^2) that are constant over the log and white
@@ -242,7 +229,13 @@ def priors_of(grid: Grid) -> tuple[StartPrior, ...]:
 
 
 def free_run_errors(
-    model: Model, runs: Sequence[Run], *, dt: float, scale: Array, warmup: int, priors: Sequence[StartPrior]
+    model: BlackBox,
+    runs: Sequence[Run],
+    *,
+    dt: float,
+    scale: Array,
+    warmup: int,
+    priors: Sequence[StartPrior],
 ) -> Array:
     """Return the free-run RMSE over the rows after the warm-up, for each prior of the start."""
     refused = np.full((len(priors), len(scale)), np.inf)
@@ -263,7 +256,7 @@ def free_run_errors(
 
 
 def free_run_misses(
-    model: Model, segment: Segment, *, dt: float, scale: Array, warmup: int, priors: Sequence[StartPrior]
+    model: BlackBox, segment: Segment, *, dt: float, scale: Array, warmup: int, priors: Sequence[StartPrior]
 ) -> Array:
     """Return the free run less the readings, from the start that each prior makes of the warm-up."""
     memory = np.array([prior.memory for prior in priors])[:, None]
@@ -278,9 +271,7 @@ def free_run_misses(
     return np.asarray((outputs[:, :-1] - segment.y)[share_of_prior] + offset[share_of_prior, None] * lasts)
 
 
-def choose(
-    grid: Grid, family: Family, *, warmup: int, progress: Callable[[float, str], None] | None = None
-) -> Choice:
+def choose(grid: Grid, family: Family, *, warmup: int, progress: Progress | None = None) -> Choice:
     """Fit every structure on every fold and choose by the one-standard-error rule."""
     cases = folds(grid)
     scored = _score(grid, family, cases, warmup, progress)
@@ -303,7 +294,7 @@ def choose(
 
 def _first_sound(
     grid: Grid, family: Family, scored: Mapping[Structure, _Errors], warmup: int
-) -> tuple[Structure, Model] | None:
+) -> tuple[Structure, BlackBox] | None:
     """Return the best structure whose fit to all data errs on them no more than it may, and that fit; None
     where there is none."""
     most = ORDER_MARGIN if len(grid.logs) < SEVERAL else ORDER_MARGIN_OF_LOGS
@@ -328,11 +319,7 @@ class _Errors(NamedTuple):
 
 
 def _score(
-    grid: Grid,
-    family: Family,
-    cases: Sequence[Fold],
-    warmup: int,
-    progress: Callable[[float, str], None] | None = None,
+    grid: Grid, family: Family, cases: Sequence[Fold], warmup: int, progress: Progress | None = None
 ) -> dict[Structure, _Errors]:
     """Return the errors of each structure that the family fits to the rest of the folds."""
     scale, priors = np.maximum(grid.output_spread(), 1e-9), priors_of(grid)
@@ -378,7 +365,7 @@ def _non_dominated(errors: Mapping[Structure, list[Array]], scale: Array) -> lis
 
 def _fit_to_all(
     grid: Grid, family: Family, structure: Structure, errors: _Errors, warmup: int
-) -> tuple[Model, float] | None:
+) -> tuple[BlackBox, float] | None:
     """Return the structure fitted to all data and its error on them, of runs that start as held-out ones do;
     None if it is unstable."""
     fitted = family(grid, only=(structure,)).get(structure)

@@ -112,7 +112,7 @@ class Solution:
         of_a = slice(len(self.shared), len(self.shared) + na)
         return whole[of_a, of_a], whole[of_a, -1]
 
-    def filter(self, records: Records, nb: int, delay: int) -> Filter:
+    def filter(self, nb: int, delay: int) -> Filter:
         """Return the filter of these numbers."""
         b = self.shared[:-1].reshape(-1, nb)
         return Filter(self.a, b, float(self.shared[-1]), delay, self.first)
@@ -303,7 +303,7 @@ class Search:
     def __call__(self, records: Records, na: int, nb: int, delay: int) -> Filter | None:
         """Return the best stable filter of this structure, None where no start leads to one."""
         best = self._search(records, na, nb, delay)
-        return None if best is None else best.filter(records, nb, delay)
+        return None if best is None else best.filter(nb, delay)
 
     def starts(self, records: Records, na: int) -> list[Array]:
         """Return denominators where the search begins, beside that of ARX."""

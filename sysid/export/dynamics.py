@@ -18,7 +18,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from itertools import product
 from statistics import NormalDist
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -76,7 +76,7 @@ class Dynamics:
     # show it
     gain_sd: Array
     units: dict[str, str]  # of inputs, disturbances and outputs
-    level: float = 0.9  # probability inside of the intervals
+    level: ClassVar[float] = 0.9  # probability inside of the intervals
 
     @property
     def dt(self) -> float:
@@ -234,7 +234,6 @@ def plant_dynamics(
     *,
     inputs: Mapping[str, float] | None = None,
     disturbances: Mapping[str, float] | None = None,
-    level: float = 0.9,
     draws: int = 24,
 ) -> Dynamics:
     """Return poles, gains, step and frequency responses of a plant about an operating point.
@@ -245,8 +244,6 @@ def plant_dynamics(
     inputs, disturbances : mapping of name to float, optional
         Where they are held, in their units.  By default in the middle of what the logs cover, an input that
         goes both ways in the middle of its positive half, and a switch on.
-    level : float, optional
-        Probability inside of the intervals, between 0 and 1.
     draws : int, optional
         Other plants that agree with the logs; none of a plant without uncertainty.
 
@@ -270,8 +267,6 @@ def plant_dynamics(
     >>> found.rows()[0]["unit"]
     'K/percent'
     """
-    if not 0 < level < 1:
-        raise UserError(f"level {level:g} is not between 0 and 1", hint="0.9 is usual")
     u, d = usual_point(plant, inputs, disturbances)
 
     def about(k: int) -> LinearPlant:
@@ -285,7 +280,7 @@ def plant_dynamics(
             continue
     few = 0 < len(plant.logs) < SEVERAL
     spread = np.array([RUN_GAIN_SD if few and name in plant.inputs else 0.0 for name in linear.inputs])
-    return Dynamics(linear, tuple(others), spread, dict(plant.units), level)
+    return Dynamics(linear, tuple(others), spread, dict(plant.units))
 
 
 def usual_point(

@@ -72,13 +72,7 @@ def bounded_least_squares(
     )
 
 
-def fit_network(
-    network: GreyModel | str | Path,
-    logs: Logs,
-    *,
-    average: float | None = None,
-    progress: Progress | None = None,
-) -> Plant:
+def fit_network(network: GreyModel | str | Path, logs: Logs, *, progress: Progress | None = None) -> Plant:
     """Fit a network, or a model of the user's own, to logs.
 
     Parameters
@@ -87,9 +81,6 @@ def fit_network(
         A network or a model of the user's own, or the name or path of a network.
     logs : Log, DataFrame, str, Path, or sequence of them
         All are fitted together.
-    average : float, optional
-        Length of the bins that are compared [s]; the model's own where absent: for a network 5 s, or five
-        steps if that is longer.
     progress : callable, optional
         Called with (fraction done, what).
 
@@ -133,8 +124,7 @@ def fit_network(
     spread = {name: float(np.nanstd(logged[name])) for name in model.outputs}
     runs = partial(free_runs, logs)
     model = model.prepared(runs, spread)
-    average = model.average if average is None else average
-    problem = make_problem(model, logs, average=average, independent=model.independent)
+    problem = make_problem(model, logs, average=model.average, independent=model.independent)
     report(0.0, "fitting from the priors")
     solution = _descend(problem, np.zeros(len(problem.free)), report, (0.0, 0.6))
     tau = residual_tau(problem.errors(solution.x), problem.tau)
@@ -146,7 +136,7 @@ def fit_network(
         solution = _descend(problem, solution.x, report, (0.8, 0.95))
     finer = model.prepared(runs, spread, problem.parameters(solution.x[None])[0])
     if finer is not model:  # its step was short enough at the prior, and is not where the fit ended
-        refined = make_problem(finer, logs, average=average, independent=model.independent)
+        refined = make_problem(finer, logs, average=model.average, independent=model.independent)
         problem = replace(refined, tau=problem.tau)
         solution = _descend(problem, solution.x, report, (0.9, 0.95))
     report(0.95, "covariance")

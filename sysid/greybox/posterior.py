@@ -35,6 +35,7 @@ from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.errors import UserError, known_names
 from thermogrip.datasets.files import atomic_path
 from thermogrip.datasets.log_files import Logs, as_logs
+from thermogrip.datasets.parallel import Progress
 from thermogrip.datasets.schema import Log
 from thermogrip.sysid.greybox.fit import bounded_least_squares
 from thermogrip.sysid.greybox.noise_model import ErrorModel
@@ -134,7 +135,7 @@ class RandomizedMap:
         seed: int = 0,
         held: Array | None = None,
         columns: Sequence[int] = (),
-        progress: Callable[[float, str], None] | None = None,
+        progress: Progress | None = None,
     ) -> Array:
         """Return draws (n, n_free) of z, in prior units, inside the bounds."""
         # draws of the normal approximation move runs 4 to 40 times as far as these (the rig's logs), for they
@@ -234,7 +235,7 @@ def run_chain(
     max_steps: int,
     normal: tuple[Array, Array] | None = None,
     seed: int = 0,
-    progress: Callable[[float, str], None] | None = None,
+    progress: Progress | None = None,
 ) -> Chain:
     """Run emcee until the chain is 50 autocorrelation times long, or ``max_steps`` are done."""
     import emcee
@@ -336,7 +337,7 @@ def sample_posterior(
     max_steps: int = 4000,
     n_samples: int = 200,
     seed: int = 0,
-    progress: Callable[[float, str], None] | None = None,
+    progress: Progress | None = None,
 ) -> tuple[Plant, Posterior]:
     """Sample the parameters of a fitted plant.
 
@@ -414,12 +415,7 @@ def sample_posterior(
 
 
 def with_draws(
-    plant: Plant,
-    problem: Problem,
-    n: int = 24,
-    *,
-    seed: int = 0,
-    progress: Callable[[float, str], None] | None = None,
+    plant: Plant, problem: Problem, n: int = 24, *, seed: int = 0, progress: Progress | None = None
 ) -> Plant:
     """Return the plant with a few draws of its posterior as its samples, for bands and closed loops."""
     z = problem.standard(plant.values)

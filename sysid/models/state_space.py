@@ -152,10 +152,6 @@ class StateSpaceModel(BlackBox):
         """Whether every pole lies inside the unit circle, at every position of the switches."""
         return bool(np.all(np.abs(self.poles()) < 1))
 
-    def gain(self) -> Array:
-        """Return the steady gain (n_y, n_u) of the linear part with the switches off."""
-        return np.asarray(self.C @ np.linalg.solve(np.eye(self.n_x) - self.A, self.B))
-
     def _term_slopes(self, u: Array, d: Array) -> Array:
         """Return F dphi/du at (u, d), shape (n_x, n_u), by central differences of a small step."""
         if not self.terms:

@@ -12,7 +12,7 @@ from scipy.signal import lfilter
 
 from thermogrip.datasets.schema import Log, make_log
 from thermogrip.sysid.blackbox.fit import family_of
-from thermogrip.sysid.blackbox.order_selection import Model
+from thermogrip.sysid.models.model import BlackBox
 from thermogrip.sysid.plant.log_grid import Grid
 
 POLE, GAIN, DELAY = 0.95, 0.5, 3  # y[k] = 0.95 y[k-1] + 0.5 u[k-3] about 25 degC: gain 10 K
@@ -80,7 +80,7 @@ def coupled() -> SimpleNamespace:
     return SimpleNamespace(A=COUPLED, B=PUSH, C=np.eye(2), log=coupled_log)
 
 
-def _fit_one(kind: str, grid: Grid, *, variant: str = "", **orders: Any) -> Model:
+def _fit_one(kind: str, grid: Grid, *, variant: str = "", **orders: Any) -> BlackBox:
     plain: dict[str, dict[str, Any]] = {"subspace": {"terms": ()}}
     plain |= {kind: {"terms": (), "delays": 1} for kind in ("arx", "oe")}
     plain |= {"sindy": {"degrees": 2, "thresholds": 0.01, "memories": 1}}
@@ -94,6 +94,6 @@ def _fit_one(kind: str, grid: Grid, *, variant: str = "", **orders: Any) -> Mode
 
 
 @pytest.fixture(scope="session")
-def fit_one() -> Callable[..., Model]:
+def fit_one() -> Callable[..., BlackBox]:
     """Return the function of (kind, grid, orders by the family's names, variant) to one model."""
     return _fit_one

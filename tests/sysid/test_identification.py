@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
+from tests.sysid.models.makers import steady_gain
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.log_files import read_log
 from thermogrip.datasets.schema import log_name, make_log
@@ -411,7 +412,7 @@ def test_an_input_that_never_moves_has_no_gain(kind):
     log = plant_log()
     log["fan"] = ("time", np.ones(log.sizes["time"]), {"units": "1", "role": "input"})
     found = fit_black_box(kind, [log], average=1.0)
-    gain = found.plant.model.gain()[0]
+    gain = steady_gain(found.plant.model)[0]
     moved, still = (found.plant.model.inputs.index(name) for name in ("q", "fan"))
     assert gain[moved] == pytest.approx(10.0, rel=0.05)
     assert abs(gain[still]) < 1e-6

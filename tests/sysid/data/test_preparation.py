@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from tests.sysid.models.makers import steady_gain
 from thermogrip.datasets.schema import make_log
 from thermogrip.sysid.data.preparation import with_rest
 from thermogrip.sysid.identification import identify
@@ -75,7 +76,7 @@ def test_a_log_that_climbs_before_its_only_move_is_fitted_and_its_gain_in_doubt(
 def test_a_step_test_recorded_from_its_step_on_gives_the_gain_and_runs_a_step_of_twice_the_size():
     found = identify(step_test(noise=0.05, quantum=0.32), models=["arx", "oe", "subspace"], draws=8)
     assert any("begins with the only move of an input" in note for note in found.notes)
-    (gain,) = np.ravel(found.plant.model.gain())
+    (gain,) = np.ravel(steady_gain(found.plant.model))
     assert abs(gain - 0.7) < 0.07
     twice = step_test(level=100.0, noise=0.05, quantum=0.32)
     assert free_run(found.plant, twice).scores["t"].rmse < 4  # of 70 K; 42 K off without the rest

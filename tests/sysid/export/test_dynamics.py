@@ -81,7 +81,7 @@ def test_a_pair_of_complex_poles_is_one_oscillation():
     ("logs", "between"), [((), 0.0), (("a",), 0.05), (("a", "b"), 0.05), (tuple("abc"), 0.0)]
 )
 def test_intervals_are_of_the_draws_and_of_what_few_logs_cannot_show(logs, between):
-    found = plant_dynamics(replace(PLANT, logs=logs), draws=8, level=0.9)
+    found = plant_dynamics(replace(PLANT, logs=logs), draws=8)
     half = 1.6448536 * 4.0 * np.hypot(0.1, between)
     assert (found.gain.low[0, 0], found.gain.high[0, 0]) == pytest.approx((4 - half, 4 + half), rel=1e-5)
     assert found.to_dict()["gain_sd_between_runs"] == between
@@ -90,8 +90,6 @@ def test_intervals_are_of_the_draws_and_of_what_few_logs_cannot_show(logs, betwe
     _, size, phase = found.frequency_response(20)
     np.testing.assert_allclose(size.low, size.value * (1 - half / 4), rtol=1e-5, atol=1e-9)
     np.testing.assert_allclose(phase.low, phase.high, atol=1e-6)  # the refits differ in gain alone
-    narrow = plant_dynamics(PLANT, draws=8, level=0.5)
-    assert narrow.gain.high[0, 0] - 4.0 == pytest.approx(0.6744898 * 0.4, rel=1e-5)
 
 
 @pytest.mark.parametrize("refits", [0, 7])
@@ -154,17 +152,9 @@ def test_the_point_is_the_middle_of_the_logs_on_one_side_of_zero(valid, middle):
     assert found.to_dict()["at_rest"]["hot"] == pytest.approx(20 + 4 * middle + 7.0)
 
 
-@pytest.mark.parametrize(
-    ("how", "says"),
-    [
-        ({"level": 1.0}, "level 1 is not between"),
-        ({"level": 0.0}, "level 0 is not"),
-        ({"inputs": {"w": 1.0}}, "no w"),
-    ],
-)
-def test_what_the_plant_cannot_have_is_refused(how, says):
-    with pytest.raises(UserError, match=says):
-        plant_dynamics(PLANT, **how)
+def test_an_input_that_the_plant_does_not_have_is_refused():
+    with pytest.raises(UserError, match="no w"):
+        plant_dynamics(PLANT, inputs={"w": 1.0})
 
 
 def test_a_plant_that_runs_away_has_no_gains():

@@ -1,4 +1,4 @@
-"""What compiled code is held against."""
+"""What compiled code is held against, and the gain of a linear model."""
 
 from __future__ import annotations
 
@@ -16,3 +16,7 @@ def roll_rows(step: Any, output: Any, x0: Any, u: Any, d: Any, p: Any, h: float,
             x = step(x, list(u_row), list(d_row), parameters, h)
         outputs.append(np.array(output(x, parameters)))
     return np.array(outputs).transpose(2, 0, 1), np.array(x).T
+
+
+def steady_gain(model: Any) -> Any:
+    return model.C @ np.linalg.solve(np.eye(model.n_x) - model.A, model.B)

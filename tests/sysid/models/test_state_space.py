@@ -153,12 +153,8 @@ def test_poles_are_those_of_the_worst_position_of_the_switches():
     assert less.stable
 
 
-def test_the_gain_is_of_the_matrices_as_they_stand():
-    model = StateSpaceModel(
-        ("q",), (), ("t",), A=[[0.5, 0.2], [0.0, 0.6]], B=[[1.0], [2.0]], C=[[1.0, 3.0]], dt=1.0
-    )
-    # x2 = 2 / 0.4 = 5, x1 = (1 + 0.2 * 5) / 0.5 = 4
-    np.testing.assert_allclose(model.gain(), [[4.0 + 15.0]])
+def test_matrices_that_are_absent_are_zero_and_the_spread_is_one():
+    model = StateSpaceModel(("q",), (), ("t",), A=np.zeros((2, 2)), B=[[1], [2]], C=[[1, 3]], dt=1.0)
     assert (model.origin, model.spread.tolist(), model.E.shape, model.c.tolist()) == (
         "statespace", np.eye(2).tolist(), (2, 0), [0.0, 0.0]
     )  # fmt: skip
