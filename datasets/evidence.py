@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import combinations, pairwise
+from itertools import combinations, pairwise, product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,25 +54,22 @@ class EvidenceSettings:
 EVIDENCE = EvidenceSettings()
 
 
-def helps_beside(columns: Mapping[str, Floats], name: str, output: str, inputs: Sequence[str]) -> bool:
-    """Tell whether the past of a column helps to predict an output beside that of the inputs and its own."""
-    reading, column, *beside = _standardised([columns[n] for n in (output, name, *inputs)])
-    gains = (_gains(reading, [column], beside, lags)[0] for lags in EVIDENCE.lags)
-    return all(gain > EVIDENCE.strong_gain for gain in gains)
-
-
 def is_moved(
     columns: Mapping[str, Floats],
     name: str,
     drives: Sequence[str],
-    at_lags: Callable[[Iterable[bool]], bool] = any,
+    beside: Sequence[str] = (),
+    at_lags: Callable[[Iterable[bool]], bool] = all,
 ) -> bool:
-    """Tell whether the past of a drive helps to predict a column, as long as the column is not stuck."""
-    is_sound = np.isfinite(drop_stuck(name, columns[name], [columns[n] for n in drives])[0])
+    """Tell whether the past of a drive helps to predict a column beside its own and that of others, as long
+    as the column is not stuck."""
+    causes = [columns[n] for n in (*drives, *beside)]
+    is_sound = np.isfinite(drop_stuck(name, columns[name], causes)[0])
     if is_sound.sum() < EVIDENCE.fewest_rows:
-        return True  # nothing of it speaks against
-    reading, *moves = _standardised([columns[n][is_sound] for n in (name, *drives)])
-    by_lags = [_gains(reading, moves, (), lags) for lags in EVIDENCE.lags]
+        return False
+    reading, *causes = _standardised([values[is_sound] for values in (columns[name], *causes)])
+    moves, others = causes[: len(drives)], causes[len(drives) :]
+    by_lags = [_gains(reading, moves, others, lags) for lags in EVIDENCE.lags]
     return any(at_lags(gain > EVIDENCE.strong_gain for gain in of_drive) for of_drive in zip(*by_lags))
 
 
@@ -233,7 +230,7 @@ def role_doubts(
         n: np.where(find_spikes(v, floor=None), np.nan, v) if n in outputs else v for n, v in columns.items()
     }
     guessed = [name for name in moving if name in reasons and not reasons[name].startswith(tuple(sound))]
-    moved = [name for name in outputs if is_moved(columns, name, inputs)]
+    moved = [name for name in outputs if is_moved(columns, name, inputs, at_lags=any)]
     read = [*outputs, *disturbances]
     for name in [name for name in inputs if name in guessed]:
         what = _unlike_an_input(name, columns, [n for n in inputs if n != name], outputs, read)
@@ -244,7 +241,7 @@ def role_doubts(
             continue
         yield f"{name} is taken as output ({reasons[name]}), but does not respond to {', '.join(inputs)}"
     for name in [name for name in disturbances if name in guessed]:
-        if is_moved(columns, name, inputs, at_lags=all):
+        if is_moved(columns, name, inputs):
             yield f"{name} is taken as disturbance ({reasons[name]}), but responds to {', '.join(inputs)}"
     for name in [name for name in others if name in guessed and not only_rises(columns[name])]:
         is_goal = name in goals and is_held(columns[name])
@@ -252,14 +249,14 @@ def role_doubts(
             continue
         # what is held like a drive may be the drive, and the input with a name its reading
         beside = [] if is_held(columns[name]) else inputs
-        helped = next((n for n in outputs if helps_beside(columns, name, n, beside)), None)
+        helped = next((n for n in outputs if is_moved(columns, n, [name], beside)), None)
         if helped is not None:
             yield f"{name} is left out ({reasons[name]}), and helps to predict {helped}"
             continue
         # what is left out may be an output with an input of its own, which is left out with it
         idle = [] if is_held(columns[name]) else [n for n in others if n in guessed and is_held(columns[n])]
         for drives in (inputs, [n for n in idle if n not in goals]):
-            if is_moved(columns, name, drives, at_lags=all):
+            if is_moved(columns, name, drives):
                 says = f"responds to {', '.join(drives)}: is it an output?"
                 yield f"{name} is left out ({reasons[name]}), but {says}"
                 break
@@ -291,7 +288,7 @@ def _at_scale(
     n: int, y: Floats, drives: Sequence[Floats], others: Sequence[Floats]
 ) -> tuple[Floats, Floats, Floats]:
     """Return the means of y over n rows, what their past and others tell of them, and what drives add."""
-    of_y, *rest = (v[: v.size // n * n].reshape(-1, n).mean(axis=1) for v in (y, *drives, *others))
+    of_y, *rest = _means_of_rows([y, *drives, *others], n)
     at_once = [_past(means, 2, first=0) for means in rest]
     known = [np.ones(of_y.size - 2), _past(of_y, 2), *at_once[len(drives) :]]
     return of_y[2:], np.column_stack(known), np.column_stack(at_once[: len(drives)])
@@ -362,7 +359,7 @@ def _unlike_an_input(
         if share_followed(values, columns[other]) > EVIDENCE.follows:
             return f"follows {other}: it may be its reading, and their effects cannot be estimated separately"
     others_held = any(is_held(columns[n]) for n in other_inputs)
-    if others_held and not is_held(values) and is_moved(columns, name, other_inputs, at_lags=all):
+    if others_held and not is_held(values) and is_moved(columns, name, other_inputs):
         return f"responds to {', '.join(other_inputs)}: is it read?"
     beside = [*other_inputs, *outputs]
     if values.size >= EVIDENCE.telling_rows and not any(_acts(columns, name, y, beside) for y in outputs):
@@ -375,12 +372,14 @@ def _acts(columns: Mapping[str, Floats], name: str, output: str, beside: Sequenc
     speed."""
     others = [n for n in beside if n != output]
     scaled = _standardised([columns[n] for n in (output, name, *others)])
-    for n in EVIDENCE.blocks:
-        y, x, *rest = (v[: v.size // n * n].reshape(-1, n).mean(axis=1) for v in scaled)
-        for lags in EVIDENCE.lags:
-            if any(
-                gain > EVIDENCE.strong_gain
-                for gain in _gains(y, [x, x * y, *(x * o for o in rest)], rest, lags)
-            ):
-                return True
+    for n, lags in product(EVIDENCE.blocks, EVIDENCE.lags):
+        y, x, *rest = _means_of_rows(scaled, n)
+        gains = _gains(y, [x, x * y, *(x * o for o in rest)], rest, lags)
+        if max(gains) > EVIDENCE.strong_gain:
+            return True
     return False
+
+
+def _means_of_rows(columns: Sequence[Floats], n: int) -> list[Floats]:
+    """Return the means of columns over n rows each."""
+    return [v[: v.size // n * n].reshape(-1, n).mean(axis=1) for v in columns]

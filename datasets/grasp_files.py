@@ -10,7 +10,7 @@ The grasps of one file share one time axis.
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -158,12 +158,13 @@ def _in_record_unit(name: str, values: Floats, unit: str, file: str | Path, colu
 
 
 def _columns(table: Table, wanted: Collection[str]) -> tuple[dict[str, Any], list[str]]:
-    """Return ``grasp_id`` and columns of these names in a record, in its units, and what was converted."""
+    """Return ``grasp_id`` and columns of these names in a record, in its units, and what was converted or is
+    not used."""
     if "grasp_id" not in table.text:
         hint = "a grasp file has grasp_id,time_s,t_surface_degC, its meta file grasp_id,material,..."
         raise UserError("no column grasp_id", file=table.file, hint=hint)
     columns: dict[str, Any] = {"grasp_id": np.asarray(table.text["grasp_id"])}
-    converted = []
+    notes, unused = [], []
     for header in [header for header in (*table.text, *table.numbers) if header != "grasp_id"]:
         name, unit = _name_and_unit(header, table.file)
         if name in columns:
@@ -173,16 +174,17 @@ def _columns(table: Table, wanted: Collection[str]) -> tuple[dict[str, Any], lis
         elif name in wanted:
             columns[name] = _in_record_unit(name, table.numbers[header], unit, table.file, header)
             if (wanted_unit := _NUMBERS[name]) != unit:
-                converted.append(f"{name}: converted from {unit} to {wanted_unit}")
-    return columns, converted
+                notes.append(f"{name}: converted from {unit} to {wanted_unit}")
+        elif not header.startswith("pump"):  # which is off in every grasp of the rig
+            unused.append(header)
+    if unused:
+        known = ", ".join([*_META_HEADERS.values(), *GRASP_LABELS])
+        notes.append(f"{Path(table.file).name}: not used: {', '.join(unused)}; known are {known}")
+    return columns, notes
 
 
-def _samples_of(table: Table) -> tuple[DataFrame, list[str]]:
-    """Return the samples of a table, in which the facts of a grasp may stand too, and what was repaired:
-    columns ``grasp_id``, ``time`` [s] and those of the sensors [degC]."""
-    import pandas as pd
-
-    columns, converted = _columns(table, _SAMPLES)
+def _check_samples(columns: Mapping[str, Any], table: Table) -> None:
+    """Raise :class:`UserError` where the samples of a table lack a time, a temperature or their grasp."""
     for need, header in (("time", "time_s"), ("t_surface", "t_surface_degC")):
         if need not in columns:
             hint = rename_hint(need, [*table.text, *table.numbers])
@@ -193,8 +195,6 @@ def _samples_of(table: Table) -> tuple[DataFrame, list[str]]:
     ):
         for line in table.lines[lost][:1]:
             raise UserError(problem, file=table.file, row=int(line), column=where, hint=hint)
-    columns["time"] = np.round(columns["time"], 6)
-    return pd.DataFrame(columns), [*table.notes, *converted]
 
 
 def _onto_one_axis(samples: DataFrame, file: str, repairs: list[str]) -> tuple[Floats, dict[str, Floats]]:
@@ -209,12 +209,13 @@ def _onto_one_axis(samples: DataFrame, file: str, repairs: list[str]) -> tuple[F
     repairs += [f"grasp {grasp}: {n} repeated time stamp(s) dropped" for grasp, n in repeated.items()]
     samples = samples[steps != 0]
     by_grasp = samples.groupby("grasp_id", sort=False)
-    step = _common_step(by_grasp["time"].agg(_mean_step), file)
+    step = _common_step(by_grasp["time"].agg(lambda stamps: _grid_of(stamps.to_numpy())[0]), file)
     time = samples["time"].to_numpy()
     axis = np.unique(time)
     # where stamps jitter each grasp is interpolated linearly onto the common step, and left NaN where the
     # nearest samples are more than 1.5 steps apart
-    if not _is_even(axis, step):
+    mean_step, deviation = _grid_of(axis, step)
+    if max(deviation, abs(mean_step - step)) > 0.02 * step:
         first, last = np.ceil(time.min() / step - 1e-6), np.floor(time.max() / step + 1e-6)
         axis = np.round(step * np.arange(first, last + 1), 9)
         repairs.append(f"time stamps jitter: interpolated onto a step of {step:g} s")
@@ -224,21 +225,15 @@ def _onto_one_axis(samples: DataFrame, file: str, repairs: list[str]) -> tuple[F
     }
 
 
-def _is_even(axis: Floats, step: float) -> bool:
-    """Tell whether all stamps lie on one grid (with holes) to 2 % of its step."""
-    moved = np.diff(axis) / step
-    if moved.min(initial=np.inf) < 0.5:
-        return False
-    count = np.concatenate([[0.0], np.cumsum(np.round(moved))])
-    exact = (axis[-1] - axis[0]) / count[-1]  # a median of rounded stamps drifts over a long recording
-    return bool(np.abs(axis - axis[0] - exact * count).max() <= 0.02 * step)
-
-
-def _mean_step(time: Series[float]) -> float:
-    """Return the mean step of a grasp, in which a hole counts as the steps that it is long; NaN of one
-    sample."""
+def _grid_of(time: Floats, usual: float | None = None) -> tuple[float, float]:
+    """Return the mean step of time stamps, in which a hole counts as the steps that it is long, and their
+    largest deviation from a grid of it; NaN of one sample.  ``usual`` is about the step, else the median."""
     moves = np.diff(time)
-    return np.ptp(time) / np.maximum(np.round(moves / np.median(moves)), 1).sum() if moves.size else np.nan
+    if not moves.size:
+        return np.nan, np.nan
+    counts = np.maximum(np.round(moves / (usual or np.median(moves))), 1)
+    step = float(moves.sum() / counts.sum())  # a median of rounded stamps drifts over a long recording
+    return step, float(np.abs(np.cumsum(moves - step * counts)).max())
 
 
 def _common_step(steps: Series[float], file: str) -> float:
@@ -278,15 +273,6 @@ def meta_path(path: str | Path) -> Path:
     return meta_path
 
 
-def _unused(table: Table, known: Collection[str]) -> list[str]:
-    """Return a line about the columns of a table that are none of the known ones, if there are any."""
-    used = ("pump", *_SAMPLE_PREFIXES)
-    columns = [header for header in (*table.text, *table.numbers) if not header.startswith(used)]
-    unused = [header for header in columns if _name_and_unit(header)[0] not in known]
-    hint = f"known are {', '.join([*_META_HEADERS.values(), *GRASP_LABELS])}"
-    return [f"{Path(table.file).name}: not used: {', '.join(unused)}; {hint}"] if unused else []
-
-
 def _rows_of_meta(meta: Table, ids: Index[str], order: Index[str], file: str) -> NDArray[np.intp]:
     """Return for each grasp its row in the meta file; both files must name the same grasps, each once."""
     without = f"grasp {{!r}} has no samples in {Path(file).name}"
@@ -323,16 +309,21 @@ def _of_tables(table: Table, meta: Table | None, name: str) -> Grasps:
     """Return the grasps of a table with a row a sample, and of one with a row a grasp, if there is one."""
     import pandas as pd
 
-    samples, repairs = _samples_of(table)
-    order = pd.Index(samples["grasp_id"].unique())
     known = (*GRASP_NUMBERS, *GRASP_LABELS)
-    facts, _ = _columns(meta or table, known)
-    ids = pd.Index(facts.pop("grasp_id"))
-    rows = _first_rows(table) if meta is None else _rows_of_meta(meta, ids, order, table.file)
+    columns, notes = _columns(table, _SAMPLES if meta else (*_SAMPLES, *known))
+    _check_samples(columns, table)
+    samples = pd.DataFrame({name: columns[name] for name in ("grasp_id", *_SAMPLES) if name in columns})
+    samples["time"] = samples["time"].round(6)
+    order = pd.Index(samples["grasp_id"].unique())
+    if meta is None:
+        facts, of_meta, rows = columns, [], _first_rows(table)
+    else:
+        facts, of_meta = _columns(meta, known)
+        rows = _rows_of_meta(meta, pd.Index(facts["grasp_id"]), order, table.file)
+    repairs = [*table.notes, *notes, *of_meta]
     axis, channels = _onto_one_axis(samples, table.file, repairs)
-    facts = {name: column[rows] for name, column in facts.items()}
-    unused = _unused(table, known) if meta is None else [*_unused(table, ()), *_unused(meta, known)]
-    attrs = {"name": name, "repairs": "\n".join([*repairs, *unused])}
+    facts = {fact: facts[fact][rows] for fact in known if fact in facts}
+    attrs = {"name": name, "repairs": "\n".join(repairs)}
     return _record(table.file, name, order.tolist(), axis, channels | facts, attrs)
 
 

@@ -7,7 +7,7 @@ text; opening a file runs no code.  Files of other programs may name units by th
 from __future__ import annotations
 
 import math
-from contextlib import AbstractContextManager
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 
 _MOST_MEMBERS = 4096  # of a file
 _PART = 16 << 20  # bytes of text that are looked at in one piece
+_not_damaged = partial(reading, "is damaged or not NetCDF-4", hint="copy or write it again")
 
 
 def open_netcdf(path: str | Path) -> xr.Dataset:
@@ -46,7 +47,7 @@ def _open_dataset(path: Path) -> xr.Dataset:
 
     check_netcdf(path)
     options: dict[str, Any] = {"engine": "h5netcdf", "decode_times": False, "decode_timedelta": False}
-    with _not_damaged(path), xr.open_dataset(path, **options) as opened:
+    with _not_damaged(file=path), xr.open_dataset(path, **options) as opened:
         data = opened.load()
     # text of variable length is read as arrays of objects
     texts = [key for key, variable in data.variables.items() if variable.dtype.kind in "OS"]
@@ -57,17 +58,13 @@ def _open_dataset(path: Path) -> xr.Dataset:
     return data
 
 
-def _not_damaged(path: str | Path) -> AbstractContextManager[None]:
-    return reading("is damaged or not NetCDF-4", file=path, hint="copy or write it again")
-
-
 def check_netcdf(path: str | Path) -> None:
     """Refuse a NetCDF-4 file that is damaged, declares more than it may hold, or has its data in others."""
     h5py = import_module("h5py")
     packed = Path(path).stat().st_size
     declared = members = 0
     # damage here leaves h5netcdf half built, and complaining when it is collected
-    with _not_damaged(path), h5py.File(path, "r") as opened:
+    with _not_damaged(file=path), h5py.File(path, "r") as opened:
         opened.attrs.get("_nc3_strict")
         groups = [opened]
         while groups:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +20,6 @@ from thermogrip.datasets.evidence import (
     EVIDENCE,
     comes_to,
     explains,
-    helps_beside,
     is_held,
     is_moved,
     one_signal,
@@ -30,6 +30,8 @@ from thermogrip.datasets.evidence import (
 from thermogrip.datasets.units import DRIVE, find_column
 
 Floats = NDArray[np.float64]
+_Columns: TypeAlias = Mapping[str, Floats]
+_Guesses: TypeAlias = dict[str, tuple[str, str]]  # role and reason, by name
 
 _SETPOINT = re.compile(
     r"^(t_?)?(setpoint|set_point|target|sp|set)(_?\d+)?(_.*)?$|^reference(_.*|\d*)$"
@@ -114,7 +116,7 @@ def assign_roles(
     outputs: Sequence[str] | None = None,
     disturbances: Sequence[str] | None = None,
     given: Mapping[str, str] | None = None,
-    columns: Mapping[str, Floats] | None = None,
+    columns: _Columns | None = None,
     file: str | None = None,
 ) -> Roles:
     """Return the role of each variable of ``units`` (name -> unit), and what the guesses among them rest on.
@@ -136,19 +138,18 @@ def assign_roles(
     guesses = {n: explain_role(n, unit) for n, unit in units.items() if n not in stated}
     requests = {f"asked_{n}": n for n in units}
     guesses |= {n: ("other", f"it is what was asked of {requests[n]}") for n in guesses if n in requests}
-    evidence: dict[str, tuple[str, str]] = {}  # of the data alone
+    evidence: _Guesses = {}  # of the data alone
     if columns is not None:
         if all(len(values) >= EVIDENCE.fewest_rows for values in columns.values()):
             guesses |= _copied_columns(columns, guesses, units)
-        guesses |= _controllers(guesses, units)
+        if any(_SETPOINT.search(_name_words(name)) for name in units):
+            guesses |= _controllers(guesses)
         evidence |= _followed_levels(columns, guesses)
         known = guesses | evidence
         fixed = {name: role for name, (role, why) in known.items() if why != NO_CLUE} | stated
         if not {"input", "output"} <= {*fixed.values()}:
             evidence |= roles_of_data(columns, units, fixed)
-        evidence |= _heated_rooms(columns, guesses | evidence, stated)
-        if not lists["input"]:
-            evidence |= _unnamed_causes(columns, guesses | evidence, stated)
+        evidence |= _moved_otherwise(columns, guesses | evidence, stated, find_causes=not lists["input"])
         guesses |= evidence
     roles, reasons = {}, {}
     for name in units:
@@ -174,32 +175,25 @@ def assign_roles(
     return Roles(roles, reasons, tuple(doubts))
 
 
-def _controllers(
-    guesses: Mapping[str, tuple[str, str]], units: Mapping[str, str]
-) -> dict[str, tuple[str, str]]:
+def _controllers(guesses: _Guesses) -> _Guesses:
     """Return the columns that are what a controller calls them, where a set point shows that it does: what it
     reads, what it drives, and its terms."""
     by_name = {name.lower(): name for name in guesses}
-    goals = {_name_words(name) for name in units if _SETPOINT.search(_name_words(name))}
-    if not goals:
-        return {}
-    out: dict[str, tuple[str, str]] = {}
     reads, drives = by_name.keys() & {"input", "pv"}, by_name.keys() & {"output", "op", "out", "co"}
-    if drives and (reads or any(role == "output" for role, _ in guesses.values())):
-        out |= {by_name[name]: ("output", f"{_OF_CONTROLLER} what it reads") for name in reads}
-        out |= {by_name[name]: ("input", f"{_OF_CONTROLLER} what it drives") for name in drives}
-    out |= {by_name[n]: ("other", f"{_OF_CONTROLLER} its mode") for n in by_name.keys() & _MODES}
     terms = by_name.keys() & {"p", "i", "d"}
-    if len(terms) > 1:
-        out |= {by_name[name]: ("other", f"{_OF_CONTROLLER} one of its terms") for name in terms}
-    return out
+    is_loop = drives and (reads or any(role == "output" for role, _ in guesses.values()))
+    meanings = (
+        (reads if is_loop else (), "output", "what it reads"),
+        (drives if is_loop else (), "input", "what it drives"),
+        (by_name.keys() & _MODES, "other", "its mode"),
+        (terms if len(terms) > 1 else (), "other", "one of its terms"),
+    )
+    return {by_name[n]: (role, f"{_OF_CONTROLLER} {what}") for names, role, what in meanings for n in names}
 
 
-def roles_of_data(
-    columns: Mapping[str, Floats], units: Mapping[str, str], fixed: Mapping[str, str]
-) -> dict[str, tuple[str, str]]:
+def roles_of_data(columns: _Columns, units: Mapping[str, str], fixed: Mapping[str, str]) -> _Guesses:
     """Return role and reason, as the data show them, of the columns (n_row,) that ``fixed`` gives no role."""
-    out: dict[str, tuple[str, str]] = {}
+    out: _Guesses = {}
     for name in [name for name in columns if name not in fixed]:
         values = columns[name][np.isfinite(columns[name])]
         steps, rows = np.diff(values), max(values.size, 1)
@@ -243,35 +237,12 @@ def roles_of_data(
     return out
 
 
-def _heated_rooms(
-    columns: Mapping[str, Floats], guesses: Mapping[str, tuple[str, str]], stated: Mapping[str, str]
-) -> dict[str, tuple[str, str]]:
-    """Return the rooms that are outputs, because a drive heats them; weather is heated by nobody."""
-    roles = {name: role for name, (role, _) in guesses.items()} | dict(stated)
-    drives = [n for n, role in roles.items() if role == "input" and n in columns]
-    alone = "output" not in roles.values()
-    out = {}
-    for name, (role, _) in guesses.items():
-        words = _name_words(name)
-        if role != "disturbance" or _OUTDOORS.search(words) or not _ROOM.search(words) or not drives:
-            continue
-        # a rig warms the room around it too: beside another output only what is called a room is one
-        if not (alone or re.search(r"(^|_)room(_|$)", words)):
-            continue
-        drive = next((n for n in drives if helps_beside(columns, n, name, ())), None)
-        if drive is not None:
-            out[name] = "output", f"it follows the drive {drive}, as no surroundings do"
-    return out
-
-
-def _followed_levels(
-    columns: Mapping[str, Floats], guesses: Mapping[str, tuple[str, str]]
-) -> dict[str, tuple[str, str]]:
+def _followed_levels(columns: _Columns, guesses: _Guesses) -> _Guesses:
     """Return the held columns whose levels a reading comes to while another column drives it, as set points,
     and the readings that no name shows, as outputs."""
     likely = [n for n in columns if guesses.get(n, ("", ""))[1] in (NO_CLUE, BY_UNIT)]
     held_names = [n for n in likely if is_held(columns[n])]
-    out: dict[str, tuple[str, str]] = {}
+    out: _Guesses = {}
     for goal in held_names:
         moving = [n for n in columns if n not in held_names]
         read = [n for n in moving if guesses.get(n, ("output", ""))[0] in ("output", "other")]
@@ -279,35 +250,46 @@ def _followed_levels(
         if reading is None:
             continue
         drives = [n for n, (role, why) in guesses.items() if role == "input" or why == NO_CLUE]
-        if any(helps_beside(columns, n, reading, ()) for n in drives if n not in (goal, reading)):
+        if any(is_moved(columns, reading, [n]) for n in drives if n not in (goal, reading)):
             out[goal] = "other", f"{reading} {FOLLOWED}"
             if guesses.get(reading, ("", ""))[1] == NO_CLUE:
                 out[reading] = "output", f"it settles at the levels of {goal}"
     return out
 
 
-def _unnamed_causes(
-    columns: Mapping[str, Floats], guesses: Mapping[str, tuple[str, str]], stated: Mapping[str, str]
-) -> dict[str, tuple[str, str]]:
-    """Return what acts on the outputs although no name says so: held columns that help to predict one are
-    inputs; what no drive moves beside a reading that one does is a disturbance."""
+def _moved_otherwise(
+    columns: _Columns, guesses: _Guesses, stated: Mapping[str, str], *, find_causes: bool
+) -> _Guesses:
+    """Return what moves, or is moved, otherwise than its name says: rooms that a drive heats are outputs,
+    held columns that help to predict an output inputs, readings that no drive moves disturbances."""
     roles = {name: role for name, (role, _) in guesses.items()} | dict(stated)
-    drives, outputs = ([n for n in columns if roles[n] == role] for role in ("input", "output"))
-    if not drives or not outputs:
-        return {}
+    drives, outputs, surroundings = (
+        [n for n in columns if roles[n] == role] for role in ("input", "output", "disturbance")
+    )
     out = {}
+    # a rig warms the room around it too: beside another output only what is called a room is one
+    rooms = re.compile(r"(^|_)room(_|$)") if outputs else _ROOM
+    for name in [n for n in surroundings if n in guesses and rooms.search(_name_words(n))]:
+        drive = next((n for n in drives if is_moved(columns, name, [n])), None)
+        if drive is not None and not _OUTDOORS.search(_name_words(name)):  # weather is heated by nobody
+            out[name] = "output", f"it follows the drive {drive}, as no surroundings do"
+    outputs += out
+    if not drives or not outputs or not find_causes:
+        return out
+    causes = {}
     for name in [n for n, (_, why) in guesses.items() if why == NO_CLUE and is_held(columns[n])]:
-        helped = next((n for n in outputs if helps_beside(columns, name, n, drives)), None)
+        helped = next((n for n in outputs if is_moved(columns, n, [name], drives)), None)
         if helped is not None:
-            out[name] = "input", f"it is held between its moves and helps to predict {helped}"
-    drives += out
+            causes[name] = "input", f"it is held between its moves and helps to predict {helped}"
+    drives += causes
+    out |= causes
     unnamed = [n for n in outputs if guesses.get(n, ("", ""))[1].startswith((BY_UNIT, FOLLOWS))]
     # two lags leave some of a smooth weather to be explained by whatever moved meanwhile
     unmoved = [n for n in outputs if not is_moved(columns, n, drives, at_lags=all if n in unnamed else any)]
     moved = [n for n in outputs if n not in unmoved]
     for name in [n for n in unmoved if n in guesses and moved]:
         of_temperature = _TEMPERATURE.search(_name_words(name))  # it may follow what a drive moves
-        if name in unnamed or (of_temperature and not is_moved(columns, name, moved, at_lags=all)):
+        if name in unnamed or (of_temperature and not is_moved(columns, name, moved)):
             out[name] = "disturbance", f"it does not respond to {', '.join(drives)}"
     return out
 
@@ -317,12 +299,10 @@ def _name_words(name: str) -> str:
     return re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", name).lower()
 
 
-def _copied_columns(
-    columns: Mapping[str, Floats], guesses: Mapping[str, tuple[str, str]], units: Mapping[str, str]
-) -> dict[str, tuple[str, str]]:
+def _copied_columns(columns: _Columns, guesses: _Guesses, units: Mapping[str, str]) -> _Guesses:
     """Return the columns that are one signal with another, or a set point less a reading, and of what."""
     moving = {n: some_rows(v) for n, v in columns.items() if np.ptp(v) > 0}  # of lost values none
-    out: dict[str, tuple[str, str]] = {}
+    out: _Guesses = {}
     # of two copies the one with a clue, else the first, stays
     order = sorted(moving, key=lambda n: (n in guesses) + (guesses.get(n, ("", ""))[1] == NO_CLUE))
     for place, name in enumerate(order):

@@ -14,6 +14,7 @@ and the variable ``t_surface``; per grasp it may have a material, temperatures, 
 from __future__ import annotations
 
 import hashlib
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -357,20 +358,17 @@ def check_grasps(grasps: xr.Dataset) -> None:
         raise fault(f"grasp {str(ids[k])!r} has a rest of {float(rests[k]):g} s", hint=hint)
     if "touch" not in grasps or "touch_group" not in grasps:
         return
-    group = label_values(grasps, "touch_group")
-    touch = np.asarray(grasps.variables["touch"].values, dtype=float)
-    for name in np.unique(group[group != ""]):
-        grasps_of_group = np.flatnonzero(group == name)
-        is_numbered = np.isfinite(touch[grasps_of_group])
-        numbers, counts = np.unique(touch[grasps_of_group][is_numbered], return_counts=True)
-        if is_numbered.any() and not is_numbered.all():
-            unnumbered = str(ids[grasps_of_group[~is_numbered][0]])
-            problem = f"grasp {unnumbered!r} of touch_group {str(name)!r} has no touch, others of it have"
-            raise fault(problem, hint="number all touches of a block, or none")
-        if (counts > 1).any():
+    groups, touch = label_values(grasps, "touch_group"), grasps.variables["touch"].values
+    is_numbered = np.isfinite(touch) & (groups != "")
+    for k in np.flatnonzero(~np.isfinite(touch) & np.isin(groups, groups[is_numbered]))[:1]:
+        of_group = f"grasp {str(ids[k])!r} of touch_group {str(groups[k])!r}"
+        hint = "number all touches of a block, or none"
+        raise fault(f"{of_group} has no touch, others of it have", hint=hint)
+    touches = zip(touch[is_numbered].tolist(), groups[is_numbered].tolist())
+    for (number, group), count in Counter(touches).items():
+        if count > 1:
             hint = "number its touches 1, 2, ..., and give a block that is touched anew another touch_group"
-            problem = f"touch {numbers[counts > 1][0]:g} of touch_group {str(name)!r} occurs twice"
-            raise fault(problem, hint=hint)
+            raise fault(f"touch {number:g} of touch_group {group!r} occurs twice", hint=hint)
 
 
 def label_values(grasps: xr.Dataset, name: str) -> NDArray[np.str_]:
