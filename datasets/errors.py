@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import errno
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
@@ -73,35 +73,30 @@ def as_user_error(
     kinds: type[Exception] | tuple[type[Exception], ...], problem: str, **where: Any
 ) -> Iterator[None]:
     """Raise an exception of these kinds as the :class:`UserError` of a problem (``{error}`` in it is what it
-    says) and a place; one that is a UserError already stays what it is."""
-    try:
-        yield
-    except UserError:
-        raise
-    except kinds as error:
-        raise UserError(problem.replace("{error}", str(error)[:200]), **where) from error
-
-
-@contextmanager
-def reading(problem: str, *, file: str | Path | None = None, hint: str) -> Iterator[None]:
-    """Raise whatever stops the reader of a file as the :class:`UserError` of a problem and a reason.
-
-    For parsers of other people's formats and for documents of ours: on damaged content they raise whatever
-    they stumble over, so no list of exceptions is complete.  Nothing but reading belongs in the block.  A
-    UserError keeps its words, and gets the file where it names none.
-    """
+    says, ``{reason}`` with its kind) and a place; one that is a UserError already keeps its words, and gets
+    the file where it names none."""
     try:
         yield
     except UserError as error:
-        if error.file is not None or file is None:
+        if error.file is not None or where.get("file") is None:
             raise
-        place: dict[str, Any] = {"file": file, "row": error.row, "column": error.column}
+        place = {"file": where["file"], "row": error.row, "column": error.column}
         raise UserError(error.problem, **place, hint=error.hint) from error
-    except Exception as error:
+    except kinds as error:
+        text = str(error)[:200]
         # our own checks raise ValueError with a sentence; what else comes says little without its kind
-        words = [] if type(error) is ValueError else [type(error).__name__]
-        reason = ": ".join(filter(None, [*words, str(error)[:200]]))
-        raise UserError(f"{problem} ({reason})" if reason else problem, file=file, hint=hint) from error
+        reason = text if type(error) is ValueError else f"{type(error).__name__}: {text}".removesuffix(": ")
+        words = problem.replace("{error}", text).replace("{reason}", reason).removesuffix(" ()")
+        raise UserError(words, **where) from error
+
+
+def reading(problem: str, *, file: str | Path | None = None, hint: str) -> AbstractContextManager[None]:
+    """Raise whatever stops the reader of a file as the :class:`UserError` of a problem and a reason.
+
+    For parsers of other people's formats and for documents of ours: on damaged content they raise whatever
+    they stumble over, so no list of exceptions is complete.  Nothing but reading belongs in the block.
+    """
+    return as_user_error(Exception, f"{problem} ({{reason}})", file=file, hint=hint)
 
 
 def known_names(name: object, known: Iterable[str], words: str = "use {}") -> str:

@@ -315,12 +315,13 @@ def _of_tables(table: Table, meta: Table | None, name: str) -> Grasps:
     samples = pd.DataFrame({name: columns[name] for name in ("grasp_id", *_SAMPLES) if name in columns})
     samples["time"] = samples["time"].round(6)
     order = pd.Index(samples["grasp_id"].unique())
+    repairs = [*table.notes, *notes]
     if meta is None:
-        facts, of_meta, rows = columns, [], _first_rows(table)
+        facts, rows = columns, _first_rows(table)
     else:
-        facts, of_meta = _columns(meta, known)
+        facts, notes = _columns(meta, known)
+        repairs += notes
         rows = _rows_of_meta(meta, pd.Index(facts["grasp_id"]), order, table.file)
-    repairs = [*table.notes, *notes, *of_meta]
     axis, channels = _onto_one_axis(samples, table.file, repairs)
     facts = {fact: facts[fact][rows] for fact in known if fact in facts}
     attrs = {"name": name, "repairs": "\n".join(repairs)}
