@@ -286,13 +286,7 @@ def _of_rows(table: Table, read: Mapping[str, Header]) -> Clock:
     beside = "dt" in table.meta  # a file may have it beside its columns
     step = next(iter(stated.values()), float(table.meta.get("dt", 1.0)))
     note = f"no time column: rows are taken {step:g} s apart; --dt S sets another step"
-    moves = {h: np.diff(v) for h, v in table.numbers.items() if v.size > 1}
-    rising = [h for h, m in moves.items() if np.median(m) / 3 < m.min() <= m.max() < 3 * np.median(m)]
-    doubt = "no column is a clock: rows are taken 1 s apart"
-    if len(rising) == 1:  # an uneven clock may be
-        doubt = f"rows are taken 1 s apart, but {rising[0]} rises in every row: is it the clock? "
-        doubt += "--columns time_s,... names it so"
-    doubt = "" if stated or beside else doubt
+    doubt = "" if stated or beside else "no column is a clock: rows are taken 1 s apart"
     return Clock(step * np.arange(len(table.lines), dtype=float), frozenset(stated), (note,), np.nan, doubt)
 
 
@@ -326,12 +320,11 @@ def read_clock(cells: Sequence[str]) -> tuple[Floats, str] | None:
     of_names, fields[2] = months.notna(), months.fillna(fields[2])
     triples = [numbers(key) for key in (1, 2, 3)]
     first, middle, _ = (float(np.nanmax(values)) for values in triples)
-    order, note = ("day", "month", "year"), ""
-    if first > 31:
-        order = ("year", "month", "day")
-    elif middle > 12 or (first <= 12 and "/" in str(cells[0])):
-        order = ("month", "day", "year")
-        note = "" if middle > 12 else " (taken as month/day)"
+    by_day, by_month, by_year = ("day", "month", "year"), ("month", "day", "year"), ("year", "month", "day")
+    month_first = middle > 12 or (first <= 12 and "/" in str(cells[0]))
+    orders = [by_month, by_day, by_year] if month_first else [by_day, by_month, by_year]
+    if first > 31 or of_names.any():
+        orders = [by_year] if first > 31 else orders[:1]
 
     def dates_in(order: Sequence[str]) -> pd.Series:
         date = dict(zip(order, triples))
@@ -339,11 +332,11 @@ def read_clock(cells: Sequence[str]) -> tuple[Floats, str] | None:
         year[(year < 1900) | (year > 2200)] = np.nan  # beyond what pandas counts in nanoseconds
         return pd.to_datetime(pd.DataFrame(date | {"year": year}), errors="coerce")
 
-    dates = dates_in(order)
-    for other in (("month", "day", "year"), ("day", "month", "year"), ("year", "month", "day")):
-        if first <= 31 and not of_names.any() and not _follow(dates) and _follow(likely := dates_in(other)):
-            dates, note = likely, f" (taken as {'/'.join(other)}, in which the days follow each other)"
-    days = (dates - pd.Timestamp(0)) / pd.Timedelta(days=1)
+    order = next((order for order in orders if _follow(dates_in(order))), orders[0])
+    note = " (taken as month/day)" if month_first and middle <= 12 and first <= 31 else ""
+    if order != orders[0]:
+        note = f" (taken as {'/'.join(order)}, in which the days follow each other)"
+    days = (dates_in(order) - pd.Timestamp(0)) / pd.Timedelta(days=1)
     return np.asarray(days, dtype=float) * 86400.0 + of_day, note
 
 

@@ -11,6 +11,7 @@ from itertools import pairwise, takewhile
 from typing import NamedTuple
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from thermogrip.datasets.errors import UserError
@@ -342,22 +343,19 @@ def doubt_rows(name: str, values: Floats) -> str:
 def doubt_repeats(columns: Sequence[Floats], lines: NDArray[np.int64]) -> list[str]:
     """Return a line where rows repeat others, cell for cell, in more rows than by chance."""
     rows = np.unique(np.nan_to_num(np.column_stack(columns)), axis=0, return_inverse=True)[1].ravel()
-    moves = np.concatenate([[0], np.cumsum(np.diff(rows) != 0)])
-    mixed = rows.astype(np.uint64) + np.uint64(1)
-    length = 1
-    while length < _REPEATED:  # each is a number of as many rows as its place is long
-        mixed = (mixed[:-length] * np.uint64(0x9E3779B97F4A7C15)) ^ (mixed[length:] + np.uint64(length))
-        length *= 2
-    if mixed.size < 2:
+    if rows.size <= _REPEATED:
         return []
-    telling = moves[length - 1 :] - moves[: moves.size - length + 1] > length / 2
-    places = np.flatnonzero(telling)
-    first, inverse = np.unique(mixed[places], return_index=True, return_inverse=True)[1:]
-    again = places[places[first[inverse.ravel()]] < places]
+    weights = np.random.default_rng(0).integers(2**63, size=_REPEATED, dtype=np.uint64)
+    of_windows = sliding_window_view(rows.astype(np.uint64), _REPEATED) @ weights  # alike where all rows are
+    moves = sliding_window_view(np.diff(rows) != 0, _REPEATED - 1).sum(axis=1)
+    places = np.flatnonzero(moves > _REPEATED / 2)
+    first, inverse = np.unique(of_windows[places], return_index=True, return_inverse=True)[1:]
+    earlier = places[first[inverse.ravel()]]
+    again = np.flatnonzero(earlier < places)
     if not again.size:
         return []
-    one = int(places[first[inverse.ravel()]][np.searchsorted(places, again[0])])
-    says = f"rows {lines[again[0]]} to {lines[again[-1] + length - 1]} repeat those from {lines[one]} on"
+    start, stop = places[again[0]], places[again[-1]] + _REPEATED - 1
+    says = f"rows {lines[start]} to {lines[stop]} repeat those from {lines[earlier[again[0]]]} on"
     return [Doubt(f"{says}: cut the file there in two")]
 
 
