@@ -362,45 +362,27 @@ def _one_column_a_signal(table: Table) -> Table:
     values = [h for h, v in readings.items() if len({*zip(signals, v)}) > count or np.unique(v).size < count]
     if len(values) != 1 or len(table.lines) < 5 * count:
         return table
-    clock = clocks[0]
+    clock, value = clocks[0], readings[values[0]]
     clock_of_text = read_clock(table.text[clock]) if clock in table.text else None
     time = table.numbers[clock] if clock_of_text is None else clock_of_text[0]
     order = np.argsort(time, kind="stable")
-    rows_of = {signal: order[np.asarray(signals)[order] == signal] for signal in dict.fromkeys(signals)}
-    kept, in_turn = _rows_in_turn([time[rows] for rows in rows_of.values()])
     times, first = np.unique(time[order], return_index=True)
-    first = first if kept is None else first[np.isin(times, kept)]
-    times = time[order[first]]
     text = {clock: [table.text[clock][row] for row in order[first]]} if clock in table.text else {}
     numbers = {} if text else {clock: times}
+    rows_of = {signal: order[np.asarray(signals)[order] == signal] for signal in dict.fromkeys(signals)}
     for signal, rows in rows_of.items():
         newest = np.searchsorted(time[rows], times, side="right") - 1
-        numbers[signal] = np.where(newest < 0, np.nan, readings[values[0]][rows[newest]])
-    signal_names = ", ".join(sorted(rows_of))
-    notes = [f"a reading of one signal in a row: {signal_names} each hold until their next reading", *in_turn]
+        numbers[signal] = np.where(newest < 0, np.nan, value[rows[newest]])
+    names = ", ".join(sorted({*signals}))
+    notes = [f"a reading of one signal in a row: {names} each hold until their next reading"]
+    steps = np.concatenate([np.diff(time[rows]) for rows in rows_of.values()])
+    period = float(np.median(steps))
+    even = np.mean(np.abs(steps - period) < CLOCK.evenness * period) >= CLOCK.monotone_share
+    if even and times.size >= 2 * max(map(len, rows_of.values())):
+        says = f"signals are read in turn, each every {period:.3g} s"
+        notes.append(repair.Doubt(f"{says}: average the log over that (--average {period:.3g})"))
     lines = np.arange(1, times.size + 1)
     return replace(table, numbers=numbers, text=text, lines=lines, notes=(*table.notes, *notes))
-
-
-def _rows_in_turn(times_of: Sequence[Floats]) -> tuple[Floats | None, list[str]]:
-    """Return the times of the rows of signals that are read in turn, once a period each, and a doubt; None
-    where they are not."""
-    fewest, most = min(map(len, times_of)), max(map(len, times_of))
-    steps = np.concatenate([np.diff(np.unique(times)) for times in times_of])
-    if fewest <= CLOCK.piece_rows or not steps.size or np.unique(np.concatenate(times_of)).size < 2 * most:
-        return None, []
-    period = float(np.median(steps))
-    if np.mean(np.abs(steps - period) < CLOCK.evenness * period) < CLOCK.monotone_share:
-        return None, []
-
-    def oldest(at: Floats) -> float:
-        """Return the age of the oldest of the newest readings [s]."""
-        newest = (np.searchsorted(times, at, side="right") - 1 for times in times_of)
-        return max(float(np.median(at - times[rows])) for times, rows in zip(times_of, newest))
-
-    kept = min(times_of, key=oldest)
-    says = f"signals are read in turn every {period:g} s"
-    return kept, [repair.Doubt(f"{says}: those of one row are up to {oldest(kept):g} s apart")]
 
 
 class _Repaired(NamedTuple):

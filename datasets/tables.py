@@ -23,7 +23,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from importlib import import_module
-from itertools import chain, count, islice, pairwise
+from itertools import chain, count, islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -65,8 +65,14 @@ _LINE_STAMP = re.compile(
 _TERMINAL = re.compile(r"(?m)^\[?" + _TIME_OF_DAY + r"(?:\]|\s+->)[ \t]*")  # PuTTY, Arduino's monitor
 _ESPHOME = re.compile(r"\[(\d{2}:\d{2}:\d{2}[.\d]*)\].*?: '([^',]+)': Sending state ([-+.\d]+|ON|OFF)\b")
 _OF_HEATERS = ("target", "temp", "pwm")  # of a section of Klipper's statistics; what follows is the host's
-_LABEL = re.compile(r"[A-Za-z_@][^:=,;]{0,63}")
-_LABELLED = re.compile(r"[A-Za-z_@][^:=,;]{0,63}?[:=]([-+.\deE]{1,30}|nan|NaN)")  # a cell, name and number
+# a reading beside its name, which has blanks where it is alone between separators; a target behind it; the
+# name of a section
+_LABELLED = re.compile(
+    r"(?:(?:^|[,;\t]) *(?P<alone>[A-Za-z_@][^:=,;/]{0,63}?) ?[:=](?=[^:=,;]*(?:[,;\t]|$))"
+    r"|(?<!\S)(?P<name>[A-Za-z_@][^:=,;/\s]{0,63}) ?[:=]|/)"
+    r" ?(?P<value>[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?|[+-]?inf|nan|NaN)(?=[\s,;/]|$)"
+    r"|(?<!\S)(?P<section>[^:=,;\s]+):(?=\s)"
+)
 _LABELLED_LINES = 10  # with the same names, that are no chance
 _MOST = 0.9  # share of a column's cells, or of a table's lines, that decide what the others should be
 _TOLERATED = 0.05  # share of rows with too few or too many cells that are left out, as a bad serial line has
@@ -159,9 +165,7 @@ def parse_text(data: bytes, file: str, columns: Sequence[str] | None = None) -> 
         notes = tuple(note for note in notes if "--columns" not in note)
     if layout.separator == " ":  # one run at a time: [ ]+$ would look at each of its blanks again
         text = re.sub(r"(?m)^ | ?\r?$", "", re.sub(r"[ \t]+", " ", text))
-    table = _parse_table(text, replace(layout, notes=notes), file, lambda name: False, _TOLERATED)
-    numbers = {name: values for name, values in table.numbers.items() if not name.startswith(_LEFT_OUT)}
-    return replace(table, numbers=numbers)
+    return _parse_table(text, replace(layout, notes=notes), file, lambda name: False, _TOLERATED)
 
 
 def _new_names(columns: Sequence[str], n: int, file: str | Path) -> list[str]:
@@ -432,21 +436,15 @@ def _labelled_cells(line: str) -> dict[str, str]:
     if stamp is not None:
         cells["time" if stamp[1] else "uptime_s"] = (stamp[1] or stamp[2]).replace(",", ".")
         line = line[stamp.end() :]
-    words: list[str] = []
-    for piece in re.split(r"[,;\t]", line.replace("/", " /")):
-        joined = re.sub(r" ?([:=/]) (?=[-+.\dn])| (=)(?=[-+.\dn])", r"\1\2", piece.strip())
-        words += [joined] if _LABELLED.fullmatch(joined) else joined.split()
-    for word in words:
-        mark = next((sign for sign in "=:" if sign in word), "")
-        name, _, value = word.partition(mark) if mark else ("", "", word)
-        name = name.strip()
-        if last and word.startswith("/") and _NUMBER_CELL.fullmatch(word[1:]):
-            cells[unused(f"{last}_target", cells)] = word[1:]
-        elif _LABEL.fullmatch(name) and (_NUMBER_CELL.fullmatch(value) or value in ("nan", "NaN")):
+    for match in _LABELLED.finditer(line):
+        name, value = match["alone"] or match["name"], match["value"]
+        if match["section"]:
+            section = match["section"]
+        elif name:
             last = f"{section}_{name}" if section and name in _OF_HEATERS else name
             cells[unused(last, cells)] = value
-        elif mark == ":" and not value:
-            section = name
+        elif last:
+            cells[unused(f"{last}_target", cells)] = value
     return cells if len(cells) > (stamp is not None) else {}
 
 
@@ -463,12 +461,12 @@ def _parse_table(
         line, cells = rows.pop()
         notes.append(f"row {line} is the last and was cut off ({len(cells)} of {n} cells): dropped")
     again = [line for line, cells in rows if any(layout.header) and cells == layout.header]
-    for line, cells in rows if tolerated and any(layout.header) else ():
+    for line, cells in rows if any(layout.header) else ():
         is_header = cells[0] and cells[0] in layout.header and _number_share(cells) == 0
         if is_header and cells != layout.header:
             problem = f"the header stands again with other columns: {_quoted_cell(','.join(cells))}"
             raise UserError(problem, file=file, row=line, hint="cut the file there in two")
-    if again and tolerated:  # the logger was started again
+    if again:  # the logger was started again
         notes.append(f"the header stands again in {name_rows(again, 5)}")
         rows = [(line, cells) for line, cells in rows if cells != layout.header]
     ragged = [line for line, cells in rows if len(cells) != n]
@@ -500,7 +498,11 @@ def _parse_table(
     if faults:
         raise _with_command(faults, names) if tolerated else faults[0]  # what may be broken is a log
     if tolerated:
-        notes += _left_empty_by_quality(columns)
+        for column in columns:
+            words = {cell.lower() for cell in column.text or ()}
+            if words > words & _GOOD > {*()}:
+                says = f"{column.name} does not call each reading good"
+                notes.append(Doubt(f"{says}: leave those cells empty that it does not"))
         numbers = [(c.name, cells) for c, cells in zip(columns, cells_of_columns) if c.numbers is not None]
         notes += _open_marks(dict(numbers))
     return _table_of(columns, file, lines, notes)
@@ -521,32 +523,17 @@ def _open_marks(cells_of: Mapping[str, Sequence[str]]) -> list[str]:
     ]
 
 
-def _left_empty_by_quality(columns: Sequence[Column]) -> list[str]:
-    """Leave the readings empty that a column of words behind them does not call good, and return what was."""
-    notes = []
-    for value, quality in pairwise(columns):
-        words = [cell.lower() for cell in quality.text or ()]
-        bad = np.array([word not in _GOOD for word in words])
-        if value.numbers is not None and words and _GOOD & {*words} and bad.any() and bad.mean() < 0.5:
-            value.numbers = np.where(bad, np.nan, value.numbers)
-            which = _quoted_cell(words[int(bad.argmax())])
-            notes.append(f"{value.name}: {bad.sum()} reading(s) left empty, {quality.name} is {which}")
-    return notes
-
-
 def _table_of(columns: Sequence[Column], file: str, lines: NDArray[np.int64], notes: Sequence[str]) -> Table:
-    numbers = {column.name: column.numbers for column in columns if column.numbers is not None}
-    text = {column.name: column.text for column in columns if column.text is not None}
-    lasting = {name: cells for name, cells in text.items() if not name.startswith(_LEFT_OUT)}
+    kept = [column for column in columns if not column.name.startswith(_LEFT_OUT)]
+    numbers = {column.name: column.numbers for column in kept if column.numbers is not None}
+    text = {column.name: column.text for column in kept if column.text is not None}
     all_notes = dict.fromkeys([*notes, *(note for column in columns for note in column.notes)])
-    return Table(file, numbers, lasting, lines, notes=tuple(all_notes))
+    return Table(file, numbers, text, lines, notes=tuple(all_notes))
 
 
 def _cell_rows(text: str, layout: Layout, file: str) -> Iterator[tuple[int, list[str]]]:
     """Yield the first line and the cells of each row that is not empty."""
-    stream = io.StringIO(text, newline="")
-    for _ in range(layout.skip):
-        next(stream, "")
+    stream = islice(io.StringIO(text, newline=""), layout.skip, None)
     reader = csv.reader(stream, delimiter=layout.separator)
     line = layout.skip + 1
     try:
@@ -563,17 +550,18 @@ def read_column(
 ) -> Column:
     """Return what the cells of a column are: numbers, a switch, or words; UserError for a cell that is no
     number among more numbers than are tolerated."""
-    if (plain := _plain_numbers(cells)) is not None:
-        return Column(name, plain)
+    joined = "".join(cells)
+    if joined.isascii() and "_" not in joined:  # which Python takes in numbers, and no file means so
+        with suppress(ValueError):
+            return Column(name, np.fromiter(map(float, cells), dtype=float, count=len(cells)))
     printed = [cell.strip() for cell in cells]
     cells = [_as_typed(cell) for cell in printed]
-    values = _to_numbers(cells)
+    values, wrong = _numbers_of(cells)
     notes = [] if cells == printed else ["numbers are as printed: a long minus, marks between thousands"]
-    wrong = _not_numbers(cells, values)
     if wrong.size and _has_decimal_comma(cells):  # between commas such cells stand in quotes
         pointed = [cell.replace(".", "").replace(",", ".") for cell in cells]  # 1.234,5 is 1234.5
-        values, notes = _to_numbers(pointed), [*notes, _COMMAS]
-        wrong = _not_numbers(cells, values)
+        values, wrong = _numbers_of(pointed)
+        notes.append("numbers have a decimal comma")
     cells_known = len(cells) - sum(cell in _LOST_CELLS for cell in cells)
     if tolerated and wrong.size and (united := _without_unit(name, cells)) is not None:
         return read_column(*united, lines, file, tolerated)
@@ -599,32 +587,11 @@ def read_column(
     raise UserError(problem, file=file, row=int(lines[wrong[0]]), column=name, hint=hint)
 
 
-_COMMAS = "numbers have a decimal comma"
-
-
-def _to_numbers(cells: Sequence[str]) -> NDArray[np.float64]:
-    """Return the numbers of cells, NaN where one is none."""
-    number_words = ["nan" if cell in _LOST_CELLS else cell for cell in cells]
-    if (plain := _plain_numbers(number_words)) is not None:
-        return plain
-    return np.array([float(cell) if _NUMBER_CELL.fullmatch(cell) else np.nan for cell in number_words])
-
-
-def _plain_numbers(cells: Sequence[str]) -> NDArray[np.float64] | None:
-    """Return the numbers of cells that are nothing else, None where one is."""
-    joined = "".join(cells)
-    if not joined.isascii() or "_" in joined:  # which Python takes in numbers, and no file means so
-        return None
-    try:
-        return np.fromiter(map(float, cells), dtype=float, count=len(cells))
-    except ValueError:
-        return None
-
-
-def _not_numbers(cells: Sequence[str], values: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Return which cells are neither numbers nor lost."""
-    at_nan = np.flatnonzero(np.isnan(values)).tolist()
-    return np.array([row for row in at_nan if cells[row] not in _LOST_CELLS], dtype=np.int64)
+def _numbers_of(cells: Sequence[str]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Return the numbers of cells, NaN where one is none, and which cells are neither numbers nor lost."""
+    values = [float(cell) if _NUMBER_CELL.fullmatch(cell) else np.nan for cell in cells]
+    wrong = [row for row, value in enumerate(values) if value != value and cells[row] not in _LOST_CELLS]
+    return np.array(values), np.array(wrong, dtype=np.int64)
 
 
 def _has_decimal_comma(cells: Sequence[str]) -> bool:
@@ -649,11 +616,12 @@ def switched(cells: Sequence[str]) -> NDArray[np.float64] | None:
     """Return the numbers of cells that are numbers or the two states of a switch, NaN where one is lost; None
     where there are other words, or two of one meaning."""
     words = ["" if cell.strip() in _LOST_CELLS else cell.strip().lower() for cell in cells]
-    values = _to_numbers(words)
-    states = {words[row] for row in _not_numbers(words, values)}
+    values, wrong = _numbers_of(words)
+    states = {words[row] for row in wrong}
     if not states <= {*_SWITCH} or len({_SWITCH[state] for state in states}) < len(states):
         return None
-    return np.array([_SWITCH.get(word, value) for word, value in zip(words, values.tolist())], dtype=float)
+    values[wrong] = [_SWITCH[words[row]] for row in wrong]
+    return values
 
 
 def _quoted_cell(cell: str) -> str:
