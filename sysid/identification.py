@@ -384,7 +384,7 @@ def rows_of(model: str, plant: Plant, name: str, run: FreeRun, *, held_out: bool
     """Return a row for each output of a free run; ``held_out``: the plant was fitted without it."""
     structure = plant.scores.structure or network_name(plant) or model
     return [
-        Row(model, structure, name, output, s.rmse, s.fit_percent, s.unit, s.n, baseline.rmse, held_out)
+        Row(name, output, s.rmse, s.fit_percent, s.unit, s.n, model, structure, baseline.rmse, held_out)
         for (output, s), baseline in zip(run.scores.items(), run.naive["no_input"].values())
     ]
 
@@ -405,8 +405,8 @@ def fold_rows(fit: BlackBoxFit) -> list[Row]:
             n, spread = int(np.isfinite(y).sum()), float(np.nanstd(y))
             percent = 100 * (1 - rmse / spread) if spread > 0 else float("nan")
             idle_rmse = float(np.sqrt(np.nanmean(idle**2)))
-            what, unit = (fit.kind, fit.choice.structure.label, fold.label, output), fit.grid.units[output]
-            rows.append(Row(*what, rmse, percent, unit, n, idle_rmse, held_out=True))
+            score = (fold.label, output, rmse, percent, fit.grid.units[output], n)
+            rows.append(Row(*score, fit.kind, fit.choice.structure.label, idle_rmse, held_out=True))
     return rows
 
 

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from importlib import import_module
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -35,11 +35,13 @@ from thermogrip.sysid.blackbox.order_selection import (
     free_run_misses,
 )
 from thermogrip.sysid.data.data_quality import reading_excess
-from thermogrip.sysid.models.model import BlackBox
 from thermogrip.sysid.plant.log_grid import MOVED, Grid, Segment, make_grid, rows_of
 from thermogrip.sysid.plant.plant import Plant
 from thermogrip.sysid.plant.plant_data import SEVERAL, PlantScores, fit_logs
 from thermogrip.sysid.plant.simulation import READING_EVERY
+
+if TYPE_CHECKING:
+    from thermogrip.sysid.blackbox.order_selection import Fitted
 
 #: The module of each kind, which is loaded where that is first fitted.
 _MODULES = {
@@ -209,7 +211,7 @@ def with_refits(fit: BlackBoxFit, n: int = 24, *, seed: int = 0, progress: Progr
     rng = np.random.default_rng(seed)
     most = _AGREES * _error(fit, fit.choice.model)
     misses = _misses(fit)
-    refits: list[BlackBox] = []
+    refits: list[Fitted] = []
     tried = 0
     while len(refits) < n and tried < _TRIES * n and (refits or tried < _HOPELESS):
         if progress is not None:
@@ -251,7 +253,7 @@ def _resampled(
     return tuple(out)
 
 
-def _error(fit: BlackBoxFit, model: BlackBox) -> float:
+def _error(fit: BlackBoxFit, model: Fitted) -> float:
     """Return the free-run error over all logs, the worst output's, in units of its spread."""
     return float(np.max(free_run_errors(model, [Run(s) for s in fit.grid.segments], **_run_settings(fit))))
 

@@ -26,7 +26,7 @@ from scipy.linalg.blas import dsyrk
 from thermogrip.datasets.arrays import Array
 from thermogrip.sysid.blackbox.order_selection import StartPrior, Structure, estimate_starts, with_spread
 from thermogrip.sysid.blackbox.subspace import subspace_family
-from thermogrip.sysid.models.neural import NeuralModel
+from thermogrip.sysid.models.neural import NeuralModel, member_shapes
 from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.log_grid import Grid
 
@@ -67,11 +67,6 @@ class _Member:
     arrays: dict[str, Array]
     x0: Array
     miss: float
-
-
-def _shapes(n: int, m: int, h: int) -> dict[str, tuple[int, ...]]:
-    """Return the shapes of a member's arrays: A, and the weights as they stand in a row."""
-    return {"A": (n, n), "B": (n, m), "c": (n,), "V": (n, h), "W": (h, n), "U": (h, m), "b": (h,)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,7 +192,7 @@ def _averaged(grid: Grid, data: _Data, members: Sequence[_Member]) -> NeuralMode
     # one of fewer states and units has more that do nothing
     arrays: dict[str, Any] = {
         name: np.stack([_grown(some.arrays[name], shape) for some in alike])
-        for name, shape in _shapes(n, len(data.w_middle), h).items()
+        for name, shape in member_shapes(n, len(data.w_middle), h).items()
     }
     model = NeuralModel(
         grid.inputs,
@@ -262,7 +257,7 @@ def _train_member(data: _Data, linear: _Linear, h: int, *, seed: int) -> _Member
     size = max(float(np.sqrt(np.mean(residuals(z0[None], 1.0)[0, len(z0) :] ** 2))), LEAST_ERROR)
     z = _levenberg_marquardt(lambda z: linearise(z, size), lambda z: residuals(z, size), z0)
     miss = float(np.sum(residuals(z[None], 1.0)[0, len(z) :] ** 2))
-    _, *weights = _shapes(n, m, h).items()
+    _, *weights = member_shapes(n, m, h).items()
     *parts, starts = np.split(z, np.cumsum([np.prod(shape) for _, shape in weights]))
     arrays = {name: part.reshape(shape) for (name, shape), part in zip(weights, parts)}
     return _Member({"A": linear.A} | arrays, starts.reshape(-1, n), miss)

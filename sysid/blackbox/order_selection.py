@@ -19,7 +19,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from itertools import pairwise, product
-from typing import Any, NamedTuple, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +27,6 @@ from numpy.typing import NDArray
 from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.parallel import Progress
-from thermogrip.sysid.models.model import BlackBox
 from thermogrip.sysid.models.state_space import (
     StateSpaceModel,
     evaluate_terms,
@@ -36,6 +35,12 @@ from thermogrip.sysid.models.state_space import (
 )
 from thermogrip.sysid.plant.log_grid import MOVED, Grid, Segment
 from thermogrip.sysid.plant.plant_data import HELD_OUT_SHARE, SEVERAL, TAIL
+
+if TYPE_CHECKING:
+    from thermogrip.sysid.models.neural import NeuralModel
+    from thermogrip.sysid.models.polynomial import SindyModel
+
+    Fitted: TypeAlias = StateSpaceModel | SindyModel | NeuralModel
 
 # of log errors, to which a standard error of few parts is limited; over whole logs, of which there are fewer
 ORDER_MARGIN, ORDER_MARGIN_OF_LOGS = float(np.log(1.05)), float(np.log(1.2))
@@ -51,7 +56,7 @@ FEWEST_HELD_OUT_ROWS = 20  # rows of a block that is held out
 _LINEAR_CORRELATION = 0.98
 _FADING_SHARE = 0.25  # of a held-out part: the memory of an offset that fades; a longer one looks lasting
 
-_Fitted = TypeVar("_Fitted", bound=BlackBox)
+_SameKind = TypeVar("_SameKind", bound="Fitted")
 
 
 class Structure(NamedTuple):
@@ -63,7 +68,7 @@ class Structure(NamedTuple):
 
 
 # (grid, only=structures or None for all that a kind of models has) -> the stable models that could be fitted
-Family: TypeAlias = Callable[..., Mapping[Structure, BlackBox]]
+Family: TypeAlias = "Callable[..., Mapping[Structure, Fitted]]"
 
 
 @dataclass(frozen=True)
@@ -76,7 +81,7 @@ class Choice:
     folds: tuple[Fold, ...]  # what was held out
     rmse: Array  # (n_fold, n_y), free-run RMSE of the chosen structure, in the outputs' units
     warmup: int  # rows at the start of each run that set its state and are not scored
-    model: BlackBox  # the structure fitted to all data
+    model: Fitted  # the structure fitted to all data
 
     @property
     def error(self) -> float:
@@ -186,7 +191,7 @@ class StartPrior:
 
 
 def estimate_starts(
-    model: BlackBox, y: Array, u: Array, d: Array, *, dt: float, scale: Array, priors: Sequence[StartPrior]
+    model: Fitted, y: Array, u: Array, d: Array, *, dt: float, scale: Array, priors: Sequence[StartPrior]
 ) -> tuple[Array, Array]:
     """Return the start and the sensors' offsets for each prior."""
     # With x0 = x_rest + s, s ~ N(0, P), offsets o ~ N(0, q^2) that are constant over the log and white
@@ -229,13 +234,7 @@ def priors_of(grid: Grid) -> tuple[StartPrior, ...]:
 
 
 def free_run_errors(
-    model: BlackBox,
-    runs: Sequence[Run],
-    *,
-    dt: float,
-    scale: Array,
-    warmup: int,
-    priors: Sequence[StartPrior],
+    model: Fitted, runs: Sequence[Run], *, dt: float, scale: Array, warmup: int, priors: Sequence[StartPrior]
 ) -> Array:
     """Return the free-run RMSE over the rows after the warm-up, for each prior of the start."""
     refused = np.full((len(priors), len(scale)), np.inf)
@@ -256,7 +255,7 @@ def free_run_errors(
 
 
 def free_run_misses(
-    model: BlackBox, segment: Segment, *, dt: float, scale: Array, warmup: int, priors: Sequence[StartPrior]
+    model: Fitted, segment: Segment, *, dt: float, scale: Array, warmup: int, priors: Sequence[StartPrior]
 ) -> Array:
     """Return the free run less the readings, from the start that each prior makes of the warm-up."""
     memory = np.array([prior.memory for prior in priors])[:, None]
@@ -294,7 +293,7 @@ def choose(grid: Grid, family: Family, *, warmup: int, progress: Progress | None
 
 def _first_sound(
     grid: Grid, family: Family, scored: Mapping[Structure, _Errors], warmup: int
-) -> tuple[Structure, BlackBox] | None:
+) -> tuple[Structure, Fitted] | None:
     """Return the best structure whose fit to all data errs on them no more than it may, and that fit; None
     where there is none."""
     most = ORDER_MARGIN if len(grid.logs) < SEVERAL else ORDER_MARGIN_OF_LOGS
@@ -365,7 +364,7 @@ def _non_dominated(errors: Mapping[Structure, list[Array]], scale: Array) -> lis
 
 def _fit_to_all(
     grid: Grid, family: Family, structure: Structure, errors: _Errors, warmup: int
-) -> tuple[BlackBox, float] | None:
+) -> tuple[Fitted, float] | None:
     """Return the structure fitted to all data and its error on them, of runs that start as held-out ones do;
     None if it is unstable."""
     fitted = family(grid, only=(structure,)).get(structure)
@@ -447,7 +446,7 @@ def held(moves: Array) -> Array:
     return np.cumsum(moves[::-1], axis=0)[::-1]
 
 
-def with_spread(model: _Fitted, grid: Grid, starts: Sequence[Array]) -> _Fitted:
+def with_spread(model: _SameKind, grid: Grid, starts: Sequence[Array]) -> _SameKind:
     """Return the model with the covariance of its state over the training data."""
     rows = [model.states(x0[None], s.u[None], s.d[None])[0] for x0, s in zip(starts, grid.segments)]
     x = np.concatenate(rows)

@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
 from thermogrip.datasets.arrays import Array
-from thermogrip.datasets.errors import UserError, known_names
+from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.files import atomic_path
 from thermogrip.datasets.log_files import Logs, as_logs
 from thermogrip.datasets.parallel import Progress
@@ -221,6 +221,11 @@ class Chain:
         """The steps (n, n_walker, n_dim) behind the burn-in."""
         return self.steps[min(int(np.ceil(3 * np.max(self.tau))), len(self.steps) // 2) :]
 
+    @property
+    def ess(self) -> Array:
+        """Effective number of samples (n_dim,) behind the burn-in, by the autocorrelation."""
+        return np.asarray(self.settled[..., 0].size / self.tau)
+
     def kept(self, n: int) -> Array:
         """Return about ``n`` rows (n, n_dim), spread evenly over walkers and steps behind the burn-in."""
         # walker by walker: a stride over all walkers of a step may meet the same few at every step
@@ -293,18 +298,9 @@ class Posterior:
     free: tuple[str, ...]  # all parameters, in the order of ``samples``
     sampled: tuple[str, ...]  # those that emcee moved; the others were integrated out
     samples: Array  # (n, n_free), whole parameter vectors in natural units
-    units: dict[str, str]
-    fitted: dict[str, float]  # the plant's own values
     chain: Chain  # of the sampled parameters, in natural units
-    tau: dict[str, float]  # autocorrelation time of each sampled parameter [steps]
-    n_steps: int  # length of the chain
-    converged: bool  # whether it is longer than 50 tau throughout
-    acceptance: float  # share of accepted moves
-    quantiles: dict[str, tuple[float, float, float]]  # 5, 50 and 95 % of each free parameter
-    likelihood: str  # what was assumed about the residuals, in words
+    sampling: Sampling  # its verdict, and what was assumed about the residuals
     off_centre: float  # of the medians from the fitted values, in standard deviations, at most
-    verdict: str  # one sentence
-    ess: dict[str, float]  # effective number of samples of each sampled parameter, by its autocorrelation
 
     def inference_data(self) -> Any:
         """Return the chain and, as ``posterior_whole``, the whole samples: arviz ``InferenceData``."""
@@ -312,11 +308,12 @@ class Posterior:
             warnings.simplefilter("ignore", FutureWarning)
             arviz: Any = import_module("arviz")
         chain = np.moveaxis(self.chain.steps, 1, 0)  # arviz wants (chain, draw)
-        about = {"likelihood": self.likelihood, "verdict": self.verdict, "converged": int(self.converged)}
+        how = self.sampling
+        about = {"likelihood": how.likelihood, "verdict": how.verdict, "converged": int(how.converged)}
         data = arviz.from_dict(
             posterior={name: chain[:, :, i] for i, name in enumerate(self.sampled)},
             sample_stats={"lp": self.chain.log_posterior.T},
-            attrs=about | {f"tau_{name}": tau for name, tau in self.tau.items()},
+            attrs=about | {f"tau_{name}": tau for name, tau in how.tau.items()},
         )
         whole = {name: self.samples[None, :, i] for i, name in enumerate(self.free)}
         data.add_groups({"posterior_whole": arviz.dict_to_dataset(whole)}, warn_on_custom_groups=False)
@@ -333,7 +330,6 @@ def sample_posterior(
     plant: Plant,
     logs: Logs,
     *,
-    free: Sequence[str] | None = None,
     max_steps: int = 4000,
     n_samples: int = 200,
     seed: int = 0,
@@ -347,9 +343,6 @@ def sample_posterior(
         A fitted network, or model of the user's own with priors.
     logs : Log, DataFrame, str, Path, or sequence of them
         The logs of the fit.
-    free : sequence of str, optional
-        Parameters that emcee samples; default the six that the data know best relative to the prior. All
-        other free parameters of the plant are integrated out, and fitted to each sample.
     max_steps : int, optional
         Give up after so many steps of the ensemble; the record is then marked as not converged.
     n_samples : int, optional
@@ -368,13 +361,13 @@ def sample_posterior(
     Raises
     ------
     UserError
-        If the plant has no free parameter or no prior, a name in ``free`` is not free, or a log does not fit.
+        If the plant has no free parameter or no prior, or a log does not fit.
 
     Examples
     --------
     >>> plant = fit_network("gripper", logs)  # doctest: +SKIP
     >>> plant, posterior = sample_posterior(plant, logs)  # minutes  # doctest: +SKIP
-    >>> posterior.converged, plant.draw(1).values["flow"]  # doctest: +SKIP
+    >>> posterior.chain.converged, plant.draw(1).values["flow"]  # doctest: +SKIP
     """
     report = progress or (lambda fraction, what: None)
     report(0.0, "averaging the logs")
@@ -385,7 +378,7 @@ def sample_posterior(
     uncertainty = score_covariance(problem, z)
     target = RandomizedMap(problem, z, uncertainty)
     spread = target.covariance
-    sampled = _choose(plant, free, spread)
+    sampled = sorted(np.argsort(np.diag(spread))[: DRAW.n_sampled].tolist())
     rng = np.random.default_rng(seed)
     n_walkers = 2 * len(sampled) + 4
     draws = rng.multivariate_normal(z[sampled], spread[np.ix_(sampled, sampled)], size=8 * n_walkers)
@@ -409,9 +402,9 @@ def sample_posterior(
     sampled_z = chain.kept(n_samples)
     whole = target.draws(len(sampled_z), seed=seed, held=sampled_z, columns=sampled)
     record = _record(plant, problem, z, sampled, chain, whole, uncertainty)
-    report(1.0, record.verdict)
-    sampling = Sampling(record.verdict, record.converged, record.likelihood, record.tau)
-    return replace(plant, samples=record.samples, scores=replace(plant.scores, posterior=sampling)), record
+    report(1.0, record.sampling.verdict)
+    scores = replace(plant.scores, posterior=record.sampling)
+    return replace(plant, samples=record.samples, scores=scores), record
 
 
 def with_draws(
@@ -443,18 +436,6 @@ def fit_problem(plant: Plant, logs: Sequence[Log]) -> Problem:
     return replace(problem, tau=np.maximum(tau, 1.0))
 
 
-def _choose(plant: Plant, free: Sequence[str] | None, spread: Array) -> list[int]:
-    """Return which free parameters are sampled."""
-    if free is None:
-        return sorted(np.argsort(np.diag(spread))[: DRAW.n_sampled].tolist())
-    for name in free:
-        if name not in plant.free:
-            raise UserError(f"{name!r} is not a free parameter", hint=known_names(name, plant.free))
-    if not free:
-        raise UserError("no parameter to sample", hint=f"choose from {', '.join(plant.free)}")
-    return [plant.free.index(name) for name in dict.fromkeys(free)]
-
-
 def _record(
     plant: Plant,
     problem: Problem,
@@ -471,7 +452,6 @@ def _record(
     steps = problem.parameters(full.reshape(-1, z.size))[:, [problem.free[i] for i in sampled]]
     drawn = replace(chain, steps=steps.reshape(chain.steps.shape))
     samples = problem.parameters(whole)[:, list(problem.free)]
-    quantiles = np.quantile(samples, [0.05, 0.5, 0.95], axis=0).T.tolist()
     length = len(chain.steps) / float(np.max(chain.tau))
     verdict = f"{'converged' if chain.converged else 'not converged'}: {length:.0f} autocorrelation times"
     units = [
@@ -485,20 +465,6 @@ def _record(
         f"{uncertainty.coarsening:.1f} times less information than the fit's weights assume; "
         "sensor offsets and start of each log allowed for"
     )
-    return Posterior(
-        free=plant.free,
-        sampled=names,
-        samples=samples,
-        units={name: plant.units.get(name, "1") for name in plant.free},
-        fitted={name: plant.values[name] for name in plant.free},
-        chain=drawn,
-        tau=dict(zip(names, chain.tau.tolist())),
-        n_steps=len(chain.steps),
-        converged=chain.converged,
-        acceptance=chain.acceptance,
-        quantiles={name: (low, mid, high) for name, (low, mid, high) in zip(plant.free, quantiles)},
-        likelihood=about,
-        off_centre=float(np.max(np.abs(np.median(whole, axis=0) - z) / whole.std(axis=0))),
-        verdict=verdict,
-        ess={name: drawn.settled[..., 0].size / tau for name, tau in zip(names, chain.tau.tolist())},
-    )
+    sampling = Sampling(verdict, chain.converged, about, dict(zip(names, chain.tau.tolist())))
+    off_centre = float(np.max(np.abs(np.median(whole, axis=0) - z) / whole.std(axis=0)))
+    return Posterior(plant.free, names, samples, drawn, sampling, off_centre)

@@ -32,6 +32,11 @@ from thermogrip.sysid.models.state_space import dot, join_columns
 _RAILS = ("low", "high")
 
 
+def member_shapes(n: int, m: int, h: int) -> dict[str, tuple[int, ...]]:
+    """Return the shapes of a member's arrays: A, and the weights as they stand in a row."""
+    return {"A": (n, n), "B": (n, m), "c": (n,), "V": (n, h), "W": (h, n), "U": (h, m), "b": (h,)}
+
+
 @dataclass(frozen=True, eq=False)
 class NeuralModel(BlackBox):
     """A mean of K small neural state-space models in scaled units."""
@@ -68,9 +73,7 @@ class NeuralModel(BlackBox):
         h = self.b.shape[1]
         m = len(self.inputs) + len(self.disturbances)
         n_y = len(self.outputs)
-        shapes: dict[str, tuple[int, ...]] = {"A": (n, n), "B": (n, m), "c": (n,), "V": (n, h)}
-        shapes |= {"W": (h, n), "U": (h, m), "b": (h,)}
-        shapes = {name: (members, *shape) for name, shape in shapes.items()}
+        shapes = {name: (members, *shape) for name, shape in member_shapes(n, m, h).items()}
         shapes |= dict.fromkeys(("y_middle", "y_size", "low", "high"), (n_y,))
         shapes |= dict.fromkeys(("w_middle", "w_size", "reach"), (m,))
         for name, shape in shapes.items():

@@ -84,14 +84,14 @@ _Ends = tuple[OpenLow, OpenHigh]
 
 @dataclass(frozen=True)
 class HeldOut:
-    """The free run of one output over one log that the fit had not seen; n scored samples."""
+    """The free run of one output over one log that the fit had not seen."""
 
-    log: str
+    log: str  # what was simulated
     output: str
     rmse: float
     fit_percent: float
-    unit: str
-    n: int
+    unit: str  # of the output
+    n: int  # scored samples
 
 
 @dataclass(frozen=True)

@@ -97,14 +97,6 @@ def predict(
     return out
 
 
-class _LevelStart(NamedTuple):
-    """A start at rest."""
-
-    level: float  # temperature of the reference
-    y: Array  # mean readings
-    d: Array  # mean ambients
-
-
 class _GapInputs(NamedTuple):
     """What acts through a gap, a step of ``dt`` [s] each."""
 
@@ -133,18 +125,19 @@ def _first_reading(stretch: Stretch) -> Array:
 
 
 def _first_start(plant: PlantData, p: Array, stretch: Stretch, warmup: float) -> Start:
-    level = _start_level(plant, stretch, warmup)
+    at_rest = _readings_at_rest(plant, stretch, warmup)
     y_offset = np.array([plant.offsets.get(name, 0.0) for name in plant.outputs])
     d_offset = np.array([plant.offsets.get(name, 0.0) for name in plant.disturbances])
     zero = np.zeros(plant.model.n_x)
-    if level is None:
+    if at_rest is None:
         start = Start(zero, zero, y_offset, d_offset, None, "started from its warm-up")
         x0 = _at_rest(plant.model, p[None], stretch, start)[0]
         start = _corrected(plant, p, stretch, replace(start, x0=x0), warmup, offsets=True)
         # the state at rest for other parameters is that of readings without the offsets that were found
         start = replace(start, shift=start.x0 - _at_rest(plant.model, p[None], stretch, start)[0])
         return replace(start, fading=start.y_offset - y_offset, memory=plant.offset_memory, warm=warmup / 2)
-    T0, y_mean, d_mean = level
+    y_mean, d_mean = at_rest
+    T0 = float(y_mean[plant.outputs.index(str(plant.reference))])
     y_own = np.array([plant.nuisance.get(name, 0.0) > 0 for name in plant.outputs], dtype=bool)
     d_own = np.array([plant.nuisance.get(name, 0.0) > 0 for name in plant.disturbances], dtype=bool)
     y_offset = np.where(y_own, y_mean - T0, y_offset)
@@ -154,8 +147,8 @@ def _first_start(plant: PlantData, p: Array, stretch: Stretch, warmup: float) ->
     return Start(x0, zero, y_offset, d_offset, T0, f"started at rest at {T0:.2f} degC")
 
 
-def _start_level(plant: PlantData, stretch: Stretch, warmup: float) -> _LevelStart | None:
-    """Return how a log starts at rest, None where it does not."""
+def _readings_at_rest(plant: PlantData, stretch: Stretch, warmup: float) -> tuple[Array, Array] | None:
+    """Return the mean readings and ambients of a log that starts at rest, None of another."""
     if plant.reference is None or not plant.disturbances:
         return None
     seconds = min(warmup, START.rest_s)
@@ -166,9 +159,7 @@ def _start_level(plant: PlantData, stretch: Stretch, warmup: float) -> _LevelSta
     # what another reads beside it is its offset in this log
     y = np.nanmean(stretch.y[early], axis=0)
     d = stretch.d[: max(1, round(seconds / plant.dt))].mean(axis=0)
-    if np.ptp(np.concatenate([y, d])) > START.rest_band:
-        return None
-    return _LevelStart(float(y[plant.outputs.index(plant.reference)]), y, d)
+    return None if np.ptp(np.concatenate([y, d])) > START.rest_band else (y, d)
 
 
 def _corrected(

@@ -203,14 +203,16 @@ def _judged(run: FreeRun, error: Array, by_inputs: InputEffect | None) -> FreeRu
     """Return the run with tests of its error (n, n_y), NaN where not scored, and the verdict on the plant."""
     plant, log = run.plant, run.measured
     simulated, scored = columns(run.log, plant.outputs), column(run.log, "scored") > 0
-    residual = residual_correlations(plant, cut_stretches(plant, log), simulated, scored, warmup=run.warmup)
+    band = free_run_band(plant, log, run.log, warmup=run.warmup)
+    residual = residual_correlations(
+        plant, cut_stretches(plant, log), simulated, scored, warmup=run.warmup, drawn=band.drawn
+    )
     with np.errstate(over="ignore", invalid="ignore"):
         offsets = np.nanmean(error, axis=0) ** 2 / np.maximum(np.nanmean(error**2, axis=0), 1e-300)
     causes: dict[str, dict[Cause, float]] = {
         name: {"start": residual.start.get(name, 0.0), "offset": float(share)}
         for name, share in zip(plant.outputs, offsets)
     }
-    band = free_run_band(plant, log, run.log, warmup=run.warmup)
     of_readings = _compare(plant, log, run.log)
     rows = replace(fit_logs([log])[0], start_s=float(log["time"].values[np.argmax(scored)]))
     verdict = judge(
@@ -221,7 +223,7 @@ def _judged(run: FreeRun, error: Array, by_inputs: InputEffect | None) -> FreeRu
         by_inputs=by_inputs,
         seen=bool(said_of_fit(plant.fitted_to, rows)),
     )
-    return replace(run, residual=residual, verdict=verdict, stated=band)
+    return replace(run, residual=residual, verdict=verdict, stated=replace(band, drawn=()))
 
 
 def score(measured: Array, simulated: Array, unit: str = "degC") -> Score:

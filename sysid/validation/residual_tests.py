@@ -86,10 +86,17 @@ class ResidualCorrelations:
 
 
 def residual_correlations(
-    plant: Plant, stretches: Sequence[Stretch], run: Array, scored: Mask, *, warmup: float
+    plant: Plant,
+    stretches: Sequence[Stretch],
+    run: Array,
+    scored: Mask,
+    *,
+    warmup: float,
+    drawn: Sequence[Array] = (),
 ) -> ResidualCorrelations:
-    """Test the residual of the free ``run`` (n, n_y) of a plant over the stretches of a log, at all rows;
-    empty where it diverged, has no residual, or has fewer than twenty blocks."""
+    """Test the residual of the free ``run`` (n, n_y) of a plant over the stretches of a log, at all rows,
+    beside those of draws of its parameters; empty where it diverged, has no residual, or has fewer than
+    twenty blocks."""
     residual = _residual(np.concatenate([stretch.y for stretch in stretches]), run, scored)
     rms = np.sqrt(np.nanmean(residual**2, axis=0)) if residual is not None else np.zeros(1)
     if residual is None or not rms.all():
@@ -98,7 +105,10 @@ def residual_correlations(
     read = np.isfinite(residual)
     if min(len(np.unique(block[rows])) for rows in read.T) < _SCORE_TEST.fewest_blocks:
         return ResidualCorrelations({}, {})
-    drawn = _draw_changes(plant, stretches, run, warmup)
+    # one sd all together; a draw that diverges has no information on small changes
+    moves = (other - run for other in drawn[: _SCORE_TEST.draws])
+    changes = [change for change in moves if np.isfinite(change).all()]
+    drawn_changes = np.array(changes).reshape(-1, *run.shape) / np.sqrt(max(1, len(changes)))
     starts = _start_changes(plant, stretches, warmup, block, read)
     signals = _signals(plant, stretches, run, width)
     tests: dict[str, dict[str, CorrelationTest]] = {}
@@ -106,11 +116,11 @@ def residual_correlations(
     for j, name in enumerate(plant.outputs):
         means = partial(_block_means, block=block, read=read[:, j])
         modes = starts[j] @ np.linalg.eigh(starts[j].T @ starts[j])[1] / rms[j]
-        null = _Null.of(
+        null = _Null(
             block=np.unique(block[read[:, j]]),
             residual=means(residual[:, j] / rms[j]),
             starts=modes[:, np.abs(modes).max(axis=0, initial=0.0) > _SCORE_TEST.least_start],
-            drawn=means(drawn[:, j] / rms[j]),
+            drawn=means(drawn_changes[:, :, j].T / rms[j]),
         )
         start_share[name] = null.start_share()
         tests[name] = {
@@ -153,16 +163,6 @@ def _block_means(values: Array, block: NDArray[np.int_], read: Mask) -> Array:
     sums = np.zeros((len(count), *values.shape[1:]))
     np.add.at(sums, place, values[read])
     return np.asarray(sums / count.reshape(-1, *[1] * (values.ndim - 1)))
-
-
-def _draw_changes(plant: Plant, stretches: Sequence[Stretch], run: Array, warmup: float) -> Array:
-    """Return the changes (rows, n_y, n_draw) of draws of the parameters, one sd all together."""
-    changes = []
-    for k in range(1, _SCORE_TEST.draws + 1 if plant.uncertain else 1):
-        change = plant.draw(k).over(stretches, warmup)[0] - run
-        if np.isfinite(change).all():  # a draw that diverges has no information on small changes
-            changes.append(change)
-    return np.stack(changes, axis=2) / np.sqrt(len(changes)) if changes else np.zeros((*run.shape, 0))
 
 
 def _start_changes(
@@ -218,25 +218,16 @@ def _signals(plant: Plant, stretches: Sequence[Stretch], run: Array, width: floa
     return out
 
 
-@dataclass(frozen=True, eq=False)
 class _Null:
     """The residual of one output in blocks (n,), and what it is made of where the model is right."""
 
-    residual: Array
-    columns: Array  # N, (n, q)
-    starts: Array  # those of them that are starts
-    inverse: Array  # V^-1
-
-    @classmethod
-    def of(cls, *, block: NDArray[np.int_], residual: Array, starts: Array, drawn: Array) -> _Null:
-        """Learn the noise of a residual."""
+    def __init__(self, *, block: NDArray[np.int_], residual: Array, starts: Array, drawn: Array) -> None:
         offset = np.full((len(residual), 1), _SCORE_TEST.offset_sd)
         columns = np.hstack([offset, starts, drawn])
         columns /= np.maximum(1.0, np.abs(columns).max(axis=0) / _SCORE_TEST.offset_sd)
-        noise = learn_noise(block, residual, columns)
-        return cls(
-            residual, columns, columns[:, 1 : 1 + starts.shape[1]], np.linalg.inv(noise + columns @ columns.T)
-        )
+        self.residual, self.columns = residual, columns  # N, (n, q)
+        self.starts = columns[:, 1 : 1 + starts.shape[1]]
+        self.inverse = np.linalg.inv(learn_noise(block, residual, columns) + columns @ columns.T)  # V^-1
 
     def start_share(self) -> float:
         """Return the share of the squared residual that is due to starts."""

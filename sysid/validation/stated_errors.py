@@ -39,7 +39,7 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log, column, columns, log_name
 from thermogrip.sysid.plant.log_grid import cut_stretches, match_logs
 from thermogrip.sysid.plant.plant import WARMUP, Plant
-from thermogrip.sysid.plant.plant_data import RUN_GAIN_SD, SEVERAL, TAIL, ExpectedError
+from thermogrip.sysid.plant.plant_data import RUN_GAIN_SD, SEVERAL, TAIL, ExpectedError, HeldOut
 from thermogrip.sysid.plant.simulation import find_starts
 
 if TYPE_CHECKING:
@@ -66,6 +66,7 @@ class Band:
     own_error: str = "the error of the fit"  # how the plant's own error was estimated, in words
     expected: dict[str, float] = field(default_factory=dict)  # rms error of the run that it describes
     likely: dict[str, tuple[float, float]] = field(default_factory=dict)  # which 9 of 10 runs lie within
+    drawn: Sequence[Array] = ()  # the free run (n, n_y) of each draw
 
 
 def expected_error(errors: Sequence[float], gain_effect: float) -> ExpectedError:
@@ -105,9 +106,8 @@ def free_run_band(
     taken = draws if plant.uncertain else 0
     stretches = cut_stretches(plant, match_logs(plant, [log])[0][0]) if taken else []
     run = columns(simulated, plant.outputs)
-    variances = np.zeros((simulated.sizes["time"], len(plant.outputs)))
-    for k in range(1, taken + 1):
-        variances += (plant.draw(k).over(stretches, warmup)[0] - run) ** 2 / taken
+    drawn = [plant.draw(k).over(stretches, warmup)[0] for k in range(1, taken + 1)]
+    variances = sum(((other - run) ** 2 / taken for other in drawn), np.zeros(run.shape))
     scored = np.asarray(simulated["scored"].values) > 0
     half = {}
     inside = {}
@@ -147,7 +147,7 @@ def free_run_band(
         words += f"{'one log' if len(plant.logs) == 1 else 'two logs'} cannot show it)"
     if is_unlike:
         words += ", wider because this run is unlike the fit (range of the readings)"
-    return Band(level, half, inside, taken, words, expected, likely)
+    return Band(level, half, inside, taken, words, expected, likely, drawn)
 
 
 def part_errors(plant: Plant, name: str) -> list[float]:
@@ -337,17 +337,11 @@ FAR_FROM_PRIOR = 3.3  # sd: beyond it lies one parameter of a right network in a
 
 
 @dataclass(frozen=True)
-class Row:
+class Row(HeldOut):
     """One line of the table: one model, one log, one output."""
 
     model: str  # kind of the candidate
     structure: str  # its orders, delays or network
-    log: str  # what was simulated
-    output: str
-    rmse: float  # of the free run
-    fit_percent: float
-    unit: str  # of the output
-    n: int  # scored samples
     no_input_rmse: float  # the same of the no-input baseline
     held_out: bool  # whether the model was fitted without these rows
 

@@ -30,7 +30,7 @@ from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.linearise import linearise_plant
 from thermogrip.sysid.plant.log_grid import roles_of
 from thermogrip.sysid.plant.plant import Plant
-from thermogrip.sysid.plant.plant_data import ExpectedError, PlantScores
+from thermogrip.sysid.plant.plant_data import ExpectedError, PlantScores, Sampling
 from thermogrip.sysid.validation.free_run import free_run, usual_warmup
 from thermogrip.sysid.validation.stated_errors import Row, Standing, Verdict
 
@@ -47,7 +47,7 @@ class Covered:
 
 
 def row(model: str) -> Row:
-    return Row(model, "order 1", "log a", "t1", 0.1234, 91.5, "degC", 77, 2.5, True)
+    return Row("log a", "t1", 0.1234, 91.5, "degC", 77, model, "order 1", 2.5, True)
 
 
 def found_of(model: str = "network", **changes: Any) -> SimpleNamespace:
@@ -255,9 +255,7 @@ def test_a_network_that_was_asked_for_and_not_fitted_is_an_error(
     assert room.bench.run("identify", "good.csv", "--out", "p.json").code == 0  # nobody asked for one
 
 
-RECORD = SimpleNamespace(
-    converged=True, verdict="well sampled", tau={"U": 9.0}, n_steps=500, likelihood="normal"
-)
+SAMPLING = Sampling("well sampled", True, "normal", {"U": 9.0})
 
 
 @pytest.mark.parametrize(
@@ -272,7 +270,9 @@ RECORD = SimpleNamespace(
 def test_a_posterior_is_an_answer_of_yes_where_it_has_converged(
     converged: bool | None, model: str, code: int, said: str, room: SimpleNamespace, stand_in: StandIn
 ) -> None:
-    record = SimpleNamespace(**{**vars(RECORD), "converged": converged})
+    sampling = replace(SAMPLING, converged=bool(converged))
+    chain = SimpleNamespace(converged=converged, steps=range(500))
+    record = SimpleNamespace(sampling=sampling, chain=chain)
     outcome: Any = UserError("at a bound")
     if converged is not None:
 
@@ -288,7 +288,7 @@ def test_a_posterior_is_an_answer_of_yes_where_it_has_converged(
     assert f"{said}" in shown
     assert room.fits[0].draws == 0
     used = model == "network" and converged is not None
-    assert json.loads(done.out)["posterior"] == (vars(record) if used else None)
+    assert json.loads(done.out)["posterior"] == (vars(sampling) | {"n_steps": 500} if used else None)
     assert room.sections[0].args[3] is (record if used else None)
     if model == "network":
         assert (sampled[0].args[0], sampled[0].seed) == (BOARD, 5)

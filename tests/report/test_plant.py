@@ -22,7 +22,7 @@ from thermogrip.sysid.experiment.information import plant_from_prior
 from thermogrip.sysid.models.network import load_network
 from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.plant import Plant
-from thermogrip.sysid.plant.plant_data import Identifiability
+from thermogrip.sysid.plant.plant_data import Identifiability, Sampling
 from thermogrip.sysid.validation.free_run import FreeRun, free_run
 from thermogrip.sysid.validation.stated_errors import Band
 
@@ -202,9 +202,9 @@ def test_parameters_answer_for_themselves_and_the_sampler_only_where_it_failed()
     names = board.free
     samples = np.random.default_rng(0).normal(3.0, 0.5, (400, len(names)))
     record: Any = SimpleNamespace(
-        samples=samples, free=names, units={}, fitted={}, tau={names[0]: 10.0}, sampled=names[:1],
-        likelihood="normal", n_steps=500, acceptance=0.3, off_centre=0.123, converged=True,
-        verdict="converged: 50 autocorrelation times", ess={names[0]: 812.4},
+        samples=samples, free=names, sampled=names[:1], off_centre=0.123,
+        sampling=Sampling("converged: 50 autocorrelation times", True, "normal", {names[0]: 10.0}),
+        chain=SimpleNamespace(steps=range(500), converged=True, acceptance=0.3, ess=np.array([812.4])),
     )  # fmt: skip
     known = plant.parameters_section(board, record)
     assert (known.verdict, known.tone) == (section.verdict, "plain")
@@ -215,8 +215,8 @@ def test_parameters_answer_for_themselves_and_the_sampler_only_where_it_failed()
     assert table.rows[0][3:5] == (pytest.approx(3.0, abs=0.1), pytest.approx(0.5, abs=0.1))
     assert (table.rows[0][7], table.rows[1][7]) == (812, None)
     assert "500 steps, converged: 50 autocorrelation times, 30 % accepted" in part(known, 4, Text).text
-    record.converged = False
-    record.verdict = "not converged: 9 autocorrelation times"
+    record.chain.converged = False
+    record.sampling = replace(record.sampling, verdict="not converged: 9 autocorrelation times")
     unsure = plant.parameters_section(board, record)
     assert unsure.tone == "warn"
     assert unsure.verdict.endswith("The sampler has not converged: 9 autocorrelation times.")

@@ -468,7 +468,7 @@ def test_no_part_held_out_tests_an_input_of_one_pulse_and_one_that_stays_on_is_o
 def table(shares, held=True):
     """Rows by candidate and log, of an error of ``share`` times that of a model without input, 2 K."""
     return [
-        stated_errors.Row(model, "", log, "t", 2.0 * share, 90.0, "K", 100, 2.0, held)
+        stated_errors.Row(log, "t", 2.0 * share, 90.0, "K", 100, model, "", 2.0, held)
         for model, logs in shares.items()
         for log, share in logs.items()
     ]

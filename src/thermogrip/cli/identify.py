@@ -162,7 +162,7 @@ def identify(
     if dynamics is None:
         console.say(nothing)
     if posterior:
-        console.say(lost if record is None else record.verdict)
+        console.say(lost if record is None else record.sampling.verdict)
     console.say(f"wrote {out}")
     more = {"dynamics": None if dynamics is None else dynamics.to_dict(), "repairs": repairs}
     console.answer(_identified(identified, plant, record, out) | more)
@@ -170,7 +170,7 @@ def identify(
         console.warn(f"in doubt: {doubt}")
     if (unprinted := len(identified.doubts) - MOST_DOUBTS) > 0:
         console.warn(f"in doubt: {unprinted} more, which --json lists")
-    if posterior and (record is None or not record.converged):
+    if posterior and (record is None or not record.chain.converged):
         return cli.ANSWER_IS_NO
     if identified.good:
         return cli.Done("good")
@@ -313,9 +313,7 @@ def _identified(found: Identification, plant: Plant, record: Posterior | None, o
     """Return the JSON answer of ``identify``."""
     sampled = None
     if record is not None:
-        sampled = {
-            key: getattr(record, key) for key in ("converged", "verdict", "tau", "n_steps", "likelihood")
-        }
+        sampled = vars(record.sampling) | {"n_steps": len(record.chain.steps)}
     return {
         "model": found.model,
         "network": getattr(plant.model, "name", None),

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from thermogrip.datasets.arrays import Array
-from thermogrip.datasets.errors import UserError, known_names
 from thermogrip.datasets.schema import column, log_name, names
 from thermogrip.report.charts import (
     DASHES,
@@ -294,16 +293,17 @@ def parameters_section(plant: Plant, record: Posterior | None = None) -> Section
         evidence.append(Text(f"These cannot be estimated separately: {'; '.join(identifiability.flat)}."))
         tone = "warn"
     if record is not None:
-        tone = tone if record.converged else "warn"
-        verdict += "" if record.converged else f" The sampler has {record.verdict}."
+        chain, sampling = record.chain, record.sampling
+        tone = tone if chain.converged else "warn"
+        verdict += "" if chain.converged else f" The sampler has {sampling.verdict}."
         caption = f"{len(record.samples)} samples of what emcee moved, pair by pair; grey lines: the fit."
         evidence += [
-            Picture(corner_figure(record), caption),
-            Text(_sentence(record.likelihood)),
+            Picture(corner_figure(plant, record), caption),
+            Text(_sentence(sampling.likelihood)),
             Text(
                 f"emcee moved {', '.join(record.sampled)}, which have an effective number of samples (ESS); "
                 "the others were integrated out and fitted to each sample. "
-                f"{record.n_steps} steps, {record.verdict}, {100 * record.acceptance:.0f} % accepted. "
+                f"{len(chain.steps)} steps, {sampling.verdict}, {100 * chain.acceptance:.0f} % accepted. "
                 f"Medians lie within {record.off_centre:.2f} standard deviations of the fitted values."
             ),
         ]
@@ -347,10 +347,11 @@ def parameter_table(plant: Plant, record: Posterior | None = None) -> Cells:
         rows.append([name, plant.values[name], plant.units.get(name, "1"), *ends])
     if record is not None:
         head[3:3], head[7:7] = ["mean", "sd"], ["ESS"]
+        effective = dict(zip(record.sampled, record.chain.ess.tolist()))
         for k, row in enumerate(rows):
             draws = record.samples[:, k]
             row[3:3] = [float(draws.mean()), float(draws.std(ddof=1))]
-            ess = record.ess.get(row[0])
+            ess = effective.get(row[0])
             row[7:7] = [None if ess is None else round(ess)]
     return tuple(head), tuple(map(tuple, rows))
 
@@ -420,47 +421,41 @@ def _sentence(text: str) -> str:
     return text + ("" if text.endswith(".") else ".")
 
 
-def corner_figure(posterior: Posterior, names: Sequence[str] | None = None) -> Figure:
-    """Draw the samples of each pair of parameters, with marginals and the fitted values; UserError if a name
-    is not a free parameter."""
+def corner_figure(plant: Plant, record: Posterior) -> Figure:
+    """Draw the samples of each pair of parameters that emcee moved, with marginals and the fitted values."""
     from matplotlib.figure import Figure
 
-    names = posterior.sampled if names is None else tuple(names)
-    for name in names:
-        if name not in posterior.free:
-            raise UserError(f"{name!r} was not sampled", hint=known_names(name, posterior.free))
-    columns = posterior.samples[:, [posterior.free.index(name) for name in names]]
+    names = record.sampled
+    columns = record.samples[:, [record.free.index(name) for name in names]]
     n = len(names)
     # without pyplot: no window system is asked for, and nothing global is left behind
     figure = Figure(figsize=(1.7 * n + 0.6, 1.7 * n + 0.6), layout="constrained")
     axes = figure.subplots(n, n, squeeze=False)
     for i in range(n):
         for j in range(n):
-            _corner_panel(axes[i, j], columns, names, posterior, i, j)
+            _corner_panel(axes[i, j], columns, names, plant, i, j)
     return figure
 
 
-def _corner_panel(
-    ax: Any, columns: Array, names: Sequence[str], posterior: Posterior, i: int, j: int
-) -> None:
+def _corner_panel(ax: Any, columns: Array, names: Sequence[str], plant: Plant, i: int, j: int) -> None:
     """Draw row i, column j of the corner figure."""
     if j > i:
         ax.set_axis_off()
         return
     ax.tick_params(labelsize=6)
     ax.locator_params(axis="x", nbins=3)
-    ax.axvline(posterior.fitted[names[j]], color="0.6", lw=0.8)
+    ax.axvline(plant.values[names[j]], color="0.6", lw=0.8)
     if i == j:
         ax.hist(columns[:, i], bins=25, color="tab:blue", alpha=0.6)
-        for edge in (posterior.quantiles[names[i]][0], posterior.quantiles[names[i]][2]):
+        for edge in np.quantile(columns[:, i], (0.05, 0.95)).tolist():
             ax.axvline(edge, color="tab:blue", lw=0.8, ls="--")
         ax.set_yticks([])
     else:
         # a ridge where two parameters trade off: neither is known well, a combination is
         ax.plot(columns[:, j], columns[:, i], ".", ms=1.5, alpha=0.4, rasterized=True)  # of thousands
-        ax.axhline(posterior.fitted[names[i]], color="0.6", lw=0.8)
+        ax.axhline(plant.values[names[i]], color="0.6", lw=0.8)
         ax.tick_params(labelleft=j == 0)  # a row shares its scale
     if i == len(names) - 1:
-        ax.set_xlabel(f"{names[j]} [{posterior.units.get(names[j], '1')}]", fontsize=7)
+        ax.set_xlabel(f"{names[j]} [{plant.units.get(names[j], '1')}]", fontsize=7)
     if j == 0 and i > 0:
-        ax.set_ylabel(f"{names[i]} [{posterior.units.get(names[i], '1')}]", fontsize=7)
+        ax.set_ylabel(f"{names[i]} [{plant.units.get(names[i], '1')}]", fontsize=7)

@@ -20,6 +20,7 @@ from thermogrip.sysid.validation.residual_tests import (
     marked_by_holm,
     residual_correlations,
 )
+from thermogrip.sysid.validation.stated_errors import free_run_band
 
 N = 1500
 
@@ -56,7 +57,9 @@ def heated(q: np.ndarray, plant: Plant, start: float = 0.0) -> np.ndarray:
 def correlations(plant: Plant, log: Log, warmup: float = 5.0) -> ResidualCorrelations:
     run, stretches = plant.simulate(log, warmup), cut_stretches(plant, log)
     scored = run["scored"].values > 0
-    return residual_correlations(plant, stretches, columns(run, plant.outputs), scored, warmup=warmup)
+    drawn = free_run_band(plant, log, run, warmup=warmup).drawn
+    y = columns(run, plant.outputs)
+    return residual_correlations(plant, stretches, y, scored, warmup=warmup, drawn=drawn)
 
 
 def signals_of(plant: Plant, log: Log, warmup: float = 20.0) -> dict[str, CorrelationTest]:
