@@ -186,12 +186,17 @@ def usual_warmup(plant: Plant, log: Log) -> float:
 
 def start_seconds(plant: Plant, log: Log) -> float:
     """Return a tenth of the slowest time constant of a plant, at most a tenth of the log [s]."""
+    return float(f"{slowest_time(plant, log) / 10:.2g}")
+
+
+def slowest_time(plant: Plant, log: Log) -> float:
+    """Return the slowest time constant of a plant, at most the length of the log [s]."""
     from thermogrip.sysid.export.dynamics import plant_dynamics
 
     slowest, seconds = float("inf"), float(log["time"][-1] - log["time"][0])
     with suppress(UserError):  # a plant that does not settle
         slowest = float(plant_dynamics(plant, draws=0).time_constants[0])
-    return float(f"{min(slowest, seconds) / 10:.2g}")
+    return min(slowest, seconds)
 
 
 def warm_up_of(time: Array) -> float:

@@ -52,6 +52,7 @@ INTERVAL = NormalDist().inv_cdf(0.95)  # half of a 90 % interval, in standard de
 _RANKS = 199  # quantiles of each part, of which their sum is made
 _DIVERGED = 1e6  # of an output's spread
 _LATER = (1 / 30, 1 / 10, 1 / 3)  # of a run: lags of an effect that comes later; half a decade apart
+_BEYOND = 0.2  # of what lies beyond the readings of the fit: gains of boards are off by .11 to .27 there
 _UNLIKE = 0.1  # of the run's error: what a run unlike the fit adds, from which it is reported
 
 
@@ -176,8 +177,7 @@ def unlike_fit(plant: Plant, log: Log, simulated: Log, warmup: float) -> dict[st
         first = first[np.isfinite(first)]
         start = float(np.mean(first - np.clip(first, low, high))) if first.size else 0.0
         # the part of the run beyond the readings of the fit, and how far those of the warm-up lie beyond
-        added = np.hypot(run - np.clip(run, low, high), start)
-        out[name] = np.asarray(added)
+        out[name] = _BEYOND * np.hypot(run - np.clip(run, low, high), start)
     return out
 
 
@@ -444,7 +444,7 @@ def verdict_of(
         )
         # it alone is forecast from what was before it, and judged as another run is
         if error.rmse < NO_BETTER * tail_idle <= tail:
-            errs = f"on the last part held out {name} errs by {tail:.2g}, without input by {tail_idle:.2g}"
+            errs = f"on the last part held out {name} errs by {tail / tail_idle:.0%} of no input's error"
             return False, f"Not good ({label}): {errs}; try other models, or longer logs. {another}"
         # a single part that was much worse, of moves that no other part has, widens the stated range and
         # condemns no plant: the fit has seen that part in the end
@@ -454,7 +454,7 @@ def verdict_of(
             (error.rmse, whole_idle, "on another run", "it needs more excitation, or more logs"),
         ):
             if not size < USEFUL * idle:
-                errs = f"{where} {name} errs by {size:.2g}, without input by {idle:.2g}"
+                errs = f"{where} {name} errs by {size / max(idle, 1e-12):.0%} of no input's error"
                 return False, f"Not good ({label}): {errs}; {advice}. {another}"
     failed = [finding.says for finding in checked.findings if finding.verdict == "fail"]
     if failed:

@@ -209,7 +209,7 @@ def test_an_answer_that_is_no_ends_with_3_and_says_what_would_help(room: SimpleN
     room.found = found_of(good=False, verdict="not good")
     done = room.bench.run("identify", "good.csv", "--out", "p.json")
     assert done.code == 3
-    assert done.err.splitlines()[-1] == "next: thermogrip excite --kind prbs --minutes 30 --out schedule.csv"
+    assert "next: thermogrip excite --kind optimal --minutes 2.7 --plant p.json" in done.err.splitlines()[-1]
     assert Path("p.json").exists()  # the plant is kept all the same
 
 
@@ -235,7 +235,7 @@ def test_a_guess_that_decides_is_a_warning_and_the_command_that_states_it_comes_
     room.found = found_of(good=False, doubts=("U is far from its prior",), signals=named)
     done = room.bench.run("identify", "good.csv", "--out", "p.json")
     assert done.code == 3
-    assert done.err.splitlines()[-1] == "next: thermogrip excite --kind prbs --minutes 30 --out schedule.csv"
+    assert "next: thermogrip excite --kind optimal --minutes 2.7 --plant p.json" in done.err.splitlines()[-1]
 
 
 @pytest.mark.parametrize(
@@ -351,7 +351,7 @@ def verdict_of(what: str) -> Verdict:
         (("better",), 0, "tune plant.json --out controller.json"),
         (("as stated", "worse"), 3, "identify LOG_OF_FIT good.csv good.csv@100:200 --out both.json"),
         (("another plant", "as stated"), 3, "identify LOG_OF_FIT good.csv good.csv@100:200 --out both.json"),
-        (("no test", "seen"), 0, "excite --kind optimal --minutes 20 --plant plant.json --out schedule.csv"),
+        (("no test", "seen"), 0, "excite --kind prbs --minutes 60 --plant plant.json --out schedule.csv"),
         (("seen", "as stated"), 0, "tune plant.json --out controller.json"),
         (("seen",), 0, "validate plant.json LOG"),
         (("start",), 3, "validate plant.json good.csv --warmup {s} --score-from {s}"),
@@ -378,7 +378,7 @@ def test_what_comes_after_validate_follows_from_what_it_found(
     ("standing", "then"),
     [
         ("as stated", "identify LOG_OF_FIT good.csv --out both.json"),
-        ("seen", "excite --kind optimal --minutes 20 --plant plant.json --out schedule.csv"),
+        ("seen", "excite --kind prbs --minutes 60 --plant plant.json --out schedule.csv"),
     ],
 )
 def test_a_plant_that_is_not_good_is_identified_anew_whatever_a_run_says(

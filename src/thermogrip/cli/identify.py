@@ -12,7 +12,7 @@ import typer
 from thermogrip.cli import options as cli
 from thermogrip.datasets.errors import UserError
 from thermogrip.media import printable
-from thermogrip.report.console import Console
+from thermogrip.report.console import Console, significant
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 
 MODELS = ("arx", "oe", "armax", "bj", "subspace", "parsim", "sindy", "neural", "network")
 USUAL_MODELS = ",".join(model for model in MODELS if model not in ("armax", "bj", "parsim", "sindy"))
+FEWEST_ROWS = 160  # of a log that is resampled (sysid.blackbox.fit)
 MOST_DOUBTS = 6  # that are printed: one command states what all of them are about
 NO_POSTERIOR = "no posterior: the model that was kept is a black box, only networks have parameters to sample"
 
@@ -175,8 +176,25 @@ def identify(
     if identified.good:
         return cli.Done("good")
     guessed = any(s.guessed for s in identified.signals) or any(log.attrs.get("clock_doubts") for log in logs)
-    stated = _stating(identified, paths, ctx.meta[cli.TYPED], logs) if identified.doubts and guessed else ""
-    return cli.Done("not good", cli.ANSWER_IS_NO, stated)
+    if identified.doubts and guessed:
+        command = _stating(identified, paths, ctx.meta[cli.TYPED], logs)
+    else:
+        command = _experiment(plant, out, logs)
+    return cli.Done("not good", cli.ANSWER_IS_NO, command)
+
+
+def _experiment(plant: Plant, path: Path, logs: Sequence[Log]) -> str:
+    """Return the command of a schedule that is long enough to identify a plant by."""
+    from thermogrip.sysid.validation.free_run import slowest_time
+
+    # each of the four blocks that identify holds out shows 95 % of a move, and a log of fewer rows has no
+    # intervals
+    slowest_s = max(slowest_time(plant, log) for log in logs)
+    step_s = max(float(log["time"].diff("time").median()) for log in logs)
+    minutes = significant(max(4 * 3 * slowest_s, FEWEST_ROWS * step_s) / 60, 2)
+    kind = "prbs" if plant.covariance is None else "optimal"
+    words = ["excite", "--kind", kind, "--minutes", minutes, "--plant", str(path), "--out", "schedule.csv"]
+    return printable(shlex.join(words))
 
 
 def _stating(found: Identification, paths: Sequence[str], typed: Sequence[str], logs: Sequence[Log]) -> str:
@@ -404,15 +422,16 @@ def validate(
         )
         urgencies = ["worse" if pair in ("as stated", "better") else "no test" for pair in urgencies]
     most_urgent = next((pair for pair in _URGENT if pair in urgencies), "")
-    code = cli.ANSWER_IS_NO if most_urgent in ("worse", "another plant", "start") else 0
-    if most_urgent != "start":
-        return cli.Done(most_urgent, code)
-    from thermogrip.sysid.validation.free_run import start_seconds
+    code, command = cli.ANSWER_IS_NO if most_urgent in ("worse", "another plant", "start") else 0, ""
+    if most_urgent == "no test":
+        command = _experiment(loaded, plant, logs)
+    elif most_urgent == "start":
+        from thermogrip.sysid.validation.free_run import start_seconds
 
-    seconds = min(start_seconds(loaded, log) for log in logs)
-    more = ["--warmup", f"{seconds:g}", "--score-from", f"{seconds:g}"]
-    command = shlex.join(["validate", str(plant), *map(str, paths), *more])
-    return cli.Done(most_urgent, code, printable(command))
+        seconds = min(start_seconds(loaded, log) for log in logs)
+        more = ["--warmup", f"{seconds:g}", "--score-from", f"{seconds:g}"]
+        command = printable(shlex.join(["validate", str(plant), *map(str, paths), *more]))
+    return cli.Done(most_urgent, code, command)
 
 
 def _urgency(verdict: Verdict) -> str:
