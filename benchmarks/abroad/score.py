@@ -68,7 +68,7 @@ def score_set(some: ForeignSet, each: bool) -> None:
         f"{found.plant.scores.structure} dt {found.plant.dt:g}",
         flush=True,
     )
-    band = run.band(0.9)
+    band = run.band()
     scored = np.asarray(run.log["scored"].values) > 0
     for name, score in run.scores.items():
         stated = found.expected[name].rmse

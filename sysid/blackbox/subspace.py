@@ -40,46 +40,32 @@ def subspace_family(
     """Return a model for each order, number of block rows f and weighting that the data allow."""
     models: dict[Structure, StateSpaceModel] = {}
     longest = max(len(segment.time) for segment in grid.segments)
-    sets = default_terms(grid) if terms is None else terms
-    n_drive, n_y = len(grid.inputs) + len(grid.disturbances), len(grid.outputs)
-    sizes = rows or [f for f in (3, 5, 8, 15, 30) if only is not None or 6 * f < longest]
-    for some in sets:
-        products = f", with {', '.join(some)}" if some else ""
-        names = {
-            (f, w, n): Structure(
-                f"order {n}, {f} block rows, {w}{products}", n * (n_drive + len(some) + n_y + 1), some
-            )
-            for f, w, n in product(sizes, weightings, orders)
-            if n < f
-        }
-        wanted = {of: name for of, name in names.items() if only is None or name in only}
-        models |= {wanted[of]: model for of, model in _realised(grid, wanted, some).items()}
-    return models
-
-
-def _realised(
-    grid: Grid, wanted: Collection[tuple[int, str, int]], terms: tuple[str, ...]
-) -> dict[tuple[int, str, int], StateSpaceModel]:
-    """Return the models of these block rows, weightings and orders."""
-    out: dict[tuple[int, str, int], StateSpaceModel] = {}
     n_y, scale = len(grid.outputs), np.maximum(grid.output_spread(), 1e-9)
-    longest = max(len(segment.time) for segment in grid.segments)
-    for f in dict.fromkeys(f for f, _, _ in wanted):
-        triangle = _triangle(grid, f, terms)
+    n_signal = len(grid.inputs) + len(grid.disturbances) + n_y
+    sizes = rows or [f for f in (3, 5, 8, 15, 30) if only is not None or 6 * f < longest]
+    for some, f in product(default_terms(grid) if terms is None else terms, sizes):
+        products = f", with {', '.join(some)}" if some else ""
+        wanted: dict[tuple[str, int], Structure] = {}
+        for weighting, n in product(weightings, orders):
+            label = f"order {n}, {f} block rows, {weighting}{products}"
+            structure = Structure(label, n * (n_signal + len(some) + 1), some)
+            if n < f and (only is None or structure in only):
+                wanted[weighting, n] = structure
+        triangle = _triangle(grid, f, some) if wanted else None
         if triangle is None:
             continue
-        for weighting in dict.fromkeys(w for size, w, _ in wanted if size == f):
+        for weighting in dict.fromkeys(weighting for weighting, _ in wanted):
             if weighting == "parsim":
                 gamma = predictor_observability(triangle, f, n_y)
             else:
                 gamma = extended_observability(*_factorise(triangle, f, n_y), weighting=weighting)
-            for n in (n for size, w, n in wanted if (size, w) == (f, weighting) and n < gamma.shape[1]):
+            for n in (n for kind, n in wanted if kind == weighting and n < gamma.shape[1]):
                 # A follows from the shift of Gamma, C is its first block row
                 before, after = gamma[:-n_y, :n], gamma[n_y:, :n]
                 shift = np.asarray(np.linalg.lstsq(before, after, rcond=None)[0], dtype=float)
-                A = stabilised(shift, longest)
-                out[f, weighting, n] = fit_inputs(grid, A, gamma[:n_y, :n] * scale[:, None], terms)
-    return out
+                C = gamma[:n_y, :n] * scale[:, None]
+                models[wanted[weighting, n]] = fit_inputs(grid, stabilised(shift, longest), C, some)
+    return models
 
 
 def extended_observability(L32: Array, L33: Array, *, weighting: str) -> Array:

@@ -72,12 +72,6 @@ class DataCheck:
 
     findings: tuple[Finding, ...]
 
-    @property
-    def verdict(self) -> Verdict:
-        """The worst verdict."""
-        order: tuple[Verdict, ...] = ("fail", "warn", "ok")
-        return next((v for v in order if any(f.verdict == v for f in self.findings)), "ok")
-
     def of(self, check: str) -> tuple[Finding, ...]:
         """Return the findings of one check."""
         return tuple(f for f in self.findings if f.check == check)
@@ -104,7 +98,7 @@ def check_data(
     Returns
     -------
     DataCheck
-        Its ``findings``, the worst ``verdict``, and ``of(check)`` for those of one check.
+        Its ``findings``, and ``of(check)`` for those of one check.
 
     Raises
     ------

@@ -3,8 +3,8 @@
 A network is a TOML file of tables: ``inputs``, ``disturbances``, ``outputs``, ``nodes``, ``boundaries``,
 ``links``, ``pipes``, ``radiation``, ``heaters``, ``peltiers`` and ``parameters``.  Elements name
 parameters, never numbers, so every number has a unit, a prior and a line that says where it comes from.
-:func:`read_network` checks the file in two passes: each table by itself (:mod:`pydantic`), then what they
-say about each other.  Each refusal names the table and the key.
+:func:`network_from_dict` checks it in two passes: each table by itself (:mod:`pydantic`), then what they say
+about each other.  Each refusal names the table and the key.
 """
 
 from __future__ import annotations
@@ -292,21 +292,15 @@ def named_network(name_or_path: str | Path) -> Network:
     :func:`thermogrip.sysid.models.network.load_network`."""
     text = str(name_or_path)
     if text in builtin_networks():
-        with resources.as_file(resources.files("thermogrip.sysid") / "networks" / f"{text}.toml") as path:
-            return read_network(path)
-    if not text.endswith(".toml") and not Path(text).is_file():
+        text = str(resources.files("thermogrip.sysid") / "networks" / f"{text}.toml")
+    elif not text.endswith(".toml") and not Path(text).is_file():
         hint = known_names(text, builtin_networks(), "name one of {}, or a TOML file")
         raise UserError(f"no network {text!r}", hint=hint)
-    return read_network(text)
-
-
-def read_network(path: str | Path) -> Network:
-    """Read and check a network file."""
-    return network_from_dict(read_toml(path, hint="see 'thermogrip init network'"), file=str(path))
+    return network_from_dict(read_toml(text, hint="see 'thermogrip init network'"), file=text)
 
 
 def network_from_dict(content: Mapping[str, Any], *, file: str | None = None) -> Network:
-    """Check the tables of a network; see :func:`read_network`."""
+    """Check the tables of a network; ``file`` is where they are from."""
     try:
         network = Network.model_validate(dict(content))
     except ValidationError as error:

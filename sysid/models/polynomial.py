@@ -19,7 +19,6 @@ from numpy.typing import ArrayLike, NDArray
 from thermogrip.datasets.arrays import Array, Values
 from thermogrip.datasets.limits import array_within, number_within
 from thermogrip.sysid.models.model import BlackBox
-from thermogrip.sysid.models.state_space import join_columns
 
 BOUND = 10.0  # spreads beyond the range of the data: a simulation that leaves it has diverged
 _MOST_DEGREE, _MOST_MEMORY = 20, 1000
@@ -88,12 +87,16 @@ class SindyModel(BlackBox):
     def states(self, x0: Array, u: Array, d: Array, times: int = 1) -> Array:
         """Return the states (B, N + 1, n_x) of :meth:`rollout`; an output beyond :data:`BOUND` times the
         range of the data has diverged, and the state is infinite from there on."""
-        from thermogrip.sysid.models.recurrences import run_polynomial  # pulls in numba
-
-        w = np.ascontiguousarray(join_columns(u, d))
-        x = run_polynomial(self.exponents, self.coefficients, np.ascontiguousarray(x0), w, times)
+        x = np.empty((len(x0), u.shape[1] + 1, self.n_x))
+        x[:, 0] = x0
         middle, reach = (self.low + self.high) / 2, BOUND * (self.high - self.low)
-        with np.errstate(invalid="ignore"):
+        with np.errstate(over="ignore", invalid="ignore"):  # a run that diverges is infinite, an answer
+            for k in range(u.shape[1]):
+                row = list(x[:, k].T)
+                for _ in range(times):
+                    row = self.one_step(row, list(u[:, k].T), list(d[:, k].T))
+                for i, value in enumerate(row):
+                    x[:, k + 1, i] = value
             within = np.abs(x[:, :, : len(self.outputs)] - middle) < reach
         x[np.maximum.accumulate(~within.all(axis=2), axis=1)] = np.inf
         return np.asarray(x)

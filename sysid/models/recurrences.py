@@ -1,4 +1,4 @@
-"""Simulations of linear, polynomial and small neural difference equations, compiled.
+"""Simulations of linear and small neural difference equations, compiled.
 
 **Neural.** With the state x (n), the drives w (m) and h units,
 
@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
 from thermogrip.datasets.arrays import Array
 
@@ -43,38 +42,6 @@ def run_linear(A: Array, on: Array, push: Array, x0: Array, times: int) -> Array
                                 total += on[of_on, k, s] * A[s + 1, i, j] * x[b, k + 1, j]
                     after[i] = total
                 x[b, k + 1] = after
-    return x
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def run_polynomial(
-    exponents: NDArray[np.int_], coefficients: Array, x0: Array, w: Array, times: int
-) -> Array:
-    """Return the states (B, N + 1, n_x), the outputs from the newest on, of y+ = coefficients m(x, w) with
-    each row of w (1 or B, N, m) ``times`` times, m the monomials of x and w."""
-    n_batch, n_x = x0.shape
-    n_y, n_term = coefficients.shape
-    rows = w.shape[1]
-    x = np.empty((n_batch, rows + 1, n_x))
-    variables, after = np.empty(n_x + w.shape[2]), np.empty(n_y)
-    for b in range(n_batch):
-        x[b, 0] = variables[:n_x] = x0[b]
-        for k in range(rows):
-            variables[n_x:] = w[min(b, len(w) - 1), k]
-            for _ in range(times):
-                after[:] = 0.0
-                for term in range(n_term):
-                    product = 1.0
-                    for i in range(len(variables)):
-                        for _power in range(exponents[term, i]):
-                            product *= variables[i]
-                    for i in range(n_y):
-                        if coefficients[i, term] != 0.0:  # 0 times what has overflowed is no number
-                            after[i] += coefficients[i, term] * product
-                for i in range(n_x - 1, n_y - 1, -1):
-                    variables[i] = variables[i - n_y]
-                variables[:n_y] = after
-            x[b, k + 1] = variables[:n_x]
     return x
 
 

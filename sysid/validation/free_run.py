@@ -78,12 +78,10 @@ class FreeRun:
     verdict: Verdict | None = None  # on the plant; None without ``tests``
     stated: Band | None = None  # the 90 % band, where it is known already
 
-    def band(self, level: float = 0.9) -> Band:
+    def band(self) -> Band:
         """Return the band about the run that a new run's readings should lie in, and the share that does;
         see :func:`~thermogrip.sysid.validation.stated_errors.free_run_band`."""
-        if self.stated is not None and level == self.stated.level:
-            return self.stated
-        return free_run_band(self.plant, self.measured, self.log, level=level, warmup=self.warmup)
+        return self.stated or free_run_band(self.plant, self.measured, self.log, warmup=self.warmup)
 
 
 def free_run(

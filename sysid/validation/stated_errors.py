@@ -28,7 +28,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from statistics import NormalDist
-from typing import TYPE_CHECKING, Any, Literal, TypeAlias
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeAlias
 
 import numpy as np
 from scipy.signal import lfilter
@@ -60,7 +60,7 @@ _UNLIKE = 0.1  # of the run's error: what a run unlike the fit adds, from which 
 class Band:
     """A band about a free run."""
 
-    level: float  # probability that it should cover a reading
+    level: ClassVar[float] = 0.9  # probability that it should cover a reading
     half: dict[str, Array]  # (n,), half-width at each row of the log, in the output's unit
     inside: dict[str, float]  # share of the scored readings that it covers
     draws: int  # of the parameters; 0: the plant has none, the band is the plant's own error alone
@@ -96,14 +96,9 @@ def expected_error(errors: Sequence[float], gain_effect: float) -> ExpectedError
     return ExpectedError(rmse, low, high, of_parts if gain_effect else None)
 
 
-def free_run_band(
-    plant: Plant, log: Log, simulated: Log, *, level: float = 0.9, draws: int = 30, warmup: float = WARMUP
-) -> Band:
+def free_run_band(plant: Plant, log: Log, simulated: Log, *, draws: int = 30, warmup: float = WARMUP) -> Band:
     """Return the band about the ``simulated`` free run of a plant over a log, of so many draws of its
     parameters (seeds 1 to ``draws``), whose state readings of ``warmup`` [s] have set."""
-    if not 0 < level < 1:
-        raise ValueError(f"level must lie between 0 and 1, got {level:g}")
-    wide = NormalDist().inv_cdf(0.5 + level / 2)
     taken = draws if plant.uncertain else 0
     stretches = cut_stretches(plant, match_logs(plant, [log])[0][0]) if taken else []
     run = columns(simulated, plant.outputs)
@@ -127,7 +122,7 @@ def free_run_band(
         gain_and_level = (effect + effect.mean()) / 2
         like_fit = variance + max(error_of_parts**2 - explained, 0.0) + gain_and_level
         added = unlike.get(name, 0.0) ** 2
-        half[name] = wide * np.sqrt(like_fit + added)
+        half[name] = INTERVAL * np.sqrt(like_fit + added)
         is_unlike = is_unlike or bool(np.mean(added) > _UNLIKE * np.mean(like_fit))
         size = np.mean((like_fit + added)[scored]) if scored.any() else np.nan
         expected[name] = float(np.sqrt(size))
@@ -148,7 +143,7 @@ def free_run_band(
         words += f"{'one log' if len(plant.logs) == 1 else 'two logs'} cannot show it)"
     if is_unlike:
         words += ", wider because this run is unlike the fit (range of the readings)"
-    return Band(level, half, inside, taken, words, expected, likely, drawn)
+    return Band(half, inside, taken, words, expected, likely, drawn)
 
 
 def part_errors(plant: Plant, name: str) -> list[float]:

@@ -88,7 +88,7 @@ def test_a_free_run_s_page_has_its_scores_band_and_baselines(run: tuple[Plant, L
     ("draws", "words"), [(7, "7 draws of the parameters and the noise"), (0, "the noise")]
 )
 def test_a_band_says_what_it_is_made_of_and_covers(draws: int, words: str) -> None:
-    band = Band(0.9, {}, {"t": 0.876, "s": 0.95}, draws, "the noise")
+    band = Band({}, {"t": 0.876, "s": 0.95}, draws, "the noise")
     said = f"90 % band from {words}; it covers 88 % of t, 95 % of s"
     assert plant.band_words(band) == said
     band = replace(band, expected={"t": 0.123, "s": 4.0}, likely={"t": (0.1, 0.2), "s": (2.0, 9.0)})

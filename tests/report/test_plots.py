@@ -47,7 +47,7 @@ def waves(n: int, shift: float = 0.0) -> Any:
 
 
 def free_run_of(n: int) -> Figure:
-    band = Band(0.9, {name: np.full(n, 0.5) for name in ("t1", "level")}, {"t1": 0.9, "level": 0.8}, 3)
+    band = Band({name: np.full(n, 0.5) for name in ("t1", "level")}, {"t1": 0.9, "level": 0.8}, 3)
     run: Any = SimpleNamespace(measured=waves(n), log=waves(n, 0.25), scores=dict.fromkeys(("t1", "level")))
     return draw_chart(free_run_chart(run, ("t1", "level"), band))
 

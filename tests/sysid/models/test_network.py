@@ -14,7 +14,7 @@ from scipy.optimize import least_squares
 from tests.sysid.models.makers import roll_rows
 from thermogrip.datasets.errors import UserError
 from thermogrip.sysid.models.network import NetworkModel, load_network
-from thermogrip.sysid.models.network_spec import builtin_networks, network_from_dict, read_network
+from thermogrip.sysid.models.network_spec import builtin_networks, named_network, network_from_dict
 
 KELVIN = 273.15
 
@@ -222,7 +222,7 @@ def test_a_file_that_is_not_toml_is_refused(tmp_path: Any):
     path = tmp_path / "net.toml"
     path.write_text("[nodes\n")
     with pytest.raises(UserError, match=r"net\.toml: is not TOML"):
-        read_network(path)
+        named_network(path)
     with pytest.raises(UserError, match="no network 'griper'"):
         load_network("griper")
 

@@ -334,8 +334,6 @@ def test_a_band_counts_scored_readings_and_adds_draws_the_fit_and_single_reading
     np.testing.assert_allclose(band.half["t"], 1.644854 * 0.5, rtol=1e-6)
     assert band.inside["t"] == 4 / 6
     assert np.isnan(free_run_band(plant, log, run.assign(scored=0 * run["scored"])).inside["t"])
-    with pytest.raises(ValueError, match="between 0 and 1, got 90"):
-        free_run_band(plant, log, run, level=90)
     seeds = []
 
     def draw(_plant, k):

@@ -40,7 +40,7 @@ def log_of(
 
 def band(**expected: float) -> Band:
     """Return a band of these stated errors, each of half to twice that."""
-    return Band(0.9, {}, {}, 0, expected=expected, likely={n: (e / 2, 2 * e) for n, e in expected.items()})
+    return Band({}, {}, 0, expected=expected, likely={n: (e / 2, 2 * e) for n, e in expected.items()})
 
 
 @pytest.mark.parametrize(
@@ -162,5 +162,4 @@ def test_rows_of_the_fit_are_no_test_but_those_behind_them_are():
 def test_a_band_that_is_known_is_not_made_again():
     run = free_run(block(), log_of())
     assert run.band() is run.stated
-    assert run.band(0.5).level == 0.5
     assert free_run(block(), log_of(), tests=False).verdict is None
