@@ -17,6 +17,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations, pairwise, product
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +25,7 @@ from numpy.typing import NDArray
 from thermogrip.datasets.repair import drop_stuck, find_spikes
 
 Floats = NDArray[np.float64]
+Columns: TypeAlias = Mapping[str, Floats]
 
 
 @dataclass(frozen=True)
@@ -55,7 +57,7 @@ EVIDENCE = EvidenceSettings()
 
 
 def is_moved(
-    columns: Mapping[str, Floats],
+    columns: Columns,
     name: str,
     drives: Sequence[str],
     beside: Sequence[str] = (),
@@ -202,23 +204,18 @@ def share_followed(values: Floats, other: Floats) -> float:
         return float(np.mean(y * x)) ** 2
     from scipy.signal import lfilter
 
-    filtered = [lfilter([1 / n], [1, 1 / n - 1], x) for n in EVIDENCE.filters]
-    late = [x[EVIDENCE.latest - k : x.size - k] for k in range(EVIDENCE.latest + 1)]
-    terms = np.column_stack([np.ones(rows), *late, *(f[EVIDENCE.latest :] for f in filtered)])
+    filtered = [lfilter([1 / n], [1, 1 / n - 1], x)[EVIDENCE.latest :] for n in EVIDENCE.filters]
+    terms = np.column_stack([np.ones(rows), _past(x, EVIDENCE.latest, first=0), *filtered])
     target = y[EVIDENCE.latest :]
-    residual = target - terms @ np.linalg.lstsq(terms, target, rcond=None)[0]
+    residual = _residuals(target, terms)
     return 1 - float(np.var(residual) / (np.var(target) or 1.0))
 
 
 def role_doubts(
-    columns: Mapping[str, Floats],
-    roles: Mapping[str, str],
-    reasons: Mapping[str, str],
-    sound: Sequence[str],
-    goals: Sequence[str],
+    columns: Columns, roles: Mapping[str, str], reasons: Mapping[str, str], goals: Sequence[str]
 ) -> Iterator[str]:
-    """Yield a line for each guessed role of a column that its course does not confirm; the reasons of those
-    that need none begin with one of ``sound``."""
+    """Yield a line for each guessed role, which has a reason, of a column that its course does not confirm;
+    the goals are set points by name."""
     moving = [n for n, v in columns.items() if np.nanmax(v, initial=-np.inf) > np.nanmin(v, initial=np.inf)]
     inputs, outputs, disturbances, others = (
         [n for n in moving if roles[n] == role] for role in ("input", "output", "disturbance", "other")
@@ -229,7 +226,7 @@ def role_doubts(
     columns = {
         n: np.where(find_spikes(v, floor=None), np.nan, v) if n in outputs else v for n, v in columns.items()
     }
-    guessed = [name for name in moving if name in reasons and not reasons[name].startswith(tuple(sound))]
+    guessed = [name for name in moving if name in reasons]
     moved = [name for name in outputs if is_moved(columns, name, inputs, at_lags=any)]
     read = [*outputs, *disturbances]
     for name in [name for name in inputs if name in guessed]:
@@ -263,7 +260,7 @@ def role_doubts(
 
 
 def effect_doubts(
-    columns: Mapping[str, Floats], inputs: Sequence[str], outputs: Sequence[str], disturbances: Sequence[str]
+    columns: Columns, inputs: Sequence[str], outputs: Sequence[str], disturbances: Sequence[str]
 ) -> Iterator[str]:
     """Yield a line for each output on which an input acts in another way late than early in a log, or that
     moves where no input does."""
@@ -340,11 +337,7 @@ def _moved_alone(y: Floats, drives: Sequence[Floats], others: Sequence[Floats]) 
 
 
 def _unlike_an_input(
-    name: str,
-    columns: Mapping[str, Floats],
-    other_inputs: Sequence[str],
-    outputs: Sequence[str],
-    read: Sequence[str],
+    name: str, columns: Columns, other_inputs: Sequence[str], outputs: Sequence[str], read: Sequence[str]
 ) -> str:
     """Return what speaks against a column as an input, empty where nothing does."""
     values = columns[name]
@@ -367,7 +360,7 @@ def _unlike_an_input(
     return ""
 
 
-def _acts(columns: Mapping[str, Floats], name: str, output: str, beside: Sequence[str]) -> bool:
+def _acts(columns: Columns, name: str, output: str, beside: Sequence[str]) -> bool:
     """Tell whether a column helps to predict an output, alone or by switching what a reading does, at any
     speed."""
     others = [n for n in beside if n != output]

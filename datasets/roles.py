@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.evidence import (
     EVIDENCE,
+    Columns,
     comes_to,
     explains,
     is_held,
@@ -30,7 +31,6 @@ from thermogrip.datasets.evidence import (
 from thermogrip.datasets.units import DRIVE, find_column
 
 Floats = NDArray[np.float64]
-_Columns: TypeAlias = Mapping[str, Floats]
 _Guesses: TypeAlias = dict[str, tuple[str, str]]  # role and reason, by name
 
 _SETPOINT = re.compile(
@@ -116,7 +116,7 @@ def assign_roles(
     outputs: Sequence[str] | None = None,
     disturbances: Sequence[str] | None = None,
     given: Mapping[str, str] | None = None,
-    columns: _Columns | None = None,
+    columns: Columns | None = None,
     file: str | None = None,
 ) -> Roles:
     """Return the role of each variable of ``units`` (name -> unit), and what the guesses among them rest on.
@@ -159,13 +159,13 @@ def assign_roles(
             reasons[name] = why
     doubts = [f"{name} is left out: {why}" for name, why in reasons.items() if why.startswith(_TOGETHER)]
     if columns is not None and lists["input"] is None:  # what was not listed was not meant
-        named = {name: why for name, why in reasons.items() if name not in evidence}
-        goals = [name for name, why in named.items() if why == IS_SET_POINT]
+        goals = [n for n, why in reasons.items() if why == IS_SET_POINT and n not in evidence]
         words = {_name_words(name) for name in units}
+        of_readings = [n for n in goals if _name_words(n).rpartition("_")[0] in words]  # called as they are
         sound = (*_ESTABLISHED, *([_IS_BOOKKEEPING] if goals else []))
-        for goal in [n for n in goals if _name_words(n).rpartition("_")[0] in words]:
-            del named[goal]  # its reading is called as it is
-        doubts += role_doubts(columns, roles, named, sound, goals)
+        unsure = {n: why for n, why in reasons.items() if not why.startswith(sound)}
+        unsure = {n: why for n, why in unsure.items() if n not in (*evidence, *of_readings)}
+        doubts += role_doubts(columns, roles, unsure, goals)
     # a role that the course of a column alone shows: whoever states the roles has no doubt
     doubts += [
         f"{name} is {'left out' if role == 'other' else f'taken as {role}'}: {why}"
@@ -191,7 +191,7 @@ def _controllers(guesses: _Guesses) -> _Guesses:
     return {by_name[n]: (role, f"{_OF_CONTROLLER} {what}") for names, role, what in meanings for n in names}
 
 
-def roles_of_data(columns: _Columns, units: Mapping[str, str], fixed: Mapping[str, str]) -> _Guesses:
+def roles_of_data(columns: Columns, units: Mapping[str, str], fixed: Mapping[str, str]) -> _Guesses:
     """Return role and reason, as the data show them, of the columns (n_row,) that ``fixed`` gives no role."""
     out: _Guesses = {}
     for name in [name for name in columns if name not in fixed]:
@@ -237,7 +237,7 @@ def roles_of_data(columns: _Columns, units: Mapping[str, str], fixed: Mapping[st
     return out
 
 
-def _followed_levels(columns: _Columns, guesses: _Guesses) -> _Guesses:
+def _followed_levels(columns: Columns, guesses: _Guesses) -> _Guesses:
     """Return the held columns whose levels a reading comes to while another column drives it, as set points,
     and the readings that no name shows, as outputs."""
     likely = [n for n in columns if guesses.get(n, ("", ""))[1] in (NO_CLUE, BY_UNIT)]
@@ -258,7 +258,7 @@ def _followed_levels(columns: _Columns, guesses: _Guesses) -> _Guesses:
 
 
 def _moved_otherwise(
-    columns: _Columns, guesses: _Guesses, stated: Mapping[str, str], *, find_causes: bool
+    columns: Columns, guesses: _Guesses, stated: Mapping[str, str], *, find_causes: bool
 ) -> _Guesses:
     """Return what moves, or is moved, otherwise than its name says: rooms that a drive heats are outputs,
     held columns that help to predict an output inputs, readings that no drive moves disturbances."""
@@ -299,7 +299,7 @@ def _name_words(name: str) -> str:
     return re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", name).lower()
 
 
-def _copied_columns(columns: _Columns, guesses: _Guesses, units: Mapping[str, str]) -> _Guesses:
+def _copied_columns(columns: Columns, guesses: _Guesses, units: Mapping[str, str]) -> _Guesses:
     """Return the columns that are one signal with another, or a set point less a reading, and of what."""
     moving = {n: some_rows(v) for n, v in columns.items() if np.ptp(v) > 0}  # of lost values none
     out: _Guesses = {}

@@ -292,13 +292,6 @@ def make_grasps(
     return grasps
 
 
-def as_record(data: xr.Dataset) -> Grasps:
-    """Return a dataset as the record that counts grasps (:mod:`thermogrip.datasets.grasp_record`)."""
-    from thermogrip.datasets.grasp_record import Grasps
-
-    return data if isinstance(data, Grasps) else Grasps(data.data_vars, coords=data.coords, attrs=data.attrs)
-
-
 def with_lead_in(grasps: Grasps) -> Grasps:
     """Return a record that begins at contact with its stated level ``t_gripper`` before it, which
     ``attrs["repairs"]`` notes; any other record is returned as it is."""

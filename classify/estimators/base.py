@@ -20,7 +20,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Self, TypeAlias
+from typing import Any, ClassVar, NamedTuple, Self, TypeAlias
 
 import numpy as np
 import xarray as xr
@@ -32,18 +32,9 @@ from thermogrip.classify.estimators.arrays import coded, grasps_of
 from thermogrip.datasets.errors import UserError, known_names
 from thermogrip.datasets.grasp_files import Records as Records
 from thermogrip.datasets.grasp_files import as_grasps
-from thermogrip.datasets.schema import (
-    GRASP_LABELS,
-    GRASP_NUMBERS,
-    as_record,
-    check_grasps,
-    log_name,
-    make_grasps,
-)
+from thermogrip.datasets.grasp_record import Grasps
+from thermogrip.datasets.schema import GRASP_LABELS, GRASP_NUMBERS, check_grasps, log_name, make_grasps
 from thermogrip.sysid.effusivity.quality import check_grasps as check_quality
-
-if TYPE_CHECKING:
-    from thermogrip.datasets.schema import Grasps
 
 Floats: TypeAlias = NDArray[np.float64]
 Labels: TypeAlias = NDArray[np.str_]
@@ -297,7 +288,8 @@ def record_list(X: Any) -> list[Grasps]:
                 f"expected Grasps, got {type(grasps).__name__}", hint="use make_grasps or read_grasps"
             )
         check_grasps(grasps)
-        records[i] = as_record(grasps)
+        if not isinstance(grasps, Grasps):  # which counts grasps
+            records[i] = Grasps(grasps.data_vars, coords=grasps.coords, attrs=grasps.attrs)
     return records
 
 
