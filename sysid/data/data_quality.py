@@ -51,6 +51,7 @@ class CheckSettings:
 
 
 _CHECKS = CheckSettings()
+_IN_CLOSED_LOOP = "noise is in the input too, so trust simulation-error fits and not one-step fits"
 
 
 @dataclass(frozen=True)
@@ -271,7 +272,7 @@ def _feedback(grid: Grid, at: int, name: str, lags: int = 3) -> Finding:
     says = f"no sign that {name} was driven by the outputs"
     if closed:
         says = f"{name} follows the outputs ({100 * explained:.0f} % of its moves): recorded in closed loop; "
-        says += "noise is in the input too, so trust simulation-error fits and not one-step fits"
+        says += _IN_CLOSED_LOOP
     return Finding("feedback", "", name, explained, "1", "warn" if closed else "ok", says)
 
 
@@ -301,10 +302,8 @@ def _relay_feedback(grid: Grid, at: int, name: str) -> Finding:
     closed = least <= _CHECKS.same_reading and len(lengths) > 2  # the holds of a clock are all alike
     says = f"no sign that {name} was driven by the outputs"
     if closed:
-        says = (
-            f"{name} is switched at the same readings again and again ({switchings} times): recorded in "
-            "closed loop; trust simulation-error fits and not one-step fits"
-        )
+        says = f"{name} is switched at the same readings {switchings} times: recorded in closed loop; "
+        says += _IN_CLOSED_LOOP
     return Finding("feedback", "", name, least, "1", "warn" if closed else "ok", says)
 
 
@@ -345,13 +344,10 @@ def _set_points(log: Log) -> list[Finding]:
     set_points = [
         n for n, unit in units.items() if explain_role(n, unit)[1] == IS_SET_POINT or n in by_course
     ]
-    says = (
-        "{} is a set point: recorded in closed loop, if its controller was on; noise is in the input too, so "
-        "trust simulation-error fits and not one-step fits"
-    )
     nothing = float("nan")
+    says = f"recorded in closed loop, if its controller was on; {_IN_CLOSED_LOOP}"
     return [
-        Finding("feedback", log_name(log), name, nothing, "1", "warn", says.format(name))
+        Finding("feedback", log_name(log), name, nothing, "1", "warn", f"{name} is a set point: {says}")
         for name in set_points
     ]
 
