@@ -131,13 +131,15 @@ def gap_rows(time: Floats, longer_than: float = GAP_SECONDS) -> NDArray[np.int64
 
 
 def describe_gaps(time: Floats, inputs: dict[str, Floats]) -> list[str]:
-    """Return a line a gap, with the inputs before and after it."""
+    """Return a line a gap, with the inputs before and after it; of many the first ones and their number."""
     repairs = []
-    for row in gap_rows(time):
+    for row in (rows := gap_rows(time))[:5]:
         before, after = time[row : row + 2]
         moved = ", ".join(f"{name} {u[row]:g} before, {u[row + 1]:g} after" for name, u in inputs.items())
         says = f"gap of {after - before:.2f} s from {before:.2f} to {after:.2f} s"
         repairs.append(f"{says} ({moved})" if moved else says)
+    if rows.size > 5:
+        repairs.append(f"{rows.size - 5} more gaps, the longest {np.diff(time)[rows[5:]].max():.2f} s")
     return repairs
 
 
@@ -270,36 +272,12 @@ def _goes_on(values: Floats) -> dict[str, NDArray[np.bool_]]:
     of the column's numbers."""
     moves = np.diff(values)
     turns = np.abs(np.diff(moves, prepend=np.nan))
-    way = np.sign(moves)
-    way = way[np.maximum.accumulate(np.where(way != 0, np.arange(way.size), 0))]  # of the last move
-    turns_back = way * np.append(0, way[:-1]) < 0  # as no line does, and a coarse reading at rest
-    straight = (turns < 1.5 * _smallest_step(values)) & ~turns_back  # half a step is for rounding
-    return {"held": moves == 0, "drawn straight": straight}
+    return {"held": moves == 0, "drawn straight": turns < 1.5 * _smallest_step(values)}  # half for rounding
 
 
 def _smallest_step(values: Floats) -> float:
     moves = np.abs(np.diff(values))
     return float(moves[moves > 0].min(initial=np.inf))
-
-
-def _cut_into_lines(
-    values: Floats, starts: NDArray[np.int64], ends: NDArray[np.int64]
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return first and last row of the lines that runs consist of: a slow reading in coarse steps bends by
-    little from row to row, and leaves its chord all the same (Douglas and Peucker 1973)."""
-    most, bends = 1.5 * _smallest_step(values), ends - starts > 3  # fewer rows cannot bend by more
-    lines = np.column_stack([starts, ends])[~bends].tolist()
-    left = np.column_stack([starts, ends])[bends].tolist()
-    while left:
-        start, end = left.pop()
-        off = np.abs(values[start : end + 1] - np.linspace(values[start], values[end], end - start + 1))
-        farthest = start + int(off.argmax())
-        if off.max() > most:
-            left += [[start, farthest], [farthest, end]]
-        else:
-            lines.append([start, end])
-    first, last = np.array(lines).T
-    return first, last
 
 
 def doubt_lead(name: str, values: Floats, drive: str, moved: Floats, time: Floats) -> str:
@@ -387,10 +365,10 @@ def drop_stuck(name: str, values: Floats, inputs: Sequence[Floats]) -> tuple[Flo
     for how, goes_on in _goes_on(values).items() if values.size >= SPIKE_WINDOW else ():
         # a settled reading stands still, but not through moves; one with noise goes straight in no rows
         trials = travel if how == "held" else np.arange(values.size)
+        if how != "held":  # by a step or none in a row a coarse reading goes straight too
+            goes_on = goes_on & (np.abs(np.diff(values)) > 1.5 * _smallest_step(values))
         ends = np.flatnonzero(np.append(~goes_on, True))
         starts = np.append(0, ends[:-1] + 1)
-        if how != "held":
-            starts, ends = _cut_into_lines(values, starts, ends)
         passed = trials[ends] - trials[starts]
         longest = int(np.argmax(passed))
         run, most = slice(int(starts[longest]), int(ends[longest]) + 1), float(passed[longest])

@@ -653,15 +653,16 @@ def workbook(path, unpacked=b"<sheet/>"):
     return path
 
 
-def test_the_first_sheet_of_a_workbook_is_read_as_its_text_would_be(tmp_path, monkeypatch):
+def test_the_largest_sheet_of_a_workbook_is_read_as_its_text_would_be(tmp_path, monkeypatch):
     stamps = pd.date_range("2026-01-01 23:59:58", periods=3, freq="2s")
     rows = [["Plant 7", None, None], ["Date", "Heater (%)", "T1 (°C)"]]
     frame = pd.DataFrame([*rows, *zip(stamps, [0, 1, 1], [20.5, 20.6, 20.7])])
-    monkeypatch.setattr(pd, "read_excel", lambda source, **_: frame)
+    monkeypatch.setattr(pd, "read_excel", lambda source, **_: {"About": frame[:1], "Run": frame})
     log = read_log(workbook(tmp_path / "log.xlsx"))
     assert log["time"].values.tolist() == [0.0, 2.0, 4.0]
     assert (names(log, "input"), column(log, "T1").tolist()) == (("Heater",), [20.5, 20.6, 20.7])
-    assert "1 line(s) before the table passed over" in log.attrs["repairs"]
+    notes = "the sheet Run is read, the largest; others: About\n1 line(s) before the table passed over"
+    assert notes in log.attrs["repairs"]
     assert read_log(tmp_path / "log.xlsx", columns=["-", "u", "y"]).sizes["time"] == 3
 
 
@@ -973,7 +974,9 @@ def test_a_gap_that_was_drawn_straight_is_left_out(write):
         log = read_log(write("".join(["time_s,heater,plate_degC\n", *rows])))
         assert said in log.attrs["repairs"]
         assert np.isnan(column(log, "plate")).sum() == pytest.approx(plate[filled].size, abs=2)
-    noise = 0.05 * np.random.default_rng(0).standard_normal(600)
-    coarse = np.floor(lfilter([0.01], [1, -0.99], HEATER) * 2 + noise * 2) / 2  # slow, in steps of .5 degC
-    rows = [f"{k},{u},{y}\n" for k, u, y in zip(PLACES, HEATER, coarse)]
+    rng = np.random.default_rng(19)
+    heater = np.repeat(50 * rng.integers(0, 2, 60), 20)  # makes noise where it is on
+    noise = np.where(heater > 0, 0.5, 0.05) * rng.standard_normal(1200)
+    coarse = np.floor(2 * (lfilter([0.01], [1, -0.99], heater) + noise)) / 2  # slow, in steps of .5 degC
+    rows = [f"{k},{u},{y}\n" for k, (u, y) in enumerate(zip(heater, coarse))]
     assert np.isfinite(column(read_log(write("".join(["time_s,heater,plate_degC\n", *rows]))), "plate")).all()
