@@ -55,7 +55,8 @@ _OUTPUT = re.compile(
 _INFLOW = re.compile(r"(^|_)(inlet|inflow|supply_air)(_|$)")
 _BOOKKEEPING = re.compile(
     r"^(error|err|control_error|integral|derivative|[pid]_?(term|part|action)|k_?[pidc]|pid_[pid]"
-    r"|ms|msec|hour|day|month|year|week|weekday|row|index|id|iteration|sample|record|counter)(_of_[a-z]+|_?no|_?\d+)?$"
+    r"|ms|msec|hour|day|month|year|week|weekday|row|index|id|iteration|sample|record|counter"
+    r"|mean|std(_dev)?|min|max)(_of_[a-z]+|_?no|_?\d+)?$"
 )
 _MODES = {"auto", "automatic", "manual", "mode", "status"}  # of a controller
 IS_SET_POINT = "its name is that of a set point"

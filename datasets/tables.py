@@ -55,7 +55,7 @@ _HEAD_LINES = 200  # of a file, that show how it is a table: the longest preambl
 #: A date, a time of day, or both, as a whole cell.
 STAMP = re.compile(
     r"()(?:(\d{1,4})[-/.](\d{1,2}|[A-Za-z]{3})[-/.](\d{1,4})(?:,?\s+|T|$))?"
-    r"(?:(\d{1,2}):(\d{2})(?::(\d{2}(?:[.,:]\d+)?))?)?\s*([AaPp][Mm])?\s*(Z|UTC|[+-]\d{2}:?\d{2})?$"
+    r"(?:(\d{1,2}):(\d{2}|\d(?=:))(?::(\d{1,2}(?:[.,:]\d+)?))?)?\s*([AaPp][Mm])?\s*(Z|UTC|[+-]\d{2}:?\d{2})?$"
 )
 _TIME_OF_DAY = r"((?:\d{1,4}[-/.]\d{1,2}[-/.]\d{1,4}[ T]+)?\d{1,2}:\d{2}:\d{2}(?:[.,:]\d+)?)"
 _KLIPPER = "Stats "  # then seconds, and sections of the board, the host and heaters
@@ -152,6 +152,8 @@ def parse_text(data: bytes, file: str, columns: Sequence[str] | None = None) -> 
     if text.startswith("LabVIEW Measurement"):
         head, _, rows = text.rpartition("***End_of_Header***")
         text = "\n" * head.count("\n") + rows.lstrip("\t\r")
+    if "X_Value\t" in text[: 1 << 20]:  # beside it LabVIEW names comments, which most rows lack
+        text = re.sub(r"\tComment[\t\r ]*\n", "\n", text, count=1)
     text, labelled = _without_labels(text)
     if not labelled:
         text = _stamps_as_column(text)
@@ -577,7 +579,7 @@ def read_column(
     if states is not None:
         return Column(name, states, notes=(f"{name}: words as {_quoted_cell(first)} read as 0 and 1",))
     if tolerated and (wrong.size >= _MOST * cells_known or STAMP.fullmatch(first)):
-        return Column(name, text=cells)
+        return Column(name, text=["" if cell in _LOST_CELLS else cell for cell in cells])
     hint = "write a number, leave the cell empty, or drop the column"
     if re.fullmatch(r"[+-]?\d+,\d+", first):
         hint = "write a decimal point"
@@ -617,10 +619,13 @@ def switched(cells: Sequence[str]) -> NDArray[np.float64] | None:
     where there are other words, or two of one meaning."""
     words = ["" if cell.strip() in _LOST_CELLS else cell.strip().lower() for cell in cells]
     values, wrong = _numbers_of(words)
-    states = {words[row] for row in wrong}
+    broken = [words[row] for row in wrong if any(map(str.isdigit, words[row]))]  # damaged
+    states = {words[row] for row in wrong} - {*broken}
     if not states <= {*_SWITCH} or len({_SWITCH[state] for state in states}) < len(states):
         return None
-    values[wrong] = [_SWITCH[words[row]] for row in wrong]
+    if len(broken) > _TOLERATED * (len(wrong) - len(broken)):
+        return None
+    values[wrong] = [_SWITCH.get(words[row], np.nan) for row in wrong]
     return values
 
 
@@ -735,7 +740,7 @@ def _matlab_arrays(members: Sequence[tuple[str, Any]]) -> Iterator[tuple[str, ND
 
 
 def read_excel_table(path: str | Path, columns: Sequence[str] | None = None) -> Table:
-    """Return the first sheet of an Excel workbook, read as its text would be."""
+    """Return the largest sheet of an Excel workbook, read as its text would be."""
     raw = read_bytes(path)
     absent, hint = "needs the package openpyxl", "pip install openpyxl, or export CSV"
     with reading("is no Excel workbook, or is damaged", file=path, hint="export CSV"):
@@ -744,8 +749,12 @@ def read_excel_table(path: str | Path, columns: Sequence[str] | None = None) -> 
         import pandas as pd
 
         with as_user_error(ImportError, absent, file=path, hint=hint):
-            frame = pd.read_excel(io.BytesIO(raw), header=None, engine="openpyxl")
-    return parse_text(frame.to_csv(index=False, header=False).encode(), str(path), columns)
+            sheets = pd.read_excel(io.BytesIO(raw), sheet_name=None, header=None, engine="openpyxl")
+    largest = max(sheets, key=lambda name: sheets[name].size)
+    table = parse_text(sheets[largest].to_csv(index=False, header=False).encode(), str(path), columns)
+    others = ", ".join(name for name in sheets if name != largest and sheets[name].size)
+    notes = [f"the sheet {largest} is read, the largest; others: {others}"] if others else []
+    return replace(table, notes=(*notes, *table.notes))
 
 
 def read_parquet_table(

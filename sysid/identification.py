@@ -244,8 +244,8 @@ def _read_logs(
     checked = check_data(logs, inputs=u, outputs=y, disturbances=d, average=average)
     if failed := [finding for finding in checked.of("excitation") if finding.verdict == "fail"]:
         moved_inputs = [name for name in u if name not in {finding.channel for finding in failed}]
-        hint = "move it in the experiment, or leave it out"
-        hint += f" with --inputs {','.join(moved_inputs)}" if 0 < len(moved_inputs) < len(u) else ""
+        hint = "move it alone in the experiment, or name what you set with --inputs"
+        hint += f" {','.join(moved_inputs)}" if 0 < len(moved_inputs) < len(u) else ""
         says, log = "; ".join(finding.says for finding in failed), logs[0]
         raise UserError(says, file=log_name(log), column=failed[0].channel, hint=hint + moved_before(log))
     roles, unused = signal_roles(logs, ([*u, *still], d, y), named, model, still)

@@ -124,10 +124,13 @@ def test_lines_of_a_printer_are_read_with_their_stamps_targets_and_duties(
 
 @pytest.mark.parametrize(("on", "off"), [("on", "off"), ("True", "False"), ("heating", "idle")])
 def test_words_beside_stamps_with_a_space_are_a_switch(tmp_path, on, off):
-    rows = [f"2024-01-13 00:00:{k:02},{on if k % 3 else off},{20 + k / 8:.4f},6.0\n" for k in range(60)]
+    cells = {30: "60.0\u00b0C", 31: "NAN"}
+    relay = [cells.get(k, on if k % 3 else off) for k in range(60)]
+    rows = [f"2024-01-13 0:0:{k},{relay[k]},{20 + k / 8:.4f},6.0\n" for k in range(60)]
     (tmp_path / "hub.csv").write_text("timestamp,relay,room,outside\n" + "".join(rows))
     log = read_log(tmp_path / "hub.csv")
-    assert column(log, "relay")[:4].tolist() == [0, 1, 1, 0]
+    assert column(log, "relay")[[*range(4), 30, 31]].tolist() == [0, 1, 1, 0, 1, 1]
+    assert log["time"].values[-1] == 59
     assert log["outside"].attrs["role"] == "disturbance"
 
 
@@ -157,7 +160,7 @@ LABVIEW = (
 @pytest.mark.parametrize(
     ("name", "head", "line", "step"),
     [
-        ("a.lvm", LABVIEW, lambda k: f"{k / 2}\t{row(k).replace(',', chr(9))}\t\n", 0.5),
+        ("a.lvm", LABVIEW, lambda k: f"{k / 2}\t{row(k).replace(',', chr(9))}\n", 0.5),
         ("putty.log", "=~=~= PuTTY log 2024.03.01 22:55:39 =~=~=\nplate_temp,heater\n",
          lambda k: f"[2024-03-01 22:55:{k:02}] {row(k)}\n", 1.0),
         ("monitor.txt", "12:00:00.000 -> plate_temp heater\n",
@@ -184,12 +187,14 @@ def test_logs_of_programs_are_read_with_their_clocks(tmp_path, name, head, line,
 
 
 def test_each_start_of_labview_s_first_column_is_a_part(tmp_path):
-    starts = [*range(12), *range(36), *range(12)]
+    starts = [*range(12), *range(36), *(6 * [*range(12)])]
     rows = "".join(f"{t}\t{HEATER[k]:g}\t{PLATE[k]:.2f}\n" for k, t in enumerate(starts))
     head = "LabVIEW Measurement\t\nX_Columns\tOne\n***End_of_Header***\t\n"
     (tmp_path / "pulses.lvm").write_text(head + rows)
     log = read_log(tmp_path / "pulses.lvm")
-    assert (list(log), np.flatnonzero(np.diff(log["time"]) > 10).tolist()) == (["c2", "c3"], [11, 47])
+    ends = np.flatnonzero(np.diff(log["time"]) > 10).tolist()
+    assert (list(log), ends) == (["c2", "c3"], [11, *range(47, 119, 12)])
+    assert log.attrs["repairs"].endswith("\n2 more gaps, the longest 11.00 s")
 
 
 def test_a_kiln_s_log_keeps_the_reading_that_has_a_blank_before_its_sign(tmp_path):

@@ -63,6 +63,7 @@ def test_an_input_of_any_course_is_told_from_its_output(word, noise, pole):
         ("spindle", "0_255", "input"),
         ("spindle", "V", "input"),
         ("battery", "1", "other"),
+        ("Std_Dev", "degC", "other"),
         ("rest", "s", "other"),
         ("t_settled", "s", "other"),
     ],
