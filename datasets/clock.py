@@ -144,10 +144,12 @@ def _behaves_as_clock(header: str, read: Header, values: Floats) -> bool:
     # however uneven: nothing else is so large, and rises; of those in seconds a counter may be
     if any(date.has(values[0]) and date.has(values[-1]) for date in _SINCE_1970[1:]):
         return bool(values[-1] > values[0])
-    if not np.all(steps > 0):
-        return False
+    # the first column of a file without names is the clock where any column is: a loop that waits for its
+    # sensors is as uneven, and may begin with some rows of one stamp
+    uneven = 1.0 if header == "c1" else CLOCK.evenness
     usual = float(np.median(steps))
-    return bool(np.mean(np.abs(steps - usual) <= CLOCK.evenness * usual) >= CLOCK.monotone_share)
+    even = (steps > 0) & (np.abs(steps - usual) <= uneven * usual)
+    return bool((header == "c1" or np.all(steps > 0)) and even.mean() >= CLOCK.monotone_share)
 
 
 def _of_text(header: str, table: Table) -> Clock | None:
@@ -250,9 +252,8 @@ def _unwrapped(counts: Floats, lines: NDArray[np.int64]) -> tuple[Floats, list[s
                 # where the time runs back by 2^16 or 2^32 counts but for one step, it goes on
                 if 0 < forward <= 2 * usual:
                     counts = counts + np.where(np.arange(counts.size) > row, 2.0**bits * count, 0.0)
-                    notes.append(
-                        f"time: a counter of {bits} bits wrapped in row {lines[row + 1]}: it goes on"
-                    )
+                    wrapped = f"a counter of {bits} bits wrapped in row {lines[row + 1]}"
+                    notes.append(f"time: {wrapped}: it goes on")
     return counts, notes
 
 
@@ -283,10 +284,9 @@ def _of_rows(table: Table, read: Mapping[str, Header]) -> Clock:
         if _STEP_NAME.fullmatch(read[h].name)
     }
     stated = {header: float(v[0]) for header, v in steps.items() if v.size == 1 and v[0] > 0}
-    beside = "dt" in table.meta  # a file may have it beside its columns
     step = next(iter(stated.values()), float(table.meta.get("dt", 1.0)))
     note = f"no time column: rows are taken {step:g} s apart; --dt S sets another step"
-    doubt = "" if stated or beside else "no column is a clock: rows are taken 1 s apart"
+    doubt = "" if stated or "dt" in table.meta else "no column is a clock: rows are taken 1 s apart"
     return Clock(step * np.arange(len(table.lines), dtype=float), frozenset(stated), (note,), np.nan, doubt)
 
 

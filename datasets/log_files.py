@@ -13,6 +13,7 @@ import os
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
@@ -326,7 +327,9 @@ def _states_as_columns(table: Table, clock: Clock) -> Table:
     notes = []
     for header in [header for header in table.text if header not in clock.columns]:
         counts = Counter(cell for cell in text[header] if cell)
-        few_words = 2 <= len(counts) <= MOST_STATES and counts.total() >= 5 * len(counts)
+        # words in single rows are notes of what was done
+        lasting = {word for word, following in pairwise(text[header]) if word == following != ""}
+        few_words = len(lasting) > 1 and len(counts) <= MOST_STATES and counts.total() >= 5 * len(counts)
         if not few_words or not all(any(map(str.isalpha, word)) for word in counts):  # numbers, misspelt
             continue
         cells = text.pop(header)

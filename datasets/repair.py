@@ -63,18 +63,16 @@ class OrderedRows(NamedTuple):
 
 
 def order_rows(time: Floats, lines: NDArray[np.int64], file: str) -> OrderedRows:
-    """Return rows of strictly increasing times; UserError where many times are missing, or time runs
-    backward."""
+    """Return rows of strictly increasing times; UserError where many are missing or run backward."""
     rows, repairs = np.arange(time.size), []
     lost = ~np.isfinite(time)
     if lost.mean() > _FEW:
         row = int(lines[lost.argmax()])
-        problem = "has no time"
-        raise UserError(problem, file=file, row=row, column="time", hint="remove the row or give its time")
+        raise UserError("has no time", file=file, row=row, column="time", hint="give it, or remove the row")
     if lost.any():
         rows = rows[~lost]
-        which = name_rows(lines[lost])
-        repairs.append(f"{lost.sum()} row{_s(int(lost.sum()))} without a time dropped ({which})")
+        count = int(lost.sum())
+        repairs.append(f"{count} row{_s(count)} without a time dropped ({name_rows(lines[lost])})")
     back = time[rows] < np.maximum.accumulate(time[rows])
     order = np.argsort(time[rows], kind="stable")
     if back.any():
@@ -83,10 +81,9 @@ def order_rows(time: Floats, lines: NDArray[np.int64], file: str) -> OrderedRows
             problem = f"time runs back from {time[rows[at]]:g} s to {time[rows[at + 1]]:g} s"
             hint = "cut the file there in two, sort its rows, or give the step of all rows with --dt"
             raise UserError(problem, file=file, row=int(lines[rows[at + 1]]), hint=hint)
-        which = name_rows(lines[rows[back]])
+        says = f"{back.sum()} row{_s(int(back.sum()))} out of order sorted ({name_rows(lines[rows[back]])})"
         rows = rows[order]
         sorted_steps = np.diff(time[rows])
-        says = f"{back.sum()} row{_s(int(back.sum()))} out of order sorted ({which})"
         between = sorted_steps.min() < np.median(sorted_steps) / 2  # where rows fall between others
         repairs.append(ClockDoubt(f"{says}, between others: did the clock run twice?") if between else says)
     first = np.concatenate([[True], np.diff(time[rows]) > 0])
@@ -114,9 +111,8 @@ def describe_steps(time: Floats) -> list[str]:
     if high - low <= 0.02 * median:
         return []
     says = f"time stamps are uneven: median step {median:.4g} s, {low:.4g} to {high:.4g} s"
-    first, last = (
-        float(np.median(part)) for part in (usual[: usual.size // 4 + 1], usual[-usual.size // 4 :])
-    )
+    quarter = usual.size // 4 + 1
+    first, last = (float(np.median(part)) for part in (usual[:quarter], usual[-quarter:]))
     if not 1 / _OTHER_STEP < last / first < _OTHER_STEP:
         return [ClockDoubt(f"{says}, {first:.4g} s at first and {last:.4g} s at last: is the unit the same?")]
     return [f"{says}; kept as they are"]
@@ -155,9 +151,8 @@ def find_spikes(values: Floats, *, floor: float | None) -> NDArray[np.bool_]:
     good = values[finite_rows]
     deviation = good - median_filter(good, size=SPIKE_WINDOW, mode="nearest")
     # |d| > max(floor, 6 s) with s = 1.4826 median |d| over the whole channel, d the deviation from the median
-    threshold = max(
-        _floor(good) if floor is None else floor, 6 * 1.4826 * float(np.median(np.abs(deviation)))
-    )
+    usual = 1.4826 * float(np.median(np.abs(deviation)))
+    threshold = max(_floor(good) if floor is None else floor, 6 * usual)
     is_far = np.abs(deviation) > threshold
     entered = np.concatenate([[False], np.abs(np.diff(good)) > threshold])
     for start in np.flatnonzero(is_far & entered).tolist():
@@ -234,9 +229,8 @@ def doubt_levels(name: str, values: Floats) -> str:
         large = np.flatnonzero(np.isclose(values[:, None], np.array(small) * factor, rtol=1e-3).any(axis=1))
         if len(small) > 1 and (rows.max() < large.min() or large.max() < rows.min()):
             row = max(rows.min(), large.min())
-            return (
-                f"{name} has other levels from row {row + 1} on, {factor:g} times apart: did its unit change?"
-            )
+            says = f"{name} has other levels from row {row + 1} on, {factor:g} times apart"
+            return f"{says}: did its unit change?"
     return ""
 
 
@@ -379,10 +373,13 @@ def drop_stuck(name: str, values: Floats, inputs: Sequence[Floats]) -> tuple[Flo
         # chance of about p = (k + 1) / (M - m + 2) (Laplace's rule); none where p^(m - 1) is under 1e-3.
         chance = (others + 1) / (trials[-1] - most + 2)
         likely = most <= 2 or chance >= 1 or chance ** (most - 1) > _STUCK_CHANCE
+        first, last = values[run][[0, -1]]
         likely |= how != "held" and most > trials[-1] / 2  # a slow one may go straight in all of them
+        # at its least or greatest value, as in other rows: so rests a drive that no name shows
+        at_end = first in (np.nanmin(values), np.nanmax(values))
+        likely |= how == "held" and at_end and np.count_nonzero(values == first) > values[run].size
         if likely or np.ptp(travel[run]) <= 1 or not np.isfinite(values[run]).all():
             continue
-        first, last = values[run][[0, -1]]
         what = f"stuck at {first:g}" if how == "held" else f"{how} from {first:g} to {last:g}"
         lost = np.isin(np.arange(values.size), np.arange(run.start, run.stop))
         problem = f"{name}: {what} for {lost.sum()} rows while the inputs move: left out"
@@ -440,10 +437,8 @@ def check_plausible(name: str, celsius: Floats, file: str) -> list[str]:
 
 def _floor(values: Floats) -> float:
     low, high = np.percentile(values, [1, 99])
-    moves = np.abs(np.diff(values))
-    quantum = float(moves[moves > 0].min()) if np.any(moves > 0) else 0.0
     # 2 % of the channel's 1-99 % range, and at least five of its smallest increments
-    return max(0.02 * float(high - low), 5 * quantum, np.finfo(float).tiny)
+    return max(0.02 * float(high - low), 5 * _smallest_step(values), np.finfo(float).tiny)
 
 
 def _leaves_and_returns(values: Floats, start: int, stop: int, threshold: float) -> bool:

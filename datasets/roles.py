@@ -52,15 +52,16 @@ _TEMPERATURE = re.compile(r"^(t|temp|temperature)(\d*|_.*)$|" + _READING.pattern
 _OUTPUT = re.compile(
     r"^(y|level|outlet|position|speed|pv|angle|velocity|response|measured)(\d*|_.*)$|" + _TEMPERATURE.pattern
 )
+_HUMIDITY = re.compile(r"humid|moisture|(^|_)rh(_|\d*$)")  # in percent, as drives are
 _INFLOW = re.compile(r"(^|_)(inlet|inflow|supply_air)(_|$)")
 _BOOKKEEPING = re.compile(
-    r"^(error|err|control_error|integral|derivative|[pid]_?(term|part|action)|k_?[pidc]|pid_[pid]"
+    r"^(error|err|control_error|proportional|integral|derivative|[pid]_?(term|part|action)|k_?[pidc]|pid_[pid]"
     r"|ms|msec|hour|day|month|year|week|weekday|row|index|id|iteration|sample|record|counter"
-    r"|mean|std(_dev)?|min|max)(_of_[a-z]+|_?no|_?\d+)?$"
+    r"|i[as]e|mean|std_?(dev)?|min|max|batt(ery)?(_level|_u?v)?)(_of_[a-z]+|_?no|_?\d+)?$"
 )
 _MODES = {"auto", "automatic", "manual", "mode", "status"}  # of a controller
 IS_SET_POINT = "its name is that of a set point"
-_IS_BOOKKEEPING = "its name is that of a number of the clock's or the controller's"
+_IS_BOOKKEEPING = "its name is that of a number of the clock, the controller or a statistic"
 NO_CLUE = "neither its name nor its unit shows what it is"
 _NEVER_MOVES, _COUNTS_ROWS = "it never moves", "it counts rows or time"
 BY_UNIT = "its unit is degC"
@@ -105,6 +106,7 @@ def explain_role(name: str, unit: str) -> tuple[str, str]:
          "its name is that of a drive"),
         (_OUTPUT.search(words) and unit != "s", "output", "its name is that of a reading"),
         (celsius, "output", BY_UNIT),
+        (unit == "percent" and _HUMIDITY.search(words), "output", "its name is that of a reading"),
         (unit in ("percent", "V", "0_255"), "input", f"its unit is {unit}"),
     )  # fmt: skip
     return next(((role, why) for applies, role, why in rows if applies), ("other", NO_CLUE))

@@ -157,6 +157,10 @@ def parse_text(data: bytes, file: str, columns: Sequence[str] | None = None) -> 
     text, labelled = _without_labels(text)
     if not labelled:
         text = _stamps_as_column(text)
+    # milliseconds behind a comma, as Python's logging writes them: each line has a cell more than names
+    under_names = re.search(r"(?m)^(.+)\n([^,\n]*\d:\d\d:\d\d,\d{3},.*)$", text[: 1 << 20])
+    if under_names and under_names[1].count(",") == under_names[2].count(",") - 1:
+        text = re.sub(r"(?m)^([^,\n]*\d:\d\d:\d\d),(?=\d{3},)", r"\1.", text)
     layout = find_layout(text, file, named=columns is not None)
     if layout.names[0] == "c1" and re.search(r"(?m)^X_Columns\W(One|Multi)", head):
         layout = replace(layout, names=["X_Value", *layout.names[1:]])
@@ -218,7 +222,7 @@ def find_layout(text: str, file: str, *, named: bool = False) -> Layout:
         raise UserError(f"has {n - 1} names above rows of {n} cells", file=file, hint=hint)
     notes = []
     if len(nameless) == n - hollow:
-        why = f"{len(above)} names above rows of {n} cells" if len(above) > n else "no header"
+        why = f"{len(above)} names above rows of {n} cells" if len(above) not in (0, 1, n) else "no header"
         notes = [f"{why}: {_NAMELESS.format(n - hollow)}"]
     elif nameless:
         notes = [f"without a name: {', '.join(nameless)}"]

@@ -247,7 +247,7 @@ def _read_logs(
         hint = "move it alone in the experiment, or name what you set with --inputs"
         hint += f" {','.join(moved_inputs)}" if 0 < len(moved_inputs) < len(u) else ""
         says, log = "; ".join(finding.says for finding in failed), logs[0]
-        raise UserError(says, file=log_name(log), column=failed[0].channel, hint=hint + moved_before(log))
+        raise UserError(says, file=log_name(log), hint=hint + moved_before(log))
     roles, unused = signal_roles(logs, ([*u, *still], d, y), named, model, still)
     all_named = named["inputs"] is not None and named["outputs"] is not None
     doubts = (*role_doubts(logs, named_all=all_named), *doubt_of_gains(logs, u))

@@ -291,7 +291,10 @@ def signals(
     if lacking:
         moving = [str(name) for name, item in logs[0].items() if np.nanmax(item) > np.nanmin(item)]
         options = " and ".join(f"--{role}s" for role in lacking)
-        hint = f"name {'it' if len(lacking) == 1 else 'them'} with {options}, of {', '.join(moving)}"
+        of_columns = ", ".join(moving) or "a run in which they move"
+        hint = f"name {'it' if len(lacking) == 1 else 'them'} with {options}, of {of_columns}"
+        still = [str(name) for name in logs[0] if name not in moving]
+        hint += f"; never moved: {', '.join(still)}" if still else ""
         hint += moved_before(logs[0]) if "input" in lacking else ""
         problem = " and ".join(f"no {role}" for role in lacking) + " among the columns"
         said = str(logs[0].attrs.get("role_doubts", "")).splitlines()

@@ -62,6 +62,9 @@ def test_a_file_without_a_clock_is_a_doubt_and_a_stated_step_is_none(tmp_path):
     (tmp_path / "log.csv").write_text("heater,t_a\n" + "".join(f"{k % 2},{20 + k % 3}\n" for k in range(30)))
     assert "rows are taken 1 s apart" in read_log(tmp_path / "log.csv").attrs["clock_doubts"]
     assert read_log(tmp_path / "log.csv", dt=0.5).attrs["clock_doubts"] == ""
+    uneven = "0,0,20\n" + "".join(f"{4 * k + k % 3},{k % 2},{20 + k % 3}\n" for k in range(30))
+    (tmp_path / "log.csv").write_text(uneven)
+    assert "so that rows are 5 s apart" in read_log(tmp_path / "log.csv").attrs["clock_doubts"]
 
 
 def test_tables_side_by_side_with_clocks_of_other_rates_are_a_doubt(tmp_path):
@@ -132,6 +135,15 @@ def test_words_beside_stamps_with_a_space_are_a_switch(tmp_path, on, off):
     assert column(log, "relay")[[*range(4), 30, 31]].tolist() == [0, 1, 1, 0, 1, 1]
     assert log["time"].values[-1] == 59
     assert log["outside"].attrs["role"] == "disturbance"
+
+
+def test_milliseconds_behind_a_comma_between_commas_are_of_their_stamp(tmp_path):
+    rows = [f"2024-05-04 12:30:{k:02},{25 * k % 1000:03},{PLATE[k]:.2f},{HEATER[k]:g}\n" for k in range(60)]
+    for header, step in (("asctime,plate,heater", 1.025), ("asctime,code,plate,heater", 1.0)):
+        (tmp_path / "log.csv").write_text(f"{header}\n{''.join(rows)}")
+        log = read_log(tmp_path / "log.csv")
+        assert np.median(np.diff(log["time"].values)) == pytest.approx(step)
+        np.testing.assert_allclose(column(log, "plate"), np.round(PLATE[:60], 2))
 
 
 def test_states_in_words_are_columns_of_0_and_1_but_for_rest(tmp_path):
@@ -211,14 +223,15 @@ def test_a_kiln_s_log_keeps_the_reading_that_has_a_blank_before_its_sign(tmp_pat
 
 def test_a_roaster_s_minutes_and_seconds_are_its_clock_and_its_events_no_states(tmp_path):
     events = {5: "Charge", 40: "Dry End", 90: "Drop"}
-    rows = [
-        f"{k // 60:02}:{k % 60:02}\t{PLATE[k]:.2f}\t{events.get(k, '')}\t{60 + 20 * (k // 40 % 2)}\n"
-        for k in range(120)
-    ]
-    (tmp_path / "roast.csv").write_text("Time1\tBT_degC\tEvent\tGas_percent\n" + "".join(rows))
-    log = read_log(tmp_path / "roast.csv")
-    assert (float(log["time"][-1]), list(log)) == (119.0, ["BT", "Gas"])
-    assert "Time1 is taken as minutes and seconds" in log.attrs["clock_doubts"]
+    for without in ("", "None"):  # a log of a fermenter writes a word in rows without a note
+        rows = [
+            f"{k // 60:02}:{k % 60:02}\t{PLATE[k]:.2f}\t{events.get(k, without)}\t{60 + 20 * (k // 40 % 2)}\n"
+            for k in range(120)
+        ]
+        (tmp_path / "roast.csv").write_text("Time1\tBT_degC\tEvent\tGas_percent\n" + "".join(rows))
+        log = read_log(tmp_path / "roast.csv")
+        assert (float(log["time"][-1]), list(log)) == (119.0, ["BT", "Gas"])
+        assert "Time1 is taken as minutes and seconds" in log.attrs["clock_doubts"]
 
 
 def test_a_hub_s_switch_is_read_though_its_words_are_few_beside_the_readings(tmp_path):

@@ -48,11 +48,9 @@ TOUCH = 23.0 + 12 * -np.expm1(-np.maximum(np.arange(200) * 0.1 - 5, 0) / 0.3)
             np.r_[WAVE[:100], 127.9, WAVE[100:300], -3.5, WAVE[300:]], 0.6, [100, 301], id="loose plug"
         ),
         pytest.param(level({50: 60.0}), 0.6, [50], id="one sample"),
-        pytest.param(level({(50, 52): 60.0}), 0.6, [50, 51], id="two samples"),
         pytest.param(level({(50, 53): 60.0}), 0.6, [50, 51, 52], id="three samples"),
         pytest.param(level({(50, 54): 60.0}), 0.6, [], id="a longer visit"),
         pytest.param(level({50: 50.0, (51, 57): 90.0}, 20.0), 0.6, [], id="half way into a visit"),
-        pytest.param(level({50: 90.0625, (51, 57): 90.0}, 20.0), 0.6, [], id="beyond a visit"),
         pytest.param(level({49: np.nan, 50: 90.0, 51: np.nan}), 0.6, [50], id="beside lost samples"),
         pytest.param(
             level({100: 90.0, 103: -10.0, 108: 127.9}, n=200), 0.6, [100, 103, 108], id="close together"
@@ -84,14 +82,7 @@ def test_in_slow_rows_a_spike_lies_beyond_all_others_by_more_than_their_range(va
 
 @pytest.mark.parametrize(
     ("celsius", "words"),
-    [
-        (25.0, ""),
-        (-80.0, ""),
-        (0.0, ""),
-        (200.0, ""),
-        (400.0, ""),
-        (298.0, "name the column t_tank_K if this is kelvin"),
-    ]
+    [(-80.0, ""), (200.0, ""), (400.0, ""), (298.0, "name the column t_tank_K if this is kelvin")]
     + [(room + k, says) for room in (0.0, 25.0, 60.0) for k, says in ((273.15, "is k"), (-273.15, "in k"))],
 )
 def test_a_temperature_in_the_wrong_unit_is_noticed_and_a_freezer_or_an_oven_is_not(celsius, words):
@@ -114,13 +105,6 @@ def test_a_lively_stretch_of_a_quiet_log_stays():
     assert np.flatnonzero(find_spikes(values, floor=0.6)).tolist() == [361]
 
 
-def test_without_a_floor_the_rule_scales_with_the_channel():
-    values = np.sin(np.arange(600) / 50)
-    values[200] += 0.9
-    small, large = find_spikes(1e-3 * values, floor=None), find_spikes(1e3 * values, floor=None)
-    assert np.flatnonzero(small).tolist() == np.flatnonzero(large).tolist() == [200]
-
-
 def test_a_spike_stands_out_from_what_the_channel_does_within_the_window():
     # over a whole period the median is 0 and |sin| has the median sin(pi/4), so the threshold is
     # 6 * 1.4826 * 0.7071 = 6.29 amplitudes; the wave itself moves by 0.31 of one beside the spike
@@ -132,12 +116,12 @@ def test_a_spike_stands_out_from_what_the_channel_does_within_the_window():
 
 
 def test_without_a_floor_a_spike_is_two_per_cent_of_the_range():
-    for size, found in ((1.8, []), (2.2, [500])):
+    for size, found, scale in ((1.8, [], 1e-3), (2.2, [500], 1e3)):
         values = 20 + np.arange(1000) / 10  # 2 % of its 1st to 99th percentile is 1.96
         values[500] += size
-        assert np.flatnonzero(find_spikes(values, floor=None)).tolist() == found
+        assert np.flatnonzero(find_spikes(scale * values, floor=None)).tolist() == found
         values[200] += 1000  # a spike is no part of the range
-        assert np.flatnonzero(find_spikes(values, floor=None)).tolist() == [200, *found]
+        assert np.flatnonzero(find_spikes(scale * values, floor=None)).tolist() == [200, *found]
 
 
 @settings(max_examples=50)
@@ -226,14 +210,11 @@ def test_a_sensor_code_is_no_reading_in_however_many_rows(code, rows):
 
 
 @pytest.mark.parametrize("step", [0.0625, 0.5, 1.0])
-def test_a_kettle_that_passes_85_degc_or_boils_at_a_code_loses_nothing(step):
+def test_a_kettle_that_passes_85_degc_and_what_counts_past_a_code_lose_nothing(step):
     course = np.concatenate([np.linspace(20, 85, 200), np.full(50, 85.0), np.linspace(85, 100, 50)])
     kept, lines = drop_codes("kettle", np.round(course / step) * step)
     assert lines == []
     assert np.isfinite(kept).all()
-
-
-def test_a_column_that_counts_past_a_code_or_is_held_at_one_loses_nothing():
     assert drop_codes("grasp", np.repeat(np.arange(80.0, 90.0), 40))[1] == []
     assert drop_codes("level", np.repeat([20.0, 85.0, 50.0, 85.0], 40))[1] == []
 
@@ -246,7 +227,8 @@ def test_a_reading_that_stands_still_while_the_heater_swings_is_stuck_and_the_so
     assert np.isnan(kept[201:]).all()
     assert np.isfinite(kept[:199]).all()
     assert "stuck at " in lines[0]
-    for healthy in (warm(), warm(step=2.0)):
+    resting = np.r_[np.zeros(3), warm()[:237] - 20, np.zeros(160)]  # as a drive that no name shows
+    for healthy in (warm(), warm(step=2.0), resting):
         assert drop_stuck("t", healthy, [heater]) == (pytest.approx(healthy), [])
     kept, lines = drop_stuck("t", np.r_[warm()[:240], np.full(160, warm()[239])], [heater])  # seven moves
     assert np.isnan(kept[241:]).all()

@@ -394,9 +394,9 @@ def test_utf_16_text_is_read_and_is_refused_where_it_ends_within_a_letter(tmp_pa
 
 def test_names_that_are_more_than_the_cells_are_not_given_to_them(tmp_path):
     path = tmp_path / "a.csv"
-    path.write_text("time,round,output,temperature\n" + "".join(f"{k},{k % 7},{20 + k}\n" for k in range(30)))
-    table = read_text_table(path)
-    assert list(table.numbers) == ["c1", "c2", "c3"]
-    assert any(
-        note.startswith("4 names above rows of 3 cells: columns named c1 to c3") for note in table.notes
-    )
+    for n in (3, 6):
+        rows = "".join(",".join(str(k % (7 + place) + place) for place in range(n)) + "\n" for k in range(30))
+        path.write_text(f"time,round,output,temperature\n{rows}")
+        table = read_text_table(path)
+        assert list(table.numbers) == [f"c{place}" for place in range(1, n + 1)]
+        assert table.notes[0].startswith(f"4 names above rows of {n} cells: columns named c1 to c{n}")
