@@ -273,22 +273,9 @@ def meta_path(path: str | Path) -> Path:
     return meta_path
 
 
-def _rows_of_meta(meta: Table, ids: Index[str], order: Index[str], file: str) -> NDArray[np.intp]:
-    """Return for each grasp its row in the meta file; both files must name the same grasps, each once."""
-    without = f"grasp {{!r}} has no samples in {Path(file).name}"
-    for wrong, problem, hint in (
-        (ids.duplicated(), "grasp_id {!r} occurs twice", "give each its own"),
-        (~ids.isin(order), without, "remove the row or add the samples"),
-    ):
-        for row in np.flatnonzero(wrong)[:1]:
-            raise UserError(problem.format(ids[row]), file=meta.file, row=int(meta.lines[row]), hint=hint)
-    for grasp in order[~order.isin(ids)][:1]:
-        raise UserError(f"no row for grasp {grasp!r} of {Path(file).name}", file=meta.file, hint="add it")
-    return ids.get_indexer(order)
-
-
-def _first_rows(table: Table) -> NDArray[np.intp]:
-    """Return the first row of each grasp in a table that repeats its facts; UserError where they differ."""
+def _rows_of_facts(table: Table, order: Index[str], file: str) -> NDArray[np.intp]:
+    """Return for each grasp of a file the first row that has its facts in a table; UserError where another
+    row has others, or the table names other grasps."""
     import pandas as pd
 
     known = ("grasp_id", *GRASP_LABELS, *GRASP_NUMBERS)
@@ -300,9 +287,14 @@ def _first_rows(table: Table) -> NDArray[np.intp]:
         header = two_rows.nunique(dropna=False).idxmax()
         (earlier, cell), (first, line) = two_rows[header], table.lines[two_rows.index]
         problem = f"{cell} of grasp {grasp!r} was {earlier} in row {first}"
-        hint = "repeat in each row what is known of its grasp"
+        hint = "give each grasp its own grasp_id, and the same facts in all of its rows"
         raise UserError(problem, file=table.file, row=int(line), column=header, hint=hint)
-    return facts.index.to_numpy()
+    for row, grasp in facts["grasp_id"][~facts["grasp_id"].isin(order)][:1].items():
+        problem, line = f"grasp {grasp!r} has no samples in {Path(file).name}", int(table.lines[row])
+        raise UserError(problem, file=table.file, row=line, hint="remove the row or add the samples")
+    for grasp in order[~order.isin(facts["grasp_id"])][:1]:
+        raise UserError(f"no row for grasp {grasp!r} of {Path(file).name}", file=table.file, hint="add it")
+    return facts.index[pd.Index(facts["grasp_id"]).get_indexer(order)].to_numpy()
 
 
 def _of_tables(table: Table, meta: Table | None, name: str) -> Grasps:
@@ -315,13 +307,9 @@ def _of_tables(table: Table, meta: Table | None, name: str) -> Grasps:
     samples = pd.DataFrame({name: columns[name] for name in ("grasp_id", *_SAMPLES) if name in columns})
     samples["time"] = samples["time"].round(6)
     order = pd.Index(samples["grasp_id"].unique())
-    repairs = [*table.notes, *notes]
-    if meta is None:
-        facts, rows = columns, _first_rows(table)
-    else:
-        facts, notes = _columns(meta, known)
-        repairs += notes
-        rows = _rows_of_meta(meta, pd.Index(facts["grasp_id"]), order, table.file)
+    facts, of_meta = (columns, []) if meta is None else _columns(meta, known)
+    rows = _rows_of_facts(meta or table, order, table.file)
+    repairs = [*table.notes, *notes, *of_meta]
     axis, channels = _onto_one_axis(samples, table.file, repairs)
     facts = {fact: facts[fact][rows] for fact in known if fact in facts}
     attrs = {"name": name, "repairs": "\n".join(repairs)}

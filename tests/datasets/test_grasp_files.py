@@ -182,7 +182,7 @@ ONE = META + "a,copper,43,23\n"
         (samples("a"), None, ["g.csv", "meta file is missing", "g_meta.csv"]),
         (samples("a", "b"), ONE, ["g_meta.csv", "no row for grasp 'b' of g.csv"]),
         (samples("a"), ONE + "b,wood,43,23\n", ["g_meta.csv", "row 3", "'b' has no samples in g.csv"]),
-        (samples("a"), ONE + "a,wood,43,23\n", ["row 3", "grasp_id 'a' occurs twice"]),
+        (samples("a"), ONE + "a,wood,43,23\n", ["row 3, column material: wood of grasp 'a' was copper"]),
         (samples("a") + samples("a").partition("\n")[2], ONE, ["'a': time runs back from 1 s to -0.5 s"]),
         (samples("a"), ONE.replace("43", "warm"), ["g_meta.csv", "row 2", "t_object_nominal_degC", "'warm'"]),
         (samples("a"), ONE.replace("nominal_degC", "nominal_C"), ["column t_object_nominal_C"]),
