@@ -14,7 +14,7 @@ x makes y respond is shown by prediction (Granger 1969): the past of x helps bes
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations, pairwise, product
 from typing import TypeAlias
@@ -56,13 +56,7 @@ class EvidenceSettings:
 EVIDENCE = EvidenceSettings()
 
 
-def is_moved(
-    columns: Columns,
-    name: str,
-    drives: Sequence[str],
-    beside: Sequence[str] = (),
-    at_lags: Callable[[Iterable[bool]], bool] = all,
-) -> bool:
+def is_moved(columns: Columns, name: str, drives: Sequence[str], beside: Sequence[str] = ()) -> bool:
     """Tell whether the past of a drive helps to predict a column beside its own and that of others, as long
     as the column is not stuck."""
     causes = [columns[n] for n in (*drives, *beside)]
@@ -71,8 +65,8 @@ def is_moved(
         return False
     reading, *causes = _standardised([values[is_sound] for values in (columns[name], *causes)])
     moves, others = causes[: len(drives)], causes[len(drives) :]
-    by_lags = [_gains(reading, moves, others, lags) for lags in EVIDENCE.lags]
-    return any(at_lags(gain > EVIDENCE.strong_gain for gain in of_drive) for of_drive in zip(*by_lags))
+    gains = np.array([_gains(reading, moves, others, lags) for lags in EVIDENCE.lags])
+    return bool(np.any(gains.min(axis=0) > EVIDENCE.strong_gain))
 
 
 def is_held(values: Floats) -> bool:
@@ -227,7 +221,7 @@ def role_doubts(
         n: np.where(find_spikes(v, floor=None), np.nan, v) if n in outputs else v for n, v in columns.items()
     }
     guessed = [name for name in moving if name in reasons]
-    moved = [name for name in outputs if is_moved(columns, name, inputs, at_lags=any)]
+    moved = [name for name in outputs if is_moved(columns, name, inputs)]
     read = [*outputs, *disturbances]
     for name in [name for name in inputs if name in guessed]:
         what = _unlike_an_input(name, columns, [n for n in inputs if n != name], outputs, read)

@@ -289,12 +289,13 @@ def _rows_of_facts(table: Table, order: Index[str], file: str) -> NDArray[np.int
         problem = f"{cell} of grasp {grasp!r} was {earlier} in row {first}"
         hint = "give each grasp its own grasp_id, and the same facts in all of its rows"
         raise UserError(problem, file=table.file, row=int(line), column=header, hint=hint)
-    for row, grasp in facts["grasp_id"][~facts["grasp_id"].isin(order)][:1].items():
-        problem, line = f"grasp {grasp!r} has no samples in {Path(file).name}", int(table.lines[row])
-        raise UserError(problem, file=table.file, row=line, hint="remove the row or add the samples")
+    without_samples = facts["grasp_id"][~facts["grasp_id"].isin(order)][:1]
+    for grasp, line in zip(without_samples, table.lines[without_samples.index]):
+        problem = f"grasp {grasp!r} has no samples in {Path(file).name}"
+        raise UserError(problem, file=table.file, row=int(line), hint="remove the row or add the samples")
     for grasp in order[~order.isin(facts["grasp_id"])][:1]:
         raise UserError(f"no row for grasp {grasp!r} of {Path(file).name}", file=table.file, hint="add it")
-    return facts.index[pd.Index(facts["grasp_id"]).get_indexer(order)].to_numpy()
+    return np.asarray(facts.index[pd.Index(facts["grasp_id"]).get_indexer(order)])
 
 
 def _of_tables(table: Table, meta: Table | None, name: str) -> Grasps:

@@ -287,8 +287,7 @@ def _moved_otherwise(
     drives += causes
     out |= causes
     unnamed = [n for n in outputs if guesses.get(n, ("", ""))[1].startswith((BY_UNIT, FOLLOWS))]
-    # two lags leave some of a smooth weather to be explained by whatever moved meanwhile
-    unmoved = [n for n in outputs if not is_moved(columns, n, drives, at_lags=all if n in unnamed else any)]
+    unmoved = [n for n in outputs if not is_moved(columns, n, drives)]
     moved = [n for n in outputs if n not in unmoved]
     for name in [n for n in unmoved if n in guesses and moved]:
         of_temperature = _TEMPERATURE.search(_name_words(name))  # it may follow what a drive moves
