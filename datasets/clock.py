@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -29,7 +30,6 @@ _TIME_NAME = re.compile(
     r"(time|timestamp|time_stamp|date|zeit|uhrzeit|datum|tijd|seconds?|secs?|millis|milliseconds|micros|minutes"
     r"|hours|x_value|epoch|clock|uptime|changed|updated|t|ts|ms|us)(_(utc|local|stamp|elapsed|abs|rel))?"
 )
-_STEP_NAME = re.compile(r"(?i)ts|dt|delta_?t|sampl(e|ing)_?(time|period|interval)")
 _COUNTER = re.compile(r"(?i)x|n|k|i|no|nr|id|index|idx|samples?|rows?|steps?|count(er)?|unnamed.*")
 _IN_SECONDS = re.compile(r"(?i)(.*_)?(s|secs?|seconds?|sekunden|x_value|uptime)")  # X_Value is LabVIEW's
 _TIME_WORDS = {"ms": 1e-3, "milli": 1e-3, "us": 1e-6, "micro": 1e-6, "minute": 60.0, "hour": 3600.0}
@@ -92,8 +92,7 @@ class Clock:
 
 
 def clock_of(table: Table, read: Mapping[str, Header], dt: float | None) -> Clock:
-    """Return the clock of a table; ``read`` is name, unit and factor by header, ``dt`` the step that the user
-    states [s]."""
+    """Return the clock of a table; ``read`` is what its headers say, ``dt`` the stated step [s]."""
     named = [
         h for h, column in read.items() if column.unit in _TIME_UNITS and _TIME_NAME.fullmatch(column.name)
     ]
@@ -125,7 +124,10 @@ def clock_of(table: Table, read: Mapping[str, Header], dt: float | None) -> Cloc
                 return replace(first, doubt=doubt)
         same = frozenset[str]().union(*(clock.columns for clock in known))
         return replace(first, columns=same)
-    return _of_rows(table, read)
+    step = float(table.meta.get("dt", 1.0))  # a file may have it beside its columns
+    note = f"no time column: rows are taken {step:g} s apart; --dt S sets another step"
+    doubt = "" if "dt" in table.meta else "no column is a clock: rows are taken 1 s apart"
+    return Clock(step * np.arange(len(table.lines), dtype=float), frozenset(), (note,), doubt=doubt)
 
 
 def _seconds_a_row(clock: Clock) -> float:
@@ -202,8 +204,6 @@ def _what_counts_mean(name: str, counts: Floats, *, wrapped: bool) -> _Counts:
     usual = float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
     whole = bool(np.all(counts == np.rint(counts)))
     likely = (date for date in _DATES if not date.calendar or (not whole and usual <= CLOCK.days_apart))
-    # dates between the years 2000 and 2100 they may be, as programs count them: in s, ms, us or ns since
-    # 1970, or in what Windows, .NET, spreadsheets and MATLAB count
     dates = next((date for date in likely if date.has(float(counts[0]))), None)
     of_board = whole and usual >= CLOCK.counts_apart and not np.all(steps % 60 == 0)
     if word is not None and (dates is None or dates.seconds == 1.0):  # a board's counter may be as large
@@ -213,8 +213,7 @@ def _what_counts_mean(name: str, counts: Floats, *, wrapped: bool) -> _Counts:
         return replace(dates, doubt=f"{name} is taken as the time in days of {dates.calendar}, {apart}")
     if dates is not None and not (dates.seconds == 1.0 and of_board):
         return dates
-    # with decimals, or less than 20 apart, they are likely seconds; whole numbers further apart are where
-    # their steps are whole minutes
+    # with decimals, less than 20 apart, or in steps of whole minutes they are likely seconds
     if not of_board:
         known = _IN_SECONDS.fullmatch(name) or (dates is not None) or _of_loop(steps)
         guess = f"{name} has no unit: taken as seconds, so that rows are {usual:g} s apart"
@@ -228,8 +227,7 @@ def _what_counts_mean(name: str, counts: Floats, *, wrapped: bool) -> _Counts:
 
 
 def _of_loop(steps: Floats) -> bool:
-    """Tell whether steps are those of a program's loop, which counts in seconds: they differ from row to row
-    by more than rounding, and are 0.1, 0.2, 0.5, 1, ... s long or not round in minutes or hours."""
+    """Tell whether steps jitter as a program's loop does, and are round in seconds alone, or not at all."""
     usual = float(np.median(steps))
     off = steps[np.abs(steps - usual) <= CLOCK.evenness * usual] - usual
     if usual < 0.095 or np.unique(np.round(off, 9)).size < 5 or off.std() < 5e-4 * usual:
@@ -246,14 +244,12 @@ def _unwrapped(counts: Floats, lines: NDArray[np.int64]) -> tuple[Floats, list[s
     back = np.flatnonzero(steps < 0)
     usual = float(np.nanmedian(steps)) if back.size else 0.0
     for row in back:
-        for bits in (16, 32):
-            for count in (1.0, 1e-3, 1e-6):  # the file may have it in s already
-                forward = float(steps[row]) + 2.0**bits * count
-                # where the time runs back by 2^16 or 2^32 counts but for one step, it goes on
-                if 0 < forward <= 2 * usual:
-                    counts = counts + np.where(np.arange(counts.size) > row, 2.0**bits * count, 0.0)
-                    wrapped = f"a counter of {bits} bits wrapped in row {lines[row + 1]}"
-                    notes.append(f"time: {wrapped}: it goes on")
+        for bits, count in product((16, 32), (1.0, 1e-3, 1e-6)):  # the file may have it in s already
+            forward = float(steps[row]) + 2.0**bits * count
+            # where the time runs back by 2^16 or 2^32 counts but for one step, it goes on
+            if 0 < forward <= 2 * usual:
+                counts = counts + np.where(np.arange(counts.size) > row, 2.0**bits * count, 0.0)
+                notes.append(f"time: a counter of {bits} bits wrapped in row {lines[row + 1]}: it goes on")
     return counts, notes
 
 
@@ -276,20 +272,6 @@ def _in_pieces(seconds: Floats, lines: NDArray[np.int64], fewest_rows: int) -> t
     return seconds, [f"time: the clock starts again in {where}: new segments, after gaps of unknown length"]
 
 
-def _of_rows(table: Table, read: Mapping[str, Header]) -> Clock:
-    """Return a clock that counts rows, by a step that stands in the file or of 1 s."""
-    steps = {
-        h: np.unique(v[np.isfinite(v)])
-        for h, v in table.numbers.items()
-        if _STEP_NAME.fullmatch(read[h].name)
-    }
-    stated = {header: float(v[0]) for header, v in steps.items() if v.size == 1 and v[0] > 0}
-    step = next(iter(stated.values()), float(table.meta.get("dt", 1.0)))
-    note = f"no time column: rows are taken {step:g} s apart; --dt S sets another step"
-    doubt = "" if stated or "dt" in table.meta else "no column is a clock: rows are taken 1 s apart"
-    return Clock(step * np.arange(len(table.lines), dtype=float), frozenset(stated), (note,), np.nan, doubt)
-
-
 def read_clock(cells: Sequence[str]) -> tuple[Floats, str] | None:
     """Return the seconds that dates and times of day mean (without a date from midnight on, UTC without an
     offset) and how they were taken; None if they are none."""
@@ -306,9 +288,8 @@ def read_clock(cells: Sequence[str]) -> tuple[Floats, str] | None:
     hour, minute, second = (np.nan_to_num(numbers(key)) for key in (4, 5, 6))
     half = fields[7].str.lower()
     hour = np.where(half.notna() & (hour == 12), 0, hour) + 12.0 * (half == "pm").to_numpy()
-    offset = fields[8].str.replace(":", "").str.extract(r"([+-])(\d{2})(\d{2})")
-    shift = pd.to_numeric(offset[1]) * 60 + pd.to_numeric(offset[2])
-    minute = minute - np.nan_to_num(np.asarray(shift.where(offset[0] == "+", -shift), dtype=float))
+    offset = fields[8].str.replace(r"([+-]\d\d):?(\d\d)", r"\1:\2:00", regex=True)
+    minute = minute - np.nan_to_num(pd.to_timedelta(offset, errors="coerce") / pd.Timedelta(minutes=1))
     of_day = 3600 * hour + 60 * minute + second
     of_day[fields[[1, 4]].isna().all(axis=1)] = np.nan
     if fields[1].isna().all() and fields[6].isna().all() and (hour.max() > 23 or not (hour[0] or minute[0])):
@@ -344,11 +325,3 @@ def _follow(dates: pd.Series) -> bool:
     """Tell whether all cells are dates, and each day is the one after another."""
     days = np.unique(np.asarray(dates, dtype="datetime64[D]"))
     return bool(dates.notna().all() and np.all(np.diff(days) == np.timedelta64(1, "D")))
-
-
-def since_first_row(seconds: Floats) -> tuple[Floats, list[str]]:
-    """Return times since 1970 [s] counted from the first row, others as they are, and a line if they were."""
-    if not seconds[0] >= EPOCH[0]:
-        return seconds, []
-    repairs = f"time is a clock of seconds since 1970: counted from the first row, {seconds[0]:.0f} s"
-    return np.round(seconds - seconds[0], 6), [repairs]

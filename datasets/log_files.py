@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thermogrip.datasets import repair
-from thermogrip.datasets.clock import CLOCK, EPOCH, Clock, clock_of, read_clock, since_first_row
+from thermogrip.datasets.clock import CLOCK, EPOCH, Clock, clock_of, read_clock
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.evidence import effect_doubts
 from thermogrip.datasets.files import atomic_path, file_format, file_stem, split_cut, write_atomic
@@ -255,18 +255,12 @@ def _read_netcdf_table(path: str | Path) -> Table:
     return Table(str(path), numbers, {}, np.arange(1, data.sizes["time"] + 1), attrs, meta, notes)
 
 
-_OF_TEXT = {
-    "csv": read_text_table,
-    "text": read_text_table,
-    "matlab": read_matlab_table,
-    "excel": read_excel_table,
-}
-
-
 def _read_table(file: Path, columns: Sequence[str] | None) -> Table:
     kind = "rosbag" if os.path.isdir(file) else file_format(file)
-    if kind in _OF_TEXT:
-        return _OF_TEXT[kind](file, columns)
+    if kind in ("csv", "text"):
+        return read_text_table(file, columns)
+    if kind in ("matlab", "excel"):
+        return read_matlab_table(file, columns) if kind == "matlab" else read_excel_table(file, columns)
     if columns is not None:
         raise UserError("has names of its own", file=file, hint="leave --columns out")
     if kind != "rosbag":
@@ -321,8 +315,7 @@ def _convert(table: Table, dt: float | None) -> _Columns:
 
 
 def _states_as_columns(table: Table, clock: Clock) -> Table:
-    """Return a table with a column of 0 and 1 for each word of columns that have a few, but for the one of
-    rest: ``off``, ``idle``, else the most frequent."""
+    """Return a table with a column of 0 and 1 for each of a few words, but ``off`` or the most frequent."""
     numbers, text = dict(table.numbers), dict(table.text)
     notes = []
     for header in [header for header in table.text if header not in clock.columns]:
@@ -344,8 +337,7 @@ def _states_as_columns(table: Table, clock: Clock) -> Table:
 
 
 def _one_column_a_signal(table: Table) -> Table:
-    """Return a table with a reading of one signal in a row, as home hubs export their history, as one with a
-    column a signal, each held until its next reading; any other table as it is."""
+    """Return a home hub's table, a reading of one signal in a row, with a column a signal; others as are."""
     clocks = [h for h, cells in table.text.items() if read_clock(cells[:20]) is not None]
     clocks += [h for h in table.numbers if read_header(h).name in ("time", "timestamp")]
     states = {h: switched(cells) for h, cells in table.text.items() if h not in clocks}
@@ -415,8 +407,10 @@ def _repair(
     if time.size < 2:
         raise UserError(f"{time.size} row(s) are not a log", file=table.file, hint="give at least two rows")
     repairs += repair.doubt_repeats([*columns.values()], table.lines[once][ordered.rows])
-    time, findings = since_first_row(time)
-    repairs += findings + repair.describe_steps(time)
+    if time[0] >= EPOCH[0]:
+        repairs.append(f"time is a clock of seconds since 1970: counted from the first row, {time[0]:.0f} s")
+        time = np.round(time - time[0], 6)
+    repairs += repair.describe_steps(time)
     inputs, stuck = [values for name, values in columns.items() if roles[name] == "input"], False
     for name, values in columns.items():
         if roles[name] == "output" and inputs:
@@ -480,19 +474,19 @@ def _without_half_lost(roles: Roles, time: Floats, columns: Mapping[str, Floats]
 def _repair_column(
     name: str, values: Floats, time: Floats, unit: str, role: str, file: str
 ) -> tuple[Floats, list[str]]:
+    repairs: list[str] = []
     values = np.where(np.isinf(values), np.nan, values)
-    if role == "input":
-        return repair.fill_input(name, values)
-    if role == "disturbance":
-        filled, repairs = repair.fill_disturbance(name, values, time)
-        return filled, repairs + (repair.check_plausible(name, filled, file) if unit == "degC" else [])
-    if role != "output":
-        return values, []
-    lost = int(np.isnan(values).sum())
-    repairs = [f"{name}: {lost} lost sample{'' if lost == 1 else 's'} left empty"] if lost else []
-    floor = repair.SPIKE_FLOOR_K if unit == "degC" else None
-    values, spikes = repair.reject_spikes(name, values, time, floor=floor)
-    return values, repairs + spikes + (repair.check_plausible(name, values, file) if unit == "degC" else [])
+    if role in ("input", "disturbance"):
+        values, repairs = repair.fill_lost(name, values, time if role == "disturbance" else None)
+    elif role == "output":
+        lost = int(np.isnan(values).sum())
+        floor = repair.SPIKE_FLOOR_K if unit == "degC" else None
+        values, repairs = repair.reject_spikes(name, values, time, floor=floor)
+        if lost:
+            repairs = [f"{name}: {lost} lost sample{'' if lost == 1 else 's'} left empty", *repairs]
+    if unit == "degC" and role in ("output", "disturbance"):
+        repairs = repairs + repair.check_plausible(name, values, file)
+    return values, repairs
 
 
 def _cut(log: Log, start: float, stop: float) -> Log:
@@ -507,8 +501,7 @@ def _cut(log: Log, start: float, stop: float) -> Log:
 
 
 def _as_csv(log: Log, ending: str) -> bytes:
-    """Return a log as text, packed as its ending says; each number is the shortest that reads back as the
-    same double."""
+    """Return a log as text, packed as its ending says; each number reads back as the same double."""
     names = [join_header(str(n), v.attrs["units"], [*log]) for n, v in log.data_vars.items()]
     header = [str(csv_cell(name)) for name in names]
     data = log.to_dataframe().to_csv(header=header, index_label="time_s", lineterminator="\n").encode()

@@ -43,7 +43,7 @@ _MOST_LEVELS = 20  # of an input that is set
 _FEWEST_HELD = 4  # rows, of a standstill
 _FEWEST_ALIKE, _MOST_TO_AND_FRO = 3, 0.4  # moves of an input; share of them
 _OTHER_STEP = 1.5  # times as long: no jitter, another step
-_FEW, _MOST_MOVED = 0.05, 10  # share of rows whose time may be wrong; rows that one may be out of place
+_FEW = 0.05  # share of rows that may be without a time, or otherwise than the others
 
 
 class Doubt(str):
@@ -63,7 +63,7 @@ class OrderedRows(NamedTuple):
 
 
 def order_rows(time: Floats, lines: NDArray[np.int64], file: str) -> OrderedRows:
-    """Return rows of strictly increasing times; UserError where many are missing or run backward."""
+    """Return rows of increasing times; UserError where many times are missing or run backward."""
     rows, repairs = np.arange(time.size), []
     lost = ~np.isfinite(time)
     if lost.mean() > _FEW:
@@ -73,20 +73,13 @@ def order_rows(time: Floats, lines: NDArray[np.int64], file: str) -> OrderedRows
         rows = rows[~lost]
         count = int(lost.sum())
         repairs.append(f"{count} row{_s(count)} without a time dropped ({name_rows(lines[lost])})")
-    back = time[rows] < np.maximum.accumulate(time[rows])
-    order = np.argsort(time[rows], kind="stable")
-    if back.any():
-        if back.mean() > _FEW or np.abs(order - np.arange(rows.size)).max() > _MOST_MOVED:
-            at = int(np.argmax(np.diff(time[rows]) < 0))
-            problem = f"time runs back from {time[rows[at]]:g} s to {time[rows[at + 1]]:g} s"
-            hint = "cut the file there in two, sort its rows, or give the step of all rows with --dt"
-            raise UserError(problem, file=file, row=int(lines[rows[at + 1]]), hint=hint)
-        says = f"{back.sum()} row{_s(int(back.sum()))} out of order sorted ({name_rows(lines[rows[back]])})"
-        rows = rows[order]
-        sorted_steps = np.diff(time[rows])
-        between = sorted_steps.min() < np.median(sorted_steps) / 2  # where rows fall between others
-        repairs.append(ClockDoubt(f"{says}, between others: did the clock run twice?") if between else says)
-    first = np.concatenate([[True], np.diff(time[rows]) > 0])
+    steps = np.diff(time[rows])
+    if (steps < 0).any():
+        at = int(np.argmax(steps < 0))
+        problem = f"time runs back from {time[rows[at]]:g} s to {time[rows[at + 1]]:g} s"
+        hint = "cut the file there in two, sort its rows, or give the step of all rows with --dt"
+        raise UserError(problem, file=file, row=int(lines[rows[at + 1]]), hint=hint)
+    first = np.append(True, steps > 0)
     starts, repeats = np.flatnonzero(first), int((~first).sum())
     if repeats > 0.25 * rows.size and starts.size > 1:  # a coarse clock
         stamps = time[rows[starts]]
@@ -140,8 +133,7 @@ def describe_gaps(time: Floats, inputs: dict[str, Floats]) -> list[str]:
 
 
 def find_spikes(values: Floats, *, floor: float | None) -> NDArray[np.bool_]:
-    """Return which samples (n,) of a channel are spikes; NaN is skipped.  ``floor`` is the
-    least deviation that can be one, None to derive it from the channel."""
+    """Return which samples (n,) are spikes; ``floor`` is the least one, None: by the channel's range."""
     spikes = np.zeros(values.shape, dtype=bool)
     finite_rows = np.flatnonzero(np.isfinite(values))
     if finite_rows.size < SPIKE_WINDOW:
@@ -206,8 +198,7 @@ def doubt_readings(name: str, values: Floats, inputs: Sequence[Floats], time: Fl
 
 
 def _longest_standstill(values: Floats, moves: Floats) -> tuple[float, int]:
-    """Return the value that a reading stands still at in most rows, and their number, although it moved
-    until then by more than the to and fro of one that settles."""
+    """Return the value at which a reading stops in most rows, and their number, where it does not settle."""
     least = 2 * float(moves[moves > 0].min())
     ends = np.flatnonzero(np.append(moves != 0, True))
     rows_at: dict[float, int] = {}
@@ -262,8 +253,7 @@ def doubt_moves(name: str, values: Floats) -> str:
 
 
 def _goes_on(values: Floats) -> dict[str, NDArray[np.bool_]]:
-    """Return which rows but the last go on as before: held at one value, or drawn straight within the steps
-    of the column's numbers."""
+    """Return which rows but the last go on as before: held, or straight within the column's steps."""
     moves = np.diff(values)
     turns = np.abs(np.diff(moves, prepend=np.nan))
     return {"held": moves == 0, "drawn straight": turns < 1.5 * _smallest_step(values)}  # half for rounding
@@ -350,8 +340,7 @@ def _rows_beyond_jumps(values: Floats, rows: NDArray[np.bool_]) -> NDArray[np.bo
 
 
 def drop_stuck(name: str, values: Floats, inputs: Sequence[Floats]) -> tuple[Floats, list[str]]:
-    """Return an output without the run in which it stands still, or goes on straight, although the inputs
-    move, and a line."""
+    """Return an output without the run in which it is held, or straight, while inputs move, and a line."""
     travel = np.zeros(values.size)  # of all inputs since the first row, in ranges
     for u in inputs:
         if (span := float(np.nanmax(u) - np.nanmin(u))) > 0:
@@ -403,23 +392,17 @@ def reject_spikes(
     return np.where(spikes, np.nan, values), [repairs]
 
 
-def fill_input(name: str, values: Floats) -> tuple[Floats, list[str]]:
-    """Return the input with each lost value held from the last row; leading lost values stay NaN."""
+def fill_lost(name: str, values: Floats, time: Floats | None = None) -> tuple[Floats, list[str]]:
+    """Return a column with lost values interpolated in time, or without times held from the last row."""
     lost = ~np.isfinite(values)
     if not lost.any():
         return values, []
-    last = np.maximum.accumulate(np.where(lost, -1, np.arange(values.size)))
-    filled = np.where(last >= 0, values[last], np.nan)
-    return filled, [f"{name}: {lost.sum()} lost value{_s(int(lost.sum()))} held from the row before"]
-
-
-def fill_disturbance(name: str, values: Floats, time: Floats) -> tuple[Floats, list[str]]:
-    """Return the disturbance with lost values interpolated in time (held at the ends)."""
-    lost = ~np.isfinite(values)
-    if not lost.any():
-        return values, []
-    filled = np.interp(time, time[~lost], values[~lost])
-    return filled, [f"{name}: {lost.sum()} lost value{_s(int(lost.sum()))} interpolated"]
+    if time is None:
+        last = np.maximum.accumulate(np.where(lost, -1, np.arange(values.size)))
+        filled, how = np.where(last >= 0, values[last], np.nan), "held from the row before"
+    else:
+        filled, how = np.interp(time, time[~lost], values[~lost]), "interpolated"
+    return filled, [f"{name}: {lost.sum()} lost value{_s(int(lost.sum()))} {how}"]
 
 
 def check_plausible(name: str, celsius: Floats, file: str) -> list[str]:

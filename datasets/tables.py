@@ -14,7 +14,6 @@ import io
 import lzma
 import math
 import re
-import shlex
 import warnings
 import zipfile
 from collections import Counter
@@ -46,11 +45,11 @@ _LOST_CELLS = frozenset(
     ["", "nan", "NaN", "NAN", "NA", "na", "N/A", "null", "NULL", "None", "-nan", "#N/A", "<NA>", "NaT",
      "-", "--", "---", "?", "*", "unknown", "unavailable"]
 )  # fmt: skip
-_CODINGS = {"cp1252": "Windows-1252", "cp932": "Shift-JIS", "gb18030": "GB 18030"}
 _COMMENT = ("#", "%", "//")  # how a line begins that is no row
 _GOOD = frozenset(["good", "ok", "valid"])  # what servers of readings (OPC) call those that are some
 _LEFT_OUT = "\x1f"  # how the name of a column begins that is not kept
 _NAMELESS = "columns named c1 to c{} by position; --columns a,b,... names them"
+_HEAD = 1 << 20  # characters of a text that are looked through for its lines' kind
 _HEAD_LINES = 200  # of a file, that show how it is a table: the longest preamble seen has 40
 #: A date, a time of day, or both, as a whole cell.
 STAMP = re.compile(
@@ -126,8 +125,7 @@ class Column:
 
 
 def read_csv_table(path: str | Path, *, text: Callable[[str], bool] | None = None) -> Table:
-    """Return the columns of a CSV file, plain, ``.gz`` or ``.xz``, of which nothing that is broken is passed
-    over; ``text`` tells which headers are those of text."""
+    """Return the columns of a CSV file that has nothing broken; ``text`` tells which headers are of text."""
     file = str(path)
     content, _ = _decoded(_bytes_of(path), file, strict=True)
     with as_user_error(csv.Error, "the header is no line of names", file=file, hint="correct it"):
@@ -140,8 +138,7 @@ def read_csv_table(path: str | Path, *, text: Callable[[str], bool] | None = Non
 
 
 def read_text_table(path: str | Path, columns: Sequence[str] | None = None) -> Table:
-    """Return the columns of a text table that any program wrote; ``columns`` are names in place of the file's
-    own, one a column, ``-`` to leave one out."""
+    """Return the columns of any program's text; ``columns`` are other names for all, ``-`` leaves one out."""
     return parse_text(_bytes_of(path), str(path), columns)
 
 
@@ -187,20 +184,15 @@ def _new_names(columns: Sequence[str], n: int, file: str | Path) -> list[str]:
 
 def check_header(headers: Sequence[str], names: Sequence[str], file: str) -> None:
     """Refuse names where a table has no header, with the ``--columns`` that would give them to it."""
-    header_words = {header.lower() for header in headers}
-    spare = len(headers) - len(names)
-    if not names or spare < 0 or header_words != {f"c{place + 1}" for place in range(len(headers))}:
-        return
-    if not header_words & {name.strip().lower() for name in names}:
-        words = [*["time_s"][:spare], *names, *["-"] * (spare - 1)]
-        hint = f"name its columns in their order, such as --columns {','.join(words)} (-: left out)"
+    places = {f"c{place}" for place in range(1, len(headers) + 1)}
+    if names and {header.lower() for header in headers} == places and not places & {*map(str.lower, names)}:
+        hint = f"name its columns in their order: --columns {','.join(['NAME'] * len(headers))} (-: left out)"
         raise UserError("has no header", file=file, hint=hint)
 
 
 def find_layout(text: str, file: str, *, named: bool = False) -> Layout:
-    """Return how a text is a table, from its first lines; a header of fewer names than cells is refused, but
-    where the columns are ``named`` otherwise."""
-    head = [(place, line) for place, line in enumerate(_head_lines(text), start=1) if line.strip()]
+    """Return how a text is a table; names fewer than cells are refused, but where others are ``named``."""
+    head = [(place, line) for place, line in enumerate(_iterate_lines(text, _HEAD), start=1) if line.strip()]
     head = head[:_HEAD_LINES]
     separator, first = _best_separator([line for _, line in head])
     if first is None:
@@ -210,9 +202,6 @@ def find_layout(text: str, file: str, *, named: bool = False) -> Layout:
     if n > MOST_COLUMNS:
         raise UserError(f"has {n} columns, more than {MOST_COLUMNS}", file=file, hint="leave some out")
     header, used = _names_above([line for _, line in head[:first]], rows[0], separator)
-    if not any(header) and len(rows) > 1:  # numbers of channels beside words are names too
-        of_channels, used = _names_above([head[first][1]], rows[1], separator)
-        header, first, rows = (of_channels, first + 1, rows[1:]) if used else (header, first, rows)
     hollow = not header[-1] and all(row[-1] == "" for row in rows)  # every line ends with a separator
     nameless = [f"c{place}" for place, name in enumerate(header[: n - hollow], 1) if not name]
     above = _cells_of_names(head[first - 1][1], n, separator) if first else []
@@ -243,8 +232,7 @@ def find_layout(text: str, file: str, *, named: bool = False) -> Layout:
 
 
 def _best_separator(lines: Sequence[str]) -> tuple[str, int | None]:
-    """Return the separator that makes most of the lines rows of numbers, and which is the first row, None
-    where no line is one."""
+    """Return the separator by which most of the lines are rows of numbers, and the first row's place."""
     most_values = -1.0
     best, best_first = ",", None
     for separator in "\t;|, ":
@@ -287,14 +275,10 @@ def _as_typed(cell: str) -> str:
 
 def _is_value(cell: str) -> bool:
     cell = _as_typed(cell)
-    if (
-        _NUMBER_CELL.fullmatch(cell.replace(",", "."))
-        or STAMP.fullmatch(cell)
-        or cell in _LOST_CELLS
-        or cell.lower() in _SWITCH
-    ):
+    if _NUMBER_CELL.fullmatch(cell.replace(",", ".")) or STAMP.fullmatch(cell) or cell in _LOST_CELLS:
         return True
-    return (match := _WITH_UNIT.fullmatch(cell)) is not None and _is_unit(match[2])
+    with_unit = _WITH_UNIT.fullmatch(cell)
+    return cell.lower() in _SWITCH or (with_unit is not None and _is_unit(with_unit[2]))
 
 
 def _number_share(row: Sequence[str]) -> float:
@@ -303,8 +287,7 @@ def _number_share(row: Sequence[str]) -> float:
 
 
 def _cells_of_names(line: str, n: int, separator: str) -> list[str]:
-    """Return the cells of a line as the names of n columns: split by any separator that gives so many, once
-    empty ones at its ends fall away; else as a row is."""
+    """Return a line's cells as names of n columns: by any separator that gives so many, else as a row's."""
     line = line.lstrip("#%/ ") if line.startswith(_COMMENT) else line
     if line.rstrip().endswith(("[", "{")):  # a matrix begins, as MATLAB writes it
         return []
@@ -316,21 +299,8 @@ def _cells_of_names(line: str, n: int, separator: str) -> list[str]:
     return as_rows
 
 
-def _are_channels(cells: Sequence[str], below: Sequence[str]) -> bool:
-    """Tell whether cells are names although most are numbers: those of channels (whole, each once, none of
-    them again in the row below), beside words above numbers."""
-    channels = [cell for cell in cells if cell.isdigit()]
-    under_words = [under for cell, under in zip(cells, below) if not _is_value(cell)]
-    return (
-        0 < len(under_words) == len(below) - len({*channels}) == len(cells) - len(channels)
-        and all(map(_is_value, under_words))
-        and all(cell != under for cell, under in zip(cells, below))
-    )
-
-
 def _names_above(lines: Sequence[str], row: Sequence[str], separator: str) -> tuple[list[str], int]:
-    """Return the names of the columns of a row, empty where the file has none, and the number of their
-    lines."""
+    """Return the names of a row's columns, empty where there is none, and the number of their lines."""
     n = len(row)
     headers: list[list[str]] = []  # the nearest first
     counted: list[bool] = []  # those that are no comments
@@ -343,8 +313,7 @@ def _names_above(lines: Sequence[str], row: Sequence[str], separator: str) -> tu
         words = [*filter(None, cells)]
         fits = len(cells) == n or len(cells) == n - 1 > 1
         no_states = [word for word in words if word.lower() not in _SWITCH]  # a name may be Heating
-        are_names = _number_share(no_states) < 0.5 or (nearest and _are_channels(cells, row))
-        if fits and words and are_names and not (comment and headers):
+        if fits and words and _number_share(no_states) < 0.5 and not (comment and headers):
             headers.append([*cells, ""][:n])
             counted.append(not comment)
     if not headers:
@@ -384,29 +353,24 @@ def _first_line_as_names(text: str, file: str) -> Layout:
 
 def _without_labels(text: str) -> tuple[str, tuple[str, ...]]:
     """Return the lines of a log that have readings beside their names, as a table with a header."""
-    head = list(islice(_head_lines(text), 5 * _HEAD_LINES))
+    start = text.find(f"\n{_KLIPPER}") + 1  # behind a printer's settings
+    head = list(islice(_iterate_lines(text[start:], _HEAD), 5 * _HEAD_LINES))
     if any(map(_ESPHOME.match, head)):
         matches = map(_ESPHOME.match, _iterate_lines(text))
         readings = (match.expand(r"\1,\2,\3") if match else "" for match in matches)
         return "\n".join(["time,name,state", *readings]), ("lines of an ESPHome log",)
     # so write serial plotters (T1:23.5,T2:24.0), printer hosts (T:22.1 /200.0 @:127, a target behind its
     # reading) and Klipper (extruder: target=200 temp=22.1 pwm=0.9); lines without them are passed over
-    stats = [line for line in _iterate_lines(text) if line.startswith(_KLIPPER)] if _KLIPPER in text else []
-    found = dict.fromkeys(chain.from_iterable(map(_labelled_cells, stats)))
-    names = ("uptime_s", *(name for name in found if name.rpartition("_")[2] in _OF_HEATERS))
-    needed = {"uptime_s"}  # a heater may be in some lines only, behind a printer's settings
-    if len(names) == 1:
-        labels = Counter(tuple(_labelled_cells(line)) for line in head)
-        del labels[()]
-        names, count = max(labels.items(), key=lambda item: (item[1], len(item[0])), default=((), 0))
-        if not names or count < min(_LABELLED_LINES, max(2, _MOST * sum(map(bool, head)))):
-            return text, ()
-        needed = {*names}
+    labels = Counter(tuple(_labelled_cells(line)) for line in head)
+    del labels[()]
+    names, count = max(labels.items(), key=lambda item: (item[1], len(item[0])), default=((), 0))
+    if not names or count < min(_LABELLED_LINES, max(2, _MOST * sum(map(bool, head)))):
+        return text, ()
     rows: list[str] = []
     passed = 0
     for line in _iterate_lines(text):
         cells = _labelled_cells(line)
-        rows.append(",".join(cells.get(name, "") for name in names) if cells.keys() >= needed else "")
+        rows.append(",".join(cells[name] for name in names) if cells.keys() >= {*names} else "")
         passed += not rows[-1] and bool(line.strip())
     first = next((place for place, row in enumerate(rows) if row), 0)
     rows[max(first - 1, 0) : first] = [",".join(names)]  # in place of a line before, if there is one
@@ -416,9 +380,8 @@ def _without_labels(text: str) -> tuple[str, tuple[str, ...]]:
 
 
 def _stamps_as_column(text: str) -> str:
-    """Return the lines of a terminal that begin with a stamp in brackets, or before an arrow, as a table with
-    the stamps as its first column."""
-    head = [line for line in islice(_head_lines(text), _HEAD_LINES) if line.strip()]
+    """Return a terminal's lines, each behind its stamp in brackets or before an arrow, with it as a cell."""
+    head = [line for line in islice(_iterate_lines(text, _HEAD), _HEAD_LINES) if line.strip()]
     stamped = [match for line in head if (match := _TERMINAL.match(line))]
     if not head or len(stamped) < _MOST * len(head):
         return text
@@ -435,6 +398,7 @@ def _stamps_as_column(text: str) -> str:
 def _labelled_cells(line: str) -> dict[str, str]:
     """Return the numbers of a line by the names beside them, and its stamp."""
     stamp = _LINE_STAMP.match(line)
+    of_klipper = stamp is not None and stamp[2]
     section = last = ""
     cells: dict[str, str] = {}
     if line.startswith("{"):  # JSON, an object a line
@@ -446,10 +410,10 @@ def _labelled_cells(line: str) -> dict[str, str]:
         name, value = match["alone"] or match["name"], match["value"]
         if match["section"]:
             section = match["section"]
-        elif name:
+        elif name in _OF_HEATERS or (name and not of_klipper):
             last = f"{section}_{name}" if section and name in _OF_HEATERS else name
             cells[unused(last, cells)] = value
-        elif last:
+        elif last and not name:
             cells[unused(f"{last}_target", cells)] = value
     return cells if len(cells) > (stamp is not None) else {}
 
@@ -457,19 +421,17 @@ def _labelled_cells(line: str) -> dict[str, str]:
 def _parse_table(
     text: str, layout: Layout, file: str, is_text: Callable[[str], bool], tolerated: float
 ) -> Table:
-    """Return the table in a text; of the columns that are wrong beyond what is tolerated the first is named.
-
-    Up to a share ``tolerated`` of the rows, and twice as many cells of a column, may be left out.
-    """
+    """Return the table in a text; a share ``tolerated`` of rows, twice that of cells, may be left out."""
     names, n = layout.names, len(layout.names)
     rows, notes = list(_cell_rows(text, layout, file)), list(layout.notes)
     if rows and len(rows[-1][1]) < n and not text.endswith(("\n", "\r")):
         line, cells = rows.pop()
         notes.append(f"row {line} is the last and was cut off ({len(cells)} of {n} cells): dropped")
-    again = [line for line, cells in rows if any(layout.header) and cells == layout.header]
+    again: list[int] = []
     for line, cells in rows if any(layout.header) else ():
-        is_header = cells[0] and cells[0] in layout.header and _number_share(cells) == 0
-        if is_header and cells != layout.header:
+        if cells == layout.header:
+            again.append(line)
+        elif cells[0] and cells[0] in layout.header and _number_share(cells) == 0:
             problem = f"the header stands again with other columns: {_quoted_cell(','.join(cells))}"
             raise UserError(problem, file=file, row=line, hint="cut the file there in two")
     if again:  # the logger was started again
@@ -490,33 +452,30 @@ def _parse_table(
     if not rows:
         raise UserError("has a header but no rows", file=file, hint="give at least two rows")
     lines = np.array([line for line, _ in rows], dtype=np.int64)
-    faults: list[UserError] = []
-    columns: list[Column] = []
-    cells_of_columns = list(zip(*(cells for _, cells in rows)))
-    for name, cells_of_column in zip(names, cells_of_columns):
-        if is_text(name):
-            columns.append(Column(name, text=[from_csv(cell.strip()) for cell in cells_of_column]))
-            continue
-        try:
-            columns.append(read_column(name, cells_of_column, lines, file, tolerated))
-        except UserError as fault:
-            faults += [] if name.startswith(_LEFT_OUT) else [fault]
-    if faults:
-        raise _with_command(faults, names) if tolerated else faults[0]  # what may be broken is a log
+    cells_of = {
+        name: cells
+        for name, cells in zip(names, zip(*(cells for _, cells in rows)))
+        if not name.startswith(_LEFT_OUT)
+    }
+    columns = [
+        Column(name, text=[from_csv(cell.strip()) for cell in cells])
+        if is_text(name)
+        else read_column(name, cells, lines, file, tolerated)
+        for name, cells in cells_of.items()
+    ]
     if tolerated:
         for column in columns:
             words = {cell.lower() for cell in column.text or ()}
             if words > words & _GOOD > {*()}:
                 says = f"{column.name} does not call each reading good"
                 notes.append(Doubt(f"{says}: leave those cells empty that it does not"))
-        numbers = [(c.name, cells) for c, cells in zip(columns, cells_of_columns) if c.numbers is not None]
+        numbers = [(c.name, cells) for c, cells in zip(columns, cells_of.values()) if c.numbers is not None]
         notes += _open_marks(dict(numbers))
     return _table_of(columns, file, lines, notes)
 
 
 def _open_marks(cells_of: Mapping[str, Sequence[str]]) -> list[str]:
-    """Return a line for each column whose mark may be of decimals or thousands (``1,250``) where no other
-    column shows which mark is the one of decimals."""
+    """Return a line for each column whose mark may be of decimals or of thousands (``1,250``)."""
     if not any("," in cells[0] + cells[-1] for cells in cells_of.values()):
         return []
     marked = {name: [c.strip() for c in cells if "," in c or "." in c] for name, cells in cells_of.items()}
@@ -530,9 +489,8 @@ def _open_marks(cells_of: Mapping[str, Sequence[str]]) -> list[str]:
 
 
 def _table_of(columns: Sequence[Column], file: str, lines: NDArray[np.int64], notes: Sequence[str]) -> Table:
-    kept = [column for column in columns if not column.name.startswith(_LEFT_OUT)]
-    numbers = {column.name: column.numbers for column in kept if column.numbers is not None}
-    text = {column.name: column.text for column in kept if column.text is not None}
+    numbers = {column.name: column.numbers for column in columns if column.numbers is not None}
+    text = {column.name: column.text for column in columns if column.text is not None}
     all_notes = dict.fromkeys([*notes, *(note for column in columns for note in column.notes)])
     return Table(file, numbers, text, lines, notes=tuple(all_notes))
 
@@ -554,8 +512,7 @@ def _cell_rows(text: str, layout: Layout, file: str) -> Iterator[tuple[int, list
 def read_column(
     name: str, cells: Sequence[str], lines: NDArray[np.int64], file: str, tolerated: float = _TOLERATED
 ) -> Column:
-    """Return what the cells of a column are: numbers, a switch, or words; UserError for a cell that is no
-    number among more numbers than are tolerated."""
+    """Return cells as numbers, a switch, or words; UserError for more that are none than are tolerated."""
     joined = "".join(cells)
     if joined.isascii() and "_" not in joined:  # which Python takes in numbers, and no file means so
         with suppress(ValueError):
@@ -585,6 +542,8 @@ def read_column(
     if tolerated and (wrong.size >= _MOST * cells_known or STAMP.fullmatch(first)):
         return Column(name, text=["" if cell in _LOST_CELLS else cell for cell in cells])
     hint = "write a number, leave the cell empty, or drop the column"
+    if tolerated:
+        hint += " (--columns, - in its place)"
     if re.fullmatch(r"[+-]?\d+,\d+", first):
         hint = "write a decimal point"
     elif STAMP.fullmatch(first):
@@ -619,8 +578,7 @@ def _without_unit(name: str, cells: Sequence[str]) -> tuple[str, list[str]] | No
 
 
 def switched(cells: Sequence[str]) -> NDArray[np.float64] | None:
-    """Return the numbers of cells that are numbers or the two states of a switch, NaN where one is lost; None
-    where there are other words, or two of one meaning."""
+    """Return cells of numbers and a switch's two states as numbers; None where there are other words."""
     words = ["" if cell.strip() in _LOST_CELLS else cell.strip().lower() for cell in cells]
     values, wrong = _numbers_of(words)
     broken = [words[row] for row in wrong if any(map(str.isdigit, words[row]))]  # damaged
@@ -637,22 +595,10 @@ def _quoted_cell(cell: str) -> str:
     return repr(cell if len(cell) <= 40 else cell[:37] + "...")
 
 
-def _with_command(faults: Sequence[UserError], names: Sequence[str]) -> UserError:
-    """Return the first fault of a log, with what reads the rest of its columns."""
-    first, bad = faults[0], {fault.column for fault in faults}
-    hint = first.hint
-    if len(bad) < len(names):
-        column_words = ",".join("-" if name in bad else name.replace(",", " ") for name in names)
-        command = shlex.join(["thermogrip", "identify", str(first.file), "--columns", column_words])
-        hint = f"{hint}, or leave columns out: {command}"
-    return UserError(first.problem, file=first.file, row=first.row, column=first.column, hint=hint)
-
-
 def frame_table(
     frame: DataFrame, file: str, *, text: Callable[[str], bool] | None = None, tolerated: float = _TOLERATED
 ) -> Table:
-    """Return the columns of a DataFrame, its index among them unless that only counts rows; what is in a
-    column of words is decided as in a file of text."""
+    """Return the columns of a DataFrame, its index among them unless that only counts rows."""
     import pandas as pd
 
     if not isinstance(frame.index, pd.RangeIndex):
@@ -697,7 +643,13 @@ def _matlab_table(path: Path, columns: Sequence[str] | None) -> Table:
             warnings.simplefilter("ignore", MatReadWarning)  # of objects without names
             content = loadmat(source, simplify_cells=True)
     members = [*_matlab_members({k: v for k, v in content.items() if not k.startswith("__")})]
-    arrays = dict(_matlab_arrays(members))
+    arrays: dict[str, NDArray[np.float64]] = {}
+    for name, value in members:
+        if isinstance(value, np.ndarray) and value.dtype.kind in "fiub" and value.ndim in (1, 2):
+            matrix = value[:, None] if value.ndim == 1 else value
+            signals = matrix if len(matrix) >= matrix.shape[1] else matrix.T
+            if len(signals) > 1 and signals.shape[1]:
+                arrays[name] = np.asarray(signals, dtype=float)
     lengths = [values.shape[0] for values in arrays.values() for _ in range(values.shape[1])]
     if not lengths:
         hint = "save the signals as vectors or a matrix (timeseries and tables are objects of MATLAB's own)"
@@ -734,15 +686,6 @@ def _matlab_members(found: Mapping[str, Any], depth: int = 0) -> Iterator[tuple[
     yield from found.items()
 
 
-def _matlab_arrays(members: Sequence[tuple[str, Any]]) -> Iterator[tuple[str, NDArray[np.float64]]]:
-    """Yield name and columns (n_row, n_column) of each array of numbers."""
-    for name, value in members:
-        if isinstance(value, np.ndarray) and value.dtype.kind in "fiub" and value.ndim in (1, 2):
-            rows = value[:, None] if value.ndim == 1 else value if len(value) >= value.shape[1] else value.T
-            if len(rows) > 1 and rows.shape[1]:
-                yield name, np.asarray(rows, dtype=float)
-
-
 def read_excel_table(path: str | Path, columns: Sequence[str] | None = None) -> Table:
     """Return the largest sheet of an Excel workbook, read as its text would be."""
     raw = read_bytes(path)
@@ -764,8 +707,7 @@ def read_excel_table(path: str | Path, columns: Sequence[str] | None = None) -> 
 def read_parquet_table(
     path: str | Path, *, text: Callable[[str], bool] | None = None, tolerated: float = _TOLERATED
 ) -> Table:
-    """Return the columns of a Parquet file, with the units and roles of its columns; see
-    :func:`frame_table`."""
+    """Return the columns of a Parquet file, with their units and roles; see :func:`frame_table`."""
     raw = read_bytes(path)
     import pyarrow.parquet as parquet
 
@@ -782,8 +724,7 @@ def read_parquet_table(
 
 
 def _check_parquet(opened: Any, packed: int, path: str | Path) -> None:
-    """Refuse columns that are no column of a table, and a table that would be too large, before any of it is
-    read."""
+    """Refuse what is no column of a table, and a table that would be too large, before any of it is read."""
     import pyarrow.types as kinds
 
     for entry in opened.schema_arrow:
@@ -805,8 +746,7 @@ def _decode(metadata: dict[bytes, bytes] | None) -> dict[str, str]:
 def _bytes_of(path: str | Path) -> bytes:
     """Return a file of text, unpacked, within the limits of :mod:`thermogrip.datasets.limits`."""
     data = read_bytes(path)
-    openers: dict[str, Any] = {".gz": gzip.open, ".xz": lzma.open}
-    opener = openers.get(Path(path).suffix.lower())
+    opener: Any = {".gz": gzip.open, ".xz": lzma.open}.get(Path(path).suffix.lower())
     if opener is None:
         return data
     spoilt = reading("is damaged or not compressed as its name says", file=path, hint="copy it again")
@@ -817,8 +757,7 @@ def _bytes_of(path: str | Path) -> bytes:
 
 
 def _decoded(data: bytes, file: str, *, strict: bool = False) -> tuple[str, tuple[str, ...]]:
-    """Return text, UTF-16 where its mark says so, as spreadsheets write it; what is not UTF-8 is taken as
-    Windows-1252, and that is noted."""
+    """Return text in UTF-8, UTF-16 where its mark says so, else in Windows-1252, which is noted."""
     notes: tuple[str, ...] = ()
     wide = data.startswith((b"\xff\xfe", b"\xfe\xff"))
     if not wide and (b"\0" in data[:4096] or data[:1] == b"\x80"):
@@ -831,27 +770,13 @@ def _decoded(data: bytes, file: str, *, strict: bool = False) -> tuple[str, tupl
         if strict:
             row = data.count(b"\n", 0, error.start) + 1
             raise UserError("is not UTF-8 text", file=file, row=row, hint="save the file as UTF-8") from error
-        text, coding = _first_coding(data)
-        strange = any(sign.isalpha() for sign in text if sign > "\x7f" and sign not in "\xb5\xaa\xba")
-        advice = "; if names look wrong, save it as UTF-8" if strange else ""
-        notes = (f"text is not UTF-8: read as {coding}{advice}",)
+        text = data.decode("cp1252", "replace")  # of spreadsheets
+        notes = ("text is not UTF-8: read as Windows-1252; if names look wrong, save it as UTF-8",)
     if not text.strip():
         raise UserError("is empty", file=file, hint="give a header and at least two rows")
     return text if "\n" in text else text.replace("\r", "\n"), notes
 
 
-def _first_coding(data: bytes) -> tuple[str, str]:
-    """Return bytes as text by the first coding of spreadsheets that has all of them, and its name."""
-    for coding, name in _CODINGS.items():
-        with suppress(UnicodeDecodeError):
-            return data.decode(coding), name
-    return data.decode("cp1252", "replace"), "Windows-1252"
-
-
-def _iterate_lines(text: str) -> Iterator[str]:
-    """Yield the lines without their ends; a list of all of them would be larger than the table."""
-    return (line.rstrip("\n") for line in io.StringIO(text, newline=None))
-
-
-def _head_lines(text: str) -> Iterator[str]:
-    return _iterate_lines(text[: 1 << 20])
+def _iterate_lines(text: str, most: int | None = None) -> Iterator[str]:
+    """Yield the lines without their ends, of at ``most`` so many characters; a list would be large."""
+    return (line.rstrip("\n") for line in io.StringIO(text[:most], newline=None))

@@ -58,17 +58,19 @@ def split_header(header: str, *, file: str | None = None) -> tuple[str, str]:
     """Return the variable name and the unit of a column header (``"1"`` without a suffix); UserError if the
     suffix is like a unit that is not read, or nothing is left as a name."""
     header = header.strip()
-    for unit in UNITS:
-        if header.endswith(f"_{unit}"):
-            return _checked_unit(header.removesuffix(f"_{unit}"), header, file), unit
-    read = read_header(header)
-    if read.unit != "1":
+    unit = next((unit for unit in UNITS if header.endswith(f"_{unit}")), "1")
+    name, read = header.removesuffix(f"_{unit}") if unit != "1" else header, read_header(header)
+    if unit == "1" and read.unit != "1":
         rename = f"rename the column to {read.name}_{read.unit}"
         hint = rename if read.scale == 1 else f"convert it and {rename}"
         raise UserError("unit is spelt another way", file=file, column=header, hint=hint)
-    if _BRACKETED.search(header) or _FOREIGN.get(header.rpartition("_")[2]) == ("", 1.0):
+    foreign = _BRACKETED.search(header) or _FOREIGN.get(header.rpartition("_")[2]) == ("", 1.0)
+    if unit == "1" and foreign:
         raise UserError("unit is unknown", file=file, column=header, hint=f"use one of {_SUFFIXES}, or none")
-    return _checked_unit(header, header, file), "1"
+    if not re.fullmatch(r"[^\s,;\"'/]+", name):
+        problem = f"{name!r} is no name for a variable"
+        raise UserError(problem, file=file, column=header, hint="name the column")
+    return name, unit
 
 
 class Header(NamedTuple):
@@ -120,13 +122,6 @@ def _bare_name(name: str) -> str:
     return re.sub(r"[\s,;\"'/()\[\]{}]+", "_", name).strip("_")
 
 
-def _checked_unit(name: str, header: str, file: str | None) -> str:
-    if not name or not re.fullmatch(r"[^\s,;\"'/]+", name):
-        problem = f"{name!r} is no name for a variable"
-        raise UserError(problem, file=file, column=header, hint="name the column")
-    return name
-
-
 def rename_hint(name: str, headers: Sequence[str]) -> str:
     """Return which column to rename where ``name``, a time or a temperature, is missing."""
     wanted = _TIME_UNITS if name == "time" else _TEMPERATURE_UNITS
@@ -134,10 +129,7 @@ def rename_hint(name: str, headers: Sequence[str]) -> str:
         unit = read_header(header).unit
         if unit in wanted and not header.startswith("time"):
             return f"rename {header!r} to {name}_{unit}"
-    like = next(
-        (h for h in headers if name == "time" and re.match(r"(time|stamp|seconds|t$)", h.lower())), ""
-    )
-    return f"rename {like!r} to time_s or time_ms" if like else f"it has {', '.join(headers)}"
+    return f"it has {', '.join(headers)}"
 
 
 def join_header(name: str, unit: str, others: Sequence[str] = ()) -> str:
