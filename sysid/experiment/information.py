@@ -42,16 +42,14 @@ class ExperimentForecast:
         *,
         lowest: float = -np.inf,
         highest: float = np.inf,
-        room: float = ROOM,
         draws: int = DRAWS,
         dt: float | None = None,
     ) -> None:
         self.plant, self.dt = plant, plant.dt if dt is None else float(dt)
         self.lowest = lowest
         self.highest = highest
-        self.room = room
         self.n_draws = draws if plant.covariance is not None or plant.samples is not None else 0
-        self._d = np.nan_to_num(plant.undisturbed(room))
+        self._d = np.nan_to_num(plant.undisturbed(ROOM))
         self._celsius = np.array([plant.units.get(name, "degC") == "degC" for name in plant.outputs])
 
     def outputs(self, u: Array) -> Array:
@@ -142,7 +140,7 @@ class ExperimentForecast:
         seen = [self.plant.valid.get(name, (0.0, 0.0)) for name in (*model.inputs, *model.outputs)]
         (least, lowest), (most, _) = (np.split(end, [len(model.inputs)]) for end in np.array(seen).T)
         still = np.where([name in model.switches for name in model.inputs], 1.0, np.clip(0.0, least, most))
-        y = np.where(self._celsius, self.room, lowest)
+        y = np.where(self._celsius, ROOM, lowest)
         return np.asarray(model.rest(y, still, self._d, p), dtype=float)
 
 

@@ -29,9 +29,9 @@ def gripper() -> Plant:
 
 
 def lag() -> Plant:
-    """A lag of 10 K a unit over a base of 20 degC, beside a count that no limit holds for."""
+    """A lag of 10 K a unit over a base of 25 degC, beside a count that no limit holds for."""
     model = StateSpaceModel(
-        ("q",), (), ("t", "n"), A=[[0.5]], B=[[5.0]], C=[[1.0], [100.0]], dt=2.0, y0=[20.0, 0.0]
+        ("q",), (), ("t", "n"), A=[[0.5]], B=[[5.0]], C=[[1.0], [100.0]], dt=2.0, y0=[25.0, 0.0]
     )
     return Plant(model, {}, dt=2.0, units={"q": "V", "t": "degC", "n": "rpm"}, valid={"q": (0.0, 3.0)})
 
@@ -39,27 +39,27 @@ def lag() -> Plant:
 @pytest.mark.parametrize(
     ("limits", "margin", "kept"),
     [
-        ({"highest": 29.9}, 0.0, True),
-        ({"highest": 29.8}, 0.0, False),
-        ({"highest": 29.9}, 0.1, False),
-        ({"highest": 30.0}, 0.1, True),
-        ({"lowest": 20.0}, 0.0, True),
-        ({"lowest": 20.1}, 0.0, False),
-        ({"lowest": 20.0}, 0.1, False),
+        ({"highest": 34.9}, 0.0, True),
+        ({"highest": 34.8}, 0.0, False),
+        ({"highest": 34.9}, 0.1, False),
+        ({"highest": 35.0}, 0.1, True),
+        ({"lowest": 25.0}, 0.0, True),
+        ({"lowest": 25.1}, 0.0, False),
+        ({"lowest": 25.0}, 0.1, False),
         ({}, 5.0, True),
     ],
 )
 def test_limits_are_of_temperatures_and_a_margin_is_inside_them(
     limits: dict[str, float], margin: float, kept: bool
 ):
-    forecast = ExperimentForecast(lag(), room=20.0, **limits)
-    u = np.ones((6, 1))  # 20, 25, 27.5 .. 29.84
-    assert forecast.outputs(u)[0, :, 0].tolist() == pytest.approx([30 - 10 * 0.5**k for k in range(7)])
+    forecast = ExperimentForecast(lag(), **limits)
+    u = np.ones((6, 1))  # 25, 30, 32.5 .. 34.84
+    assert forecast.outputs(u)[0, :, 0].tolist() == pytest.approx([35 - 10 * 0.5**k for k in range(7)])
     assert forecast.stays(u, margin=margin) is kept
     assert (forecast.n_draws, forecast.dt) == (0, 2.0)
     assert not forecast.stays(np.full((6, 1), np.inf))
     only = replace(lag(), units={"q": "V", "t": "rpm", "n": "rpm"})
-    assert ExperimentForecast(only, room=20.0, **limits).stays(u, margin=margin)
+    assert ExperimentForecast(only, **limits).stays(u, margin=margin)
 
 
 def test_signals_that_are_no_temperatures_begin_where_the_logs_had_them():
@@ -70,11 +70,10 @@ def test_signals_that_are_no_temperatures_begin_where_the_logs_had_them():
     plant = Plant(model, {}, dt=2.0, units=units, valid={"wind": (2.0, 7.0), "n": (30.0, 90.0)})
     seen: list[Any] = []
     object.__setattr__(model, "rest", lambda *args: seen.append(args) or np.zeros(1))
-    forecast = ExperimentForecast(plant, room=22.0)
+    forecast = ExperimentForecast(plant)
     forecast.outputs(np.zeros((2, 1)))
     y, u, d, _ = seen[0]
-    assert (y.tolist(), u.tolist(), d.tolist()) == ([22.0, 30.0], [0.0], [4.5, 22.0])
-    assert ExperimentForecast(replace(plant, valid={})).room == 25.0
+    assert (y.tolist(), u.tolist(), d.tolist()) == ([25.0, 30.0], [0.0], [4.5, 25.0])
 
 
 def test_draws_keep_the_limits_too_and_are_counted(gripper: Plant):
