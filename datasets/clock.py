@@ -277,8 +277,9 @@ def read_clock(cells: Sequence[str]) -> tuple[Floats, str] | None:
     offset) and how they were taken; None if they are none."""
     import pandas as pd
 
-    fields = pd.Series(list(cells), dtype=object).str.strip().str.extract(STAMP)
-    if fields[[1, 4]].isna().all(axis=1).mean() > 1 - CLOCK.monotone_share:
+    texts = pd.Series(list(cells), dtype=object).str.strip()
+    fields = texts.str.extract(STAMP)
+    if not fields[texts != ""][[1, 4]].notna().any(axis=1).mean() >= CLOCK.monotone_share:  # of none nan
         return None
 
     def numbers(key: int) -> Floats:

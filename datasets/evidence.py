@@ -224,8 +224,12 @@ def role_doubts(
     moved = [name for name in outputs if is_moved(columns, name, inputs)]
     read = [*outputs, *disturbances]
     for name in [name for name in inputs if name in guessed]:
-        what = _unlike_an_input(name, columns, [n for n in inputs if n != name], outputs, read)
-        if what:
+        beside = [n for n in inputs if n != name]
+        # a percentage is of a drive, or of a humidity or a level, which the outputs move
+        by_unit = reasons[name].startswith("its unit is") and not is_held(columns[name])
+        movers = [n for n in outputs if by_unit and _acts(columns, n, name, beside)]
+        what = f"responds to {', '.join(movers)}: is it read?" if movers else ""
+        if what := what or _unlike_an_input(name, columns, beside, outputs, read):
             yield f"{name} is taken as input ({reasons[name]}), but {what}"
     for name in [name for name in outputs if name in guessed and name not in moved]:
         if columns[name].size < EVIDENCE.telling_rows or any(_acts(columns, u, name, read) for u in inputs):

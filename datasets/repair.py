@@ -68,7 +68,8 @@ def order_rows(time: Floats, lines: NDArray[np.int64], file: str) -> OrderedRows
     lost = ~np.isfinite(time)
     if lost.mean() > _FEW:
         row = int(lines[lost.argmax()])
-        raise UserError("has no time", file=file, row=row, column="time", hint="give it, or remove the row")
+        problem = f"has no time ({lost.sum()} of {lost.size} rows)"
+        raise UserError(problem, file=file, row=row, column="time", hint="remove them or give their times")
     if lost.any():
         rows = rows[~lost]
         count = int(lost.sum())

@@ -452,6 +452,13 @@ def test_a_name_that_the_course_of_the_column_denies_is_a_doubt(name, values, do
     assert not assign_roles({"heater": "percent", "t_plate": "degC"}, columns=columns).doubts
 
 
+def test_a_percentage_that_a_reading_moves_is_asked_about_as_an_input():
+    t_box = np.cumsum(plant_of(0 * STEPS, noise=1, seed=9)) / 50
+    columns = {"t_box": t_box, "wilgoc": 60 - plant_of(t_box, seed=10)}
+    doubts = assign_roles({"t_box": "degC", "wilgoc": "percent"}, columns=columns).doubts
+    assert "wilgoc is taken as input (its unit is percent), but responds to t_box: is it read?" in doubts
+
+
 def test_an_output_with_an_input_of_its_own_is_not_left_out_in_silence():
     mist = np.repeat(np.random.default_rng(5).choice([0.0, 1.0], 50), 20)
     columns = {"heater": STEPS, "t_plate": SLOW, "mist": mist, "wet": plant_of(25 * mist, seed=8)}
