@@ -220,10 +220,9 @@ def role_doubts(
     columns = {
         n: np.where(find_spikes(v, floor=None), np.nan, v) if n in outputs else v for n, v in columns.items()
     }
-    guessed = [name for name in moving if name in reasons]
     moved = [name for name in outputs if is_moved(columns, name, inputs)]
     read = [*outputs, *disturbances]
-    for name in [name for name in inputs if name in guessed]:
+    for name in [name for name in inputs if name in reasons]:
         beside = [n for n in inputs if n != name]
         # a percentage is of a drive, or of a humidity or a level, which the outputs move
         by_unit = reasons[name].startswith("its unit is") and not is_held(columns[name])
@@ -231,14 +230,14 @@ def role_doubts(
         what = f"responds to {', '.join(movers)}: is it read?" if movers else ""
         if what := what or _unlike_an_input(name, columns, beside, outputs, read):
             yield f"{name} is taken as input ({reasons[name]}), but {what}"
-    for name in [name for name in outputs if name in guessed and name not in moved]:
+    for name in [name for name in outputs if name in reasons and name not in moved]:
         if columns[name].size < EVIDENCE.telling_rows or any(_acts(columns, u, name, read) for u in inputs):
             continue
         yield f"{name} is taken as output ({reasons[name]}), but does not respond to {', '.join(inputs)}"
-    for name in [name for name in disturbances if name in guessed]:
+    for name in [name for name in disturbances if name in reasons]:
         if is_moved(columns, name, inputs):
             yield f"{name} is taken as disturbance ({reasons[name]}), but responds to {', '.join(inputs)}"
-    for name in [name for name in others if name in guessed and not only_rises(columns[name])]:
+    for name in [name for name in others if name in reasons and not only_rises(columns[name])]:
         is_goal = name in goals and is_held(columns[name])
         if is_goal and any(comes_to(columns[n], columns[name]) for n in outputs):
             continue
@@ -249,7 +248,7 @@ def role_doubts(
             yield f"{name} is left out ({reasons[name]}), and helps to predict {helped}"
             continue
         # what is left out may be an output with an input of its own, which is left out with it
-        idle = [] if is_held(columns[name]) else [n for n in others if n in guessed and is_held(columns[n])]
+        idle = [] if is_held(columns[name]) else [n for n in others if n in reasons and is_held(columns[n])]
         for drives in (inputs, [n for n in idle if n not in goals]):
             if is_moved(columns, name, drives):
                 says = f"responds to {', '.join(drives)}: is it an output?"

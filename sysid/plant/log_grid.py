@@ -153,9 +153,9 @@ def make_grid(
     ]
     if not segments:
         raise UserError(
-            f"the logs are too short: no stretch has {min_rows} rows of {step:g} s",
+            f"the logs are too short: no segment between gaps has {min_rows} rows of {step:g} s",
             file=rows[0].log,
-            hint="give a longer log or average less",
+            hint="give a longer log, one with fewer gaps, or a shorter step with --average S",
         )
     units = {name: str(logs[0][name].attrs.get("units", "1")) for name in (*u, *d, *y)}
     moves = np.concatenate([rows_of_log.u for rows_of_log in rows]).T

@@ -268,7 +268,7 @@ def test_what_cannot_be_fitted_is_refused_by_name():
     both = r"no input and no output .*; name them with --inputs and --outputs, of t; never moved: number$"
     with pytest.raises(UserError, match=both):
         signals([make_log(T, still)])
-    with pytest.raises(UserError, match="no stretch has 20 rows of 20 s"):
+    with pytest.raises(UserError, match="no segment between gaps has 20 rows of 20 s"):
         make_grid([log_of(T)], average=20.0)
     mute = log_of(3.0 * T, name="b")
     mute["t"].values[:] = np.nan
