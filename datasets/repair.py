@@ -68,8 +68,8 @@ def order_rows(time: Floats, lines: NDArray[np.int64], file: str) -> OrderedRows
     lost = ~np.isfinite(time)
     if lost.mean() > _FEW:
         row = int(lines[lost.argmax()])
-        problem = f"has no time ({lost.sum()} of {lost.size} rows)"
-        raise UserError(problem, file=file, row=row, column="time", hint="remove them or give their times")
+        hint = f"give a time to {lost.sum()} rows, or remove them"
+        raise UserError("has no time", file=file, row=row, column="time", hint=hint)
     if lost.any():
         rows = rows[~lost]
         count = int(lost.sum())
