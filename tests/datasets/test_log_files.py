@@ -146,7 +146,7 @@ def test_the_unfinished_last_line_of_a_killed_logger_is_dropped(write):
         ("# only\n# comments\n", ["only comments"]),
         ("time_s\n0\n1\n", ["nothing else"]),
         (HEAD + "0,0,25\n1,0,25\n0.5,0,25\n", ["row 4", "time runs back"]),
-        ("date;t_degC\n" + "1-3-2019 00:05;20\n" * 20 + ";20\n" * 4, ["row 22", "has no time; give a time to 4 rows"]),
+        ("date;t_degC\n" + "1-3-2019 00:05;20\n" * 20 + ";20\n" * 4, ["row 22", "a time to 4 rows"]),
         (b"time_s,t_degC\n0,1\n1,\xff\xfe\n", ["row 3", "is not a number"]),
         ((HEAD + ROWS).encode("utf-16-le"), ["is not text"]),
         (bytes(range(256)) * 20, ["is not text"]),
