@@ -69,7 +69,8 @@ _OF_HEATERS = ("target", "temp", "pwm")  # of a section of Klipper's statistics;
 _LABELLED = re.compile(
     r"(?:(?:^|[,;\t]) *(?P<alone>[A-Za-z_@][^:=,;/]{0,63}?) ?[:=](?=[^:=,;]*(?:[,;\t]|$))"
     r"|(?<!\S)(?P<name>[A-Za-z_@][^:=,;/\s]{0,63}) ?[:=]|/)"
-    r" ?(?P<value>[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?|[+-]?inf|nan|NaN)(?=[\s,;/]|$)"
+    r" ?(?P<value>[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?|[+-]?inf|nan|NaN)"
+    r" ?(?P<unit>[\u00b0\u00ba]?[CF]|%|)(?=[\s,;/]|$)"
     r"|(?<!\S)(?P<section>[^:=,;\s]+):(?=\s)"
 )
 _LABELLED_LINES = 10  # with the same names, that are no chance
@@ -412,7 +413,7 @@ def _labelled_cells(line: str) -> dict[str, str]:
             section = match["section"]
         elif name in _OF_HEATERS or (name and not of_klipper):
             last = f"{section}_{name}" if section and name in _OF_HEATERS else name
-            cells[unused(last, cells)] = value
+            cells[unused(f"{last} [{match['unit']}]" if match["unit"] else last, cells)] = value
         elif last and not name:
             cells[unused(f"{last}_target", cells)] = value
     return cells if len(cells) > (stamp is not None) else {}
@@ -636,8 +637,12 @@ def _matlab_table(path: Path, columns: Sequence[str] | None) -> Table:
     from scipy.io.matlab import MatReadWarning
 
     source: Any = io.BytesIO(raw)  # the stubs know names only
+    hint = (
+        "save the signals alone, as vectors or a matrix (timeseries, tables and functions are MATLAB's own)"
+    )
     with reading("is no MATLAB file, or is damaged", file=path, hint="save it again"):
-        declared = sum(8 * math.prod(shape) for _, shape, _ in whosmat(source))
+        with as_user_error(TypeError, "has functions among its variables", file=path, hint=hint):
+            declared = sum(8 * math.prod(shape) for _, shape, _ in whosmat(source))
         limits.check_unpacked(len(raw), declared, file=path, what="declares")
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", MatReadWarning)  # of objects without names
@@ -652,7 +657,6 @@ def _matlab_table(path: Path, columns: Sequence[str] | None) -> Table:
                 arrays[name] = np.asarray(signals, dtype=float)
     lengths = [values.shape[0] for values in arrays.values() for _ in range(values.shape[1])]
     if not lengths:
-        hint = "save the signals as vectors or a matrix (timeseries and tables are objects of MATLAB's own)"
         raise UserError("has no columns of numbers", file=path, hint=hint)
     n = max(set(lengths), key=lambda length: (length * lengths.count(length), length))
     arrays_kept = {name: values for name, values in arrays.items() if values.shape[0] == n}

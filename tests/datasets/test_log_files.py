@@ -635,10 +635,9 @@ def test_a_matlab_file_is_a_log_of_its_columns_and_its_step(tmp_path):
     assert "has no columns of numbers" in refused(matlab(tmp_path, name="words.mat", s="text"))
 
 
-def test_a_matlab_file_that_unpacks_to_too_much_is_refused(tmp_path):
-    path = matlab(tmp_path, data=np.zeros((3_000_000, 1)))
-    assert path.stat().st_size < 100_000
-    assert "which no record does" in refused(path)
+def test_a_matlab_file_with_functions_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr("scipy.io.whosmat", lambda _: [("f", None, "function")])
+    assert "has functions among its variables; save the signals" in refused(matlab(tmp_path, u=[1.0]))
 
 
 def workbook(path, unpacked=b"<sheet/>"):

@@ -238,6 +238,7 @@ def test_cells_are_numbers_switches_times_or_words(text, cells, lines, notes):
         ("a:1\tb:2\na:3\tb:4\n", {"a": "1 3", "b": "2 4"}),
         ("a:1 b:2\n\na:3 b:4\n", {"a": "1 3", "b": "2 4"}),
         ('{"a":1,"b":2.5}\n{"a": 3, "b": 4}\n', {"a": "1 3", "b": "2.5 4"}),
+        ("T: 21.5\u00b0C - duty = 40 %\n" * 2, {"T [\u00b0C]": "21.5 21.5", "duty [%]": "40 40"}),
     ],
 )
 def test_cells_that_begin_with_the_names_of_their_columns(text, cells):
