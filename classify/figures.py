@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from thermogrip.classify.evaluation.comparison import POOLED, Comparison
 from thermogrip.datasets.errors import UserError
-from thermogrip.media import panels
+from thermogrip.media.rendering import panels
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -23,7 +23,7 @@ from thermogrip.datasets.netcdf import numbers_and_unit, open_netcdf, write_netc
 from thermogrip.datasets.schema import GRASP_LABELS, GRASP_NUMBERS, check_grasps, make_grasps, with_lead_in
 from thermogrip.datasets.tables import Table, read_csv_table, read_parquet_table
 from thermogrip.datasets.units import join_header, rename_hint, split_header, to_record_unit
-from thermogrip.media import csv_cell
+from thermogrip.media.rendering import csv_cell
 
 if TYPE_CHECKING:
     import xarray as xr

@@ -39,7 +39,7 @@ from thermogrip.datasets.tables import (
     unused,
 )
 from thermogrip.datasets.units import Header, join_header, read_header, to_record_unit
-from thermogrip.media import csv_cell
+from thermogrip.media.rendering import csv_cell
 
 if TYPE_CHECKING:
     from pandas import DataFrame

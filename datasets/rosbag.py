@@ -101,8 +101,8 @@ def _column(name: str, entry: Any, path: str | Path) -> Column:
 def read_rosbag_table(path: str | Path, topics: TopicMap | None = None) -> Table:
     """Return the columns of a bag on one time axis, by this map, the TOML file beside the bag, or guessed."""
     file = Path(path)
-    inside = (file / f"{file.name}.topics.toml", file / "topics.toml") if os.path.isdir(file) else ()
-    maps = (*inside, file.parent / f"{file_stem(file)}.topics.toml", file.parent / "topics.toml")
+    maps = [file / f"{file.name}.topics.toml", file / "topics.toml"]  # in the folder of a bag, or beside it
+    maps += [file.parent / f"{file_stem(file)}.topics.toml", file.parent / "topics.toml"]
     map_beside = next((path for path in maps if path.is_file()), None)
     topic_map = topics or (read_topic_map(map_beside) if map_beside else TopicMap({}))
     notes: list[str] = []
@@ -266,8 +266,6 @@ def _bag_table(
 
 
 def _messages(file: Path, notes: list[str]) -> Iterator[Message]:
-    with os_faults(file):
-        file.stat()
     bag_files = bag_parts(file) if os.path.isdir(file) else [file]
     if os.path.isdir(file) and not (file / "metadata.yaml").is_file():
         notes.append("has no metadata.yaml: its writer died; all of its files are read")

@@ -34,7 +34,7 @@ from thermogrip.datasets.errors import UserError, as_user_error, reading
 from thermogrip.datasets.files import check_source, read_bytes
 from thermogrip.datasets.repair import Doubt, name_rows
 from thermogrip.datasets.units import read_header
-from thermogrip.media import from_csv
+from thermogrip.media.rendering import from_csv
 
 if TYPE_CHECKING:
     from pandas import DataFrame

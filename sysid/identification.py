@@ -25,7 +25,7 @@ from thermogrip.datasets.errors import UserError, known_names
 from thermogrip.datasets.log_files import Logs, as_logs
 from thermogrip.datasets.parallel import Progress, Workers, in_order, sub_progress
 from thermogrip.datasets.schema import Log, log_name
-from thermogrip.media import Shown
+from thermogrip.media.rendering import Shown
 from thermogrip.sysid.blackbox.fit import (
     BLACK_BOXES,
     RESAMPLED,

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from thermogrip.datasets.grasp_files import read_grasps, write_grasps
 from thermogrip.datasets.log_files import read_log, write_log
 from thermogrip.datasets.schema import make_grasps, make_log
-from thermogrip.media import csv_cell, csv_text, from_csv, markdown, printable
+from thermogrip.media.rendering import csv_cell, csv_text, from_csv, markdown, printable
 
 HOSTILE = ["=cmd|'/c calc'!A0", "@SUM(1)", "+1+1", "-2+3", "'=1", "$\\frac{$", "a,b", 'a"b', "[red]x[/]"]
 

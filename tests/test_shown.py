@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import pytest
 
 from tests.end_to_end.conftest import small_plant
-from thermogrip.media import Shown
+from thermogrip.media.rendering import Shown
 from thermogrip.mpc import Controller, PIController, simulate_closed_loop
 from thermogrip.sysid import load_network
 from thermogrip.sysid.experiment.information import plant_from_prior

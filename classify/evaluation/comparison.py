@@ -22,7 +22,7 @@ from thermogrip.classify.decisions.predict import Row, table_csv
 from thermogrip.classify.evaluation import metrics as s
 from thermogrip.classify.evaluation.metrics import calibration_interval, mean_intervals
 from thermogrip.datasets.files import make_folder, write_atomic, write_json
-from thermogrip.media import Shown
+from thermogrip.media.rendering import Shown
 
 POOLED = "pooled"
 

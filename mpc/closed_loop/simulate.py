@@ -18,7 +18,7 @@ import numpy as np
 
 from thermogrip.datasets.arrays import Array, Mask
 from thermogrip.datasets.schema import Log, column, names
-from thermogrip.media import Shown
+from thermogrip.media.rendering import Shown
 from thermogrip.mpc.design.relays import Relay, Switches
 from thermogrip.mpc.interface import Controller, Move, Readings, Regulator, Target
 from thermogrip.mpc.plant.prediction import drive_range, held_start, prediction_model

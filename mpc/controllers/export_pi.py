@@ -16,7 +16,7 @@ from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.files import write_atomic
 from thermogrip.datasets.parallel import Progress
-from thermogrip.media import markdown
+from thermogrip.media.rendering import markdown
 from thermogrip.mpc.controllers.export import Agreement, Export, footprint, relay_files, run_build
 from thermogrip.mpc.controllers.pi import PIController
 from thermogrip.mpc.estimator.call_times import SAME

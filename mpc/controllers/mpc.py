@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.errors import UserError, reading
-from thermogrip.media import Shown
+from thermogrip.media.rendering import Shown
 from thermogrip.mpc.controllers.compiled import CompiledStep
 from thermogrip.mpc.controllers.controller_file import Parts, read_parts
 from thermogrip.mpc.controllers.linear_equivalent import to_control

@@ -24,7 +24,7 @@ from typing import Any
 
 from thermogrip.datasets.errors import UserError, as_user_error
 from thermogrip.datasets.units import split_header
-from thermogrip.media import without_password
+from thermogrip.media.rendering import without_password
 from thermogrip.rig.clock import BackOff
 from thermogrip.rig.interface import Event
 from thermogrip.rig.serial.port import FIRST_WAIT_S, LONGEST_WAIT_S

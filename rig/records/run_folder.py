@@ -40,7 +40,7 @@ from thermogrip.datasets.files import (
 from thermogrip.datasets.grasp_files import read_grasps, write_grasps
 from thermogrip.datasets.log_files import write_log
 from thermogrip.datasets.schema import Grasps, Log
-from thermogrip.media import csv_text, from_csv
+from thermogrip.media.rendering import csv_text, from_csv
 from thermogrip.rig.guard.sensor_checks import room_sensors
 from thermogrip.rig.interface import Event
 from thermogrip.rig.records.mcap_export import write_mcap

@@ -18,7 +18,7 @@ from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.errors import UserError, known_names, reading
 from thermogrip.datasets.files import check_json, read_json, write_json
 from thermogrip.datasets.schema import Log, column, log_name, make_log
-from thermogrip.media import Shown
+from thermogrip.media.rendering import Shown
 from thermogrip.sysid.models.model import Model, whole_steps
 from thermogrip.sysid.plant import plant_data
 from thermogrip.sysid.plant.log_grid import Stretch, at_rows, cut_stretches, match_logs

@@ -11,7 +11,7 @@ import typer
 
 from thermogrip.cli import options as cli
 from thermogrip.datasets.errors import UserError
-from thermogrip.media import printable
+from thermogrip.media.rendering import printable
 from thermogrip.report.console import Console, significant
 
 if TYPE_CHECKING:

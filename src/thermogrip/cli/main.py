@@ -34,7 +34,7 @@ from thermogrip import __version__
 from thermogrip.cli.options import TYPED, ExitCode, check_files
 from thermogrip.datasets.errors import UserError, known_names, os_fault
 from thermogrip.datasets.files import note_seed, work
-from thermogrip.media import printable, without_password
+from thermogrip.media.rendering import printable, without_password
 
 #: Options that may stand alone, and what they mean then: any free port, and the one that Foxglove asks for.
 ALONE = {"--live": "0", "--foxglove": "8765"}

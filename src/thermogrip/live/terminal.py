@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from math import isfinite
 from typing import TYPE_CHECKING, Any
 
-from thermogrip.media import printable
+from thermogrip.media.rendering import printable
 from thermogrip.rig.session.snapshot import Snapshot
 
 if TYPE_CHECKING:

@@ -30,7 +30,7 @@ import typer
 from thermogrip.datasets.errors import UserError
 from thermogrip.live.server import PAGE
 from thermogrip.live.terminal import line, panel
-from thermogrip.media import printable
+from thermogrip.media.rendering import printable
 from thermogrip.report.console import Console, plain
 from thermogrip.rig.session.loop import PHASES
 from thermogrip.rig.session.signals import check_stopped

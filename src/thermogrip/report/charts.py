@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thermogrip.datasets.arrays import Array
-from thermogrip.media import panels
+from thermogrip.media.rendering import panels
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist

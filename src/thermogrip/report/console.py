@@ -22,7 +22,7 @@ from shutil import get_terminal_size
 from textwrap import TextWrapper
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-from thermogrip.media import printable
+from thermogrip.media.rendering import printable
 
 if TYPE_CHECKING:
     from thermogrip.datasets.parallel import Progress

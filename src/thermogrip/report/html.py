@@ -25,7 +25,7 @@ import numpy as np
 
 from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.files import provenance, write_atomic
-from thermogrip.media import printable
+from thermogrip.media.rendering import printable
 from thermogrip.report.charts import Chart, Curve, Panel, draw_chart, thinned
 from thermogrip.report.console import short
 

@@ -1,0 +1,1 @@
+"""What every room renders: text for any medium, panels of figures, results in a few lines."""
