@@ -344,9 +344,13 @@ def _one_column_a_signal(table: Table) -> Table:
     named = [h for h in states if states[h] is None and 2 <= len({*table.text[h]}) <= MOST_SIGNALS]
     stamps = {h: table.text.get(h) or table.numbers[h].tolist() for h in clocks}
     clocks = [h for h in clocks if len({*stamps[h]}) > 1]
-    if len(named) > 1 and clocks and 2 * len({*stamps[clocks[0]]}) <= len(table.lines):
-        # beside each stamp a signal stands once, words of its quality do not
-        named = [max(named, key=lambda h: len({*zip(stamps[clocks[0]], table.text[h])}))]
+    if len(named) > 1 and clocks:
+        finest = max(named, key=lambda h: len({*table.text[h]}))
+        if len({*zip(*(table.text[h] for h in named))}) == len({*table.text[finest]}):
+            named = [finest]  # of each signal the others say its kind or unit
+        elif 2 * len({*stamps[clocks[0]]}) <= len(table.lines):
+            # beside each stamp a signal stands once, words of its quality do not
+            named = [max(named, key=lambda h: len({*zip(stamps[clocks[0]], table.text[h])}))]
     if not clocks or len(named) != 1:
         return table
     signals = [name.rpartition(".")[2] for name in table.text[named[0]]]

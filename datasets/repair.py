@@ -83,13 +83,17 @@ def order_rows(time: Floats, lines: NDArray[np.int64], file: str) -> OrderedRows
     first = np.append(True, steps > 0)
     starts, repeats = np.flatnonzero(first), int((~first).sum())
     if repeats > 0.25 * rows.size and starts.size > 1:  # a coarse clock
-        stamps = time[rows[starts]]
-        ends = np.append(starts, rows.size), np.append(stamps, stamps[-1] + np.median(np.diff(stamps)))
+        stamps, counts = time[rows[starts]], np.diff(starts)
+        counts = counts[1:] if counts.size > 1 else counts
+        between, apart = np.median(np.diff(stamps)), np.median(np.diff(stamps)) / np.median(counts)
+        # the log may begin and end within a stamp: of its rows some are there, as far apart as the others
+        begin = max(stamps[0], stamps[1] - apart * starts[1])
+        end = stamps[-1] + min(between, apart * (rows.size - starts[-1]))
+        nodes = np.append(starts, rows.size), np.concatenate([[begin], stamps[1:], [end]])
         says = f"time has {starts.size} stamps for {rows.size} rows: rows spread evenly between them"
-        counts = np.diff(starts)[1:]
-        even = not counts.size or np.ptp(counts) <= 2
+        even = np.ptp(counts) <= 2
         repairs.append(says if even else ClockDoubt(f"{says}, {counts.min()} to {counts.max()} each"))
-        return OrderedRows(np.interp(np.arange(rows.size), *ends), rows, repairs)
+        return OrderedRows(np.interp(np.arange(rows.size), *nodes), rows, repairs)
     if repeats:
         which = name_rows(lines[rows[~first]])
         repairs.append(f"{repeats} repeated time stamp{_s(repeats)} dropped ({which})")

@@ -148,7 +148,9 @@ def parse_text(data: bytes, file: str, columns: Sequence[str] | None = None) -> 
     text, coded = _decoded(data, file)
     head = ""
     if text.startswith("LabVIEW Measurement"):
-        head, _, rows = text.rpartition("***End_of_Header***")
+        head, mark, rows = text.rpartition("***End_of_Header***")
+        if (parts := head.count(mark)) > 1:  # the file has a heading, and each part one
+            coded = (*coded, Doubt(f"has {parts} parts with headings: only the last is read; cut the file"))
         text = "\n" * head.count("\n") + rows.lstrip("\t\r")
     if "X_Value\t" in text[: 1 << 20]:  # beside it LabVIEW names comments, which most rows lack
         text = re.sub(r"\tComment[\t\r ]*\n", "\n", text, count=1)
@@ -428,6 +430,10 @@ def _parse_table(
     if rows and len(rows[-1][1]) < n and not text.endswith(("\n", "\r")):
         line, cells = rows.pop()
         notes.append(f"row {line} is the last and was cut off ({len(cells)} of {n} cells): dropped")
+    comments = [line for line, cells in rows if tolerated and cells[0].startswith(_COMMENT)]
+    if comments:
+        notes.append(f"comments between rows passed over ({name_rows(comments, 5)})")
+        rows = [(line, cells) for line, cells in rows if not cells[0].startswith(_COMMENT)]
     again: list[int] = []
     for line, cells in rows if any(layout.header) else ():
         if cells == layout.header:

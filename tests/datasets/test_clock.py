@@ -207,6 +207,9 @@ def test_each_start_of_labview_s_first_column_is_a_part(tmp_path):
     ends = np.flatnonzero(np.diff(log["time"]) > 10).tolist()
     assert (list(log), ends) == (["c2", "c3"], [11, *range(47, 119, 12)])
     assert log.attrs["repairs"].endswith("\n2 more gaps, the longest 11.00 s")
+    part = "***End_of_Header***\t\n" + rows
+    (tmp_path / "twice.lvm").write_text(head + part + part)
+    assert "has 2 parts with headings: only the last" in read_log(tmp_path / "twice.lvm").attrs["role_doubts"]
 
 
 def test_a_kiln_s_log_keeps_the_reading_that_has_a_blank_before_its_sign(tmp_path):

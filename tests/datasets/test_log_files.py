@@ -559,7 +559,7 @@ FOREIGN = [
     (b"time_s,T_\xb0C,q1\n0,20,1\n1,20,1\n", [0, 1], "T degC output 20|q1 1 input 1", ["as Windows-1252"]),
     (HEAD + "".join(f"{k},{'ERR' if k == 4 else .5},20\n" for k in range(40)) + "# end\n", range(40),
      "drive 1 input .5|t_tank degC output 20",
-     ["1 row(s) with too few or too many cells left out (row 42)",
+     ["comments between rows passed over (row 42)",
       "drive: 1 cell(s) that are no numbers left empty (row 6: 'ERR')", "drive: 1 lost value held"]),
     (HEAD + "".join(f"{k // 5},.5,20\n" for k in range(20)), np.arange(20) / 5,
      "drive 1 input .5|t_tank degC output 20", ["time has 4 stamps for 20 rows: rows spread evenly"]),
@@ -771,20 +771,21 @@ def test_a_table_with_a_reading_of_one_signal_in_a_row_has_a_column_for_each_sig
 
 
 def test_an_annotated_table_of_readings_in_a_row_is_read_by_what_varies(write):
-    rows = "".join(
-        f",,{at},1970-01-01T00:00:00Z,2024-01-01T00:{k:02}:00Z,{20 + at * k},{name},rig\r\n"
-        for at, name in enumerate(("heater", "tank_temp"))
-        for k in range(30)
-    )
     head = (
-        "#group,false,false,true,false,false,true,true\r\n,result,table,_start,_time,_value,_field,_from\r\n"
+        "#group,false,false,true,false,false,true,true\r\n,result,table,_start,_time,_value,_unit,_field\r\n"
     )
-    log = read_log(write(head + rows))
-    assert {str(name): item.values[:3].tolist() for name, item in log.items()} == {
-        "heater": [20, 20, 20],
-        "tank_temp": [20, 21, 22],
+    tables = [
+        f",,{at},1970-01-01T00:00:00Z,2024-01-01T00:{k:02}:{15 * at}Z,{20 + at * k},{unit},{name}\r\n"
+        for at, (name, unit) in enumerate([("heater", "%"), ("fan", "%"), ("tank_temp", "C")])
+        for k in range(30)
+    ]
+    log = read_log(write("".join([head, *tables[:30], head, *tables[30:60], head, *tables[60:]])))
+    assert {str(name): float(item[-1]) for name, item in log.items()} == {
+        "heater": 20,
+        "fan": 49,
+        "tank_temp": 78,
     }
-    assert np.diff(log["time"].values).tolist() == [60.0] * 29
+    assert "comments between rows passed over (rows 33, 65)" in log.attrs["repairs"]
 
 
 def test_a_logger_that_was_started_again_writes_its_header_again(write):

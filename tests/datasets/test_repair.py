@@ -144,8 +144,8 @@ def test_what_is_rejected_is_lost_and_the_rest_is_untouched(at, size, sign):
     [
         ([0, 1, 1, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10], range(11), [0, 1, *range(4, 13)],
          "2 repeated time stamps dropped (rows 4, 5)"),
-        ([0, 0, 0, 3, 3, 3, 6, 6, 6], range(9), range(9),
-         "time has 3 stamps for 9 rows: rows spread evenly between them"),
+        ([0, 0, 3, 3, 3, 6, 6, 6, 9], range(1, 10), range(9),
+         "time has 4 stamps for 9 rows: rows spread evenly between them"),
         ([*range(30), np.nan, *range(30, 39)], range(39), [*range(30), *range(31, 40)],
          "1 row without a time dropped (row 32)"),
     ],
