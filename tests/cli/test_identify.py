@@ -231,6 +231,10 @@ def test_a_guess_that_decides_is_a_warning_and_the_command_that_states_it_comes_
     last_line = room.bench.run("identify", *typed).err.splitlines()[-1]
     typed.remove("good.csv")  # the rest of what was typed stays
     assert last_line == f"next: thermogrip identify good.csv --inputs q1 {' '.join(typed)}"
+    nameless = tuple(replace(signal, name=f"c{place}") for place, signal in enumerate(signals, 2))
+    room.found = found_of(good=False, doubts=("c2 is taken as input",), signals=nameless)
+    last_line = room.bench.run("identify", "good.csv", "--out", "p.json").err.splitlines()[-1]
+    assert "--inputs c2 --outputs c3 --out p.json  # better, name its columns in their order" in last_line
     named = tuple(replace(signal, guessed=False) for signal in signals)  # no roles will mend the other doubts
     room.found = found_of(good=False, doubts=("U is far from its prior",), signals=named)
     done = room.bench.run("identify", "good.csv", "--out", "p.json")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shlex
 from functools import partial
 from pathlib import Path
@@ -212,6 +213,8 @@ def _stating(found: Identification, paths: Sequence[str], typed: Sequence[str], 
     if driven and by_course:
         measured = {"input": driven, "disturbance": [*named["disturbance"], *by_course]}
         command += f"  # can you set {', '.join(by_course)}? if not: {shlex.join(_stated_roles(measured))}"
+    elif all(re.fullmatch(r"c\d+", signal.name) for signal in found.signals):
+        command += "  # better, name its columns in their order: --columns time_s,heater_percent,oven_degC,-"
     return printable(command)
 
 
