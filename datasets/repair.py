@@ -78,7 +78,7 @@ def order_rows(time: Floats, lines: NDArray[np.int64], file: str) -> OrderedRows
     if (steps < 0).any():
         at = int(np.argmax(steps < 0))
         problem = f"time runs back from {time[rows[at]]:g} s to {time[rows[at + 1]]:g} s"
-        hint = "cut the file there in two, sort its rows, or give the step of all rows with --dt"
+        hint = "cut the file there in two, sort its rows, or give the step with --dt where a run goes on"
         raise UserError(problem, file=file, row=int(lines[rows[at + 1]]), hint=hint)
     first = np.append(True, steps > 0)
     starts, repeats = np.flatnonzero(first), int((~first).sum())
