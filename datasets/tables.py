@@ -189,7 +189,9 @@ def check_header(headers: Sequence[str], names: Sequence[str], file: str) -> Non
     """Refuse names where a table has no header, with the ``--columns`` that would give them to it."""
     places = {f"c{place}" for place in range(1, len(headers) + 1)}
     if names and {header.lower() for header in headers} == places and not places & {*map(str.lower, names)}:
-        hint = f"name its columns in their order: --columns {','.join(['NAME'] * len(headers))} (-: left out)"
+        spare = len(headers) - len(names)
+        words = [*["time_s"][:spare], *names, *["-"] * (spare - 1)]
+        hint = f"name its columns in their order, such as --columns {','.join(words)} (-: left out)"
         raise UserError("has no header", file=file, hint=hint)
 
 
