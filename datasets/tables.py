@@ -475,7 +475,7 @@ def _parse_table(
     if tolerated:
         for column in columns:
             words = {cell.lower() for cell in column.text or ()}
-            if words > words & _GOOD > {*()}:
+            if words & _GOOD and words - _GOOD:
                 says = f"{column.name} does not call each reading good"
                 notes.append(Doubt(f"{says}: leave those cells empty that it does not"))
         numbers = [(c.name, cells) for c, cells in zip(columns, cells_of.values()) if c.numbers is not None]
