@@ -25,6 +25,7 @@ from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log, log_name
 from thermogrip.sysid.models.model import GreyModel
+from thermogrip.sysid.models.state_space import symmetric_root
 from thermogrip.sysid.plant.log_grid import Stretch, cut_stretches
 from thermogrip.sysid.plant.plant import Plant
 from thermogrip.sysid.plant.simulation import Start, find_starts, predict
@@ -87,7 +88,7 @@ class Problem:
             p = self.parameters(z[None])[0]
             self._starts.clear()
             self._starts[point] = [
-                find_starts(self.plant, p, stretches, start_seconds(self.model, stretches, self.plant.dt))
+                find_starts(self.plant, p, stretches, float(stretches[0].time[-1]))
                 for stretches, _ in self.logs
             ]
         return self._starts[point]
@@ -133,9 +134,26 @@ class Problem:
         ahead = _DIFFERENCE_STEP * np.diag(sign)
         around = np.vstack([z, z + ahead, z - ahead] if central else [z, z + ahead])
         out = []
-        for r in self.residuals(around, self.start(z)):
+        for r, by_start in zip(self.residuals(around, self.start(z)), self._start_slopes(z)):
             rise = (r[1 : len(z) + 1] - r[len(z) + 1 :]) / 2 if central else r[1:] - r[0]
-            out.append((r[0], (rise / (_DIFFERENCE_STEP * sign[:, None])).T))
+            slopes = (rise / (_DIFFERENCE_STEP * sign[:, None])).T
+            # the start that is best moves with z: what it explains of a slope is no knowledge of a parameter
+            known = np.eye(by_start.shape[1]) + by_start.T @ by_start
+            out.append((r[0], slopes - by_start @ np.linalg.solve(known, by_start.T @ slopes)))
+        return out
+
+    def _start_slopes(self, z: Array) -> list[Array]:
+        """Return what a spread of each state at a log's start does to its residuals (m, n_x); nothing where
+        the log starts at rest."""
+        starts = self.start(z)
+        unmoved = self.residuals(z[None], starts)
+        out = [np.empty((r.shape[1], 0)) for r in unmoved]
+        # a tenth of a spread: a state near a limit must not cross it
+        for step in 0.1 * symmetric_root(self.model.spread).T:
+            moved = [[log[0].moved(step), *log[1:]] for log in starts]
+            for k, r in enumerate(self.residuals(z[None], moved)):
+                if starts[k][0].level is None:
+                    out[k] = np.column_stack([out[k], 10.0 * (r[0] - unmoved[k][0])])
         return out
 
     @property

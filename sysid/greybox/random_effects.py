@@ -23,10 +23,10 @@ from scipy.signal import lfilter
 
 from thermogrip.datasets.arrays import Array
 from thermogrip.sysid.greybox.noise_model import Block, LogData
-from thermogrip.sysid.greybox.problem import Problem, start_seconds
+from thermogrip.sysid.greybox.problem import Problem
 from thermogrip.sysid.models.model import Model
 from thermogrip.sysid.models.state_space import symmetric_root
-from thermogrip.sysid.plant.simulation import READING_EVERY, Start, predict
+from thermogrip.sysid.plant.simulation import Start, predict
 
 
 @dataclass(frozen=True)
@@ -200,19 +200,6 @@ def _of_start(problem: Problem, at: int, k: int, p: Array, start: Start) -> list
     d = stretches[k].d - start.d_offset
     y, _ = problem.model.rollout(x0, stretches[k].u[None], d[None], p, problem.plant.dt)
     change = 10.0 * (y[1:] - y[0])  # (n_x, N + 1, n_y)
-    if k == 0 and start.level is None:
-        # A start that was estimated from its first readings is as uncertain as these leave it, of which one
-        # in READING_EVERY counts and whose sensors may be off.  90 per cent intervals of logs that begin warm
-        # cover 75 (four logs) and 87 per cent (one); those of the model's own spread as much, but up to 15
-        # times as wide (40 rigs of benchmarks/coverage, their first third cut; a tank under a lamp).
-        seconds = start_seconds(problem.model, stretches, problem.plant.dt)
-        read = np.nan_to_num(change[:, : round(seconds / problem.plant.dt) + 1])
-        off = np.diag([problem.plant.nuisance.get(name, 0.0) for name in problem.plant.outputs])[:, None]
-        columns = np.concatenate([read, np.broadcast_to(off, (len(off), *read.shape[1:]))]) / problem.sd
-        counted = (1 + seconds / READING_EVERY) / read.shape[1]
-        known = np.eye(len(columns)) + counted * np.einsum("atj,btj->ab", columns, columns)
-        unknown = np.linalg.inv(known)[: len(read), : len(read)]
-        change = np.tensordot(np.linalg.cholesky(unknown).T, change, axes=1)
     scaled = [o @ change[:, :, j].T / problem.sd[j] for j, o in enumerate(bins[k].operators)]
     stacked = np.nan_to_num(np.vstack(scaled))
     modes = stacked @ np.linalg.eigh(stacked.T @ stacked)[1]

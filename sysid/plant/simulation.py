@@ -59,6 +59,10 @@ class Start:
     memory: float = np.inf  # [s] in which it falls to 1/e
     warm: float = 0.0  # middle of the warm-up, after which it fades, in seconds of this stretch
 
+    def moved(self, step: Array) -> Start:
+        """Return the start with its state moved by a step (n_x,)."""
+        return replace(self, x0=self.x0 + step, shift=self.shift + step)
+
     def offset(self, time: Array) -> Array:
         """Return the offset (n, n_y) at seconds ``time`` of the stretch; (n_y,) of one that lasts."""
         if np.isinf(self.memory):

@@ -174,11 +174,10 @@ def free_run(
 
 def usual_warmup(plant: Plant, log: Log) -> float:
     """Return the seconds of readings that set the state where nothing is said."""
-    if not plant.scores.held_out_by_part:  # a network has few states, and begins at rest where sensors agree
-        return max(5.0, plant.dt)
-    # one of one or two logs was scored from the steady start of a part, fifty rows, and its slowest state
-    # needs a tenth of its time constant to show; no run spends more than a tenth of its log on that
-    of_fit = warm_up_of(log["time"].values) if 0 < len(plant.logs) < SEVERAL else 0.0
+    # a black box of one or two logs was scored from the steady start of a part, fifty rows; the slowest state
+    # needs a tenth of its time constant to show, and no run spends more than a tenth of its log on that
+    few = plant.scores.held_out_by_part and 0 < len(plant.logs) < SEVERAL
+    of_fit = warm_up_of(log["time"].values) if few else 0.0
     return max(5.0, plant.dt, of_fit, start_seconds(plant, log))
 
 

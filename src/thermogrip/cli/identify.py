@@ -365,8 +365,8 @@ def validate(
         cli.opt(
             "--warmup",
             "S",
-            "Measured outputs of these first seconds may set the state; where absent 5 s, of a black box a "
-            "tenth of its slowest time constant, at least what scored its fit, at most a tenth of the log.",
+            "Measured outputs of these first seconds may set the state; where absent a tenth of the slowest "
+            "time constant, 5 s at least (of a black box what scored its fit), at most a tenth of the log.",
             min=0,
         ),
     ] = None,

@@ -70,6 +70,20 @@ def test_a_slope_on_a_bound_is_taken_from_inside():
     np.testing.assert_allclose(slopes, central, rtol=2e-3, atol=1e-6)
 
 
+def test_what_a_start_explains_of_a_slope_is_no_knowledge_of_a_parameter():
+    warm = made(0, seconds=900.0).isel(time=slice(300, None))
+    problem = problem_of(heater(), warm)
+    z = np.full(len(problem.free), 0.1)
+    starts, ((_, slopes),) = problem.start(z), problem.by_log(z)
+    assert starts[0][0].level is None
+    held = problem.residuals(np.vstack([z, z + 1e-4 * np.eye(len(z))]), starts)[0]
+    step = np.sqrt(np.diag(problem.model.spread))
+    by_start = problem.residuals(z[None], [[starts[0][0].moved(0.1 * step)]])[0][0] - held[0]
+    explained = [by_start @ slope / np.linalg.norm(by_start) for slope in slopes.T]
+    before = [by_start @ (r - held[0]) / 1e-4 / np.linalg.norm(by_start) for r in held[1:]]
+    assert np.abs(explained).max() < 0.05 * np.abs(before).max()
+
+
 def test_a_start_is_estimated_from_what_the_model_states_or_half_of_a_short_log():
     class Long(TwoGains):
         warmup = 30.0

@@ -95,7 +95,7 @@ def test_a_start_that_the_warmup_did_not_determine_is_reported_and_no_term_is_su
         x0 = [[2 * rng.standard_normal(), 0.0]]
         y = model.rollout(x0, q[None, :, None], np.zeros((1, N, 0)), (), 1.0)[0][0, :-1, 0]
         log = log_of(q, y + 0.05 * rng.standard_normal(N))
-        short, long = free_run(plant, log), free_run(plant, log, 60.0, 60.0)
+        short, long = free_run(plant, log, 5.0), free_run(plant, log, 60.0, 60.0)
         assert not suspected(short)
         assert not suspected(long)
         assert not any("is the start" in note for note in long.notes)
