@@ -469,7 +469,7 @@ def _pooled(rows: Sequence[Row]) -> tuple[float, float]:
 
 def doubts_of(plant: Plant) -> list[str]:
     """Return what of a plant itself is not certain, a line each."""
-    return [*_far_from_prior(plant), *_heaters_that_cool(plant)]
+    return [*_far_from_prior(plant), *_effects_in_doubt(plant)]
 
 
 def _far_from_prior(plant: Plant) -> list[str]:
@@ -491,25 +491,31 @@ def _far_from_prior(plant: Plant) -> list[str]:
     return out
 
 
-def _heaters_that_cool(plant: Plant) -> list[str]:
-    heaters = [name for name in plant.inputs if "heat" in name.lower()]
-    warmed = [name for name in plant.outputs if plant.units.get(name) == "degC"]
-    if not heaters or not warmed:
-        return []
+def _effects_in_doubt(plant: Plant) -> list[str]:
     from thermogrip.sysid.export.dynamics import plant_dynamics
 
     try:
-        dynamics = plant_dynamics(plant, draws=0)
+        rows = plant_dynamics(plant).rows()
     except UserError:  # it does not settle
         return []
-    gains = {(row["input"], row["output"]): row["gain"] for row in dynamics.rows()}
-    return [
-        f"{heater} lowers {output} (gain {gains[heater, output]:.2g}): recorded in closed loop, or not what "
-        "heats it?"
-        for heater in heaters
-        for output in warmed
-        if gains.get((heater, output), 0.0) < 0
-    ]
+    out = []
+    for name in plant.inputs:
+        effects = [row for row in rows if row["input"] == name]
+        # a controller needs the sign of one; an interval is missing where the plant has no uncertainty
+        if effects and all((row["low"] or 0.0) < 0 < (row["high"] or 0.0) for row in effects):
+            likely = max(effects, key=lambda row: abs(row["gain"]) / (row["high"] - row["low"]))
+            interval = f"{likely['low']:.2g} to {likely['high']:.2g}"
+            out.append(f"whether {name} raises or lowers {likely['output']} (gain {interval}): move it more")
+        cooled = [
+            row for row in effects if "heat" in name.lower() and plant.units.get(row["output"]) == "degC"
+        ]
+        out += [
+            f"{name} lowers {row['output']} (gain {row['gain']:.2g}): recorded in closed loop, or not what "
+            "heats it?"
+            for row in cooled
+            if row["gain"] is not None and row["gain"] < 0
+        ]
+    return out
 
 
 def network_name(plant: Plant) -> str:

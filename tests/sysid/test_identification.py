@@ -404,7 +404,7 @@ def test_a_guessed_column_that_never_moves_is_left_out_and_reported():
 def test_stated_inputs_that_never_move_are_refused_together_with_the_way_out():
     with pytest.raises(UserError, match=r"fan never moves.*; valve never moves") as refused:
         identify(with_still(fan=0.4, valve=7.0), models=["arx"], average=2.0)
-    assert "leave it out with --inputs q" in str(refused.value)
+    assert "or name what you set with --inputs q" in str(refused.value)
 
 
 @pytest.mark.parametrize("kind", ["oe", "subspace"])
@@ -518,9 +518,21 @@ def test_a_parameter_far_beyond_its_prior_is_a_doubt_that_names_the_network(off,
 def test_a_heater_that_cools_is_a_doubt(gain, doubts):
     model = StateSpaceModel(("heater",), (), ("t",), A=[[0.9]], B=[[0.1 * gain]], C=[[1.0]], dt=1.0)
     plant = Plant(model, {}, dt=1.0, units={"heater": "percent", "t": "degC"}, valid={"heater": (0.0, 100.0)})
-    found = stated_errors._heaters_that_cool(plant)
+    found = stated_errors.doubts_of(plant)
     assert len(found) == doubts
     assert all(f"heater lowers t (gain {gain:.2g}): recorded in closed loop" in line for line in found)
+
+
+@pytest.mark.parametrize(("gain", "good"), [(1.0, True), (0.0, False)])
+def test_an_input_whose_effect_has_no_certain_sign_is_a_doubt(gain, good):
+    """A house was good for control by its weather alone: its heating had a gain of -.05 to .07."""
+    rng = np.random.default_rng(5)
+    q, room = np.repeat(rng.choice([0.0, 1.0], (2, 60)), 15, axis=1)
+    t = lfilter([0.0, 0.1], [1, -0.9], gain * q + 3 * room) + 0.05 * rng.standard_normal(900)
+    columns = {"q": (q, "1", "input"), "room": (room, "1", "disturbance"), "t": (t, "1", "output")}
+    found = identify([make_log(np.arange(900.0), columns)], models=["arx"])
+    assert found.good is good
+    assert any("whether q raises or lowers t" in line for line in found.doubts) is not good
 
 
 @pytest.mark.parametrize(
