@@ -205,19 +205,6 @@ def block_means(
     return means.index.to_numpy(dtype=float), means.to_numpy(dtype=float)
 
 
-def held_means(
-    time: NDArray[np.float64], values: NDArray[np.float64], edges: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Return the means of the staircases (n_time, n) over the cells between the edges."""
-    # with U(t) the integral of the held input up to t, which is piecewise linear, its mean over [a, b) is
-    # exactly (U(b) - U(a)) / (b - a), whatever the jitter of the rows
-    area = np.zeros_like(values)
-    np.cumsum(values[:-1] * np.diff(time)[:, None], axis=0, out=area[1:])
-    row = np.clip(np.searchsorted(time, edges, side="right") - 1, 0, None)
-    integral = area[row] + values[row] * (edges - time[row])[:, None]
-    return np.asarray(np.diff(integral, axis=0) / np.diff(edges)[:, None], dtype=float)
-
-
 def log_name(log: xr.Dataset) -> str:
     """Return the record's name in tables and messages."""
     return str(log.attrs.get("name", "log"))

@@ -22,12 +22,13 @@ from scipy.signal import lfilter
 from thermogrip.cli.excite import optimal_for, schedule_for
 from thermogrip.datasets.examples import example_path
 from thermogrip.datasets.log_files import read_log
-from thermogrip.datasets.schema import Log, columns, held_means, make_log
+from thermogrip.datasets.schema import Log, columns, make_log
 from thermogrip.sysid.experiment.information import ExperimentForecast, plant_from_prior
 from thermogrip.sysid.experiment.optimal import inputs_of
 from thermogrip.sysid.greybox.fit import fit_network
 from thermogrip.sysid.models.network import NetworkModel, load_network
 from thermogrip.sysid.models.network_spec import network_from_dict
+from thermogrip.sysid.plant.log_grid import held_means
 from thermogrip.sysid.plant.plant import Plant
 from thermogrip.sysid.plant.plant_data import PlantScores
 

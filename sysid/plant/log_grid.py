@@ -20,7 +20,7 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.limits import MOST_BYTES
 from thermogrip.datasets.log_files import NO_NUMBERS, Logs, as_logs
 from thermogrip.datasets.roles import guess_role
-from thermogrip.datasets.schema import Log, column, columns, held_means, log_name
+from thermogrip.datasets.schema import Log, column, columns, log_name
 from thermogrip.datasets.schema import gaps as gaps_of
 from thermogrip.datasets.schema import names as names_of
 from thermogrip.sysid.models.network_spec import SHARES
@@ -193,6 +193,17 @@ def cut_stretches(plant: PlantData, log: Log, *, gaps: str = "restart") -> list[
     smooth = [plant.model.smooth if plant.units.get(n, "degC") == "degC" else 0.0 for n in plant.disturbances]
     stretches = _stretches(rows, step=plant.dt, steps=steps, smooth=smooth)
     return [replace(stretch, time=stretch.time + middle) for stretch in stretches]
+
+
+def held_means(time: Array, values: Array, edges: Array) -> Array:
+    """Return the means of the staircases (n_time, n) over the cells between the edges."""
+    # with U(t) the integral of the held input up to t, which is piecewise linear, its mean over [a, b) is
+    # exactly (U(b) - U(a)) / (b - a), whatever the jitter of the rows
+    area = np.zeros_like(values)
+    np.cumsum(values[:-1] * np.diff(time)[:, None], axis=0, out=area[1:])
+    row = np.clip(np.searchsorted(time, edges, side="right") - 1, 0, None)
+    integral = area[row] + values[row] * (edges - time[row])[:, None]
+    return np.asarray(np.diff(integral, axis=0) / np.diff(edges)[:, None], dtype=float)
 
 
 def _stretches(
