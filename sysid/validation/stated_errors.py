@@ -495,27 +495,26 @@ def _effects_in_doubt(plant: Plant) -> list[str]:
     from thermogrip.sysid.export.dynamics import plant_dynamics
 
     try:
-        rows = plant_dynamics(plant).rows()
+        dynamics = plant_dynamics(plant)
     except UserError:  # it does not settle
         return []
-    out = []
-    for name in plant.inputs:
-        effects = [row for row in rows if row["input"] == name]
-        # a controller needs the sign of one; an interval is missing where the plant has no uncertainty
-        if effects and all((row["low"] or 0.0) < 0 < (row["high"] or 0.0) for row in effects):
-            likely = max(effects, key=lambda row: abs(row["gain"]) / (row["high"] - row["low"]))
-            interval = f"{likely['low']:.2g} to {likely['high']:.2g}"
-            out.append(f"whether {name} raises or lowers {likely['output']} (gain {interval}): move it more")
-        cooled = [
-            row for row in effects if "heat" in name.lower() and plant.units.get(row["output"]) == "degC"
-        ]
-        out += [
-            f"{name} lowers {row['output']} (gain {row['gain']:.2g}): recorded in closed loop, or not what "
-            "heats it?"
-            for row in cooled
-            if row["gain"] is not None and row["gain"] < 0
-        ]
-    return out
+    _, step = dynamics.step_response()
+    # a controller needs the sign of one response; of a slow plant the logs show its first part alone
+    is_certain = np.any(
+        (step.low[1:] > 0) | (step.high[1:] < 0) | np.isnan(step.low[1:]), axis=(0, 1)
+    ).tolist()
+    out = [
+        f"whether {name} raises or lowers {' or '.join(plant.outputs)}: move it more"
+        for name, certain in zip(dynamics.linear.inputs, is_certain)
+        if name in plant.inputs and not certain
+    ]
+    return out + [
+        f"{row['input']} lowers {row['output']} (gain {row['gain']:.2g}): "
+        "recorded in closed loop, or not what heats it?"
+        for row in dynamics.rows()
+        if row["input"] in plant.inputs and "heat" in row["input"].lower()
+        if plant.units.get(row["output"]) == "degC" and (row["gain"] or 0.0) < 0
+    ]
 
 
 def network_name(plant: Plant) -> str:
