@@ -552,7 +552,7 @@ def read_column(
         return Column(name, text=["" if cell in _LOST_CELLS else cell for cell in cells])
     hint = "write a number, leave the cell empty, or drop the column"
     if tolerated:
-        hint += " (--columns, - in its place)"
+        hint += " (- in --columns)"
     if re.fullmatch(r"[+-]?\d+,\d+", first):
         hint = "write a decimal point"
     elif STAMP.fullmatch(first):

@@ -130,7 +130,7 @@ def test_the_unfinished_last_line_of_a_killed_logger_is_dropped(write):
         (HEAD + "0,0.5,25\n1,0.5,warm\n2,0,25\n", ["row 3", "column t_tank_degC", "'warm' is not a number"]),
         ("# note\n" + HEAD + "0,x,25\n1,0,25\n", ["row 3", "column drive", "'x'"]),
         (HEAD + "0,x,25\n1,0\n2,0,hot\n3,0,25\n", ["row 3: has 2 cell(s), the header has 3; complete"]),
-        (HEAD + "0,0.5,25\n1,0.5,warm\n2,0,25\n", ["or drop the column (--columns, - in its place)"]),
+        (HEAD + "0,0.5,25\n1,0.5,warm\n2,0,25\n", ["or drop the column (- in --columns)"]),
         (HEAD.replace(",", ";") + "0;0,5;25\n1;0.5;25\n", ["row 2", "column drive", "write a decimal point"]),
         (HEAD + "0,0.5,25\n", ["1 row(s) are not a log"]),
         ("", ["is empty", "header"]),

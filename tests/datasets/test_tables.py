@@ -127,7 +127,7 @@ def rows(n, changed, head="a,b\n"):
 
 
 SHORT = {k: f"{k}\n" for k in range(3, 9)}
-CELL = "write a number, leave the cell empty, or drop the column (--columns, - in its place)"
+CELL = "write a number, leave the cell empty, or drop the column (- in --columns)"
 LEFT = "row(s) with too few or too many cells left out"
 
 
