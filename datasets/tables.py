@@ -536,7 +536,10 @@ def read_column(
         notes.append("numbers have a decimal comma")
     cells_known = len(cells) - sum(cell in _LOST_CELLS for cell in cells)
     if tolerated and wrong.size and (united := _without_unit(name, cells)) is not None:
-        return read_column(*united, lines, file, tolerated)
+        named, bare, factors = united
+        column = read_column(named, bare, lines, file, tolerated)
+        scaled = None if column.numbers is None else column.numbers * factors
+        return replace(column, numbers=scaled)
     first = cells[wrong[0]] if wrong.size else ""
     states = switched(cells) if tolerated else None
     if states is not None and np.isfinite(values).any() and len({cells[row].lower() for row in wrong}) > 1:
@@ -574,16 +577,19 @@ def _has_decimal_comma(cells: Sequence[str]) -> bool:
     return any(map(comma.fullmatch, cells)) and all(map(thousands.fullmatch, (c for c in cells if "." in c)))
 
 
-def _without_unit(name: str, cells: Sequence[str]) -> tuple[str, list[str]] | None:
-    """Return a column's name and cells where one unit stands behind each of its numbers (``23.4 °C``)."""
+def _without_unit(name: str, cells: Sequence[str]) -> tuple[str, list[str], list[float]] | None:
+    """Return a column's name, its cells without the units of one quantity (``1.2 kW``), and factors."""
     matches = [None if cell in _LOST_CELLS else _WITH_UNIT.fullmatch(cell) for cell in cells]
-    units = {match[2] for match in matches if match is not None}
     if any(match is None and cell not in _LOST_CELLS for match, cell in zip(matches, cells)):
         return None
-    if len(units) != 1 or not _is_unit(unit := units.pop()):
+    read = {match[2]: read_header(f"x [{match[2]}]") for match in matches if match is not None}
+    units = {header.unit for header in read.values()}
+    if len(units) != 1 or "1" in units:
         return None
-    named = name if read_header(name).unit != "1" else f"{name} [{unit}]"
-    return named, ["" if match is None else match[1] for match in matches]
+    named = name if read_header(name).unit != "1" else f"{name} [{next(iter(read))}]"
+    scale = read_header(named).scale
+    factors = [1.0 if match is None else read[match[2]].scale / scale for match in matches]
+    return named, ["" if match is None else match[1] for match in matches], factors
 
 
 def switched(cells: Sequence[str]) -> NDArray[np.float64] | None:

@@ -504,6 +504,8 @@ def test_a_netcdf_file_is_repaired_and_has_names_of_its_own(tmp_path):
 
 
 FOREIGN = [
+    ("time_s,Power_W,Plate\n0,1.2 kW,20 °C\n1,950 W,21 °C\n2,0 W,22.5 °C\n", [0, 1, 2],
+     "Power W input 1200|Plate degC output 20", []),
     ("Time (sec), Heater 1 (%), Temperature 1 (degC), Set Point 1 (degC)\n0,10,20,23\n2,10,21,23\n",
      [0, 2], "Heater_1 percent input 10|Temperature_1 degC output 20|Set_Point_1 degC other 23",
      ["time: Time (sec) is taken as the time in s", "read 'Heater 1 (%)' as Heater_1 [percent], "]),
