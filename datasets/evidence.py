@@ -26,6 +26,7 @@ from thermogrip.datasets.repair import drop_stuck, find_spikes
 
 Floats = NDArray[np.float64]
 Columns: TypeAlias = Mapping[str, Floats]
+_Matrices: TypeAlias = tuple[Floats, Floats, Floats]
 
 
 @dataclass(frozen=True)
@@ -64,9 +65,8 @@ def is_moved(columns: Columns, name: str, drives: Sequence[str], beside: Sequenc
     if is_sound.sum() < EVIDENCE.fewest_rows:
         return False
     reading, *causes = _standardised([values[is_sound] for values in (columns[name], *causes)])
-    moves, others = causes[: len(drives)], causes[len(drives) :]
-    gains = np.array([_gains(reading, moves, others, lags) for lags in EVIDENCE.lags])
-    return bool(np.any(gains.min(axis=0) > EVIDENCE.strong_gain))
+    gains = [_gains(reading, _bases(causes[: len(drives)], k), causes[len(drives) :]) for k in EVIDENCE.lags]
+    return bool(np.any(np.min(gains, axis=0) > EVIDENCE.strong_gain))
 
 
 def is_held(values: Floats) -> bool:
@@ -114,10 +114,10 @@ def explains(y: Floats, *some: Floats) -> bool:
 def predictive_gain(columns: Sequence[Floats]) -> Floats:
     """Return how much column i helps to predict column j, G (n, n), the least over the lags."""
     scaled = _standardised(columns)
-    least = [np.min([_gains(y, scaled, (), lags) for lags in EVIDENCE.lags], axis=0) for y in scaled]
+    pasts = (_bases(scaled, lags) for lags in EVIDENCE.lags)
+    least = np.min([[_gains(y, bases, ()) for y in scaled] for bases in pasts], axis=0)
     gain = np.reshape(least, (len(scaled), len(scaled))).T
-    np.fill_diagonal(gain, 0.0)
-    return gain
+    return gain * (1 - np.eye(len(scaled)))
 
 
 def some_rows(values: Floats) -> Floats:
@@ -141,34 +141,45 @@ def _standardised(columns: Sequence[Floats]) -> list[Floats]:
     return scaled
 
 
-def _gains(y: Floats, causes: Sequence[Floats], beside: Sequence[Floats], lags: int) -> list[float]:
+def _bases(causes: Sequence[Floats], lags: int) -> Floats:
+    """Return an orthonormal basis of each cause's past (n_cause, n_row, lags), empty where rows are few."""
+    if not causes or len(causes[0]) < 6 * lags:
+        return np.zeros((len(causes), 0, lags))
+    axes, sizes, _ = np.linalg.svd([_past(cause, lags) for cause in causes], full_matrices=False)
+    return np.asarray(axes * (sizes > 1e-9 * sizes[:, :1])[:, None])
+
+
+def _gains(y: Floats, bases: Floats, beside: Sequence[Floats]) -> Floats:
     """Return the gain in the information criterion of y, where the past of each cause stands beside its own
     and that of others; 0 where it is negative, or rows are too few."""
-    if len(y) < 6 * lags:
-        return [0.0] * len(causes)
+    n_causes, rows, lags = bases.shape
+    if not bases.size:
+        return np.zeros(n_causes)
     # what the pasts of y and of others explain is taken out of all once (Frisch and Waugh 1933)
-    known = np.column_stack([np.ones(len(y) - lags), *(_past(values, lags) for values in (y, *beside))])
-    targets = np.column_stack([y[lags:], *(_past(cause, lags) for cause in causes)])
-    target, *residuals = np.split(_residuals(targets, known), range(1, targets.shape[1], lags), axis=1)
-    return [max(0.0, _fit(target[:, 0], new)[0]) for new in residuals]
+    axes = _decomposed([np.ones(rows), *(_past(values, lags) for values in (y, *beside))])[0]
+    target, explained = y[lags:] - axes @ (axes.T @ y[lags:]), axes.T @ bases
+    shares, directions = np.linalg.eigh(np.eye(lags) - explained.transpose(0, 2, 1) @ explained)
+    shares = np.where(shares > 1e-14, shares, np.inf)[:, None]  # less is rounding: it adds nothing
+    factors = directions / shares @ directions.transpose(0, 2, 1) @ (target @ bases)[..., None]
+    errors = target - (bases @ factors - axes @ (explained @ factors))[..., 0]
+    return np.maximum(_criterion(target, errors, rows, lags), 0.0)
 
 
 def _past(values: Floats, lags: int, first: int = 1) -> Floats:
     return np.stack([values[lags - k : len(values) - k] for k in range(first, lags + 1)], axis=1)
 
 
-def _residuals(targets: Floats, known: Floats) -> Floats:
-    return np.asarray(targets - known @ np.linalg.lstsq(known, targets, rcond=None)[0])
+def _decomposed(terms: Sequence[Floats]) -> _Matrices:
+    """Return an orthonormal basis of what columns span, its singular values and the columns' loadings."""
+    axes, sizes, loadings = np.linalg.svd(matrix := np.column_stack(terms), full_matrices=False)
+    is_usable = sizes > np.finfo(float).eps * max(matrix.shape) * sizes[0]
+    return axes[:, is_usable], sizes[is_usable], loadings[is_usable]
 
 
-def _fit(target: Floats, new: Floats) -> tuple[float, Floats]:
-    """Return the gain in the information criterion of a target by new columns, and their factors."""
-    rows, n_new = new.shape
-    factors = np.asarray(np.linalg.lstsq(new, target, rcond=1e-9)[0])
-    squares = [float(np.sum(r**2)) + 1e-12 * rows for r in (target, target - new @ factors)]
-    # G = N log(RSS of y on its own past / RSS with that of x beside it) - n log N, of n lags and N rows
-    # (Granger 1969)
-    return rows * float(np.log(squares[0] / squares[1])) - n_new * float(np.log(rows)), factors
+def _criterion(target: Floats, errors: Floats, rows: int, n_new: int) -> Floats:
+    # G = N log(RSS without new columns / RSS with them) - n log N, of n columns and N rows (Granger 1969)
+    before, after = (np.sum(r**2, axis=-1) + 1e-12 * rows for r in (target, errors))
+    return np.asarray(rows * np.log(before / after) - n_new * np.log(rows))
 
 
 def comes_to(reading: Floats, goal: Floats) -> bool:
@@ -176,10 +187,9 @@ def comes_to(reading: Floats, goal: Floats) -> bool:
     the last half of each hold."""
     bounds = [0, *(np.flatnonzero(np.diff(goal)) + 1), goal.size]
     spans = [(a, b) for a, b in pairwise(bounds) if b - a >= EVIDENCE.fewest_rows]
-    holds = [(goal[a], reading[(a + b) // 2 : b]) for a, b in spans]
-    holds = [(level, second_half) for level, second_half in holds if np.isfinite(second_half).all()]
-    levels = np.array([level for level, _ in holds])
-    reached = [abs(level - np.median(half)) <= EVIDENCE.held_size * np.ptp(levels) for level, half in holds]
+    halves = {a: reading[(a + b) // 2 : b] for a, b in spans if np.isfinite(reading[(a + b) // 2 : b]).all()}
+    levels = np.array([goal[a] for a in halves])
+    reached = [abs(goal[a] - np.median(v)) <= EVIDENCE.held_size * np.ptp(levels) for a, v in halves.items()]
     return np.unique(levels).size >= 3 and float(np.mean(reached)) > 0.5
 
 
@@ -199,10 +209,9 @@ def share_followed(values: Floats, other: Floats) -> float:
     from scipy.signal import lfilter
 
     filtered = [lfilter([1 / n], [1, 1 / n - 1], x)[EVIDENCE.latest :] for n in EVIDENCE.filters]
-    terms = np.column_stack([np.ones(rows), _past(x, EVIDENCE.latest, first=0), *filtered])
+    axes = _decomposed([np.ones(rows), _past(x, EVIDENCE.latest, first=0), *filtered])[0]
     target = y[EVIDENCE.latest :]
-    residual = _residuals(target, terms)
-    return 1 - float(np.var(residual) / (np.var(target) or 1.0))
+    return 1 - float(np.var(target - axes @ (axes.T @ target)) / (np.var(target) or 1.0))
 
 
 def role_doubts(
@@ -217,10 +226,8 @@ def role_doubts(
     if not inputs or not outputs:
         return
     # one spike hides every effect; repairs reject it once roles are known
-    columns = {
-        n: np.where(find_spikes(v, floor=None), np.nan, v) if n in outputs else v for n, v in columns.items()
-    }
-    moved = [name for name in outputs if is_moved(columns, name, inputs)]
+    spikes = {n: find_spikes(columns[n], floor=None) for n in outputs}
+    columns = {**columns, **{n: np.where(spikes[n], np.nan, columns[n]) for n in outputs}}
     read = [*outputs, *disturbances]
     for name in [name for name in inputs if name in reasons]:
         beside = [n for n in inputs if n != name]
@@ -230,10 +237,9 @@ def role_doubts(
         what = f"responds to {', '.join(movers)}: is it read?" if movers else ""
         if what := what or _unlike_an_input(name, columns, beside, outputs, read):
             yield f"{name} is taken as input ({reasons[name]}), but {what}"
-    for name in [name for name in outputs if name in reasons and name not in moved]:
-        if columns[name].size < EVIDENCE.telling_rows or any(_acts(columns, u, name, read) for u in inputs):
-            continue
-        yield f"{name} is taken as output ({reasons[name]}), but does not respond to {', '.join(inputs)}"
+    for n in [n for n in outputs if n in reasons and not is_moved(columns, n, inputs)]:
+        if columns[n].size >= EVIDENCE.telling_rows and not any(_acts(columns, u, n, read) for u in inputs):
+            yield f"{n} is taken as output ({reasons[n]}), but does not respond to {', '.join(inputs)}"
     for name in [name for name in disturbances if name in reasons]:
         if is_moved(columns, name, inputs):
             yield f"{name} is taken as disturbance ({reasons[name]}), but responds to {', '.join(inputs)}"
@@ -251,8 +257,8 @@ def role_doubts(
         idle = [] if is_held(columns[name]) else [n for n in others if n in reasons and is_held(columns[n])]
         for drives in (inputs, [n for n in idle if n not in goals]):
             if is_moved(columns, name, drives):
-                says = f"responds to {', '.join(drives)}: is it an output?"
-                yield f"{name} is left out ({reasons[name]}), but {says}"
+                what = f"responds to {', '.join(drives)}: is it an output?"
+                yield f"{name} is left out ({reasons[name]}), but {what}"
                 break
 
 
@@ -264,23 +270,19 @@ def effect_doubts(
     names = [*inputs, *outputs, *disturbances]
     scaled = dict(zip(names, _standardised([columns[n] for n in names])))
     for output in outputs if inputs else ():
-        for name in inputs:
-            others = [scaled[n] for n in (*inputs, *disturbances) if n != name]
-            ratios = _ratios_of_effects(scaled[output], scaled[name], others)
+        drives, others = [scaled[n] for n in inputs], [scaled[n] for n in disturbances]
+        for name, ratios in zip(inputs, _ratios_of_effects(scaled[output], drives, others)):
             # of 222 pairs in sound logs the larger is at least .53, of drives with the sign turned -.9
             if max(ratios) < 0:
                 yield f"{name} moves {output} one way at first and the other way later: did its sign change?"
             elif min(ratios) > 0 and max(ratios) > EVIDENCE.other_unit**2 * min(ratios):
                 size = f"{max(ratios):.3g} times as far in one part of the log as in another"
                 yield f"{name} moves {output} {size}: did its unit change?"
-        rows = _moved_alone(scaled[output], [scaled[n] for n in inputs], [scaled[n] for n in disturbances])
-        if rows:
+        if rows := _moved_alone(scaled[output], drives, others):
             yield f"{output} moves in {rows} rows with {', '.join(inputs)} held: what moved it there?"
 
 
-def _at_scale(
-    n: int, y: Floats, drives: Sequence[Floats], others: Sequence[Floats]
-) -> tuple[Floats, Floats, Floats]:
+def _at_scale(n: int, y: Floats, drives: Sequence[Floats], others: Sequence[Floats]) -> _Matrices:
     """Return the means of y over n rows, what their past and others tell of them, and what drives add."""
     of_y, *rest = _means_of_rows([y, *drives, *others], n)
     at_once = [_past(means, 2, first=0) for means in rest]
@@ -288,26 +290,36 @@ def _at_scale(
     return of_y[2:], np.column_stack(known), np.column_stack(at_once[: len(drives)])
 
 
-def _ratios_of_effects(y: Floats, drive: Floats, others: Sequence[Floats]) -> tuple[float, float]:
-    """Return the regression of what the late moves of a drive would do by its early effect on what they do,
-    and the other way round, at the scale where both effects are clearest."""
-    clearest, ratios = EVIDENCE.strong_gain, (1.0, 1.0)
+def _ratios_of_effects(y: Floats, drives: Sequence[Floats], others: Sequence[Floats]) -> list[list[float]]:
+    """Return for each drive the regression of what its late moves would do by its early effect on what they
+    do, and the other way round, at the scale where both effects are clearest."""
+    clearest, ratios = [EVIDENCE.strong_gain] * len(drives), [[1.0, 1.0]] * len(drives)
     for n in EVIDENCE.blocks:
-        target, known, acting = _at_scale(n, y, [drive], others)
+        target, known, acting = _at_scale(n, y, drives, others)
         size = int(EVIDENCE.part * target.size)
         if size < EVIDENCE.fewest_rows:
             break
-        columns = np.column_stack([target, acting])
-        early, late = (_residuals(columns[rows], known[rows]) for rows in (slice(size), slice(-size, None)))
-        (gain_early, of_early), (gain_late, of_late) = (_fit(r[:, 0], r[:, 1:]) for r in (early, late))
-        if min(gain_early, gain_late) > clearest:
-            clearest = min(gain_early, gain_late)
-            ratios = _ratio(late[:, 1:], of_early, of_late), _ratio(early[:, 1:], of_late, of_early)
+        halves = (slice(size), slice(-size, None))
+        effects = (_added(target[rows], known[rows], acting[rows], len(drives)) for rows in halves)
+        for drive, (early, late) in enumerate(zip(*effects)):
+            if min(early[0], late[0]) > clearest[drive]:
+                clearest[drive] = min(early[0], late[0])
+                ratios[drive] = [float(early[1] @ late[2]), float(late[1] @ early[2])]
     return ratios
 
 
-def _ratio(acting: Floats, of_other: Floats, own: Floats) -> float:
-    return float((acting @ of_other) @ (acting @ own) / np.sum((acting @ own) ** 2))
+def _added(y: Floats, known: Floats, acting: Floats, n_drives: int) -> Iterator[tuple[float, Floats, Floats]]:
+    """Yield of each drive, beside what is known and the other drives, the gain by its columns, their factors,
+    and what turns factors into a ratio to the effect of these: all from one decomposition."""
+    axes, sizes, loadings = _decomposed([known, acting])
+    explained = axes.T @ y
+    errors = y - axes @ explained
+    for of_drive in np.split(loadings[:, known.shape[1] :], n_drives, axis=1):
+        shares, directions = np.linalg.eigh(of_drive.T @ of_drive)  # 1: no other column has this direction
+        basis = np.linalg.qr(of_drive @ directions[:, shares > 1 - 1e-9] / sizes[:, None])[0]
+        own, effect = basis.T @ (sizes[:, None] * of_drive), basis.T @ explained
+        gain = float(_criterion(np.append(errors, effect), errors, y.size, own.shape[1]))
+        yield gain, np.asarray(np.linalg.pinv(own, 1e-9) @ effect), effect @ own / (effect @ effect or 1.0)
 
 
 def _moved_alone(y: Floats, drives: Sequence[Floats], others: Sequence[Floats]) -> int:
@@ -323,12 +335,11 @@ def _moved_alone(y: Floats, drives: Sequence[Floats], others: Sequence[Floats]) 
         inside = (places >= first / n + 2) & (places < last // n - 1)
         if min(inside.sum(), (~inside).sum()) < EVIDENCE.fewest_rows:
             break
-        residuals = _residuals(np.column_stack([target, acting])[~inside], known[~inside])
         terms = np.column_stack([known, acting])
         errors = target - terms @ np.linalg.lstsq(terms[~inside], target[~inside], rcond=1e-9)[0]
-        is_moved_elsewhere = _fit(residuals[:, 0], residuals[:, 1:])[0] > EVIDENCE.strong_gain
+        ((gain_elsewhere, *_),) = _added(target[~inside], known[~inside], acting[~inside], 1)
         times = np.mean(errors[inside] ** 2) / np.mean(errors[~inside] ** 2)
-        if is_moved_elsewhere and times > EVIDENCE.moved_alone:
+        if gain_elsewhere > EVIDENCE.strong_gain and times > EVIDENCE.moved_alone:
             return last - first
     return 0
 
@@ -360,12 +371,11 @@ def _unlike_an_input(
 def _acts(columns: Columns, name: str, output: str, beside: Sequence[str]) -> bool:
     """Tell whether a column helps to predict an output, alone or by switching what a reading does, at any
     speed."""
-    others = [n for n in beside if n != output]
-    scaled = _standardised([columns[n] for n in (output, name, *others)])
+    scaled = _standardised([columns[n] for n in (output, name, *(n for n in beside if n != output))])
     for n, lags in product(EVIDENCE.blocks, EVIDENCE.lags):
         y, x, *rest = _means_of_rows(scaled, n)
-        gains = _gains(y, [x, x * y, *(x * o for o in rest)], rest, lags)
-        if max(gains) > EVIDENCE.strong_gain:
+        gains = _gains(y, _bases([x, x * y, *(x * o for o in rest)], lags), rest)
+        if gains.max() > EVIDENCE.strong_gain:
             return True
     return False
 
