@@ -182,29 +182,6 @@ def gaps(log: Log, longer_than: float = 10.0) -> list[tuple[int, float, float]]:
     return [(int(row), float(time[row]), float(time[row + 1])) for row in gap_rows(time, longer_than)]
 
 
-def block_means(
-    log: Log, values: NDArray[np.float64], seconds: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return starts (n_block,) and means (n_block, n) of what is there of values (n_time, n) in blocks of so
-    many seconds, which begin anew after each gap."""
-    import pandas as pd
-
-    time = log["time"].values
-    step = float(np.median(np.diff(time)))
-    if not seconds >= step * (1 - 1e-9):
-        problem = f"cannot average over {seconds:g} s: the rows are {step:g} s apart"
-        raise UserError(problem, file=log_name(log), hint="choose a longer block")
-    segment = np.searchsorted([row for row, _, _ in gaps(log)], np.arange(time.size))
-    begin = pd.Series(time).groupby(segment).transform("first").to_numpy()
-    # rows a rounding error before an edge belong behind it: 3 * 0.1 > 0.3
-    starts = begin + seconds * np.floor((time - begin) / seconds + 1e-9)
-    means = pd.DataFrame(values).groupby(starts).mean()
-    if len(means) < 2:
-        problem = f"{len(means)} block of {seconds:g} s is not a log"
-        raise UserError(problem, file=log_name(log), hint="choose a shorter block")
-    return means.index.to_numpy(dtype=float), means.to_numpy(dtype=float)
-
-
 def log_name(log: xr.Dataset) -> str:
     """Return the record's name in tables and messages."""
     return str(log.attrs.get("name", "log"))

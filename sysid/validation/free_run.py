@@ -24,7 +24,7 @@ import numpy as np
 
 from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.schema import Log, block_means, column, columns, gaps, log_name
+from thermogrip.datasets.schema import Log, column, columns, gaps, log_name
 from thermogrip.sysid.plant.log_grid import cut_stretches, match_logs
 from thermogrip.sysid.plant.plant_data import SEVERAL, fit_logs, said_of_fit
 from thermogrip.sysid.validation.residual_tests import SQUARED, ResidualCorrelations, residual_correlations
@@ -287,6 +287,27 @@ def _compare(plant: Plant, log: Log, simulated: Log, average: float | None = Non
         with np.errstate(invalid="ignore"):  # a run that went to infinity makes no step there
             one_step[name] = score(y[1:], y[:-1] + np.diff(v), unit)
     return _Scores(scores, one_step, {"mean": mean, "no_input": no_input})
+
+
+def block_means(log: Log, values: Array, seconds: float) -> tuple[Array, Array]:
+    """Return starts (n_block,) and means (n_block, n) of what is there of values (n_time, n) in blocks of so
+    many seconds, which begin anew after each gap."""
+    import pandas as pd
+
+    time = log["time"].values
+    step = float(np.median(np.diff(time)))
+    if not seconds >= step * (1 - 1e-9):
+        problem = f"cannot average over {seconds:g} s: the rows are {step:g} s apart"
+        raise UserError(problem, file=log_name(log), hint="choose a longer block")
+    segment = np.searchsorted([row for row, _, _ in gaps(log)], np.arange(time.size))
+    begin = pd.Series(time).groupby(segment).transform("first").to_numpy()
+    # rows a rounding error before an edge belong behind it: 3 * 0.1 > 0.3
+    starts = begin + seconds * np.floor((time - begin) / seconds + 1e-9)
+    means = pd.DataFrame(values).groupby(starts).mean()
+    if len(means) < 2:
+        problem = f"{len(means)} block of {seconds:g} s is not a log"
+        raise UserError(problem, file=log_name(log), hint="choose a shorter block")
+    return means.index.to_numpy(dtype=float), means.to_numpy(dtype=float)
 
 
 def _notes(run: FreeRun, by_inputs: InputEffect | None) -> list[str]:

@@ -12,8 +12,9 @@ from hypothesis import strategies as st
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.examples import example_path
 from thermogrip.datasets.log_files import read_log
-from thermogrip.datasets.schema import block_means, column, cut, gaps, make_log
+from thermogrip.datasets.schema import column, cut, gaps, make_log
 from thermogrip.sysid.plant.log_grid import held_means
+from thermogrip.sysid.validation.free_run import block_means
 
 
 def made(time, drive, t_a=None):
