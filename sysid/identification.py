@@ -46,6 +46,7 @@ from thermogrip.sysid.data.preparation import (
     with_rest,
     without_still,
 )
+from thermogrip.sysid.export.dynamics import Dynamics, settled_dynamics
 from thermogrip.sysid.plant.innovations import innovation_noise
 from thermogrip.sysid.plant.log_grid import match_logs, misfit, moved_before, signals
 from thermogrip.sysid.plant.log_grid import rows_of as log_rows
@@ -93,6 +94,7 @@ class Identification(Shown):
     runs: tuple[FreeRun, ...] = ()  # of ``plant`` over each log, its residual not tested
     # of the chosen model fitted without them, over each log, or last part of one, that was held out, by name
     held_out_runs: Mapping[str, FreeRun] = field(default_factory=dict)
+    dynamics: Dynamics | None = None  # gains and responses of ``plant``; None where it does not settle
 
     @property
     def expected(self) -> dict[str, ExpectedError]:
@@ -598,11 +600,12 @@ def _judged(
     runs = tuple(run_held_out(plant, whole_log) for whole_log in whole)
     for whole_log, run in zip(whole, runs):
         rows += rows_of(kind, plant, whole_log.name, run, held_out=False)
-    plant = _with_expected(plant, kind, rows, task.logs)
+    dynamics = settled_dynamics(plant)
+    plant = _with_expected(plant, kind, rows, task.logs, dynamics)
     refused = [line for fold in folds for line in fold.refused]
     # a fit without the last part that could not be run over it says nothing of another run either
     not_scored = [line for line in refused if line.startswith(f"{kind} without ")]
-    doubts = (*task.doubts, *doubts_of(plant), *not_scored)
+    doubts = (*task.doubts, *doubts_of(plant, dynamics), *not_scored)
     good, verdict = verdict_of(kind, plant, rows, task.checked, doubts)
     covered = evidence(plant, [log_rows(log, plant.inputs, plant.outputs, ()) for log in task.logs])
     verdict += f" {covered.sentence(plant.units)}."
@@ -620,10 +623,13 @@ def _judged(
         signals=task.signals,
         runs=runs,
         held_out_runs={name: run for fold in folds if fold.kind == kind for name, run in fold.runs.items()},
+        dynamics=dynamics,
     )
 
 
-def _with_expected(plant: Plant, kind: str, rows: Sequence[Row], logs: Sequence[Log]) -> Plant:
+def _with_expected(
+    plant: Plant, kind: str, rows: Sequence[Row], logs: Sequence[Log], dynamics: Dynamics | None
+) -> Plant:
     """Return the plant with its held-out scores and the error of another run."""
     held_out = [
         # of a constant reading no share can be fitted, and JSON has no NaN
@@ -631,7 +637,8 @@ def _with_expected(plant: Plant, kind: str, rows: Sequence[Row], logs: Sequence[
         for row in rows
         if row.held_out and row.model == kind
     ]
-    plant = with_gain_spreads(replace(plant, scores=replace(plant.scores, held_out=held_out)))
+    plant = replace(plant, scores=replace(plant.scores, held_out=held_out))
+    plant = with_gain_spreads(plant, dynamics)
     differs = _rms_of_changes(between_runs(plant, logs))
     expected = {
         name: expected_error(part_errors(plant, name), differs.get(name, 0.0)) for name in plant.outputs

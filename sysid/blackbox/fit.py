@@ -62,7 +62,7 @@ RESAMPLED = ("arx", "oe", "armax", "bj", "subspace", "parsim", "sindy")
 _AVERAGED = ("sindy", "neural")  # fitted at the averaged rate alone
 _FEWEST_ROWS = 160  # of means over five rows: eight blocks' worth of the shortest that is held out
 _MEMORIES, _MEMORY_ROWS = 32, 20  # l of the bootstrap: this part of the logs, and so many rows at least
-_SHORTEST = 160  # rows of logs that are resampled: l is an eighth
+FEWEST_RESAMPLED = 160  # rows of logs that are resampled: l is an eighth
 _TRIES, _HOPELESS = 3, 8  # fits per draw; fits of which none agrees
 _AGREES = 1.5  # times the error of the fit
 
@@ -204,9 +204,9 @@ def with_refits(fit: BlackBoxFit, n: int = 24, *, seed: int = 0, progress: Progr
     if fit.kind not in RESAMPLED:
         raise ValueError(f"{fit.kind} is not refitted; choose from {', '.join(RESAMPLED)}")
     rows = sum(len(segment.time) for segment in fit.grid.segments)
-    if rows < _SHORTEST:
+    if rows < FEWEST_RESAMPLED:
         problem = f"{rows} rows of {fit.grid.dt:g} s are too few to resample their errors"
-        raise UserError(f"{fit.kind}: {problem}", hint=f"a log of {_SHORTEST} rows has intervals")
+        raise UserError(f"{fit.kind}: {problem}", hint=f"a log of {FEWEST_RESAMPLED} rows has intervals")
     family = _remembering(fit.kind)
     rng = np.random.default_rng(seed)
     most = _AGREES * _error(fit, fit.choice.model)

@@ -19,10 +19,10 @@ from thermogrip.sysid.greybox.problem import prior_plant
 from thermogrip.sysid.models.model import GreyModel
 from thermogrip.sysid.models.network import NetworkModel
 from thermogrip.sysid.models.state_space import symmetric_root
+from thermogrip.sysid.plant.linearise import ROOM
 from thermogrip.sysid.plant.plant import Plant
 
 DIFFERENCE_STEP = 1e-3  # of a parameter's sd
-ROOM = 25.0  # degC
 DRAWS = 8  # of the parameters, that keep the limits too
 
 

@@ -283,6 +283,14 @@ def plant_dynamics(
     return Dynamics(linear, tuple(others), spread, dict(plant.units))
 
 
+def settled_dynamics(plant: Plant) -> Dynamics | None:
+    """Return :func:`plant_dynamics` in the middle of what the logs cover, None where it does not settle."""
+    try:
+        return plant_dynamics(plant)
+    except UserError:
+        return None
+
+
 def usual_point(
     plant: Plant, inputs: Mapping[str, float] | None, disturbances: Mapping[str, float] | None
 ) -> tuple[dict[str, float], dict[str, float]]:

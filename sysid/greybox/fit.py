@@ -26,7 +26,7 @@ from thermogrip.datasets.parallel import Progress
 from thermogrip.datasets.schema import Log, columns, log_name
 from thermogrip.sysid.data.data_quality import reading_excess
 from thermogrip.sysid.greybox.identifiability import describe
-from thermogrip.sysid.greybox.problem import Problem, make_problem, start_seconds
+from thermogrip.sysid.greybox.problem import Problem, make_problem
 from thermogrip.sysid.greybox.sandwich import score_covariance
 from thermogrip.sysid.models.model import GreyModel
 from thermogrip.sysid.models.network import load_network
@@ -36,6 +36,7 @@ from thermogrip.sysid.plant.plant import Plant
 from thermogrip.sysid.plant.simulation import find_starts, predict
 
 _HUGE = 1e150  # residuals beyond it would overflow when squared
+_WARM_ROWS = 30  # of a log, from whose readings its start is estimated at least
 _STUCK = 5.0  # rms residual in sensor sd from which a fit does not explain the logs
 
 
@@ -242,12 +243,15 @@ def _fit_verdict(
 
 
 def free_runs(logs: Sequence[Log], model: GreyModel, p: Array) -> list[tuple[str, Array]]:
-    """Return the free runs of a model over logs with parameters p, by log and stretch."""
+    """Return the free runs of a model over logs with parameters p, by log and stretch,
+    from what the model states of a log's beginning and thirty rows, or half of a short log."""
     values, sensors = dict(zip(model.parameters, p.tolist())), dict(model.sensor_sd)
     plant = Plant(model, values, dt=model.dt, units=model.units, noise=sensors)
     out: list[tuple[str, Array]] = []
     for log in logs:
         stretches = cut_stretches(plant, log)
-        starts = find_starts(plant, p, stretches, start_seconds(model, stretches, model.dt))
+        first = stretches[0].time
+        warmup = max(model.warmup, _WARM_ROWS * float(np.median(np.diff(first))))
+        starts = find_starts(plant, p, stretches, min(warmup, max(float(first[-1]) / 2, model.dt)))
         out += [(log_name(log), run) for run in predict(model, model.dt, p[None], stretches, starts)]
     return out

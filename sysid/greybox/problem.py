@@ -30,9 +30,6 @@ from thermogrip.sysid.plant.log_grid import Stretch, cut_stretches
 from thermogrip.sysid.plant.plant import Plant
 from thermogrip.sysid.plant.simulation import Start, find_starts, predict
 
-_WARM_ROWS = 30  # of a log, from whose readings its start is estimated at least
-
-
 _DIFFERENCE_STEP = 1e-4  # of a prior sd
 
 
@@ -199,14 +196,6 @@ def make_problem(model: GreyModel, logs: Sequence[Log], *, average: float, indep
     sd = np.array([model.sensor_sd[name] for name in model.outputs])
     tau = np.full(len(sd), max(1.0, independent / (steps * plant.dt)))
     return Problem(plant, tuple(prepared_logs), tuple(map(log_name, logs)), free, steps * plant.dt, sd, tau)
-
-
-def start_seconds(model: GreyModel, stretches: Sequence[Stretch], dt: float) -> float:
-    """Return the seconds from which a log's start is estimated: what the model asks for (more than a free
-    run's) and thirty rows, or half of a short log."""
-    first = stretches[0].time
-    wanted = max(model.warmup, _WARM_ROWS * float(np.median(np.diff(first))))
-    return min(wanted, max(float(first[-1]) / 2, dt))
 
 
 def _bins(stretch: Stretch, dt: float, steps: int) -> _Bins:

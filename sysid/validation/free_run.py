@@ -34,6 +34,7 @@ from thermogrip.sysid.validation.stated_errors import (
     Cause,
     InputEffect,
     Verdict,
+    drawn_runs,
     effect_of_run,
     free_run_band,
     judge,
@@ -81,7 +82,8 @@ class FreeRun:
     def band(self) -> Band:
         """Return the band about the run that a new run's readings should lie in, and the share that does;
         see :func:`~thermogrip.sysid.validation.stated_errors.free_run_band`."""
-        return self.stated or free_run_band(self.plant, self.measured, self.log, warmup=self.warmup)
+        drawn = drawn_runs(self.plant, self.measured, self.warmup)
+        return self.stated or free_run_band(self.plant, self.measured, self.log, drawn, warmup=self.warmup)
 
 
 def free_run(
@@ -205,9 +207,10 @@ def _judged(run: FreeRun, error: Array, by_inputs: InputEffect | None) -> FreeRu
     """Return the run with tests of its error (n, n_y), NaN where not scored, and the verdict on the plant."""
     plant, log = run.plant, run.measured
     simulated, scored = columns(run.log, plant.outputs), column(run.log, "scored") > 0
-    band = free_run_band(plant, log, run.log, warmup=run.warmup)
+    drawn = list(drawn_runs(plant, log, run.warmup))
+    band = free_run_band(plant, log, run.log, drawn, warmup=run.warmup)
     residual = residual_correlations(
-        plant, cut_stretches(plant, log), simulated, scored, warmup=run.warmup, drawn=band.drawn
+        plant, cut_stretches(plant, log), simulated, scored, warmup=run.warmup, drawn=drawn
     )
     with np.errstate(over="ignore", invalid="ignore"):
         offsets = np.nanmean(error, axis=0) ** 2 / np.maximum(np.nanmean(error**2, axis=0), 1e-300)
@@ -225,7 +228,7 @@ def _judged(run: FreeRun, error: Array, by_inputs: InputEffect | None) -> FreeRu
         by_inputs=by_inputs,
         seen=bool(said_of_fit(plant.fitted_to, rows)),
     )
-    return replace(run, residual=residual, verdict=verdict, stated=replace(band, drawn=()))
+    return replace(run, residual=residual, verdict=verdict, stated=band)
 
 
 def score(measured: Array, simulated: Array, unit: str = "degC") -> Score:

@@ -24,8 +24,7 @@ half of the error without input, and so does it on another run.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from statistics import NormalDist
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeAlias
@@ -44,6 +43,7 @@ from thermogrip.sysid.plant.simulation import find_starts
 
 if TYPE_CHECKING:
     from thermogrip.sysid.data.data_quality import DataCheck
+    from thermogrip.sysid.export.dynamics import Dynamics
 
 PRIOR_SPREAD = 0.5  # sd of ln e of the parts of a log: the median over 22 series of 14 public logs is 0.51
 PRIOR_PARTS = 4  # which that counts as: as many as one log has blocks
@@ -67,7 +67,6 @@ class Band:
     own_error: str = "the error of the fit"  # how the plant's own error was estimated, in words
     expected: dict[str, float] = field(default_factory=dict)  # rms error of the run that it describes
     likely: dict[str, tuple[float, float]] = field(default_factory=dict)  # which 9 of 10 runs lie within
-    drawn: Sequence[Array] = ()  # the free run (n, n_y) of each draw
 
 
 def expected_error(errors: Sequence[float], gain_effect: float) -> ExpectedError:
@@ -96,14 +95,25 @@ def expected_error(errors: Sequence[float], gain_effect: float) -> ExpectedError
     return ExpectedError(rmse, low, high, of_parts if gain_effect else None)
 
 
-def free_run_band(plant: Plant, log: Log, simulated: Log, *, draws: int = 30, warmup: float = WARMUP) -> Band:
-    """Return the band about the ``simulated`` free run of a plant over a log, of so many draws of its
-    parameters (seeds 1 to ``draws``), whose state readings of ``warmup`` [s] have set."""
-    taken = draws if plant.uncertain else 0
-    stretches = cut_stretches(plant, match_logs(plant, [log])[0][0]) if taken else []
-    run = columns(simulated, plant.outputs)
-    drawn = [plant.draw(k).over(stretches, warmup)[0] for k in range(1, taken + 1)]
-    variances = sum(((other - run) ** 2 / taken for other in drawn), np.zeros(run.shape))
+def drawn_runs(plant: Plant, log: Log, warmup: float = WARMUP, *, draws: int = 30) -> Iterator[Array]:
+    """Yield the free runs (n, n_y) over a log of so many draws of the parameters (seeds from 1 on), whose
+    starts readings of ``warmup`` [s] set; none of a plant without uncertainty."""
+    if plant.uncertain:
+        stretches = cut_stretches(plant, match_logs(plant, [log])[0][0])
+        yield from (plant.draw(k).over(stretches, warmup)[0] for k in range(1, draws + 1))
+
+
+def free_run_band(
+    plant: Plant, log: Log, simulated: Log, drawn: Iterable[Array], *, warmup: float = WARMUP
+) -> Band:
+    """Return the band about the ``simulated`` free run of a plant over a log, whose state readings of
+    ``warmup`` [s] have set, of the runs of its draws."""
+    run, taken = columns(simulated, plant.outputs), 0
+    variances = np.zeros(run.shape)
+    for other in drawn:
+        variances += (other - run) ** 2
+        taken += 1
+    variances /= max(1, taken)
     scored = np.asarray(simulated["scored"].values) > 0
     half = {}
     inside = {}
@@ -143,7 +153,7 @@ def free_run_band(plant: Plant, log: Log, simulated: Log, *, draws: int = 30, wa
         words += f"{'one log' if len(plant.logs) == 1 else 'two logs'} cannot show it)"
     if is_unlike:
         words += ", wider because this run is unlike the fit (range of the readings)"
-    return Band(half, inside, taken, words, expected, likely, drawn)
+    return Band(half, inside, taken, words, expected, likely)
 
 
 def part_errors(plant: Plant, name: str) -> list[float]:
@@ -182,18 +192,14 @@ def between_runs(plant: Plant, logs: Sequence[Log], most: float = 1.0) -> dict[s
     return effect_of_inputs(plant, logs, most) if 0 < len(plant.logs) < SEVERAL else {}
 
 
-def with_gain_spreads(plant: Plant) -> Plant:
+def with_gain_spreads(plant: Plant, dynamics: Dynamics | None) -> Plant:
     """Return the plant with the spread that its draws show of gains that no part held out tests."""
-    spreads, shown = dict(plant.scores.untested), []
-    if any(spreads.values()) and plant.uncertain:
-        from thermogrip.sysid.export.dynamics import plant_dynamics
-
-        with suppress(UserError):  # it does not settle
-            shown = [row for row in plant_dynamics(plant).rows() if row["gain"] and row["high"] is not None]
-    for row in shown:
-        by_draws = (row["high"] - row["low"]) / (2 * INTERVAL) / abs(row["gain"])
-        if by_draws < spreads.get(row["input"], 0.0):  # at 1 the input may as well do nothing
-            spreads[row["input"]] = by_draws
+    spreads = dict(plant.scores.untested)
+    for row in dynamics.rows() if dynamics is not None else ():
+        if row["input"] in spreads and row["gain"] and row["high"] is not None:
+            by_draws = (row["high"] - row["low"]) / (2 * INTERVAL) / abs(row["gain"])
+            # at 1 the input may as well do nothing
+            spreads[row["input"]] = min(by_draws, spreads[row["input"]])
     return replace(plant, scores=replace(plant.scores, untested=spreads))
 
 
@@ -467,9 +473,9 @@ def _pooled(rows: Sequence[Row]) -> tuple[float, float]:
     return error, idle
 
 
-def doubts_of(plant: Plant) -> list[str]:
+def doubts_of(plant: Plant, dynamics: Dynamics | None) -> list[str]:
     """Return what of a plant itself is not certain, a line each."""
-    return [*_far_from_prior(plant), *_effects_in_doubt(plant)]
+    return [*_far_from_prior(plant), *_effects_in_doubt(plant, dynamics)]
 
 
 def _far_from_prior(plant: Plant) -> list[str]:
@@ -491,12 +497,8 @@ def _far_from_prior(plant: Plant) -> list[str]:
     return out
 
 
-def _effects_in_doubt(plant: Plant) -> list[str]:
-    from thermogrip.sysid.export.dynamics import plant_dynamics
-
-    try:
-        dynamics = plant_dynamics(plant)
-    except UserError:  # it does not settle
+def _effects_in_doubt(plant: Plant, dynamics: Dynamics | None) -> list[str]:
+    if dynamics is None:
         return []
     _, step = dynamics.step_response()
     # a controller needs the sign of one response; of a slow plant the logs show its first part alone

@@ -20,6 +20,7 @@ from thermogrip.sysid import Plant, identification, identify
 from thermogrip.sysid.blackbox.fit import fit_black_box
 from thermogrip.sysid.blackbox.order_selection import Structure
 from thermogrip.sysid.data import preparation
+from thermogrip.sysid.export.dynamics import plant_dynamics
 from thermogrip.sysid.greybox.problem import prior_plant
 from thermogrip.sysid.identification import Held, beyond_reach, choose_black_box
 from thermogrip.sysid.models.network import load_network
@@ -494,7 +495,7 @@ def test_errors_stated_and_kept_are_those_of_what_was_held_out():
     rows += table({"arx": {"a": 1.0}}, False)
     rows[0] = replace(rows[0], fit_percent=np.nan)  # of a constant reading
     model = StateSpaceModel(("q",), (), ("t",), A=[[0.9]], B=[[1.0]], C=[[1.0]], dt=1.0)
-    plant = identification._with_expected(Plant(model, {}, dt=1.0), "arx", rows, [])
+    plant = identification._with_expected(Plant(model, {}, dt=1.0), "arx", rows, [], None)
     assert plant.scores.held_out == [
         HeldOut(tail, "t", 3.0, 0.0, "K", 100), HeldOut("block 1 of 4", "t", 2.0, 90.0, "K", 100),
     ]  # fmt: skip
@@ -518,7 +519,7 @@ def test_a_parameter_far_beyond_its_prior_is_a_doubt_that_names_the_network(off,
 def test_a_heater_that_cools_is_a_doubt(gain, doubts):
     model = StateSpaceModel(("heater",), (), ("t",), A=[[0.9]], B=[[0.1 * gain]], C=[[1.0]], dt=1.0)
     plant = Plant(model, {}, dt=1.0, units={"heater": "percent", "t": "degC"}, valid={"heater": (0.0, 100.0)})
-    found = stated_errors.doubts_of(plant)
+    found = stated_errors.doubts_of(plant, plant_dynamics(plant))
     assert len(found) == doubts
     assert all(f"heater lowers t (gain {gain:.2g}): recorded in closed loop" in line for line in found)
 

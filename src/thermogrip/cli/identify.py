@@ -30,7 +30,6 @@ if TYPE_CHECKING:
 
 MODELS = ("arx", "oe", "armax", "bj", "subspace", "parsim", "sindy", "neural", "network")
 USUAL_MODELS = ",".join(model for model in MODELS if model not in ("armax", "bj", "parsim", "sindy"))
-FEWEST_ROWS = 160  # of a log that is resampled (sysid.blackbox.fit)
 MOST_DOUBTS = 6  # that are printed: one command states what all of them are about
 NO_POSTERIOR = "no posterior: the model that was kept is a black box, only networks have parameters to sample"
 
@@ -129,6 +128,7 @@ def identify(
     from thermogrip.datasets.parallel import sub_progress
     from thermogrip.report.html import write_report
     from thermogrip.report.plant import identification_sections
+    from thermogrip.sysid.export.dynamics import settled_dynamics
     from thermogrip.sysid.identification import identify as fit_models
 
     record, lost = None, NO_POSTERIOR
@@ -155,14 +155,14 @@ def identify(
                 plant, logs, out, seed, sub_progress(progress, 0.6, 1.0, "posterior")
             )
     plant.save(out)
-    dynamics, nothing = _dynamics(plant)
+    dynamics = identified.dynamics if record is None else settled_dynamics(plant)
     if report is not None:
         lead = f"From {', '.join(log.attrs['name'] for log in logs)}."
         sections = identification_sections(identified, logs, plant, record, dynamics)
         write_report(report, "Identification", lead, sections)
     _show_identified(console, identified, plant, dynamics)
     if dynamics is None:
-        console.say(nothing)
+        console.say("no gains at rest: the plant does not settle in the middle of its logs")
     if posterior:
         console.say(lost if record is None else record.sampling.verdict)
     console.say(f"wrote {out}")
@@ -186,13 +186,14 @@ def identify(
 
 def _experiment(plant: Plant, path: Path, logs: Sequence[Log]) -> str:
     """Return the command of a schedule that is long enough to identify a plant by."""
+    from thermogrip.sysid.blackbox.fit import FEWEST_RESAMPLED
     from thermogrip.sysid.validation.free_run import slowest_time
 
     # each of the four blocks that identify holds out shows 95 % of a move, and a log of fewer rows has no
     # intervals
     slowest_s = max(slowest_time(plant, log) for log in logs)
     step_s = max(float(log["time"].diff("time").median()) for log in logs)
-    minutes = significant(max(4 * 3 * slowest_s, FEWEST_ROWS * step_s) / 60, 2)
+    minutes = significant(max(4 * 3 * slowest_s, FEWEST_RESAMPLED * step_s) / 60, 2)
     kind = "prbs" if plant.covariance is None else "optimal"
     words = ["excite", "--kind", kind, "--minutes", minutes, "--plant", str(path), "--out", "schedule.csv"]
     return printable(shlex.join(words))
@@ -280,16 +281,6 @@ def _repaired(console: Console, logs: Sequence[Log]) -> dict[str, list[str]]:
         for line in repairs[log.attrs["name"]]:
             console.warn(f"{log.attrs['name']}: {line}")
     return repairs
-
-
-def _dynamics(plant: Plant) -> tuple[Dynamics | None, str]:
-    """Return gains and responses of the plant, or in words why it has none."""
-    from thermogrip.sysid.export.dynamics import plant_dynamics
-
-    try:
-        return plant_dynamics(plant), ""
-    except UserError as error:
-        return None, f"no gains at rest: {error.problem}"
 
 
 def _show_identified(

@@ -228,10 +228,12 @@ def test_a_fit_that_runs_out_of_iterations_says_so(monkeypatch: pytest.MonkeyPat
     assert "the fit ran out of iterations" in plant.verdict
 
 
-def test_free_runs_are_named_by_their_logs():
-    logs, model = [a_log(1, seconds=100), a_log(2, seconds=120)], TwoGains()
+def test_free_runs_are_named_by_their_logs_and_start_from_half_of_a_short_one(monkeypatch):
+    logs, model = [a_log(1, seconds=100), a_log(2, seconds=41)], TwoGains()
+    asked, find_starts = [], greybox.find_starts
+    monkeypatch.setattr(greybox, "find_starts", lambda *of: asked.append(of[-1]) or find_starts(*of))
     found = greybox.free_runs(logs, model, np.array([3.0, 5.0]))
-    assert [name for name, _ in found] == ["log 1", "log 2"]
+    assert ([name for name, _ in found], asked) == (["log 1", "log 2"], [30.0, 20.0])
     for (_, run), log in zip(found, logs):
         y, _ = model.rollout(np.zeros((1, 2)), log["q"].values[None, :, None], np.zeros(0), [[3.0, 5.0]], 1.0)
         n = log.sizes["time"] - 1

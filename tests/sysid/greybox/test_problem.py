@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from tests.sysid.greybox.makers import TwoGains, a_log, heater, made
-from thermogrip.sysid.greybox.problem import Problem, make_problem, prior_plant, start_seconds
+from thermogrip.sysid.greybox.problem import Problem, make_problem, prior_plant
 from thermogrip.sysid.models.network import load_network
 from thermogrip.sysid.models.network_spec import Parameter
 
@@ -82,15 +82,6 @@ def test_what_a_start_explains_of_a_slope_is_no_knowledge_of_a_parameter():
     explained = [by_start @ slope / np.linalg.norm(by_start) for slope in slopes.T]
     before = [by_start @ (r - held[0]) / 1e-4 / np.linalg.norm(by_start) for r in held[1:]]
     assert np.abs(explained).max() < 0.05 * np.abs(before).max()
-
-
-def test_a_start_is_estimated_from_what_the_model_states_or_half_of_a_short_log():
-    class Long(TwoGains):
-        warmup = 30.0
-
-    problem = problem_of(Long(), a_log(1), a_log(2, seconds=41), a_log(3, seconds=61))
-    found = [start_seconds(problem.model, stretches, problem.plant.dt) for stretches, _ in problem.logs]
-    assert found == [30.0, 20.0, 30.0]
 
 
 def test_bins_are_whole_steps_and_hold_the_means_of_their_rows():

@@ -20,7 +20,7 @@ from thermogrip.sysid.validation.residual_tests import (
     marked_by_holm,
     residual_correlations,
 )
-from thermogrip.sysid.validation.stated_errors import free_run_band
+from thermogrip.sysid.validation.stated_errors import drawn_runs
 
 N = 1500
 
@@ -57,9 +57,10 @@ def heated(q: np.ndarray, plant: Plant, start: float = 0.0) -> np.ndarray:
 def correlations(plant: Plant, log: Log, warmup: float = 5.0) -> ResidualCorrelations:
     run, stretches = plant.simulate(log, warmup), cut_stretches(plant, log)
     scored = run["scored"].values > 0
-    drawn = free_run_band(plant, log, run, warmup=warmup).drawn
     y = columns(run, plant.outputs)
-    return residual_correlations(plant, stretches, y, scored, warmup=warmup, drawn=drawn)
+    return residual_correlations(
+        plant, stretches, y, scored, warmup=warmup, drawn=list(drawn_runs(plant, log, warmup))
+    )
 
 
 def signals_of(plant: Plant, log: Log, warmup: float = 20.0) -> dict[str, CorrelationTest]:

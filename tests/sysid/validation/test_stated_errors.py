@@ -23,6 +23,7 @@ from thermogrip.sysid.validation.stated_errors import (
     MOST_DISAGREEMENT,
     between_runs,
     check_ensemble,
+    drawn_runs,
     ensemble_disagreement,
     expected_error,
     free_run_band,
@@ -50,6 +51,10 @@ def schedule():
     return make_log(t, signals)
 
 
+def band_of(plant, log, run, **more):
+    return free_run_band(plant, log, run, drawn_runs(plant, log, **more))
+
+
 def measured(truth, schedule, seed):
     log = truth.simulate(schedule)
     rng = np.random.default_rng(seed)
@@ -63,7 +68,7 @@ def test_readings_of_a_drawn_plant_lie_inside_as_often_as_stated(heater, schedul
     shares = []
     for k in range(count):
         log = measured(heater.draw(100 + k), schedule, k)
-        band = free_run_band(heater, log, heater.simulate(log))
+        band = band_of(heater, log, heater.simulate(log))
         shares.append(np.mean(list(band.inside.values())))
     # one draw's error is slow, so a log is worth about one draw: sd of a share ~0.17
     assert np.mean(shares) == pytest.approx(0.9, abs=3 * 0.17 / np.sqrt(count))
@@ -78,9 +83,9 @@ def test_what_the_draws_do_not_explain_of_the_held_out_errors_is_in_the_band(sch
     noise = {"t1": 0.1, "t2": 0.1}
     plant = Plant(block(0.9), {}, dt=2.0, noise=noise, scores=PlantScores(held_out_by_part=errors))
     run = plant.simulate(schedule)
-    assert np.allclose(free_run_band(plant, schedule, run).half["t1"], 1.6449, rtol=1e-3)
+    assert np.allclose(band_of(plant, schedule, run).half["t1"], 1.6449, rtol=1e-3)
     ensemble = replace(plant, refits=(block(0.905), block(0.895)))
-    band = free_run_band(ensemble, schedule, run).half
+    band = band_of(ensemble, schedule, run).half
     assert np.mean(band["t1"] ** 2) == pytest.approx(1.6449**2, rel=1e-3)  # no wider on average, and not even
     assert np.ptp(band["t1"]) > 0.01
     assert np.mean(band["t2"] ** 2) > (1.6449 * 0.001) ** 2  # draws that run further apart than it erred
@@ -88,9 +93,7 @@ def test_what_the_draws_do_not_explain_of_the_held_out_errors_is_in_the_band(sch
 
 def test_draws_run_over_a_log_in_other_units(heater, schedule):
     shares = schedule.assign(q1=(schedule["q1"] / 100).assign_attrs(schedule["q1"].attrs | {"units": "1"}))
-    half, other = (
-        free_run_band(heater, log, heater.simulate(log), draws=3).half for log in (schedule, shares)
-    )
+    half, other = (band_of(heater, log, heater.simulate(log), draws=3).half for log in (schedule, shares))
     np.testing.assert_allclose(other["t1"], half["t1"], rtol=1e-9)
 
 
@@ -109,7 +112,7 @@ def test_another_run_adds_what_its_gain_changes(schedule):
     added = between_runs(plant, [schedule])
     for name in plant.outputs:  # linear from rest: 5 percent of the response
         np.testing.assert_allclose(added[name], 0.05 * run[name].values, atol=1e-9)
-    half = free_run_band(plant, schedule, run).half["t1"]
+    half = band_of(plant, schedule, run).half["t1"]
     # half of it is a level, as wide where the inputs do nothing: that of another day
     changes = (added["t1"] ** 2 + np.mean(added["t1"] ** 2)) / 2
     np.testing.assert_allclose(half, 1.6449 * np.sqrt(0.01 + 0.6745**2 * changes), rtol=1e-3)
@@ -242,7 +245,7 @@ def test_the_band_of_a_fit_to_means_covers_readings(heater, schedule):
     plant = fit_network("tclab", [log])
     assert plant.scores.average_s > 3.0  # of several readings each
     run = plant.simulate(log, warmup=50.0, score_from=50.0)
-    band = free_run_band(replace(plant, logs=("a", "b", "c")), log, run)  # nothing for another run
+    band = band_of(replace(plant, logs=("a", "b", "c")), log, run)  # nothing for another run
     assert min(band.inside.values()) == pytest.approx(0.9, abs=0.04)
     assert max(band.inside.values()) == pytest.approx(0.9, abs=0.04)
 
@@ -329,11 +332,11 @@ def still(**scores):
 def test_a_band_counts_scored_readings_and_adds_draws_the_fit_and_single_readings(monkeypatch):
     plant, log, run = still(reading_excess={"t": 0.3})
     log["t"].values[:] = [9, 9, 9, 9, 9, 0.82, -0.83, 0.82, np.nan, -0.82, 0.83, 0.0]  # 1.6449 * 0.5 = 0.822
-    band = free_run_band(plant, log, run)
+    band = band_of(plant, log, run)
     assert (band.level, band.draws, band.own_error) == (0.9, 0, "the error of the fit")
     np.testing.assert_allclose(band.half["t"], 1.644854 * 0.5, rtol=1e-6)
     assert band.inside["t"] == 4 / 6
-    assert np.isnan(free_run_band(plant, log, run.assign(scored=0 * run["scored"])).inside["t"])
+    assert np.isnan(band_of(plant, log, run.assign(scored=0 * run["scored"])).inside["t"])
     seeds = []
 
     def draw(_plant, k):
@@ -341,21 +344,21 @@ def test_a_band_counts_scored_readings_and_adds_draws_the_fit_and_single_reading
         return SimpleNamespace(over=lambda *_: (run["t"].values[:, None] + k, []))
 
     monkeypatch.setattr(Plant, "draw", draw)
-    drawn = free_run_band(replace(plant, refits=(plant.model,)), log, run, draws=3)
+    drawn = band_of(replace(plant, refits=(plant.model,)), log, run, draws=3)
     np.testing.assert_allclose(drawn.half["t"], 1.644854 * np.sqrt((1 + 4 + 9) / 3 + 0.25), rtol=1e-6)
     assert drawn.draws == 3
-    assert free_run_band(replace(plant, refits=(plant.model,)), log, run).draws == 30
+    assert band_of(replace(plant, refits=(plant.model,)), log, run).draws == 30
     assert seeds == [1, 2, 3, *range(1, 31)]
 
 
 def test_the_words_of_a_band_say_what_its_own_error_is_and_what_is_assumed():
     plant, log, run = still(held_out_by_part={"t": [2.0, 1.0, 0.5]})
-    band = free_run_band(plant, log, run)
+    band = band_of(plant, log, run)
     assert band.own_error == "the errors of free runs over parts held out of it"
     assert band.expected["t"] == pytest.approx(1.0)  # their geometric mean
     assert band.likely["t"][0] < 0.5 < 2.0 < band.likely["t"][1]
     again = " and a gain that varies by 5 % from run to run (assumed, 0 % of the squared error: "
     again += "{} cannot show it)"
     for logs, how in ((("a",), "one log"), (("a", "b"), "two logs"), (("a", "b", "c"), None), ((), None)):
-        band = free_run_band(replace(still()[0], logs=logs), log, run)
+        band = band_of(replace(still()[0], logs=logs), log, run)
         assert band.own_error == "the error of the fit" + (again.format(how) if how else "")
