@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.repair import GAP_SECONDS, GAP_STEPS, name_rows
 from thermogrip.datasets.tables import STAMP, Table
 from thermogrip.datasets.units import Header, to_record_unit
@@ -22,7 +23,6 @@ from thermogrip.datasets.units import Header, to_record_unit
 if TYPE_CHECKING:
     import pandas as pd
 
-Floats = NDArray[np.float64]
 
 _TIME_UNITS = ("1", "s", "ms", "min")
 _TIME_NAME = re.compile(
@@ -84,7 +84,7 @@ _SINCE_1970 = _DATES[:4]
 class Clock:
     """The time of each row of a table."""
 
-    seconds: Floats  # (n_row,), NaN where a row has none
+    seconds: Array  # (n_row,), NaN where a row has none
     columns: frozenset[str]  # the headers that it was read from, or stands in place of
     notes: tuple[str, ...] = ()  # what was taken for it and what was repaired, a line each
     zero: float = np.nan  # of ``seconds`` on the file's own clock [s]; NaN where it has none
@@ -136,7 +136,7 @@ def _seconds_a_row(clock: Clock) -> float:
     return float(np.ptp(clock.seconds[rows])) / max(int(np.ptp(rows)), 1)
 
 
-def _behaves_as_clock(header: str, read: Header, values: Floats) -> bool:
+def _behaves_as_clock(header: str, read: Header, values: Array) -> bool:
     """Tell whether a column that is not named as a time rises in nearly even steps, as only a clock does."""
     values = values[np.isfinite(values)]  # a table beside may end earlier
     steps = np.diff(_unwrapped(values, np.arange(values.size))[0])
@@ -197,7 +197,7 @@ def _of_numbers(header: str, table: Table, read: Header) -> Clock | None:
     return Clock(seconds, frozenset([header]), (note, *notes, *restarts), 0.0, doubt)
 
 
-def _what_counts_mean(name: str, counts: Floats, *, wrapped: bool) -> _Counts:
+def _what_counts_mean(name: str, counts: Array, *, wrapped: bool) -> _Counts:
     """Return what the counts of a clock without a unit mean."""
     word = next((f for begin, f in _TIME_WORDS.items() if name.lower().startswith(begin)), None)
     steps = np.diff(counts)
@@ -226,7 +226,7 @@ def _what_counts_mean(name: str, counts: Floats, *, wrapped: bool) -> _Counts:
     return _Counts(scale, doubt=doubt)
 
 
-def _of_loop(steps: Floats) -> bool:
+def _of_loop(steps: Array) -> bool:
     """Tell whether steps jitter as a program's loop does, and are round in seconds alone, or not at all."""
     usual = float(np.median(steps))
     off = steps[np.abs(steps - usual) <= CLOCK.evenness * usual] - usual
@@ -237,7 +237,7 @@ def _of_loop(steps: Floats) -> bool:
     return any(abs(in_seconds / one - 1) < CLOCK.late for one in (1, 2, 5, 10)) or not any(is_round)
 
 
-def _unwrapped(counts: Floats, lines: NDArray[np.int64]) -> tuple[Floats, list[str]]:
+def _unwrapped(counts: Array, lines: NDArray[np.int64]) -> tuple[Array, list[str]]:
     """Return a counter that goes on where it wrapped at 16 or 32 bits, and a line for each wrap."""
     notes: list[str] = []
     steps = np.diff(counts)
@@ -253,7 +253,7 @@ def _unwrapped(counts: Floats, lines: NDArray[np.int64]) -> tuple[Floats, list[s
     return counts, notes
 
 
-def _in_pieces(seconds: Floats, lines: NDArray[np.int64], fewest_rows: int) -> tuple[Floats, list[str]]:
+def _in_pieces(seconds: Array, lines: NDArray[np.int64], fewest_rows: int) -> tuple[Array, list[str]]:
     """Return times that go on after a gap where the clock started again, and a line for each restart."""
     back = np.flatnonzero(np.diff(seconds) < 0) + 1
     pieces = np.split(seconds, back)
@@ -272,7 +272,7 @@ def _in_pieces(seconds: Floats, lines: NDArray[np.int64], fewest_rows: int) -> t
     return seconds, [f"time: the clock starts again in {where}: new segments, after gaps of unknown length"]
 
 
-def read_clock(cells: Sequence[str]) -> tuple[Floats, str] | None:
+def read_clock(cells: Sequence[str]) -> tuple[Array, str] | None:
     """Return the seconds that dates and times of day mean (without a date from midnight on, UTC without an
     offset) and how they were taken; None if they are none."""
     import pandas as pd
@@ -282,7 +282,7 @@ def read_clock(cells: Sequence[str]) -> tuple[Floats, str] | None:
     if not fields[texts != ""][[1, 4]].notna().any(axis=1).mean() >= CLOCK.monotone_share:  # of none nan
         return None
 
-    def numbers(key: int) -> Floats:
+    def numbers(key: int) -> Array:
         plain = fields[key].str.replace("[,:]", ".", regex=True)
         return np.asarray(pd.to_numeric(plain, errors="coerce"), dtype=float)
 

@@ -20,13 +20,12 @@ from itertools import combinations, pairwise, product
 from typing import TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
+from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.repair import drop_stuck, find_spikes
 
-Floats = NDArray[np.float64]
-Columns: TypeAlias = Mapping[str, Floats]
-_Matrices: TypeAlias = tuple[Floats, Floats, Floats]
+Columns: TypeAlias = Mapping[str, Array]
+_Matrices: TypeAlias = tuple[Array, Array, Array]
 
 
 @dataclass(frozen=True)
@@ -69,7 +68,7 @@ def is_moved(columns: Columns, name: str, drives: Sequence[str], beside: Sequenc
     return bool(np.any(np.min(gains, axis=0) > EVIDENCE.strong_gain))
 
 
-def is_held(values: Floats) -> bool:
+def is_held(values: Array) -> bool:
     """Tell whether a column moves in few rows, and then far, as what a person or a relay sets does."""
     finite = values[np.isfinite(values)]
     moves = np.abs(np.diff(finite))
@@ -78,7 +77,7 @@ def is_held(values: Floats) -> bool:
     return bool(far and not _flickers(finite))
 
 
-def _flickers(values: Floats) -> bool:
+def _flickers(values: Array) -> bool:
     """Tell whether a column goes to and fro between neighbours of its levels, three or more, as the steps of
     a converter do: a relay has two, a staircase goes on, set levels skip some."""
     levels, places = np.unique(values, return_inverse=True)
@@ -90,12 +89,12 @@ def _flickers(values: Floats) -> bool:
     return bool(enough and np.mean(np.abs(ways) == 1) > 0.9 and np.mean(back[1:] & back[:-1]) > 0.5)
 
 
-def one_signal(one: Floats, other: Floats) -> bool:
+def one_signal(one: Array, other: Array) -> bool:
     """Tell whether two columns are multiples of each other and a constant, each within its own steps."""
     return explains(one, other) and explains(other, one)
 
 
-def explains(y: Floats, *some: Floats) -> bool:
+def explains(y: Array, *some: Array) -> bool:
     """Tell whether a column is a sum of multiples of others but for rounding; of few moves nobody can."""
     if min(np.count_nonzero(np.diff(v)) for v in (y, some[-1])) < EVIDENCE.fewest_moves:
         return False
@@ -111,7 +110,7 @@ def explains(y: Floats, *some: Floats) -> bool:
     return True
 
 
-def predictive_gain(columns: Sequence[Floats]) -> Floats:
+def predictive_gain(columns: Sequence[Array]) -> Array:
     """Return how much column i helps to predict column j, G (n, n), the least over the lags."""
     scaled = _standardised(columns)
     pasts = (_bases(scaled, lags) for lags in EVIDENCE.lags)
@@ -120,12 +119,12 @@ def predictive_gain(columns: Sequence[Floats]) -> Floats:
     return gain * (1 - np.eye(len(scaled)))
 
 
-def some_rows(values: Floats) -> Floats:
+def some_rows(values: Array) -> Array:
     """Return every n-th row of a long column: what moves late counts as what moves first."""
     return values[:: -(-values.size // EVIDENCE.most_rows)]
 
 
-def _standardised(columns: Sequence[Floats]) -> list[Floats]:
+def _standardised(columns: Sequence[Array]) -> list[Array]:
     """Return the rows that are looked at of columns, gaps filled, of mean 0 and standard deviation 1."""
     scaled = []
     for values in map(some_rows, columns):
@@ -141,7 +140,7 @@ def _standardised(columns: Sequence[Floats]) -> list[Floats]:
     return scaled
 
 
-def _bases(causes: Sequence[Floats], lags: int) -> Floats:
+def _bases(causes: Sequence[Array], lags: int) -> Array:
     """Return an orthonormal basis of each cause's past (n_cause, n_row, lags), empty where rows are few."""
     if not causes or len(causes[0]) < 6 * lags:
         return np.zeros((len(causes), 0, lags))
@@ -149,7 +148,7 @@ def _bases(causes: Sequence[Floats], lags: int) -> Floats:
     return np.asarray(axes * (sizes > 1e-9 * sizes[:, :1])[:, None])
 
 
-def _gains(y: Floats, bases: Floats, beside: Sequence[Floats]) -> Floats:
+def _gains(y: Array, bases: Array, beside: Sequence[Array]) -> Array:
     """Return the gain in the information criterion of y, where the past of each cause stands beside its own
     and that of others; 0 where it is negative, or rows are too few."""
     n_causes, rows, lags = bases.shape
@@ -165,24 +164,24 @@ def _gains(y: Floats, bases: Floats, beside: Sequence[Floats]) -> Floats:
     return np.maximum(_criterion(target, errors, rows, lags), 0.0)
 
 
-def _past(values: Floats, lags: int, first: int = 1) -> Floats:
+def _past(values: Array, lags: int, first: int = 1) -> Array:
     return np.stack([values[lags - k : len(values) - k] for k in range(first, lags + 1)], axis=1)
 
 
-def _decomposed(terms: Sequence[Floats]) -> _Matrices:
+def _decomposed(terms: Sequence[Array]) -> _Matrices:
     """Return an orthonormal basis of what columns span, its singular values and the columns' loadings."""
     axes, sizes, loadings = np.linalg.svd(matrix := np.column_stack(terms), full_matrices=False)
     is_usable = sizes > np.finfo(float).eps * max(matrix.shape) * sizes[0]
     return axes[:, is_usable], sizes[is_usable], loadings[is_usable]
 
 
-def _criterion(target: Floats, errors: Floats, rows: int, n_new: int) -> Floats:
+def _criterion(target: Array, errors: Array, rows: int, n_new: int) -> Array:
     # G = N log(RSS without new columns / RSS with them) - n log N, of n columns and N rows (Granger 1969)
     before, after = (np.sum(r**2, axis=-1) + 1e-12 * rows for r in (target, errors))
     return np.asarray(rows * np.log(before / after) - n_new * np.log(rows))
 
 
-def comes_to(reading: Floats, goal: Floats) -> bool:
+def comes_to(reading: Array, goal: Array) -> bool:
     """Tell whether most of the levels that a goal is held at, three at least, are those that a reading has in
     the last half of each hold."""
     bounds = [0, *(np.flatnonzero(np.diff(goal)) + 1), goal.size]
@@ -193,14 +192,14 @@ def comes_to(reading: Floats, goal: Floats) -> bool:
     return np.unique(levels).size >= 3 and float(np.mean(reached)) > 0.5
 
 
-def only_rises(values: Floats) -> bool:
+def only_rises(values: Array) -> bool:
     """Tell whether a column never falls, or never rises, as totals and counters do."""
     moves = np.diff(values[np.isfinite(values)])
     rising = np.all(moves >= 0) or np.all(moves <= 0)
     return bool(rising and np.unique(moves).size > 1 and np.count_nonzero(moves) > EVIDENCE.fewest_rows)
 
 
-def share_followed(values: Floats, other: Floats) -> float:
+def share_followed(values: Array, other: Array) -> float:
     """Return the share of a column's variance that another one explains, at once, late or filtered."""
     y, x = _standardised([values, other])
     rows = y.size - EVIDENCE.latest
@@ -282,7 +281,7 @@ def effect_doubts(
             yield f"{output} moves in {rows} rows with {', '.join(inputs)} held: what moved it there?"
 
 
-def _at_scale(n: int, y: Floats, drives: Sequence[Floats], others: Sequence[Floats]) -> _Matrices:
+def _at_scale(n: int, y: Array, drives: Sequence[Array], others: Sequence[Array]) -> _Matrices:
     """Return the means of y over n rows, what their past and others tell of them, and what drives add."""
     of_y, *rest = _means_of_rows([y, *drives, *others], n)
     at_once = [_past(means, 2, first=0) for means in rest]
@@ -290,7 +289,7 @@ def _at_scale(n: int, y: Floats, drives: Sequence[Floats], others: Sequence[Floa
     return of_y[2:], np.column_stack(known), np.column_stack(at_once[: len(drives)])
 
 
-def _ratios_of_effects(y: Floats, drives: Sequence[Floats], others: Sequence[Floats]) -> list[list[float]]:
+def _ratios_of_effects(y: Array, drives: Sequence[Array], others: Sequence[Array]) -> list[list[float]]:
     """Return for each drive the regression of what its late moves would do by its early effect on what they
     do, and the other way round, at the scale where both effects are clearest."""
     clearest, ratios = [EVIDENCE.strong_gain] * len(drives), [[1.0, 1.0]] * len(drives)
@@ -308,7 +307,7 @@ def _ratios_of_effects(y: Floats, drives: Sequence[Floats], others: Sequence[Flo
     return ratios
 
 
-def _added(y: Floats, known: Floats, acting: Floats, n_drives: int) -> Iterator[tuple[float, Floats, Floats]]:
+def _added(y: Array, known: Array, acting: Array, n_drives: int) -> Iterator[tuple[float, Array, Array]]:
     """Yield of each drive, beside what is known and the other drives, the gain by its columns, their factors,
     and what turns factors into a ratio to the effect of these: all from one decomposition."""
     axes, sizes, loadings = _decomposed([known, acting])
@@ -322,7 +321,7 @@ def _added(y: Floats, known: Floats, acting: Floats, n_drives: int) -> Iterator[
         yield gain, np.asarray(np.linalg.pinv(own, 1e-9) @ effect), effect @ own / (effect @ effect or 1.0)
 
 
-def _moved_alone(y: Floats, drives: Sequence[Floats], others: Sequence[Floats]) -> int:
+def _moved_alone(y: Array, drives: Sequence[Array], others: Sequence[Array]) -> int:
     """Return the rows of the longest hold of all drives if y is predicted far worse in it, else 0."""
     moves = np.flatnonzero(np.any([np.diff(u) != 0 for u in drives], axis=0)) + 1
     if not EVIDENCE.fewest_moves <= moves.size <= EVIDENCE.held_share * y.size:
@@ -380,6 +379,6 @@ def _acts(columns: Columns, name: str, output: str, beside: Sequence[str]) -> bo
     return False
 
 
-def _means_of_rows(columns: Sequence[Floats], n: int) -> list[Floats]:
+def _means_of_rows(columns: Sequence[Array], n: int) -> list[Array]:
     """Return the means of columns over n rows each."""
     return [v[: v.size // n * n].reshape(-1, n).mean(axis=1) for v in columns]

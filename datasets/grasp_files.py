@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.errors import UserError, reading
 from thermogrip.datasets.files import file_format, file_stem, write_atomic
 from thermogrip.datasets.netcdf import numbers_and_unit, open_netcdf, write_netcdf
@@ -31,7 +32,6 @@ if TYPE_CHECKING:
 
     from thermogrip.datasets.schema import Grasps
 
-Floats = NDArray[np.float64]
 #: What is taken for grasps: themselves, paths of files; one or several.
 Records: TypeAlias = "Grasps | str | Path | Sequence[Grasps | str | Path]"
 
@@ -146,7 +146,7 @@ def _name_and_unit(header: str, file: str | None = None) -> tuple[str, str]:
     return name.lower() if name.lower() in GRASP_LABELS else _FROM_META.get(name, name), unit  # "Material"
 
 
-def _in_record_unit(name: str, values: Floats, unit: str, file: str | Path, column: str) -> Floats:
+def _in_record_unit(name: str, values: Array, unit: str, file: str | Path, column: str) -> Array:
     """Return the numbers of a variable in the unit that a record has it in; UserError where theirs is of
     another kind."""
     numbers, unit_after = to_record_unit(values, unit)
@@ -197,7 +197,7 @@ def _check_samples(columns: Mapping[str, Any], table: Table) -> None:
             raise UserError(problem, file=table.file, row=int(line), column=where, hint=hint)
 
 
-def _onto_one_axis(samples: DataFrame, file: str, repairs: list[str]) -> tuple[Floats, dict[str, Floats]]:
+def _onto_one_axis(samples: DataFrame, file: str, repairs: list[str]) -> tuple[Array, dict[str, Array]]:
     """Return the common time axis (n_time,) and the channels (n_grasp, n_time), grasps in order of their
     first rows; what is repaired is added to the repairs."""
     steps = samples.groupby("grasp_id", sort=False)["time"].diff()
@@ -225,7 +225,7 @@ def _onto_one_axis(samples: DataFrame, file: str, repairs: list[str]) -> tuple[F
     }
 
 
-def _grid_of(time: Floats, usual: float | None = None) -> tuple[float, float]:
+def _grid_of(time: Array, usual: float | None = None) -> tuple[float, float]:
     """Return the mean step of time stamps, in which a hole counts as the steps that it is long, and their
     largest deviation from a grid of it; NaN of one sample.  ``usual`` is about the step, else the median."""
     moves = np.diff(time)
@@ -249,7 +249,7 @@ def _common_step(steps: Series[float], file: str) -> float:
     return plain if abs(plain / step - 1) < 0.01 else float(f"{step:.4g}")
 
 
-def _on_axis(axis: Floats, time: Series[float], values: Series[float], step: float) -> Floats:
+def _on_axis(axis: Array, time: Series[float], values: Series[float], step: float) -> Array:
     """Return a grasp on the axis: as it is where it has a sample, NaN where none is near."""
     finite = np.isfinite(values)
     if not finite.any():
@@ -341,7 +341,7 @@ def _record(
     file: str | Path,
     stem: str,
     ids: Sequence[str],
-    axis: Floats,
+    axis: Array,
     variables: dict[str, Any],
     attrs: dict[Any, Any],
 ) -> Grasps:

@@ -20,8 +20,7 @@ from warnings import catch_warnings, simplefilter
 from thermogrip.datasets.errors import UserError
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
+    from thermogrip.datasets.arrays import Array
 
 #: Levels of brackets in a document, and the largest number in it.
 MOST_DEPTH, MOST_NUMBER = 64, 1e100
@@ -157,7 +156,7 @@ def number_within(content: Mapping[str, Any], key: str, low: float, high: float)
     return float(value)
 
 
-def array_within(content: Mapping[str, Any], key: str, largest: float = LARGEST) -> NDArray[np.float64]:
+def array_within(content: Mapping[str, Any], key: str, largest: float = LARGEST) -> Array:
     """Return an array of a document; ValueError where an entry is not finite or beyond ``largest``."""
     import numpy as np  # the command line imports this module, and --help loads no heavy package
 

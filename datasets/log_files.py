@@ -18,9 +18,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
 from thermogrip.datasets import repair
+from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.clock import CLOCK, EPOCH, Clock, clock_of, read_clock
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.evidence import effect_doubts
@@ -46,7 +46,6 @@ if TYPE_CHECKING:
 
     from thermogrip.datasets.schema import Log
 
-Floats = NDArray[np.float64]
 #: What is taken for logs: themselves, DataFrames, paths of files; one or several.
 Logs: TypeAlias = "Log | DataFrame | str | Path | Sequence[Log | DataFrame | str | Path]"
 
@@ -62,7 +61,7 @@ class _Columns:
     """The columns of a table in the units of records."""
 
     clock: Clock
-    values: dict[str, Floats]  # by name
+    values: dict[str, Array]  # by name
     units: dict[str, str]
     names_of: dict[str, str]  # the name that each header became
     repairs: list[str]  # what was converted and left out
@@ -244,7 +243,7 @@ def _read_netcdf_table(path: str | Path) -> Table:
         hint = "give it a dimension and a variable 'time' in seconds"
         raise UserError("no time axis", file=path, hint=hint)
     not_over_time = [str(name) for name, variable in data.data_vars.items() if variable.dims != ("time",)]
-    numbers: dict[str, Floats] = {}
+    numbers: dict[str, Array] = {}
     attrs: dict[str, dict[str, str]] = {}
     for name in ["time", *map(str, data.drop_vars(not_over_time).data_vars)]:
         numbers[name], unit = numbers_and_unit(data[name], name, str(path))
@@ -278,7 +277,7 @@ def _convert(table: Table, dt: float | None) -> _Columns:
     clock = clock_of(table, read, dt)
     table = _states_as_columns(table, clock)
     read |= {h: Header(read_header(h).name, "1", 1.0) for h in table.numbers if h not in read}
-    columns: dict[str, Floats] = {}
+    columns: dict[str, Array] = {}
     units: dict[str, str] = {}
     names_of = dict.fromkeys(clock.columns, "time")
     repairs, renamed = [*table.notes, *clock.notes], []
@@ -387,13 +386,13 @@ def _one_column_a_signal(table: Table) -> Table:
 class _Repaired(NamedTuple):
     """Time and columns of a log, and a line a finding."""
 
-    time: Floats
-    columns: dict[str, Floats]
+    time: Array
+    columns: dict[str, Array]
     repairs: list[str]
 
 
 def _repair(
-    time: Floats, columns: dict[str, Floats], units: dict[str, str], roles: dict[str, str], table: Table
+    time: Array, columns: dict[str, Array], units: dict[str, str], roles: dict[str, str], table: Table
 ) -> _Repaired:
     """Return the repaired time and columns."""
     again = np.diff(time) == 0
@@ -460,7 +459,7 @@ def _reading_doubts(roles: Mapping[str, str], log: _Repaired) -> list[str]:
     return [doubt for doubt in doubts if doubt]
 
 
-def _without_half_lost(roles: Roles, time: Floats, columns: Mapping[str, Floats]) -> Roles:
+def _without_half_lost(roles: Roles, time: Array, columns: Mapping[str, Array]) -> Roles:
     """Return roles without the outputs that miss a long part of what others have, which a fit would lose."""
     lost = {n: float(np.isnan(v).mean()) for n, v in columns.items() if roles.of[n] == "output"}
     whole = next((n for n, share in lost.items() if share < LOST_SHARE / 5), None)
@@ -476,8 +475,8 @@ def _without_half_lost(roles: Roles, time: Floats, columns: Mapping[str, Floats]
 
 
 def _repair_column(
-    name: str, values: Floats, time: Floats, unit: str, role: str, file: str
-) -> tuple[Floats, list[str]]:
+    name: str, values: Array, time: Array, unit: str, role: str, file: str
+) -> tuple[Array, list[str]]:
     repairs: list[str] = []
     values = np.where(np.isinf(values), np.nan, values)
     if role in ("input", "disturbance"):

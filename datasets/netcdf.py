@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.errors import UserError, os_faults, reading
 from thermogrip.datasets.files import atomic_path, check_source
 from thermogrip.datasets.limits import MOST_BYTES, check_unpacked, in_own_process, most_unpacked
@@ -117,7 +117,7 @@ def write_netcdf(data: xr.Dataset, path: str | Path) -> Path:
     return Path(path)
 
 
-def numbers_and_unit(variable: xr.DataArray, name: str, file: str) -> tuple[NDArray[np.float64], str]:
+def numbers_and_unit(variable: xr.DataArray, name: str, file: str) -> tuple[Array, str]:
     """Return a variable's numbers and its unit, "" where it states none; UserError where it holds no numbers
     or an unknown unit."""
     if variable.dtype.kind not in "fiub":

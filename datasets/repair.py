@@ -14,9 +14,8 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
+from thermogrip.datasets.arrays import Array, Mask
 from thermogrip.datasets.errors import UserError
-
-Floats = NDArray[np.float64]
 
 #: Values that are no readings, in degC, and whose they are.
 SENSOR_CODES = {
@@ -57,12 +56,12 @@ class ClockDoubt(Doubt):
 class OrderedRows(NamedTuple):
     """Rows in the order of time."""
 
-    time: Floats  # strictly increasing
+    time: Array  # strictly increasing
     rows: NDArray[np.int64]  # that the times belong to
     repairs: list[str]
 
 
-def order_rows(time: Floats, lines: NDArray[np.int64], file: str) -> OrderedRows:
+def order_rows(time: Array, lines: NDArray[np.int64], file: str) -> OrderedRows:
     """Return rows of increasing times; UserError where many times are missing or run backward."""
     rows, repairs = np.arange(time.size), []
     lost = ~np.isfinite(time)
@@ -100,7 +99,7 @@ def order_rows(time: Floats, lines: NDArray[np.int64], file: str) -> OrderedRows
     return OrderedRows(time[rows[first]], rows[first], repairs)
 
 
-def describe_steps(time: Floats) -> list[str]:
+def describe_steps(time: Array) -> list[str]:
     """Return a line if the time stamps are uneven by more than 2 % of their median step."""
     step = np.diff(time)
     median = float(np.median(step))
@@ -116,15 +115,15 @@ def describe_steps(time: Floats) -> list[str]:
     return [f"{says}; kept as they are"]
 
 
-def gap_rows(time: Floats, longer_than: float = GAP_SECONDS) -> NDArray[np.int64]:
-    """Return the rows after which the log has a gap: longer than that and than five median steps."""
+def gap_rows(time: Array) -> NDArray[np.int64]:
+    """Return the rows after which the log has a gap: longer than 10 s and than five median steps."""
     step = np.diff(time)
     if not step.size:
         return np.empty(0, dtype=np.int64)
-    return np.flatnonzero((step > longer_than) & (step > GAP_STEPS * np.median(step)))
+    return np.flatnonzero((step > GAP_SECONDS) & (step > GAP_STEPS * np.median(step)))
 
 
-def describe_gaps(time: Floats, inputs: dict[str, Floats]) -> list[str]:
+def describe_gaps(time: Array, inputs: dict[str, Array]) -> list[str]:
     """Return a line a gap, with the inputs before and after it; of many the first ones and their number."""
     repairs = []
     for row in (rows := gap_rows(time))[:5]:
@@ -137,7 +136,7 @@ def describe_gaps(time: Floats, inputs: dict[str, Floats]) -> list[str]:
     return repairs
 
 
-def find_spikes(values: Floats, *, floor: float | None) -> NDArray[np.bool_]:
+def find_spikes(values: Array, *, floor: float | None) -> Mask:
     """Return which samples (n,) are spikes; ``floor`` is the least one, None: by the channel's range."""
     spikes = np.zeros(values.shape, dtype=bool)
     finite_rows = np.flatnonzero(np.isfinite(values))
@@ -160,7 +159,7 @@ def find_spikes(values: Floats, *, floor: float | None) -> NDArray[np.bool_]:
     return spikes
 
 
-def drop_codes(name: str, values: Floats) -> tuple[Floats, list[str]]:
+def drop_codes(name: str, values: Array) -> tuple[Array, list[str]]:
     """Return a column with what is no reading but a sensor's code as NaN, and a line for each code."""
     repairs = []
     for code, whose in SENSOR_CODES.items():
@@ -172,7 +171,7 @@ def drop_codes(name: str, values: Floats) -> tuple[Floats, list[str]]:
     return values, repairs
 
 
-def doubt_readings(name: str, values: Floats, inputs: Sequence[Floats], time: Floats) -> str:
+def doubt_readings(name: str, values: Array, inputs: Sequence[Array], time: Array) -> str:
     """Return the doubt on a reading's order, codes, standstills or largest jump, empty without one."""
     moves = np.abs(np.diff(values))
     if values.size < SPIKE_WINDOW or not np.nansum(moves):
@@ -202,7 +201,7 @@ def doubt_readings(name: str, values: Floats, inputs: Sequence[Floats], time: Fl
     return f"{problem}: if its sensor or unit changed there, cut the log: LOG@{time[row + 1] - time[0]:g}:"
 
 
-def _longest_standstill(values: Floats, moves: Floats) -> tuple[float, int]:
+def _longest_standstill(values: Array, moves: Array) -> tuple[float, int]:
     """Return the value at which a reading stops in most rows, and their number, where it does not settle."""
     least = 2 * float(moves[moves > 0].min())
     ends = np.flatnonzero(np.append(moves != 0, True))
@@ -216,7 +215,7 @@ def _longest_standstill(values: Floats, moves: Floats) -> tuple[float, int]:
     return max(rows_at.items(), key=lambda item: item[1], default=(np.nan, 0))
 
 
-def doubt_levels(name: str, values: Floats) -> str:
+def doubt_levels(name: str, values: Array) -> str:
     """Return the doubt on an input with two levels or more that come again, as multiples, after some row."""
     levels = np.unique(values[values != 0])
     for factor in _OTHER_SCALES if levels.size <= _MOST_LEVELS else ():
@@ -230,7 +229,7 @@ def doubt_levels(name: str, values: Floats) -> str:
     return ""
 
 
-def doubt_moves(name: str, values: Floats) -> str:
+def doubt_moves(name: str, values: Array) -> str:
     """Return the doubt on an input that goes from one level to another as no drive does."""
     bounds = np.concatenate([[0], np.flatnonzero(np.diff(values)) + 1, [values.size]])
     holds = np.flatnonzero(np.diff(bounds) > _FEWEST_HELD)
@@ -257,19 +256,19 @@ def doubt_moves(name: str, values: Floats) -> str:
     return ""
 
 
-def _goes_on(values: Floats) -> dict[str, NDArray[np.bool_]]:
+def _goes_on(values: Array) -> dict[str, Mask]:
     """Return which rows but the last go on as before: held, or straight within the column's steps."""
     moves = np.diff(values)
     turns = np.abs(np.diff(moves, prepend=np.nan))
     return {"held": moves == 0, "drawn straight": turns < 1.5 * _smallest_step(values)}  # half for rounding
 
 
-def _smallest_step(values: Floats) -> float:
+def _smallest_step(values: Array) -> float:
     moves = np.abs(np.diff(values))
     return float(moves[moves > 0].min(initial=np.inf))
 
 
-def doubt_lead(name: str, values: Floats, drive: str, moved: Floats, time: Floats) -> str:
+def doubt_lead(name: str, values: Array, drive: str, moved: Array, time: Array) -> str:
     """Return the doubt on a reading that bends before a drive moves, as under no plant and no controller."""
     rows = np.flatnonzero(np.diff(moved)) + 1
     if np.unique(moved).size > _MOST_LEVELS or rows.size < SPIKE_WINDOW // 2 or np.isnan(values).any():
@@ -294,7 +293,7 @@ def doubt_lead(name: str, values: Floats, drive: str, moved: Floats, time: Float
     return f"{name} moves {ahead:g} s before {drive} does: are their clocks alike?"
 
 
-def doubt_rows(name: str, values: Floats) -> str:
+def doubt_rows(name: str, values: Array) -> str:
     """Return the doubt on an output that is read in n-th rows only, held or drawn straight between."""
     if np.isnan(values).any():
         return ""
@@ -307,7 +306,7 @@ def doubt_rows(name: str, values: Floats) -> str:
     return ""
 
 
-def doubt_repeats(columns: Sequence[Floats], lines: NDArray[np.int64]) -> list[str]:
+def doubt_repeats(columns: Sequence[Array], lines: NDArray[np.int64]) -> list[str]:
     """Return a line where rows repeat others, cell for cell, in more rows than by chance."""
     rows = np.unique(np.nan_to_num(np.column_stack(columns)), axis=0, return_inverse=True)[1].ravel()
     if rows.size <= _REPEATED:
@@ -326,7 +325,7 @@ def doubt_repeats(columns: Sequence[Floats], lines: NDArray[np.int64]) -> list[s
     return [Doubt(f"{says}: cut the file there in two")]
 
 
-def _rows_beyond_jumps(values: Floats, rows: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _rows_beyond_jumps(values: Array, rows: Mask) -> Mask:
     """Return those of the rows whose runs are entered and left by jumps as no other rows make."""
     moves = np.abs(np.diff(values))
     usual = moves[~(rows[1:] | rows[:-1]) & np.isfinite(moves)]
@@ -344,7 +343,7 @@ def _rows_beyond_jumps(values: Floats, rows: NDArray[np.bool_]) -> NDArray[np.bo
     return beyond_jumps
 
 
-def drop_stuck(name: str, values: Floats, inputs: Sequence[Floats]) -> tuple[Floats, list[str]]:
+def drop_stuck(name: str, values: Array, inputs: Sequence[Array]) -> tuple[Array, list[str]]:
     """Return an output without the run in which it is held, or straight, while inputs move, and a line."""
     travel = np.zeros(values.size)  # of all inputs since the first row, in ranges
     for u in inputs:
@@ -381,9 +380,7 @@ def drop_stuck(name: str, values: Floats, inputs: Sequence[Floats]) -> tuple[Flo
     return values, []
 
 
-def reject_spikes(
-    name: str, values: Floats, time: Floats, *, floor: float | None
-) -> tuple[Floats, list[str]]:
+def reject_spikes(name: str, values: Array, time: Array, *, floor: float | None) -> tuple[Array, list[str]]:
     """Return the channel with its spikes as NaN, and what was found."""
     spikes = find_spikes(values, floor=floor)
     if spikes.any() and np.median(np.diff(time)) >= _SLOW_ROWS:  # spikes are beyond others by their range
@@ -397,7 +394,7 @@ def reject_spikes(
     return np.where(spikes, np.nan, values), [repairs]
 
 
-def fill_lost(name: str, values: Floats, time: Floats | None = None) -> tuple[Floats, list[str]]:
+def fill_lost(name: str, values: Array, time: Array | None = None) -> tuple[Array, list[str]]:
     """Return a column with lost values interpolated in time, or without times held from the last row."""
     lost = ~np.isfinite(values)
     if not lost.any():
@@ -410,7 +407,7 @@ def fill_lost(name: str, values: Floats, time: Floats | None = None) -> tuple[Fl
     return filled, [f"{name}: {lost.sum()} lost value{_s(int(lost.sum()))} {how}"]
 
 
-def check_plausible(name: str, celsius: Floats, file: str) -> list[str]:
+def check_plausible(name: str, celsius: Array, file: str) -> list[str]:
     """Return a line if a temperature is likely in another unit; UserError if half is below absolute zero."""
     median = float(np.nanmedian(celsius))
     if median < -273.15:
@@ -423,13 +420,13 @@ def check_plausible(name: str, celsius: Floats, file: str) -> list[str]:
     return []
 
 
-def _floor(values: Floats) -> float:
+def _floor(values: Array) -> float:
     low, high = np.percentile(values, [1, 99])
     # 2 % of the channel's 1-99 % range, and at least five of its smallest increments
     return max(0.02 * float(high - low), 5 * _smallest_step(values), np.finfo(float).tiny)
 
 
-def _leaves_and_returns(values: Floats, start: int, stop: int, threshold: float) -> bool:
+def _leaves_and_returns(values: Array, start: int, stop: int, threshold: float) -> bool:
     """Tell whether values[start:stop] is entered and left by jumps that nothing around it resembles."""
     enter, leave = values[start] - values[start - 1], values[stop] - values[stop - 1]
     half = SPIKE_WINDOW // 2

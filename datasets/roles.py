@@ -13,7 +13,6 @@ from dataclasses import dataclass, field
 from typing import TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.evidence import (
@@ -30,7 +29,6 @@ from thermogrip.datasets.evidence import (
 )
 from thermogrip.datasets.units import DRIVE, find_column
 
-Floats = NDArray[np.float64]
 _Guesses: TypeAlias = dict[str, tuple[str, str]]  # role and reason, by name
 
 _SETPOINT = re.compile(

@@ -22,8 +22,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.errors import UserError, as_user_error, known_names, os_faults, reading
 from thermogrip.datasets.files import check_source, file_stem, read_bytes, read_toml
 from thermogrip.datasets.limits import Unpacker, check_size
@@ -31,8 +31,6 @@ from thermogrip.datasets.roles import guess_role
 from thermogrip.datasets.schema import ROLES
 from thermogrip.datasets.tables import Table
 from thermogrip.datasets.units import UNITS, split_header, to_record_unit
-
-Floats = NDArray[np.float64]
 
 _NO_NUMBER = (KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError)
 _SINGLE_FIELDS = {"temperature": "degC", "data": ""}  # the one field of a message without a map, and its unit
@@ -248,7 +246,7 @@ def _bag_table(
         clock = max(outputs, key=lambda name: len(frames[name]))
     axis = frames[clock][["time"]]
     rows = axis["time"].to_numpy()
-    numbers: dict[str, Floats] = {"time_s": rows - rows[0]}
+    numbers: dict[str, Array] = {"time_s": rows - rows[0]}
     attrs: dict[str, dict[str, str]] = {"time_s": {}}
     for name, column in columns.items():
         messages = frames[name]

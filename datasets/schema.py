@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.errors import UserError, known_names
 from thermogrip.datasets.repair import gap_rows
 
@@ -131,7 +132,7 @@ def names(log: Log, role: str) -> tuple[str, ...]:
     return tuple(str(key) for key, variable in log.data_vars.items() if variable.attrs.get("role") == role)
 
 
-def column(log: Log, name: str) -> NDArray[np.float64]:
+def column(log: Log, name: str) -> Array:
     """Return one variable of the log as a float array of shape (n_time,)."""
     if name not in log:
         hint = known_names(name, map(str, log.data_vars), "it has {}")
@@ -139,7 +140,7 @@ def column(log: Log, name: str) -> NDArray[np.float64]:
     return np.asarray(log[name].values, dtype=float)
 
 
-def columns(log: Log, wanted: Sequence[str]) -> NDArray[np.float64]:
+def columns(log: Log, wanted: Sequence[str]) -> Array:
     """Return several variables of the log as a float array of shape (n_time, n_wanted)."""
     if not wanted:
         return np.empty((log.sizes["time"], 0))
@@ -175,11 +176,10 @@ def cut(log: Log, start: float = -np.inf, stop: float = np.inf) -> Log:
     return log.isel(time=np.flatnonzero(inside))
 
 
-def gaps(log: Log, longer_than: float = 10.0) -> list[tuple[int, float, float]]:
-    """Return (row before, time before [s], time after [s]) of each gap, longer than this [s] and than five
-    median steps."""
+def gaps(log: Log) -> list[tuple[int, float, float]]:
+    """Return (row before, time before [s], time after [s]) of each gap; see :func:`gap_rows`."""
     time = log["time"].values
-    return [(int(row), float(time[row]), float(time[row + 1])) for row in gap_rows(time, longer_than)]
+    return [(int(row), float(time[row]), float(time[row + 1])) for row in gap_rows(time)]
 
 
 def log_name(log: xr.Dataset) -> str:
@@ -187,7 +187,7 @@ def log_name(log: xr.Dataset) -> str:
     return str(log.attrs.get("name", "log"))
 
 
-def hash_columns(data: Mapping[str, NDArray[np.float64]]) -> str:
+def hash_columns(data: Mapping[str, Array]) -> str:
     """Return the SHA-256 of columns, in whatever order they stand."""
     # + 0.0: -0 and 0 are one number, of two byte patterns
     values = [np.asarray(v, dtype="<f8") + 0.0 for v in data.values()]

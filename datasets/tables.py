@@ -30,6 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thermogrip.datasets import limits
+from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.errors import UserError, as_user_error, reading
 from thermogrip.datasets.files import check_source, read_bytes
 from thermogrip.datasets.repair import Doubt, name_rows
@@ -96,7 +97,7 @@ class Table:
     """Columns of one file: numbers as float, text as str, and the file's line of each row."""
 
     file: str
-    numbers: dict[str, NDArray[np.float64]]
+    numbers: dict[str, Array]
     text: dict[str, list[str]]
     lines: NDArray[np.int64]
     attrs: dict[str, dict[str, str]] = field(default_factory=dict)  # by column: ``units``, ``role``
@@ -120,7 +121,7 @@ class Column:
     """What the cells of a column are: numbers, or text."""
 
     name: str
-    numbers: NDArray[np.float64] | None = None
+    numbers: Array | None = None
     text: list[str] | None = None
     notes: tuple[str, ...] = ()
 
@@ -564,7 +565,7 @@ def read_column(
     raise UserError(problem, file=file, row=int(lines[wrong[0]]), column=name, hint=hint)
 
 
-def _numbers_of(cells: Sequence[str]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def _numbers_of(cells: Sequence[str]) -> tuple[Array, NDArray[np.int64]]:
     """Return the numbers of cells, NaN where one is none, and which cells are neither numbers nor lost."""
     values = [float(cell) if _NUMBER_CELL.fullmatch(cell) else np.nan for cell in cells]
     wrong = [row for row, value in enumerate(values) if value != value and cells[row] not in _LOST_CELLS]
@@ -592,7 +593,7 @@ def _without_unit(name: str, cells: Sequence[str]) -> tuple[str, list[str], list
     return named, ["" if match is None else match[1] for match in matches], factors
 
 
-def switched(cells: Sequence[str]) -> NDArray[np.float64] | None:
+def switched(cells: Sequence[str]) -> Array | None:
     """Return cells of numbers and a switch's two states as numbers; None where there are other words."""
     words = ["" if cell.strip() in _LOST_CELLS else cell.strip().lower() for cell in cells]
     values, wrong = _numbers_of(words)
@@ -662,7 +663,7 @@ def _matlab_table(path: Path, columns: Sequence[str] | None) -> Table:
             warnings.simplefilter("ignore", MatReadWarning)  # of objects without names
             content = loadmat(source, simplify_cells=True)
     members = [*_matlab_members({k: v for k, v in content.items() if not k.startswith("__")})]
-    arrays: dict[str, NDArray[np.float64]] = {}
+    arrays: dict[str, Array] = {}
     for name, value in members:
         if isinstance(value, np.ndarray) and value.dtype.kind in "fiub" and value.ndim in (1, 2):
             matrix = value[:, None] if value.ndim == 1 else value

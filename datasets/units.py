@@ -16,8 +16,8 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.errors import UserError, known_names
 
 UNITS = ("degC", "K", "degF", "percent", "V", "A", "W", "s", "ms", "min", "0_255")
@@ -141,7 +141,7 @@ def join_header(name: str, unit: str, others: Sequence[str] = ()) -> str:
     return header
 
 
-def to_record_unit(values: NDArray[np.float64], unit: str) -> tuple[NDArray[np.float64], str]:
+def to_record_unit(values: Array, unit: str) -> tuple[Array, str]:
     """Return the values in the unit of the records (degC for temperatures, s for times, else as they are)."""
     if unit == "K":
         return np.round(values - 273.15, 10), "degC"  # 298.15 - 273.15 is 25 - 2e-14 in binary

@@ -31,7 +31,6 @@ if TYPE_CHECKING:
 
     Signals: TypeAlias = PlantData | GreyModel
 
-GAP = 10.0  # [s], and five steps of a slow log: beyond it the input is unknown
 BRIDGED = 5  # rows
 MOVED = 0.01  # of an input's range: less is noise of its reading
 _LONGEST_GAP = 1_000_000  # steps, behind which a plant is long at rest; a damaged clock may have centuries
@@ -74,7 +73,7 @@ class Rows(Segment):
 def rows_of(log: Log, inputs: Sequence[str], outputs: Sequence[str], disturbances: Sequence[str]) -> Rows:
     """Return the columns of a log by role."""
     u, d, y = (columns(log, group) for group in (inputs, disturbances, outputs))
-    after = tuple(row + 1 for row, _, _ in gaps_of(log, GAP))
+    after = tuple(row + 1 for row, _, _ in gaps_of(log))
     return Rows(np.asarray(log["time"].values, dtype=float), y, u, d, log_name(log), after)
 
 

@@ -72,7 +72,6 @@ def test_the_gap_of_the_example_is_found():
     ((at, before, after),) = gaps(log)
     assert (before, after) == (1129.942, 1168.643)
     assert log["time"].values[at] == before
-    assert gaps(log, longer_than=60.0) == []
     assert gaps(read_log(example_path("multisine"))) == []
 
 
