@@ -412,15 +412,11 @@ def fold_rows(fit: BlackBoxFit) -> list[Row]:
     return rows
 
 
-def relative_error(row: Row) -> float:
-    """Return the error over that of a model without input."""
-    return row.rmse / max(row.no_input_rmse, 1e-12)
-
-
 def _mean_errors(rows: Sequence[Row]) -> dict[str, float]:
+    """Return by candidate the mean of its errors over those of a model without input."""
     errors: dict[str, list[float]] = {}
     for row in rows:
-        errors.setdefault(row.model, []).append(relative_error(row))
+        errors.setdefault(row.model, []).append(row.rmse / max(row.no_input_rmse, 1e-12))
     return {model: float(np.mean(each)) for model, each in errors.items()}
 
 

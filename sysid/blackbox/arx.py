@@ -128,4 +128,4 @@ def _arx_model(
         # its first reading and first drives have always stood
         first = np.nan_to_num(first_readings(segment.y), nan=0.0)
         starts.append(np.vstack([first, held(A @ first + B @ drive[0])[1:]]))
-    return polynomial_model(grid, A, B, weights[-1], starts, terms=terms, origin="arx")
+    return polynomial_model(grid, A, B, weights[-1], starts, terms=terms)

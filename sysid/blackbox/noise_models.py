@@ -73,7 +73,6 @@ def solve_armax(c: Array, records: Records, nb: int, delay: int) -> Solution | N
 class ArmaxSearch(Search):
     """Fits one output, structure by structure, and remembers each C that it found."""
 
-    origin = "armax"
     noise_per_pole = 1  # C
     solve = staticmethod(solve_armax)
 
@@ -136,7 +135,6 @@ def autoregression(errors: Sequence[Array], known: Sequence[NDArray[np.bool_]]) 
 class NoiseSearch(Search):
     """The same, with the filter fitted again with a model of its noise."""
 
-    origin = "bj"
     noise_numbers = 1  # D
 
     def __call__(self, records: Records, na: int, nb: int, delay: int) -> Filter | None:

@@ -415,7 +415,6 @@ def as_state_space(
     starts: Sequence[Array],
     *,
     terms: tuple[str, ...],
-    origin: str,
     **more: Any,
 ) -> StateSpaceModel:
     """Return x+ = A x + W w + c, y = C x as a model of the grid's signals; where it is stable with the
@@ -423,14 +422,12 @@ def as_state_space(
     labels = grid.inputs, grid.disturbances, grid.outputs
     B, E, F = np.split(W, np.cumsum([len(grid.inputs), len(grid.disturbances)]), axis=1)
     matrices = {"A": A, "B": B, "C": C, "E": E, "F": F, "c": c} | more
-    model = StateSpaceModel(
-        *labels, **matrices, dt=grid.dt, switches=grid.switches, terms=terms, origin=origin
-    )
+    model = StateSpaceModel(*labels, **matrices, dt=grid.dt, switches=grid.switches, terms=terms)
     return with_spread(model, grid, starts) if model.stable else model
 
 
 def polynomial_model(
-    grid: Grid, A: Array, B: Array, c: Array, starts: Sequence[Array], *, terms: tuple[str, ...], origin: str
+    grid: Grid, A: Array, B: Array, c: Array, starts: Sequence[Array], *, terms: tuple[str, ...]
 ) -> StateSpaceModel:
     """Return y[k] = sum_i A_i y[k - i] + sum_i B_i w[k - i] + c, i = 1 ... n, in observer form: v_i+ =
     A_i v_1 + v_(i+1) + B_i w, c in v_1, y = v_1; A (n, n_y, n_y), B (n, n_y, n_w), ``starts`` (n, n_y)."""
@@ -438,7 +435,7 @@ def polynomial_model(
     matrix, C = np.eye(n * n_y, k=n_y), np.eye(n_y, n * n_y)
     matrix[:, :n_y] += A.reshape(-1, n_y)
     states = [start.ravel() for start in starts]
-    return as_state_space(grid, matrix, B.reshape(-1, n_w), C, c @ C, states, terms=terms, origin=origin)
+    return as_state_space(grid, matrix, B.reshape(-1, n_w), C, c @ C, states, terms=terms)
 
 
 def held(moves: Array) -> Array:

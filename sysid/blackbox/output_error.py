@@ -265,13 +265,11 @@ def oe_family(
             fitted = [search_one(record, na, nb, nk) for search_one, record in zip(searches, records)]
             filters = [filter_of_output for filter_of_output in fitted if filter_of_output is not None]
             if len(filters) == len(fitted):
-                out[structure] = assemble(grid, filters, products, origin=kind.origin)
+                out[structure] = assemble(grid, filters, products)
     return out
 
 
-def assemble(
-    grid: Grid, filters: Sequence[Filter], terms: tuple[str, ...], *, origin: str
-) -> StateSpaceModel:
+def assemble(grid: Grid, filters: Sequence[Filter], terms: tuple[str, ...]) -> StateSpaceModel:
     """Return the model of one filter per output."""
     na, (n_drive, nb), delay = len(filters[0].a), filters[0].b.shape, filters[0].delay
     n, n_y = max(na, delay - 1 + nb), len(filters)
@@ -287,13 +285,12 @@ def assemble(
         start[:na] += np.transpose([each.first[segment] for each in filters])
         start[0] += constant
         starts.append(start)
-    return order_selection.polynomial_model(grid, A, B, constant, starts, terms=terms, origin=origin)
+    return order_selection.polynomial_model(grid, A, B, constant, starts, terms=terms)
 
 
 class Search:
     """Fits one output, structure by structure, and remembers the denominators that it found."""
 
-    origin = "oe"
     noise_numbers, noise_per_pole = 0, 0  # of the model of the noise
     solve: Callable[..., Solution | None] = staticmethod(solve)  # at a denominator
 

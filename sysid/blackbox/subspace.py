@@ -99,7 +99,7 @@ def fit_inputs(grid: Grid, A: Array, C: Array, terms: tuple[str, ...] = ()) -> S
     weights, starts = least_squares(columns, n, targets, DEPENDENT)
     W = weights.reshape(len(centre) + 1, n).T
     c = W[:, -1] - W[:, :-1] @ centre
-    return as_state_space(grid, A, W[:, :-1], C, c, list(starts), terms=terms, origin="subspace", y0=y0)
+    return as_state_space(grid, A, W[:, :-1], C, c, list(starts), terms=terms, y0=y0)
 
 
 def _unit_responses(drive: Array, A: Array, C: Array) -> Array:
@@ -114,8 +114,8 @@ def _unit_responses(drive: Array, A: Array, C: Array) -> Array:
     push = w[None, :, :-1, None] * C[:, None, None, :]
     starts = np.zeros((n_y, len(w), n))
     starts[:, 0] = C
-    pushes, nothing = push.reshape(-1, rows - 1, n), np.zeros((1, rows - 1, 0))
-    runs = run_linear(np.ascontiguousarray(A.T)[None], nothing, pushes, starts.reshape(-1, n), 1)
+    pushes = push.reshape(-1, rows - 1, n)
+    runs = run_linear(np.ascontiguousarray(A.T), pushes, starts.reshape(-1, n), 1)
     return np.asarray(np.moveaxis(runs.reshape(n_y, len(w), rows, n), 1, 2).reshape(n_y, rows, -1))
 
 

@@ -59,7 +59,6 @@ class NeuralModel(BlackBox):
     spread: Array = field(default_factory=lambda: np.empty(0))  # (K n, K n) of the state in the data
 
     kind = "neural"
-    origin = "neural"
     title = "neural model"
     arrays = (
         *("A", "B", "c", "V", "W", "U", "b"),

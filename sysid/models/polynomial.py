@@ -40,7 +40,6 @@ class SindyModel(BlackBox):
     spread: Array = field(default_factory=lambda: np.empty(0))
 
     kind = "sindy"
-    origin = "sindy"
     title = "SINDy model"
     arrays = ("coefficients", "low", "high", "spread")
 

@@ -62,7 +62,6 @@ class LinearPlant:
     w: Array  # (n_w,), of it
     y: Array  # (n_y,), of it
     dt: float | None  # step [s]; None is continuous time
-    name: str = "plant"
 
     @property
     def D(self) -> Array:

@@ -283,7 +283,7 @@ class Plant(Shown, plant_data.PlantData):
         from thermogrip.sysid.plant.linearise import control_system, linearise_plant  # pulls in scipy.linalg
 
         linear = linearise_plant(self, **point)
-        return control_system(linear, (linear.A, linear.B, linear.C, linear.D, linear.dt or 0), linear.name)
+        return control_system(linear, (linear.A, linear.B, linear.C, linear.D, linear.dt or 0), "plant")
 
     def to_scipy(self, **point: Any) -> Any:
         """Return the plant about an operating point as a ``scipy.signal.StateSpace``, discrete where dt is

@@ -1,4 +1,4 @@
-"""A small plant that every test can afford: a driven tank, and a skin that follows it while the pump runs."""
+"""A small plant that every test can afford: a driven tank, and a skin that follows it."""
 
 from __future__ import annotations
 

@@ -72,4 +72,3 @@ def test_the_family_has_the_structures_of_output_error_with_c_beside():
     found, plain = armax_family(grid, **how), oe_family(grid, **how)
     assert [s.label for s in found] == [s.label for s in plain]
     assert [s.size - p.size for s, p in zip(found, plain)] == [1, 1, 2, 2]
-    assert {model.origin for model in found.values()} == {"armax"}

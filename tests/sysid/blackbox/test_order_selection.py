@@ -283,9 +283,9 @@ def test_the_spread_of_the_states_is_that_of_the_run_and_a_trace_more():
         segment(np.zeros((2, 1)), [[1.0], [2.0]]), segment(np.zeros((1, 1)), [[3.0]]), inputs=("q",)
     )
     W, A = np.array(parts["B"]), np.array(parts["A"])
-    starts, how = [np.array([4.0, 0.0]), np.array([1.0, 0.0])], {"terms": (), "origin": "arx"}
+    starts, how = [np.array([4.0, 0.0]), np.array([1.0, 0.0])], {"terms": ()}
     found = selection.as_state_space(grid, A, W, np.eye(1, 2), np.zeros(2), starts, **how)
-    assert (found.dt, found.origin, found.outputs) == (2.0, "arx", ("t",))
+    assert (found.dt, found.outputs) == (2.0, ("t",))
     # states 4, 4, 6 and 1, 6.5: sum 21.5, squares 111.25, so 18.8 / 4
     assert np.trace(found.spread) == pytest.approx(4.7 * (1 + 2e-8), rel=1e-12)
     assert found.spread[1, 1] == pytest.approx(4.7e-8)
@@ -300,7 +300,7 @@ def test_products_have_columns_of_their_own_after_inputs_and_disturbances():
     part = segment(np.zeros((2, 1)), np.zeros((2, 2)), np.zeros((2, 1)))
     grid = grid_of(part, inputs=("q", "p"), disturbances=("room",))
     matrices = np.eye(1) / 2, np.array([[1.0, 2.0, 3.0, 4.0]]), np.eye(1), np.ones(1), [np.zeros(1)]
-    model = selection.as_state_space(grid, *matrices, terms=("|q|",), origin="oe", y0=np.array([7.0]))
+    model = selection.as_state_space(grid, *matrices, terms=("|q|",), y0=np.array([7.0]))
     assert [part.tolist() for part in (model.B, model.E, model.F)] == [[[1.0, 2.0]], [[3.0]], [[4.0]]]
     assert (model.y0.tolist(), model.c.tolist(), model.terms) == ([7.0], [1.0], ("|q|",))
 

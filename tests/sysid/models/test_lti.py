@@ -140,7 +140,7 @@ def test_a_point_is_of_what_is_named_and_where_the_plant_is_put():
     near = linearise_plant(plant, inputs={"q": 2.0}, disturbances={"wind": 7.0}, state=[3.0], dt=4.0)
     assert (near.w.tolist(), near.x.tolist(), near.y.tolist()) == ([2.0, 7.0], [3.0], [23.0, 41.0])
     assert (near.states, near.inputs, near.outputs) == (("x1",), ("q", "wind"), ("t", "t2"))
-    assert (near.dt, near.name) == (4.0, "plant")
+    assert near.dt == 4.0
     np.testing.assert_allclose([*near.A[0], *near.B[0]], [0.81, 0.95, 0.38], rtol=1e-6)  # two steps
     with pytest.raises(UserError, match="has no q there; its inputs and disturbances are q, wind"):
         linearise_plant(plant, disturbances={"q": 2.0})

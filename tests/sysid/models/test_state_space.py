@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import casadi as ca
 import numpy as np
 import pytest
@@ -30,7 +28,6 @@ def switched_model(seed: int = 0) -> StateSpaceModel:
         switches=("pump",),
         terms=("drive*|drive|", "pump*drive"),
         F=rng.standard_normal((3, 2)),
-        A_switch={"pump": 0.05 * rng.standard_normal((3, 3))},
     )
 
 
@@ -140,24 +137,9 @@ def test_a_step_that_is_nearly_a_multiple_is_one():
     assert (y[0, :, 0].tolist(), end.tolist()) == ([5.0, 1.0, 4.0], [[4.0]])
 
 
-def test_poles_are_those_of_the_worst_position_of_the_switches():
-    switches = ("a", "b")
-    model = StateSpaceModel(
-        switches, (), ("t",), A=np.diag([0.5, 0.1]), B=np.zeros((2, 2)), C=[[1.0, 0.0]], dt=2.0,
-        switches=switches, A_switch={"a": np.diag([0.3, 0.0]), "b": np.diag([0.2, 0.0])},
-    )  # fmt: skip
-    assert sorted(model.poles().real) == pytest.approx([0.1, 1.0])  # both on
-    assert not model.stable
-    less = replace(model, A_switch={"a": np.diag([-1.2, 0.0])})
-    assert sorted(less.poles().real) == pytest.approx([-0.7, 0.1])
-    assert less.stable
-
-
 def test_matrices_that_are_absent_are_zero_and_the_spread_is_one():
     model = StateSpaceModel(("q",), (), ("t",), A=np.zeros((2, 2)), B=[[1], [2]], C=[[1, 3]], dt=1.0)
-    assert (model.origin, model.spread.tolist(), model.E.shape, model.c.tolist()) == (
-        "statespace", np.eye(2).tolist(), (2, 0), [0.0, 0.0]
-    )  # fmt: skip
+    assert (model.spread.tolist(), model.E.shape, model.c.tolist()) == (np.eye(2).tolist(), (2, 0), [0, 0])
 
 
 def test_an_unstable_model_reports_it_and_overflows_quietly():
@@ -173,7 +155,7 @@ def test_a_dict_makes_the_model_again():
     both = [some.rollout(np.ones((1, 3)), u[None], d[None], (), 2.0)[0] for some in (model, again)]
     np.testing.assert_array_equal(both[0], both[1])
     assert again.to_dict() == model.to_dict()
-    assert (again.terms, again.switches, again.origin) == (model.terms, model.switches, "statespace")
+    assert (again.terms, again.switches) == (model.terms, model.switches)
 
 
 @pytest.mark.parametrize("change", [{"A": [[1.0]]}, {"dt": "fast"}, {"terms": ["heat"]}, {"A": None}])
