@@ -266,6 +266,9 @@ def effect_doubts(
 ) -> Iterator[str]:
     """Yield a line for each output on which an input acts in another way late than early in a log, or that
     moves where no input does."""
+    for name, other in product(inputs, disturbances):
+        if explains(columns[name], columns[other]):
+            yield f"{name} is computed from {other}: their effects cannot be estimated separately"
     names = [*inputs, *outputs, *disturbances]
     scaled = dict(zip(names, _standardised([columns[n] for n in names])))
     for output in outputs if inputs else ():

@@ -101,9 +101,9 @@ def read_log(
     log : Log
         Temperatures in degC, time in s.  ``attrs["repairs"]`` has a line a repair, ``attrs["guesses"]`` a
         line a guessed role with its reason, ``attrs["role_doubts"]`` and ``attrs["clock_doubts"]`` one a
-        guess that decides what a fit sees, ``attrs["name"]`` the file's stem and cut, ``attrs["sha256"]``
-        the hash of the file's data, ``attrs["began"]`` the date and time of the first row, if the file has a
-        clock.
+        guess that decides what a fit sees (``attrs["reading_doubts"]`` those that stated roles do not
+        settle), ``attrs["name"]`` the file's stem and cut, ``attrs["sha256"]`` the hash of the file's data,
+        ``attrs["began"]`` the date and time of the first row, if the file has a clock.
 
     Raises
     ------
@@ -148,15 +148,16 @@ def read_log(
         log.attrs.update({k: v for k, v in table.meta.items() if k not in ("schema", "version")})
     else:
         repaired = _repair(read.clock.seconds, read.values, read.units, roles.of, table)
-        roles = replace(roles, doubts=(*_reading_doubts(roles.of, repaired), *roles.doubts))
+        repairs = [*read.repairs, *repaired.repairs]
+        of_clock = [line for line in repairs if isinstance(line, repair.ClockDoubt)]
+        doubts = [line for line in repairs if isinstance(line, repair.Doubt) and line not in of_clock]
+        findings = [*doubts, *_reading_doubts(roles.of, read.units, repaired)]
         if outputs is None:
             roles = _without_half_lost(roles, repaired.time, repaired.columns)
-        repairs = [*read.repairs, *repaired.repairs]
         log = _made(repaired._replace(repairs=repairs), read, roles, file)
-        of_clock = [line for line in repairs if isinstance(line, repair.ClockDoubt)]
-        others = [line for line in repairs if isinstance(line, repair.Doubt) and line not in of_clock]
         log.attrs["clock_doubts"] = "\n".join(filter(None, [read.clock.doubt, *of_clock]))
-        log.attrs["role_doubts"] = "\n".join([*others, *roles.doubts])
+        log.attrs["reading_doubts"] = "\n".join(line for line in findings if NO_NUMBERS not in line)
+        log.attrs["role_doubts"] = "\n".join([*findings, *roles.doubts])
     for header, name in read.names_of.items():
         if (words := table.attrs.get(header, {}).get("flag_meanings")) and name in log:
             log[name].attrs["flag_meanings"] = words
@@ -398,9 +399,7 @@ def _repair(
     again = np.diff(time) == 0
     alike = np.all([(v[1:] == v[:-1]) | np.isnan(v[1:]) for v in columns.values()], axis=0)
     # else the clock is coarse; where nothing moves nobody can tell
-    written_twice = (
-        again.any() and alike[again].all() and 2 * np.count_nonzero(alike[~again]) < (~again).sum()
-    )
+    written_twice = again.any() and alike[again].all() and 2 * alike[~again].sum() < (~again).sum()
     once = np.append(True, ~(again & written_twice))
     ordered = repair.order_rows(time[once], table.lines[once], table.file)
     time, repairs = ordered.time, ordered.repairs
@@ -443,14 +442,13 @@ def _repair(
     return _Repaired(time, columns, repairs)
 
 
-def _reading_doubts(roles: Mapping[str, str], log: _Repaired) -> list[str]:
+def _reading_doubts(roles: Mapping[str, str], units: Mapping[str, str], log: _Repaired) -> list[str]:
     """Return a line for each reading with runs like a sensor's code, or a jump that no input makes."""
     drives = {name: values for name, values in log.columns.items() if roles[name] == "input"}
-    inputs = [*drives.values()]
     readings = {name: v for name, v in log.columns.items() if roles[name] in ("output", "disturbance")}
-    doubts = [repair.doubt_readings(name, values, inputs, log.time) for name, values in readings.items()]
+    doubts = [repair.doubt_readings(name, v, [*drives.values()], log.time) for name, v in readings.items()]
     for name, values in drives.items():
-        doubts += [repair.doubt_levels(name, values), repair.doubt_moves(name, values)]
+        doubts += [repair.doubt_levels(name, values, units[name]), repair.doubt_moves(name, values)]
     for name in [name for name in readings if roles[name] == "output"]:
         doubts.append(repair.doubt_rows(name, readings[name]))
         doubts += [repair.doubt_lead(name, readings[name], *drive, log.time) for drive in drives.items()]

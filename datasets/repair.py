@@ -71,8 +71,7 @@ def order_rows(time: Array, lines: NDArray[np.int64], file: str) -> OrderedRows:
         raise UserError("has no time", file=file, row=row, column="time", hint=hint)
     if lost.any():
         rows = rows[~lost]
-        count = int(lost.sum())
-        repairs.append(f"{count} row{_s(count)} without a time dropped ({name_rows(lines[lost])})")
+        repairs.append(f"{lost.sum()} row{_s(lost.sum())} without a time dropped ({name_rows(lines[lost])})")
     steps = np.diff(time[rows])
     if (steps < 0).any():
         at = int(np.argmax(steps < 0))
@@ -103,15 +102,16 @@ def describe_steps(time: Array) -> list[str]:
     """Return a line if the time stamps are uneven by more than 2 % of their median step."""
     step = np.diff(time)
     median = float(np.median(step))
+    quarter = step.size // 4 + 1
+    first, last = (float(np.median(part)) for part in (step[:quarter], step[-quarter:]))
+    if not 1 / _OTHER_STEP < last / first < _OTHER_STEP:
+        says = f"rows are {first:.4g} s apart at first and {last:.4g} s at last"
+        return [ClockDoubt(f"{says}: is the unit the same? cut the log there, or average it")]
     usual = step[step <= max(GAP_SECONDS, GAP_STEPS * median)]
     low, high = float(usual.min()), float(usual.max())
     if high - low <= 0.02 * median:
         return []
     says = f"time stamps are uneven: median step {median:.4g} s, {low:.4g} to {high:.4g} s"
-    quarter = usual.size // 4 + 1
-    first, last = (float(np.median(part)) for part in (usual[:quarter], usual[-quarter:]))
-    if not 1 / _OTHER_STEP < last / first < _OTHER_STEP:
-        return [ClockDoubt(f"{says}, {first:.4g} s at first and {last:.4g} s at last: is the unit the same?")]
     return [f"{says}; kept as they are"]
 
 
@@ -215,8 +215,9 @@ def _longest_standstill(values: Array, moves: Array) -> tuple[float, int]:
     return max(rows_at.items(), key=lambda item: item[1], default=(np.nan, 0))
 
 
-def doubt_levels(name: str, values: Array) -> str:
-    """Return the doubt on an input with two levels or more that come again, as multiples, after some row."""
+def doubt_levels(name: str, values: Array, unit: str) -> str:
+    """Return the doubt on the unit of an input: two levels or more come again, as multiples, after some row,
+    or in percent it goes beyond its full scale, or to a hundredth of that."""
     levels = np.unique(values[values != 0])
     for factor in _OTHER_SCALES if levels.size <= _MOST_LEVELS else ():
         small = [v for v in levels.tolist() if np.isclose(levels, v * factor, rtol=1e-3).any()]
@@ -226,7 +227,10 @@ def doubt_levels(name: str, values: Array) -> str:
             row = max(rows.min(), large.min())
             says = f"{name} has other levels from row {row + 1} on, {factor:g} times apart"
             return f"{says}: did its unit change?"
-    return ""
+    highest = float(np.max(np.abs(values)))
+    if unit != "percent" or highest == 0 or 1 < highest <= 100 * (1 + _FEW):
+        return ""
+    return f"{name} goes to {highest:g} percent: if it is none, name it {name}_0_255 or without a unit"
 
 
 def doubt_moves(name: str, values: Array) -> str:
@@ -295,8 +299,6 @@ def doubt_lead(name: str, values: Array, drive: str, moved: Array, time: Array) 
 
 def doubt_rows(name: str, values: Array) -> str:
     """Return the doubt on an output that is read in n-th rows only, held or drawn straight between."""
-    if np.isnan(values).any():
-        return ""
     for between, goes_on in _goes_on(values).items():
         rows = np.flatnonzero(~goes_on)
         if rows.size < SPIKE_WINDOW or (n := int(np.median(np.diff(rows)))) < 2:
@@ -332,8 +334,7 @@ def _rows_beyond_jumps(values: Array, rows: Mask) -> Mask:
     # without a move it is no reading: it is held between levels, and the code may be one of them
     if values.size < SPIKE_WINDOW or not rows.any() or rows.all() or not usual.any():
         return np.zeros(values.size, dtype=bool)
-    # a column that rarely moves does so by its steps
-    # more than five times what the other rows rarely move: a kettle that passes 85 degC does not jump there;
+    # beyond its steps, and what other rows rarely move: a kettle that passes 85 degC does not jump there
     least = _CODE_JUMP * max(float(np.quantile(usual, 0.99)), float(usual[usual > 0].min()))
     between, beyond_jumps = rows[1:] ^ rows[:-1], rows.copy()
     edges = np.flatnonzero(np.diff(rows.astype(int), prepend=0, append=0))

@@ -57,6 +57,7 @@ _BOOKKEEPING = re.compile(
     r"|ms|msec|hour|day|month|year|week|weekday|row|index|id|iteration|sample|record|counter"
     r"|i[as]e|mean|std_?(dev)?|min|max|batt(ery)?(_level|_u?v)?)(_of_[a-z]+|_?no|_?\d+)?$"
 )
+_ESTIMATES = ("_hat", "hat", "_est", "_estimate", "_estimated", "_pred", "_predicted", "_filtered")
 _MODES = {"auto", "automatic", "manual", "mode", "status"}  # of a controller
 IS_SET_POINT = "its name is that of a set point"
 _IS_BOOKKEEPING = "its name is that of a number of the clock, the controller or a statistic"
@@ -137,8 +138,9 @@ def assign_roles(
             chosen[name] = role
     stated = dict(given or {}) | chosen
     guesses = {n: explain_role(n, unit) for n, unit in units.items() if n not in stated}
-    requests = {f"asked_{n}": n for n in units}
-    guesses |= {n: ("other", f"it is what was asked of {requests[n]}") for n in guesses if n in requests}
+    made_of = {f"asked_{n}": f"it is what was asked of {n}" for n in units}
+    made_of |= {f"{n}{end}": f"it is an estimate of {n}" for n in units for end in _ESTIMATES}
+    guesses |= {n: ("other", made_of[n]) for n in guesses if n in made_of}
     evidence: _Guesses = {}  # of the data alone
     if columns is not None:
         if all(len(values) >= EVIDENCE.fewest_rows for values in columns.values()):

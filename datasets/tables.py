@@ -59,9 +59,7 @@ STAMP = re.compile(
 )
 _TIME_OF_DAY = r"((?:\d{1,4}[-/.]\d{1,2}[-/.]\d{1,4}[ T]+)?\d{1,2}:\d{2}:\d{2}(?:[.,:]\d+)?)"
 _KLIPPER = "Stats "  # then seconds, and sections of the board, the host and heaters
-_LINE_STAMP = re.compile(
-    r"\W{0,2}" + _TIME_OF_DAY + rf"|{_KLIPPER}(\d+\.\d+):"
-)  # how a line of a program's log begins: a stamp, or Klipper's seconds
+_LINE_STAMP = re.compile(r"\W{0,2}" + _TIME_OF_DAY + rf"|{_KLIPPER}(\d+\.\d+):")  # begins a line
 _TERMINAL = re.compile(r"(?m)^\[?" + _TIME_OF_DAY + r"(?:\]|\s+->)[ \t]*")  # PuTTY, Arduino's monitor
 _ESPHOME = re.compile(r"\[(\d{2}:\d{2}:\d{2}[.\d]*)\].*?: '([^',]+)': Sending state ([-+.\d]+|ON|OFF)\b")
 _OF_HEATERS = ("target", "temp", "pwm")  # of a section of Klipper's statistics; what follows is the host's
@@ -211,10 +209,11 @@ def find_layout(text: str, file: str, *, named: bool = False) -> Layout:
     hollow = not header[-1] and all(row[-1] == "" for row in rows)  # every line ends with a separator
     nameless = [f"c{place}" for place, name in enumerate(header[: n - hollow], 1) if not name]
     above = _cells_of_names(head[first - 1][1], n, separator) if first else []
-    if 1 < len(above) == n - 1 and _number_share(above) < 0.5 and not (hollow or named):
-        # commas may be decimals, or the first column be without a name: each name would be another column's
+    # commas may be decimals, or the first column be without a name: each name would be another column's
+    fewest = n - 1 if separator != "," or any("." in cell for row in rows for cell in row) else n / 2
+    if max(fewest, 2) <= len(above) < n and _number_share(above) < 0.5 and not (hollow or named):
         hint = f"name all with --columns {','.join(['NAME'] * n)}, or write decimals with a point"
-        raise UserError(f"has {n - 1} names above rows of {n} cells", file=file, hint=hint)
+        raise UserError(f"has {len(above)} names above rows of {n} cells", file=file, hint=hint)
     notes = []
     if len(nameless) == n - hollow:
         why = f"{len(above)} names above rows of {n} cells" if len(above) not in (0, 1, n) else "no header"
@@ -462,11 +461,8 @@ def _parse_table(
     if not rows:
         raise UserError("has a header but no rows", file=file, hint="give at least two rows")
     lines = np.array([line for line, _ in rows], dtype=np.int64)
-    cells_of = {
-        name: cells
-        for name, cells in zip(names, zip(*(cells for _, cells in rows)))
-        if not name.startswith(_LEFT_OUT)
-    }
+    by_name = zip(names, zip(*(cells for _, cells in rows)))
+    cells_of = {name: cells for name, cells in by_name if not name.startswith(_LEFT_OUT)}
     columns = [
         Column(name, text=[from_csv(cell.strip()) for cell in cells])
         if is_text(name)

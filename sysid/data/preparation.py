@@ -76,8 +76,8 @@ def _guesses(logs: Sequence[Log]) -> dict[str, str]:
 
 
 def role_doubts(logs: Sequence[Log], *, named_all: bool) -> tuple[str, ...]:
-    """Return the guesses of clock and roles that decide what was fitted; roles that are named are none."""
-    kinds = ["clock_doubts"] + ([] if named_all else ["role_doubts"])
+    """Return what is in doubt and decides what was fitted: where roles are named, clock and readings."""
+    kinds = ["clock_doubts", "reading_doubts" if named_all else "role_doubts"]
     lines = [line for log in logs for kind in kinds for line in str(log.attrs.get(kind, "")).splitlines()]
     return tuple(dict.fromkeys(lines))
 

@@ -796,26 +796,12 @@ def test_a_unit_behind_each_number_is_the_column_s(write):
     np.testing.assert_allclose(column(log, "Tank"), 20 + np.arange(9) / 1.8)
 
 
-@pytest.mark.parametrize(
-    ("heater_moves", "said"), [(False, "plate jumps to -46.85 and stays in 30 rows"), (True, "")]
-)
-def test_runs_of_an_unknown_code_are_asked_about_unless_a_drive_makes_them(write, heater_moves, said):
-    heater = np.repeat([20, 80, 50, 90, 30, 70], 100)
-    plate = 25 + heater / 10 + 0.1 * np.random.default_rng(0).standard_normal(600)
-    for start in (130, 330, 530):
-        plate[start : start + 10] = -46.85
-        heater[start : start + 10] *= 0 if heater_moves else 1
-    rows = "".join(f"{k},{u},{y:.2f}\n" for k, (u, y) in enumerate(zip(heater, plate)))
-    doubts = read_log(write("time_s,heater,plate_degC\n" + rows)).attrs["role_doubts"]
-    assert said in doubts
-    assert ("jumps" in doubts) == bool(said)
-
-
 PLACES = np.arange(600)
 HEATER = np.random.default_rng(1).choice([20.0, 50.0, 90.0], 30).repeat(20)
 PLATE = np.convolve(HEATER, np.ones(60) / 60)[:600] + 0.1 * np.random.default_rng(0).standard_normal(600)
 LATER = (PLACES >= 300) * 1.0
 SLOW = lfilter([0.03], [1, -0.97], HEATER) + 0.05 * np.random.default_rng(0).standard_normal(600)
+CODE = (PLACES % 200 > 125) & (PLACES % 200 < 136)
 SHUFFLED_IN_FIVES = np.random.default_rng(0).permuted(PLACES[2:597].reshape(-1, 5), axis=1).ravel()
 
 
@@ -828,6 +814,16 @@ SHUFFLED_IN_FIVES = np.random.default_rng(0).permuted(PLACES[2:597].reshape(-1, 
         (PLACES, HEATER, np.repeat(PLATE[::10], 10), "read in every 10th row only, held"),
         (PLACES, HEATER, np.interp(PLACES, PLACES[::10], PLATE[::10]), "10th row only, drawn straight"),
         (PLACES, HEATER, np.where((PLACES > 300) & (PLACES < 340), PLATE[300], PLATE), "is held at"),
+        (PLACES, HEATER, np.where(CODE, -46.85, PLATE), "plate jumps to -46.85 and stays in 30 rows"),
+        (
+            PLACES,
+            np.where(CODE, 0, HEATER),
+            np.where(CODE, -46.85, PLATE),
+            "is held at -46.85",
+        ),  # by the heater
+        (PLACES, HEATER, np.minimum(PLATE, 60), "plate is held at 60 for "),  # a sensor at its end
+        (PLACES, 2.55 * HEATER, PLATE, "heater goes to 229.5 percent: if it is none, name it heater_0_255"),
+        (PLACES, HEATER / 100, PLATE, "heater goes to 0.9 percent: if it is none"),
         (PLACES, HEATER, PLATE[np.minimum(PLACES + 10, 599)], "plate moves 11 s before heater does"),
         (PLACES, HEATER, PLATE + LATER * (32 + 0.8 * PLATE), "stays there, as nowhere else"),
         (PLACES, HEATER * np.where(LATER, 2.55, 1), PLATE, "2.55 times apart: did its unit change"),
@@ -836,16 +832,17 @@ SHUFFLED_IN_FIVES = np.random.default_rng(0).permuted(PLACES[2:597].reshape(-1, 
         (PLACES, np.where((PLACES > 200) & (PLACES < 360), 90, HEATER), SLOW, "with heater held"),
         (np.r_[:2, SHUFFLED_IN_FIVES, 597:600], HEATER, PLATE, "to and fro in 18 of its 18 moves"),
         (PLACES, np.interp(PLACES, PLACES[::5], HEATER[::5]), PLATE, "in 5 rows, 18 times: is it an average"),
-        (PLACES, np.interp(PLACES, PLACES[::5], 1.0 * (HEATER[::5] > 30)), PLATE, ""),  # of a limited rate
+        (PLACES, np.interp(PLACES, PLACES[::5], 9.0 * (HEATER[::5] > 30)), PLATE, ""),  # of a limited rate
         (PLACES, HEATER, np.floor(PLATE / 4 + 0.9 * (PLACES % 2)), ""),  # a coarse reading that flickers
     ],
 )
 def test_columns_that_are_not_one_course_of_one_unit_are_doubts(write, order, heater, plate, doubt):
     cells = zip(PLACES, heater[order], plate[order])
-    text = "time_s,heater,plate_degC\n" + "".join(f"{k},{u:g},{y:.3f}\n" for k, u, y in cells)
+    text = "time_s,heater_percent,plate_degC\n" + "".join(f"{k},{u:g},{y:.3f}\n" for k, u, y in cells)
     doubts = read_log(write(text)).attrs["role_doubts"]
     assert doubt in doubts
     assert bool(doubts) == bool(doubt)
+    assert doubt in read_log(write(text), ["heater"], ["plate"]).attrs["reading_doubts"]  # roles settle none
 
 
 def test_what_comes_late_in_a_long_log_counts_as_what_comes_first(write):
@@ -893,12 +890,13 @@ def test_rows_that_were_written_twice_are_read_once(write):
     assert "40 rows dropped that repeat the one before and its time" in log.attrs["repairs"]
 
 
-def test_a_sensor_at_its_end_is_asked_about(write):
-    heater = np.repeat([20, 80, 50, 90, 30, 70], 100)
-    plate = np.convolve(heater, np.ones(60) / 60)[:600] + np.random.default_rng(0).standard_normal(600)
-    rows = "".join(f"{k},{u},{min(y, 60):.1f}\n" for k, (u, y) in enumerate(zip(heater, plate)))
-    doubts = read_log(write("time_s,heater,plate_degC\n" + rows)).attrs["role_doubts"]
-    assert "plate is held at 60 for " in doubts
+def test_a_supply_that_the_weather_sets_is_asked_about(write):
+    outside = np.round(10 + 8 * np.sin(PLACES / 40), 1)
+    supply = np.round(60 - 1.3 * outside)
+    room = lfilter([0.03], [1, -0.97], supply) + 0.05 * np.random.default_rng(0).standard_normal(600)
+    rows = "".join(f"{k},{u:g},{w},{y:.2f}\n" for k, (u, w, y) in enumerate(zip(supply, outside, room)))
+    log = read_log(write("time_s,supply_degC,outside_degC,room_degC\n" + rows), ["supply"], ["room"])
+    assert "supply is computed from outside: their effects cannot" in log.attrs["reading_doubts"]
 
 
 def test_a_server_s_readings_of_bad_quality_are_asked_about(write):

@@ -175,6 +175,9 @@ def test_even_stamps_are_not_worth_a_line_and_uneven_ones_are():
     assert describe_steps(np.arange(50) * 0.1) == []
     uneven = np.cumsum(np.tile([0.18, 0.2, 0.22], 30))
     assert describe_steps(uneven)[0].startswith("time stamps are uneven: median step 0.2 s, 0.18 to 0.22 s")
+    assert describe_steps(np.r_[:9000:300, 9000:9900:10])[0].startswith(
+        "rows are 300 s apart at first and 10 s"
+    )
 
 
 def test_a_gap_is_longer_than_ten_seconds_and_five_steps():

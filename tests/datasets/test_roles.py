@@ -352,6 +352,7 @@ def test_roles_that_the_course_alone_shows_are_doubts():
     assert roles.of == {"c1": "input", "c2": "output"}
     assert len(roles.doubts) == 2
     assert assign_roles({"q1": "1", "t1": "1"}, columns={"q1": drive, "t1": plant_of(drive)}).doubts == ()
+    assert assign_roles(dict.fromkeys(["u", "y", "y_hat", "yhat"], "1")).of["y_hat"] == "other"
 
 
 @pytest.mark.parametrize(

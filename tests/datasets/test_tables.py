@@ -154,6 +154,7 @@ LEFT = "row(s) with too few or too many cells left out"
         ('a,b\n1,2\n"3,4\n5,6\n', "", "row 3: has 1 cell(s), the header has 2; complete"),
         ("a,b\n1,1_0\n2,3\n", "", "'1_0' is not a number"),
         ("a,b\n1,2,5\n2,3,5\n", "", "2 names above rows of 3 cells; name all with --columns NAME,NAME"),
+        ("a,b\n1,2,5,5\n2,3,5,1\n", "", "2 names above rows of 4 cells; name all with"),  # decimal commas
         ('"t" "u"\n"1" 0 5\n"2" 1 5\n', "", "has 2 names above rows of 3 cells"),  # as R writes row names
         (rows(9, {4: "b,a\n"}), "", "row 6: the header stands again with other columns: 'b,a'; cut the file"),
         ('a {"T":1,"U":2}\nb {"T":1}\n' * 9, "", "lines of several kinds are none)"),
@@ -390,7 +391,7 @@ def test_utf_16_text_is_read_and_is_refused_where_it_ends_within_a_letter(tmp_pa
 def test_names_that_are_more_than_the_cells_are_not_given_to_them(tmp_path):
     path = tmp_path / "a.csv"
     for n in (3, 6):
-        rows = "".join(",".join(str(k % (7 + place) + place) for place in range(n)) + "\n" for k in range(30))
+        rows = "".join(",".join(f"{k % (7 + place)}.5" for place in range(n)) + "\n" for k in range(30))
         path.write_text(f"time,round,output,temperature\n{rows}")
         table = read_text_table(path)
         assert list(table.numbers) == [f"c{place}" for place in range(1, n + 1)]

@@ -7,7 +7,7 @@ import pytest
 
 from tests.sysid.models.makers import steady_gain
 from thermogrip.datasets.schema import make_log
-from thermogrip.sysid.data.preparation import with_rest
+from thermogrip.sysid.data.preparation import role_doubts, with_rest
 from thermogrip.sysid.identification import identify
 from thermogrip.sysid.validation.free_run import free_run
 
@@ -62,6 +62,12 @@ def test_a_later_move_of_any_log_tells_the_gain_of_all():
         [step_test(), step_test(level=30.0, name="b"), step_test(at=0, name="c")], ["q"], ["t"]
     )
     assert ([log.sizes["time"] for log in longer], len(said)) == ([N + 50, N + 50, N], 2)
+
+
+def test_named_roles_settle_no_doubt_on_readings():
+    log = step_test().assign_attrs(clock_doubts="dt", reading_doubts="t jumps", role_doubts="t jumps\nq is")
+    for named_all, doubts in ((False, ("dt", "t jumps", "q is")), (True, ("dt", "t jumps"))):
+        assert role_doubts([log], named_all=named_all) == doubts
 
 
 @pytest.mark.parametrize("kind", ["arx", "subspace"])
