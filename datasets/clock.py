@@ -28,7 +28,7 @@ _TIME_UNITS = ("1", "s", "ms", "min")
 _TIME_NAME = re.compile(
     r"(?i)((elapsed|rel|relative|abs|unix|epoch|utc|local|system|log|sample|test|run|date|last)_?)*"
     r"(time|timestamp|time_stamp|date|zeit|uhrzeit|datum|tijd|seconds?|secs?|millis|milliseconds|micros|minutes"
-    r"|hours|x_value|epoch|clock|uptime|changed|updated|t|ts|ms|us)(_(utc|local|stamp|elapsed|abs|rel))?"
+    r"|hours|x_value|epoch|clock|uptime|elapsed|changed|updated|t|ts|ms|us)(_(utc|local|stamp|elapsed|abs|rel))?"
 )
 _COUNTER = re.compile(r"(?i)x|n|k|i|no|nr|id|index|idx|samples?|rows?|steps?|count(er)?|unnamed.*")
 _IN_SECONDS = re.compile(r"(?i)(.*_)?(s|secs?|seconds?|sekunden|x_value|uptime)")  # X_Value is LabVIEW's

@@ -407,7 +407,9 @@ def _repair(
         repairs.append(f"{again.sum()} rows dropped that repeat the one before and its time")
     columns = {name: values[once][ordered.rows] for name, values in columns.items()}
     if time.size < 2:
-        raise UserError(f"{time.size} row(s) are not a log", file=table.file, hint="give at least two rows")
+        why = [note for note in table.notes if isinstance(note, repair.Doubt)]
+        problem = "; ".join([f"{time.size} row(s) are not a log", *why])
+        raise UserError(problem, file=table.file, hint="give at least two rows")
     repairs += repair.doubt_repeats([*columns.values()], table.lines[once][ordered.rows])
     if time[0] >= EPOCH[0]:
         repairs.append(f"time is a clock of seconds since 1970: counted from the first row, {time[0]:.0f} s")

@@ -146,9 +146,12 @@ def find_spikes(values: Array, *, floor: float | None) -> Mask:
 
     good = values[finite_rows]
     deviation = good - median_filter(good, size=SPIKE_WINDOW, mode="nearest")
-    # |d| > max(floor, 6 s) with s = 1.4826 median |d| over the whole channel, d the deviation from the median
+    # |d| > max(floor, 6 s), d the deviation from the median, s = 1.4826 median |d| over the whole channel, or
+    # the noise of its converter, whose readings go to and fro by a count
     usual = 1.4826 * float(np.median(np.abs(deviation)))
-    threshold = max(_floor(good) if floor is None else floor, 6 * usual)
+    if floor is None:  # 2 % of the channel's 1-99 % range, and at least five of its smallest increments
+        floor = max(0.02 * float(np.ptp(np.percentile(good, [1, 99]))), 5 * _smallest_step(good))
+    threshold = max(floor, 6 * max(usual, _converter_step(good) / np.sqrt(12)))
     is_far = np.abs(deviation) > threshold
     entered = np.concatenate([[False], np.abs(np.diff(good)) > threshold])
     for start in np.flatnonzero(is_far & entered).tolist():
@@ -272,6 +275,13 @@ def _smallest_step(values: Array) -> float:
     return float(moves[moves > 0].min(initial=np.inf))
 
 
+def _converter_step(values: Array) -> float:
+    """Return the step between most of the levels of a coarse reading, 0 of one whose levels lie otherwise."""
+    steps = np.diff(np.unique(values))
+    alike = steps.size >= _FEWEST_ALIKE and np.isclose(np.median(steps), steps.min())
+    return float(steps.min()) if alike else 0.0
+
+
 def doubt_lead(name: str, values: Array, drive: str, moved: Array, time: Array) -> str:
     """Return the doubt on a reading that bends before a drive moves, as under no plant and no controller."""
     rows = np.flatnonzero(np.diff(moved)) + 1
@@ -352,16 +362,18 @@ def drop_stuck(name: str, values: Array, inputs: Sequence[Array]) -> tuple[Array
             travel[1:] += np.cumsum(np.abs(np.nan_to_num(np.diff(u))) / span)
     for how, goes_on in _goes_on(values).items() if values.size >= SPIKE_WINDOW else ():
         # a settled reading stands still, but not through moves; one with noise goes straight in no rows
-        trials = travel if how == "held" else np.arange(values.size)
+        trials = travel
         if how != "held":  # by a step or none in a row a coarse reading goes straight too
-            goes_on = goes_on & (np.abs(np.diff(values)) > 1.5 * _smallest_step(values))
+            moves = np.abs(np.diff(values)) > 1.5 * _smallest_step(values)
+            goes_on, trials = goes_on & moves, np.append(0.0, np.cumsum(moves))
         ends = np.flatnonzero(np.append(~goes_on, True))
         starts = np.append(0, ends[:-1] + 1)
         passed = trials[ends] - trials[starts]
         longest = int(np.argmax(passed))
         run, most = slice(int(starts[longest]), int(ends[longest]) + 1), float(passed[longest])
         # but for the first row of each run: its reading is from before its move
-        others = float(np.maximum(np.delete(passed, longest) - 1, 0).sum())
+        first_moves = trials[np.minimum(starts + 1, ends)] - trials[starts]
+        others = float(np.delete(passed - first_moves, longest).sum())
         # With M the trials (moves of the inputs, in ranges; rows) of the whole log, m those within the run
         # that has most of them and k those within all other runs, a sound reading goes on through one with a
         # chance of about p = (k + 1) / (M - m + 2) (Laplace's rule); none where p^(m - 1) is under 1e-3.
@@ -419,12 +431,6 @@ def check_plausible(name: str, celsius: Array, file: str) -> list[str]:
     if median < -150:  # it was converted
         return [f"{name}: median of {median:.1f} degC; is the column really in kelvin?"]
     return []
-
-
-def _floor(values: Array) -> float:
-    low, high = np.percentile(values, [1, 99])
-    # 2 % of the channel's 1-99 % range, and at least five of its smallest increments
-    return max(0.02 * float(high - low), 5 * _smallest_step(values), np.finfo(float).tiny)
 
 
 def _leaves_and_returns(values: Array, start: int, stop: int, threshold: float) -> bool:

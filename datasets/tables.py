@@ -648,11 +648,9 @@ def _matlab_table(path: Path, columns: Sequence[str] | None) -> Table:
     from scipy.io.matlab import MatReadWarning
 
     source: Any = io.BytesIO(raw)  # the stubs know names only
-    hint = (
-        "save the signals alone, as vectors or a matrix (timeseries, tables and functions are MATLAB's own)"
-    )
+    hint = "save the signals alone, as vectors or a matrix (no timeseries, datetimes, tables, functions)"
     with reading("is no MATLAB file, or is damaged", file=path, hint="save it again"):
-        with as_user_error(TypeError, "has functions among its variables", file=path, hint=hint):
+        with as_user_error(TypeError, "has MATLAB's own objects among its variables", file=path, hint=hint):
             declared = sum(8 * math.prod(shape) for _, shape, _ in whosmat(source))
         limits.check_unpacked(len(raw), declared, file=path, what="declares")
         with warnings.catch_warnings():

@@ -52,13 +52,14 @@ DRIVE = re.compile(
     r"|actuator|control|relay|mv|q[hc]|[qu])(\d*|_.*)$"
 )
 _LONGEST_HEADER = 200  # characters of a header that is looked through for a unit
+_RATE = re.compile(r".+_(?:[mN]?[lL]|m|Nm3|m3|k?g|gal|rev|K|C|degC)_(?:s|min)")  # per time, which no time is
 
 
 def split_header(header: str, *, file: str | None = None) -> tuple[str, str]:
     """Return the variable name and the unit of a column header (``"1"`` without a suffix); UserError if the
     suffix is like a unit that is not read, or nothing is left as a name."""
     header = header.strip()
-    unit = next((unit for unit in UNITS if header.endswith(f"_{unit}")), "1")
+    unit = next((unit for unit in UNITS if header.endswith(f"_{unit}") and not _RATE.fullmatch(header)), "1")
     name, read = header.removesuffix(f"_{unit}") if unit != "1" else header, read_header(header)
     if unit == "1" and read.unit != "1":
         rename = f"rename the column to {read.name}_{read.unit}"
@@ -87,7 +88,7 @@ def read_header(header: str, others: Sequence[str] = ()) -> Header:
     header = header.strip()
     # a letter that others continue is no unit: zone_a, zone_b, zone_c
     series = any(f"{header[:-1]}{letter}" in others for letter in "abdeABDE" if letter != header[-1:])
-    for unit in UNITS:
+    for unit in UNITS if _RATE.fullmatch(header) is None else ():
         if header.endswith(f"_{unit}") and not (series and len(unit) == 1):
             return Header(_bare_name(header.removesuffix(f"_{unit}")), unit, 1.0)
     match = _UNIT_AT_END.fullmatch(header) if len(header) <= _LONGEST_HEADER else None

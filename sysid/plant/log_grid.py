@@ -65,6 +65,12 @@ class Rows(Segment):
         """The median time between rows [s]."""
         return float(np.median(np.diff(self.time)))
 
+    @property
+    def recorded(self) -> float:
+        """The time [s] that the rows cover, without the gaps."""
+        in_gaps = np.diff(self.time)[np.array(self.after, dtype=int) - 1]
+        return float(np.ptp(self.time) - in_gaps.sum())
+
     def from_row_on(self) -> Rows:
         """Return inputs that were applied up to their rows as inputs that are applied from them on."""
         return replace(self, u=np.concatenate([self.u[1:], self.u[-1:]]))
@@ -141,9 +147,8 @@ def make_grid(
     native = float(np.median([rows_of_log.step for rows_of_log in rows]))
     step, why = _chosen_step(rows, y, native) if average is None else (float(average), "asked for")
     if step < native * 0.999:
-        raise UserError(
-            f"averaging over {step:g} s is shorter than the sample time {native:g} s", hint="average longer"
-        )
+        problem = f"averaging over {step:g} s is shorter than the sample time {native:g} s"
+        raise UserError(problem, hint="average longer")
     segments = [
         segment
         for rows_of_log in rows
@@ -344,7 +349,7 @@ def quantum(values: Array) -> float:
 def dominant_time(logs: Sequence[Rows]) -> float:
     """Return the time constant [s] that dominates the outputs, from a first-order model at a coarse step; a
     twentieth of the longest log where the data give no stable answer."""
-    longest = max(float(np.ptp(rows.time)) for rows in logs)
+    longest = max(rows.recorded for rows in logs)
     native = max(rows.step for rows in logs)
     steps = [max(step, native) for step in (longest / 400, longest / 150)]
     segments = [
@@ -357,7 +362,7 @@ def dominant_time(logs: Sequence[Rows]) -> float:
 def _chosen_step(logs: Sequence[Rows], outputs: Sequence[str], native: float) -> tuple[float, str]:
     """Return the averaging step [s], a whole multiple of the sample time, and which of the rules set it."""
     slow = dominant_time(logs)
-    longest = max(float(np.ptp(rows.time)) for rows in logs)
+    longest = max(rows.recorded for rows in logs)
     most = min(slow / 10, longest / 200)  # whatever the time constant, rows must be left to fit
     needed = max(native, slow / 100)  # finer steps cost time and add nothing
     why = "the logs' own" if needed == native else f"a hundredth of the dominant time constant, {slow:.3g} s"

@@ -83,7 +83,7 @@ def room(bench: Bench, stand_in: StandIn, monkeypatch: pytest.MonkeyPatch) -> Si
 
     made = SimpleNamespace(bench=bench, like="gripper", found=found_of(), record=None, dynamics=DYNAMICS)
     made.asked = stand_in("thermogrip.sysid.export.dynamics.plant_dynamics", lambda *_, **__: made.dynamics)
-    made.read = stand_in("thermogrip.datasets.log_files.read_log", log)
+    made.read, made.log = stand_in("thermogrip.datasets.log_files.read_log", log), log
     made.networks = stand_in("thermogrip.cli.options.find_network", load_network)
     made.fits = stand_in(f"{IDENTIFICATION}.identify", fit)
     made.shipped = stand_in(
@@ -234,7 +234,13 @@ def test_a_guess_that_decides_is_a_warning_and_the_command_that_states_it_comes_
     room.found = found_of(good=False, doubts=("c2 is taken as input",), signals=nameless)
     last_line = room.bench.run("identify", "good.csv", "--out", "p.json").err.splitlines()[-1]
     assert "--inputs c2 --outputs c3 --out p.json  # better, name its columns in their order" in last_line
+    for doubt, step in (("t1 is taken as the time", "1"), ("no column is a clock", "S")):  # nobody knows it
+        room.log.attrs["clock_doubts"] = doubt
+        assert (
+            f"--outputs c3 --dt {step} --out" in room.bench.run("identify", "good.csv", "--out", "p.json").err
+        )
     named = tuple(replace(signal, guessed=False) for signal in signals)  # no roles will mend the other doubts
+    room.log.attrs["clock_doubts"] = ""
     room.found = found_of(good=False, doubts=("U is far from its prior",), signals=named)
     done = room.bench.run("identify", "good.csv", "--out", "p.json")
     assert done.code == 3

@@ -45,6 +45,7 @@ def jittered(step, first=0):
         ("uptime", jittered(1000), 1.0, "taken as milliseconds"),
         ("c1", jittered(500), 0.5, "taken as milliseconds"),
         ("row", np.arange(ROWS), 1.0, "rows are 1 s apart"),
+        ("elapsed_s", 10 * (np.arange(ROWS) // 2), 5.0, ""),  # of few digits
         ("Ticks", 638_000_000_000_000_000 + 2 * 10**7 * np.arange(ROWS), 2.0, "rows 2 s apart"),  # of .NET
         ("c1", 1_700_000_000_000 + np.cumsum(np.tile([150, 400, 400, 2000], ROWS // 4)), 0.4, ""),
     ],
@@ -210,6 +211,9 @@ def test_each_start_of_labview_s_first_column_is_a_part(tmp_path):
     part = "***End_of_Header***\t\n" + rows
     (tmp_path / "twice.lvm").write_text(head + part + part)
     assert "has 2 parts with headings: only the last" in read_log(tmp_path / "twice.lvm").attrs["role_doubts"]
+    (tmp_path / "twice.lvm").write_text(head + part + "***End_of_Header***\t\n0\t1\t2\n")
+    with pytest.raises(ValueError, match="are not a log; has 2 parts with headings"):
+        read_log(tmp_path / "twice.lvm")
 
 
 def test_a_kiln_s_log_keeps_the_reading_that_has_a_blank_before_its_sign(tmp_path):

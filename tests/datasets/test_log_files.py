@@ -630,7 +630,7 @@ def test_a_matlab_file_is_a_log_of_its_columns_and_its_step(tmp_path):
 
 def test_a_matlab_file_with_functions_is_refused(tmp_path, monkeypatch):
     monkeypatch.setattr("scipy.io.whosmat", lambda _: [("f", None, "function")])
-    assert "has functions among its variables; save the signals" in refused(matlab(tmp_path, u=[1.0]))
+    assert "has MATLAB's own objects among its variables; save" in refused(matlab(tmp_path, u=[1.0]))
 
 
 def workbook(path, unpacked=b"<sheet/>"):

