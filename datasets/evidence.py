@@ -17,7 +17,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations, pairwise, product
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -25,7 +25,6 @@ from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.repair import drop_stuck, find_spikes
 
 Columns: TypeAlias = Mapping[str, Array]
-_Matrices: TypeAlias = tuple[Array, Array, Array]
 
 
 @dataclass(frozen=True)
@@ -48,9 +47,10 @@ class EvidenceSettings:
     jump: float = 10.0  # times what a column rarely moves, is no move of it
     telling_rows: int = 200  # of fewer, an effect may not be seen
     follows: float = 0.9  # share of its variance that another input explains
-    part: float = 0.4  # of a log, at each end: a change half way lies between them
-    other_unit: float = 30.0  # times as far; of 222 pairs in sound logs 18, of a drive in hundredths 94
-    moved_alone: float = 25.0  # times the errors elsewhere; of those logs 10, of held drives 14 to 138
+    parts: tuple[int, ...] = (2, 4, 8)  # that a log is cut into
+    part_block: int = 10  # rows that are averaged there: of 3 late effects are lost, of 30 fast ones
+    no_help: float = 0.8  # of the mean square error that remains is none
+    unlike: float = 8.0  # times the errors elsewhere; of 102 outputs of sound logs 6 at most
 
 
 EVIDENCE = EvidenceSettings()
@@ -155,7 +155,7 @@ def _gains(y: Array, bases: Array, beside: Sequence[Array]) -> Array:
     if not bases.size:
         return np.zeros(n_causes)
     # what the pasts of y and of others explain is taken out of all once (Frisch and Waugh 1933)
-    axes = _decomposed([np.ones(rows), *(_past(values, lags) for values in (y, *beside))])[0]
+    axes = _basis([np.ones(rows), *(_past(values, lags) for values in (y, *beside))])
     target, explained = y[lags:] - axes @ (axes.T @ y[lags:]), axes.T @ bases
     shares, directions = np.linalg.eigh(np.eye(lags) - explained.transpose(0, 2, 1) @ explained)
     shares = np.where(shares > 1e-14, shares, np.inf)[:, None]  # less is rounding: it adds nothing
@@ -168,11 +168,10 @@ def _past(values: Array, lags: int, first: int = 1) -> Array:
     return np.stack([values[lags - k : len(values) - k] for k in range(first, lags + 1)], axis=1)
 
 
-def _decomposed(terms: Sequence[Array]) -> _Matrices:
-    """Return an orthonormal basis of what columns span, its singular values and the columns' loadings."""
-    axes, sizes, loadings = np.linalg.svd(matrix := np.column_stack(terms), full_matrices=False)
-    is_usable = sizes > np.finfo(float).eps * max(matrix.shape) * sizes[0]
-    return axes[:, is_usable], sizes[is_usable], loadings[is_usable]
+def _basis(terms: Sequence[Array]) -> Array:
+    """Return an orthonormal basis of what columns span."""
+    axes, sizes, _ = np.linalg.svd(matrix := np.column_stack(terms), full_matrices=False)
+    return np.asarray(axes[:, sizes > np.finfo(float).eps * max(matrix.shape) * sizes[0]])
 
 
 def _criterion(target: Array, errors: Array, rows: int, n_new: int) -> Array:
@@ -208,7 +207,7 @@ def share_followed(values: Array, other: Array) -> float:
     from scipy.signal import lfilter
 
     filtered = [lfilter([1 / n], [1, 1 / n - 1], x)[EVIDENCE.latest :] for n in EVIDENCE.filters]
-    axes = _decomposed([np.ones(rows), _past(x, EVIDENCE.latest, first=0), *filtered])[0]
+    axes = _basis([np.ones(rows), _past(x, EVIDENCE.latest, first=0), *filtered])
     target = y[EVIDENCE.latest :]
     return 1 - float(np.var(target - axes @ (axes.T @ target)) / (np.var(target) or 1.0))
 
@@ -264,86 +263,69 @@ def role_doubts(
 def effect_doubts(
     columns: Columns, inputs: Sequence[str], outputs: Sequence[str], disturbances: Sequence[str]
 ) -> Iterator[str]:
-    """Yield a line for each output on which an input acts in another way late than early in a log, or that
-    moves where no input does."""
+    """Yield a line for each input computed from a disturbance, and for each output that does not follow the
+    inputs in some part of a log as elsewhere."""
     for name, other in product(inputs, disturbances):
         if explains(columns[name], columns[other]):
             yield f"{name} is computed from {other}: their effects cannot be estimated separately"
     names = [*inputs, *outputs, *disturbances]
     scaled = dict(zip(names, _standardised([columns[n] for n in names])))
     for output in outputs if inputs else ():
+        is_read = some_rows(np.isfinite(columns[output]).astype(float))
         drives, others = [scaled[n] for n in inputs], [scaled[n] for n in disturbances]
-        for name, ratios in zip(inputs, _ratios_of_effects(scaled[output], drives, others)):
-            # of 222 pairs in sound logs the larger is at least .53, of drives with the sign turned -.9
-            if max(ratios) < 0:
-                yield f"{name} moves {output} one way at first and the other way later: did its sign change?"
-            elif min(ratios) > 0 and max(ratios) > EVIDENCE.other_unit**2 * min(ratios):
-                size = f"{max(ratios):.3g} times as far in one part of the log as in another"
-                yield f"{name} moves {output} {size}: did its unit change?"
-        if rows := _moved_alone(scaled[output], drives, others):
-            yield f"{output} moves in {rows} rows with {', '.join(inputs)} held: what moved it there?"
+        if part := _part_unlike_others(scaled[output], drives, others, is_read):
+            says = f"{output} does not follow {', '.join(inputs)} in {part} of the log as it does elsewhere"
+            yield f"{says}: did a drive, a sensor, a unit or the step of the rows change there?"
 
 
-def _at_scale(n: int, y: Array, drives: Sequence[Array], others: Sequence[Array]) -> _Matrices:
-    """Return the means of y over n rows, what their past and others tell of them, and what drives add."""
-    of_y, *rest = _means_of_rows([y, *drives, *others], n)
-    at_once = [_past(means, 2, first=0) for means in rest]
-    known = [np.ones(of_y.size - 2), _past(of_y, 2), *at_once[len(drives) :]]
-    return of_y[2:], np.column_stack(known), np.column_stack(at_once[: len(drives)])
+def _part_unlike_others(y: Array, drives: Sequence[Array], others: Sequence[Array], is_read: Array) -> str:
+    """Return the part of a log in which drives, by their effect in the others, predict y no better than its
+    past alone does, and far worse than there; empty without one."""
+    of_y, read, *rest = _means_of_rows([y, is_read, *drives, *others], EVIDENCE.part_block)
+    whole = _past(read, 2, first=0).min(axis=1) == 1
+    if whole.sum() < 2 * EVIDENCE.fewest_rows:
+        return ""
+    at_once = [_past(means, 2, first=0)[whole] for means in rest]
+    known = [np.ones(whole.sum()), _past(of_y, 2)[whole], *at_once[len(drives) :]]
+    by_past, by_drives = (_Fit(of_y[2:][whole], terms) for terms in (known, known + at_once[: len(drives)]))
+    n_new = by_drives.basis.shape[1] - by_past.basis.shape[1]
+    for count in EVIDENCE.parts:
+        rows = len(by_past.errors) // count
+        for place in range(count if rows >= EVIDENCE.fewest_rows else 0):
+            part = slice(place * rows, (place + 1) * rows)
+            past, driven = by_past.without(part), by_drives.without(part)
+            gain = (count - 1) * rows * np.log(past.elsewhere / driven.elsewhere)
+            least = max(EVIDENCE.no_help * past.here, EVIDENCE.unlike * driven.elsewhere)
+            if gain > EVIDENCE.strong_gain + n_new * np.log(count * rows) and driven.here_fair > least:
+                return f"part {place + 1} of {count}"
+    return ""
 
 
-def _ratios_of_effects(y: Array, drives: Sequence[Array], others: Sequence[Array]) -> list[list[float]]:
-    """Return for each drive the regression of what its late moves would do by its early effect on what they
-    do, and the other way round, at the scale where both effects are clearest."""
-    clearest, ratios = [EVIDENCE.strong_gain] * len(drives), [[1.0, 1.0]] * len(drives)
-    for n in EVIDENCE.blocks:
-        target, known, acting = _at_scale(n, y, drives, others)
-        size = int(EVIDENCE.part * target.size)
-        if size < EVIDENCE.fewest_rows:
-            break
-        halves = (slice(size), slice(-size, None))
-        effects = (_added(target[rows], known[rows], acting[rows], len(drives)) for rows in halves)
-        for drive, (early, late) in enumerate(zip(*effects)):
-            if min(early[0], late[0]) > clearest[drive]:
-                clearest[drive] = min(early[0], late[0])
-                ratios[drive] = [float(early[1] @ late[2]), float(late[1] @ early[2])]
-    return ratios
+class _PartErrors(NamedTuple):
+    """Mean square errors of a fit to the rows outside of a part."""
+
+    here: float
+    here_fair: float  # less where terms go further than elsewhere: an error of an effect grows with them
+    elsewhere: float
 
 
-def _added(y: Array, known: Array, acting: Array, n_drives: int) -> Iterator[tuple[float, Array, Array]]:
-    """Yield of each drive, beside what is known and the other drives, the gain by its columns, their factors,
-    and what turns factors into a ratio to the effect of these: all from one decomposition."""
-    axes, sizes, loadings = _decomposed([known, acting])
-    explained = axes.T @ y
-    errors = y - axes @ explained
-    for of_drive in np.split(loadings[:, known.shape[1] :], n_drives, axis=1):
-        shares, directions = np.linalg.eigh(of_drive.T @ of_drive)  # 1: no other column has this direction
-        basis = np.linalg.qr(of_drive @ directions[:, shares > 1 - 1e-9] / sizes[:, None])[0]
-        own, effect = basis.T @ (sizes[:, None] * of_drive), basis.T @ explained
-        gain = float(_criterion(np.append(errors, effect), errors, y.size, own.shape[1]))
-        yield gain, np.asarray(np.linalg.pinv(own, 1e-9) @ effect), effect @ own / (effect @ effect or 1.0)
+class _Fit:
+    """A regression, and what it would be without a part of its rows."""
 
+    def __init__(self, target: Array, terms: Sequence[Array]) -> None:
+        self.basis = _basis(terms)
+        self.errors = target - self.basis @ (self.basis.T @ target)
 
-def _moved_alone(y: Array, drives: Sequence[Array], others: Sequence[Array]) -> int:
-    """Return the rows of the longest hold of all drives if y is predicted far worse in it, else 0."""
-    moves = np.flatnonzero(np.any([np.diff(u) != 0 for u in drives], axis=0)) + 1
-    if not EVIDENCE.fewest_moves <= moves.size <= EVIDENCE.held_share * y.size:
-        return 0
-    bounds = [0, *(int(row) for row in moves), y.size]
-    first, last = max(pairwise(bounds), key=lambda hold: hold[1] - hold[0])
-    for n in EVIDENCE.blocks:
-        target, known, acting = _at_scale(n, y, drives, others)
-        places = np.arange(2, 2 + target.size)
-        inside = (places >= first / n + 2) & (places < last // n - 1)
-        if min(inside.sum(), (~inside).sum()) < EVIDENCE.fewest_rows:
-            break
-        terms = np.column_stack([known, acting])
-        errors = target - terms @ np.linalg.lstsq(terms[~inside], target[~inside], rcond=1e-9)[0]
-        ((gain_elsewhere, *_),) = _added(target[~inside], known[~inside], acting[~inside], 1)
-        times = np.mean(errors[inside] ** 2) / np.mean(errors[~inside] ** 2)
-        if gain_elsewhere > EVIDENCE.strong_gain and times > EVIDENCE.moved_alone:
-            return last - first
-    return 0
+    def without(self, part: slice) -> _PartErrors:
+        """Return the errors of a fit without these rows (Woodbury's identity)."""
+        inside, elsewhere = self.basis[part], len(self.basis) - len(self.basis[part])
+        covariance = np.linalg.pinv(np.eye(inside.shape[1]) - inside.T @ inside, 1e-9, hermitian=True)
+        change = covariance @ (inside.T @ self.errors[part])
+        here = (self.errors[part] + inside @ change) ** 2
+        there = self.errors @ self.errors + change @ change - here.sum()  # errors are orthogonal to the basis
+        further = np.sum(inside @ covariance * inside, axis=1) * elsewhere / len(inside)
+        fair = float(np.mean(here / (1 + further)))
+        return _PartErrors(float(here.mean()), fair, max(float(there), 1e-12) / elsewhere)
 
 
 def _unlike_an_input(

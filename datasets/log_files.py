@@ -415,6 +415,10 @@ def _repair(
         repairs.append(f"time is a clock of seconds since 1970: counted from the first row, {time[0]:.0f} s")
         time = np.round(time - time[0], 6)
     repairs += repair.describe_steps(time)
+    for name in [name for name in columns if roles[name] == "input"]:
+        if (unknown_rows := repair.unknown_rows(columns[name], time)).any():
+            repairs.append(f"{unknown_rows.sum()} rows in which {name} is lost for longer left out")
+            time, columns = time[~unknown_rows], {n: values[~unknown_rows] for n, values in columns.items()}
     inputs, stuck = [values for name, values in columns.items() if roles[name] == "input"], False
     for name, values in columns.items():
         if roles[name] == "output" and inputs:
@@ -455,7 +459,9 @@ def _reading_doubts(roles: Mapping[str, str], units: Mapping[str, str], log: _Re
         doubts.append(repair.doubt_rows(name, readings[name]))
         doubts += [repair.doubt_lead(name, readings[name], *drive, log.time) for drive in drives.items()]
     of_role = ([n for n in log.columns if roles[n] == role] for role in ("input", "output", "disturbance"))
-    doubts += effect_doubts(log.columns, *of_role)
+    after_gap = np.isin(np.arange(log.time.size), repair.gap_rows(log.time) + 1)
+    read = {name: np.where(after_gap, np.nan, values) for name, values in readings.items()}
+    doubts += effect_doubts(log.columns | read, *of_role)
     return [doubt for doubt in doubts if doubt]
 
 

@@ -123,6 +123,18 @@ def gap_rows(time: Array) -> NDArray[np.int64]:
     return np.flatnonzero((step > GAP_SECONDS) & (step > GAP_STEPS * np.median(step)))
 
 
+def unknown_rows(values: Array, time: Array) -> NDArray[np.bool_]:
+    """Return the rows of an input's holes longer than a gap, where it is written in each row and not only as
+    it changes."""
+    filled = np.isfinite(values)
+    unknown = np.zeros(values.size, dtype=bool)
+    is_written_in_each = 2 * np.count_nonzero(filled[1:] & filled[:-1]) > np.count_nonzero(filled)
+    for row in gap_rows(time[filled]).tolist() if is_written_in_each else ():
+        before, after = np.flatnonzero(filled)[row : row + 2]
+        unknown[before + 1 : after] = True
+    return unknown
+
+
 def describe_gaps(time: Array, inputs: dict[str, Array]) -> list[str]:
     """Return a line a gap, with the inputs before and after it; of many the first ones and their number."""
     repairs = []
