@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     from thermogrip.sysid.models.model import GreyModel
     from thermogrip.sysid.plant.plant import Plant
     from thermogrip.sysid.validation import Band, FreeRun
-    from thermogrip.sysid.validation.stated_errors import Verdict
 
 MODELS = ("arx", "oe", "armax", "bj", "subspace", "parsim", "sindy", "neural", "network")
 USUAL_MODELS = ",".join(model for model in MODELS if model not in ("armax", "bj", "parsim", "sindy"))
@@ -409,7 +408,8 @@ def validate(
             console.say(f"{log.attrs['name']}: {note}")
     answers = [run_answer(log.attrs["name"], run, band) for log, run, band in zip(logs, runs, bands)]
     console.answer({"logs": answers, "repairs": repairs})
-    urgencies = [_urgency(run.verdict) for run in runs if run.verdict is not None]
+    verdicts = [run.verdict for run in runs if run.verdict is not None]
+    urgencies = [each.cause if each.cause in ("start", "seen") else each.standing for each in verdicts]
     if said_not_good(loaded.verdict) and set(urgencies) & {"as stated", "better", "seen"}:
         console.say(
             f"{plant.name}: identify did not call it good, and a run as was stated does not change that"
@@ -426,11 +426,6 @@ def validate(
         more = ["--warmup", f"{seconds:g}", "--score-from", f"{seconds:g}"]
         command = printable(shlex.join(["validate", str(plant), *map(str, paths), *more]))
     return cli.Done(most_urgent, code, command)
-
-
-def _urgency(verdict: Verdict) -> str:
-    """Return which of what may come next a verdict asks for."""
-    return verdict.cause if verdict.cause in ("start", "seen") else verdict.standing
 
 
 #: Of verdicts on several logs, which one says what comes next.

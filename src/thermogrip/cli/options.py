@@ -520,11 +520,6 @@ def _hint_of_extra_word(ctx: Any, word: str) -> str:
     return ""
 
 
-def _meant(path: str, kind: str) -> list[str]:
-    """Return the files that a path is, where a pattern may stand for them."""
-    return matching_files(path) if kind == "grasps" else [path]
-
-
 def check_files(ctx: Any) -> None:
     """Refuse what is not there, of another kind, or not whole among what a verb was given."""
     named_files = []
@@ -539,7 +534,8 @@ def check_files(ctx: Any) -> None:
     )  # a misspelt name is refused before files are read
     named = ("network", "page", "port")  # which need no file
     files = [(path, kind) for path, kind in named_files if kind not in named or os.path.isfile(path)]
-    files = [(each, kind) for path, kind in files for each in _meant(path, kind)]
+    # of grasps a pattern may stand for several
+    files = [(p, k) for path, k in files for p in (matching_files(path) if k == "grasps" else [path])]
     for path, _ in files:
         check_exists(path, _hint_of_extra_word(ctx, path))
     for path, kind in files:

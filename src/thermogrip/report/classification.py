@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 _SCORES: Columns = (
     ("classifier", lambda row: row["classifier"]),
     ("condition", lambda row: row["condition"]),
-    ("n", lambda row: _of_tested(row)),
+    ("n", lambda row: f"{row['n']}/{row['n_test']}" if row["n_test"] > row["n"] else int(row["n"])),
     ("accuracy", lambda row: _with_interval(row["accuracy"], row["low"], row["high"])),
     ("caution", lambda row: row["caution"]),
     ("log loss", lambda row: _with_interval(row["log_loss"], row["log_loss_low"], row["log_loss_high"])),
@@ -122,6 +122,7 @@ def comparison_sections(name: str, comparison: Comparison) -> list[Section]:
     scores = comparison.scores()
     groups = [row["condition"] for row in scores]
     shown = POOLED if POOLED in groups else groups[0]
+    counted = "grasps" if comparison.repeats == 1 else f"grasps a split, mean of {comparison.repeats}"
     contents: list[Any] = [
         Picture(accuracy_figure(comparison), f"By condition.{_below(scores)} {comparison.interval_note}"),
         Table(
@@ -130,7 +131,10 @@ def comparison_sections(name: str, comparison: Comparison) -> list[Section]:
             dense=True,
         ),
         Text(ECE_TEXT),
-        Picture(confusion_figure(comparison, shown), _confusion_caption(comparison, shown)),
+        Picture(
+            confusion_figure(comparison, shown),
+            f"Confusion, {shown}: rows true, columns predicted; {counted}. Shade: share of the row.",
+        ),
         Picture(
             reliability_figure(comparison, shown),
             f"Confidence beside accuracy, {shown}, in bins of 0.1 with 95 % intervals; below, grasps a bin.",
@@ -162,26 +166,11 @@ def _below(scores: Sequence[Mapping[str, Any]]) -> str:
     return " Below the line: touched twice or of unknown temperature, not in the pool." if pooled else ""
 
 
-def _confusion_caption(comparison: Comparison, shown: str) -> str:
-    """Return what the numbers of the confusions count."""
-    counted = "grasps" if comparison.repeats == 1 else f"grasps a split, mean of {comparison.repeats}"
-    return f"Confusion, {shown}: rows true, columns predicted; {counted}. Shade: share of the row."
-
-
 def score_table(comparison: Comparison) -> Cells:
     """Return all scores, each with its interval, and what to read each with where there is anything."""
     rows = comparison.scores()
     shown = [column for column in _SCORES if column[0] != "caution" or any(row["caution"] for row in rows)]
     return cells(shown, rows)
-
-
-def _of_test(row: Mapping[str, Any]) -> str:
-    return f" of {row['n_test']} in the test" if row["n_test"] > row["n"] else ""
-
-
-def _of_tested(row: Mapping[str, Any]) -> int | str:
-    """Return the number of grasps that were scored, of those tested where some were not."""
-    return f"{row['n']}/{row['n_test']}" if row["n_test"] > row["n"] else int(row["n"])
 
 
 def _with_interval(value: float, low: float | None, high: float | None) -> str:
@@ -232,10 +221,11 @@ def _who_wins(comparison: Comparison, condition: str) -> tuple[str, str]:
         (row for row in comparison.scores() if row["condition"] == condition), key=lambda row: row["log_loss"]
     )
     best = rows[0]
+    tested = f" of {best['n_test']} in the test" if best["n_test"] > best["n"] else ""
     verdict = (
         f"{best['classifier']} has the lowest log loss ({best['log_loss']:.2f}; chance "
         f"{best['log_loss_chance']:.2f}) and {100 * best['accuracy']:.0f} % right of n = {best['n']} grasps"
-        f"{_of_test(best)} ({100 * best['low']:.0f} to {100 * best['high']:.0f} %)."
+        f"{tested} ({100 * best['low']:.0f} to {100 * best['high']:.0f} %)."
     )
     others = [
         f"{row['classifier']}: {100 * row['accuracy']:.0f} %, log loss {row['log_loss']:.2f}."

@@ -18,6 +18,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
 from importlib import resources
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -138,8 +139,9 @@ class Plot:
     @property
     def size(self) -> Iterator[tuple[int, int]]:
         """Yield the points and the numbers a point of every curve."""
-        for curve in self._curves():
-            yield len(curve.x), 2 + 2 * (curve.low is not None)
+        for panel in chain.from_iterable(self.chart.columns):
+            for curve in panel.curves:
+                yield len(curve.x), 2 + 2 * (curve.low is not None)
 
     def data(self, most: int) -> Markup:
         """Return the chart as JSON that may stand in a script element, at most so many points a curve."""
@@ -172,11 +174,6 @@ class Plot:
         text = json.dumps(head | {"columns": columns, "arrays": list(arrays)}, allow_nan=False)
         return Markup(text.replace("<", "\\u003c"))
 
-    def _curves(self) -> Iterator[Curve]:
-        for column in self.chart.columns:
-            for panel in column:
-                yield from panel.curves
-
 
 Part: TypeAlias = Text | Commands | Table | Picture | Plot
 
@@ -207,7 +204,7 @@ def html_page(title: str, lead: str, sections: Sequence[Section]) -> str:
         loader=loader,
         autoescape=True,  # names in files are other people's text
         undefined=StrictUndefined,
-        finalize=_finalize,
+        finalize=lambda value: printable(value) if type(value) is str else value,
         trim_blocks=True,
         lstrip_blocks=True,
     )
@@ -216,7 +213,9 @@ def html_page(title: str, lead: str, sections: Sequence[Section]) -> str:
     plots = [evidence for section in sections for evidence in section.parts if isinstance(evidence, Plot)]
     # styles, figures and script are in the page, which opens without a network; its content security policy
     # names the hashes of this script and this style alone
-    script, style = _script(drawing=bool(plots)), _asset("uPlot.min.css") + _asset("report.css")
+    script, style = _asset("report.js"), _asset("uPlot.min.css") + _asset("report.css")
+    if plots:  # https://github.com/leeoniya/uPlot, version 1.6.32
+        script = f"/*! {_asset('uPlot.LICENSE')} */\n{_asset('uPlot.iife.min.js')}\n{script}"
     signs = {"icons": ICONS, "marks": {tone: icon.split()[0] for tone, icon in ICONS.items()}}
     sources = {name: Markup(text) for name, text in (("style", style), ("script", script))}
     hashes = {f"{name}_hash": _source(text) for name, text in sources.items()}
@@ -243,13 +242,6 @@ def _asset(name: str) -> str:
     return (resources.files("thermogrip") / "templates" / name).read_text(encoding="utf-8")
 
 
-def _script(*, drawing: bool) -> str:
-    """Return the script of a page, with what draws charts where there are any."""
-    # https://github.com/leeoniya/uPlot, version 1.6.32
-    drawn = f"/*! {_asset('uPlot.LICENSE')} */\n{_asset('uPlot.iife.min.js')}\n" if drawing else ""
-    return drawn + _asset("report.js")
-
-
 def _source(text: str) -> str:
     """Return the hash of an inline script or style as a content security policy has it."""
     return "sha256-" + base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
@@ -264,11 +256,6 @@ def _packed(values: Array) -> str:
 
 def _is_number(cell: Any) -> bool:
     return isinstance(cell, int | float)
-
-
-def _finalize(value: Any) -> Any:
-    """Return what the template prints, text without control characters."""
-    return printable(value) if type(value) is str else value
 
 
 def literal(figure: Figure) -> Figure:

@@ -105,7 +105,8 @@ class PaperResult:
     @property
     def copies_verdict(self) -> str:
         """What copies of a grasp say of other grasps, in a sentence, where the copies were learnt."""
-        learnt = self._learnt()
+        # cases whose further copies were mostly named right
+        learnt = [row for row in self.copies if row["copies_right"] >= LEARNT * row["copies_n"]]
         if not learnt:
             return "The paper's LSTM has learnt the copies of no case, so nothing is said of their worth."
 
@@ -121,10 +122,6 @@ class PaperResult:
             f"all other grasps of the same blocks. Of these it is {100 * sure:.0f} % sure on average, in the "
             f"{len(learnt)} cases whose copies it learnt."
         )
-
-    def _learnt(self) -> list[dict[str, Any]]:
-        """Return the cases whose further copies were mostly named right."""
-        return [row for row in self.copies if row["copies_right"] >= LEARNT * row["copies_n"]]
 
     def sections(self) -> list[Section]:
         """Return the report."""
