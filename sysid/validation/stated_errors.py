@@ -500,14 +500,9 @@ def _far_from_prior(plant: Plant) -> list[str]:
 def _effects_in_doubt(plant: Plant, dynamics: Dynamics | None) -> list[str]:
     if dynamics is None:
         return []
-    _, step = dynamics.step_response()
-    # a controller needs the sign of one response; of a slow plant the logs show its first part alone
-    is_certain = np.any(
-        (step.low[1:] > 0) | (step.high[1:] < 0) | np.isnan(step.low[1:]), axis=(0, 1)
-    ).tolist()
     out = [
         f"whether {name} raises or lowers {' or '.join(plant.outputs)}: move it more"
-        for name, certain in zip(dynamics.linear.inputs, is_certain)
+        for name, certain in zip(dynamics.linear.inputs, dynamics.is_certain.tolist())
         if name in plant.inputs and not certain
     ]
     return out + [
