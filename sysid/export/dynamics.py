@@ -141,8 +141,8 @@ class Dynamics:
         response, *others = (_rise(near, steps, 300)[1:] for near in (self.linear, *self.draws))
         if len(others) < RESPONSE.least_draws:
             return np.ones(response.shape[-1], dtype=bool)
-        # of 33 inputs without effect that were added to public logs 3 pass, and 14 where 0 out of the interval
-        # at any time is enough; of the 44 others 2 fail
+        # of 33 inputs without effect that were added to public logs 3 pass, and 14 where it is enough that
+        # an interval leaves 0 out at any time; of the 44 others 2 fail
         off = np.array(others) - response
         sd = np.maximum(np.sqrt(np.mean(off**2, axis=0)), 1e-150)
         size, *of_draws = (np.mean((each / sd) ** 2, axis=(0, 1)) for each in (response, *off))
