@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike
 from scipy.linalg import logm
 
 from thermogrip.datasets.arrays import Array
-from thermogrip.datasets.errors import UserError, known_names
+from thermogrip.datasets.errors import UserError, as_user_error, known_names
 from thermogrip.datasets.files import KEY, atomic_path, provenance, write_atomic
 from thermogrip.sysid.models.model import GreyModel, whole_steps
 
@@ -262,11 +262,9 @@ def _continuous(plant: PlantData, x: Array, u: Array, d: Array, moved: Sequence[
 
 def control_system(labels: Any, numbers: Sequence[Any], name: str) -> Any:
     """Return A, B, C, D, dt as a ``StateSpace`` with the inputs, outputs and states that ``labels`` has."""
-    try:
+    hint = "pip install 'thermogrip[control]', or pip install control"
+    with as_user_error(ImportError, "control is not installed", hint=hint):
         import control
-    except ImportError as error:
-        hint = "pip install 'thermogrip[control]', or pip install control"
-        raise UserError("control is not installed", hint=hint) from error
     return control.StateSpace(
         *numbers,
         **{group: list(getattr(labels, group)) for group in ("inputs", "outputs", "states")},

@@ -33,7 +33,7 @@ def test_each_figure_shows_what_it_should_in_the_colours_widths_and_units_of_the
     """``closed_loop_chart.txt`` has every artist; THERMOGRIP_FIGURES=write writes it: read the difference."""
     alone: Any = SimpleNamespace(**{**vars(run()), "outputs": {"skin": run().outputs["skin"]}})
     figures: dict[str, Figure] = {
-        "closed loop": draw_chart(closed_loop_chart(run(), "a run", limits={"tank": (20.0, 45.0)})),
+        "closed loop": draw_chart(closed_loop_chart(run(), limits={"tank": (20.0, 45.0)})),
         "closed loop of one output": draw_chart(closed_loop_chart(alone)),
     }
     found = [line for name, figure in figures.items() for line in (f"# {name}", *described(figure))]

@@ -333,6 +333,8 @@ def classify(
     cli.choices("--materials", unlisted, model_dir / "classifier.json", "classes")
     console = Console(as_json)
     anywhere = Path.absolute if cluster else Path  # its workers run in other folders
+    places = [model_dir, *map(Path, known or ())]
+    files = [file for place in places for file in (place, *place.glob("*")) if file.is_file()]
     ask = _Question(
         anywhere(model_dir),
         cli.comma(candidates),
@@ -341,7 +343,7 @@ def classify(
         next_touch=next_touch,
         nearest=nearest,
         known=tuple(str(anywhere(Path(path))) for path in known or ()),
-        changed_at=_changed_at([model_dir, *(known or ())]),
+        changed_at=max((file.stat().st_mtime_ns for file in files), default=0),
     )
     if serve and pool != 1:
         raise UserError("--serve answers one after the other", hint="leave --workers and --cluster out")
@@ -460,12 +462,6 @@ class _Question:
 def _answerer(ask: _Question) -> _Answerer:
     """Return what answers a record, loaded once a process."""
     return ask.load()
-
-
-def _changed_at(paths: Iterable[str | Path]) -> int:
-    """Return when the last of these files, and of those in these folders, was written [ns]."""
-    files = [file for path in map(Path, paths) for file in (path, *path.glob("*")) if file.is_file()]
-    return max((file.stat().st_mtime_ns for file in files), default=0)
 
 
 @dataclass(frozen=True)

@@ -41,9 +41,7 @@ def loops_chart(runs: Mapping[str, Log], targets: Mapping[str, float], output: s
     return Chart(tuple(columns), wide=3.6)
 
 
-def closed_loop_chart(
-    run: ClosedLoop, title: str = "", *, limits: Mapping[str, tuple[float, float]] | None = None
-) -> Chart:
+def closed_loop_chart(run: ClosedLoop, *, limits: Mapping[str, tuple[float, float]] | None = None) -> Chart:
     """Return the regulated outputs with target and band, the others with their limits (the tank's) [degC],
     and the drives; any status but ``ok`` is a cross on the drive."""
     t, called = run.time, run.sample_time
@@ -57,7 +55,7 @@ def closed_loop_chart(
     settled = tuple(
         segment.begin_s + segment.settle_s for segment in run.segments if np.isfinite(segment.settle_s)
     )
-    rows = [Panel("regulated [degC]", tuple(regulated), title, 2.4, marks=settled)]
+    rows = [Panel("regulated [degC]", tuple(regulated), height=2.4, marks=settled)]
     others = [name for name in run.outputs if name not in run.target]
     if others:
         curves = []
