@@ -39,7 +39,7 @@ from thermogrip.datasets.parallel import Progress
 from thermogrip.datasets.schema import Log
 from thermogrip.sysid.greybox.fit import bounded_least_squares
 from thermogrip.sysid.greybox.noise_model import ErrorModel
-from thermogrip.sysid.greybox.problem import Problem, make_problem
+from thermogrip.sysid.greybox.problem import DIFFERENCE_STEP, Problem, make_problem
 from thermogrip.sysid.greybox.sandwich import ScoreCovariance, score_covariance
 from thermogrip.sysid.models.model import GreyModel
 from thermogrip.sysid.plant.log_grid import match_logs, roles_of
@@ -51,7 +51,6 @@ from thermogrip.sysid.plant.plant_data import Sampling
 class DrawSettings:
     """Numbers of the draws and of the chain."""
 
-    difference_step: float = 1e-4  # of z
     enough: float = 1e-2  # share of the objective by which the last step lowers it
     evaluations: int = 40  # at most, of one: with 20 the objective of one log's is a tenth larger
     least_error: float = 1e-3  # of A: the least that V may be in any direction
@@ -165,10 +164,10 @@ class RandomizedMap:
             return np.hstack([whole - self.z - xi, along - noise, off_span])
 
         def slopes(point: Array) -> Array:
-            sign = np.where(point + DRAW.difference_step > self.high[moving], -1.0, 1.0)
-            ahead = DRAW.difference_step * np.diag(sign)
+            sign = np.where(point + DIFFERENCE_STEP > self.high[moving], -1.0, 1.0)
+            ahead = DIFFERENCE_STEP * np.diag(sign)
             r = residuals(np.vstack([point, point + ahead]))
-            return np.asarray(((r[1:] - r[0]) / (DRAW.difference_step * sign[:, None])).T)
+            return np.asarray(((r[1:] - r[0]) / (DIFFERENCE_STEP * sign[:, None])).T)
 
         least = bounded_least_squares(
             lambda point: residuals(point[None])[0],

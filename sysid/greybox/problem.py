@@ -30,7 +30,7 @@ from thermogrip.sysid.plant.log_grid import Stretch, cut_stretches
 from thermogrip.sysid.plant.plant import Plant
 from thermogrip.sysid.plant.simulation import Start, find_starts, predict
 
-_DIFFERENCE_STEP = 1e-4  # of a prior sd
+DIFFERENCE_STEP = 1e-4  # of a prior sd
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,13 +127,13 @@ class Problem:
         """Return residual (m,) and Jacobian (m, n) of each log, without the prior, by ``central`` differences
         (twice the cost) where a null direction is looked for."""
         # a step outside the box may not be simulated
-        sign = np.where(z + _DIFFERENCE_STEP > self.box[1], -1.0, 1.0)
-        ahead = _DIFFERENCE_STEP * np.diag(sign)
+        sign = np.where(z + DIFFERENCE_STEP > self.box[1], -1.0, 1.0)
+        ahead = DIFFERENCE_STEP * np.diag(sign)
         around = np.vstack([z, z + ahead, z - ahead] if central else [z, z + ahead])
         out = []
         for r, by_start in zip(self.residuals(around, self.start(z)), self._start_slopes(z)):
             rise = (r[1 : len(z) + 1] - r[len(z) + 1 :]) / 2 if central else r[1:] - r[0]
-            slopes = (rise / (_DIFFERENCE_STEP * sign[:, None])).T
+            slopes = (rise / (DIFFERENCE_STEP * sign[:, None])).T
             # the start that is best moves with z: what it explains of a slope is no knowledge of a parameter
             known = np.eye(by_start.shape[1]) + by_start.T @ by_start
             out.append((r[0], slopes - by_start @ np.linalg.solve(known, by_start.T @ slopes)))
