@@ -10,7 +10,6 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,21 +17,28 @@ from numpy.typing import NDArray
 from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.repair import GAP_SECONDS, GAP_STEPS, name_rows
 from thermogrip.datasets.tables import STAMP, Table
-from thermogrip.datasets.units import Header, to_record_unit
-
-if TYPE_CHECKING:
-    import pandas as pd
-
+from thermogrip.datasets.units import Header, any_unit, to_record_unit
 
 _TIME_UNITS = ("1", "s", "ms", "min")
 _TIME_NAME = re.compile(
     r"(?i)((elapsed|rel|relative|abs|unix|epoch|utc|local|system|log|sample|test|run|date|last)_?)*"
     r"(time|timestamp|time_stamp|date|zeit|uhrzeit|datum|tijd|seconds?|secs?|millis|milliseconds|micros|minutes"
-    r"|hours|x_value|epoch|clock|uptime|elapsed|changed|updated|t|ts|ms|us)(_(utc|local|stamp|elapsed|abs|rel))?"
+    r"|hours?|days|weeks|(day|hour|minute|second)s?_of_(the_)?(year|day)"
+    r"|x_value|epoch|clock|uptime|elapsed|changed|updated|t|ts|ms|us)(_(utc|local|stamp|elapsed|abs|rel))?"
 )
 _COUNTER = re.compile(r"(?i)x|n|k|i|no|nr|id|index|idx|samples?|rows?|steps?|count(er)?|unnamed.*")
 _IN_SECONDS = re.compile(r"(?i)(.*_)?(s|secs?|seconds?|sekunden|x_value|uptime)")  # X_Value is LabVIEW's
-_TIME_WORDS = {"ms": 1e-3, "milli": 1e-3, "us": 1e-6, "micro": 1e-6, "minute": 60.0, "hour": 3600.0}
+_PART = re.compile(
+    r"(?P<year>(?i:y{2,4}|years?))|(?P<month>MM|(?i:mon|months?))|(?P<day>(?i:dd|days?))"
+    r"|(?P<hour>(?i:hh|hr|hours?))|(?P<minute>mm|(?i:mi|mins?|minutes?))|(?P<second>(?i:ss|secs?|seconds?))"
+)
+_PARTS = {"year": 2001.0, "month": 1.0, "day": 1.0, "hour": 0.0, "minute": 0.0, "second": 0.0}  # if absent
+_COUNTERS = {
+    2.0**bits * count: f"a counter of {bits} bits wrapped"
+    for bits, count in product((16, 32), (1.0, 1e-3, 1e-6))  # the file may have it in s already
+}
+_PERIODS = {3600.0: "an hour ended"}  # [s]
+_PERIODS |= {86400.0 * days: f"{days} day(s) ended" for days in (1, 7, 28, 29, 30, 31, 365, 366)}
 EPOCH = (946684800.0, 4102444800.0)  # s since 1970 of the years 2000 and 2100
 
 
@@ -93,37 +99,39 @@ class Clock:
 
 def clock_of(table: Table, read: Mapping[str, Header], dt: float | None) -> Clock:
     """Return the clock of a table; ``read`` is what its headers say, ``dt`` the stated step [s]."""
-    named = [
-        h for h, column in read.items() if column.unit in _TIME_UNITS and _TIME_NAME.fullmatch(column.name)
-    ]
+    parts = _of_parts(table, read)
+    of_parts = parts.columns if parts is not None else frozenset[str]()
+    names = {h: column.name for h, column in read.items() if column.unit in _TIME_UNITS and h not in of_parts}
+    named = [header for header, name in names.items() if _TIME_NAME.fullmatch(name)]
     # a clock that starts again with each cycle comes after one that does not
     back = {h for h in named if h in table.numbers and (np.diff(table.numbers[h]) < 0).any()}
     named.sort(key=lambda header: (header in back, read[header].name != "time"))
     others = [h for h in table.text if h not in named and read_clock(table.text[h][:20]) is not None]
-    others += [h for h in table.numbers if h not in named and _behaves_as_clock(h, read[h], table.numbers[h])]
+    unnamed = {h: v for h, v in table.numbers.items() if h in names and h not in named}
+    others += [header for header, values in unnamed.items() if _behaves_as_clock(header, values)]
     if dt is not None:
-        instead = [*named, *others[:1]]
+        instead = [*named, *(of_parts or others[:1])]
         place = f" in place of {', '.join(instead)}" if instead else ""
         rows = np.arange(len(table.lines), dtype=float)
         return Clock(rows * dt, frozenset(instead), (f"time: rows are {dt:g} s apart, as asked{place}",))
     clocks = [
         _of_text(header, table) if header in table.text else _of_numbers(header, table, read[header])
         for header in [*named, *others]
-    ]
-    if likely := [clock for clock in clocks if clock is not None]:
-        known = [clock for clock in likely if not clock.doubt and np.isfinite(clock.seconds).any()]
-        if not known:
-            return likely[0]
+    ] + [parts]
+    likely = [clock for clock in clocks if clock is not None]
+    if known := [clock for clock in likely if not clock.doubt and np.isfinite(clock.seconds).any()]:
         first, *others_known = known
         usual = _seconds_a_row(first)
         for clock in others_known:
             if abs(_seconds_a_row(clock) - usual) > CLOCK.late * usual:
-                names = (", ".join(sorted(c.columns)) for c in (first, clock))
+                both = (", ".join(sorted(c.columns)) for c in (first, clock))
                 steps = f"{_seconds_a_row(clock):.4g} s a row, not {usual:.4g}"
-                doubt = "{} is taken as the time of all columns, and {} goes ".format(*names) + steps
+                doubt = "{} is taken as the time of all columns, and {} goes ".format(*both) + steps
                 return replace(first, doubt=doubt)
         same = frozenset[str]().union(*(clock.columns for clock in known))
         return replace(first, columns=same)
+    if likely:
+        return likely[0]
     step = float(table.meta.get("dt", 1.0))  # a file may have it beside its columns
     note = f"no time column: rows are taken {step:g} s apart; --dt S sets another step"
     doubt = "" if "dt" in table.meta else "no column is a clock: rows are taken 1 s apart"
@@ -136,12 +144,12 @@ def _seconds_a_row(clock: Clock) -> float:
     return float(np.ptp(clock.seconds[rows])) / max(int(np.ptp(rows)), 1)
 
 
-def _behaves_as_clock(header: str, read: Header, values: Array) -> bool:
+def _behaves_as_clock(header: str, values: Array) -> bool:
     """Tell whether a column that is not named as a time rises in nearly even steps, as only a clock does."""
     values = values[np.isfinite(values)]  # a table beside may end earlier
     steps = np.diff(_unwrapped(values, np.arange(values.size))[0])
     enough = 4 if re.fullmatch(r"c1", header) or _COUNTER.fullmatch(header) else CLOCK.piece_rows
-    if read.unit not in _TIME_UNITS or steps.size < enough or not np.all(steps >= 0):
+    if steps.size < enough or not np.all(steps >= 0):
         return False
     # however uneven: nothing else is so large, and rises; of those in seconds a counter may be
     if any(date.has(values[0]) and date.has(values[-1]) for date in _SINCE_1970[1:]):
@@ -171,59 +179,83 @@ def _of_text(header: str, table: Table) -> Clock | None:
     return Clock(seconds - zero, frozenset(headers), (note,), zero, doubt)
 
 
+def _of_parts(table: Table, read: Mapping[str, Header]) -> Clock | None:
+    """Return the clock of which two or more parts (year ... second) that follow each other are columns."""
+    matches = {header: _PART.fullmatch(read[header].name) for header in table.numbers}
+    headers = {str(match.lastgroup): header for header, match in matches.items() if match is not None}
+    parts = [part for part in _PARTS if part in headers]
+    if len(parts) < 2 or "-".join(parts) not in "-".join(_PARTS):
+        return None
+    values = {part: table.numbers[headers[part]] for part in parts}
+    finest, coarser = (np.diff(values[part]) for part in parts[:-3:-1])
+    if not (finest < 0).any() and coarser.any():
+        return None  # they are totals
+    absent = {part: np.full(len(table.lines), first) for part, first in _PARTS.items()}
+    year, month, day, hour, minute, second = (absent | values).values()
+    seconds = 86400 * _days(year, month, day) + 3600 * hour + 60 * minute + second
+    seconds = _unwrapped(seconds, table.lines, _PERIODS)[0]
+    if (np.diff(seconds) < 0).any() or not np.nanmax(seconds, initial=0) > np.nanmin(seconds, initial=np.inf):
+        return None
+    zero, columns = float(np.nanmin(seconds)), [headers[part] for part in parts]
+    note = f"time: {', '.join(columns)} counted from the first row"
+    return Clock(seconds - zero, frozenset(columns), (note,), zero if "year" in parts else np.nan)
+
+
 def _of_numbers(header: str, table: Table, read: Header) -> Clock | None:
     """Return the clock in a column of numbers; None where it does not rise."""
     counts, (name, unit, scale) = table.numbers[header], read
-    counts, notes = _unwrapped(counts, table.lines)
+    # without a unit the first word may be one: millis, hours, day_of_year
+    first = name.split("_")[0]
+    plural = first if len(first) < 3 else f"{first.rstrip('s')}s"
+    of_size, multiple = any_unit(plural) if unit == "1" else (unit, scale)
+    size = multiple * {"s": 1.0, "ms": 1e-3, "min": 60.0}.get(of_size, np.nan)
+    counts, notes = _unwrapped(counts, table.lines, _COUNTERS | {s / size: w for s, w in _PERIODS.items()})
     finite = counts[np.isfinite(counts)]
     stated = name == "time" and unit != "1"
-    rising = finite.size > 1 and np.mean(np.diff(finite) >= 0) >= CLOCK.monotone_share and np.ptp(finite) > 0
-    if not (stated or rising):
+    repeats = 1 - CLOCK.monotone_share if _PART.fullmatch(name) else 1.0  # a part alone is no time
+    rising = np.mean(np.diff(finite) >= 0) >= CLOCK.monotone_share if np.unique(finite).size > 1 else False
+    if not stated and (not rising or np.mean(np.diff(finite) == 0) > repeats):
         return None
-    meant = _what_counts_mean(name, finite, wrapped=bool(notes)) if unit == "1" else _Counts(scale)
+    meant = _what_counts_mean(name, finite, size, wrapped=bool(notes)) if unit == "1" else _Counts(scale)
     scale, doubt = meant.seconds, meant.doubt
     seconds = to_record_unit(counts if scale == 1 else counts * scale, unit)[0] + meant.zero
     of_start = name.lower() in ("x_value", "uptime")  # of LabVIEW and Klipper: each start is a part
     seconds, restarts = _in_pieces(seconds, table.lines, 2 if of_start else CLOCK.piece_rows)
+    found = [*notes, *restarts]
     if stated and scale == 1:
-        converted = [f"time: converted from {unit} to s"] if unit != "s" else []
-        return Clock(seconds, frozenset([header]), (*converted, *notes, *restarts), 0.0)
-    taken = f"{header} is taken as the time in {unit if unit != '1' else 's'}"
+        found = [f"time: converted from {unit} to s"] * (unit != "s") + found
+        return Clock(seconds, frozenset([header]), tuple(found), 0.0)
     factor = "" if scale == 1 else f", times {scale:g}"
-    if _TIME_NAME.fullmatch(name) is None and unit == "1" and not doubt and meant not in _SINCE_1970:
-        step = scale * float(np.median(np.diff(finite)))
-        doubt = f"{header} is taken as the time, its rows {step:g} s apart"
-    note = f"time: {taken}{factor}" + ("; --dt S sets another step" if doubt else "")
-    return Clock(seconds, frozenset([header]), (note, *notes, *restarts), 0.0, doubt)
+    taken = f"time: {header} is taken as the time in {unit if unit != '1' else 's'}{factor}"
+    note = f"{taken}; --dt S sets another step" if doubt else taken
+    return Clock(seconds, frozenset([header]), (note, *found), 0.0, doubt)
 
 
-def _what_counts_mean(name: str, counts: Array, *, wrapped: bool) -> _Counts:
-    """Return what the counts of a clock without a unit mean."""
-    word = next((f for begin, f in _TIME_WORDS.items() if name.lower().startswith(begin)), None)
+def _what_counts_mean(name: str, counts: Array, word: float, *, wrapped: bool) -> _Counts:
+    """Return what the counts of a clock without a unit mean; ``word`` is the size of that in its name."""
     steps = np.diff(counts)
     usual = float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
     whole = bool(np.all(counts == np.rint(counts)))
     likely = (date for date in _DATES if not date.calendar or (not whole and usual <= CLOCK.days_apart))
     dates = next((date for date in likely if date.has(float(counts[0]))), None)
     of_board = whole and usual >= CLOCK.counts_apart and not np.all(steps % 60 == 0)
-    if word is not None and (dates is None or dates.seconds == 1.0):  # a board's counter may be as large
-        return _Counts(word)
     if dates is not None and dates.calendar:
         apart = f"so that rows are {usual * dates.seconds:.3g} s apart"
         return replace(dates, doubt=f"{name} is taken as the time in days of {dates.calendar}, {apart}")
-    if dates is not None and not (dates.seconds == 1.0 and of_board):
+    # a board's counter may be as large
+    if dates is not None and (dates.seconds != 1.0 or not (of_board or np.isfinite(word))):
         return dates
-    # with decimals, less than 20 apart, or in steps of whole minutes they are likely seconds
-    if not of_board:
-        known = _IN_SECONDS.fullmatch(name) or (dates is not None) or _of_loop(steps)
-        guess = f"{name} has no unit: taken as seconds, so that rows are {usual:g} s apart"
-        return _Counts(1.0, doubt="" if known else guess)
+    # with decimals, less than 20 apart, or in steps of whole minutes they are likely seconds;
     # 32 bits of microseconds last for 72 minutes, of milliseconds for 50 days
     fine = usual >= CLOCK.microseconds_apart or (wrapped and counts[-1] > 2**32)
-    scale, unit = (1e-6, "microseconds") if fine else (1e-3, "milliseconds")
+    scale = word if np.isfinite(word) else 1.0 if not of_board else 1e-6 if fine else 1e-3
+    in_seconds = not of_board and (_IN_SECONDS.fullmatch(name) or _of_loop(steps))
+    if _TIME_NAME.fullmatch(name) if np.isfinite(word) else in_seconds:
+        return _Counts(scale)
     # a guess, as is a time that counts rows: it is reported as a doubt, with the option that settles it
-    doubt = f"{name} has no unit: taken as {unit}, so that rows are {usual * scale:g} s apart"
-    return _Counts(scale, doubt=doubt)
+    unit = {1.0: "seconds", 1e-3: "milliseconds", 1e-6: "microseconds"}.get(scale, f"{scale:g} s")
+    guess = f"{name} has no unit: taken as {unit}, so that rows are {usual * scale:g} s apart"
+    return _Counts(scale, doubt=guess)
 
 
 def _of_loop(steps: Array) -> bool:
@@ -237,19 +269,21 @@ def _of_loop(steps: Array) -> bool:
     return any(abs(in_seconds / one - 1) < CLOCK.late for one in (1, 2, 5, 10)) or not any(is_round)
 
 
-def _unwrapped(counts: Array, lines: NDArray[np.int64]) -> tuple[Array, list[str]]:
-    """Return a counter that goes on where it wrapped at 16 or 32 bits, and a line for each wrap."""
+def _unwrapped(
+    counts: Array, lines: NDArray[np.int64], periods: Mapping[float, str] = _COUNTERS
+) -> tuple[Array, list[str]]:
+    """Return counts that go on where they began again after a period, and a line for each time."""
     notes: list[str] = []
     steps = np.diff(counts)
     back = np.flatnonzero(steps < 0)
-    usual = float(np.nanmedian(steps)) if back.size else 0.0
-    for row in back:
-        for bits, count in product((16, 32), (1.0, 1e-3, 1e-6)):  # the file may have it in s already
-            forward = float(steps[row]) + 2.0**bits * count
-            # where the time runs back by 2^16 or 2^32 counts but for one step, it goes on
-            if 0 < forward <= 2 * usual:
-                counts = counts + np.where(np.arange(counts.size) > row, 2.0**bits * count, 0.0)
-                notes.append(f"time: a counter of {bits} bits wrapped in row {lines[row + 1]}: it goes on")
+    usual = float(np.median(np.abs(steps)[steps != 0])) if 0 < back.size < steps.size / 2 else 0.0
+    # what counts from its own start does not begin again with a day, as a counter does that is full
+    periods = _COUNTERS if back.size and counts[0] <= 2 * usual else periods
+    for row in back if usual else ():
+        # where the time runs back by a period but for one step, it goes on
+        for period in [period for period in periods if 0 < steps[row] + period <= 2 * usual][:1]:
+            counts = counts + np.where(np.arange(counts.size) > row, period, 0.0)
+            notes.append(f"time: {periods[period]} in row {lines[row + 1]}: it goes on")
     return counts, notes
 
 
@@ -293,36 +327,35 @@ def read_clock(cells: Sequence[str]) -> tuple[Array, str] | None:
     minute = minute - np.nan_to_num(pd.to_timedelta(offset, errors="coerce") / pd.Timedelta(minutes=1))
     of_day = 3600 * hour + 60 * minute + second
     of_day[fields[[1, 4]].isna().all(axis=1)] = np.nan
-    if fields[1].isna().all() and fields[6].isna().all() and (hour.max() > 23 or not (hour[0] or minute[0])):
+    of_hour = (minute % 1).any() or hour.max() > 23 or not (hour[0] or minute[0])
+    if fields[1].isna().all() and fields[6].isna().all() and of_hour:
         return 60 * hour + minute, _ELAPSED
     if fields[1].isna().all():
         steps = np.diff(of_day, prepend=of_day[0])
         return of_day + 86400.0 * np.cumsum(np.nan_to_num(steps) < -43200), ""
     months = fields[2].str.lower().map(_MONTHS)
     of_names, fields[2] = months.notna(), months.fillna(fields[2])
-    triples = [numbers(key) for key in (1, 2, 3)]
-    first, middle, _ = (float(np.nanmax(values)) for values in triples)
     by_day, by_month, by_year = ("day", "month", "year"), ("month", "day", "year"), ("year", "month", "day")
-    month_first = middle > 12 or (first <= 12 and "/" in str(cells[0]))
-    orders = [by_month, by_day, by_year] if month_first else [by_day, by_month, by_year]
-    if first > 31 or of_names.any():
-        orders = [by_year] if first > 31 else orders[:1]
-
-    def dates_in(order: Sequence[str]) -> pd.Series:
-        date = dict(zip(order, triples))
-        year = np.where(date["year"] < 100, date["year"] + 2000, date["year"])
-        year[(year < 1900) | (year > 2200)] = np.nan  # beyond what pandas counts in nanoseconds
-        return pd.to_datetime(pd.DataFrame(date | {"year": year}), errors="coerce")
-
-    order = next((order for order in orders if _follow(dates_in(order))), orders[0])
-    note = " (taken as month/day)" if month_first and middle <= 12 and first <= 31 else ""
+    orders = [by_month, by_day, by_year] if "/" in str(cells[0]) else [by_day, by_month, by_year]
+    if of_names.any():
+        orders = [by_day, by_year]
+    triples = [numbers(key) for key in (1, 2, 3)]
+    dates = {order: _days(**dict(zip(order, triples))) for order in orders}
+    most = max(np.isfinite(days).sum() for days in dates.values())
+    orders = [order for order in orders if np.isfinite(dates[order]).sum() == most]
+    follow = (order for order in orders if (np.diff(np.unique(dates[order])) == 1).all())
+    order = next(follow, orders[0])
+    note = " (taken as month/day)" if order == by_month and len(orders) > 1 else ""
     if order != orders[0]:
         note = f" (taken as {'/'.join(order)}, in which the days follow each other)"
-    days = (dates_in(order) - pd.Timestamp(0)) / pd.Timedelta(days=1)
-    return np.asarray(days, dtype=float) * 86400.0 + of_day, note
+    return dates[order] * 86400.0 + of_day, note
 
 
-def _follow(dates: pd.Series) -> bool:
-    """Tell whether all cells are dates, and each day is the one after another."""
-    days = np.unique(np.asarray(dates, dtype="datetime64[D]"))
-    return bool(dates.notna().all() and np.all(np.diff(days) == np.timedelta64(1, "D")))
+def _days(year: Array, month: Array, day: Array) -> Array:
+    """Return the days since 1970 of dates; NaN where there is no such date."""
+    import pandas as pd
+
+    year = np.where(year < 100, year + 2000, year)
+    year[(year < 1900) | (year > 2200)] = np.nan  # beyond what pandas counts in nanoseconds
+    dates = pd.to_datetime(pd.DataFrame({"year": year, "month": month, "day": day}), errors="coerce")
+    return np.asarray((dates - pd.Timestamp(0)) / pd.Timedelta(days=1), dtype=float)

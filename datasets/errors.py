@@ -28,20 +28,8 @@ _HINTS = {
 
 
 class UserError(ValueError):
-    """The user's input is at fault.
-
-    Parameters
-    ----------
-    problem : str
-        What is wrong, in one clause.
-    file : str or Path, optional
-        The file at fault.
-    row : int, optional
-        Row of the file, counted as an editor counts lines (the header is 1).
-    column : str, optional
-        Column name as in the file.
-    hint : str, optional
-        What to do about it, in one clause.
+    """The user's input is at fault: what is wrong, in which row (as an editor counts lines, the header is 1)
+    and column of which file, and a hint what to do about it, a clause each.
 
     Examples
     --------

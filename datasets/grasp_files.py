@@ -23,7 +23,7 @@ from thermogrip.datasets.files import file_format, file_stem, write_atomic
 from thermogrip.datasets.netcdf import numbers_and_unit, open_netcdf, write_netcdf
 from thermogrip.datasets.schema import GRASP_LABELS, GRASP_NUMBERS, check_grasps, make_grasps, with_lead_in
 from thermogrip.datasets.tables import Table, read_csv_table, read_parquet_table
-from thermogrip.datasets.units import join_header, rename_hint, split_header, to_record_unit
+from thermogrip.datasets.units import join_header, split_header, to_record_unit
 from thermogrip.media.rendering import csv_cell
 
 if TYPE_CHECKING:
@@ -187,7 +187,7 @@ def _check_samples(columns: Mapping[str, Any], table: Table) -> None:
     """Raise :class:`UserError` where the samples of a table lack a time, a temperature or their grasp."""
     for need, header in (("time", "time_s"), ("t_surface", "t_surface_degC")):
         if need not in columns:
-            hint = rename_hint(need, [*table.text, *table.numbers])
+            hint = f"rename one: it has {', '.join([*table.text, *table.numbers])}"
             raise UserError(f"no column {header}", file=table.file, hint=hint)
     for lost, problem, where, hint in (
         (~np.isfinite(columns["time"]), "has no time", None, "remove the row"),

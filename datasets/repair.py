@@ -89,12 +89,15 @@ def order_rows(time: Array, lines: NDArray[np.int64], file: str) -> OrderedRows:
         end = stamps[-1] + min(between, apart * (rows.size - starts[-1]))
         nodes = np.append(starts, rows.size), np.concatenate([[begin], stamps[1:], [end]])
         says = f"time has {starts.size} stamps for {rows.size} rows: rows spread evenly between them"
-        even = np.ptp(counts) <= 2
+        even = starts.size > 2 and np.ptp(counts) <= 2
         repairs.append(says if even else ClockDoubt(f"{says}, {counts.min()} to {counts.max()} each"))
         return OrderedRows(np.interp(np.arange(rows.size), *nodes), rows, repairs)
     if repeats:
         which = name_rows(lines[rows[~first]])
-        repairs.append(f"{repeats} repeated time stamp{_s(repeats)} dropped ({which})")
+        says = f"{repeats} repeated time stamp{_s(repeats)} dropped ({which})"
+        # where a clock stood still nobody knows how long
+        stood = np.diff(np.append(starts, rows.size)).max() > _FEWEST_HELD
+        repairs.append(ClockDoubt(f"time stands still: {says}") if stood else says)
     return OrderedRows(time[rows[first]], rows[first], repairs)
 
 

@@ -338,9 +338,3 @@ def label_values(grasps: xr.Dataset, name: str) -> NDArray[np.str_]:
 def has_touch_groups(grasps: Grasps) -> bool:
     """Return whether a record has touches of one block (``touch_group``)."""
     return bool((label_values(grasps, "touch_group") != "").any())
-
-
-def unit_names(grasps: Grasps) -> NDArray[np.str_]:
-    """Return the unit that each grasp belongs to, shape (n_grasp,): its touch group, or itself."""
-    groups = label_values(grasps, "touch_group")
-    return np.where(groups == "", np.asarray(grasps["grasp"].values).astype(str), groups)

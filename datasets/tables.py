@@ -55,7 +55,7 @@ _HEAD_LINES = 200  # of a file, that show how it is a table: the longest preambl
 #: A date, a time of day, or both, as a whole cell.
 STAMP = re.compile(
     r"()(?:(\d{1,4})[-/.](\d{1,2}|[A-Za-z]{3})[-/.](\d{1,4})(?:,?\s+|T|$))?"
-    r"(?:(\d{1,2}):(\d{2}|\d(?=:))(?::(\d{1,2}(?:[.,:]\d+)?))?)?\s*([AaPp][Mm])?\s*(Z|UTC|[+-]\d{2}:?\d{2})?$"
+    r"(?:(\d{1,3}):(\d{2}(?:\.\d+)?|\d(?=:))(?::(\d{1,2}(?:[.,:]\d+)?))?)?\s*([AaPp][Mm])?\s*(Z|UTC|[+-]\d{2}:?\d{2})?$"
 )
 _TIME_OF_DAY = r"((?:\d{1,4}[-/.]\d{1,2}[-/.]\d{1,4}[ T]+)?\d{1,2}:\d{2}:\d{2}(?:[.,:]\d+)?)"
 _KLIPPER = "Stats "  # then seconds, and sections of the board, the host and heaters

@@ -28,10 +28,11 @@ _TIME_UNITS, _TEMPERATURE_UNITS = ("s", "ms", "min"), ("degC", "K", "degF")
 # suffix as people write it -> unit, "" where the toolkit has none, and the factor to it
 _SPELT = {"degC": "C celsius Celsius deg degCelsius", "degF": "F fahrenheit Fahrenheit"}
 _SPELT |= {"K": "degK kelvin Kelvin", "percent": "pct perc %", "V": "volt volts", "A": "amp amps ampere"}
-_SPELT |= {"W": "watt watts", "s": "sec secs seconds second", "ms": "milliseconds msec"}
+_SPELT |= {"W": "watt watts", "s": "sec secs seconds second", "ms": "milliseconds msec millis"}
 _SPELT |= {"min": "minutes minute mins", "": "Hz kHz Pa kPa bar rpm kg mm Ohm ohm kOhm J kJ N lpm LPM"}
 _MULTIPLES = {
-    "s": {"h": 3.6e3, "hr": 3.6e3, "hour": 3.6e3, "hours": 3.6e3, "us": 1e-6, "ns": 1e-9, "days": 86.4e3},
+    "s": dict.fromkeys(("h", "hr", "hour", "hours"), 3.6e3)
+    | {"us": 1e-6, "micros": 1e-6, "ns": 1e-9, "days": 86.4e3, "weeks": 604.8e3},
     "V": {"mV": 1e-3, "kV": 1e3},
     "A": {"mA": 1e-3, "uA": 1e-6},
     "W": {"mW": 1e-3, "kW": 1e3},
@@ -121,16 +122,6 @@ def any_unit(word: str) -> tuple[str, float]:
 
 def _bare_name(name: str) -> str:
     return re.sub(r"[\s,;\"'/()\[\]{}]+", "_", name).strip("_")
-
-
-def rename_hint(name: str, headers: Sequence[str]) -> str:
-    """Return which column to rename where ``name``, a time or a temperature, is missing."""
-    wanted = _TIME_UNITS if name == "time" else _TEMPERATURE_UNITS
-    for header in headers:
-        unit = read_header(header).unit
-        if unit in wanted and not header.startswith("time"):
-            return f"rename {header!r} to {name}_{unit}"
-    return f"it has {', '.join(headers)}"
 
 
 def join_header(name: str, unit: str, others: Sequence[str] = ()) -> str:

@@ -25,10 +25,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import logsumexp
 
-from thermogrip.classify.estimators.base import Floats, GraspClassifier, normalised, pick
+from thermogrip.classify.estimators.base import Floats, GraspClassifier, normalised, pick, unit_names
 from thermogrip.classify.estimators.posterior import PosteriorClassifier
 from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.schema import unit_names
 from thermogrip.sysid.effusivity.predictive import PosteriorPredictive, next_touch
 from thermogrip.sysid.effusivity.quality import check_grasps
 

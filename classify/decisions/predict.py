@@ -36,10 +36,11 @@ from thermogrip.classify.estimators.base import (
     normalised,
     pick,
     record_list,
+    unit_names,
 )
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.files import write_atomic
-from thermogrip.datasets.schema import has_touch_groups, label_values, log_name, unit_names
+from thermogrip.datasets.schema import has_touch_groups, label_values, log_name
 from thermogrip.media.rendering import csv_text
 from thermogrip.sysid.effusivity.data import touches, with_object_range
 from thermogrip.sysid.effusivity.gripper_model import GripperModel

@@ -33,7 +33,14 @@ from thermogrip.datasets.errors import UserError, known_names
 from thermogrip.datasets.grasp_files import Records as Records
 from thermogrip.datasets.grasp_files import as_grasps
 from thermogrip.datasets.grasp_record import Grasps
-from thermogrip.datasets.schema import GRASP_LABELS, GRASP_NUMBERS, check_grasps, log_name, make_grasps
+from thermogrip.datasets.schema import (
+    GRASP_LABELS,
+    GRASP_NUMBERS,
+    check_grasps,
+    label_values,
+    log_name,
+    make_grasps,
+)
 from thermogrip.sysid.effusivity.quality import check_grasps as check_quality
 
 Floats: TypeAlias = NDArray[np.float64]
@@ -299,6 +306,12 @@ def despiked(records: Sequence[Grasps]) -> list[Grasps]:
         record.assign(t_surface=record["t_surface"].where(~spiked)) if spiked.any() else record
         for record, spiked in ((record, check_quality(record).spiked) for record in records)
     ]
+
+
+def unit_names(grasps: Grasps) -> NDArray[np.str_]:
+    """Return the unit that each grasp belongs to, shape (n_grasp,): its touch group, or itself."""
+    groups = label_values(grasps, "touch_group")
+    return np.where(groups == "", np.asarray(grasps["grasp"].values).astype(str), groups)
 
 
 def grasp_labels(grasps: Grasps, y: ArrayLike | None = None) -> Labels:

@@ -26,9 +26,10 @@ from thermogrip.classify.estimators.base import (
     as_array,
     check_shapes,
     times_from,
+    unit_names,
 )
 from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.schema import Grasps, unit_names
+from thermogrip.datasets.schema import Grasps
 
 
 class Augmented(NamedTuple):

@@ -21,7 +21,7 @@ from sklearn.base import clone
 from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
 
 from thermogrip.classify.decisions.predict import Row, joined_touches
-from thermogrip.classify.estimators.base import Floats, GraspClassifier, grasp_labels, level, pick
+from thermogrip.classify.estimators.base import Floats, GraspClassifier, grasp_labels, level, pick, unit_names
 from thermogrip.classify.estimators.features import LEAST_DIFFERENCE, object_difference
 from thermogrip.classify.estimators.lda import ArrayClassifier, is_estimator
 from thermogrip.classify.estimators.registry import classifier_name, make_classifier
@@ -31,7 +31,7 @@ from thermogrip.classify.evaluation.splits import Fold, Plan, plan_folds
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.grasp_files import Records
 from thermogrip.datasets.parallel import Progress, Workers, in_order
-from thermogrip.datasets.schema import Grasps, log_name, unit_names
+from thermogrip.datasets.schema import Grasps, log_name
 from thermogrip.sysid.effusivity.quality import check_grasps, contact_faults
 
 LAST_UNTOUCHED = -0.5  # s; contact may precede the "closed" message by 0.3 s

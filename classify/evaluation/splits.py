@@ -17,11 +17,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from thermogrip.classify.estimators.base import despiked, grasp_labels, pick, record_list
+from thermogrip.classify.estimators.base import despiked, grasp_labels, pick, record_list, unit_names
 from thermogrip.classify.evaluation.comparison import Caution
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.grasp_files import Records
-from thermogrip.datasets.schema import Grasps, has_touch_groups, label_values, log_name, unit_names
+from thermogrip.datasets.schema import Grasps, has_touch_groups, label_values, log_name
 
 _TELLING_VALUES = 10
 

@@ -192,7 +192,7 @@ ONE = META + "a,copper,43,23\n"
         (samples("a", start=0), META + "a,copper,43,\n", ["grasp 'a' has no sample before"]),
         (samples("a").replace("grasp_id", "id"), ONE, ["no column grasp_id", "a grasp file has grasp_id"]),
         (samples("a").replace("time_s", "time"), ONE, ["column time: has no unit", "time_s"]),
-        (samples("a").replace("time_s", "when_s"), ONE, ["no column time_s", "rename 'when_s' to time_s"]),
+        (samples("a").replace("time_s", "when_s"), ONE, ["no column time_s", "it has grasp_id, when_s"]),
         (samples("a").replace("t_surface_degC", "t_skin_degC"), ONE, ["no column t_surface_degC; rename"]),
         (samples("a").replace("t_surface_degC", "t_surface_V"), ONE, ["unit 'V' does not fit"]),
         (samples("a").replace("a,0.3", ",0.3"), ONE, ["row 10", "column grasp_id", "is empty"]),

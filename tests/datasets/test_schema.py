@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from thermogrip.classify.estimators.base import record_list
+from thermogrip.classify.estimators.base import record_list, unit_names
 from thermogrip.datasets import schema
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import (
@@ -25,7 +25,6 @@ from thermogrip.datasets.schema import (
     make_grasps,
     make_log,
     names,
-    unit_names,
 )
 
 GOOD = ([20.0, 21.0], "degC", "output")
