@@ -454,7 +454,8 @@ def _reading_doubts(roles: Mapping[str, str], units: Mapping[str, str], log: _Re
     readings = {name: v for name, v in log.columns.items() if roles[name] in ("output", "disturbance")}
     doubts = [repair.doubt_readings(name, v, [*drives.values()], log.time) for name, v in readings.items()]
     for name, values in drives.items():
-        doubts += [repair.doubt_levels(name, values, units[name]), repair.doubt_moves(name, values)]
+        doubts.append(repair.doubt_levels(name, values, units[name]))
+        doubts.append(repair.doubt_moves(name, values, [*readings.values()]))
     for name in [name for name in readings if roles[name] == "output"]:
         doubts.append(repair.doubt_rows(name, readings[name]))
         doubts += [repair.doubt_lead(name, readings[name], *drive, log.time) for drive in drives.items()]

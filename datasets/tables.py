@@ -455,8 +455,7 @@ def _parse_table(
             hint = "write one table, with the same columns in each row (lines of several kinds are none)"
         raise UserError(problem, file=file, row=ragged[0], hint=hint)
     if ragged:
-        left_out = f"{len(ragged)} row(s) with too few or too many cells left out"
-        notes.append(f"{left_out} ({name_rows(ragged, 5)})")
+        notes.append(f"{len(ragged)} row(s) with too few or too many cells left out ({name_rows(ragged, 5)})")
     rows = [(line, cells) for line, cells in rows if len(cells) == n]
     if not rows:
         raise UserError("has a header but no rows", file=file, hint="give at least two rows")
@@ -550,9 +549,7 @@ def read_column(
         return Column(name, states, notes=(f"{name}: words as {_quoted_cell(first)} read as 0 and 1",))
     if tolerated and (wrong.size >= _MOST * cells_known or STAMP.fullmatch(first)):
         return Column(name, text=["" if cell in _LOST_CELLS else cell for cell in cells])
-    hint = "write a number, leave the cell empty, or drop the column"
-    if tolerated:
-        hint += " (- in --columns)"
+    hint = f"write a number, leave the cell empty, or drop the column{' (- in --columns)' * bool(tolerated)}"
     if re.fullmatch(r"[+-]?\d+,\d+", first):
         hint = "write a decimal point"
     elif STAMP.fullmatch(first):

@@ -801,6 +801,7 @@ HEATER = np.random.default_rng(1).choice([20.0, 50.0, 90.0], 30).repeat(20)
 PLATE = np.convolve(HEATER, np.ones(60) / 60)[:600] + 0.1 * np.random.default_rng(0).standard_normal(600)
 LATER = (PLACES >= 300) * 1.0
 CODE = (PLACES % 200 > 125) & (PLACES % 200 < 136)
+FILLED = [np.interp(PLACES, SOUND := np.r_[:205, 230:600], v[SOUND]) for v in (HEATER, PLATE)]
 SHUFFLED_IN_FIVES = np.random.default_rng(0).permuted(PLACES[2:597].reshape(-1, 5), axis=1).ravel()
 
 
@@ -828,6 +829,7 @@ SHUFFLED_IN_FIVES = np.random.default_rng(0).permuted(PLACES[2:597].reshape(-1, 
         (PLACES, HEATER * np.where(LATER, 2.55, 1), PLATE, "2.55 times apart: did its unit change"),
         (PLACES, np.where(LATER, 110 - HEATER, HEATER), PLATE, "of the log as it does elsewhere"),
         (np.r_[:2, SHUFFLED_IN_FIVES, 597:600], HEATER, PLATE, "to and fro in 18 of its 18 moves"),
+        (PLACES, *FILLED, "heater and all readings go straight in rows 206 to 230"),
         (PLACES, np.interp(PLACES, PLACES[::5], HEATER[::5]), PLATE, "in 5 rows, 18 times: is it an average"),
         (PLACES, np.interp(PLACES, PLACES[::5], 9.0 * (HEATER[::5] > 30)), PLATE, ""),  # of a limited rate
         (PLACES, HEATER, np.floor(PLATE / 4 + 0.9 * (PLACES % 2)), ""),  # a coarse reading that flickers
