@@ -172,10 +172,9 @@ def cut_stretches(plant: PlantData, log: Log, *, gaps: str = "restart") -> list[
     """Return the stretches of a log, which is in the plant's units, on the plant's grid."""
     rows = rows_of(log, plant.inputs, plant.outputs, plant.disturbances)
     _check_known(log, (*plant.inputs, *plant.disturbances))
-    middle = float(log.attrs.get("averaged_s", 0.0)) / 2  # where the mean of a block belongs
 
     def steps(seconds: float) -> int:
-        n = max(1, int(np.ceil((seconds + middle) / plant.dt - 1e-9)))
+        n = max(1, int(np.ceil(seconds / plant.dt - 1e-9)))
         n_signals = len(plant.inputs) + len(plant.disturbances) + len(plant.outputs)
         if 8 * n * n_signals > MOST_BYTES // _GRIDS:  # refused before its grid is made
             hint = "cut the log, or use a plant of a longer step"
@@ -185,18 +184,13 @@ def cut_stretches(plant: PlantData, log: Log, *, gaps: str = "restart") -> list[
     # logs of a rig that says of an input what was applied up to the row are moved by one row
     rows = rows.from_row_on() if plant.inputs_end_at_row else rows
     for name, step in plant.model.command_steps.items():
-        # a driver drops what lies behind a multiple of its step; of averaged commands only the mean of the
-        # loss is known, half a step
+        # a driver drops what lies behind a multiple of its step
         command = rows.u[:, plant.inputs.index(name)]
-        if "averaged_s" in log.attrs:
-            command -= np.sign(command) * np.minimum(np.abs(command), step / 2)
-        else:
-            command[:] = np.trunc(command / step + 1e-9 * np.sign(command)) * step
+        command[:] = np.trunc(command / step + 1e-9 * np.sign(command)) * step
     rows = replace(rows, after=()) if gaps == "hold" else rows
     # an ambient's sensor is slow and coarse; what is no temperature, such as a lamp, acts when it changes
     smooth = [plant.model.smooth if plant.units.get(n, "degC") == "degC" else 0.0 for n in plant.disturbances]
-    stretches = _stretches(rows, step=plant.dt, steps=steps, smooth=smooth)
-    return [replace(stretch, time=stretch.time + middle) for stretch in stretches]
+    return list(_stretches(rows, step=plant.dt, steps=steps, smooth=smooth))
 
 
 def held_means(time: Array, values: Array, edges: Array) -> Array:
