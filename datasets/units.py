@@ -87,6 +87,19 @@ def read_header(header: str, others: Sequence[str] = ()) -> Header:
     """Return name, unit and the factor to that unit of a column header as any program writes it; a word
     that is no unit stays a part of the name, which is empty where the header has none."""
     header = header.strip()
+    read = _read_to_end(header, others)
+    if read != Header(_bare_name(header), "1", 1.0) or len(header) > _LONGEST_HEADER:
+        return read
+    # Time (min) Run 1; Temp, degC (sensor 3)
+    for bracket in reversed([*re.finditer(r"[\[(]|(?<=[\])])", header)]):
+        before = _read_to_end(header[: bracket.start()].rstrip(), others)
+        if before.unit != "1":
+            return before._replace(name=_bare_name(f"{before.name} {header[bracket.start() :]}"))
+    return read
+
+
+def _read_to_end(header: str, others: Sequence[str]) -> Header:
+    """Return the header, read with its unit last."""
     # a letter that others continue is no unit: zone_a, zone_b, zone_c
     series = any(f"{header[:-1]}{letter}" in others for letter in "abdeABDE" if letter != header[-1:])
     for unit in UNITS if _RATE.fullmatch(header) is None else ():
