@@ -144,7 +144,7 @@ class Dynamics:
         # of 33 inputs without effect that were added to public logs 3 pass, and 14 where it is enough that
         # an interval leaves 0 out at any time; of the 44 others 2 fail
         off = np.array(others) - response
-        sd = np.maximum(np.sqrt(np.mean(off**2, axis=0)), 1e-150)
+        sd = np.maximum(np.sqrt(np.mean(off**2, axis=0)), 1e-9 * np.abs(response) + 1e-150)
         size, *of_draws = (np.mean((each / sd) ** 2, axis=(0, 1)) for each in (response, *off))
         return np.asarray(size > np.max(of_draws, axis=0))
 

@@ -167,3 +167,14 @@ def test_a_draw_that_runs_away_is_left_out():
     grows = replace(two_by_two(), A=np.diag([1.02, FAST, 0, 0, 0]))
     found = plant_dynamics(replace(PLANT, refits=(*PLANT.refits, grows)), draws=30)
     assert 8 <= len(found.draws) < 30
+
+
+def test_an_input_acts_for_certain_where_no_draw_is_as_far_from_the_plant_as_the_plant_from_0():
+    def made(gain):
+        return StateSpaceModel(("a", "b"), (), ("t",), A=[[0.9]], B=[[1.0, gain]], C=[[1.0]], dt=1.0)
+
+    for gain, acts in ((0.3, False), (3.0, True), (-3.0, True)):
+        refits = tuple(made(gain + off) for off in np.linspace(-1.0, 1.0, 9))
+        plant = Plant(made(gain), {}, dt=1.0, refits=refits)
+        assert plant_dynamics(plant).is_certain.tolist() == [True, acts]
+        assert plant_dynamics(plant, draws=3).is_certain.all()  # too few say nothing
