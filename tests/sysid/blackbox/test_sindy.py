@@ -6,7 +6,6 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import make_log
 from thermogrip.sysid.blackbox import sindy
 from thermogrip.sysid.blackbox.order_selection import Structure
@@ -50,7 +49,6 @@ def test_the_equation_of_the_simulation_is_found_in_degrees_and_runs_free_over_a
     assert coefficient(model, [2, 0]) == pytest.approx(-0.0005, rel=1e-2)
     assert coefficient(model, [1, 0]) == pytest.approx(1 - 0.02 + 0.0005 * 50, rel=1e-3)
     assert coefficient(model, [1, 1]) == pytest.approx(0.0, abs=1e-3)
-    assert model.equations()[0].startswith("t[k+1] = ")
     assert np.abs(free_run_error(model)).max() < 0.05
     linear = fit_one("sindy", grid, degrees=1, thresholds=0.0)
     assert np.sqrt(np.mean(free_run_error(linear) ** 2)) > 0.1
@@ -89,15 +87,6 @@ def test_equations_that_diverge_are_infinite_not_wrong_and_no_model(grid):
     for rise, bounded in ((1.01, False), (0.9, True)):  # a plant that grows leaves the range of its data
         model = sindy._bounded_model(grid, np.array([[1, 0], [0, 0]]), np.array([[rise, 1.0]]), 1)
         assert (model is not None) == bounded
-
-
-def test_a_dict_makes_the_model_again_and_a_broken_one_is_refused(grid, fit_one):
-    model = fit_one("sindy", grid)
-    again = SindyModel.from_dict(model.to_dict())
-    assert again.equations() == model.equations()
-    assert model.to_dict()["equations"] == list(model.equations())
-    with pytest.raises(UserError, match="not a SINDy model"):
-        SindyModel.from_dict(model.to_dict() | {"coefficients": [[1.0]]})
 
 
 def test_the_structures_are_degrees_thresholds_and_memories(grid, monkeypatch):
