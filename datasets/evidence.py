@@ -22,7 +22,7 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 
 from thermogrip.datasets.arrays import Array
-from thermogrip.datasets.repair import drop_stuck, find_spikes
+from thermogrip.datasets.repair import drop_stuck
 
 Columns: TypeAlias = Mapping[str, Array]
 
@@ -57,8 +57,7 @@ EVIDENCE = EvidenceSettings()
 
 
 def is_moved(columns: Columns, name: str, drives: Sequence[str], beside: Sequence[str] = ()) -> bool:
-    """Tell whether the past of a drive helps to predict a column beside its own and that of others, as long
-    as the column is not stuck."""
+    """Tell whether the past of drives helps to predict a column that reads, beside its own and others'."""
     causes = [columns[n] for n in (*drives, *beside)]
     is_sound = np.isfinite(drop_stuck(name, columns[name], causes)[0])
     if is_sound.sum() < EVIDENCE.fewest_rows:
@@ -66,6 +65,11 @@ def is_moved(columns: Columns, name: str, drives: Sequence[str], beside: Sequenc
     reading, *causes = _standardised([values[is_sound] for values in (columns[name], *causes)])
     gains = [_gains(reading, _bases(causes[: len(drives)], k), causes[len(drives) :]) for k in EVIDENCE.lags]
     return bool(np.any(np.min(gains, axis=0) > EVIDENCE.strong_gain))
+
+
+def responds(columns: Columns, name: str, drives: Sequence[str], beside: Sequence[str]) -> bool:
+    """Tell whether drives help to predict a column, from row to row or more slowly."""
+    return is_moved(columns, name, drives) or any(_acts(columns, u, name, beside) for u in drives)
 
 
 def is_held(values: Array) -> bool:
@@ -215,17 +219,13 @@ def share_followed(values: Array, other: Array) -> float:
 def role_doubts(
     columns: Columns, roles: Mapping[str, str], reasons: Mapping[str, str], goals: Sequence[str]
 ) -> Iterator[str]:
-    """Yield a line for each guessed role, which has a reason, of a column that its course does not confirm;
-    the goals are set points by name."""
+    """Yield a line for each role with a reason that the column's course denies; goals are set points."""
     moving = [n for n, v in columns.items() if np.nanmax(v, initial=-np.inf) > np.nanmin(v, initial=np.inf)]
     inputs, outputs, disturbances, others = (
         [n for n in moving if roles[n] == role] for role in ("input", "output", "disturbance", "other")
     )
     if not inputs or not outputs:
         return
-    # one spike hides every effect; repairs reject it once roles are known
-    spikes = {n: find_spikes(columns[n], floor=None) for n in outputs}
-    columns = {**columns, **{n: np.where(spikes[n], np.nan, columns[n]) for n in outputs}}
     read = [*outputs, *disturbances]
     for name in [name for name in inputs if name in reasons]:
         beside = [n for n in inputs if n != name]
@@ -235,8 +235,8 @@ def role_doubts(
         what = f"responds to {', '.join(movers)}: is it read?" if movers else ""
         if what := what or _unlike_an_input(name, columns, beside, outputs, read):
             yield f"{name} is taken as input ({reasons[name]}), but {what}"
-    for n in [n for n in outputs if n in reasons and not is_moved(columns, n, inputs)]:
-        if columns[n].size >= EVIDENCE.telling_rows and not any(_acts(columns, u, n, read) for u in inputs):
+    for n in [n for n in outputs if n in reasons and columns[n].size >= EVIDENCE.telling_rows]:
+        if not responds(columns, n, inputs, read):
             yield f"{n} is taken as output ({reasons[n]}), but does not respond to {', '.join(inputs)}"
     for name in [name for name in disturbances if name in reasons]:
         if is_moved(columns, name, inputs):
@@ -353,8 +353,7 @@ def _unlike_an_input(
 
 
 def _acts(columns: Columns, name: str, output: str, beside: Sequence[str]) -> bool:
-    """Tell whether a column helps to predict an output, alone or by switching what a reading does, at any
-    speed."""
+    """Tell whether a column, alone or by switching what a reading does, acts on an output at any speed."""
     scaled = _standardised([columns[n] for n in (output, name, *(n for n in beside if n != output))])
     for n, lags in product(EVIDENCE.blocks, EVIDENCE.lags):
         y, x, *rest = _means_of_rows(scaled, n)

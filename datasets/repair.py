@@ -398,7 +398,9 @@ def drop_stuck(name: str, values: Array, inputs: Sequence[Array]) -> tuple[Array
         chance = (others + 1) / (trials[-1] - most + 2)
         likely = most <= 2 or chance >= 1 or chance ** (most - 1) > _STUCK_CHANCE
         first, last = values[run][[0, -1]]
-        likely |= how != "held" and most > trials[-1] / 2  # a slow one may go straight in all of them
+        # a line that is rounded to a column's steps is within one of its chord; what cools bends further
+        chord = np.linspace(first, last, run.stop - run.start)
+        likely |= how != "held" and np.abs(values[run] - chord).max() > 1.001 * _smallest_step(values)
         # at its least or greatest value, as in other rows: so rests a drive that no name shows
         at_end = first in (np.nanmin(values), np.nanmax(values))
         likely |= how == "held" and at_end and np.count_nonzero(values == first) > values[run].size

@@ -24,9 +24,11 @@ from thermogrip.datasets.evidence import (
     is_moved,
     one_signal,
     predictive_gain,
+    responds,
     role_doubts,
     some_rows,
 )
+from thermogrip.datasets.repair import find_spikes
 from thermogrip.datasets.units import DRIVE, find_column
 
 _Guesses: TypeAlias = dict[str, tuple[str, str]]  # role and reason, by name
@@ -145,6 +147,10 @@ def assign_roles(
     if columns is not None:
         if all(len(values) >= EVIDENCE.fewest_rows for values in columns.values()):
             guesses |= _copied_columns(columns, guesses, units)
+        # one spike hides every effect; repairs reject it once roles are known
+        read = [n for n, (role, _) in guesses.items() if role != "input" and not is_held(columns[n])]
+        spikes = {n: find_spikes(columns[n], floor=None) for n in read}
+        columns = {**columns, **{n: np.where(spikes[n], np.nan, columns[n]) for n in read}}
         if any(_SETPOINT.search(_name_words(name)) for name in units):
             guesses |= _controllers(guesses)
         evidence |= _followed_levels(columns, guesses)
@@ -287,7 +293,7 @@ def _moved_otherwise(
     drives += causes
     out |= causes
     unnamed = [n for n in outputs if guesses.get(n, ("", ""))[1].startswith((BY_UNIT, FOLLOWS))]
-    unmoved = [n for n in outputs if not is_moved(columns, n, drives)]
+    unmoved = [n for n in outputs if not responds(columns, n, drives, outputs)]
     moved = [n for n in outputs if n not in unmoved]
     for name in [n for n in unmoved if n in guesses and moved]:
         of_temperature = _TEMPERATURE.search(_name_words(name))  # it may follow what a drive moves

@@ -223,8 +223,10 @@ def test_a_reading_that_stands_still_while_the_heater_swings_is_stuck_and_the_so
     assert np.isfinite(kept[:199]).all()
     assert "stuck at " in lines[0]
     resting = np.r_[np.zeros(3), warm()[:237] - 20, np.zeros(160)]  # as a drive that no name shows
-    for healthy in (warm(), warm(step=2.0), resting):
-        assert drop_stuck("t", healthy, [heater]) == (pytest.approx(healthy), [])
+    noise, drive = np.random.default_rng(5).standard_normal((2, 400))
+    cools = np.round(np.where(np.arange(400) < 300, noise, -999 * np.exp(-np.arange(400) / 100)), 1)
+    for healthy, moved in ((warm(), heater), (warm(step=2.0), heater), (resting, heater), (cools, drive)):
+        assert drop_stuck("t", healthy, [moved]) == (pytest.approx(healthy), [])
     kept, lines = drop_stuck("t", np.r_[warm()[:240], np.full(160, warm()[239])], [heater])  # seven moves
     assert np.isnan(kept[241:]).all()
     still = np.full(400, 23.5)

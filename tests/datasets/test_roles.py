@@ -469,8 +469,10 @@ def test_an_output_with_an_input_of_its_own_is_not_left_out_in_silence():
 
 def test_a_spike_hides_no_response():
     spiked = np.where(np.arange(STEPS.size) == 300, 9e3, SLOW + SMOOTH)
-    columns = {"heater": STEPS, "t_plate": spiked}
-    assert not assign_roles({"heater": "percent", "t_plate": "degC"}, columns=columns).doubts
+    columns = {"heater": STEPS, "t_plate": spiked, "fan": relay(5)[: STEPS.size]}
+    columns["air_temp"] = 20 + plant_of(columns["fan"])
+    roles = assign_roles({"heater": "percent", "t_plate": "1", "fan": "1", "air_temp": "1"}, columns=columns)
+    assert (roles.of["t_plate"], roles.doubts) == ("output", ())
 
 
 def test_what_readings_say_of_each_other_is_a_doubt():
