@@ -22,7 +22,7 @@ from thermogrip.datasets.units import Header, any_unit, to_record_unit
 _TIME_UNITS = ("1", "s", "ms", "min")
 _TIME_NAME = re.compile(
     r"(?i)((elapsed|rel|relative|abs|unix|epoch|utc|local|system|log|sample|test|run|date|last)_?)*"
-    r"(time|timestamp|time_stamp|date|zeit|uhrzeit|datum|tijd|seconds?|secs?|millis|milliseconds|micros|minutes"
+    r"(time(_?stamp)?|date|zeit|uhrzeit|datum|tijd|sec(ond)?s?|milli(second)?s|micros|minutes"
     r"|hours?|days|weeks|(day|hour|minute|second)s?_of_(the_)?(year|day)"
     r"|x_value|epoch|clock|uptime|elapsed|changed|updated|t|ts|ms|us)(_(utc|local|stamp|elapsed|abs|rel))?"
 )

@@ -147,7 +147,7 @@ def read_log(
         log = _made(_Repaired(read.clock.seconds, read.values, repairs), read, roles, file)
         log.attrs.update({k: v for k, v in table.meta.items() if k not in ("schema", "version")})
     else:
-        repaired = _repair(read.clock.seconds, read.values, read.units, roles.of, table)
+        repaired = _repair(read.clock, read.values, read.units, roles.of, table)
         repairs = [*read.repairs, *repaired.repairs]
         of_clock = [line for line in repairs if isinstance(line, repair.ClockDoubt)]
         doubts = [line for line in repairs if isinstance(line, repair.Doubt) and line not in of_clock]
@@ -393,15 +393,15 @@ class _Repaired(NamedTuple):
 
 
 def _repair(
-    time: Array, columns: dict[str, Array], units: dict[str, str], roles: dict[str, str], table: Table
+    clock: Clock, columns: dict[str, Array], units: dict[str, str], roles: dict[str, str], table: Table
 ) -> _Repaired:
     """Return the repaired time and columns."""
-    again = np.diff(time) == 0
+    again = np.diff(clock.seconds) == 0
     alike = np.all([(v[1:] == v[:-1]) | np.isnan(v[1:]) for v in columns.values()], axis=0)
     # else the clock is coarse; where nothing moves nobody can tell
     written_twice = again.any() and alike[again].all() and 2 * alike[~again].sum() < (~again).sum()
     once = np.append(True, ~(again & written_twice))
-    ordered = repair.order_rows(time[once], table.lines[once], table.file)
+    ordered = repair.order_rows(clock.seconds[once], table.lines[once], table.file, *sorted(clock.columns))
     time, repairs = ordered.time, ordered.repairs
     if written_twice:
         repairs.append(f"{again.sum()} rows dropped that repeat the one before and its time")

@@ -61,14 +61,14 @@ class OrderedRows(NamedTuple):
     repairs: list[str]
 
 
-def order_rows(time: Array, lines: NDArray[np.int64], file: str) -> OrderedRows:
-    """Return rows of increasing times; UserError where many times are missing or run backward."""
+def order_rows(time: Array, lines: NDArray[np.int64], file: str, *clock: str) -> OrderedRows:
+    """Return rows of increasing times, of these columns; UserError where many are missing or run backward."""
     rows, repairs = np.arange(time.size), []
     lost = ~np.isfinite(time)
     if lost.mean() > _FEW:
         row = int(lines[lost.argmax()])
         hint = f"give a time to {lost.sum()} rows, or remove them"
-        raise UserError("has no time", file=file, row=row, column="time", hint=hint)
+        raise UserError("has no time", file=file, row=row, column=", ".join(clock) or "time", hint=hint)
     if lost.any():
         rows = rows[~lost]
         repairs.append(f"{lost.sum()} row{_s(lost.sum())} without a time dropped ({name_rows(lines[lost])})")
@@ -182,8 +182,8 @@ def drop_codes(name: str, values: Array) -> tuple[Array, list[str]]:
         rows = _rows_beyond_jumps(values, np.abs(values - code) < 1e-6)
         if rows.any():
             values = np.where(rows, np.nan, values)
-            count = int(rows.sum())
-            repairs.append(f"{name}: {count} row{_s(count)} of {code:g} left empty, no reading ({whose})")
+            says = f"of {code:g} left empty, no reading ({whose})"
+            repairs.append(f"{name}: {rows.sum()} row{_s(rows.sum())} {says}")
     return values, repairs
 
 

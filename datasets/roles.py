@@ -303,8 +303,8 @@ def _moved_otherwise(
 
 
 def _name_words(name: str) -> str:
-    """Return a name in lower case with its words apart: ``BeerSet`` as ``beer_set``."""
-    return re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", name).lower()
+    """Return a name in lower case with its words apart: ``BeerSet`` and ``Beer-Set`` as ``beer_set``."""
+    return re.sub(r"[-.:]+|(?<=[a-z0-9])(?=[A-Z])", "_", name).lower()
 
 
 def _copied_columns(columns: Columns, guesses: _Guesses, units: Mapping[str, str]) -> _Guesses:

@@ -31,7 +31,7 @@ def test_an_input_of_any_course_is_told_from_its_output(word, noise, pole):
     [
         ("drive", "1", "input"),
         ("pump", "1", "input"),
-        ("pump", "V", "input"),
+        ("Zone-1.Cooling-SP", "1", "other"),
         ("q2", "percent", "input"),
         ("pwm", "0_255", "input"),
         ("flow", "1", "input"),
