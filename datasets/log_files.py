@@ -23,7 +23,7 @@ from thermogrip.datasets import repair
 from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.clock import CLOCK, EPOCH, Clock, clock_of, read_clock
 from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.evidence import effect_doubts
+from thermogrip.datasets.evidence import effect_doubts, is_held
 from thermogrip.datasets.files import atomic_path, file_format, file_stem, split_cut, write_atomic
 from thermogrip.datasets.roles import Roles, assign_roles, guess_role
 from thermogrip.datasets.schema import check_log, cut, hash_columns, make_log
@@ -301,7 +301,8 @@ def _convert(table: Table, dt: float | None) -> _Columns:
             repairs.append(f"{name}: converted to {unit} (times {scale:g})")
         if units[name] != unit:
             repairs.append(f"{name}: converted from {unit} to {units[name]}")
-        if table.meta.get("schema") != "thermogrip.log" and guess_role(name, units[name]) != "input":
+        is_set = guess_role(name, units[name]) == "input" or is_held(columns[name])
+        if table.meta.get("schema") != "thermogrip.log" and not is_set:
             columns[name], lost = repair.drop_codes(name, columns[name])
             repairs += lost
     words = [header for header in table.text if header not in clock.columns]

@@ -164,7 +164,10 @@ def find_spikes(values: Array, *, floor: float | None) -> Mask:
     usual = 1.4826 * float(np.median(np.abs(deviation)))
     if floor is None:  # 2 % of the channel's 1-99 % range, and at least five of its smallest increments
         floor = max(0.02 * float(np.ptp(np.percentile(good, [1, 99]))), 5 * _smallest_step(good))
-    threshold = max(floor, 6 * max(usual, _converter_step(good) / np.sqrt(12)))
+    steps = np.diff(np.unique(good))  # between most levels of a coarse reading a count
+    if steps.size >= _FEWEST_ALIKE and np.isclose(np.median(steps), steps.min()):
+        usual = max(usual, float(steps.min()) / np.sqrt(12))
+    threshold = max(floor, 6 * usual)
     is_far = np.abs(deviation) > threshold
     entered = np.concatenate([[False], np.abs(np.diff(good)) > threshold])
     for start in np.flatnonzero(is_far & entered).tolist():
@@ -291,13 +294,6 @@ def _goes_on(values: Array) -> dict[str, Mask]:
 def _smallest_step(values: Array) -> float:
     moves = np.abs(np.diff(values))
     return float(moves[moves > 0].min(initial=np.inf))
-
-
-def _converter_step(values: Array) -> float:
-    """Return the step between most of the levels of a coarse reading, 0 of one whose levels lie otherwise."""
-    steps = np.diff(np.unique(values))
-    alike = steps.size >= _FEWEST_ALIKE and np.isclose(np.median(steps), steps.min())
-    return float(steps.min()) if alike else 0.0
 
 
 def doubt_lead(name: str, values: Array, drive: str, moved: Array, time: Array) -> str:

@@ -297,11 +297,14 @@ def test_roles_can_be_given(write):
     assert "column t_rom: no such column" in refused(path, outputs=["t_rom"])
 
 
-def test_the_spike_rule_is_for_outputs_alone(write):
+def test_the_rules_of_spikes_and_codes_are_for_readings_alone(write):
     rows = "".join(f"{n},{90 if n == 50 else 20},{90 if n == 50 else 20}\n" for n in range(100))
     log = read_log(write("time_s,t_a_degC,t_set_degC\n" + rows))
     assert np.isnan(column(log, "t_a")).sum() == 1
     assert column(log, "t_set")[50] == 90
+    levels = np.repeat([20, 22, 85, 20, 22], 60)  # of a drive without a name: 85 is no DS18B20's code
+    log = read_log(write("".join(f"{n},{level},{n % 7}\n" for n, level in enumerate(levels))))
+    assert column(log, "c2").tolist() == levels.tolist()
 
 
 def test_a_netcdf_of_another_program_is_read_by_its_units(tmp_path):
