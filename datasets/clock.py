@@ -37,8 +37,7 @@ _COUNTERS = {
     2.0**bits * count: f"a counter of {bits} bits wrapped"
     for bits, count in product((16, 32), (1.0, 1e-3, 1e-6))  # the file may have it in s already
 }
-_PERIODS = {3600.0: "an hour ended"}  # [s]
-_PERIODS |= {86400.0 * days: f"{days} day(s) ended" for days in (1, 7, 28, 29, 30, 31, 365, 366)}
+_PERIODS = {86400.0 * n: f"{n:.3g} day(s) ended" for n in (1 / 24, 1, 7, 28, 29, 30, 31, 365, 366)}  # [s]
 EPOCH = (946684800.0, 4102444800.0)  # s since 1970 of the years 2000 and 2100
 
 
@@ -221,14 +220,13 @@ def _of_numbers(header: str, table: Table, read: Header) -> Clock | None:
     seconds = to_record_unit(counts if scale == 1 else counts * scale, unit)[0] + meant.zero
     of_start = name.lower() in ("x_value", "uptime")  # of LabVIEW and Klipper: each start is a part
     seconds, restarts = _in_pieces(seconds, table.lines, 2 if of_start else CLOCK.piece_rows)
-    found = [*notes, *restarts]
     if stated and scale == 1:
-        found = [f"time: converted from {unit} to s"] * (unit != "s") + found
-        return Clock(seconds, frozenset([header]), tuple(found), 0.0)
-    factor = "" if scale == 1 else f", times {scale:g}"
-    taken = f"time: {header} is taken as the time in {unit if unit != '1' else 's'}{factor}"
+        taken = f"time: converted from {unit} to s" if unit != "s" else ""
+    else:
+        factor = "" if scale == 1 else f", times {scale:g}"
+        taken = f"time: {header} is taken as the time in {unit if unit != '1' else 's'}{factor}"
     note = f"{taken}; --dt S sets another step" if doubt else taken
-    return Clock(seconds, frozenset([header]), (note, *found), 0.0, doubt)
+    return Clock(seconds, frozenset([header]), tuple(filter(None, [note, *notes, *restarts])), 0.0, doubt)
 
 
 def _what_counts_mean(name: str, counts: Array, word: float, *, wrapped: bool) -> _Counts:
