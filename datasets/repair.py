@@ -358,8 +358,8 @@ def _rows_beyond_jumps(values: Array, rows: Mask) -> Mask:
     # without a move it is no reading: it is held between levels, and the code may be one of them
     if values.size < SPIKE_WINDOW or not rows.any() or rows.all() or not usual.any():
         return np.zeros(values.size, dtype=bool)
-    # beyond its steps, and what other rows rarely move: a kettle that passes 85 degC does not jump there
-    least = _CODE_JUMP * max(float(np.quantile(usual, 0.99)), float(usual[usual > 0].min()))
+    # beyond what it rarely moves where it does: a kettle that passes 85 degC does not jump there
+    least = _CODE_JUMP * float(np.quantile(usual[usual > 0], 0.99))
     between, beyond_jumps = rows[1:] ^ rows[:-1], rows.copy()
     edges = np.flatnonzero(np.diff(rows.astype(int), prepend=0, append=0))
     for start, stop in edges.reshape(-1, 2).tolist():
