@@ -21,9 +21,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.optimize import least_squares
 
-from thermogrip.datasets.arrays import Array, Mask, Values
+from thermogrip.datasets.arrays import Array, Mask
 from thermogrip.datasets.errors import UserError
-from thermogrip.sysid.models.model import Model, Sizes
+from thermogrip.sysid.models.model import Model, Sizes, Values
 from thermogrip.sysid.models.user_model import OwnModel
 from thermogrip.sysid.plant.linearise import settled
 

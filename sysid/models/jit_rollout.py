@@ -22,8 +22,7 @@ import numpy as np
 from llvmlite import binding, ir
 from numpy.typing import ArrayLike
 
-from thermogrip.datasets.arrays import Run, Values
-from thermogrip.sysid.models.model import Output, Sizes, Step
+from thermogrip.sysid.models.model import Output, Run, Sizes, Step, Values
 
 #: Numbers side by side.
 WIDTH = 8

@@ -15,14 +15,14 @@ parameter, how well each sensor reads, and the times over which the fit averages
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Any, ClassVar, NamedTuple, Protocol, Self, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from thermogrip.datasets.arrays import Array, Run, Values
+from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.errors import UserError, reading
 from thermogrip.datasets.limits import STEP_RANGE, array_within, number_within
 from thermogrip.sysid.models.network_spec import Parameter
@@ -37,7 +37,10 @@ class Sizes(NamedTuple):
     n_p: int  # parameters
 
 
-# (x, u, d, p, h [s]) -> state after h seconds; (x, p) -> outputs: lists of numbers, NumPy rows or symbols
+Run = tuple[Array, Array]  # outputs (B, N + 1, n_y) and last states (B, n_x) of a batch
+# what the arithmetic takes: numbers, rows with an entry a member of a batch, CasADi's symbols
+Values = Sequence[Any]
+# (x, u, d, p, h [s]) -> state after h seconds; (x, p) -> outputs
 Step = Callable[[Values, Values, Values, Values, Any], list[Any]]
 Output = Callable[[Values, Values], list[Any]]
 

@@ -19,9 +19,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from thermogrip.datasets.arrays import Array, Run, Values
+from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.errors import UserError, reading
-from thermogrip.sysid.models.model import SMOOTH, Described, FreeRuns, RestWeights, Sizes
+from thermogrip.sysid.models.model import SMOOTH, Described, FreeRuns, RestWeights, Run, Sizes, Values
 from thermogrip.sysid.models.network_spec import (
     Network,
     Parameter,

@@ -25,8 +25,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from thermogrip.datasets.arrays import Array, Values
-from thermogrip.sysid.models.model import BlackBox, gauss_newton
+from thermogrip.datasets.arrays import Array
+from thermogrip.sysid.models.model import BlackBox, Values, gauss_newton
 from thermogrip.sysid.models.state_space import dot, join_columns
 
 _RAILS = ("low", "high")

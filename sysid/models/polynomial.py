@@ -16,9 +16,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from thermogrip.datasets.arrays import Array, Values
+from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.limits import array_within, number_within
-from thermogrip.sysid.models.model import BlackBox
+from thermogrip.sysid.models.model import BlackBox, Values
 
 BOUND = 10.0  # spreads beyond the range of the data: a simulation that leaves it has diverged
 _MOST_DEGREE, _MOST_MEMORY = 20, 1000

@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from thermogrip.datasets.arrays import Array, Values
-from thermogrip.sysid.models.model import BlackBox
+from thermogrip.datasets.arrays import Array
+from thermogrip.sysid.models.model import BlackBox, Values
 
 
 @dataclass(frozen=True, eq=False)

@@ -40,9 +40,9 @@ from numpy.lib.mixins import NDArrayOperatorsMixin
 from numpy.typing import ArrayLike
 from pydantic import AfterValidator, BeforeValidator, Field, ValidationError, model_validator
 
-from thermogrip.datasets.arrays import Array, Run, Values
+from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.errors import UserError, known_names, reading
-from thermogrip.sysid.models.model import Described, FreeRuns, RestWeights, Sizes
+from thermogrip.sysid.models.model import Described, FreeRuns, RestWeights, Run, Sizes, Values
 from thermogrip.sysid.models.network_spec import OpenHigh, OpenLow, Parameter, Table
 
 if TYPE_CHECKING:
