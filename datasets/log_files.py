@@ -455,7 +455,7 @@ def _reading_doubts(roles: Mapping[str, str], units: Mapping[str, str], log: _Re
     readings = {name: v for name, v in log.columns.items() if roles[name] in ("output", "disturbance")}
     doubts = [repair.doubt_readings(name, v, [*drives.values()], log.time) for name, v in readings.items()]
     for name, values in drives.items():
-        doubts.append(repair.doubt_levels(name, values, units[name]))
+        doubts.append(repair.doubt_full_scale(name, values, units[name]))
         doubts.append(repair.doubt_moves(name, values, [*readings.values()]))
     for name in [name for name in readings if roles[name] == "output"]:
         doubts.append(repair.doubt_rows(name, readings[name]))

@@ -37,7 +37,6 @@ _SLOW_ROWS = 60.0  # s, in which a plant moves and comes back by itself
 GAP_SECONDS = 10.0  # of the least gap
 GAP_STEPS = 5.0  # median steps of the rows, of the least gap
 _REPEATED = 32  # rows with moves in most of them, that are not alike by chance
-_OTHER_SCALES = (2.55, 10.0, 100.0, 255.0, 1000.0)  # of percent, 0 to 255, 0 to 1, W and kW
 _MOST_LEVELS = 20  # of an input that is set
 _FEWEST_HELD = 4  # rows, of a standstill
 _FEWEST_ALIKE, _MOST_TO_AND_FRO = 3, 0.4  # moves of an input; share of them
@@ -234,17 +233,8 @@ def _longest_standstill(values: Array, moves: Array) -> tuple[float, int]:
     return max(rows_at.items(), key=lambda item: item[1], default=(np.nan, 0))
 
 
-def doubt_levels(name: str, values: Array, unit: str) -> str:
-    """Return the doubt on the unit of an input: two levels or more come again, as multiples, after some row,
-    or in percent it goes beyond its full scale, or to a hundredth of that."""
-    levels = np.unique(values[values != 0])
-    for factor in _OTHER_SCALES if levels.size <= _MOST_LEVELS else ():
-        small = [v for v in levels.tolist() if np.isclose(levels, v * factor, rtol=1e-3).any()]
-        rows = np.flatnonzero(np.isin(values, small))
-        large = np.flatnonzero(np.isclose(values[:, None], np.array(small) * factor, rtol=1e-3).any(axis=1))
-        if len(small) > 1 and (rows.max() < large.min() or large.max() < rows.min()):
-            row = max(rows.min(), large.min())
-            return f"{name} has other levels from row {row + 1}, {factor:g} times apart: did its unit change?"
+def doubt_full_scale(name: str, values: Array, unit: str) -> str:
+    """Return the doubt on an input that in percent goes beyond its full scale, or to a hundredth of that."""
     highest = float(np.max(np.abs(values)))
     if unit != "percent" or highest == 0 or 1 < highest <= 100 * (1 + _FEW):
         return ""
