@@ -234,7 +234,8 @@ def test_a_guess_that_decides_is_a_warning_and_the_command_that_states_it_comes_
     room.found = found_of(good=False, doubts=("c2 is taken as input",), signals=nameless)
     last_line = room.bench.run("identify", "good.csv", "--out", "p.json").err.splitlines()[-1]
     assert "--inputs c2 --outputs c3 --out p.json  # better, name its columns in their order" in last_line
-    for doubt, step in (("t1 is taken as the time", "1"), ("no column is a clock", "S")):  # nobody knows it
+    of_two = "a is taken as the time of all columns, and b goes 2 s a row"
+    for doubt, step in (("t1 is taken as the time", "1"), ("no column is a clock", "S"), (of_two, "S")):
         room.log.attrs["clock_doubts"] = doubt
         assert (
             f"--outputs c3 --dt {step} --out" in room.bench.run("identify", "good.csv", "--out", "p.json").err

@@ -206,7 +206,8 @@ def _stating(found: Identification, paths: Sequence[str], typed: Sequence[str], 
     words = ["identify", *paths, *_stated_roles(unsaid)]
     if "--dt" not in typed and (doubts := "".join(log.attrs.get("clock_doubts", "") for log in logs)):
         step = float(logs[0]["time"].diff("time").median())
-        words += ["--dt", "S" if "no column is a clock" in doubts else f"{step:g}"]  # S: to be filled in
+        unknown = re.search("no column is a clock|the time of all columns|apart at first", doubts)
+        words += ["--dt", "S" if unknown else f"{step:g}"]  # S: to be filled in
     command = shlex.join([*words, *(word for word in typed if word not in paths)])
     by_course = [s.name for s in found.signals if s.role == "input" and s.guessed and "name" not in s.why]
     driven = [name for name in named["input"] if name not in by_course]
