@@ -1,7 +1,5 @@
 """Kinds of arrays that the rooms hand each other."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

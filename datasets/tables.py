@@ -86,6 +86,8 @@ _NUMBER_CELL = re.compile(
 # what programs print within numbers: a mark between thousands, blanks behind a sign
 _PRINTED_BLANKS = re.compile(r"(?<=\d)[\xa0\u2009\u202f'\u2019](?=\d{3}(?!\d))|(?<=^[+-])\s+(?=\d)")
 _OPEN = re.compile(r"[+-]?[1-9]\d{0,2}[.,]\d{3}")  # a number with a mark of decimals, or of thousands
+_GROUPED = re.compile(r"[+-]?\d{1,3}(\.\d{3})+(,\d+)?")  # one with marks of thousands
+_DECIMAL_COMMA = re.compile(r"[+-]?(\d*|\d{1,3}(\.\d{3})+),\d+([eE][+-]?\d+)?")
 _SCALES = re.compile(r"(?i)scal(e|ing)|factor|faktor|multipl|offset|\bx ?10+\b")
 _WITH_UNIT = re.compile(r"([+-]?[\d.,]+(?:[eE][+-]?\d+)?)\s*([^\W\d_]{1,4}|%|[°º]\s?[CFK])")
 
@@ -526,7 +528,8 @@ def read_column(
     cells = [_as_typed(cell) for cell in printed]
     values, wrong = _numbers_of(cells)
     notes = [] if cells == printed else ["numbers are as printed: a long minus, marks between thousands"]
-    if wrong.size and _has_decimal_comma(cells):  # between commas such cells stand in quotes
+    by_comma = wrong.size and any(map(_DECIMAL_COMMA.fullmatch, cells))
+    if by_comma and all("." not in cell or _GROUPED.fullmatch(cell) for cell in cells):
         pointed = [cell.replace(".", "").replace(",", ".") for cell in cells]  # 1.234,5 is 1234.5
         values, wrong = _numbers_of(pointed)
         notes.append("numbers have a decimal comma")
@@ -563,12 +566,6 @@ def _numbers_of(cells: Sequence[str]) -> tuple[Array, NDArray[np.int64]]:
     values = [float(cell) if _NUMBER_CELL.fullmatch(cell) else np.nan for cell in cells]
     wrong = [row for row, value in enumerate(values) if value != value and cells[row] not in _LOST_CELLS]
     return np.array(values), np.array(wrong, dtype=np.int64)
-
-
-def _has_decimal_comma(cells: Sequence[str]) -> bool:
-    comma = re.compile(r"[+-]?(\d*|\d{1,3}(\.\d{3})+),\d+([eE][+-]?\d+)?")
-    thousands = re.compile(r"[+-]?\d{1,3}(\.\d{3})+(,\d+)?")
-    return any(map(comma.fullmatch, cells)) and all(map(thousands.fullmatch, (c for c in cells if "." in c)))
 
 
 def _without_unit(name: str, cells: Sequence[str]) -> tuple[str, list[str], list[float]] | None:
