@@ -453,7 +453,11 @@ def _reading_doubts(roles: Mapping[str, str], units: Mapping[str, str], log: _Re
     """Return a line for each reading with runs like a sensor's code, or a jump that no input makes."""
     drives = {name: values for name, values in log.columns.items() if roles[name] == "input"}
     readings = {name: v for name, v in log.columns.items() if roles[name] in ("output", "disturbance")}
-    doubts = [repair.doubt_readings(name, v, [*drives.values()], log.time) for name, v in readings.items()]
+    doubts = []
+    for name, values in readings.items():
+        if roles[name] == "disturbance" and units[name] != "degC":
+            values = np.where(values == 0, np.nan, values)  # at night and in a calm no sensor ends
+        doubts.append(repair.doubt_readings(name, values, [*drives.values()], log.time))
     for name, values in drives.items():
         doubts.append(repair.doubt_full_scale(name, values, units[name]))
         doubts.append(repair.doubt_moves(name, values, [*readings.values()]))

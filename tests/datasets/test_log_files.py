@@ -817,12 +817,7 @@ SHUFFLED_IN_FIVES = np.random.default_rng(0).permuted(PLACES[2:597].reshape(-1, 
         (PLACES, HEATER, np.interp(PLACES, PLACES[::10], PLATE[::10]), "10th row only, drawn straight"),
         (PLACES, HEATER, np.where((PLACES > 300) & (PLACES < 340), PLATE[300], PLATE), "is held at"),
         (PLACES, HEATER, np.where(CODE, -46.85, PLATE), "plate jumps to -46.85 and stays in 30 rows"),
-        (
-            PLACES,
-            np.where(CODE, 0, HEATER),
-            np.where(CODE, -46.85, PLATE),
-            "is held at -46.85",
-        ),  # by the heater
+        (PLACES, np.where(CODE, 0, HEATER), np.where(CODE, -46.85, PLATE), "is held at -46.85"),
         (PLACES, HEATER, np.minimum(PLATE, 60), "plate is held at 60 for "),  # a sensor at its end
         (PLACES, 2.55 * HEATER, PLATE, "heater goes to 229.5 percent: if it is none, name it heater_0_255"),
         (PLACES, HEATER / 100, PLATE, "heater goes to 0.9 percent: if it is none"),
@@ -843,6 +838,15 @@ def test_columns_that_are_not_one_course_of_one_unit_are_doubts(write, order, he
     assert doubt in doubts
     assert bool(doubts) == bool(doubt)
     assert doubt in read_log(write(text), ["heater"], ["plate"]).attrs["reading_doubts"]  # roles settle none
+
+
+@pytest.mark.parametrize(("out", "doubt"), [("sun", ""), ("outdoor_degC", "outdoor is held at 0 for")])
+def test_a_sensor_ends_at_0_degrees_and_light_at_night(write, out, doubt):
+    course = np.maximum(9 * np.sin(PLACES / 50) + 0.01 * np.random.default_rng(0).standard_normal(600), 0)
+    rows = "".join(f"{k},{u:g},{y:.3f},{d:.3f}\n" for k, u, y, d in zip(PLACES, HEATER, PLATE, course))
+    path = write(f"time_s,heater,plate_degC,{out}\n{rows}")
+    doubts = read_log(path, ["heater"], ["plate"], [out.removesuffix("_degC")]).attrs["reading_doubts"]
+    assert doubts.startswith(doubt) and bool(doubts) == bool(doubt)
 
 
 @pytest.mark.parametrize(("lost", "rows"), [((PLACES > 300) & (PLACES < 341), 560), (PLACES % 20 > 0, 600)])
