@@ -166,7 +166,9 @@ def _gains(y: Array, bases: Array, beside: Sequence[Array]) -> Array:
     shares = np.where(shares > 1e-14, shares, np.inf)[:, None]  # less is rounding: it adds nothing
     factors = directions / shares @ directions.transpose(0, 2, 1) @ (target @ bases)[..., None]
     errors = target - (bases @ factors - axes @ (explained @ factors))[..., 0]
-    return np.maximum(_criterion(target, errors, rows, lags), 0.0)
+    # G = N log(RSS without new columns / RSS with them) - n log N, of n columns and N rows (Granger 1969)
+    before, after = (np.sum(r**2, axis=-1) + 1e-12 * rows for r in (target, errors))
+    return np.asarray(np.maximum(rows * np.log(before / after) - lags * np.log(rows), 0.0))
 
 
 def _past(values: Array, lags: int, first: int = 1) -> Array:
@@ -177,12 +179,6 @@ def _basis(terms: Sequence[Array]) -> Array:
     """Return an orthonormal basis of what columns span."""
     axes, sizes, _ = np.linalg.svd(matrix := np.column_stack(terms), full_matrices=False)
     return np.asarray(axes[:, sizes > np.finfo(float).eps * max(matrix.shape) * sizes.max(initial=0.0)])
-
-
-def _criterion(target: Array, errors: Array, rows: int, n_new: int) -> Array:
-    # G = N log(RSS without new columns / RSS with them) - n log N, of n columns and N rows (Granger 1969)
-    before, after = (np.sum(r**2, axis=-1) + 1e-12 * rows for r in (target, errors))
-    return np.asarray(rows * np.log(before / after) - n_new * np.log(rows))
 
 
 def comes_to(reading: Array, goal: Array) -> bool:

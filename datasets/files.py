@@ -124,14 +124,6 @@ def note_seed(seed: int | None) -> None:
         now.seed = seed
 
 
-def note_read(path: str | Path) -> None:
-    """Report a file that is read; those of the package itself and those that the command wrote do not
-    count."""
-    now, name = _WORK.get(), os.path.abspath(path)
-    if now and name not in now.written and not os.path.realpath(name).startswith(_ROOMS):
-        now.read.setdefault(name, "")
-
-
 def note_written(path: str | Path) -> None:
     """Report a file that was written."""
     if now := _WORK.get():
@@ -176,7 +168,9 @@ def check_source(path: str | Path) -> int:
     handed = str(path).startswith(("/dev/fd/", "/proc/self/fd/")) or str(path) == "/dev/stdin"
     if not stat.S_ISREG(about.st_mode) and not (handed and stat.S_ISFIFO(about.st_mode)):
         raise UserError("is no file but a device, a pipe or a socket", file=path, hint="name a file")
-    note_read(path)
+    now, name = _WORK.get(), os.path.abspath(path)  # files of the package and of the command do not count
+    if now and name not in now.written and not os.path.realpath(name).startswith(_ROOMS):
+        now.read.setdefault(name, "")
     return about.st_size if stat.S_ISREG(about.st_mode) else 0
 
 
