@@ -148,13 +148,13 @@ def _behaves_as_clock(header: str, values: Array) -> bool:
     values = values[np.isfinite(values)]  # a table beside may end earlier
     steps = np.diff(_unwrapped(values, np.arange(values.size))[0])
     enough = 4 if re.fullmatch(r"c1", header) or _COUNTER.fullmatch(header) else CLOCK.piece_rows
-    if steps.size < enough or not np.all(steps >= 0):
+    if steps.size < enough or (header != "c1" and np.any(steps < 0)):
         return False
     # however uneven: nothing else is so large, and rises; of those in seconds a counter may be
     if any(date.has(values[0]) and date.has(values[-1]) for date in _SINCE_1970[1:]):
         return bool(values[-1] > values[0])
     # the first column of a file without names is the clock where any column is: a loop that waits for its
-    # sensors is as uneven, and may begin with some rows of one stamp
+    # sensors is as uneven, may begin with some rows of one stamp, and starts again
     uneven = 1.0 if header == "c1" else CLOCK.evenness
     usual = float(np.median(steps))
     even = (steps > 0) & (np.abs(steps - usual) <= uneven * usual)

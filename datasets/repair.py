@@ -180,8 +180,9 @@ def find_spikes(values: Array, *, floor: float | None) -> Mask:
 def drop_codes(name: str, values: Array) -> tuple[Array, list[str]]:
     """Return a column with what is no reading but a sensor's code as NaN, and a line for each code."""
     repairs = []
+    rounding = min(_smallest_step(values) / 2, 0.5) + 1e-6  # of a logger with few digits
     for code, whose in SENSOR_CODES.items():
-        rows = _rows_beyond_jumps(values, np.abs(values - code) < 1e-6)
+        rows = _rows_beyond_jumps(values, np.abs(values - code) < rounding)
         if rows.any():
             values = np.where(rows, np.nan, values)
             says = f"of {code:g} left empty, no reading ({whose})"

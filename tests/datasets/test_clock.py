@@ -97,11 +97,13 @@ def test_a_counter_that_wraps_goes_on(tmp_path, bits, header, count):
 
 
 def test_a_board_that_was_reset_begins_a_new_segment_after_a_gap(tmp_path):
-    log = log_of(tmp_path, np.r_[np.arange(70), np.arange(2, 52)] * 1000, "millis")
+    counts = np.r_[np.arange(70), np.arange(2, 52)] * 1000
+    log = log_of(tmp_path, counts, "millis")
     steps = np.diff(log["time"].values)
     assert np.flatnonzero(steps > 10).tolist() == [69]
     np.testing.assert_allclose(np.delete(steps, 69), 1.0)
     assert "the clock starts again in row 72: new segments" in log.attrs["repairs"]
+    assert "the clock starts again in row 71" in log_of(tmp_path, counts, None).attrs["repairs"]
 
 
 def printer(k):

@@ -202,6 +202,8 @@ def test_a_sensor_code_is_no_reading_in_however_many_rows(code, rows):
     kept, lines = drop_codes("t", values)
     assert np.flatnonzero(np.isnan(kept)).tolist() == [*range(400)[rows]]
     assert f"of {code:g} left empty, no reading" in lines[0]
+    values[rows] = round(code, 1)  # as a logger of tenths has it
+    assert np.isnan(drop_codes("t", np.round(values, 1))[0][rows]).all()
 
 
 @pytest.mark.parametrize("step", [0.0625, 0.5, 1.0])

@@ -174,9 +174,8 @@ def test_beside_held_inputs_what_nothing_predicts_is_a_disturbance():
     walk, room = np.cumsum(np.random.default_rng(8).standard_normal((2, 600)), axis=1)
     columns = {"c2": HELD, "c4": slow, "c5": 25 + 80 * walk / np.ptp(walk), "c6": 22 + room / np.ptp(room)}
     found = assign_roles(dict.fromkeys(columns, "1"), columns=columns)
-    roles, reasons = found.of, found.reasons
-    assert roles == {"c2": "input", "c4": "output", "c5": "disturbance", "c6": "disturbance"}
-    assert reasons["c5"] == "no other column predicts its course"
+    assert found.of == {"c2": "input", "c4": "output", "c5": "disturbance", "c6": "disturbance"}
+    assert found.reasons["c5"] == "no other column predicts its course"
 
 
 def test_beside_a_set_point_input_and_output_are_the_controllers():
@@ -195,19 +194,15 @@ def test_beside_a_set_point_input_and_output_are_the_controllers():
     assert assign_roles(units, columns=columns).of["input"] == "input"
 
 
-def test_one_column_beside_the_weather_is_the_output():
+def test_one_column_alone_or_beside_the_weather_is_the_output():
     columns = {"oat": ROOM, "meter": 2 * NOISY}
     roles = assign_roles({"oat": "1", "meter": "W"}, columns=columns).of
     assert roles == {"oat": "disturbance", "meter": "output"}
     late = np.maximum(np.arange(300.0) - 2, 0)  # a step test whose step is at its start
     columns = {"c2": 20.0 * (late > 0), "c4": np.round(24.7 + 6 * (1 - np.exp(-late / 60)), 1)}
     assert assign_roles(dict.fromkeys(columns, "1"), columns=columns).of == {"c2": "input", "c4": "output"}
-
-
-def test_one_column_alone_is_read_and_not_moved():
-    columns = {"value": np.sin(np.arange(200.0) / 9), "feed_id": np.full(200, 635051.0)}
-    roles = assign_roles(dict.fromkeys(columns, "1"), columns=columns)
-    assert roles.of == {"value": "output", "feed_id": "other"}
+    columns = {"value": np.sin(np.arange(200.0) / 9), "feed": np.full(200, 635051.0)}
+    assert assign_roles(dict.fromkeys(columns, "1"), columns=columns).of == {"value": "output", "feed": "other"}
 
 
 READING = np.round(4 * (20 + 5 * plant_of(HELD, noise=0.02))) / 4  # degC, a converter of 0.25
