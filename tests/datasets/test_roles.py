@@ -201,8 +201,8 @@ def test_one_column_alone_or_beside_the_weather_is_the_output():
     late = np.maximum(np.arange(300.0) - 2, 0)  # a step test whose step is at its start
     columns = {"c2": 20.0 * (late > 0), "c4": np.round(24.7 + 6 * (1 - np.exp(-late / 60)), 1)}
     assert assign_roles(dict.fromkeys(columns, "1"), columns=columns).of == {"c2": "input", "c4": "output"}
-    columns = {"value": np.sin(np.arange(200.0) / 9), "feed": np.full(200, 635051.0)}
-    assert assign_roles(dict.fromkeys(columns, "1"), columns=columns).of == {"value": "output", "feed": "other"}
+    columns = {"c1": np.sin(np.arange(200.0) / 9), "c2": np.full(200, 635051.0)}
+    assert assign_roles(dict.fromkeys(columns, "1"), columns=columns).of == {"c1": "output", "c2": "other"}
 
 
 READING = np.round(4 * (20 + 5 * plant_of(HELD, noise=0.02))) / 4  # degC, a converter of 0.25
