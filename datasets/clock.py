@@ -118,7 +118,7 @@ def clock_of(table: Table, read: Mapping[str, Header], dt: float | None) -> Cloc
         for header in [*named, *others]
     ] + [parts]
     likely = [clock for clock in clocks if clock is not None]
-    if known := [clock for clock in likely if not clock.doubt and np.isfinite(clock.seconds).any()]:
+    if known := [clock for clock in likely if not clock.doubt and np.unique(clock.seconds).size > 1]:
         first, *others_known = known
         usual = _seconds_a_row(first)
         for clock in others_known:
@@ -193,7 +193,8 @@ def _of_parts(table: Table, read: Mapping[str, Header]) -> Clock | None:
     year, month, day, hour, minute, second = (absent | values).values()
     seconds = 86400 * _days(year, month, day) + 3600 * hour + 60 * minute + second
     seconds = _unwrapped(seconds, table.lines, _PERIODS)[0]
-    if (np.diff(seconds) < 0).any() or not np.nanmax(seconds, initial=0) > np.nanmin(seconds, initial=np.inf):
+    moves = np.diff(seconds[np.isfinite(seconds)])
+    if not moves.any() or np.mean(moves >= 0) < CLOCK.monotone_share:
         return None
     zero, columns = float(np.nanmin(seconds)), [headers[part] for part in parts]
     note = f"time: {', '.join(columns)} counted from the first row"

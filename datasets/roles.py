@@ -56,7 +56,7 @@ _HUMIDITY = re.compile(r"humid|moisture|(^|_)rh(_|\d*$)")  # in percent, as driv
 _INFLOW = re.compile(r"(^|_)(inlet|inflow|supply_air)(_|$)")
 _BOOKKEEPING = re.compile(
     r"^(error|err|control_error|proportional|integral|derivative|[pid]_?(term|part|action)|k_?[pidc]|pid_[pid]"
-    r"|ms|msec|hour|day|month|year|week|weekday|row|index|id|iteration|sample|record|counter"
+    r"|ms|msec|second|minute|hour|day|month|year|week|weekday|row|index|id|iteration|sample|record|counter"
     r"|i[as]e|mean|std_?(dev)?|min|max|batt(ery)?(_level|_u?v)?)(_of_[a-z]+|_?no|_?\d+)?$"
 )
 _ESTIMATES = ("_hat", "hat", "_est", "_estimate", "_estimated", "_pred", "_predicted", "_filtered")
