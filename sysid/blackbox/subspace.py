@@ -114,8 +114,8 @@ def _unit_responses(drive: Array, A: Array, C: Array) -> Array:
     push = w[None, :, :-1, None] * C[:, None, None, :]
     starts = np.zeros((n_y, len(w), n))
     starts[:, 0] = C
-    pushes = push.reshape(-1, rows - 1, n)
-    runs = run_linear(np.ascontiguousarray(A.T), pushes, starts.reshape(-1, n), 1)
+    pushes, nothing = push.reshape(-1, rows - 1, n), np.zeros((1, rows - 1, 0))
+    runs = run_linear(np.ascontiguousarray(A.T)[None], nothing, pushes, starts.reshape(-1, n), 1)
     return np.asarray(np.moveaxis(runs.reshape(n_y, len(w), rows, n), 1, 2).reshape(n_y, rows, -1))
 
 

@@ -19,23 +19,27 @@ from thermogrip.datasets.arrays import Array
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def run_linear(A: Array, push: Array, x0: Array, times: int) -> Array:
-    """Return the states (B, N + 1, n_x) of x+ = A x + push, each row ``times`` times; ``push`` (1 or B, N,
-    n_x) is one for all where it has one."""
+def run_linear(A: Array, on: Array, push: Array, x0: Array, times: int) -> Array:
+    """Return the states (B, N + 1, n_x) of x+ = (A[0] + sum_s on_s A[s + 1]) x + push, each row ``times``
+    times; ``on`` (1 or B, N, n_s) and ``push`` (1 or B, N, n_x) as one for all where they have one."""
     n_batch, n_x = x0.shape
     rows = push.shape[1]
     x = np.empty((n_batch, rows + 1, n_x))
     after = np.empty(n_x)
     for b in range(n_batch):
         x[b, 0] = x0[b]
-        of_push = min(b, len(push) - 1)
+        of_on, of_push = min(b, len(on) - 1), min(b, len(push) - 1)
         for k in range(rows):
             x[b, k + 1] = x[b, k]
             for _ in range(times):
                 for i in range(n_x):
                     total = push[of_push, k, i]
                     for j in range(n_x):
-                        total += A[i, j] * x[b, k + 1, j]
+                        total += A[0, i, j] * x[b, k + 1, j]
+                    for s in range(on.shape[2]):
+                        if on[of_on, k, s] != 0.0:
+                            for j in range(n_x):
+                                total += on[of_on, k, s] * A[s + 1, i, j] * x[b, k + 1, j]
                     after[i] = total
                 x[b, k + 1] = after
     return x

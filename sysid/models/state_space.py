@@ -2,10 +2,10 @@
 
 With x the state, u the inputs, d the measured disturbances and y the outputs, one step of length ``dt`` is
 
-    x+ = A x + B u + E d + F phi(u, d) + c,        y = C x + y0.
+    x+ = A x + B u + E d + F phi(u, d) + sum_s u_s A_s x + c,        y = C x + y0.
 
 Transport delays are states (a shift register).  ``phi`` are products of inputs, their magnitudes and
-disturbances (``"drive*|drive|"``).
+disturbances (``"drive*|drive|"``); with ``A_s`` a switch such as the pump changes how the states couple.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from thermogrip.datasets.arrays import Array
+from thermogrip.datasets.limits import array_within
 from thermogrip.sysid.models.model import BlackBox, Values
 
 
@@ -35,6 +36,7 @@ class StateSpaceModel(BlackBox):
     # names of ``phi``: factors joined by ``*``, each an input or disturbance or its magnitude ``|name|``
     terms: tuple[str, ...] = ()
     F: Array = field(default_factory=lambda: np.empty(0))  # (n_x, n_terms) matrix of the terms
+    A_switch: Mapping[str, Array] = field(default_factory=dict)  # change of ``A`` while the switch is on
     # (n_x, n_x) covariance of the state in the data of the fit; the identity where absent
     spread: Array = field(default_factory=lambda: np.empty(0))
 
@@ -59,7 +61,11 @@ class StateSpaceModel(BlackBox):
             object.__setattr__(self, "spread", np.eye(n_x))
         for name, shape in shapes.items():
             object.__setattr__(self, name, _shaped(name, getattr(self, name), shape))
-        strangers = set(self.switches) - set(self.inputs)
+        switched = {
+            key: _shaped(f"A_switch {key}", value, (n_x, n_x)) for key, value in self.A_switch.items()
+        }
+        object.__setattr__(self, "A_switch", switched)
+        strangers = (set(self.switches) | set(switched)) - set(self.inputs)
         if strangers:
             raise ValueError(f"switches must be inputs, {sorted(strangers)} are not")
         if not self.dt > 0:
@@ -74,8 +80,11 @@ class StateSpaceModel(BlackBox):
     def one_step(self, x: Values, u: Values, d: Values) -> list[Any]:
         """Return the state one step of the model later."""
         phi = products(self.terms, self.inputs + self.disturbances, [*u, *d])
+        switched = [(u[self.inputs.index(name)], matrix) for name, matrix in self.A_switch.items()]
         return [
-            dot(self.A[i], x) + (self.c[i] + dot(self.B[i], u) + dot(self.E[i], d) + dot(self.F[i], phi))
+            dot(self.A[i], x)
+            + (self.c[i] + dot(self.B[i], u) + dot(self.E[i], d) + dot(self.F[i], phi))
+            + sum(on * dot(matrix[i], x) for on, matrix in switched)
             for i in range(self.n_x)
         ]
 
@@ -87,7 +96,8 @@ class StateSpaceModel(BlackBox):
     def rest(self, y: ArrayLike, u: ArrayLike, d: ArrayLike, p: ArrayLike) -> Array:
         """Return the state (n_x,) of a plant at rest whose outputs read y."""
         u, d, y = (np.asarray(value, dtype=float) for value in (u, d, y))
-        push = self.push(u, d)
+        switched = (u[self.inputs.index(name)] * matrix for name, matrix in self.A_switch.items())
+        A, push = self.A + sum(switched, 0.0 * self.A), self.push(u, d)
         move = np.array([name not in self.switches for name in self.inputs], dtype=bool)
         gain = (self.B + self._term_slopes(u, d))[:, move]
         n_v = gain.shape[1]
@@ -96,7 +106,7 @@ class StateSpaceModel(BlackBox):
         # min |x - A x - B v - E d - c|^2 + eps |v - u|^2 subject to C x + y0 = y
         rows = np.block(
             [
-                [(np.eye(self.n_x) - self.A) / scale, -gain / scale],
+                [(np.eye(self.n_x) - A) / scale, -gain / scale],
                 [np.zeros((n_v, self.n_x)), 1e-4 * np.eye(n_v)],
                 [1e-7 / scale * np.eye(self.n_x), np.zeros((self.n_x, n_v))],
             ]
@@ -110,15 +120,15 @@ class StateSpaceModel(BlackBox):
         """Return the states (B, N + 1, n_x) of :meth:`rollout`, ``times`` steps with each row."""
         from thermogrip.sysid.models.recurrences import run_linear  # pulls in numba
 
-        push = np.ascontiguousarray(self.push(u, d))
-        return np.asarray(run_linear(np.ascontiguousarray(self.A), push, np.ascontiguousarray(x0), times))
+        on = np.ascontiguousarray(u[:, :, [self.inputs.index(name) for name in self.A_switch]])
+        A, push = np.stack([self.A, *self.A_switch.values()]), np.ascontiguousarray(self.push(u, d))
+        return np.asarray(run_linear(A, on, push, np.ascontiguousarray(x0), times))
 
     @staticmethod
     def others(data: Mapping[str, Any]) -> dict[str, Any]:
-        """Refuse what version 0.2.0 had for plants made by hand."""
-        if data.get("A_switch"):
-            raise ValueError("has states that a switch couples")
-        return {}
+        """Return the fields that are neither names nor plain arrays."""
+        switched = {str(key): array_within(data["A_switch"], key) for key in data["A_switch"]}
+        return {"A_switch": switched}
 
     def push(self, u: Array, d: Array) -> Array:
         """Return B u + E d + F phi(u, d) + c for rows of inputs, shape (..., n_x)."""
@@ -129,12 +139,16 @@ class StateSpaceModel(BlackBox):
         return np.asarray(out)
 
     def poles(self) -> NDArray[np.complex128]:
-        """Return the eigenvalues of A."""
-        return np.asarray(np.linalg.eigvals(self.A), dtype=complex)
+        """Return the eigenvalues of A at the position of the switches where the largest is largest."""
+        positions = [self.A]
+        for matrix in self.A_switch.values():
+            positions += [position + matrix for position in positions]
+        sets = [np.linalg.eigvals(position) for position in positions]
+        return np.asarray(max(sets, key=lambda roots: float(np.abs(roots).max(initial=0.0))), dtype=complex)
 
     @property
     def stable(self) -> bool:
-        """Whether every pole lies inside the unit circle."""
+        """Whether every pole lies inside the unit circle, at every position of the switches."""
         return bool(np.all(np.abs(self.poles()) < 1))
 
     def _term_slopes(self, u: Array, d: Array) -> Array:

@@ -57,18 +57,19 @@ class Bench:
 
 
 def small_plant() -> Plant:
-    """Return a tank with a drive, a skin and a pump that moves neither: 300 s and 15 s, 0.4 K/s at most."""
+    """Return a tank with a drive and a skin behind a pump: 300 s and 15 s, 0.4 K/s at full drive."""
     dt = 0.5
     model = StateSpaceModel(
         ("drive", "pump"),
         ("t_ambient",),
         ("t_tank", "t_surface"),
-        A=np.array([[1 - dt / 300, 0.0], [dt / 15, 1 - dt / 2000 - dt / 15]]),
+        A=np.array([[1 - dt / 300, 0.0], [0.0, 1 - dt / 2000]]),
         B=np.array([[dt * 0.4, 0.0], [0.0, 0.0]]),
         E=np.array([[dt / 300], [dt / 2000]]),
         C=np.eye(2),
         dt=dt,
         switches=("pump",),
+        A_switch={"pump": np.array([[0.0, 0.0], [dt / 15, -dt / 15]])},
     )
     units = {"drive": "1", "pump": "1", "t_ambient": "degC", "t_tank": "degC", "t_surface": "degC"}
     noise = {"t_tank": 0.05, "t_surface": 0.05}

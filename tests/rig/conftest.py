@@ -1,4 +1,4 @@
-"""A small plant that every test can afford: a driven tank, and a skin that follows it."""
+"""A small plant that every test can afford: a driven tank, and a skin that follows it while the pump runs."""
 
 from __future__ import annotations
 

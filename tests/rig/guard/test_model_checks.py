@@ -74,8 +74,8 @@ def test_a_sensor_that_is_wrong_alone_is_found(plant: Plant, name: str) -> None:
     assert followed.drive(0.5, 60.0, error=lambda t: {name: 0.15 * t}) <= 15.0
 
 
-def test_a_pump_that_stands_still_is_found() -> None:
-    followed = Followed(drill_plants()[0])
+def test_a_pump_that_stands_still_is_found(plant: Plant) -> None:
+    followed = Followed(plant)
     followed.drive(0.8, 40.0)
     assert followed.drive(0.8, 60.0, pump=0) <= 30.0
 
@@ -137,7 +137,7 @@ def integrator(outputs: tuple[str, ...] = ("a",), *, pump: bool = False) -> Plan
     inputs, switches = (("q", "pump"), ("pump",)) if pump else (("q",), ())
     model = StateSpaceModel(
         inputs, (), outputs, A=[[1.0]], B=[[0.1, 0.0][: len(inputs)]], C=np.ones((n, 1)), dt=1.0,
-        y0=[0.0] * n, switches=switches,
+        y0=[0.0] * n, switches=switches, A_switch={"pump": np.zeros((1, 1))} if pump else {},
     )  # fmt: skip
     return Plant(model, {}, dt=1.0, units=dict.fromkeys(inputs, "1"))
 

@@ -11,7 +11,7 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.sysid.models.state_space import StateSpaceModel
 
 
-def model_with_products(seed: int = 0) -> StateSpaceModel:
+def switched_model(seed: int = 0) -> StateSpaceModel:
     rng = np.random.default_rng(seed)
     A = np.diag([0.9, 0.5, 0.2]) + 0.05 * rng.standard_normal((3, 3))
     return StateSpaceModel(
@@ -28,6 +28,7 @@ def model_with_products(seed: int = 0) -> StateSpaceModel:
         switches=("pump",),
         terms=("drive*|drive|", "pump*drive"),
         F=rng.standard_normal((3, 2)),
+        A_switch={"pump": 0.05 * rng.standard_normal((3, 3))},
     )
 
 
@@ -48,8 +49,8 @@ def test_a_free_run_of_a_mimo_model_is_scipys_dlsim():
     np.testing.assert_allclose(got[0, :-1], want, rtol=0, atol=1e-10)
 
 
-def test_rollout_of_a_model_with_products_is_its_own_step_repeated():
-    model, (u, d) = model_with_products(), schedule(200)
+def test_rollout_of_a_switched_model_is_its_own_step_repeated():
+    model, (u, d) = switched_model(), schedule(200)
     x0 = np.array([[0.0, 1.0, -1.0], [2.0, 0.0, 0.0]])
     y, x_end = model.rollout(x0, u[None], d[None], (), 2.0)
     for b in range(2):
@@ -61,7 +62,7 @@ def test_rollout_of_a_model_with_products_is_its_own_step_repeated():
 
 
 def test_each_member_of_a_batch_has_its_own_switch():
-    model = model_with_products()
+    model = switched_model()
     parts = [schedule(50, seed) for seed in (1, 2)]
     u, d = (np.stack(both) for both in zip(*parts))
     y, _ = model.rollout(np.zeros((2, 3)), u, d, (), 2.0)
@@ -71,7 +72,7 @@ def test_each_member_of_a_batch_has_its_own_switch():
 
 
 def test_casadi_symbols_run_the_same_lines():
-    model, (u, d) = model_with_products(), schedule(1)
+    model, (u, d) = switched_model(), schedule(1)
     x, us, ds = ca.SX.sym("x", 3), ca.SX.sym("u", 2), ca.SX.sym("d", 1)
     split = [ca.vertsplit(part) for part in (x, us, ds)]
     step = ca.Function("step", [x, us, ds], [ca.vertcat(*model.step(*split, (), 2.0))])
@@ -80,7 +81,7 @@ def test_casadi_symbols_run_the_same_lines():
 
 
 def test_a_step_of_three_times_dt_is_three_steps_with_the_input_held():
-    model, (u, d) = model_with_products(), schedule(40)
+    model, (u, d) = switched_model(), schedule(40)
     x, x0 = [0.1, 0.2, 0.3], np.array([[0.1, 0.2, 0.3]])
     fine, x_fine = model.rollout(x0, np.repeat(u, 3, axis=0)[None], np.repeat(d, 3, axis=0)[None], (), 2.0)
     coarse, x_coarse = model.rollout(x0, u[None], d[None], (), 6.0)
@@ -137,6 +138,15 @@ def test_a_step_that_is_nearly_a_multiple_is_one():
     assert (y[0, :, 0].tolist(), end.tolist()) == ([5.0, 1.0, 4.0], [[4.0]])
 
 
+def test_poles_are_those_of_the_worst_position_of_the_switches():
+    switched = {"a": np.diag([0.3, 0.0]), "b": np.diag([0.2, 0.0])}
+    model = StateSpaceModel(
+        ("a", "b"), (), ("t",), A=np.diag([0.5, 0.1]), B=np.zeros((2, 2)), C=[[1.0, 0.0]], dt=2.0,
+        switches=("a", "b"), A_switch=switched,
+    )  # fmt: skip
+    assert (sorted(model.poles().real), model.stable) == (pytest.approx([0.1, 1.0]), False)  # both on
+
+
 def test_matrices_that_are_absent_are_zero_and_the_spread_is_one():
     model = StateSpaceModel(("q",), (), ("t",), A=np.zeros((2, 2)), B=[[1], [2]], C=[[1, 3]], dt=1.0)
     assert (model.spread.tolist(), model.E.shape, model.c.tolist()) == (np.eye(2).tolist(), (2, 0), [0, 0])
@@ -150,7 +160,7 @@ def test_an_unstable_model_reports_it_and_overflows_quietly():
 
 
 def test_a_dict_makes_the_model_again():
-    model, (u, d) = model_with_products(), schedule(20)
+    model, (u, d) = switched_model(), schedule(20)
     again = StateSpaceModel.from_dict(model.to_dict())
     both = [some.rollout(np.ones((1, 3)), u[None], d[None], (), 2.0)[0] for some in (model, again)]
     np.testing.assert_array_equal(both[0], both[1])
@@ -161,7 +171,7 @@ def test_a_dict_makes_the_model_again():
 @pytest.mark.parametrize("change", [{"A": [[1.0]]}, {"dt": "fast"}, {"terms": ["heat"]}, {"A": None}])
 def test_a_broken_dict_is_the_users_to_repair(change):
     with pytest.raises(UserError, match="state-space"):
-        StateSpaceModel.from_dict(model_with_products().to_dict() | change)
+        StateSpaceModel.from_dict(switched_model().to_dict() | change)
 
 
 def test_matrices_that_do_not_fit_or_are_not_numbers_are_refused():

@@ -26,7 +26,7 @@ def _black_box() -> Plant:
         ("drive", "pump"),
         ("t_ambient",),
         ("t_tank", "t_surface"),
-        A=[[1 - 2 / 300, 0.0], [2 / 15, 1 - 2 / 2000 - 2 / 15]],
+        A=[[1 - 2 / 300, 0.0], [0.0, 1 - 2 / 2000]],
         B=[[0.8, 0.0], [0.0, 0.0]],
         E=[[2 / 300], [2 / 2000]],
         C=np.eye(2),
@@ -34,6 +34,7 @@ def _black_box() -> Plant:
         terms=("drive*drive",),
         dt=2.0,
         switches=("pump",),
+        A_switch={"pump": np.array([[0.0, 0.0], [2 / 15, -2 / 15]])},
     )
     units = {"drive": "1", "pump": "1", "t_ambient": "degC", "t_tank": "degC", "t_surface": "degC"}
     return Plant(model, {}, dt=2.0, units=units, valid={"drive": (-1.0, 1.0)})
