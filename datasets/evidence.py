@@ -22,7 +22,6 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 
 from thermogrip.datasets.arrays import Array
-from thermogrip.datasets.repair import drop_stuck
 
 Columns: TypeAlias = Mapping[str, Array]
 
@@ -44,7 +43,6 @@ class EvidenceSettings:
     blocks: tuple[int, ...] = (1, 3, 10, 30)  # rows that are averaged: slow effects drown in noise at one
     latest: int = 10  # rows by which a reading of an input is late
     filters: tuple[int, ...] = (3, 10, 30)
-    jump: float = 10.0  # times what a column rarely moves, is no move of it
     telling_rows: int = 200  # of fewer, an effect may not be seen
     follows: float = 0.9  # share of its variance that another input explains
     parts: tuple[int, ...] = (2, 4, 8)  # that a log is cut into
@@ -58,12 +56,8 @@ EVIDENCE = EvidenceSettings()
 
 
 def is_moved(columns: Columns, name: str, drives: Sequence[str], beside: Sequence[str] = ()) -> bool:
-    """Tell whether the past of drives helps to predict a column that reads, beside its own and others'."""
-    causes = [columns[n] for n in (*drives, *beside)]
-    is_sound = np.isfinite(drop_stuck(name, columns[name], causes)[0])
-    if is_sound.sum() < EVIDENCE.fewest_rows:
-        return False
-    reading, *causes = _standardised([values[is_sound] for values in (columns[name], *causes)])
+    """Tell whether the past of a drive helps to predict a column beside its own and that of others."""
+    reading, *causes = _standardised([columns[n] for n in (name, *drives, *beside)])
     gains = [_gains(reading, _bases(causes[: len(drives)], k), causes[len(drives) :]) for k in EVIDENCE.lags]
     return bool(np.any(np.min(gains, axis=0) > EVIDENCE.strong_gain))
 
@@ -135,12 +129,6 @@ def _standardised(columns: Sequence[Array]) -> list[Array]:
     for values in map(some_rows, columns):
         rows, finite = np.arange(values.size), np.isfinite(values)
         filled = np.interp(rows, rows[finite], values[finite]) if finite.any() else np.zeros(values.size)
-        moves = np.diff(filled, prepend=filled[0])
-        usual = np.quantile(np.abs(moves[moves != 0]), 0.99) if moves.any() else 0.0
-        # where a sensor or its unit is changed, the course before and after it tells all the same
-        beyond = np.abs(moves) > EVIDENCE.jump * usual
-        if np.count_nonzero(beyond) == 1:  # a drive jumps more often
-            filled = filled[0] + np.cumsum(np.where(beyond, 0.0, moves))
         scaled.append((filled - filled.mean()) / (np.std(filled) or 1.0))
     return scaled
 

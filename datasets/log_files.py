@@ -407,22 +407,27 @@ def _repair(
     if written_twice:
         repairs.append(f"{again.sum()} rows dropped that repeat the one before and its time")
     columns = {name: values[once][ordered.rows] for name, values in columns.items()}
+    lines = table.lines[once][ordered.rows]
+    left_out = {"a program filled all columns": repair.filled_rows(columns, roles)}
+    for name in [name for name in columns if roles[name] == "input"]:
+        left_out[f"{name} is not known"] = repair.unknown_rows(columns[name], time)
+    for why, rows in left_out.items():
+        which = repair.name_rows(lines[rows])
+        repairs += [f"{rows.sum()} row(s) left out in which {why}: {which}"] if rows.any() else []
+    kept = ~np.any([*left_out.values()], axis=0)
+    time, columns = time[kept], {name: values[kept] for name, values in columns.items()}
     if time.size < 2:
-        why = [note for note in table.notes if isinstance(note, repair.Doubt)]
-        problem = "; ".join([f"{time.size} row(s) are not a log", *why])
+        why_few = [*repairs, *(note for note in table.notes if isinstance(note, repair.Doubt))]
+        problem = "; ".join([f"{time.size} row(s) are not a log", *why_few])
         raise UserError(problem, file=table.file, hint="give at least two rows")
-    repairs += repair.doubt_repeats([*columns.values()], table.lines[once][ordered.rows])
+    repairs += repair.doubt_repeats([*columns.values()], lines[kept])
     if time[0] >= EPOCH[0]:
         repairs.append(f"time is a clock of seconds since 1970: counted from the first row, {time[0]:.0f} s")
         time = np.round(time - time[0], 6)
     repairs += repair.describe_steps(time)
-    for name in [name for name in columns if roles[name] == "input"]:
-        if (unknown_rows := repair.unknown_rows(columns[name], time)).any():
-            repairs.append(f"{unknown_rows.sum()} rows in which {name} is lost for longer left out")
-            time, columns = time[~unknown_rows], {n: values[~unknown_rows] for n, values in columns.items()}
     inputs, stuck = [values for name, values in columns.items() if roles[name] == "input"], False
     for name, values in columns.items():
-        if roles[name] == "output" and inputs:
+        if roles[name] == "output" and inputs and time.size >= repair.SPIKE_WINDOW:
             moving, findings = repair.drop_stuck(name, values, inputs)
             repairs, stuck = repairs + findings, stuck or bool(findings)
             if np.isfinite(moving).any():
@@ -431,13 +436,6 @@ def _repair(
                 roles[name] = "other"
         columns[name], findings = _repair_column(name, values, time, units[name], roles[name], table.file)
         repairs += findings
-    inputs = [values for name, values in columns.items() if roles[name] == "input"]
-    if unknown := max((int(np.isfinite(values).argmax()) for values in inputs), default=0):  # nothing to hold
-        if time.size - unknown < 2:
-            problem = "an input is unknown until the last row"
-            raise UserError(problem, file=table.file, hint="give its value from the start")
-        repairs.append(f"{unknown} row(s) before the first value of an input dropped")
-        time, columns = time[unknown:], {name: values[unknown:] for name, values in columns.items()}
     finite_outputs = [np.isfinite(v) for n, v in columns.items() if roles[n] == "output"]
     read = np.any(finite_outputs or [np.ones(time.size, dtype=bool)], axis=0)
     if stuck and not (read[0] and read[-1]):  # a held-out part without any reading has no error
@@ -459,8 +457,7 @@ def _reading_doubts(roles: Mapping[str, str], units: Mapping[str, str], log: _Re
             values = np.where(values == 0, np.nan, values)  # at night and in a calm no sensor ends
         doubts.append(repair.doubt_readings(name, values, [*drives.values()], log.time))
     for name, values in drives.items():
-        doubts.append(repair.doubt_full_scale(name, values, units[name]))
-        doubts.append(repair.doubt_moves(name, values, [*readings.values()]))
+        doubts += [repair.doubt_full_scale(name, values, units[name]), repair.doubt_moves(name, values)]
     for name in [name for name in readings if roles[name] == "output"]:
         doubts.append(repair.doubt_rows(name, readings[name]))
         doubts += [repair.doubt_lead(name, readings[name], *drive, log.time) for drive in drives.items()]

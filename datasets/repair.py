@@ -6,7 +6,7 @@ lost disturbance is interpolated.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import pairwise, takewhile
 from typing import NamedTuple
 
@@ -123,11 +123,11 @@ def gap_rows(time: Array) -> NDArray[np.int64]:
     return np.flatnonzero((step > GAP_SECONDS) & (step > GAP_STEPS * np.median(step)))
 
 
-def unknown_rows(values: Array, time: Array) -> NDArray[np.bool_]:
-    """Return the rows of an input's holes longer than a gap, where it is written in each row and not only as
-    it changes."""
+def unknown_rows(values: Array, time: Array) -> Mask:
+    """Return the rows of an input before its first value, and of holes longer than a gap, where it is written
+    in each row and not only as it changes."""
     filled = np.isfinite(values)
-    unknown = np.zeros(values.size, dtype=bool)
+    unknown = ~np.logical_or.accumulate(filled)
     is_written_in_each = 2 * np.count_nonzero(filled[1:] & filled[:-1]) > np.count_nonzero(filled)
     for row in gap_rows(time[filled]).tolist() if is_written_in_each else ():
         before, after = np.flatnonzero(filled)[row : row + 2]
@@ -203,8 +203,8 @@ def doubt_readings(name: str, values: Array, inputs: Sequence[Array], time: Arra
         rows = _rows_beyond_jumps(values, values == end)
         edges = np.flatnonzero(np.diff(rows.astype(int)))
         driven = [any(np.ptp(u[max(edge - SPIKE_LENGTH, 0) : edge + 2]) for u in inputs) for edge in edges]
-        if rows.sum() > SPIKE_LENGTH * max(edges.size / 2, 1) and 2 * sum(driven) <= edges.size:
-            says = f"{name} jumps to {end:g} and stays in {rows.sum()} rows while no input moves"
+        if rows.any() and 2 * sum(driven) <= edges.size:
+            says = f"{name} jumps to {end:g} and stays in {rows.sum()} row(s) while no input moves"
             return f"{says}: if that is a sensor's code, leave those cells empty"
     value, held = _longest_standstill(values, moves)
     if held >= SPIKE_WINDOW:
@@ -242,7 +242,7 @@ def doubt_full_scale(name: str, values: Array, unit: str) -> str:
     return f"{name} goes to {highest:g} percent: if it is none, name it {name}_0_255 or without a unit"
 
 
-def doubt_moves(name: str, values: Array, readings: Sequence[Array]) -> str:
+def doubt_moves(name: str, values: Array) -> str:
     """Return the doubt on an input that goes from one level to another as no drive does."""
     bounds = np.concatenate([[0], np.flatnonzero(np.diff(values)) + 1, [values.size]])
     holds = np.flatnonzero(np.diff(bounds) > _FEWEST_HELD)
@@ -259,12 +259,6 @@ def doubt_moves(name: str, values: Array, readings: Sequence[Array]) -> str:
         straight = np.linspace(move[0], move[-1], move.size)
         if rows >= _FEWEST_HELD and np.abs(move - straight).max() <= _FEW * size:
             ramps.setdefault(rows, []).append(size)
-            first, last = bounds[before + 1], bounds[after]
-            # no plant answers a ramp so: of 672 simulated readings three, without noise, of 47 filled gaps 40
-            likely = readings if rows >= SPIKE_WINDOW else ()
-            drawn = [(_goes_on(v)["drawn straight"] & (np.diff(v) != 0))[first : last - 1] for v in likely]
-            if drawn and np.all(drawn):
-                return f"{name} and all readings go straight in rows {first + 1} to {last}: was a gap filled?"
     # of 150 drives of sound logs a quarter of the moves at most, of rows shuffled in fives half and more
     if to_and_fro > max(_MOST_TO_AND_FRO * count, _FEWEST_ALIKE):
         return f"{name} goes to and fro in {to_and_fro} of its {count} moves: are its rows in order?"
@@ -342,6 +336,46 @@ def doubt_repeats(columns: Sequence[Array], lines: NDArray[np.int64]) -> list[st
     return [Doubt(f"{says}: cut the file there in two")]
 
 
+def filled_rows(columns: Mapping[str, Array], roles: Mapping[str, str]) -> Mask:
+    """Return the rows that a program filled, in all columns at once, with zeros, the last values or lines.
+
+    A plant bends after its drive: no plant made rows in which all readings are drawn, and inputs too, or
+    held, if at both ends a reading and another column bend in the same row.
+    """
+    readings = {n: v for n, v in columns.items() if roles[n] in ("output", "disturbance")}
+    inputs = {n: v for n, v in columns.items() if roles[n] == "input"}
+    filled = np.zeros(len(next(iter(columns.values()))), dtype=bool)
+    are_zero = np.all([values == 0 for values in (readings | inputs).values()], axis=0)
+    for values in readings.values():
+        filled |= _rows_beyond_jumps(values, are_zero)
+    for start, stop in _drawn_lines([*readings.values()]) if readings else ():
+        moved = {n: u for n, u in inputs.items() if np.ptp(u[start - 2 : stop])}
+        # a step in the first row would explain the run
+        explained = any(u[start - 1] == u[stop] or not _is_line(u, start, stop) for u in moved.values())
+        straight = {n: _goes_on(v)["drawn straight"] for n, v in (readings | moved).items()}
+        bends = [[n for n in straight if not straight[n][row]] for row in (start - 1, stop)]
+        if not explained and all(len(names) > 1 and readings.keys() & names for names in bends):
+            filled[start:stop] = True
+    return filled
+
+
+def _drawn_lines(columns: Sequence[Array]) -> list[list[int]]:
+    """Return start and stop of the rows in which all columns are on lines, more of them than by chance."""
+    straight = np.all([_goes_on(values)["drawn straight"] for values in columns], axis=0)
+    runs = np.flatnonzero(np.diff(straight.astype(int), prepend=0, append=0)).reshape(-1, 2)
+    count = np.diff(runs).ravel()
+    chance = (straight.sum() - count + 1) / (straight.size - count + 2)  # of one row, as in drop_stuck
+    is_within = (runs[:, 0] > 1) & (runs[:, 1] < straight.size)
+    runs = runs[is_within & (straight.size * chance**count < _STUCK_CHANCE)]
+    return [[a, b] for a, b in runs.tolist() if all(_is_line(values, a, b) for values in columns)]
+
+
+def _is_line(values: Array, start: int, stop: int) -> bool:
+    """Tell whether rows lie on the line between those beside them, all of them rounded by half a step."""
+    line = np.linspace(values[start - 1], values[stop], stop - start + 2)
+    return bool(np.abs(values[start - 1 : stop + 1] - line).max() < 1.01 * _smallest_step(values))
+
+
 def _rows_beyond_jumps(values: Array, rows: Mask) -> Mask:
     """Return those of the rows whose runs are entered and left by jumps as no other rows make."""
     moves = np.abs(np.diff(values))
@@ -365,39 +399,30 @@ def drop_stuck(name: str, values: Array, inputs: Sequence[Array]) -> tuple[Array
     for u in inputs:
         if (span := float(np.nanmax(u) - np.nanmin(u))) > 0:
             travel[1:] += np.cumsum(np.abs(np.nan_to_num(np.diff(u))) / span)
-    for how, goes_on in _goes_on(values).items() if values.size >= SPIKE_WINDOW else ():
-        # a settled reading stands still, but not through moves; one with noise goes straight in no rows
-        trials = travel
-        if how != "held":  # by a step or none in a row a coarse reading goes straight too
-            moves = np.abs(np.diff(values)) > 1.5 * _smallest_step(values)
-            goes_on, trials = goes_on & moves, np.append(0.0, np.cumsum(moves))
-        ends = np.flatnonzero(np.append(~goes_on, True))
-        starts = np.append(0, ends[:-1] + 1)
-        passed = trials[ends] - trials[starts]
-        longest = int(np.argmax(passed))
-        run, most = slice(int(starts[longest]), int(ends[longest]) + 1), float(passed[longest])
-        # but for the first row of each run: its reading is from before its move
-        first_moves = trials[np.minimum(starts + 1, ends)] - trials[starts]
-        others = float(np.delete(passed - first_moves, longest).sum())
-        # With M the trials (moves of the inputs, in ranges; rows) of the whole log, m those within the run
-        # that has most of them and k those within all other runs, a sound reading goes on through one with a
-        # chance of about p = (k + 1) / (M - m + 2) (Laplace's rule); none where p^(m - 1) is under 1e-3.
-        chance = (others + 1) / (trials[-1] - most + 2)
-        likely = most <= 2 or chance >= 1 or chance ** (most - 1) > _STUCK_CHANCE
-        first, last = values[run][[0, -1]]
-        # a line that is rounded to a column's steps is within one of its chord; what cools bends further
-        chord = np.linspace(first, last, run.stop - run.start)
-        likely |= how != "held" and np.abs(values[run] - chord).max() > 1.001 * _smallest_step(values)
-        # at its least or greatest value, as in other rows: so rests a drive that no name shows
-        at_end = first in (np.nanmin(values), np.nanmax(values))
-        likely |= how == "held" and at_end and np.count_nonzero(values == first) > values[run].size
-        if likely or np.ptp(travel[run]) <= 1 or not np.isfinite(values[run]).all():
-            continue
-        what = f"stuck at {first:g}" if how == "held" else f"{how} from {first:g} to {last:g}"
-        lost = np.isin(np.arange(values.size), np.arange(run.start, run.stop))
-        problem = f"{name}: {what} for {lost.sum()} rows while the inputs move: left out"
-        return np.where(lost, np.nan, values), [problem]
-    return values, []
+    ends = np.flatnonzero(np.append(np.diff(values) != 0, True))
+    starts = np.append(0, ends[:-1] + 1)
+    passed = travel[ends] - travel[starts]
+    longest = int(np.argmax(passed))
+    run, most = slice(int(starts[longest]), int(ends[longest]) + 1), float(passed[longest])
+    # but for the first row of each run: its reading is from before its move
+    first_moves = travel[np.minimum(starts + 1, ends)] - travel[starts]
+    others = float(np.delete(passed - first_moves, longest).sum())
+    # With M the moves of the inputs, in ranges, in the whole log, m those within the run that has most of
+    # them and k those within all other runs, a sound reading, which may settle, is held through one with a
+    # chance of about p = (k + 1) / (M - m + 2) (Laplace's rule); none where p^(m - 1) is under 1e-3.
+    chance = (others + 1) / (travel[-1] - most + 2)
+    likely = most <= 2 or chance >= 1 or chance ** (most - 1) > _STUCK_CHANCE
+    # at its least or greatest value, as in other rows: so rests a drive that no name shows
+    at_end = values[run.start] in (np.nanmin(values), np.nanmax(values))
+    likely |= at_end and np.count_nonzero(values == values[run.start]) > values[run].size
+    what = f"stuck at {values[run.start]:g}"
+    if likely:
+        drawn = [slice(a, b) for a, b in _drawn_lines([values]) if values[a - 1] != values[b]]
+        run = next((rows for rows in drawn if np.ptp(travel[rows]) > 1), slice(0, 0))
+        what = f"drawn straight from {values[run.start]:g} to {values[run.stop - 1]:g}"
+    lost = np.isin(np.arange(values.size), np.arange(run.start, run.stop))
+    problem = f"{name}: {what} for {lost.sum()} rows while the inputs move: left out"
+    return np.where(lost, np.nan, values), [problem] if lost.any() else []
 
 
 def reject_spikes(name: str, values: Array, time: Array, *, floor: float | None) -> tuple[Array, list[str]]:

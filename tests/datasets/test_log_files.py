@@ -108,16 +108,6 @@ def test_a_lost_input_is_held_a_lost_disturbance_interpolated_and_a_lost_output_
     assert "t_room: 1 lost value interpolated" in repairs(log)
 
 
-def test_a_room_that_cannot_be_is_refused_and_one_in_kelvin_is_noticed(write):
-    def room(unit, value):
-        return write(f"time_s,t_room_{unit},t_a_degC\n" + "".join(f"{n},{value},20\n" for n in range(4)))
-
-    assert "column t_room: median of -300" in refused(room("degC", -300))
-    said = repairs(read_log(room("degC", 295)))
-    assert said == ["t_room: median of 295.0 degC; name the column t_room_K if this is kelvin"]
-    assert "kelvin" not in " ".join(repairs(read_log(room("K", 295))))
-
-
 def test_the_unfinished_last_line_of_a_killed_logger_is_dropped(write):
     log = read_log(write(HEAD + ROWS + "1.5,0."))
     assert log.sizes["time"] == 3
@@ -136,7 +126,6 @@ def test_the_unfinished_last_line_of_a_killed_logger_is_dropped(write):
         ("", ["is empty", "header"]),
         ("# only\n# comments\n", ["only comments"]),
         ("time_s\n0\n1\n", ["nothing else"]),
-        (HEAD + "0,0,25\n1,0,25\n0.5,0,25\n", ["row 4", "time runs back"]),
         ("date;t_degC\n" + "1-3-2019 00:05;20\n" * 20 + ";20\n" * 4, ["row 22", "a time to 4 rows"]),
         (b"time_s,t_degC\n0,1\n1,\xff\xfe\n", ["row 3", "is not a number"]),
         ((HEAD + ROWS).encode("utf-16-le"), ["is not text"]),
@@ -144,7 +133,7 @@ def test_the_unfinished_last_line_of_a_killed_logger_is_dropped(write):
         (pickle.dumps({"a": 1}), ["is not text"]),
         (b"cos\nsystem\n(S'echo owned'\ntR.", ["log.csv"]),
         (HEAD + "0,0,-300\n1,0,-300\n", ["absolute zero"]),
-        (HEAD + "0,,25\n1,,25\n2,1,25\n", ["unknown until the last row"]),
+        (HEAD + "0,,25\n1,,25\n2,1,25\n", ["2 row(s) left out in which drive is not known: rows 2, 3"]),
     ],
 )
 def test_a_fault_is_one_line_that_names_its_place(write, text, expected):
@@ -803,7 +792,6 @@ HEATER = np.random.default_rng(1).choice([20.0, 50.0, 90.0], 30).repeat(20)
 PLATE = np.convolve(HEATER, np.ones(60) / 60)[:600] + 0.1 * np.random.default_rng(0).standard_normal(600)
 LATER = (PLACES >= 300) * 1.0
 CODE = (PLACES % 200 > 125) & (PLACES % 200 < 136)
-FILLED = [np.interp(PLACES, SOUND := np.r_[:205, 230:600], v[SOUND]) for v in (HEATER, PLATE)]
 SHUFFLED_IN_FIVES = np.random.default_rng(0).permuted(PLACES[2:597].reshape(-1, 5), axis=1).ravel()
 
 
@@ -816,7 +804,7 @@ SHUFFLED_IN_FIVES = np.random.default_rng(0).permuted(PLACES[2:597].reshape(-1, 
         (PLACES, HEATER, np.repeat(PLATE[::10], 10), "read in every 10th row only, held"),
         (PLACES, HEATER, np.interp(PLACES, PLACES[::10], PLATE[::10]), "10th row only, drawn straight"),
         (PLACES, HEATER, np.where((PLACES > 300) & (PLACES < 340), PLATE[300], PLATE), "is held at"),
-        (PLACES, HEATER, np.where(CODE, -46.85, PLATE), "plate jumps to -46.85 and stays in 30 rows"),
+        (PLACES, HEATER, np.where(CODE, -46.85, PLATE), "plate jumps to -46.85 and stays in 30 row(s)"),
         (PLACES, np.where(CODE, 0, HEATER), np.where(CODE, -46.85, PLATE), "is held at -46.85"),
         (PLACES, HEATER, np.minimum(PLATE, 60), "plate is held at 60 for "),  # a sensor at its end
         (PLACES, 2.55 * HEATER, PLATE, "heater goes to 229.5 percent: if it is none, name it heater_0_255"),
@@ -824,8 +812,8 @@ SHUFFLED_IN_FIVES = np.random.default_rng(0).permuted(PLACES[2:597].reshape(-1, 
         (PLACES, HEATER, PLATE[np.minimum(PLACES + 10, 599)], "plate moves 11 s before heater does"),
         (PLACES, HEATER, PLATE + LATER * (32 + 0.8 * PLATE), "stays there, as nowhere else"),
         (PLACES, np.where(LATER, 110 - HEATER, HEATER), PLATE, "of the log as it does elsewhere"),
+        (PLACES, HEATER, np.r_[-30, PLATE[1:]], "jumps to -30 and stays in 1 row(s) while no input moves"),
         (np.r_[:2, SHUFFLED_IN_FIVES, 597:600], HEATER, PLATE, "to and fro in 18 of its 18 moves"),
-        (PLACES, *FILLED, "heater and all readings go straight in rows 206 to 230"),
         (PLACES, np.interp(PLACES, PLACES[::5], HEATER[::5]), PLATE, "in 5 rows, 18 times: is it an average"),
         (PLACES, np.interp(PLACES, PLACES[::5], 9.0 * (HEATER[::5] > 30)), PLATE, ""),  # of a limited rate
         (PLACES, HEATER, np.floor(PLATE / 4 + 0.9 * (PLACES % 2)), ""),  # a coarse reading that flickers
@@ -974,6 +962,25 @@ def test_the_rows_after_the_only_sensor_stuck_are_left_out(tmp_path):
     log = read_log(tmp_path / "stuck.csv")
     assert log.sizes["time"] == 300
     assert "300 rows at the ends of the log, in which no output reads, left out" in log.attrs["repairs"]
+
+
+@pytest.mark.parametrize(
+    ("lost", "how"),
+    [("205:230", "drawn"), ("50:350", "drawn"), ("405:435", "held"), ("300:330", "zero"), ("0:0", "held")],
+)
+def test_rows_that_a_program_filled_in_all_columns_at_once_are_left_out(write, lost, how):
+    is_lost = np.isin(PLACES, np.arange(*map(int, lost.split(":"))))
+    ramp = np.where((PLACES > 110) & (PLACES < 171), PLACES - 90, HEATER)  # by the drive itself
+    noise = 0.05 * np.random.default_rng(0).standard_normal((2, 600))
+    columns = [ramp, *(lfilter([1 - a], [1, -a], ramp) + v for a, v in zip((0.9, 0.97), noise))]
+    last = np.maximum.accumulate(np.where(is_lost, 0, PLACES))
+    for k, v in enumerate(columns):
+        drawn = np.interp(PLACES, PLACES[~is_lost], v[~is_lost])
+        columns[k] = {"drawn": drawn, "held": v[last], "zero": np.where(is_lost, 0, v)}[how]
+    rows = "".join(f"{k},{u:.3f},{a:.3f},{b:.3f}\n" for k, (u, a, b) in enumerate(zip(*columns)))
+    log = read_log(write("time_s,heater,plate_degC,block_degC\n" + rows))
+    assert np.setxor1d(log["time"].values, PLACES[~is_lost]).size <= 2
+    assert ("left out in which a program filled all columns: row" in log.attrs["repairs"]) == is_lost.any()
 
 
 def test_a_gap_that_was_drawn_straight_is_left_out(write):

@@ -15,7 +15,6 @@ from thermogrip.datasets.repair import (
     describe_steps,
     drop_codes,
     drop_stuck,
-    fill_lost,
     find_spikes,
     gap_rows,
     order_rows,
@@ -180,12 +179,6 @@ def test_a_gap_is_longer_than_ten_seconds_and_five_steps():
     assert gap_rows(np.array([0.0, 1.0, 2.0, 12.1, 13.1])).tolist() == [2]
     assert gap_rows(np.arange(10) * 60.0).tolist() == []
     assert gap_rows(np.array([5.0])).tolist() == []
-
-
-def test_an_input_is_held_and_never_taken_from_later():
-    values, lines = fill_lost("drive", np.array([np.nan, 0.5, np.nan, np.nan, 0.7]))
-    np.testing.assert_array_equal(values, [np.nan, 0.5, 0.5, 0.5, 0.7])
-    assert "3 lost values held" in lines[0]
 
 
 def warm(rows=400, step=0.0625, seed=3):
