@@ -127,8 +127,7 @@ def clock_of(table: Table, read: Mapping[str, Header], dt: float | None) -> Cloc
                 steps = f"{_seconds_a_row(clock):.4g} s a row, not {usual:.4g}"
                 doubt = "{} is taken as the time of all columns, and {} goes ".format(*both) + steps
                 return replace(first, doubt=doubt)
-        same = frozenset[str]().union(*(clock.columns for clock in known))
-        return replace(first, columns=same)
+        return replace(first, columns=frozenset[str]().union(*(clock.columns for clock in known)))
     if likely:
         return likely[0]
     step = float(table.meta.get("dt", 1.0))  # a file may have it beside its columns

@@ -114,8 +114,7 @@ def predictive_gain(columns: Sequence[Array]) -> Array:
     scaled = _standardised(columns)
     pasts = (_bases(scaled, lags) for lags in EVIDENCE.lags)
     least = np.min([[_gains(y, bases, ()) for y in scaled] for bases in pasts], axis=0)
-    gain = np.reshape(least, (len(scaled), len(scaled))).T
-    return gain * (1 - np.eye(len(scaled)))
+    return np.reshape(least, (len(scaled), len(scaled))).T * (1 - np.eye(len(scaled)))
 
 
 def some_rows(values: Array) -> Array:

@@ -8,7 +8,7 @@ helps to predict an output) is reported as a doubt.  Whoever states the roles ha
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TypeAlias
 
@@ -59,7 +59,7 @@ _BOOKKEEPING = re.compile(
     r"|ms|msec|second|minute|hour|day|month|year|week|weekday|row|index|id|iteration|sample|record|counter"
     r"|i[as]e|mean|std_?(dev)?|min|max|batt(ery)?(_level|_u?v)?)(_of_[a-z]+|_?no|_?\d+)?$"
 )
-_ESTIMATES = ("_hat", "hat", "_est", "_estimate", "_estimated", "_pred", "_predicted", "_filtered")
+_ESTIMATE = re.compile(r"(_?hat|_(est(imated?)?|pred(icted)?|filt(ered)?|avg|average|smooth(ed)?))$")
 _MODES = {"auto", "automatic", "manual", "mode", "status"}  # of a controller
 IS_SET_POINT = "its name is that of a set point"
 _IS_BOOKKEEPING = "its name is that of a number of the clock, the controller or a statistic"
@@ -141,7 +141,7 @@ def assign_roles(
     stated = dict(given or {}) | chosen
     guesses = {n: explain_role(n, unit) for n, unit in units.items() if n not in stated}
     made_of = {f"asked_{n}": f"it is what was asked of {n}" for n in units}
-    made_of |= {f"{n}{end}": f"it is an estimate of {n}" for n in units for end in _ESTIMATES}
+    made_of |= {n: f"it is made of {of}" for n in units if (of := _ESTIMATE.sub("", n)) != n and of in units}
     guesses |= {n: ("other", made_of[n]) for n in guesses if n in made_of}
     evidence: _Guesses = {}  # of the data alone
     if columns is not None:
@@ -175,6 +175,7 @@ def assign_roles(
         unsure = {n: why for n, why in reasons.items() if not why.startswith(sound)}
         unsure = {n: why for n, why in unsure.items() if n not in (*evidence, *of_readings)}
         doubts += role_doubts(columns, roles, unsure, goals)
+    doubts += _kelvin_doubts(columns or {}, [n for n in reasons if roles[n] == "output" and units[n] == "1"])
     # a role that the course of a column alone shows: whoever states the roles has no doubt
     doubts += [
         f"{name} is {'left out' if role == 'other' else f'taken as {role}'}: {why}"
@@ -182,6 +183,14 @@ def assign_roles(
         if reasons.get(name) == why and (role != "other" or why.endswith(FOLLOWED))
     ]
     return Roles(roles, reasons, tuple(doubts))
+
+
+def _kelvin_doubts(columns: Columns, outputs: Sequence[str]) -> Iterator[str]:
+    """Yield a line for each output without a unit that may be in kelvin, its tenths or its hundredths."""
+    for name in [name for name in outputs if name in columns]:
+        median = float(np.nanmedian(columns[name]))
+        if any(250 < median * part < 350 for part in (1, 0.1, 0.01)):
+            yield f"{name} has no unit and a median of {median:.4g}: kelvin, or a part of it? State its unit"
 
 
 def _controllers(guesses: _Guesses) -> _Guesses:

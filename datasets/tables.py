@@ -530,15 +530,13 @@ def read_column(
     notes = [] if cells == printed else ["numbers are as printed: a long minus, marks between thousands"]
     by_comma = wrong.size and any(map(_DECIMAL_COMMA.fullmatch, cells))
     if by_comma and all("." not in cell or _GROUPED.fullmatch(cell) for cell in cells):
-        pointed = [cell.replace(".", "").replace(",", ".") for cell in cells]  # 1.234,5 is 1234.5
-        values, wrong = _numbers_of(pointed)
+        values, wrong = _numbers_of([cell.replace(".", "").replace(",", ".") for cell in cells])  # 1.234,5
         notes.append("numbers have a decimal comma")
     cells_known = len(cells) - sum(cell in _LOST_CELLS for cell in cells)
     if tolerated and wrong.size and (united := _without_unit(name, cells)) is not None:
         named, bare, factors = united
         column = read_column(named, bare, lines, file, tolerated)
-        scaled = None if column.numbers is None else column.numbers * factors
-        return replace(column, numbers=scaled)
+        return replace(column, numbers=None if column.numbers is None else column.numbers * factors)
     first = cells[wrong[0]] if wrong.size else ""
     states = switched(cells) if tolerated else None
     if states is not None and np.isfinite(values).any() and len({cells[row].lower() for row in wrong}) > 1:
