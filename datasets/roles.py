@@ -41,7 +41,7 @@ _SETPOINT = re.compile(
 _SET_DRIVE = re.compile(r"^(set|soll)(_.*|\d*)$|_(set|soll)$|^(goal|desired)")  # set_percent is of a drive
 _OF_DRIVES = ("percent", "V", "A", "W", "0_255")
 _OUTDOORS = re.compile(
-    r"(^|_)(outside|outdoors?|weather|wind|cloud|rain|dew|sol)(_|$)|solar|irradia|^(to|te|text|toa|oat|ghi)$"
+    r"(^|_)(outside|outdoors?|weather|wind|cloud|rain|sol)(_|$)|solar|irradia|^(to|te|text|toa|oat|ghi)$"
 )
 _ROOM = re.compile(r"ambient|(^|_)(amb|room)(_|$)")
 _INPUT = re.compile(
@@ -57,12 +57,12 @@ _INFLOW = re.compile(r"(^|_)(inlet|inflow|supply_air)(_|$)")
 _BOOKKEEPING = re.compile(
     r"^(error|err|control_error|proportional|integral|derivative|[pid]_?(term|part|action)|k_?[pidc]|pid_[pid]"
     r"|ms|msec|second|minute|hour|day|month|year|week|weekday|row|index|id|iteration|sample|record|counter"
-    r"|i[as]e|mean|std_?(dev)?|min|max|batt(ery)?(_level|_u?v)?)(_of_[a-z]+|_?no|_?\d+)?$"
+    r"|i[as]e|mean|std_?(dev)?|min|max|dew_?point|feels_like|heat_index|batt(ery)?(_level|_u?v)?)(_of_[a-z]+|_?no|_?\d+)?$"
 )
 _ESTIMATE = re.compile(r"(_?hat|_(est(imated?)?|pred(icted)?|filt(ered)?|avg|average|smooth(ed)?))$")
 _MODES = {"auto", "automatic", "manual", "mode", "status"}  # of a controller
 IS_SET_POINT = "its name is that of a set point"
-_IS_BOOKKEEPING = "its name is that of a number of the clock, the controller or a statistic"
+_IS_BOOKKEEPING = "its name is that of a clock, a controller's term or a computed value"
 NO_CLUE = "neither its name nor its unit shows what it is"
 _NEVER_MOVES, _COUNTS_ROWS = "it never moves", "it counts rows or time"
 BY_UNIT = "its unit is degC"

@@ -235,9 +235,9 @@ GOAL = np.repeat([30.0, 60.0], 300)
         ({"a": ("1", HELD), "t_a": ("degC", READING), "b": ("1", np.arange(600) % 24.0)},
          "input output other", "it counts rows or time"),
         ({"a": ("1", HELD), "t_a": ("degC", READING), "Hour": ("1", HELD[::-1])},
-         "input output other", "its name is that of a number of the clock, the controller or a statistic"),
+         "input output other", "its name is that of a clock, a controller's term or a computed value"),
         ({"u1": ("1", HELD), "t_a": ("degC", READING), "Kp": ("1", HELD[::-1])},
-         "input output other", "its name is that of a number of the clock, the controller or a statistic"),
+         "input output other", "its name is that of a clock, a controller's term or a computed value"),
     ],
 )  # fmt: skip
 def test_what_is_computed_or_counted_is_neither_moved_nor_read(columns, roles, reason):
@@ -357,7 +357,7 @@ def test_roles_that_the_course_alone_shows_are_doubts():
     ("name", "role"),
     [("BeerSet", "other"), ("BeerTemp", "output"), ("extruder_temp", "output"), ("extruder_target", "other"),
      ("extruder_pwm", "input"), ("@", "input"), ("B@", "input"), ("T_target", "other"),
-     ("outside", "disturbance"), ("T_Sollwert", "other")],
+     ("outside", "disturbance"), ("T_Sollwert", "other"), ("Dew point", "other")],
 )  # fmt: skip
 def test_names_that_programs_give_their_columns(name, role):
     assert guess_role(name, "1") == role
