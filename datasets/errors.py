@@ -28,8 +28,9 @@ _HINTS = {
 
 
 class UserError(ValueError):
-    """The user's input is at fault: what is wrong, in which row (as an editor counts lines, the header is 1)
-    and column of which file, and a hint what to do about it, a clause each.
+    """The user's input is at fault.
+
+    What is wrong, the file, its row (as an editor counts lines) and column, and what to do: a clause each.
 
     Examples
     --------

@@ -66,8 +66,7 @@ def file_stem(path: str | Path) -> str:
 
 
 def _ending(path: str | Path) -> str:
-    name = Path(path).name.lower()
-    return next((e for e in FORMATS if name.endswith(e)), Path(path).suffix.lower())
+    return next((e for e in FORMATS if Path(path).name.lower().endswith(e)), Path(path).suffix.lower())
 
 
 class CutFile(NamedTuple):
