@@ -148,16 +148,16 @@ def read_log(
         log.attrs.update({k: v for k, v in table.meta.items() if k not in ("schema", "version")})
     else:
         repaired = _repair(read.clock, read.values, read.units, roles.of, table)
-        repairs = [*read.repairs, *repaired.repairs]
+        unusual, doubted = _reading_doubts(read, roles, repaired)
+        repairs = [*read.repairs, *repaired.repairs, *unusual]  # whoever states the roles is warned
         of_clock = [line for line in repairs if isinstance(line, repair.ClockDoubt)]
-        doubts = [line for line in repairs if isinstance(line, repair.Doubt) and line not in of_clock]
-        findings = [*doubts, *_reading_doubts(roles.of, read.units, repaired)]
+        doubted += [line for line in repairs if isinstance(line, repair.Doubt) and line not in of_clock]
         if outputs is None:
             roles = _without_half_lost(roles, repaired.time, repaired.columns)
         log = _made(repaired._replace(repairs=repairs), read, roles, file)
         log.attrs["clock_doubts"] = "\n".join(filter(None, [read.clock.doubt, *of_clock]))
-        log.attrs["reading_doubts"] = "\n".join(line for line in findings if NO_NUMBERS not in line)
-        log.attrs["role_doubts"] = "\n".join([*findings, *roles.doubts])
+        log.attrs["reading_doubts"] = "\n".join(line for line in doubted if NO_NUMBERS not in line)
+        log.attrs["role_doubts"] = "\n".join([*doubted, *unusual, *roles.doubts])
     for header, name in read.names_of.items():
         if (words := table.attrs.get(header, {}).get("flag_meanings")) and name in log:
             log[name].attrs["flag_meanings"] = words
@@ -447,25 +447,25 @@ def _repair(
     return _Repaired(time, columns, repairs)
 
 
-def _reading_doubts(roles: Mapping[str, str], units: Mapping[str, str], log: _Repaired) -> list[str]:
-    """Return a line for each reading with runs like a sensor's code, or a jump that no input makes."""
-    drives = {name: values for name, values in log.columns.items() if roles[name] == "input"}
-    readings = {name: v for name, v in log.columns.items() if roles[name] in ("output", "disturbance")}
-    doubts = []
+def _reading_doubts(read: _Columns, roles: Roles, log: _Repaired) -> tuple[list[str], list[str]]:
+    """Return what of readings is unusual, as a few of sound logs are too, and what no sound log has."""
+    drives = {name: values for name, values in log.columns.items() if roles.of[name] == "input"}
+    readings = {name: v for name, v in log.columns.items() if roles.of[name] in ("output", "disturbance")}
+    unusual, doubts = [], []
     for name, values in readings.items():
-        if roles[name] == "disturbance" and units[name] != "degC":
+        if roles.of[name] == "disturbance" and read.units[name] != "degC":
             values = np.where(values == 0, np.nan, values)  # at night and in a calm no sensor ends
-        doubts.append(repair.doubt_readings(name, values, [*drives.values()], log.time))
+        unusual.append(repair.doubt_readings(name, values, [*drives.values()], log.time))
     for name, values in drives.items():
-        doubts += [repair.doubt_full_scale(name, values, units[name]), repair.doubt_moves(name, values)]
-    for name in [name for name in readings if roles[name] == "output"]:
+        doubts += [repair.doubt_full_scale(name, values, read.units[name]), repair.doubt_moves(name, values)]
+    for name in [name for name in readings if roles.of[name] == "output"]:
         doubts.append(repair.doubt_rows(name, readings[name]))
-        doubts += [repair.doubt_lead(name, readings[name], *drive, log.time) for drive in drives.items()]
-    of_role = ([n for n in log.columns if roles[n] == role] for role in ("input", "output", "disturbance"))
+        unusual += [repair.doubt_lead(name, readings[name], *drive, log.time) for drive in drives.items()]
+    of_role = ([n for n in log.columns if roles.of[n] == role] for role in ("input", "output", "disturbance"))
     after_gap = np.isin(np.arange(log.time.size), repair.gap_rows(log.time) + 1)
-    read = {name: np.where(after_gap, np.nan, values) for name, values in readings.items()}
-    doubts += effect_doubts(log.columns | read, *of_role)
-    return [doubt for doubt in doubts if doubt]
+    sensed = {name: np.where(after_gap, np.nan, values) for name, values in readings.items()}
+    doubts += effect_doubts(log.columns | sensed, *of_role)
+    return [*filter(None, unusual)], [*filter(None, doubts)]
 
 
 def _without_half_lost(roles: Roles, time: Array, columns: Mapping[str, Array]) -> Roles:
