@@ -448,7 +448,7 @@ def _repair(
 
 
 def _reading_doubts(read: _Columns, roles: Roles, log: _Repaired) -> tuple[list[str], list[str]]:
-    """Return what of readings is unusual, as a few of sound logs are too, and what no sound log has."""
+    """Return what is unusual in readings, as in many sound logs, and what hardly any sound log has."""
     drives = {name: values for name, values in log.columns.items() if roles.of[name] == "input"}
     readings = {name: v for name, v in log.columns.items() if roles.of[name] in ("output", "disturbance")}
     unusual, doubts = [], []
